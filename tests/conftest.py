@@ -1,0 +1,19 @@
+import numpy as np
+import pytest
+import warp as wp
+
+wp.config.log_level = wp.LOG_WARNING
+
+
+def pytest_addoption(parser):
+    parser.addoption("--device", default="cpu", help="Warp device that the kernels run on")
+
+
+@pytest.fixture(scope="session")
+def device(request):
+    return wp.get_device(request.config.getoption("--device"))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)

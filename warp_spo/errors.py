@@ -1,0 +1,32 @@
+"""The errors a caller may want to tell apart; every other mistake is a plain ValueError or TypeError."""
+
+
+class DirectedLoopError(ValueError):
+    """The edges contain a directed loop, so that (I - E)^-1 has no meaning as a sum over paths.
+
+    Raised on topology, not on a determinant: two loops that share a node can have det(I - E) = -1 and still no
+    resolvent in the sense of the paper.
+
+    Attributes:
+        cycle: nodes of one loop, each the parent of the next, the last the parent of the first.
+    """
+
+    def __init__(self, call: str, cycle: list[int]):
+        self.cycle = list(cycle)
+        nodes = " -> ".join(str(node) for node in [*self.cycle, self.cycle[0]])
+        super().__init__(
+            f"{call}: nodes {nodes} form a directed loop; cut one of its edges (Tree.from_edges returns the cut "
+            f"edges of a graph) or aggregate its nodes into one"
+        )
+
+
+class UnsupportedError(ValueError):
+    """The model is valid, but holds something that this library does not represent.
+
+    Attributes:
+        what: the thing that is not supported, by name.
+    """
+
+    def __init__(self, call: str, what: str, way_out: str = ""):
+        self.what = what
+        super().__init__(f"{call}: {what} is not supported" + (f"; {way_out}" if way_out else ""))
