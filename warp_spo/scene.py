@@ -413,8 +413,8 @@ class Scene:
     # -- sizes and names -------------------------------------------------------------------------------------------
     @property
     def worlds(self) -> int:
-        """Worlds whose values the scene holds; a scene of one world serves any number."""
-        return max(array.shape[0] for array in self.values.values())
+        """Worlds of the source model, or whose values the scene holds; a scene of one world serves any number."""
+        return max(array.shape[0] for array in (self.q_index, *self.values.values()))
 
     @property
     def body_count(self) -> int:
@@ -473,7 +473,7 @@ class Scene:
         scene.values = dict(self.values)
         for name, value in values.items():
             scene.values[name] = self.check_value("Scene.with_values", name, value)
-        counts = {array.shape[0] for array in scene.values.values()} - {1}
+        counts = {array.shape[0] for array in (scene.q_index, *scene.values.values())} - {1}
         if len(counts) > 1:
             raise ValueError(f"Scene.with_values: values for {sorted(counts)} worlds; expected one world count")
         worlds = scene.worlds

@@ -1,0 +1,61 @@
+"""The blocks of a rigid-body system, for the operators: phi(p, k), H(k) and M(k) as dense row-major matrices."""
+
+import functools
+
+import warp as wp
+
+from .factorization import BlockTables
+from .spatial import spatial
+from .topology import Topology
+
+
+@functools.cache
+def fill(T) -> wp.Kernel:
+    """One thread for each (node, world) writes the node's blocks; see kernels/factorization.py for their places."""
+    s = spatial(T)
+
+    @wp.func
+    def put(out: wp.array2d[T], world: int, first: int, row: int, column: int, m: s.mat33):
+        for a in range(3):
+            for b in range(3):
+                out[world, first + 6 * (row + a) + column + b] = m[a, b]
+
+    @wp.kernel(module=f"warp_spo_rigid_blocks_{T.__name__}", enable_backward=False)
+    def kernel(
+        topology: Topology,
+        tables: BlockTables,
+        pose: wp.array3d[T],
+        axis: wp.array3d[T],
+        rigid: wp.array3d[T],
+        armature: wp.array2d[T],
+        weight_out: wp.array2d[T],
+        H_out: wp.array2d[T],
+        M_out: wp.array2d[T],
+        Delta_out: wp.array2d[T],
+    ):
+        node, world = wp.tid()
+        if topology.parent[node] >= 0:
+            R = s.load_matrix(pose, node, 0, world)
+            at = tables.weight[node]
+            put(weight_out, world, at, 0, 0, R)
+            put(weight_out, world, at, 0, 3, s.skew(s.load(pose, node, 9, world)) * R)
+            put(weight_out, world, at, 3, 0, s.mat33())
+            put(weight_out, world, at, 3, 3, R)
+        mass = rigid[node, 0, world]
+        moment = s.skew(s.load(rigid, node, 1, world))
+        at = tables.square[node]
+        put(M_out, world, at, 0, 0, s.load_symmetric(rigid, node, 4, world))
+        put(M_out, world, at, 0, 3, moment)
+        put(M_out, world, at, 3, 0, wp.transpose(moment))
+        put(M_out, world, at, 3, 3, wp.diag(s.vec3(mass, mass, mass)))
+        first, count = topology.qd_start[node], topology.dof_count[node]
+        for i in range(count):
+            for c in range(6):
+                H_out[world, tables.hinge[node] + 6 * i + c] = axis[first + i, c, world]
+            for j in range(count):
+                value = T(0.0)
+                if i == j:
+                    value = armature[first + i, world]
+                Delta_out[world, tables.pivot[node] + i * count + j] = value
+
+    return kernel

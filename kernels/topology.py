@@ -1,0 +1,16 @@
+"""The tables of a scene's tree that every recursion reads; filled by warp_spo.dynamics."""
+
+import warp as wp
+
+
+@wp.struct
+class Topology:
+    order: wp.array[int]  # nodes, level by level, roots first
+    parent: wp.array[int]  # [node], -1 = the inertial frame
+    child_start: wp.array[int]  # [node + 1], into children
+    children: wp.array[int]
+    motion: wp.array[int]  # [node], warp_spo.scene.SCREWS, BALL or FREE
+    q_start: wp.array[int]  # [node], first coordinate of the node's hinge
+    qd_start: wp.array[int]  # [node], first degree of freedom of the node's hinge
+    dof_count: wp.array[int]  # [node]
+    dof_node: wp.array[int]  # [dof]

@@ -1,0 +1,325 @@
+"""The border between the caller's arrays and Warp's: one :class:`Call` for every public call.
+
+The caller's arrays are torch tensors, Warp arrays or NumPy arrays, ``[world, ...]`` and C-contiguous. torch and Warp
+arrays are used where they are: they must have the object's dtype and device, nothing is copied silently. NumPy arrays
+are cast and copied. The kind of the first array is the kind of the result.
+"""
+
+import functools
+import sys
+
+import numpy as np
+import warp as wp
+
+NUMPY, WARP, TORCH = "NumPy", "Warp", "torch"
+_DTYPES = {"float32": wp.float32, "float64": wp.float64}
+
+
+def parse_dtype(dtype, call: str = "dtype") -> type:
+    """Return ``wp.float32`` or ``wp.float64`` for the name or the NumPy, Warp or torch type of that name.
+
+    Raises:
+        ValueError: any other type. Python's ``float`` too, which is float32 to Warp and float64 to NumPy.
+    """
+    name = getattr(dtype, "__name__", None) or str(dtype).removeprefix("torch.")
+    if name not in _DTYPES:
+        raise ValueError(
+            f'{call}: dtype is {dtype!r}; expected "float32" or "float64" (or Warp\'s, NumPy\'s, torch\'s)'
+        )
+    return _DTYPES[name]
+
+
+def parse_device(device=None) -> wp.Device:
+    """Return the Warp device for a name, a Warp device or a torch device; None is Warp's current one."""
+    if device is not None and type(device).__module__ == "torch":
+        device = _torch().device_name(device)
+    return wp.get_device(device)
+
+
+def kind_of(array, call: str, name: str) -> str:
+    """Return ``NUMPY``, ``WARP`` or ``TORCH``.
+
+    Raises:
+        TypeError: anything else.
+    """
+    if isinstance(array, wp.array):
+        return WARP
+    if isinstance(array, np.ndarray):
+        return NUMPY
+    if "torch" in sys.modules and _torch().is_tensor(array):
+        return TORCH
+    raise TypeError(
+        f"{call}: {name} is of type {type(array).__name__}; expected a torch tensor, a Warp array or a NumPy array; "
+        f"wrap numbers in numpy.array(...)"
+    )
+
+
+class Call:
+    """One call: takes the caller's arrays in, gives the result back in the caller's kind.
+
+    ::
+
+        with Call("Dynamics.forward_dynamics", device, dtype) as call:
+            q = call.read("q", q, (worlds, nq), "[world, coordinate]")
+            qdd = call.write(out, (worlds, nv), "[world, dof]")
+            wp.launch(...)
+        return call.result
+
+    Inside the block Warp's current stream of the device is torch's, if any array is a torch tensor on CUDA. With
+    torch and Warp arrays and ``out`` given, nothing is allocated, copied or waited for. NumPy results and NumPy arrays
+    passed to :meth:`update` are filled when the block ends.
+
+    Args:
+        name: the call, for errors.
+        device: where the kernels run.
+        dtype: ``wp.float32`` or ``wp.float64``.
+        kind: kind of the result where no array says it.
+
+    Attributes:
+        result: what :meth:`write` was given or made, in the caller's kind; a tuple if :meth:`write` was called more
+            than once. Set when the block ends without an exception.
+    """
+
+    __slots__ = ("device", "dtype", "kind", "name", "result")
+    __slots__ += ("_inputs", "_outputs", "_results", "_saved_stream", "_staged")
+
+    def __init__(self, name: str, device: wp.Device, dtype: type, kind: str | None = None):
+        self.name = name
+        self.device = device
+        self.dtype = dtype
+        self.kind = kind
+        self.result = None
+        self._inputs = []  # (name, caller's array, Warp array)
+        self._outputs = []
+        self._results = []  # (caller's array or None, Warp array)
+        self._staged = []  # (NumPy array to fill, Warp array)
+        self._saved_stream = None
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, error, traceback):
+        try:
+            if error is None:
+                self._finish()
+        finally:
+            if self._saved_stream is not None:
+                wp.set_stream(self._saved_stream, self.device, sync=False)
+
+    def read(self, name: str, array, shape: tuple, meaning: str = "", *, dtype=None, optional: bool = False):
+        """Return an input as a Warp array of scalars on the device; None stays None if ``optional``.
+
+        Args:
+            name: the argument, for errors.
+            array: the caller's array.
+            shape: expected shape; -1 is any size.
+            meaning: the axes in words, such as ``"[world, dof]"``.
+            dtype: expected scalar type, the call's unless given.
+
+        Raises:
+            TypeError: not an array.
+            ValueError: wrong shape, dtype, device; not contiguous; requires grad; overlaps an output.
+        """
+        if array is None and optional:
+            return None
+        taken = self._take(name, array, shape, meaning, dtype or self.dtype)
+        self._check_apart(name, array, taken, self._outputs)
+        self._inputs.append((name, array, taken))
+        return taken
+
+    def update(self, name: str, array, shape: tuple, meaning: str = "", *, dtype=None, optional: bool = True):
+        """Return an array that the call changes in place; as :meth:`read`, a NumPy array is written back."""
+        if array is None and optional:
+            return None
+        taken = self._take(name, array, shape, meaning, dtype or self.dtype, change=True)
+        self._add_output(name, array, taken)
+        if isinstance(array, np.ndarray):
+            self._staged.append((array, taken))
+        return taken
+
+    def write(self, out, shape: tuple, meaning: str = "", *, name: str = "out", dtype=None):
+        """Return the array for a result: ``out`` itself, or a new one of the kind of the first array read.
+
+        Its content is undefined. Raises as :meth:`read`, and TypeError if ``out`` is of another kind.
+        """
+        dtype = dtype or self.dtype
+        if out is None:
+            out, taken = self._new(tuple(shape), dtype)
+        else:
+            kind = kind_of(out, self.name, name)
+            if self.kind is not None and kind != self.kind:
+                raise TypeError(
+                    f"{self.name}: {name} is {_describe(out, kind)}; expected a {self.kind} array, the kind of "
+                    f"the first array of the call; pass {name} in that kind"
+                )
+            if kind == NUMPY:
+                self._check(name, out, kind, out.shape, shape, meaning, dtype, out.dtype.name == dtype.__name__)
+                taken = wp.empty(tuple(shape), dtype=dtype, device=self.device)
+                self._check_writeable(name, out)
+                self._staged.append((out, taken))
+            else:
+                taken = self._take(name, out, shape, meaning, dtype, change=True)
+            self._add_output(name, out, taken)
+        self._results.append((out, taken))
+        return taken
+
+    def _new(self, shape, dtype):
+        if self.kind == TORCH and self.device.is_cuda:
+            self._enter_stream()
+        owner, array = new(self.kind, shape, dtype, self.device)
+        return (None if self.kind in (None, NUMPY) else owner), array
+
+    def _take(self, name, array, shape, meaning, dtype, change=False):
+        kind = kind_of(array, self.name, name)
+        if self.kind is None:
+            self.kind = kind
+        if kind == NUMPY:
+            return self._take_numpy(name, array, shape, meaning, dtype, change)
+        if kind == WARP:
+            came = array.shape
+            same = array.dtype is dtype
+            if not same and getattr(array.dtype, "_wp_scalar_type_", None) is dtype:
+                # vectors and transforms are scalars with further axes
+                came = came + array.dtype._shape_
+                same = True
+            self._check(name, array, kind, came, shape, meaning, dtype, same)
+            if array.device != self.device or not array.is_contiguous:
+                self._refuse_place(name, array, kind, array.is_contiguous)
+            if array.requires_grad and wp._src.context.runtime.tape is not None:
+                self._refuse_grad(name, "is recorded by wp.Tape", "leave the tape's block")
+            return array if array.dtype is dtype else view(array.ptr, came, dtype, self.device.alias)
+        torch = _torch()
+        self._check(name, array, kind, array.shape, shape, meaning, dtype, torch.has_dtype(array, dtype))
+        if not torch.is_on(array, self.device) or not array.is_contiguous():
+            self._refuse_place(name, array, kind, array.is_contiguous())
+        if array.requires_grad and torch.is_grad_enabled():
+            self._refuse_grad(name, "requires grad", f"pass {name}.detach(), or call inside torch.no_grad()")
+        if self.device.is_cuda:
+            self._enter_stream()
+        if change:
+            torch.mark_changed(array)
+        return view(array.data_ptr(), tuple(array.shape), dtype, self.device.alias)
+
+    def _take_numpy(self, name, array, shape, meaning, dtype, change):
+        kinds = "biuf" if dtype in (wp.float32, wp.float64) else "biu"
+        self._check(name, array, NUMPY, array.shape, shape, meaning, dtype, array.dtype.kind in kinds)
+        if change:
+            self._check_writeable(name, array)
+        if self.device.is_capturing:
+            raise ValueError(
+                f"{self.name}: {name} is {_describe(array, NUMPY)} inside a graph capture; expected an array on "
+                f"{self.device}; copy it there before the capture"
+            )
+        host = np.array(array, dtype=wp.dtype_to_numpy(dtype), order="C", ndmin=1)
+        staged = wp.array(host, dtype=dtype, device="cpu", copy=False) if host.size else None
+        if staged is None or self.device.is_cpu:
+            return staged if staged is not None else wp.empty(array.shape, dtype=dtype, device=self.device)
+        taken = wp.empty(array.shape, dtype=dtype, device=self.device)
+        wp.copy(taken, staged)  # on the current stream: wp.array(host, device=...) would use the null stream
+        return taken
+
+    def _check(self, name, array, kind, came, shape, meaning, dtype, dtype_fits):
+        if came == shape or (len(came) == len(shape) and all(e in (-1, c) for c, e in zip(came, shape, strict=True))):
+            if dtype_fits:
+                return
+            way = f"convert it to {dtype.__name__}"
+            if dtype is self.dtype and _dtype_name(array) in _DTYPES:
+                way += f", or build the object with dtype={_dtype_name(array)!r}"
+        else:
+            way = f"reshape {name}, or build the object for this size"
+        sizes = ", ".join("any" if size == -1 else str(size) for size in shape) + ("," if len(shape) == 1 else "")
+        expected = f"{dtype.__name__} ({sizes}) {meaning}".rstrip()
+        raise ValueError(f"{self.name}: {name} is {_describe(array, kind)}; expected {expected}; {way}")
+
+    def _refuse_place(self, name, array, kind, contiguous):
+        if contiguous:
+            way = f"move it there, or build the object with device={str(array.device)!r}"
+            raise ValueError(f"{self.name}: {name} is {_describe(array, kind)}; expected it on {self.device}; {way}")
+        raise ValueError(
+            f"{self.name}: {name} is {_describe(array, kind)} with strides; expected a C-contiguous array; "
+            f"pass {name}.contiguous()"
+        )
+
+    def _refuse_grad(self, name, what, way_out):
+        raise ValueError(f"{self.name}: {name} {what}; derivatives are not available through this call; {way_out}")
+
+    def _check_writeable(self, name, array):
+        if not array.flags.writeable:
+            raise ValueError(f"{self.name}: {name} is a read-only NumPy array; expected one to write into; pass a copy")
+
+    def _add_output(self, name, array, taken):
+        self._check_apart(name, array, taken, self._inputs)
+        self._check_apart(name, array, taken, self._outputs)
+        self._outputs.append((name, array, taken))
+
+    def _check_apart(self, name, array, taken, others):
+        for other_name, other, other_taken in others:
+            if isinstance(array, np.ndarray):
+                overlap = isinstance(other, np.ndarray) and np.shares_memory(array, other)
+            else:
+                overlap = taken.size and other_taken.size and _bytes_meet(taken, other_taken)
+            if overlap:
+                raise ValueError(
+                    f"{self.name}: {name} overlaps {other_name} in memory; expected an array that is written to "
+                    f"be apart from every other; pass a fresh array for one of them"
+                )
+
+    def _enter_stream(self):
+        if self._saved_stream is None:
+            current = self.device.stream
+            wanted = _torch().stream(self.device)
+            self._saved_stream = current
+            if wanted.cuda_stream != current.cuda_stream:
+                # NumPy arrays of this call may be on their way on the other stream; without any, nothing may wait,
+                # because waiting on a stream outside of a capture ends the capture.
+                numpy_came = any(isinstance(array, np.ndarray) for _, array, _ in self._inputs + self._outputs)
+                wp.set_stream(wanted, self.device, sync=numpy_came)
+
+    def _finish(self):
+        numpy_came = any(isinstance(array, np.ndarray) for _, array, _ in self._inputs)
+        if self.device.is_cuda and (numpy_came or self._staged or self.kind in (None, NUMPY)):
+            wp.synchronize_stream(self.device.stream)  # also: copies made here are freed in no stream's order
+        for array, taken in self._staged:
+            array[...] = taken.numpy()
+        results = tuple(taken.numpy() if out is None else out for out, taken in self._results)
+        self.result = results[0] if len(results) == 1 else results or None
+
+
+def new(kind: str | None, shape: tuple, dtype: type, device: wp.Device) -> tuple:
+    """Return (owner, Warp array) of undefined content; the memory is free again when the owner is dropped.
+
+    For torch the owner is a tensor, so that torch orders the reuse of the memory on the stream it was used on.
+    """
+    if kind == TORCH:
+        tensor = _torch().empty(shape, dtype, device)
+        return tensor, view(tensor.data_ptr(), shape, dtype, device.alias)
+    array = wp.empty(shape, dtype=dtype, device=device)
+    return array, array
+
+
+@functools.lru_cache(maxsize=4096)
+def view(pointer: int, shape: tuple, dtype: type, device: str) -> wp.array:
+    """Return a Warp array over memory that someone else owns. Cached, because making one takes 4 us."""
+    return wp.array(ptr=pointer, shape=shape, dtype=dtype, device=device)
+
+
+def _bytes_meet(a, b) -> bool:
+    return a.ptr < b.ptr + b.size * wp.types.type_size_in_bytes(b.dtype) and b.ptr < a.ptr + a.size * (
+        wp.types.type_size_in_bytes(a.dtype)
+    )
+
+
+def _dtype_name(array) -> str:
+    return getattr(array.dtype, "__name__", None) or str(array.dtype).removeprefix("torch.")
+
+
+def _describe(array, kind) -> str:
+    place = "" if kind == NUMPY else f" on {array.device}"
+    return f"a {kind} array {_dtype_name(array)} {tuple(array.shape)}{place}"
+
+
+@functools.cache
+def _torch():
+    from . import torch  # torch is met in that file only, and only if the caller has brought it
+
+    return torch

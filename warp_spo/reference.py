@@ -1,0 +1,411 @@
+"""The specification: every operator and algorithm as dense float64 NumPy, for one world, dull on purpose.
+
+A. Jain, "Graph Theory Roots of Spatial Operators for Kinematics and Dynamics". Spatial vectors are [omega; v] and
+[moment; force], in the axes of a node frame and about its origin. Node k is body k; its frame is the child anchor of
+the hinge that carries the body. N = 6 bodies rows, node after node; the columns of H.T are in the order of qd.
+
+Two roads lead to the dynamics and share nothing but poses: the paper's matrices, built by ``inv(I - E)`` (``E_phi``,
+``phi``, ``H``, ``M``, ``mass_matrix``, ``P``, ``D``, ...), and Newton's and Euler's equations for each body in plain
+three-vectors of the world (``inverse_dynamics``, ``bias_force``, ``jacobian``). This file imports NumPy only: a scene
+is read by the names of its attributes.
+"""
+
+from functools import cached_property
+
+import numpy as np
+
+
+def skew(vector):
+    """The matrix a~ with a~ b = a x b, shape (3, 3)."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def rotation_exp(vector):
+    """Rotation matrix (3, 3) of a rotation vector [rad]."""
+    angle = np.linalg.norm(vector)
+    k = skew(vector)
+    return np.eye(3) + np.sinc(angle / np.pi) * k + 0.5 * np.sinc(0.5 * angle / np.pi) ** 2 * k @ k
+
+
+def rotation(quaternion):
+    """Rotation matrix (3, 3) of a quaternion xyzw of any length but zero."""
+    x, y, z, w = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(quaternion)
+    k = skew((x, y, z))
+    return np.eye(3) + 2.0 * w * k + 2.0 * k @ k
+
+
+def quaternion(matrix):
+    """A unit quaternion xyzw, of either sign, of a rotation matrix: the eigenvector of Bar-Itzhack's matrix."""
+    b = np.empty((4, 4))
+    b[:3, :3] = matrix + matrix.T - np.trace(matrix) * np.eye(3)
+    b[:3, 3] = b[3, :3] = matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]
+    b[3, 3] = np.trace(matrix)
+    return np.linalg.eigh(b)[1][:, -1]
+
+
+def quaternion_product(a, b):
+    """The quaternion xyzw of the rotation b followed by a."""
+    return np.array([*(a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3])), a[3] * b[3] - a[:3] @ b[:3]])
+
+
+def rotation_vector(matrix):
+    """Rotation vector [rad], no longer than pi, of a rotation matrix."""
+    q = quaternion(matrix)
+    q = q if q[3] >= 0.0 else -q
+    length = np.linalg.norm(q[:3])
+    return q[:3] * (2.0 * np.arctan2(length, q[3]) / length if length > 0.0 else 2.0)
+
+
+def homogeneous(pose):
+    """The 4 x 4 matrix of a pose (x, y, z, qx, qy, qz, qw)."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation(pose[3:]), pose[:3]
+    return matrix
+
+
+def pose7(matrix):
+    """Pose (x, y, z, qx, qy, qz, qw) of a 4 x 4 matrix; the quaternion has unit length and either sign."""
+    return np.concatenate([matrix[:3, 3], quaternion(matrix[:3, :3])])
+
+
+class Dense:
+    """A scene at one configuration of one world.
+
+    Args:
+        scene: anything with the attributes hinges, hinge_of, values, q_start and qd_start of a Scene.
+        q: coordinates [coordinate], [m, rad, unit quaternion xyzw]; quaternions are normalised when read.
+        qd: velocities [dof] that the methods use when they are given none; zero if left out.
+        world: row of ``scene.values``; an array with fewer rows gives its last.
+
+    Raises:
+        ValueError: q or qd of a wrong length.
+        numpy.linalg.LinAlgError: from what needs D^-1 or the inverse mass matrix, if a hinge moves no inertia.
+    """
+
+    def __init__(self, scene, q, qd=None, world=0):
+        self.scene, self.world = scene, world
+        self.body_count, self.dof_count = len(scene.hinge_of), int(scene.qd_start[-1])
+        self.q = self._vector("q", q, int(scene.q_start[-1]))
+        self.qd = self._vector("qd", np.zeros(self.dof_count) if qd is None else qd, self.dof_count)
+        self.hinge = [scene.hinges[h] for h in scene.hinge_of]  # by node
+        self.parent = [hinge.parent for hinge in self.hinge]
+        self.dofs = [np.arange(scene.qd_start[h], scene.qd_start[h + 1]) for h in scene.hinge_of]
+        self.rows = [np.arange(6 * k, 6 * k + 6) for k in range(self.body_count)]
+        children = [[k for k, p in enumerate(self.parent) if p == node] for node in range(-1, self.body_count)]
+        self.outward = list(children[0])  # grows while it is read: parents before children
+        for node in self.outward:
+            self.outward += children[node + 1]
+        self._place()
+
+    @staticmethod
+    def _vector(name, value, size):
+        value = np.asarray(value, dtype=np.float64)
+        if value.shape != (size,):
+            raise ValueError(f"reference.Dense: {name} has shape {value.shape}; expected ({size},), one world's")
+        return value
+
+    def value(self, name):
+        """``scene.values[name]`` of this world."""
+        array = self.scene.values[name]
+        return array[min(self.world, array.shape[0] - 1)]
+
+    # -- poses -------------------------------------------------------------------------------------------------------
+    def _place(self):
+        """World poses as 4 x 4 matrices: of bodies, of node frames, and of the frames between a hinge's screws."""
+        self.body_matrix, self.node_matrix = np.empty((2, self.body_count, 4, 4))
+        self.stages = [[] for _ in self.hinge]  # by node: the parent anchor, then the frame after each screw
+        for k in self.outward:
+            h, hinge, inboard = self.scene.hinge_of[k], self.hinge[k], np.eye(4)
+            q = self.q[self.scene.q_start[h] : self.scene.q_start[h + 1]]
+            if self.parent[k] >= 0:
+                inboard = self.body_matrix[self.parent[k]]
+            self.stages[k].append(inboard @ homogeneous(self.value("joint_X_p")[h]))
+            if hinge.kind == "ball":
+                self.stages[k].append(self.stages[k][0] @ homogeneous([0.0, 0.0, 0.0, *q]))
+            elif hinge.kind == "free":
+                self.stages[k].append(self.stages[k][0] @ homogeneous(q))
+            else:
+                for (axis, angular, linear), x in zip(hinge.screws, q, strict=True):
+                    step = np.eye(4)
+                    step[:3, :3], step[:3, 3] = rotation_exp(angular * x * axis), linear * x * axis
+                    self.stages[k].append(self.stages[k][-1] @ step)
+            self.node_matrix[k] = self.stages[k][-1]
+            self.body_matrix[k] = self.node_matrix[k] @ np.linalg.inv(homogeneous(self.value("joint_X_c")[h]))
+
+    @property
+    def frames(self):
+        """World pose of every node frame [node, 7], [m, unit quaternion xyzw of either sign]."""
+        return np.array([pose7(matrix) for matrix in self.node_matrix])
+
+    @property
+    def body_poses(self):
+        """World pose of every body frame [body, 7], [m, unit quaternion xyzw of either sign]; Newton's body_q."""
+        return np.array([pose7(matrix) for matrix in self.body_matrix])
+
+    @cached_property
+    def com(self):
+        """Centre of mass of every body in the world [body, 3], [m]."""
+        return np.einsum("kij,kj->ki", self.body_matrix[:, :3, :3], self.value("body_com")) + self.body_matrix[:, :3, 3]
+
+    # -- the paper's matrices ----------------------------------------------------------------------------------------
+    @cached_property
+    def E_phi(self):
+        """[N, N]: w(p, k) = [[R, l~ R], [0, R]], (R, l) the pose of node frame k in node frame p. Eq. 4, 15."""
+        E = np.zeros((6 * self.body_count,) * 2)
+        for k, p in enumerate(self.parent):
+            if p >= 0:
+                relative = np.linalg.inv(self.node_matrix[p]) @ self.node_matrix[k]
+                R, l = relative[:3, :3], relative[:3, 3]
+                E[np.ix_(self.rows[p], self.rows[k])] = np.block([[R, skew(l) @ R], [np.zeros((3, 3)), R]])
+        return E
+
+    @cached_property
+    def phi(self):
+        """(I - E_phi)^-1 [N, N]. Eq. 9."""
+        return np.linalg.inv(np.eye(len(self.E_phi)) - self.E_phi)
+
+    @cached_property
+    def H(self):
+        """[dof, N]: a row is the motion of a node frame against the hinge's parent at unit velocity. Eq. 19."""
+        H = np.zeros((self.dof_count, 6 * self.body_count))
+        for k, hinge in enumerate(self.hinge):
+            R, origin = self.node_matrix[k][:3, :3], self.node_matrix[k][:3, 3]
+            for i, dof in enumerate(self.dofs[k]):
+                # omega and v in the world, v being that of the point of the child that is at ``point``
+                if hinge.kind == "ball":
+                    omega, v, point = self.stages[k][0][:3, i], np.zeros(3), origin
+                elif hinge.kind == "free":
+                    direction, point = self.stages[k][0][:3, i % 3], self.com[k]
+                    omega, v = (np.zeros(3), direction) if i < 3 else (direction, np.zeros(3))
+                else:
+                    axis, angular, linear = hinge.screws[i]
+                    direction, point = self.stages[k][i][:3, :3] @ axis, self.stages[k][i][:3, 3]
+                    omega, v = angular * direction, linear * direction
+                H[dof, self.rows[k]] = np.concatenate([R.T @ omega, R.T @ (v + np.cross(omega, origin - point))])
+        return H
+
+    @cached_property
+    def M(self):
+        """Block diagonal of the bodies' spatial inertias about their node frames [N, N], [kg m^2, kg m, kg]."""
+        M = np.zeros((6 * self.body_count,) * 2)
+        for k, h in enumerate(self.scene.hinge_of):
+            to_node = np.linalg.inv(homogeneous(self.value("joint_X_c")[h]))
+            mass, R = self.value("body_mass")[k], to_node[:3, :3]
+            c = skew(R @ self.value("body_com")[k] + to_node[:3, 3])
+            inertia = R @ self.value("body_inertia")[k] @ R.T
+            M[np.ix_(self.rows[k], self.rows[k])] = np.block(
+                [[inertia + mass * c @ c.T, mass * c], [mass * c.T, mass * np.eye(3)]]
+            )
+        return M
+
+    @property
+    def Delta(self):
+        """Armature [dof, dof], [kg m^2 or kg]."""
+        return np.diag(self.value("joint_armature"))
+
+    @cached_property
+    def mass_matrix(self):
+        """H phi M phi^T H^T + Delta [dof, dof]. Eq. 1a."""
+        return self.H @ self.phi @ self.M @ self.phi.T @ self.H.T + self.Delta
+
+    @cached_property
+    def _riccati(self):
+        P, D, G = self.M.copy(), self.Delta.copy(), np.zeros(self.H.T.shape)
+        for k in reversed(self.outward):
+            rows, dofs = self.rows[k], self.dofs[k]
+            H, Pk = self.H[np.ix_(dofs, rows)], P[np.ix_(rows, rows)]
+            Dk = H @ Pk @ H.T + self.Delta[np.ix_(dofs, dofs)]
+            Gk = np.linalg.solve(Dk, H @ Pk).T
+            D[np.ix_(dofs, dofs)], G[np.ix_(rows, dofs)] = Dk, Gk
+            if self.parent[k] >= 0:
+                to = self.rows[self.parent[k]]
+                w = self.E_phi[np.ix_(to, rows)]
+                P[np.ix_(to, to)] += w @ (np.eye(6) - Gk @ H) @ Pk @ w.T
+        return P, D, G
+
+    @property
+    def P(self):
+        """Articulated-body inertias [N, N], block diagonal: P(k) = M(k) + sum over children of w (I - G H) P w^T."""
+        return self._riccati[0]
+
+    @property
+    def D(self):
+        """H P H^T + Delta [dof, dof], block diagonal by hinge."""
+        return self._riccati[1]
+
+    @property
+    def G(self):
+        """P H^T D^-1 [N, dof], a block for each hinge."""
+        return self._riccati[2]
+
+    @property
+    def K(self):
+        """E_phi G [N, dof]: the Kalman gain."""
+        return self.E_phi @ self.G
+
+    @property
+    def E_psi(self):
+        """E_phi (I - G H) = E_phi - K H [N, N]."""
+        return self.E_phi - self.K @ self.H
+
+    @cached_property
+    def psi(self):
+        """(I - E_psi)^-1 [N, N]."""
+        return np.linalg.inv(np.eye(len(self.E_phi)) - self.E_psi)
+
+    @property
+    def log_det(self):
+        """log det of the mass matrix, natural logarithm."""
+        return np.linalg.slogdet(self.mass_matrix)[1]
+
+    # -- classical mechanics in the world ----------------------------------------------------------------------------
+    def _motion(self, qd, qdd):
+        """Of every node frame, world axes: angular velocity, velocity and acceleration of the origin, angular
+        acceleration, each [node, 3], by differentiating the poses of the chain of frames twice by hand."""
+        W, V, A, AL = np.zeros((4, self.body_count, 3))
+        cross = np.cross
+        for k in self.outward:
+            anchor, node, p = self.stages[k][0], self.node_matrix[k], self.parent[k]
+            w, v, a, al = np.zeros((4, 3))
+            if p >= 0:  # the anchor moves with the parent
+                r = anchor[:3, 3] - self.node_matrix[p][:3, 3]
+                w, al = W[p], AL[p]
+                v, a = V[p] + cross(w, r), A[p] + cross(al, r) + cross(w, cross(w, r))
+            x, xd = qd[self.dofs[k]], qdd[self.dofs[k]]
+            if self.hinge[k].kind == "ball":
+                spin, spin_rate = anchor[:3, :3] @ x, anchor[:3, :3] @ xd
+                w, al = w + spin, al + cross(w, spin) + spin_rate
+            elif self.hinge[k].kind == "free":
+                slide, spin = anchor[:3, :3] @ x[:3], anchor[:3, :3] @ x[3:]
+                r, s = self.com[k] - anchor[:3, 3], node[:3, 3] - self.com[k]
+                v = v + cross(w, r) + slide
+                a = a + cross(al, r) + cross(w, cross(w, r)) + 2.0 * cross(w, slide) + anchor[:3, :3] @ xd[:3]
+                w, al = w + spin, al + cross(w, spin) + anchor[:3, :3] @ xd[3:]
+                v, a = v + cross(w, s), a + cross(al, s) + cross(w, cross(w, s))
+            else:
+                for i, (axis, angular, linear) in enumerate(self.hinge[k].screws):
+                    direction = self.stages[k][i][:3, :3] @ axis
+                    r = self.stages[k][i + 1][:3, 3] - self.stages[k][i][:3, 3]
+                    slide, spin = linear * x[i] * direction, angular * x[i] * direction
+                    v = v + cross(w, r) + slide
+                    a = a + cross(al, r) + cross(w, cross(w, r) + 2.0 * slide) + linear * xd[i] * direction
+                    w, al = w + spin, al + cross(w, spin) + angular * xd[i] * direction
+            W[k], V[k], A[k], AL[k] = w, v, a, al
+        return W, V, A, AL
+
+    @cached_property
+    def _node_jacobian(self):
+        """Of every node frame's origin, world axes: velocity, then angular velocity [node, 6, dof]."""
+        columns = [self._motion(unit, np.zeros(self.dof_count)) for unit in np.eye(self.dof_count)]
+        return np.stack([np.concatenate([V, W], axis=1) for W, V, _, _ in columns], axis=-1) if columns else np.zeros(
+            (self.body_count, 6, 0))
+
+    def _jacobian_at(self, body, point):
+        J = self._node_jacobian[body].copy()
+        J[:3] -= skew(point - self.node_matrix[body][:3, 3]) @ J[3:]
+        return J
+
+    def jacobian(self, frames):
+        """Of every frame: velocity of its origin, then angular velocity, world axes [frame, 6, dof], [m, 1 per unit].
+
+        Args:
+            frames: each a body index, or (body index, pose (7,) in the body).
+        """
+        rows = []
+        for frame in frames:
+            body, pose = frame if isinstance(frame, (tuple, list)) else (frame, (0, 0, 0, 0, 0, 0, 1))
+            matrix = self.body_matrix[body] @ homogeneous(np.asarray(pose, dtype=np.float64))
+            rows.append(self._jacobian_at(body, matrix[:3, 3]))
+        return np.array(rows).reshape(-1, 6, self.dof_count)
+
+    def operational_inertia_inverse(self, frames):
+        """J mass_matrix^-1 J^T [6 frames, 6 frames], J as in :meth:`jacobian`, frame after frame."""
+        J = self.jacobian(frames).reshape(-1, self.dof_count)
+        return J @ np.linalg.solve(self.mass_matrix, J.T)
+
+    def body_velocities(self, qd=None):
+        """Of every body: CoM velocity [m/s], then angular velocity [rad/s], world axes [body, 6]; Newton's body_qd."""
+        W, V, _, _ = self._motion(self._qd(qd), np.zeros(self.dof_count))
+        return np.concatenate([V + np.cross(W, self.com - self.node_matrix[:, :3, 3]), W], axis=1)
+
+    def _qd(self, qd):
+        return self.qd if qd is None else self._vector("qd", qd, self.dof_count)
+
+    def inverse_dynamics(self, qd, qdd, body_f=None):
+        """tau = mass_matrix qdd + bias [dof], dual to qd [N m, N].
+
+        Newton and Euler for each body at its CoM in world axes, m (a - g) and I alpha + omega x I omega less the
+        external wrench, projected with the CoM's Jacobian (d'Alembert), and the armature.
+
+        Args:
+            qd, qdd: [dof]; qd None means the constructor's, qdd is the time derivative of qd.
+            body_f: external force [N], then torque [N m] at the CoM, world axes [body, 6]; None: none.
+        """
+        qdd = self._vector("qdd", qdd, self.dof_count)
+        W, _, A, AL = self._motion(self._qd(qd), qdd)
+        tau = self.value("joint_armature") * qdd
+        for k, R in enumerate(self.body_matrix[:, :3, :3]):
+            r = self.com[k] - self.node_matrix[k][:3, 3]
+            a = A[k] + np.cross(AL[k], r) + np.cross(W[k], np.cross(W[k], r))
+            inertia = R @ self.value("body_inertia")[k] @ R.T
+            force = self.value("body_mass")[k] * (a - self.value("gravity"))
+            moment = inertia @ AL[k] + np.cross(W[k], inertia @ W[k])
+            wrench = np.concatenate([force, moment]) - (0.0 if body_f is None else np.asarray(body_f)[k])
+            tau = tau + self._jacobian_at(k, self.com[k]).T @ wrench
+        return tau
+
+    def bias_force(self, qd=None, body_f=None):
+        """Inverse dynamics at qdd = 0 [dof]: velocity terms, gravity, less body_f."""
+        return self.inverse_dynamics(qd, np.zeros(self.dof_count), body_f)
+
+    @property
+    def gravity_force(self):
+        """The force that holds the scene still [dof]: the bias force at qd = 0."""
+        return self.bias_force(np.zeros(self.dof_count))
+
+    def forward_dynamics(self, qd=None, tau=None, body_f=None):
+        """qdd [dof] by a dense solve; qd None means the constructor's, tau None zero."""
+        tau = np.zeros(self.dof_count) if tau is None else self._vector("tau", tau, self.dof_count)
+        return np.linalg.solve(self.mass_matrix, tau - self.bias_force(qd, body_f))
+
+    # -- what belongs to a step --------------------------------------------------------------------------------------
+    def passive_force(self, qd=None):
+        """-damping qd - stiffness deviation [dof].
+
+        The deviation is q - rest of a screw's coordinate and of a free hinge's position; of a rotation (ball, free) it
+        is the rotation vector of R(q) R(rest)^T, no longer than pi, in the parent anchor's axes, those of qd.
+        """
+        rest, deviation = self.value("joint_rest_q"), np.zeros(self.dof_count)
+        for k, h in enumerate(self.scene.hinge_of):
+            q, r = (array[self.scene.q_start[h] : self.scene.q_start[h + 1]] for array in (self.q, rest))
+            if self.hinge[k].kind in ("ball", "free"):
+                turn = rotation_vector(rotation(q[-4:]) @ rotation(r[-4:]).T)
+                deviation[self.dofs[k]] = np.concatenate([q[:-4] - r[:-4], turn])
+            else:
+                deviation[self.dofs[k]] = q - r
+        return -self.value("joint_damping") * self._qd(qd) - self.value("joint_stiffness") * deviation
+
+    def integrate(self, qd, dt):
+        """q after qd has been constant for dt [s]; quaternions come out with unit length.
+
+        Screws: q + qd dt. Ball and free: the quaternion becomes exp(omega dt) * quaternion, omega in the parent
+        anchor's axes. Free: the CoM moves by v dt, and the anchor's origin follows from it.
+        """
+        qd, new = self._qd(qd), self.q.copy()
+        for k, h in enumerate(self.scene.hinge_of):
+            entries = slice(self.scene.q_start[h], self.scene.q_start[h + 1])
+            q, x = self.q[entries], qd[self.dofs[k]]
+            if self.hinge[k].kind not in ("ball", "free"):
+                new[entries] = q + x * dt
+                continue
+            half = 0.5 * dt * x[-3:]
+            angle = np.linalg.norm(half)
+            turn = np.array([*(np.sinc(angle / np.pi) * half), np.cos(angle)])
+            turned = quaternion_product(turn, q[-4:] / np.linalg.norm(q[-4:]))
+            new[entries][-4:] = turned / np.linalg.norm(turned)
+            if self.hinge[k].kind == "free":
+                to_node = np.linalg.inv(homogeneous(self.value("joint_X_c")[h]))
+                c = to_node[:3, :3] @ self.value("body_com")[k] + to_node[:3, 3]
+                new[entries][:3] = q[:3] + rotation(q[3:]) @ c + x[:3] * dt - rotation(turned) @ c
+        return new
