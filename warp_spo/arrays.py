@@ -54,6 +54,11 @@ def kind_of(array, call: str, name: str) -> str:
     )
 
 
+def shape_of(array) -> tuple:
+    """Return the shape in scalars: Warp's vectors, matrices and transforms are trailing axes."""
+    return tuple(array.shape) + tuple(getattr(array.dtype, "_shape_", ()) if isinstance(array, wp.array) else ())
+
+
 class Call:
     """One call: takes the caller's arrays in, gives the result back in the caller's kind.
 

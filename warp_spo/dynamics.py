@@ -1,27 +1,26 @@
 """The algorithms that users call, on thousands of worlds at once.
 
-Three times, three costs: ``Dynamics(scene, worlds)`` allocates, the first call of an operation compiles its kernels, and
+Three times, three costs: ``Dynamics(scene, worlds)`` allocates, the first call of an operation compiles its kernels,
 every further call only launches. Inside, a vector is [omega; v] in the node frame; q, qd and forces are Newton's.
 """
 
 from __future__ import annotations
 
-import math
 import operator
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from . import plan as plans
-from .arrays import Call, parse_device, parse_dtype
+from .arrays import Call, parse_device, parse_dtype, shape_of
 from .errors import UnsupportedError
-from .kernels import articulated, composite, kinematics, newton_euler, passive
-from .kernels.spatial import ARTICULATED, MOTION, POSE, RIGID
-from .kernels.topology import Topology
-from .parameters import VARIABLE, Parameters
+from .frames import Frame, Frames
+from .kernels import articulated, kinematics, passive
+from .parameters import VARIABLE
+from .recursions import Recursions
 from .scene import Scene
 from .spatial_operators import SpatialOperators
 
@@ -42,7 +41,6 @@ OPERATIONS = (
     "integrate",
 )
 LOOPS = ("raise", "cut", "embed", "multipliers")
-Frame = Any  # a body (index or label), or (body, pose in the body)
 
 
 class Dynamics:
@@ -88,14 +86,11 @@ class Dynamics:
         _check_loops(scene, loops)
         self.plan = plans.choose(scene.tree, self.worlds, granularity)
         self.granularity = self.plan.granularity
-        self.topology = _topology(scene, self.device)
-        screw = np.column_stack([scene.dof_axis, scene.dof_angular, scene.dof_linear])
-        self._screw = wp.array(screw, dtype=self.dtype, device=self.device)
-        self._parameters = Parameters(
-            scene, self.topology, self.worlds, self.device, self.dtype, self.variable
-        )
-        self._workspace: dict[Any, wp.array] = {}
-        self._frames: dict[tuple, tuple[wp.array, wp.array]] = {}
+        self.recursions = self._make_recursions()
+        self._frames = Frames(scene, self.device, self.dtype)
+
+    def _make_recursions(self) -> Recursions:
+        return Recursions(self.scene, self.plan, self.device, self.dtype, self.variable)
 
     # -- values ----------------------------------------------------------------------------------------------------
     def set(self, **values: Any) -> None:
@@ -116,7 +111,7 @@ class Dynamics:
                 if not hasattr(value, "shape"):
                     value = np.asarray(value, dtype=np.float64)
                 shape = self.scene.values[name].shape[1:]
-                if value.ndim == len(shape) + 1:
+                if len(shape_of(value)) > len(shape):
                     shape = (self.worlds, *shape)
                 array = call.read(name, value, shape, "[world, ...] or [...] as Newton has it")
                 if name in self.variable:
@@ -128,23 +123,22 @@ class Dynamics:
                     f"Dynamics.set: {', '.join(folded)} inside a graph capture; expected variable values only; build "
                     f"Dynamics with variable=({', '.join(map(repr, folded))},)"
                 )
+            parameters = self.recursions.parameters
             for name, array in taken.items():
-                self._parameters.copy_in(name, array)
-            self._parameters.refresh(taken)
+                parameters.copy_in(name, array)
+            parameters.refresh(taken)
             if folded:
                 self._rebuild({name: array.numpy() for name, array in folded.items()})
 
     def _rebuild(self, folded: dict[str, np.ndarray]) -> None:
         warnings.warn(
-            f"Dynamics.set: {', '.join(folded)} was folded into the kernels' data, which is rebuilt; graphs captured "
-            f"before are out of date. Name it in variable= to set it without rebuilding",
-            stacklevel=4,
+            f"Dynamics.set: {', '.join(folded)} is folded into the kernels' data, which is rebuilt; graphs captured "
+            f"before are out of date; name it in variable= to set it without rebuilding",
+            stacklevel=3,
         )
-        self.scene, before = self.scene.with_values(**folded), self._parameters
-        self._parameters = Parameters(
-            self.scene, self.topology, self.worlds, self.device, self.dtype, self.variable
-        )
-        self._parameters.adopt_variable(before)
+        before, self.scene = self.recursions, self.scene.with_values(**folded)
+        self.recursions = self._make_recursions()
+        self.recursions.parameters.adopt_variable(before.parameters)
 
     def prepare(self, operation: str, **options: Any) -> None:
         """Compile and allocate all that ``operation`` needs, so that its next call only launches.
@@ -208,17 +202,17 @@ class Dynamics:
             body_f = self._read_body_f(call, body_f)
             status = call.update("status", status, (self.worlds,), "[world]", dtype=wp.int32)
             out = call.write(out, (self.worlds, self.scene.dof_count), "[world, dof]")
-            self._hinges(q, qd)
+            run, moves = self.recursions, qd is not None
+            run.hinges(q, qd)
             force = None
-            if qd is not None or body_f is not None:
-                acceleration = None if qd is None else self._accelerations(None, bias=True, gravity=False)
-                force = self._body_forces(acceleration, velocity=qd is not None, body_f=body_f)
-            self._factor()
-            self._solve(tau, force, out, gravity=True)
+            if moves or body_f is not None:
+                # gravity stays out of the velocity terms: as the frame's acceleration it meets nothing to cancel
+                acceleration = run.accelerations(None, bias=True, gravity=False) if moves else None
+                force = run.body_forces(acceleration, moves, body_f)
+            pivot = run.factor()
+            run.solve(tau, out, force, gravity=True)
             if status is not None:
-                self._launch(
-                    articulated.status, self.worlds, [self._array("pivot"), q, qd, tau, body_f], [status]
-                )
+                run.launch(articulated.status, self.worlds, [pivot, q, qd, tau, body_f], [status])
         return call.result
 
     def inverse_dynamics(self, q: Any, qd: Any = None, qdd: Any = None, body_f: Any = None, out: Any = None) -> Any:
@@ -245,15 +239,10 @@ class Dynamics:
             qdd = self._read_rate(call, "qdd", qdd)
             body_f = self._read_body_f(call, body_f)
             out = call.write(out, (self.worlds, self.scene.dof_count), "[world, dof]")
-            self._hinges(q, qd)
-            acceleration = self._accelerations(qdd, bias=qd is not None, gravity=True)
-            force = self._body_forces(acceleration, velocity=qd is not None, body_f=body_f)
-            self._sweep(
-                newton_euler.force,
-                self.plan.inward,
-                [self._array("pose"), self._array("axis"), self._parameters.field("joint_armature"), qdd],
-                [force, out],
-            )
+            run, moves = self.recursions, qd is not None
+            run.hinges(q, qd)
+            force = run.body_forces(run.accelerations(qdd, bias=moves, gravity=True), moves, body_f)
+            run.hinge_forces(qdd, force, out)
         return call.result
 
     def mass_matrix(self, q: Any, out: Any = None) -> Any:
@@ -262,15 +251,8 @@ class Dynamics:
             q, _ = self._read_state(call, q, None)
             dofs = self.scene.dof_count
             out = call.write(out, (self.worlds, dofs, dofs), "[world, dof, dof]")
-            self._hinges(q, None)
-            pose, axis = self._array("pose"), self._array("axis")
-            bodies = self._array("composite", (self.scene.body_count, RIGID, self.worlds))
-            self._sweep(composite.composite, self.plan.inward, [pose, self._parameters.rigid], [bodies])
-            out.zero_()
-            armature = self._parameters.field("joint_armature")
-            self._launch(
-                composite.mass_matrix, (dofs, self.worlds), [self.topology, pose, axis, armature, bodies], [out]
-            )
+            self.recursions.hinges(q)
+            self.recursions.mass_matrix(out)
         return call.result
 
     def mass_matrix_inverse(self, q: Any, out: Any = None) -> Any:
@@ -279,9 +261,9 @@ class Dynamics:
             q, _ = self._read_state(call, q, None)
             dofs = self.scene.dof_count
             out = call.write(out, (self.worlds, dofs, dofs), "[world, dof, dof]")
-            self._hinges(q, None)
-            self._factor()
-            self._sandwich(None, dofs, out)
+            self.recursions.hinges(q)
+            self.recursions.factor()
+            self.recursions.sandwich(None, dofs, out)
         return call.result
 
     def solve_mass_matrix(self, q: Any, b: Any, out: Any = None) -> Any:
@@ -289,13 +271,13 @@ class Dynamics:
         with self._call("solve_mass_matrix") as call:
             q, _ = self._read_state(call, q, None)
             shape = (self.worlds, self.scene.dof_count)
-            if getattr(b, "ndim", 2) == 3:
+            if hasattr(b, "shape") and len(b.shape) == 3:
                 shape = (*shape, b.shape[2])
             b = call.read("b", b, shape, "[world, dof] or [world, dof, columns]")
             out = call.write(out, shape, "like b")
-            self._hinges(q, None)
-            self._factor()
-            self._solve(b, None, out, gravity=False)
+            self.recursions.hinges(q)
+            self.recursions.factor()
+            self.recursions.solve(b, out)
         return call.result
 
     def log_det_mass_matrix(self, q: Any, out: Any = None) -> Any:
@@ -303,9 +285,9 @@ class Dynamics:
         with self._call("log_det_mass_matrix") as call:
             q, _ = self._read_state(call, q, None)
             out = call.write(out, (self.worlds,), "[world]")
-            self._hinges(q, None)
-            self._factor()
-            self._launch(articulated.log_determinant, self.worlds, [self._array("pivot")], [out])
+            run = self.recursions
+            run.hinges(q)
+            run.launch(articulated.log_determinant, self.worlds, [run.factor()], [out])
         return call.result
 
     def passive_force(self, q: Any, qd: Any = None, out: Any = None) -> Any:
@@ -317,8 +299,9 @@ class Dynamics:
         with self._call("passive_force") as call:
             q, qd = self._read_state(call, q, qd)
             out = call.write(out, (self.worlds, self.scene.dof_count), "[world, dof]")
-            fields = [self._parameters.field(name) for name in ("joint_damping", "joint_stiffness", "joint_rest_q")]
-            self._launch(passive.passive_force, self._nodes, [self.topology, *fields, q, qd], [out])
+            run = self.recursions
+            fields = [run.parameters.field(name) for name in ("joint_damping", "joint_stiffness", "joint_rest_q")]
+            run.launch(passive.passive_force, run.nodes, [run.topology, *fields, q, qd], [out])
         return call.result
 
     # -- kinematics ------------------------------------------------------------------------------------------------
@@ -327,8 +310,9 @@ class Dynamics:
         with self._call("body_poses") as call:
             q, _ = self._read_state(call, q, None)
             out = call.write(out, (self.worlds, self.scene.body_count, 7), "[world, body, 7]")
-            self._hinges(q, None)
-            self._launch(kinematics.body_poses, self._nodes, [self._world_poses(), self._parameters.anchor], [out])
+            run = self.recursions
+            run.hinges(q)
+            run.launch(kinematics.body_poses, run.nodes, [run.world_poses(), run.parameters.anchor], [out])
         return call.result
 
     def body_velocities(self, q: Any, qd: Any, out: Any = None) -> Any:
@@ -336,11 +320,10 @@ class Dynamics:
         with self._call("body_velocities") as call:
             q, qd = self._read_state(call, q, qd, optional=False)
             out = call.write(out, (self.worlds, self.scene.body_count, 6), "[world, body, 6]")
-            self._hinges(q, qd)
-            world_pose = self._world_poses()
-            self._launch(
-                kinematics.body_velocities, self._nodes, [world_pose, self._parameters.com, self._array("velocity")], [out]
-            )
+            run = self.recursions
+            run.hinges(q, qd)
+            inputs = [run.world_poses(), run.parameters.com, run.array("velocity")]
+            run.launch(kinematics.body_velocities, run.nodes, inputs, [out])
         return call.result
 
     def jacobian(self, q: Any, frames: Sequence[Frame], out: Any = None) -> Any:
@@ -355,24 +338,25 @@ class Dynamics:
         """
         with self._call("jacobian") as call:
             q, _ = self._read_state(call, q, None)
-            nodes, offsets = self._frame_tables("jacobian", frames)
+            nodes, origins = self._frames.tables(call.name, frames)
             out = call.write(out, (self.worlds, len(nodes), 6, self.scene.dof_count), "[world, frame, 6, dof]")
-            self._hinges(q, None)
-            self._jacobian(nodes, offsets, out)
+            self.recursions.hinges(q)
+            self.recursions.jacobian(nodes, origins, out)
         return call.result
 
     def operational_inertia_inverse(self, q: Any, frames: Sequence[Frame], out: Any = None) -> Any:
         """J Mass^-1 J* for the frames of :meth:`jacobian` [world, 6 frames, 6 frames]."""
         with self._call("operational_inertia_inverse") as call:
             q, _ = self._read_state(call, q, None)
-            nodes, offsets = self._frame_tables("operational_inertia_inverse", frames)
+            nodes, origins = self._frames.tables(call.name, frames)
             rows, dofs = 6 * len(nodes), self.scene.dof_count
             out = call.write(out, (self.worlds, rows, rows), "[world, 6 frames, 6 frames]")
-            self._hinges(q, None)
-            J = self._array(("jacobian", len(nodes)), (self.worlds, len(nodes), 6, dofs))
-            self._jacobian(nodes, offsets, J)
-            self._factor()
-            self._sandwich(J.reshape((self.worlds, rows, dofs)).transpose((0, 2, 1)), rows, out)
+            run = self.recursions
+            run.hinges(q)
+            J = run.array(("jacobian", len(nodes)), self.worlds, len(nodes), 6, dofs)
+            run.jacobian(nodes, origins, J)
+            run.factor()
+            run.sandwich(J.reshape((self.worlds, rows, dofs)).transpose((0, 2, 1)), rows, out)
         return call.result
 
     def integrate(self, q: Any, qd: Any, dt: float, out: Any = None) -> Any:
@@ -383,12 +367,13 @@ class Dynamics:
         with self._call("integrate") as call:
             q, qd = self._read_state(call, q, qd, optional=False)
             out = call.write(out, (self.worlds, self.scene.coord_count), "[world, coordinate]")
-            self._launch(kinematics.integrate, self._nodes, [self.topology, self._parameters.com, q, qd, float(dt)], [out])
+            run = self.recursions
+            run.launch(kinematics.integrate, run.nodes, [run.topology, run.parameters.com, q, qd, float(dt)], [out])
         return call.result
 
     # -- operators -------------------------------------------------------------------------------------------------
     def operators(self, q: Any) -> SpatialOperators:
-        """The paper's operators at ``q``: phi, psi, H, K, D, G, M, P, Delta, E_phi, E_psi; ``update(q)`` refills them."""
+        """The paper's operators at ``q``: phi, psi, H, K, D, G, M, P, Delta ...; their ``update(q)`` refills them."""
         operators = SpatialOperators(self)
         operators.update(q)
         return operators
@@ -397,32 +382,23 @@ class Dynamics:
         """What runs where, and why."""
         scene, tree = self.scene, self.scene.tree
         widths = [count for _, count in self.plan.outward]
-        memory = sum(array.capacity for array in self._workspace.values()) / 2**20
+        memory = self.recursions.workspace_bytes / 2**20
+        gravity = self.recursions.parameters.gravity
         return "\n".join(
             [
                 f"{scene!r}",
                 f"worlds       {self.worlds} on {self.device}, {self.dtype.__name__}",
                 f"granularity  {self.granularity}: {self.plan.reason}",
                 f"levels       {len(widths)} of {min(widths)} to {max(widths)} nodes, {len(tree.segments)} segments",
-                "launches     forward dynamics 4 a level + 2, inverse dynamics 3 a level + 2, mass matrix 1 a level + 2",
+                "launches     forward dynamics 5 a level + 1, inverse dynamics 3 a level + 1, mass matrix 1 a level + 2",
                 f"variable     {', '.join(self.variable) or 'nothing'}",
-                f"gravity      {'none' if self._parameters.gravity is None else 'acceleration of the inertial frame'}",
+                f"gravity      {'none' if gravity is None else 'acceleration of the inertial frame'}",
                 f"loops        {len(scene.loops)} left open" if scene.loops else "loops        none",
                 f"workspace    {memory:.1f} MiB so far",
             ]
         )
 
-    def configuration(self, q: wp.array) -> tuple[wp.array, ...]:
-        """For the operators: pose and H* of every node, its pose in the inertial frame, inertias and armature."""
-        self._hinges(q, None)
-        pose, axis = self._array("pose"), self._array("axis")
-        return pose, axis, self._world_poses(), self._parameters.rigid, self._parameters.field("joint_armature")
-
     # -- steps -----------------------------------------------------------------------------------------------------
-    @property
-    def _nodes(self) -> tuple[int, int]:
-        return self.scene.body_count, self.worlds
-
     def _call(self, name: str) -> Call:
         return Call(f"Dynamics.{name}", self.device, self.dtype)
 
@@ -435,164 +411,6 @@ class Dynamics:
 
     def _read_body_f(self, call: Call, body_f: Any) -> Any:
         return call.read("body_f", body_f, (self.worlds, self.scene.body_count, 6), "[world, body, 6]", optional=True)
-
-    def _array(self, name: Any, shape: tuple[int, ...] | None = None) -> wp.array:
-        """A workspace array, allocated at its first use."""
-        array = self._workspace.get(name)
-        if array is None:
-            assert shape is not None, f"workspace array {name} is read before it is written"
-            array = self._workspace[name] = wp.empty(shape, dtype=self.dtype, device=self.device)
-        return array
-
-    def _launch(self, factory: Callable, dim: Any, inputs: list, outputs: list) -> None:
-        wp.launch(factory(self.dtype), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
-
-    def _sweep(self, factory: Callable, levels: Sequence, inputs: list, outputs: list, columns: Any = None) -> None:
-        """One launch a level; ``columns`` = (first, count) adds that axis between node and world."""
-        kernel = factory(self.dtype)
-        for first, count in levels:
-            dim = (count, self.worlds) if columns is None else (count, columns[1], self.worlds)
-            head = [self.topology, first] if columns is None else [self.topology, first, columns[0]]
-            wp.launch(kernel, dim=dim, inputs=head + inputs, outputs=outputs, device=self.device)
-
-    def _hinges(self, q: wp.array, qd: wp.array | None) -> None:
-        """Pose and H* of every node; with qd also V and its bias."""
-        bodies, worlds = self._nodes
-        outputs = [
-            self._array("pose", (bodies, POSE, worlds)),
-            self._array("axis", (self.scene.dof_count, MOTION, worlds)),
-            self._array("velocity", (bodies, MOTION, worlds)) if qd is not None else None,
-            self._array("bias", (bodies, MOTION, worlds)) if qd is not None else None,
-        ]
-        inputs = [self.topology, self._screw, self._parameters.tree, self._parameters.com, q, qd]
-        self._launch(kinematics.hinge, self._nodes, inputs, outputs)
-        if qd is not None:
-            self._sweep(kinematics.velocity, self.plan.outward[1:], [outputs[0]], outputs[2:])
-
-    def _accelerations(self, qdd: wp.array | None, bias: bool, gravity: bool) -> wp.array:
-        acceleration = self._array("acceleration", (self.scene.body_count, MOTION, self.worlds))
-        inputs = [
-            self._array("pose"),
-            self._array("axis"),
-            self._parameters.gravity if gravity else None,
-            self._array("bias") if bias else None,
-            qdd,
-        ]
-        self._sweep(newton_euler.acceleration, self.plan.outward, inputs, [acceleration])
-        return acceleration
-
-    def _body_forces(self, acceleration: wp.array | None, velocity: bool, body_f: wp.array | None) -> wp.array:
-        force = self._array("force", (self.scene.body_count, MOTION, self.worlds))
-        inputs = [
-            self._parameters.rigid,
-            self._parameters.com,
-            acceleration,
-            self._array("velocity") if velocity else None,
-            body_f,
-            None if body_f is None else self._world_poses(),
-        ]
-        self._launch(newton_euler.body_force, self._nodes, inputs, [force])
-        return force
-
-    def _world_poses(self) -> wp.array:
-        world_pose = self._array("world_pose", (self.scene.body_count, POSE, self.worlds))
-        self._sweep(kinematics.poses, self.plan.outward, [self._array("pose")], [world_pose])
-        return world_pose
-
-    def _factor(self) -> None:
-        dofs = self.scene.dof_count
-        self._sweep(
-            articulated.factor,
-            self.plan.inward,
-            [
-                self._array("pose"),
-                self._array("axis"),
-                self._parameters.rigid,
-                self._parameters.field("joint_armature"),
-            ],
-            [
-                self._array("articulated", (self.scene.body_count, ARTICULATED, self.worlds)),
-                self._array("gain", (dofs, MOTION, self.worlds)),
-                self._array("pivot", (dofs, self.worlds)),
-            ],
-        )
-
-    def _chunks(self, columns: int) -> tuple[list[tuple[int, int]], wp.array]:
-        """Right-hand sides in turns, and the workspace that one turn needs."""
-        bytes_per_column = self.scene.body_count * MOTION * self.worlds * wp.types.type_size_in_bytes(self.dtype)
-        chunk = self.plan.column_chunk(columns, bytes_per_column)
-        work = self._array(("columns", chunk), (self.scene.body_count, MOTION, chunk * self.worlds))
-        return [(first, min(chunk, columns - first)) for first in range(0, columns, chunk)], work
-
-    def _reduce(self, b: Any, force: Any, identity: bool, out: wp.array, columns: tuple[int, int], work: wp.array) -> None:
-        factors = [self._array(name) for name in ("pose", "axis", "gain", "pivot")]
-        self._sweep(articulated.reduce, self.plan.inward, [*factors, force, b, identity], [work, out], columns)
-
-    def _solve(self, b: wp.array | None, force: wp.array | None, out: wp.array, gravity: bool) -> None:
-        """out = Mass^-1 (b - H phi force), for one column or several."""
-        shape = (*out.shape[:2], math.prod(out.shape[2:]))
-        out, b = out.reshape(shape), None if b is None else b.reshape(shape)
-        factors = [self._array(name) for name in ("pose", "axis", "gain", "pivot")]
-        chunks, work = self._chunks(shape[2])
-        for columns in chunks:
-            self._reduce(b, force, False, out, columns, work)
-            base = self._parameters.gravity if gravity else None
-            self._sweep(articulated.expand, self.plan.outward, [*factors, base], [work, out], columns)
-
-    def _sandwich(self, b: wp.array | None, count: int, out: wp.array) -> None:
-        """out = b* Mass^-1 b; b None is the unit matrix."""
-        y = self._array(("half", count), (self.worlds, self.scene.dof_count, count))
-        chunks, work = self._chunks(count)
-        for columns in chunks:
-            self._reduce(b, None, b is None, y, columns, work)
-        self._launch(articulated.weighted_product, out.shape, [y, self._array("pivot")], [out])
-
-    def _jacobian(self, nodes: wp.array, offsets: wp.array, out: wp.array) -> None:
-        inputs = [
-            self.topology,
-            nodes,
-            offsets,
-            self._parameters.anchor,
-            self._array("pose"),
-            self._world_poses(),
-            self._array("axis"),
-        ]
-        self._launch(kinematics.jacobian, (len(nodes), self.worlds), inputs, [out])
-
-    def _frame_tables(self, call: str, frames: Sequence[Frame]) -> tuple[wp.array, wp.array]:
-        key = tuple(self._frame(call, frame) for frame in _frame_list(call, frames))
-        if key not in self._frames:
-            bodies = wp.array([body for body, _ in key], dtype=int, device=self.device)
-            offsets = wp.array(np.array([offset for _, offset in key]), dtype=self.dtype, device=self.device)
-            self._frames[key] = (bodies, offsets)
-        return self._frames[key]
-
-    def _frame(self, call: str, frame: Frame) -> tuple[int, tuple[float, ...]]:
-        body, pose = frame if isinstance(frame, tuple) else (frame, (0.0,) * 6 + (1.0,))
-        if isinstance(body, str):
-            if body not in self.scene.body_labels:
-                raise ValueError(f"Dynamics.{call}: no body {body!r}; see scene.body_labels")
-            body = self.scene.body_labels.index(body)
-        try:
-            body, pose = operator.index(body), tuple(float(x) for x in pose)
-        except TypeError:
-            raise TypeError(
-                f"Dynamics.{call}: a frame is {frame!r}; expected a body (index or label) or (body, pose in the body)"
-            ) from None
-        if not 0 <= body < self.scene.body_count:
-            raise ValueError(f"Dynamics.{call}: a frame's body is {body}; expected 0 to {self.scene.body_count - 1}")
-        if len(pose) != 7 or abs(math.hypot(*pose[3:]) - 1.0) > 1e-5:
-            raise ValueError(f"Dynamics.{call}: a frame's pose is {pose}; expected x, y, z and a unit quaternion xyzw")
-        return body, pose[:3]
-
-
-def _frame_list(call: str, frames: Any) -> list:
-    if isinstance(frames, (str, tuple)) or not hasattr(frames, "__iter__"):
-        frames = [frames] if not isinstance(frames, tuple) or len(frames) == 2 and hasattr(frames[1], "__len__") else frames
-    frames = list(frames)
-    if not frames:
-        raise ValueError(f"Dynamics.{call}: frames is empty; expected one body or (body, pose) or more")
-    return frames
 
 
 def _world_count(scene: Scene, worlds: Any) -> int:
@@ -627,27 +445,3 @@ def _check_loops(scene: Scene, loops: str) -> None:
             f"Dynamics: the scene has {len(scene.loops)} loop joint(s): {names}; expected a tree; loops='cut' leaves "
             f"them open"
         )
-
-
-def _topology(scene: Scene, device: wp.Device) -> Topology:
-    tree, hinge_of = scene.tree, scene.hinge_of
-    hinges = [scene.hinges[h] for h in hinge_of]
-    dof_node = np.zeros(scene.dof_count, dtype=np.int32)
-    for node, hinge in enumerate(hinges):
-        first = scene.qd_start[hinge_of[node]]
-        dof_node[first : first + hinge.dof_count] = node
-    tables = {
-        "order": [node for level in tree.levels for node in level],
-        "parent": tree.parent,
-        "child_start": np.cumsum([0] + [len(children) for children in tree.children]),
-        "children": [child for children in tree.children for child in children],
-        "motion": [hinge.motion for hinge in hinges],
-        "q_start": scene.q_start[hinge_of],
-        "qd_start": scene.qd_start[hinge_of],
-        "dof_count": [hinge.dof_count for hinge in hinges],
-        "dof_node": dof_node,
-    }
-    topology = Topology()
-    for name, table in tables.items():
-        setattr(topology, name, wp.array(np.asarray(table, dtype=np.int32), dtype=int, device=device))
-    return topology

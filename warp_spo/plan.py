@@ -45,7 +45,8 @@ def choose(tree: Tree, worlds: int, granularity: str | None) -> Plan:
         UnsupportedError: one that this version does not offer.
     """
     if granularity is not None and granularity not in GRANULARITIES:
-        raise ValueError(f"Dynamics: granularity is {granularity!r}; expected None or one of {', '.join(GRANULARITIES)}")
+        names = ", ".join(GRANULARITIES)
+        raise ValueError(f"Dynamics: granularity is {granularity!r}; expected None or one of {names}")
     if granularity in ("segment", "tree"):
         raise UnsupportedError(
             "Dynamics", f"granularity={granularity!r}", "leave it out, or ask for 'node', which serves every scene"

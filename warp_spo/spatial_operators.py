@@ -65,23 +65,14 @@ class SpatialOperators:
         scene = dynamics.scene
         with Call("operators.update", dynamics.device, dynamics.dtype) as call:
             q = call.read("q", q, (dynamics.worlds, scene.coord_count), "[world, coordinate]")
-            pose, axis, world_pose, rigid, armature = dynamics.configuration(q)
-            f = self._factorization
-            wp.launch(
-                rigid_blocks.fill(dynamics.dtype),
-                dim=(scene.body_count, dynamics.worlds),
-                inputs=[dynamics.topology, f.tables, pose, axis, rigid, armature],
-                outputs=[self.E_phi.weights, self.H.weights, self.M.weights, self.Delta.weights],
-                device=dynamics.device,
-            )
+            run, f = dynamics.recursions, self._factorization
+            run.hinges(q)
+            armature = run.parameters.field("joint_armature")
+            inputs = [run.topology, f.tables, run.array("pose"), run.array("axis"), run.parameters.rigid, armature]
+            outputs = [self.E_phi.weights, self.H.weights, self.M.weights, self.Delta.weights]
+            run.launch(rigid_blocks.fill, run.nodes, inputs, outputs)
             f.update()
-            wp.launch(
-                kinematics.body_poses(dynamics.dtype),
-                dim=(scene.body_count, dynamics.worlds),
-                inputs=[world_pose, None],
-                outputs=[self._frames],
-                device=dynamics.device,
-            )
+            run.launch(kinematics.body_poses, run.nodes, [run.world_poses(), None], [self._frames])
             self._kind = call.kind
         for operator in (self.E_phi, self.phi, self.H, self.M, self.Delta, self.P, self.D, self.D_inverse, self.G):
             operator.kind = self._kind
