@@ -86,7 +86,7 @@ def from_newton(model: newton.Model) -> Scene:
     # Flat entries of q and qd that each world's hinges own.
     q_index, dof_index = _entries(worlds.q_start, worlds.hinges), _entries(worlds.qd_start, worlds.hinges)
 
-    read = lambda name, rows: getattr(model, name).numpy()[rows].astype(np.float64)  # noqa: E731
+    read = lambda name, rows: _host(model, name)[rows].astype(np.float64)  # noqa: E731
     values = {name: read(name, worlds.bodies) for name in ("body_mass", "body_com", "body_inertia")}
     values["body_inertia"] = _symmetric(values["body_inertia"])
     values |= {name: _unit_pose(read(name, worlds.hinges)) for name in ("joint_X_p", "joint_X_c")}
@@ -94,8 +94,8 @@ def from_newton(model: newton.Model) -> Scene:
     for name in ("joint_limit_lower", "joint_limit_upper", "joint_effort_limit", "joint_velocity_limit"):
         values[name] = values[name].clip(-UNLIMITED, UNLIMITED)  # USD files give infinities
     values["joint_rest_q"] = read("joint_rest_q", q_index)
-    gravity = model.gravity.numpy().astype(np.float64) + 0.0  # the last row is that of bodies outside worlds; no -0.0
-    values["gravity"] = gravity[:-1] if len(gravity) > worlds.count else gravity[-worlds.count :]
+    gravity = _host(model, "gravity").astype(np.float64) + 0.0  # no -0.0
+    values["gravity"] = gravity[: worlds.count] if worlds.declared else gravity[-1:]  # last: bodies outside worlds
 
     body_labels = worlds.labels(model.body_label, worlds.bodies)
     bodies = [
@@ -112,7 +112,7 @@ def from_newton(model: newton.Model) -> Scene:
         if kind in (JointType.BALL, JointType.FREE, JointType.DISTANCE):
             turn = slice(q.stop - 4, q.stop)
             values["joint_rest_q"][:, turn] = _unit_or_identity(values["joint_rest_q"][:, turn])
-        per_dof = {name.removeprefix("joint_"): values[name][0, dof] for name in DOF_VALUES}
+        per_dof: dict[str, Any] = {name.removeprefix("joint_"): values[name][0, dof] for name in DOF_VALUES}
         hinges.append(Hinge(**worlds.edge(joint), rest=values["joint_rest_q"][0, q], label=label, **per_dof))
     loop_labels = worlds.labels(model.joint_label, worlds.loops)
     loops = [Loop(**worlds.edge(joint), label=label) for joint, label in zip(worlds.loops[0], loop_labels, strict=True)]
@@ -135,13 +135,13 @@ def _refuse_what_no_scene_holds(model: newton.Model) -> None:
 
     if model.tendon_count:
         refuse("a model with tendons:", list(model.tendon_label), "build it without them")
-    mujoco = getattr(model, "mujoco", None)
+    mujoco: Any = getattr(model, "mujoco", None)
     if model.custom_frequency_counts.get("mujoco:tendon", 0):
         labels = [str(label) for label in getattr(mujoco, "tendon_label", [])]
         refuse("a model with MuJoCo tendons (model.mujoco.tendon_*):", labels, "remove <tendon> from the file")
     if model.custom_frequency_counts.get("mujoco:equality_constraint", 0):
         # target_kind 0: no loop joint and no mimic stands for the row
-        lost = (mujoco.equality_constraint_target_kind.numpy() == 0) & mujoco.equality_constraint_enabled.numpy()
+        lost = (_host(mujoco, "equality_constraint_target_kind") == 0) & _host(mujoco, "equality_constraint_enabled")
         labels = [str(mujoco.equality_constraint_label[row]) for row in np.flatnonzero(lost)]
         if labels:
             refuse(
@@ -150,7 +150,7 @@ def _refuse_what_no_scene_holds(model: newton.Model) -> None:
                 "import with convert_mjc_equality_constraints=True, or remove it from the file",
             )
     if model.joint_count:
-        for joint, kind in enumerate(model.joint_type.numpy()):
+        for joint, kind in enumerate(_host(model, "joint_type")):
             if kind not in KINDS:
                 refuse(
                     f"a {JointType(kind).name} joint:",
@@ -166,16 +166,17 @@ class _Worlds:
         if model.body_count == 0:
             raise ValueError("from_newton: the model has no bodies; expected one or more")
         self.model = model
-        names = ("type", "parent", "child", "articulation", "enabled", "dof_dim", "X_p", "X_c", "q_start", "qd_start")
-        for name in names:
-            array = getattr(model, f"joint_{name}")
-            setattr(self, name, array.numpy() if model.joint_count else np.zeros(0, dtype=int))
-        self.axis = model.joint_axis.numpy() if model.joint_dof_count else np.zeros((0, 3))
+        read = lambda name: _host(model, f"joint_{name}") if model.joint_count else np.zeros(0, dtype=int)  # noqa: E731
+        self.type, self.parent, self.child = read("type"), read("parent"), read("child")
+        self.articulation, self.enabled = read("articulation"), read("enabled").astype(bool)
+        self.dof_dim, self.X_p, self.X_c = read("dof_dim"), read("X_p"), read("X_c")
+        self.q_start, self.qd_start = read("q_start"), read("qd_start")
+        self.axis = _host(model, "joint_axis") if model.joint_dof_count else np.zeros((0, 3))
         body_world = self._world_of_bodies()
         joint_world = body_world[self.child]
         is_hinge = self._carries()
         self._check_joints(is_hinge, body_world)
-        is_loop = ~is_hinge & self.enabled.astype(bool)
+        is_loop = ~is_hinge & self.enabled
 
         # Counts first: from the first world with another count on, rows cannot be compared.
         self.limit, self.what = self.count, ""
@@ -204,9 +205,10 @@ class _Worlds:
         self.hinge_slot[self.hinges] = np.arange(self.hinges.shape[1])
 
     def _world_of_bodies(self) -> np.ndarray:
-        world = self.model.body_world.numpy()
+        world = _host(self.model, "body_world")
         outside = np.flatnonzero(world < 0)
-        if len(outside) == len(world):
+        self.declared = len(outside) < len(world)
+        if not self.declared:
             self.count = 1
             return np.zeros_like(world)
         if len(outside):
@@ -256,11 +258,11 @@ class _Worlds:
             "put all connected tree joints into one add_articulation",
         )
         refuse(
-            is_hinge & ~self.enabled.astype(bool),
+            is_hinge & ~self.enabled,
             "a disabled joint of the tree",
             "enable it, or build the model with a free joint in its place",
         )
-        flags = self.model.body_flags.numpy()[self.child] & int(newton.BodyFlags.KINEMATIC)
+        flags = _host(self.model, "body_flags")[self.child] & int(newton.BodyFlags.KINEMATIC)
         refuse(
             is_hinge & (flags != 0) & (self.type != JointType.FIXED),
             "which carries a kinematic body",
@@ -272,12 +274,12 @@ class _Worlds:
         model = self.model
         if model.joint_count == 0:
             return np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros((0, 2))
-        reference, coeffs = model.joint_mimic_joint.numpy(), model.joint_mimic_coeffs.numpy().reshape(-1, 2)
+        reference, coeffs = _host(model, "joint_mimic_joint"), _host(model, "joint_mimic_coeffs").reshape(-1, 2)
         follower = np.flatnonzero(reference >= 0)
         reference, coeffs = reference[follower], coeffs[follower]
         if model.constraint_mimic_count:  # the older, separate list
-            on = model.constraint_mimic_enabled.numpy().astype(bool)
-            old = lambda name: getattr(model, f"constraint_mimic_{name}").numpy()[on]  # noqa: E731
+            on = _host(model, "constraint_mimic_enabled").astype(bool)
+            old = lambda name: _host(model, f"constraint_mimic_{name}")[on]  # noqa: E731
             follower, reference = np.append(follower, old("joint0")), np.append(reference, old("joint1"))
             coeffs = np.concatenate([coeffs, np.stack([old("coef0"), old("coef1")], axis=1)])
         return follower.astype(int), reference.astype(int), coeffs.astype(np.float64)
@@ -363,6 +365,10 @@ class _Worlds:
             for other, prefix, rest in zip(others, prefixes, rests, strict=True)
         )
         return rests if own else first
+
+
+def _host(owner: Any, name: str) -> np.ndarray:
+    return getattr(owner, name).numpy()
 
 
 def _names(labels: list[str]) -> str:
@@ -460,10 +466,10 @@ def _finalize(builder: newton.ModelBuilder) -> newton.Model:
         model = builder.finalize(device="cpu", skip_validation_joints=True)
     if builder.body_count == 0:
         return model
-    before, after = np.array(builder.body_inertia, dtype=np.float64).reshape(-1, 3, 3), model.body_inertia.numpy()
+    before, after = np.array(builder.body_inertia, dtype=np.float64).reshape(-1, 3, 3), _host(model, "body_inertia")
     scale = np.maximum(np.abs(before).max(axis=(1, 2)), np.finfo(np.float32).tiny)
     moved = np.abs(after - before).max(axis=(1, 2)) > REPAIR * scale
-    moved |= ~np.isclose(builder.body_mass, model.body_mass.numpy(), rtol=REPAIR, atol=0.0)
+    moved |= ~np.isclose(builder.body_mass, _host(model, "body_mass"), rtol=REPAIR, atol=0.0)
     if moved.any():
         names = _names([builder.body_label[body] for body in np.flatnonzero(moved)])
         warnings.warn(
@@ -477,10 +483,11 @@ def _finalize(builder: newton.ModelBuilder) -> newton.Model:
 
 def _read_urdf(file: Path, floating: bool | None) -> newton.ModelBuilder:
     robot = ET.parse(file).getroot()
-    held_by = {  # link -> the link that holds it fast
-        joint.find("child").get("link"): joint.find("parent").get("link") if joint.get("type") == "fixed" else None
-        for joint in robot.findall("joint")
-    }
+    held_by: dict[str | None, str | None] = {}  # link -> the link that holds it fast, None if it can move
+    for joint in robot.findall("joint"):
+        parent, child = joint.find("parent"), joint.find("child")
+        if parent is not None and child is not None:
+            held_by[child.get("link")] = parent.get("link") if joint.get("type") == "fixed" else None
 
     def moves(name: str | None) -> bool:
         while name in held_by:
@@ -514,7 +521,6 @@ def _read_mjcf(file: Path, floating: bool | None) -> newton.ModelBuilder:
             str(file),
             floating=floating,
             parse_visuals=False,
-            parse_sites=False,
             parse_meshes=_weighs_by_mesh(root),
             parse_mujoco_options=parse_mujoco_options,
         )
@@ -528,11 +534,10 @@ def _read_mjcf(file: Path, floating: bool | None) -> newton.ModelBuilder:
             builder = import_with(parse_mujoco_options=False)
         except ValueError:
             raise error from None
-    for option in root.findall("option"):
-        if option.get("gravity"):
-            builder.gravity = np.array(option.get("gravity").split(), dtype=float)
-    if any(flag.get("gravity") == "disable" for flag in root.findall("option/flag")):
-        builder.gravity = np.zeros(3)
+    for option in root.findall("option[@gravity]"):  # which Newton 1.8 does not read
+        builder.gravity = [float(g) for g in option.get("gravity", "").split()]
+    if root.find("option/flag[@gravity='disable']") is not None:
+        builder.gravity = [0.0, 0.0, 0.0]
     return builder
 
 
@@ -563,7 +568,5 @@ def _weighs_by_mesh(root: ET.Element) -> bool:
 
 def _read_usd(file: Path, floating: bool | None) -> newton.ModelBuilder:
     builder = newton.ModelBuilder()
-    builder.add_usd(
-        str(file), floating=floating, load_visual_shapes=False, load_sites=False, skip_mesh_approximation=True
-    )
+    builder.add_usd(str(file), floating=floating, load_visual_shapes=False, skip_mesh_approximation=True)
     return builder
