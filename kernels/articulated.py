@@ -72,7 +72,8 @@ def factor(T) -> wp.Kernel:
             C -= wp.outer(n, f_D)
             m -= wp.outer(f, f_D)
         if topology.parent[node] >= 0:
-            J, C, m = s.articulated_to_parent(s.load_matrix(pose, node, 0, world), s.load(pose, node, 9, world), J, C, m)
+            R, l = s.load_matrix(pose, node, 0, world), s.load(pose, node, 9, world)
+            J, C, m = s.articulated_to_parent(R, l, J, C, m)
             s.store_symmetric(articulated_out, node, 0, world, J)
             s.store_matrix(articulated_out, node, 6, world, C)
             s.store_symmetric(articulated_out, node, 15, world, m)

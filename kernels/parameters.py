@@ -72,7 +72,8 @@ def derive(T) -> wp.Kernel:
         s.store(anchor_out, node, 9, world, round_vector(p_c))
 
         mass = body_mass[world, node]
-        com = wp.transpose(R_c) * (vec3(body_com[world, node, 0], body_com[world, node, 1], body_com[world, node, 2]) - p_c)
+        com = vec3(body_com[world, node, 0], body_com[world, node, 1], body_com[world, node, 2])
+        com = wp.transpose(R_c) * (com - p_c)
         inertia = mat33()
         for row in range(3):
             for column in range(3):

@@ -1,4 +1,4 @@
-"""Laws that every operation of Dynamics obeys, as functions that raise AssertionError; test_planted_bugs.py breaks them.
+"""Laws that every operation of Dynamics obeys: functions that raise AssertionError; test_planted_bugs.py breaks them.
 
 An operation is a name in OPERATIONS: which arrays it takes, and how the dense reference computes it for one world.
 """

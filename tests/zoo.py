@@ -195,8 +195,7 @@ def permuted(scene, seed=0):
     def renumbered(edge, kind):
         fields = {f: getattr(edge, f) for f in kind.__dataclass_fields__ if kind.__dataclass_fields__[f].init}
         fields |= dict(parent=node(edge.parent), child=node(edge.child), axis=None, linear=None, angular=None)
-        if kind is Hinge:
-            fields["pitch"] = 0.0
+        fields["pitch"] = 0.0
         moved = {"d6": dict(linear=edge.linear, angular=edge.angular)}.get(edge.kind, dict(axis=edge.axis))
         if edge.kind == "helical":
             moved["pitch"] = edge.pitch

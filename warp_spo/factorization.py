@@ -60,20 +60,20 @@ class Factorization:
         def packed(scalars: int) -> wp.array:
             return wp.zeros((self.worlds, max(1, scalars)), dtype=self.dtype, device=self.device)
 
-        N, dofs = E_phi.shape[0], H.shape[0]
+        N, dofs, kind = E_phi.shape[0], H.shape[0], E_phi.kind
         if Delta is None:
             zero = wp.zeros((1, max(1, pivot_offsets[-1])), dtype=self.dtype, device=self.device)
-            Delta = Blocks((dofs, dofs), pivot_places, zero, pivot_offsets[:-1])
+            Delta = Blocks((dofs, dofs), pivot_places, zero, pivot_offsets[:-1], kind)
         _check_places("Delta", Delta, pivot_places)
         self.E_phi, self.H, self.M, self.Delta = E_phi, H, M, Delta
         self.phi = E_phi.resolvent()
-        self.P = Blocks((N, N), M.places, packed(M.weights.shape[1]), M.offsets)
-        self.D = Blocks((dofs, dofs), pivot_places, packed(Delta.weights.shape[1]), Delta.offsets)
-        self.D_inverse = Blocks((dofs, dofs), pivot_places, packed(Delta.weights.shape[1]), Delta.offsets)
+        self.P = Blocks((N, N), M.places, packed(M.weights.shape[1]), M.offsets, kind)
+        self.D = Blocks((dofs, dofs), pivot_places, packed(Delta.weights.shape[1]), Delta.offsets, kind)
+        self.D_inverse = Blocks((dofs, dofs), pivot_places, packed(Delta.weights.shape[1]), Delta.offsets, kind)
         gain_places = [(E_phi.starts[k], row[k], m[k], r[k]) for k in nodes]
-        self.G = Blocks((N, dofs), gain_places, packed(H.weights.shape[1]), H.offsets)
+        self.G = Blocks((N, dofs), gain_places, packed(H.weights.shape[1]), H.offsets, kind)
         self.K = E_phi @ self.G
-        self.E_psi = BWA.packed(tree, m, packed(E_phi.weights.shape[1]), E_phi.offsets)
+        self.E_psi = BWA.packed(tree, m, packed(E_phi.weights.shape[1]), E_phi.offsets, kind)
         self.psi = self.E_psi.resolvent()
 
         offset_of = dict(zip((child for _, child in tree.edges), E_phi.offsets, strict=True))

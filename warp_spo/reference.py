@@ -317,11 +317,11 @@ class Dense:
             body, pose = frame if isinstance(frame, (tuple, list)) else (frame, (0, 0, 0, 0, 0, 0, 1))
             matrix = self.body_matrix[body] @ homogeneous(np.asarray(pose, dtype=np.float64))
             rows.append(self._jacobian_at(body, matrix[:3, 3]))
-        return np.array(rows).reshape(-1, 6, self.dof_count)
+        return np.array(rows).reshape(len(rows), 6, self.dof_count)
 
     def operational_inertia_inverse(self, frames):
         """J mass_matrix^-1 J^T [6 frames, 6 frames], J as in :meth:`jacobian`, frame after frame."""
-        J = self.jacobian(frames).reshape(-1, self.dof_count)
+        J = self.jacobian(frames).reshape(6 * len(frames), self.dof_count)
         return J @ np.linalg.solve(self.mass_matrix, J.T)
 
     def body_velocities(self, qd=None):

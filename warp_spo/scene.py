@@ -99,21 +99,27 @@ class Body:
             raise UnsupportedError(call, "a flexible body (modes=)", "leave modes out for a rigid body")
         object.__setattr__(self, "mass", float(_array(call, "mass [kg]", self.mass, ())))
         object.__setattr__(self, "com", _array(call, "com [m]", self.com, (3,)))
-        object.__setattr__(self, "inertia", _array(call, "inertia [kg m^2]", self.inertia, (3, 3)))
+        inertia = _array(call, "inertia [kg m^2]", self.inertia, (3, 3))
         if self.mass < 0.0:
             raise ValueError(f"{call}: mass is {self.mass} kg; expected zero or more")
-        check_inertia(call, self.inertia)
+        object.__setattr__(self, "inertia", checked_inertia(call, inertia))
 
 
-def check_inertia(call: str, inertia: np.ndarray) -> None:
-    """Raise ValueError unless every [..., 3, 3] inertia is symmetric and has no negative eigenvalue."""
+def checked_inertia(call: str, inertia: np.ndarray) -> np.ndarray:
+    """``inertia`` [..., 3, 3] less the rounding that its two triangles differ by.
+
+    Raises:
+        ValueError: it is not symmetric, or has a negative eigenvalue.
+    """
     scale = np.abs(inertia).max(axis=(-1, -2))
     skew = np.abs(inertia - np.swapaxes(inertia, -1, -2)).max(axis=(-1, -2))
     if np.any(skew > SYMMETRY * scale):
         raise ValueError(f"{call}: inertia is not symmetric, by {skew.max():.3g} kg m^2; expected I = I.T")
-    lowest = np.linalg.eigvalsh(0.5 * (inertia + np.swapaxes(inertia, -1, -2)))[..., 0]
+    symmetric = 0.5 * (inertia + np.swapaxes(inertia, -1, -2))
+    lowest = np.linalg.eigvalsh(symmetric)[..., 0]
     if np.any(lowest < -SYMMETRY * scale):
         raise ValueError(f"{call}: inertia has the eigenvalue {lowest.min():.3g} kg m^2; expected none below zero")
+    return symmetric
 
 
 def _axes(call: str, kind: str, axis: Any, linear: Any, angular: Any, pitch: float) -> list[tuple[np.ndarray, ...]]:
@@ -149,12 +155,17 @@ def _axes(call: str, kind: str, axis: Any, linear: Any, angular: Any, pitch: flo
     if axis is None:
         raise ValueError(f"{call}: a {kind} hinge needs axis=, unit vector(s) in the parent anchor frame")
     if kind == "universal":
-        return [turn(v) for v in rows("axis", axis, [2])]
+        vectors = rows("axis", axis, [2])
+        if np.linalg.norm(np.cross(*vectors)) < SYMMETRY:
+            raise ValueError(f"{call}: the axes of a universal hinge are parallel; expected two directions")
+        return [turn(v) for v in vectors]
     if kind == "planar":
         vectors = rows("axis", axis, [1, 2])
         if len(vectors) == 1:
             vectors = np.concatenate([in_plane(vectors[0])])
         normal = np.cross(vectors[0], vectors[1])
+        if abs(vectors[0] @ vectors[1]) > SYMMETRY:
+            raise ValueError(f"{call}: the directions of a planar hinge are oblique; expected a right angle")
         return [slide(vectors[0]), slide(vectors[1]), turn(_unit(call, "axis[0] x axis[1]", normal))]
     vector = rows("axis", axis, [1])[0]
     return {
@@ -260,7 +271,11 @@ class Hinge:
         rest = np.zeros(self.coord_count) if self.rest is None else np.asarray(self.rest, dtype=np.float64)
         if self.rest is None and self.motion != SCREWS:
             rest[-1] = 1.0  # the identity quaternion
-        put("rest", _array(call, "rest", rest.reshape(-1) if rest.ndim == 0 else rest, (self.coord_count,)))
+        rest = _array(call, "rest", np.broadcast_to(rest, (self.coord_count,)) if rest.ndim == 0 else rest,
+                      (self.coord_count,))
+        if self.motion != SCREWS:
+            _unit(call, "the quaternion (xyzw) of rest", rest[-4:])
+        put("rest", rest)
 
     @property
     def motion(self) -> int:
@@ -291,13 +306,14 @@ class Loop:
     axis: Any = None
     linear: Any = None
     angular: Any = None
+    pitch: float = 0.0
     parent_pose: Any = IDENTITY_POSE
     child_pose: Any = IDENTITY_POSE
     label: str = ""
     screws: tuple = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        hinge = Hinge(self.kind, self.parent, self.child, self.axis, self.linear, self.angular,
+        hinge = Hinge(self.kind, self.parent, self.child, self.axis, self.linear, self.angular, self.pitch,
                       parent_pose=self.parent_pose, child_pose=self.child_pose, label=self.label)
         for name in ("kind", "screws", "parent_pose", "child_pose"):
             object.__setattr__(self, name, getattr(hinge, name))
@@ -330,6 +346,7 @@ class Scene:
         couplings: mimics.
 
     Attributes:
+        bodies, hinges, loops, couplings: as given; :meth:`with_values` changes ``values`` alone.
         tree: the :class:`Tree` over the bodies.
         hinge_of: index of the hinge that carries each body [body].
         q_start, qd_start: first entry of q and qd of each hinge, and the total at the end [hinge + 1].
@@ -498,7 +515,7 @@ class Scene:
         if name in ("joint_X_p", "joint_X_c"):
             array[..., 3:] = _unit(call, f"the quaternions of {name}", array[..., 3:])
         if name == "body_inertia":
-            check_inertia(call, array)
+            array = checked_inertia(call, array)
         if name == "body_mass" and array.min() < 0.0:
             raise ValueError(f"{call}: body_mass has {array.min()} kg; expected zero or more")
         return array
