@@ -21,7 +21,7 @@ class Workspace:
     def __init__(self, call: Call, worlds: int, columns: int):
         self._sizes = worlds, columns
         self._memory = call.kind, call.dtype, call.device
-        self._arrays = {}
+        self._arrays: dict[tuple, tuple] = {}
 
     def take(self, owner: "Operator", rows: int, use: object = 0) -> wp.array:
         """Return the temporary [world, row, column] that ``owner`` may use while it is being applied."""
@@ -56,7 +56,7 @@ class Operator(abc.ABC):
         self.device = device
         self.dtype = dtype
         self.kind = kind
-        self._workspaces = {}
+        self._workspaces: dict[tuple, Workspace] = {}
 
     @abc.abstractmethod
     def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
@@ -274,7 +274,7 @@ def _with_columns(array: wp.array) -> wp.array:
     """[world, row] as [world, row, 1]."""
     if array.ndim == 3:
         return array
-    return view(array.ptr or 0, (*array.shape, 1), array.dtype, array.device.alias)
+    return view(array.ptr or 0, (*array.shape, 1), array.dtype, str(array.device))
 
 
 def _flatten(kind: type, operands, name: str) -> tuple:

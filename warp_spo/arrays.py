@@ -7,6 +7,7 @@ are cast and copied. The kind of the first array is the kind of the result.
 
 import functools
 import sys
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -85,19 +86,29 @@ class Call:
             than once. Set when the block ends without an exception.
     """
 
-    __slots__ = ("device", "dtype", "kind", "name", "result")
-    __slots__ += ("_inputs", "_outputs", "_results", "_saved_stream", "_staged")
+    __slots__ = (
+        "_inputs",
+        "_outputs",
+        "_results",
+        "_saved_stream",
+        "_staged",
+        "device",
+        "dtype",
+        "kind",
+        "name",
+        "result",
+    )
 
     def __init__(self, name: str, device: wp.Device, dtype: type, kind: str | None = None):
         self.name = name
         self.device = device
         self.dtype = dtype
         self.kind = kind
-        self.result = None
-        self._inputs = []  # (name, caller's array, Warp array)
-        self._outputs = []
-        self._results = []  # (caller's array or None, Warp array)
-        self._staged = []  # (NumPy array to fill, Warp array)
+        self.result: Any = None
+        self._inputs: list[tuple] = []  # (name, caller's array, Warp array)
+        self._outputs: list[tuple] = []
+        self._results: list[tuple] = []  # (caller's array or None, Warp array)
+        self._staged: list[tuple] = []  # (NumPy array to fill, Warp array)
         self._saved_stream = None
 
     def __enter__(self):

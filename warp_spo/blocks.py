@@ -6,6 +6,7 @@ the device at any time, and the operator applies what it finds.
 
 from collections.abc import Sequence
 from itertools import accumulate
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -26,7 +27,7 @@ class Table:
     def __init__(
         self, row_levels: Sequence[Sequence[int]], blocks: Sequence[tuple], transposed: bool, device: wp.Device
     ):
-        meeting = {row: [] for level in row_levels for row in level}
+        meeting: dict[int, list[tuple]] = {row: [] for level in row_levels for row in level}
         for row_start, column_start, rows, columns, offset in blocks:
             if transposed:
                 first, count, entry = column_start, columns, (row_start, rows, offset - column_start, 1, columns)
@@ -34,15 +35,17 @@ class Table:
                 first, count, entry = row_start, rows, (column_start, columns, offset - row_start * columns, columns, 1)
             for row in range(first, first + count):
                 meeting[row].append(entry)
-        entries, begin_of, table = [], {}, []
+        entries: list[tuple] = []
+        begin_of: dict[tuple, int] = {}
+        table: list[tuple[int, int, int]] = []
         for row, met in meeting.items():
             key = tuple(met)
             if key not in begin_of:  # the rows of a node share their entries
                 begin_of[key] = len(entries)
                 entries += met
             table.append((row, begin_of[key], begin_of[key] + len(met)))
-        self.rows = wp.array(np.array(table, np.int32).reshape(-1, 3), dtype=wp.vec3i, device=device)
-        self.entries = wp.array(np.array(entries, np.int32).reshape(-1, 5), dtype=block_sparse.Entry, device=device)
+        self.rows: Any = wp.array(np.array(table, np.int32).reshape(-1, 3), dtype=wp.vec3i, device=device)
+        self.entries: Any = wp.array(np.array(entries, np.int32).reshape(-1, 5), dtype=block_sparse.Entry, device=device)
         self.levels = list(zip(accumulate(map(len, row_levels), initial=0), map(len, row_levels), strict=False))
 
     def gather(self, weights, x, out, alpha, add):
@@ -85,8 +88,8 @@ class Blocks(Operator):
     def __init__(
         self,
         shape: tuple[int, int],
-        places: Sequence[tuple[int, int, int, int]],
-        weights: wp.array,
+        places: Sequence[tuple[int, ...]],
+        weights: Any,
         offsets: Sequence[int] | None = None,
         kind: str | None = WARP,
     ):
@@ -98,7 +101,7 @@ class Blocks(Operator):
                     f"Blocks: a block of {rows} x {columns} at ({row}, {column}) reaches out of a matrix of "
                     f"{shape[0]} x {shape[1]}; expected it inside; a place is (row start, column start, rows, columns)"
                 )
-        super().__init__(tuple(shape), weights.shape[0], weights.device, weights.dtype, kind)
+        super().__init__((shape[0], shape[1]), weights.shape[0], weights.device, weights.dtype, kind)
         blocks = [(*place, offset) for place, offset in zip(self.places, self.offsets, strict=True)]
         self.weights = weights
         self._forward = Table([range(shape[0])], blocks, False, weights.device)

@@ -150,7 +150,7 @@ class Dynamics:
         """
         if operation not in OPERATIONS:
             raise ValueError(f"Dynamics.prepare: no operation {operation!r}; expected one of {', '.join(OPERATIONS)}")
-        q = wp.array(np.tile(self.scene.neutral_q, (self.worlds, 1)), dtype=self.dtype, device=self.device)
+        q: Any = wp.array(np.tile(self.scene.neutral_q, (self.worlds, 1)), dtype=self.dtype, device=self.device)
         rate = wp.zeros((self.worlds, self.scene.dof_count), dtype=self.dtype, device=self.device)
         extra: dict[str, Any] = {}
         if options.pop("body_f", False):
@@ -270,7 +270,7 @@ class Dynamics:
         """Mass^-1 b in O(dof) a column; b and the result [world, dof] or [world, dof, columns]."""
         with self._call("solve_mass_matrix") as call:
             q, _ = self._read_state(call, q, None)
-            shape = (self.worlds, self.scene.dof_count)
+            shape: tuple = (self.worlds, self.scene.dof_count)
             if hasattr(b, "shape") and len(b.shape) == 3:
                 shape = (*shape, b.shape[2])
             b = call.read("b", b, shape, "[world, dof] or [world, dof, columns]")

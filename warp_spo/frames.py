@@ -32,8 +32,8 @@ class Frames:
             raise ValueError(f"{call}: frames is {frames!r}; expected a list of bodies or of (body, pose in the body)")
         key = tuple(self._checked(call, frame) for frame in frames)
         if key not in self._tables:
-            bodies = wp.array([body for body, _ in key], dtype=int, device=self._device)
-            origins = wp.array(np.array([origin for _, origin in key]), dtype=self._dtype, device=self._device)
+            bodies: Any = wp.array([body for body, _ in key], dtype=int, device=self._device)
+            origins: Any = wp.array(np.array([origin for _, origin in key]), dtype=self._dtype, device=self._device)
             self._tables[key] = (bodies, origins)
         return self._tables[key]
 

@@ -40,7 +40,7 @@ def spread(array: wp.array, axis: int, worlds: int) -> wp.array:
         return array
     shape, strides = list(array.shape), list(array.strides)
     shape[axis], strides[axis] = worlds, 0
-    view = wp.array(ptr=array.ptr, shape=tuple(shape), strides=tuple(strides), dtype=array.dtype, device=array.device)
+    view: Any = wp.array(ptr=array.ptr, shape=tuple(shape), strides=tuple(strides), dtype=array.dtype, device=array.device)
     view._ref = array  # keeps the memory
     return view
 
@@ -56,7 +56,7 @@ class Parameters:
         self.scene, self.worlds, self.device, self.dtype = scene, worlds, device, dtype
         self.variable = variable
         self._topology = topology
-        self._hinge_of = wp.array(scene.hinge_of, dtype=int, device=device)
+        self._hinge_of: Any = wp.array(scene.hinge_of, dtype=int, device=device)
         self._fields: dict[str, tuple[wp.array, wp.array]] = {}  # by dof, coordinate or component: (own, spread)
         self._values: dict[str, wp.array] = {}
         for name, value in scene.values.items():

@@ -34,7 +34,7 @@ class Recursions:
         self.worlds = plan.worlds
         self.topology = _topology(scene, device)
         screw = np.column_stack([scene.dof_axis, scene.dof_angular, scene.dof_linear])
-        self._screw = wp.array(screw, dtype=dtype, device=device)
+        self._screw: Any = wp.array(screw, dtype=dtype, device=device)
         self.parameters = Parameters(scene, self.topology, self.worlds, device, dtype, variable)
         self._workspace: dict[Any, wp.array] = {}
 

@@ -28,6 +28,8 @@ UNLIMITED = 1e10
 SYMMETRY = 1e-6  # relative: what a float32 file or importer leaves of a symmetric inertia, a unit axis or quaternion
 ALIASES = {"spherical": "ball", "distance": "free"}
 
+Screw = tuple[Any, float, float]  # axis [3], radians and metres per coordinate
+
 SCREWS, BALL, FREE = 0, 1, 2  # how a hinge's coordinates become a motion
 MOTION = {"ball": BALL, "free": FREE}
 
@@ -122,8 +124,8 @@ def checked_inertia(call: str, inertia: np.ndarray) -> np.ndarray:
     return symmetric
 
 
-def _axes(call: str, kind: str, axis: Any, linear: Any, angular: Any, pitch: float) -> list[tuple[np.ndarray, ...]]:
-    """The screws of a hinge, inboard first: (axis, radians per coordinate, metres per coordinate)."""
+def _axes(call: str, kind: str, axis: Any, linear: Any, angular: Any, pitch: float) -> list[Screw]:
+    """The screws of a hinge, inboard first."""
 
     def rows(name: str, value: Any, counts: Sequence[int]) -> np.ndarray:
         array = np.atleast_2d(np.asarray(() if value is None else value, dtype=np.float64))
@@ -409,7 +411,8 @@ class Scene:
         if count == 0:
             raise ValueError("Scene: no bodies; expected one or more")
         carried: dict[int, str] = {}
-        for index, hinge in enumerate((*self.hinges, *self.loops)):
+        edges: list[Any] = [*self.hinges, *self.loops]
+        for index, hinge in enumerate(edges):
             name = f"hinge {index} {hinge.label!r}" if index < len(self.hinges) else f"loop {hinge.label!r}"
             if not (-1 <= hinge.parent < count and 0 <= hinge.child < count) or hinge.parent == hinge.child:
                 raise ValueError(f"Scene: {name} joins body {hinge.parent} to body {hinge.child}; expected two of "

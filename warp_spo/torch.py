@@ -1,11 +1,12 @@
 """torch at the border: what :mod:`warp_spo.arrays` asks of tensors. The only file besides env.py that imports torch."""
 
 import functools
+from typing import Any
 
 import torch
 import warp as wp
 
-_DTYPES = {wp.float32: torch.float32, wp.float64: torch.float64, wp.int32: torch.int32, wp.int64: torch.int64}
+_DTYPES: dict[Any, torch.dtype] = {wp.float32: torch.float32, wp.float64: torch.float64, wp.int32: torch.int32, wp.int64: torch.int64}
 _DTYPES |= {wp.uint8: torch.uint8, wp.bool: torch.bool}
 
 is_grad_enabled = torch.is_grad_enabled
