@@ -19,11 +19,23 @@ EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
 def factor(T) -> wp.Kernel:
     """Inward, one level: P(k) = M(k) + sum over children phi P+ phi*, U = P H*, D = H U + Delta, P+ = P - U D^-1 U*.
 
-    A pivot that rounding may have invented, D <= 8 eps (H P H* + Delta) before its hinge's other columns were
-    eliminated, becomes NaN: whatever depends on it is lost, and says so.
+    A pivot that rounding may have invented becomes NaN: whatever depends on it is lost, and says so. That is one of at
+    most 4 eps times the size of what cancels in it: |H| |P| |H*| + |Delta|, entry by entry, and what the hinge's columns
+    that are eliminated before it bring along. Along an axis of the node frame nothing cancels: any D > 0 is kept.
     """
     s = spatial(T)
-    least = T(8.0 * EPSILON[T])
+    least = T(4.0 * EPSILON[T])
+    vec3, mat33 = s.vec3, s.mat33
+
+    @wp.func
+    def magnitude(w: vec3, v: vec3, w_o: vec3, v_o: vec3, J: mat33, C: mat33, m: mat33):
+        """(w; v)* P (w_o; v_o) with the absolute value of every factor."""
+        total = T(0.0)
+        for i in range(3):
+            total += wp.abs(w[i]) * (wp.dot(wp.abs(J[i]), wp.abs(w_o)) + wp.dot(wp.abs(C[i]), wp.abs(v_o)))
+            total += wp.abs(w_o[i]) * wp.dot(wp.abs(C[i]), wp.abs(v))
+            total += wp.abs(v[i]) * wp.dot(wp.abs(m[i]), wp.abs(v_o))
+        return total
 
     @wp.kernel(module=f"warp_spo_articulated_{T.__name__}", enable_backward=False)
     def kernel(
@@ -51,22 +63,27 @@ def factor(T) -> wp.Kernel:
 
         first = topology.qd_start[node]
         count = topology.dof_count[node]
-        for e in range(count):  # before anything is eliminated
+        J_0, C_0, m_0 = J, C, m
+        for e in range(count):  # the size of what cancels in D, kept in D's place until D is known
             dof = first + e
             w, v = s.load(axis, dof, 0, world), s.load(axis, dof, 3, world)
-            n, f = J * w + C * v, wp.transpose(C) * w + m * v
-            pivot_out[dof, world] = wp.dot(w, n) + wp.dot(v, f) + armature[dof, world]
+            pivot_out[dof, world] = magnitude(w, v, w, v, J, C, m) + wp.abs(armature[dof, world])
         for e in range(count):
             dof = first + count - 1 - e
             w, v = s.load(axis, dof, 0, world), s.load(axis, dof, 3, world)
             n, f = J * w + C * v, wp.transpose(C) * w + m * v
             D = wp.dot(w, n) + wp.dot(v, f) + armature[dof, world]
-            whole = pivot_out[dof, world]
-            if not (D > T(0.0) and D > least * whole):
+            size = pivot_out[dof, world]
+            if not (D > T(0.0) and D > least * size):
                 D = T(wp.nan)
             s.store(gain_out, dof, 0, world, n)
             s.store(gain_out, dof, 3, world, f)
             pivot_out[dof, world] = D
+            for other in range(first, dof):
+                w_o, v_o = s.load(axis, other, 0, world), s.load(axis, other, 3, world)
+                share = wp.abs(wp.dot(w_o, n) + wp.dot(v_o, f)) / D
+                coupling = magnitude(w_o, v_o, w, v, J_0, C_0, m_0)
+                pivot_out[other, world] += share * (T(2.0) * coupling + share * size)
             n_D, f_D = n / D, f / D
             J -= wp.outer(n, n_D)
             C -= wp.outer(n, f_D)
@@ -252,3 +269,5 @@ def status(T) -> wp.Kernel:
         status_out[world] = word
 
     return kernel
+
+KERNELS = (factor, reduce, expand, log_determinant, weighted_product, status)

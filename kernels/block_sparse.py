@@ -113,3 +113,5 @@ def unit(T):
         out[world, row, column] = wp.where(row == first + column, T(1.0), T(0.0))
 
     return block_unit
+
+KERNELS = (gather, sweep, scale, unit)

@@ -82,3 +82,5 @@ def mass_matrix(T) -> wp.Kernel:
                 last = first + topology.dof_count[node] - 1
 
     return kernel
+
+KERNELS = (composite, mass_matrix)

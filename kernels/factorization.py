@@ -129,3 +129,5 @@ def factorize(T) -> wp.Kernel:
                     psi_out[world, own + a * m + b] = psi
 
     return kernel
+
+KERNELS = (factorize,)

@@ -1,4 +1,4 @@
-"""Position and velocity of every node: hinge motion, then outward sweeps V = phi* H* qd (eq. 20)."""
+"""Position, velocity and acceleration of every node: hinge motion, then outward sweeps V = phi* H* qd (eq. 20)."""
 
 import functools
 
@@ -58,7 +58,7 @@ def hinge(T) -> wp.Kernel:
                 s.store(axis_out, first + i, 3, world, slide)
                 p += R * p_i
                 R = R * R_i
-                if qd:
+                if velocity_out:
                     w, v = s.motion_to_child(R_i, p_i, w, v)
                     dw, dv = s.motion_to_child(R_i, p_i, dw, dv)
                     rate = qd[world, first + i]
@@ -84,7 +84,7 @@ def hinge(T) -> wp.Kernel:
                 if motion == FREE:
                     s.store(axis_out, first + i, 0, world, vec3())
                     s.store(axis_out, first + i, 3, world, column)
-            if qd:
+            if velocity_out:
                 Rt = wp.transpose(R)
                 w = Rt * vec3(qd[world, angular], qd[world, angular + 1], qd[world, angular + 2])
                 v = wp.cross(r, w)
@@ -96,7 +96,7 @@ def hinge(T) -> wp.Kernel:
         R_tree = s.load_matrix(tree, node, 0, world)
         s.store_matrix(pose_out, node, 0, world, R_tree * R)
         s.store(pose_out, node, 9, world, s.load(tree, node, 9, world) + R_tree * p)
-        if qd:
+        if velocity_out:
             s.store(velocity_out, node, 0, world, w)
             s.store(velocity_out, node, 3, world, v)
             s.store(bias_out, node, 0, world, dw)
@@ -106,31 +106,58 @@ def hinge(T) -> wp.Kernel:
 
 
 @functools.cache
-def velocity(T) -> wp.Kernel:
-    """Outward, one level: V(k) = phi*(p, k) V(p) + H* qd and a(k) = crm(V(k)) H* qd + dH*/dt qd, both in place."""
+def motion(T) -> wp.Kernel:
+    """Outward, one level: V(k) = phi* V(p) + H* qd, alpha(k) = phi* alpha(p) + H* qdd + a(k); what is absent is zero.
+
+    a(k) = crm(V(k)) H* qd + dH*/dt qd. ``velocity_out`` comes in as H* qd and leaves as V; gravity is the acceleration
+    -g of the inertial frame. Without ``acceleration_out`` only V is computed.
+    """
     s = spatial(T)
 
     @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
     def kernel(
-        topology: Topology, level: int, pose: wp.array3d[T], velocity_out: wp.array3d[T], bias_out: wp.array3d[T]
+        topology: Topology,
+        level: int,
+        pose: wp.array3d[T],
+        axis: wp.array3d[T],
+        bias: wp.array3d[T],
+        gravity: wp.array2d[T],
+        qdd: wp.array2d[T],
+        velocity_out: wp.array3d[T],
+        acceleration_out: wp.array3d[T],
     ):
         i, world = wp.tid()
         node = topology.order[level + i]
         parent = topology.parent[node]
-        w_j, v_j = s.load(velocity_out, node, 0, world), s.load(velocity_out, node, 3, world)
-        w, v = s.motion_to_child(
-            s.load_matrix(pose, node, 0, world),
-            s.load(pose, node, 9, world),
-            s.load(velocity_out, parent, 0, world),
-            s.load(velocity_out, parent, 3, world),
-        )
-        # crm(V) H* qd = crm(phi* V(p)) H* qd: a motion does not act on itself
-        dw = s.load(bias_out, node, 0, world) + wp.cross(w, w_j)
-        dv = s.load(bias_out, node, 3, world) + wp.cross(v, w_j) + wp.cross(w, v_j)
-        s.store(velocity_out, node, 0, world, w + w_j)
-        s.store(velocity_out, node, 3, world, v + v_j)
-        s.store(bias_out, node, 0, world, dw)
-        s.store(bias_out, node, 3, world, dv)
+        R, l = s.load_matrix(pose, node, 0, world), s.load(pose, node, 9, world)
+        aw, av = s.vec3(), s.vec3()  # what velocities contribute to alpha
+        if velocity_out:
+            w_j, v_j = s.load(velocity_out, node, 0, world), s.load(velocity_out, node, 3, world)
+            w, v = s.vec3(), s.vec3()
+            if parent >= 0:
+                w, v = s.load(velocity_out, parent, 0, world), s.load(velocity_out, parent, 3, world)
+                w, v = s.motion_to_child(R, l, w, v)
+            s.store(velocity_out, node, 0, world, w + w_j)
+            s.store(velocity_out, node, 3, world, v + v_j)
+            # crm(V) H* qd = crm(phi* V(p)) H* qd: a motion does not act on itself
+            aw = s.load(bias, node, 0, world) + wp.cross(w, w_j)
+            av = s.load(bias, node, 3, world) + wp.cross(v, w_j) + wp.cross(w, v_j)
+        if acceleration_out:
+            dw, dv = s.vec3(), s.vec3()
+            if parent >= 0:
+                dw, dv = s.load(acceleration_out, parent, 0, world), s.load(acceleration_out, parent, 3, world)
+            elif gravity:
+                dv = -s.vec3(gravity[0, world], gravity[1, world], gravity[2, world])
+            dw, dv = s.motion_to_child(R, l, dw, dv)
+            dw += aw
+            dv += av
+            if qdd:
+                first = topology.qd_start[node]
+                for dof in range(first, first + topology.dof_count[node]):
+                    dw += s.load(axis, dof, 0, world) * qdd[world, dof]
+                    dv += s.load(axis, dof, 3, world) * qdd[world, dof]
+            s.store(acceleration_out, node, 0, world, dw)
+            s.store(acceleration_out, node, 3, world, dv)
 
     return kernel
 
@@ -291,3 +318,5 @@ def integrate(T) -> wp.Kernel:
                 out[world, coord + i] = q[world, coord + i] + dt * qd[world, dof - 3 + i] + before[i] - after[i]
 
     return kernel
+
+KERNELS = (hinge, motion, poses, body_poses, body_velocities, jacobian, integrate)

@@ -1,7 +1,4 @@
-"""Newton-Euler recursion: T = H phi (M alpha + b) + Delta qdd, with alpha = phi* (H* qdd + a) and b = crf(V) M V.
-
-theory: Jain, dual force relation of eq. 20; gravity is the acceleration -g of the inertial frame.
-"""
+"""Newton-Euler recursion: tau = H phi (M alpha + b) + Delta qdd, b = crf(V) M V; the force relation dual to eq. 20."""
 
 import functools
 
@@ -9,46 +6,6 @@ import warp as wp
 
 from .spatial import spatial
 from .topology import Topology
-
-
-@functools.cache
-def acceleration(T) -> wp.Kernel:
-    """Outward, one level: alpha(k) = phi*(p, k) alpha(p) + H* qdd + a(k); what is not given is zero."""
-    s = spatial(T)
-
-    @wp.kernel(module=f"warp_spo_newton_euler_{T.__name__}", enable_backward=False)
-    def kernel(
-        topology: Topology,
-        level: int,
-        pose: wp.array3d[T],
-        axis: wp.array3d[T],
-        gravity: wp.array2d[T],
-        bias: wp.array3d[T],
-        qdd: wp.array2d[T],
-        acceleration_out: wp.array3d[T],
-    ):
-        i, world = wp.tid()
-        node = topology.order[level + i]
-        parent = topology.parent[node]
-        w, v = s.vec3(), s.vec3()
-        if parent >= 0:
-            w = s.load(acceleration_out, parent, 0, world)
-            v = s.load(acceleration_out, parent, 3, world)
-        elif gravity:
-            v = -s.vec3(gravity[0, world], gravity[1, world], gravity[2, world])
-        w, v = s.motion_to_child(s.load_matrix(pose, node, 0, world), s.load(pose, node, 9, world), w, v)
-        if bias:
-            w += s.load(bias, node, 0, world)
-            v += s.load(bias, node, 3, world)
-        if qdd:
-            first = topology.qd_start[node]
-            for dof in range(first, first + topology.dof_count[node]):
-                w += s.load(axis, dof, 0, world) * qdd[world, dof]
-                v += s.load(axis, dof, 3, world) * qdd[world, dof]
-        s.store(acceleration_out, node, 0, world, w)
-        s.store(acceleration_out, node, 3, world, v)
-
-    return kernel
 
 
 @functools.cache
@@ -134,3 +91,5 @@ def force(T) -> wp.Kernel:
             tau_out[world, dof] = tau
 
     return kernel
+
+KERNELS = (body_force, force)

@@ -111,3 +111,5 @@ def widen(T) -> wp.Kernel:
         value_out[world, i] = wp.float64(value[world, i])
 
     return kernel
+
+KERNELS = (derive, transpose, widen)

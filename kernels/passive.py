@@ -70,3 +70,5 @@ def passive_force(T) -> wp.Kernel:
                 out[world, dof + i] -= stiffness[dof + i, world] * turn[i]
 
     return kernel
+
+KERNELS = (passive_force,)

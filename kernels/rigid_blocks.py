@@ -59,3 +59,5 @@ def fill(T) -> wp.Kernel:
                 Delta_out[world, tables.pivot[node] + i * count + j] = value
 
     return kernel
+
+KERNELS = (fill,)

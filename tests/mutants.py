@@ -8,7 +8,7 @@ import warp_spo.kernels
 
 
 def mutant(folder, file, old, new):
-    """A copy of ``kernels/<file>.py`` in which ``old``, found exactly once, is ``new``; its Warp modules are its own."""
+    """A copy of ``kernels/<file>.py`` in which ``old``, found once, is ``new``; its Warp modules are its own."""
     source = (pathlib.Path(warp_spo.kernels.__path__[0]) / f"{file}.py").read_text()
     assert source.count(old) == 1, f"{file}.py holds {source.count(old)} times: {old}"
     source = source.replace(old, new).replace('f"warp_spo_', 'f"mutant_')

@@ -277,6 +277,7 @@ def test_a_scene_that_cannot_move(dtype, device):
     assert dyn.mass_matrix_inverse(nothing).shape == (3, 0, 0)
     np.testing.assert_array_equal(dyn.log_det_mass_matrix(nothing), np.zeros(3))
     assert dyn.body_poses(nothing).shape == (3, 2, 7)
+    np.testing.assert_array_equal(dyn.body_velocities(nothing, nothing), np.zeros((3, 2, 6)))
     assert dyn.operators(nothing).phi.dense().shape == (3, 12, 12)
 
 

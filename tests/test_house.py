@@ -6,9 +6,9 @@ import subprocess
 import sys
 
 import pytest
-import warp_spo.kernels
 
 import warp_spo
+import warp_spo.kernels
 
 PACKAGE = pathlib.Path(warp_spo.__file__).parent
 KERNELS = pathlib.Path(warp_spo.kernels.__path__[0])

@@ -174,7 +174,7 @@ def test_updates_and_products_allocate_nothing(device):
 
 # -- no robots ---------------------------------------------------------------------------------------------------------
 def abstract_system(parent, seed, device, dtype="float64", worlds=3, delta=True):
-    """Random weights, hinge maps and inertias on a tree: node sizes 2 to 7, hinge sizes 0 to 2, weights of rank 1 or 2."""
+    """Random weights of rank 2, hinge maps and inertias on a tree: node sizes 2 to 7, hinge sizes 0 to 2."""
     rng = np.random.default_rng(seed)
     n = len(parent)
     m = rng.integers(2, 8, n)

@@ -12,7 +12,7 @@ import numbers
 import warp as wp
 
 from .arrays import Call, kind_of, new, parse_device, parse_dtype, view
-from .kernels import block_sparse
+from .kernels import block_sparse, declare
 
 
 class Workspace:
@@ -57,6 +57,7 @@ class Operator(abc.ABC):
         self.dtype = dtype
         self.kind = kind
         self._workspaces: dict[tuple, Workspace] = {}
+        declare(block_sparse, dtype)
 
     @abc.abstractmethod
     def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:

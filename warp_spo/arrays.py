@@ -30,11 +30,19 @@ def parse_dtype(dtype, call: str = "dtype") -> type:
     return _DTYPES[name]
 
 
-def parse_device(device=None) -> wp.Device:
-    """Return the Warp device for a name, a Warp device or a torch device; None is Warp's current one."""
-    if device is not None and type(device).__module__ == "torch":
-        device = _torch().device_name(device)
-    return wp.get_device(device)
+def parse_device(device=None, call: str = "device") -> wp.Device:
+    """Return the Warp device for a name, a Warp device or a torch device; None is Warp's current one.
+
+    Raises:
+        ValueError: no device of this machine.
+    """
+    try:
+        if device is not None and type(device).__module__ == "torch":
+            return wp.get_device(_torch().device_name(device))
+        return wp.get_device(device)
+    except (ValueError, RuntimeError, AssertionError):  # AssertionError: torch without CUDA
+        known = ", ".join(repr(known.alias) for known in wp.get_devices())
+        raise ValueError(f"{call}: device is {device!r}; expected one of this machine's: {known}") from None
 
 
 def kind_of(array, call: str, name: str) -> str:

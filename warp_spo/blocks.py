@@ -44,8 +44,9 @@ class Table:
                 begin_of[key] = len(entries)
                 entries += met
             table.append((row, begin_of[key], begin_of[key] + len(met)))
-        self.rows: Any = wp.array(np.array(table, np.int32).reshape(-1, 3), dtype=wp.vec3i, device=device)
-        self.entries: Any = wp.array(np.array(entries, np.int32).reshape(-1, 5), dtype=block_sparse.Entry, device=device)
+        rows, gathered = np.array(table, np.int32).reshape(-1, 3), np.array(entries, np.int32).reshape(-1, 5)
+        self.rows: Any = wp.array(rows, dtype=wp.vec3i, device=device)
+        self.entries: Any = wp.array(gathered, dtype=block_sparse.Entry, device=device)
         self.levels = list(zip(accumulate(map(len, row_levels), initial=0), map(len, row_levels), strict=False))
 
     def gather(self, weights, x, out, alpha, add):

@@ -80,7 +80,7 @@ class Dynamics:
             )
         self.scene = scene
         self.worlds = _world_count(scene, worlds)
-        self.device = parse_device(device)
+        self.device = parse_device(device, "Dynamics")
         self.dtype = parse_dtype(dtype, "Dynamics")
         self.variable = _variable_names(variable)
         _check_loops(scene, loops)
@@ -153,10 +153,10 @@ class Dynamics:
         q: Any = wp.array(np.tile(self.scene.neutral_q, (self.worlds, 1)), dtype=self.dtype, device=self.device)
         rate = wp.zeros((self.worlds, self.scene.dof_count), dtype=self.dtype, device=self.device)
         extra: dict[str, Any] = {}
-        if options.pop("body_f", False):
+        if operation in ("forward_dynamics", "inverse_dynamics", "bias_force") and options.pop("body_f", False):
             shape = (self.worlds, self.scene.body_count, 6)
             extra["body_f"] = wp.zeros(shape, dtype=self.dtype, device=self.device)
-        if options.pop("status", False):
+        if operation == "forward_dynamics" and options.pop("status", False):
             extra["status"] = wp.zeros(self.worlds, dtype=wp.int32, device=self.device)
         arguments: dict[str, tuple] = {
             "forward_dynamics": (q, rate, rate),
@@ -169,6 +169,8 @@ class Dynamics:
         given = arguments.get(operation, (q,))
         if operation == "solve_mass_matrix":
             columns = options.pop("columns", None)
+            if columns is not None and (not isinstance(columns, int) or columns < 0):
+                raise ValueError(f"Dynamics.prepare: columns is {columns!r}; expected how many right-hand sides")
             shape = (self.worlds, self.scene.dof_count) + (() if columns is None else (columns,))
             given = (q, wp.zeros(shape, dtype=self.dtype, device=self.device))
         if operation in ("jacobian", "operational_inertia_inverse"):
@@ -207,8 +209,8 @@ class Dynamics:
             force = None
             if moves or body_f is not None:
                 # gravity stays out of the velocity terms: as the frame's acceleration it meets nothing to cancel
-                acceleration = run.accelerations(None, bias=True, gravity=False) if moves else None
-                force = run.body_forces(acceleration, moves, body_f)
+                alpha, velocity = run.accelerations(None, moves, gravity=False) if moves else (None, None)
+                force = run.body_forces(alpha, velocity, body_f)
             pivot = run.factor()
             run.solve(tau, out, force, gravity=True)
             if status is not None:
@@ -241,7 +243,7 @@ class Dynamics:
             out = call.write(out, (self.worlds, self.scene.dof_count), "[world, dof]")
             run, moves = self.recursions, qd is not None
             run.hinges(q, qd)
-            force = run.body_forces(run.accelerations(qdd, bias=moves, gravity=True), moves, body_f)
+            force = run.body_forces(*run.accelerations(qdd, moves, gravity=True), body_f)
             run.hinge_forces(qdd, force, out)
         return call.result
 
@@ -322,7 +324,7 @@ class Dynamics:
             out = call.write(out, (self.worlds, self.scene.body_count, 6), "[world, body, 6]")
             run = self.recursions
             run.hinges(q, qd)
-            inputs = [run.world_poses(), run.parameters.com, run.array("velocity")]
+            inputs = [run.world_poses(), run.parameters.com, run.velocities()]
             run.launch(kinematics.body_velocities, run.nodes, inputs, [out])
         return call.result
 
@@ -368,7 +370,8 @@ class Dynamics:
             q, qd = self._read_state(call, q, qd, optional=False)
             out = call.write(out, (self.worlds, self.scene.coord_count), "[world, coordinate]")
             run = self.recursions
-            run.launch(kinematics.integrate, run.nodes, [run.topology, run.parameters.com, q, qd, float(dt)], [out])
+            inputs = [run.topology, run.parameters.com, q, qd, _seconds(call.name, dt)]
+            run.launch(kinematics.integrate, run.nodes, inputs, [out])
         return call.result
 
     # -- operators -------------------------------------------------------------------------------------------------
@@ -390,7 +393,7 @@ class Dynamics:
                 f"worlds       {self.worlds} on {self.device}, {self.dtype.__name__}",
                 f"granularity  {self.granularity}: {self.plan.reason}",
                 f"levels       {len(widths)} of {min(widths)} to {max(widths)} nodes, {len(tree.segments)} segments",
-                "launches     forward dynamics 5 a level + 1, inverse dynamics 3 a level + 1, mass matrix 1 a level + 2",
+                "launches     forward dynamics 4 a level + 2, inverse dynamics 2 + 2, mass matrix 1 + 2",
                 f"variable     {', '.join(self.variable) or 'nothing'}",
                 f"gravity      {'none' if gravity is None else 'acceleration of the inertial frame'}",
                 f"loops        {len(scene.loops)} left open" if scene.loops else "loops        none",
@@ -413,6 +416,15 @@ class Dynamics:
         return call.read("body_f", body_f, (self.worlds, self.scene.body_count, 6), "[world, body, 6]", optional=True)
 
 
+def _seconds(call: str, dt: Any) -> float:
+    if getattr(dt, "requires_grad", False):
+        raise ValueError(f"{call}: dt requires grad; derivatives are not available through this call; pass float(dt)")
+    try:
+        return float(dt)
+    except (TypeError, ValueError):
+        raise TypeError(f"{call}: dt is {dt!r}; expected a number of seconds, the same in all worlds") from None
+
+
 def _world_count(scene: Scene, worlds: Any) -> int:
     if worlds is None:
         return scene.worlds
@@ -427,7 +439,10 @@ def _world_count(scene: Scene, worlds: Any) -> int:
 
 
 def _variable_names(variable: Any) -> tuple[str, ...]:
-    names = (variable,) if isinstance(variable, str) else tuple(variable)
+    try:
+        names = (variable,) if isinstance(variable, str) else tuple(variable)
+    except TypeError:
+        raise TypeError(f"Dynamics: variable is {variable!r}; expected names such as ('body_mass',)") from None
     for name in names:
         if name not in VARIABLE:
             raise ValueError(f"Dynamics: variable names {name!r}; expected some of {', '.join(VARIABLE)}")

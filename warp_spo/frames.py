@@ -43,6 +43,10 @@ class Frames:
         if isinstance(body, str):
             if body not in labels:
                 raise ValueError(f"{call}: no body {body!r} in the scene; expected one of scene.body_labels")
+            if labels.count(body) > 1:
+                raise ValueError(
+                    f"{call}: {labels.count(body)} bodies have the label {body!r}; expected one; pass the body's index"
+                )
             body = labels.index(body)
         try:
             body, pose = operator.index(body), tuple(float(number) for number in pose)
@@ -52,6 +56,7 @@ class Frames:
             ) from None
         if not 0 <= body < len(labels):
             raise ValueError(f"{call}: a frame's body is {body}; expected 0 to {len(labels) - 1}")
-        if len(pose) != 7 or not abs(math.hypot(*pose[3:]) - 1.0) < 1e-5:  # float32 poses are unit to 1e-7
+        unit = len(pose) == 7 and abs(math.hypot(*pose[3:]) - 1.0) < 1e-5  # float32 poses are unit to 1e-7
+        if not unit or not all(map(math.isfinite, pose)):
             raise ValueError(f"{call}: a frame's pose is {pose}; expected x, y, z and a unit quaternion xyzw")
         return body, pose[:3]

@@ -40,7 +40,8 @@ def spread(array: wp.array, axis: int, worlds: int) -> wp.array:
         return array
     shape, strides = list(array.shape), list(array.strides)
     shape[axis], strides[axis] = worlds, 0
-    view: Any = wp.array(ptr=array.ptr, shape=tuple(shape), strides=tuple(strides), dtype=array.dtype, device=array.device)
+    place = {"ptr": array.ptr, "shape": tuple(shape), "strides": tuple(strides)}
+    view: Any = wp.array(**place, dtype=array.dtype, device=array.device)
     view._ref = array  # keeps the memory
     return view
 

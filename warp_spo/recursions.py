@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .kernels import articulated, composite, kinematics, newton_euler
+from .kernels import articulated, composite, declare, kinematics, newton_euler, parameters, passive, rigid_blocks
 from .kernels.spatial import ARTICULATED, MOTION, POSE, RIGID
 from .kernels.topology import Topology
 from .parameters import Parameters
@@ -31,6 +31,8 @@ class Recursions:
 
     def __init__(self, scene: Scene, plan: Plan, device: wp.Device, dtype: type, variable: tuple[str, ...]):
         self.scene, self.plan, self.device, self.dtype = scene, plan, device, dtype
+        for file in (parameters, kinematics, newton_euler, articulated, composite, passive, rigid_blocks):
+            declare(file, dtype)
         self.worlds = plan.worlds
         self.topology = _topology(scene, device)
         screw = np.column_stack([scene.dof_axis, scene.dof_angular, scene.dof_linear])
@@ -80,7 +82,7 @@ class Recursions:
 
     # -- kinematics ------------------------------------------------------------------------------------------------
     def hinges(self, q: wp.array, qd: wp.array | None = None) -> None:
-        """Pose and H* of every node; with qd also V and its bias a."""
+        """Pose and H* of every node; with qd also H* qd and dH*/dt qd."""
         outputs = [
             self._per_node("pose", POSE),
             self.array("axis", self.scene.dof_count, MOTION, self.worlds),
@@ -89,8 +91,22 @@ class Recursions:
         ]
         inputs = [self.topology, self._screw, self.parameters.tree, self.parameters.com, q, qd]
         self.launch(kinematics.hinge, self.nodes, inputs, outputs)
-        if qd is not None:
-            self._sweep(kinematics.velocity, self.plan.outward[1:], [outputs[0]], outputs[2:])
+
+    def velocities(self) -> wp.array:
+        """V = phi* H* qd, after hinges with qd."""
+        velocity = self.array("velocity")
+        inputs = [self.array("pose"), self.array("axis"), self.array("bias"), None, None]
+        self._sweep(kinematics.motion, self.plan.outward, inputs, [velocity, None])
+        return velocity
+
+    def accelerations(self, qdd: wp.array | None, moves: bool, gravity: bool) -> tuple[wp.array, wp.array | None]:
+        """alpha = phi* (H* qdd + a), with or without gravity, and V if it ``moves``: after hinges with qd."""
+        velocity, bias = (self.array("velocity"), self.array("bias")) if moves else (None, None)
+        acceleration = self._per_node("acceleration", MOTION)
+        base = self.parameters.gravity if gravity else None
+        inputs = [self.array("pose"), self.array("axis"), bias, base, qdd]
+        self._sweep(kinematics.motion, self.plan.outward, inputs, [velocity, acceleration])
+        return acceleration, velocity
 
     def world_poses(self) -> wp.array:
         """Pose of every node frame in the inertial frame."""
@@ -105,30 +121,11 @@ class Recursions:
         self.launch(kinematics.jacobian, (len(frame_nodes), self.worlds), inputs, [out])
 
     # -- Newton-Euler ----------------------------------------------------------------------------------------------
-    def accelerations(self, qdd: wp.array | None, bias: bool, gravity: bool) -> wp.array:
-        """alpha = phi* (H* qdd + a) for qdd, with or without velocity terms and gravity."""
-        acceleration = self._per_node("acceleration", MOTION)
-        inputs = [
-            self.array("pose"),
-            self.array("axis"),
-            self.parameters.gravity if gravity else None,
-            self.array("bias") if bias else None,
-            qdd,
-        ]
-        self._sweep(newton_euler.acceleration, self.plan.outward, inputs, [acceleration])
-        return acceleration
-
-    def body_forces(self, acceleration: wp.array | None, velocity: bool, body_f: wp.array | None) -> wp.array:
-        """M alpha + crf(V) M V less the external wrench, of every node by itself."""
+    def body_forces(self, acceleration: Any, velocity: Any, body_f: Any) -> wp.array:
+        """M alpha + crf(V) M V less the external wrench, of every node by itself; None is zero."""
         force = self._per_node("force", MOTION)
-        inputs = [
-            self.parameters.rigid,
-            self.parameters.com,
-            acceleration,
-            self.array("velocity") if velocity else None,
-            body_f,
-            None if body_f is None else self.world_poses(),
-        ]
+        world_pose = None if body_f is None else self.world_poses()
+        inputs = [self.parameters.rigid, self.parameters.com, acceleration, velocity, body_f, world_pose]
         self.launch(newton_euler.body_force, self.nodes, inputs, [force])
         return force
 

@@ -52,13 +52,18 @@ DOF_VALUES = {
 
 def _array(call: str, name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     try:
-        array = np.asarray(value, dtype=np.float64)
+        array = np.array(value, dtype=np.float64)  # a copy: what the caller does to his later changes nothing here
     except (TypeError, ValueError):
         raise ValueError(f"{call}: {name} is {value!r}; expected numbers of shape {shape}") from None
     if array.shape != shape:
         raise ValueError(f"{call}: {name} has shape {array.shape}; expected {shape}")
     if not np.isfinite(array).all():
         raise ValueError(f"{call}: {name} is {array.tolist()}; expected finite numbers")
+    return _read_only(array)
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    array.flags.writeable = False
     return array
 
 
@@ -71,7 +76,7 @@ def _unit(call: str, name: str, vector: np.ndarray) -> np.ndarray:
 
 def _pose(call: str, name: str, value: Any) -> np.ndarray:
     pose = _array(call, name, value, (7,))
-    return np.concatenate([pose[:3], _unit(call, f"the quaternion (xyzw) of {name}", pose[3:])])
+    return _read_only(np.concatenate([pose[:3], _unit(call, f"the quaternion (xyzw) of {name}", pose[3:])]))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -104,7 +109,7 @@ class Body:
         inertia = _array(call, "inertia [kg m^2]", self.inertia, (3, 3))
         if self.mass < 0.0:
             raise ValueError(f"{call}: mass is {self.mass} kg; expected zero or more")
-        object.__setattr__(self, "inertia", checked_inertia(call, inertia))
+        object.__setattr__(self, "inertia", _read_only(checked_inertia(call, inertia)))
 
 
 def checked_inertia(call: str, inertia: np.ndarray) -> np.ndarray:
@@ -389,6 +394,8 @@ class Scene:
         for name in DOF_VALUES:
             field = name.removeprefix("joint_")
             self.values[name] = np.concatenate([getattr(hinge, field) for hinge in self.hinges])[None]
+        for array in self.values.values():
+            _read_only(array)
 
         screws = [self._screws_of(hinge) for hinge in self.hinges]
         self.dof_axis = np.concatenate([axis for axis, _, _ in screws]).reshape(-1, 3)

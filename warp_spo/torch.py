@@ -6,8 +6,14 @@ from typing import Any
 import torch
 import warp as wp
 
-_DTYPES: dict[Any, torch.dtype] = {wp.float32: torch.float32, wp.float64: torch.float64, wp.int32: torch.int32, wp.int64: torch.int64}
-_DTYPES |= {wp.uint8: torch.uint8, wp.bool: torch.bool}
+_DTYPES: dict[Any, torch.dtype] = {
+    wp.float32: torch.float32,
+    wp.float64: torch.float64,
+    wp.int32: torch.int32,
+    wp.int64: torch.int64,
+    wp.uint8: torch.uint8,
+    wp.bool: torch.bool,
+}
 
 is_grad_enabled = torch.is_grad_enabled
 mark_changed = torch.autograd.graph.increment_version  # so that a backward pass that saved the tensor notices

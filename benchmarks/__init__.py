@@ -1,0 +1,1 @@
+"""Benchmarks: error and run time of every operation on a handful of robots. ``python -m benchmarks --help``."""

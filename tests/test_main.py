@@ -1,0 +1,104 @@
+"""The main job, ``python -m warp_spo``: its table, its report, its exit codes."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from warp_spo import __main__ as job
+from warp_spo import report
+from warp_spo.operations import OPERATIONS, TOLERANCE
+
+# Two bars on the ground whose tips are pinned together: a loop.
+LOOP = """<mujoco><default><geom size=".03"/></default><worldbody>
+<body name="a"><joint name="j0" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .4"/>
+  <body name="b" pos="0 0 .4"><joint name="j1" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .4 0 0"/></body>
+</body>
+<body name="c" pos=".4 0 0"><joint name="j2" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .4"/></body>
+</worldbody><equality><connect name="pin" body1="b" body2="c" anchor=".4 0 0"/></equality></mujoco>"""
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(job, "WARM_UP", 0.0)
+    monkeypatch.setattr(job, "BUDGET", 0.0)
+
+
+def test_reports_every_operation_in_both_precisions(tmp_path, capsys, device):
+    assert job.main(["cartpole", "--worlds", "3", "--device", str(device), "--report", str(tmp_path)]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""  # not a terminal: no bar
+    lines = [line.split() for line in out.splitlines() if " float" in line and "tolerance" not in line]
+    assert [tuple(line[:3:2]) for line in lines] == [(op, dtype) for op in OPERATIONS for dtype in TOLERANCE]
+    for _, _, dtype, error, *_ in lines:
+        assert 0.0 <= float(error) <= TOLERANCE[dtype]
+    assert (tmp_path / "error-runtime.png").read_bytes().startswith(b"\x89PNG")
+    text = (tmp_path / "table.md").read_text()
+    assert text.count("| phi.T |") == 2 and "(error-runtime.png)" in text
+
+
+def test_a_wrong_result_fails_and_is_named(capsys, monkeypatch, device):
+    wrong = dataclasses.replace(OPERATIONS["gravity_force"], reference=lambda dense, q: 1.001 * dense.gravity_force)
+    nothing = dataclasses.replace(OPERATIONS["mass_matrix"], call=lambda *inputs, out: None)
+    chosen = {"phi": OPERATIONS["phi"], "gravity_force": wrong, "mass_matrix": nothing}
+    monkeypatch.setattr(job, "OPERATIONS", chosen)
+    assert job.main(["cartpole", "--worlds", "2", "--dtype", "float64", "--device", str(device)]) == 1
+    failed = [line for line in capsys.readouterr().err.splitlines() if line.startswith("FAILED")]
+    assert len(failed) == 2
+    assert "gravity_force in float64 has error 1.0e-03; expected at most 1e-10" in failed[0]
+    assert "mass_matrix in float64 gives NaN" in failed[1]
+
+
+def test_loops_are_cut_and_named(tmp_path, capsys, monkeypatch, device):
+    monkeypatch.setattr(job, "OPERATIONS", {"mass_matrix": OPERATIONS["mass_matrix"]})
+    (tmp_path / "loop.xml").write_text(LOOP)
+    assert job.main([str(tmp_path / "loop.xml"), "--worlds", "2", "--device", str(device)]) == 0
+    assert "loops are cut: 1 loop joint(s) are left open: pin" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["no_such_robot"], "expected one of humanoid, ant, quadruped, cartpole"),
+        (["no/such/file.urdf"], "no file 'no/such/file.urdf'"),
+        ([__file__], "ends in '.py'"),
+        (["cartpole", "--worlds", "0"], "worlds is 0; expected one or more"),
+        (["cartpole", "--device", "abacus"], "--device is 'abacus'; expected one of those here: cpu"),
+    ],
+)
+def test_mistakes_are_one_line(arguments, expected, capsys):
+    assert job.main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and expected in err
+
+
+def test_a_mistaken_option_is_one_line(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        job.main(["--worlds", "many"])
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_missing_matplotlib_names_the_extra(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert job.main(["cartpole", "--worlds", "2", "--report", str(tmp_path / "report")]) == 2
+    err = capsys.readouterr().err
+    assert "pip install warp_spo[plots]" in err and err.count("\n") == 1
+    assert not (tmp_path / "report").exists()
+
+
+def test_runs_as_a_module():
+    root = Path(job.__file__).parent.parent
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, "-m", "warp_spo", "no_such_robot"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and done.stdout == ""
+    assert "Traceback" not in done.stderr and "unknown robot 'no_such_robot'" in done.stderr
+
+
+def test_numbers_have_three_digits_and_a_unit():
+    values = [2.0, 0.0345, 1.0e-3, 999.6e-6, 4.2e-6, 5.0e-8]
+    assert [report.duration(v) for v in values] == ["2.00 s", "34.5 ms", "1.00 ms", "1.00 ms", "4.20 us", "50.0 ns"]
+    assert [report.rate(v) for v in (14.2e9, 3.0e6, 999.0, 12.0)] == ["14.2 G", "3.00 M", "999", "12.0"]

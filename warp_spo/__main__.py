@@ -1,0 +1,157 @@
+"""``python -m warp_spo [ROBOT]``: run every operation on a robot in many worlds, with error and run time of each.
+
+ROBOT is a URDF, MJCF or USD file, or one that Newton ships: humanoid (the default), ant, quadruped, cartpole. A sample
+of worlds is compared with the dense float64 reference. Exit code 0: every error is within its tolerance; 1: one is
+not; 2: a mistake in the call.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+import warp as wp
+
+from . import report
+from .dynamics import Dynamics
+from .operations import OPERATIONS, TOLERANCE, Inputs
+from .scene import Scene
+from .trial import SAMPLE, Subject, Trial
+
+WORLDS = {False: 1024, True: 4096}  # on a CPU, on a GPU
+WARM_UP, BUDGET = 0.05, 0.3  # [s] for each operation: all of them in well under a minute
+SETS = {False: 1, True: 4}  # sets of inputs; one graph goes through them in turn
+FILES = "error-runtime.png", "table.md"
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; see --help\n")
+
+
+def parser() -> Parser:
+    text = argparse.RawDescriptionHelpFormatter
+    p = Parser(prog="python -m warp_spo", description=__doc__, formatter_class=text)
+    p.add_argument("robot", nargs="?", default="humanoid", metavar="ROBOT", help="a file, or a robot that Newton ships")
+    p.add_argument("--worlds", type=int, metavar="N", help="default: 1024 on a CPU, 4096 on a GPU")
+    p.add_argument("--device", metavar="D", help="Warp device, such as cpu or cuda:0; default: the current one")
+    p.add_argument("--dtype", choices=("float32", "float64", "both"), default="both", help="default: both")
+    p.add_argument("--report", type=Path, metavar="DIR", help=f"write {' and '.join(FILES)} there")
+    return p
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The main job; returns the exit code. ``argv``: arguments, those of the process unless given."""
+    options = parser().parse_args(argv)
+    wp.config.log_level = wp.LOG_WARNING  # before newton is imported
+    try:
+        pyplot = report.load_pyplot() if options.report else None
+        if options.report:
+            options.report.mkdir(parents=True, exist_ok=True)
+        scene = load(options.robot)
+        device = find_device(options.device)
+        worlds = options.worlds if options.worlds is not None else WORLDS[device.is_cuda]
+        dtypes = ("float32", "float64") if options.dtype == "both" else (options.dtype,)
+        dyns = [Dynamics(scene, worlds, device, dtype, loops="cut") for dtype in dtypes]
+    except (ValueError, TypeError, RuntimeError, OSError, ImportError) as error:
+        return refuse(str(error))
+
+    title = f"{Path(options.robot).stem}: {scene.body_count} bodies, {scene.dof_count} dof, {worlds} worlds on "
+    title += f"{device.alias} ({device.name})" if device.is_cuda else device.alias
+    print(title)
+    if scene.loops:
+        labels = ", ".join(loop.label or f"body {loop.parent} to body {loop.child}" for loop in scene.loops)
+        print(f"loops are cut: {len(scene.loops)} loop joint(s) are left open: {labels}")
+    try:
+        rows = list(run(dyns))
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "allocat" not in str(error):
+            raise
+        return refuse(f"{worlds} worlds do not fit into the memory of {device.alias}; pass fewer with --worlds")
+    print(report.text_table(rows))
+    print(
+        f"error: largest relative error of {min(SAMPLE, worlds)} worlds against dense float64 (log_det: absolute); "
+        f"tolerance {', '.join(f'{dtype} {TOLERANCE[dtype]:.0e}' for dtype in dtypes)}"
+    )
+    if options.report:
+        paths = [options.report / name for name in FILES]
+        report.picture(pyplot, title, rows, TOLERANCE, paths[0])
+        paths[1].write_text(report.markdown(title, rows, FILES[0]))
+        print(f"wrote {', '.join(map(str, paths))}")
+    failed = [row for row in rows if not row["error"] <= TOLERANCE[row["dtype"]]]
+    for row in failed:
+        lost = row["error"] != row["error"]
+        what = "gives NaN (does a hinge move no inertia?)" if lost else f"has error {row['error']:.1e}"
+        expected = f"expected at most {TOLERANCE[row['dtype']]:.0e}"
+        print(f"FAILED: {row['op']} in {row['dtype']} {what}; {expected}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def refuse(message: str) -> int:
+    """Say what is wrong in one line on stderr; return the exit code."""
+    print(f"python -m warp_spo: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+def find_device(name: str | None) -> wp.Device:
+    """The Warp device of that name; None is the current one.
+
+    Raises:
+        ValueError: no such device here; lists those that are.
+    """
+    try:
+        return wp.get_device(name)
+    except (ValueError, RuntimeError):
+        found = ", ".join(device.alias for device in wp.get_devices())
+        raise ValueError(f"--device is {name!r}; expected one of those here: {found}") from None
+
+
+def load(robot: str) -> Scene:
+    """The scene of a file, or of a robot that Newton ships; warnings become lines on stderr.
+
+    Raises:
+        ValueError, OSError, ImportError: as :func:`warp_spo.newton.load`.
+    """
+    if os.sep in robot or Path(robot).suffix:
+        path = Path(robot)
+        if not path.is_file():  # says so without the seconds that newton's import takes
+            raise FileNotFoundError(f"no file {robot!r} (from {os.getcwd()!r}); expected a URDF, MJCF or USD file")
+    from . import newton
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        scene = newton.load(robot if os.sep in robot or Path(robot).suffix else newton.shipped(robot))
+    for warning in caught:
+        if issubclass(warning.category, UserWarning):
+            print(f"note: {warning.message}", file=sys.stderr)
+    return scene
+
+
+def run(dyns: list[Dynamics]) -> Iterator[dict[str, Any]]:
+    """Yield a row for each operation and Dynamics (of one scene and world count), the precisions next to each other.
+
+    Rows have op, granularity, dtype, worlds, error (see :meth:`warp_spo.operations.Operation.error`) and seconds, the
+    median run time of one evaluation of all worlds.
+    """
+    scene, worlds, cuda = dyns[0].scene, dyns[0].worlds, dyns[0].device.is_cuda
+    inputs = [Inputs(scene, worlds, seed) for seed in range(SETS[cuda])]
+    subjects = [Subject(dyn, inputs) for dyn in dyns]
+    with report.Progress(len(OPERATIONS) * len(dyns)) as progress:
+        for operation in OPERATIONS.values():
+            for subject in subjects:
+                dtype = subject.dyn.dtype.__name__
+                progress.step(f"{operation.name} {dtype}")
+                timing, error = Trial(subject, operation).measure(warm_up=WARM_UP, budget=BUDGET)
+                row = dict(op=operation.name, granularity=subject.dyn.granularity, dtype=dtype, worlds=worlds)
+                yield row | dict(error=error, seconds=timing.median)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,214 @@
+"""Every operation once: what it reads, how it is called, and what the dense float64 reference says about it.
+
+The main job, the benchmarks and their tests iterate over :data:`OPERATIONS`; a new operation is one line there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from .reference import Dense
+from .scene import SCREWS, Scene
+
+DT = 0.01  # time step of integrate [s]
+FRAME_POSE = (0.1, -0.05, 0.2, 0.0, 0.0, 0.0, 1.0)  # of the second of the two frames, in its body [m]
+WEIGHT_FLOOR = 1e-2  # gravity cannot act on some hinges: compare with at least this share of the weight, at 1 m
+TOLERANCE = {
+    # Largest error of an operation that counts as correct. Rounding grows with depth and with the condition of the mass
+    # matrix; Newton's robots reach 3e-6 and 1e-14. What is wrong, and not rounded, is off by 1e-2 or more.
+    "float32": 1e-4,
+    "float64": 1e-10,
+}
+INPUTS = ("q", "qd", "qdd", "tau", "b", "x")
+
+Shape = Callable[[Scene], tuple[int, ...]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Operation:
+    """One operation on a :class:`warp_spo.trial.Subject`.
+
+    Attributes:
+        name: as users write it.
+        reads: names of its inputs, see :class:`Inputs`.
+        shape: of the result in one world.
+        call: ``call(subject, *inputs, out)`` launches it; inputs and out are Warp arrays [world, ...].
+        reference: ``reference(dense, *inputs)``, the result in one world, of that world's inputs.
+        at_first_q: it is applied at the configuration of the first set of inputs (vector time).
+        reveal: ``reveal(subject, *inputs, out)`` writes a result that shows what ``call`` did, where that is not out.
+        quaternions: first entry of each quaternion of a flat result; q and -q are the same rotation.
+        scale: ``scale(dense, expected)``, what the error is divided by: the 2-norm of the expected result unless given.
+    """
+
+    name: str
+    reads: tuple[str, ...]
+    shape: Shape
+    call: Callable[..., Any]
+    reference: Callable[..., Any]
+    at_first_q: bool = False
+    reveal: Callable[..., Any] | None = None
+    quaternions: Callable[[Scene], list[int]] = lambda scene: []
+    scale: Callable[[Dense, np.ndarray], float] = lambda dense, expected: float(np.linalg.norm(expected))
+
+    def error(self, dense: Dense, inputs: list[np.ndarray], result: np.ndarray) -> float:
+        """``|result - expected| / |expected|`` in one world, 2-norms; NaN if the reference cannot be computed."""
+        try:
+            expected = np.ravel(self.reference(dense, *inputs))
+            scale = self.scale(dense, expected)
+        except np.linalg.LinAlgError:  # a hinge that moves no inertia
+            return float("nan")
+        result = result.astype(np.float64).ravel()
+        for first in self.quaternions(dense.scene):
+            if result[first : first + 4] @ expected[first : first + 4] < 0.0:
+                result[first : first + 4] *= -1.0
+        return float(np.linalg.norm(result - expected) / (scale if scale > 0.0 else 1.0))
+
+
+class Inputs:
+    """Random inputs in all worlds, and the reference at them. They are float32 numbers: exact in either precision.
+
+    q: angles and lengths U(-1, 1) [rad, m], rotations uniform; qd, qdd, b, x: N(0, 1); tau: 10 N(0, 1).
+
+    Args:
+        scene: whose inputs.
+        worlds: how many.
+        seed: equal seeds, equal inputs; each input has its own stream.
+    """
+
+    def __init__(self, scene: Scene, worlds: int, seed: int = 0):
+        self.scene, self.worlds, self.seed = scene, worlds, seed
+        self._arrays: dict[str, np.ndarray] = {}
+        self._dense: dict[int, Dense] = {}
+
+    def array(self, name: str) -> np.ndarray:
+        """Input ``name`` [world, n], float32."""
+        if name not in self._arrays:
+            scene, rng = self.scene, np.random.default_rng([self.seed, INPUTS.index(name)])
+            array: np.ndarray
+            if name == "q":
+                array = rng.uniform(-1.0, 1.0, (self.worlds, scene.coord_count))
+                for first in rotations(scene):
+                    turn = rng.standard_normal((self.worlds, 4))
+                    array[:, first : first + 4] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
+            else:
+                size = sum(scene.node_sizes) if name == "x" else scene.dof_count
+                array = rng.standard_normal((self.worlds, size), dtype=np.float32)
+                array *= 10.0 if name == "tau" else 1.0
+            self._arrays[name] = array.astype(np.float32)
+        return self._arrays[name]
+
+    def dense(self, world: int) -> Dense:
+        """The reference at q of one world; what it computed is kept."""
+        if world not in self._dense:
+            self._dense[world] = Dense(self.scene, self.array("q")[world], world=world)
+        return self._dense[world]
+
+
+def rotations(scene: Scene) -> list[int]:
+    """First entry in q of every quaternion."""
+    ends = [end for hinge, end in zip(scene.hinges, scene.q_start[1:], strict=True) if hinge.motion != SCREWS]
+    return [int(end) - 4 for end in ends]
+
+
+def two_frames(scene: Any) -> list:
+    """Two frames for Jacobians: a tip's body frame, and one off the body frame of another tip, or of another body."""
+    parents = {hinge.parent for hinge in scene.hinges}
+    bodies = sorted(range(len(scene.hinges)), key=lambda body: (body in parents, body))[:2]
+    return [bodies[0], (bodies[-1], FRAME_POSE)]
+
+
+def _dof(scene: Scene) -> tuple[int, ...]:
+    return (scene.dof_count,)
+
+
+def _square(scene: Scene) -> tuple[int, ...]:
+    return scene.dof_count, scene.dof_count
+
+
+def _nodes(scene: Scene) -> tuple[int, ...]:
+    return (sum(scene.node_sizes),)
+
+
+def _weight_floor(dense: Dense, expected: np.ndarray) -> float:
+    weight = float(np.sum(dense.value("body_mass")) * np.linalg.norm(dense.value("gravity")))
+    return max(float(np.linalg.norm(expected)), WEIGHT_FLOOR * weight)
+
+
+def _method(name: str, reads: str, shape: Shape, reference: Callable[..., Any], *extra: Any, **more: Any) -> Operation:
+    """An operation of Dynamics; ``extra`` are further arguments, a function of the scene if callable."""
+
+    def call(subject: Any, *inputs: Any, out: Any) -> None:
+        given = [value(subject.dyn.scene) if callable(value) else value for value in extra]
+        getattr(subject.dyn, name)(*inputs, *given, out=out)
+
+    return Operation(name, tuple(reads.split()), shape, call, reference, **more)
+
+
+def _operator(name: str, of: Callable[[Any], Any], reference: Callable[..., Any]) -> Operation:
+    """An operator of the scene, applied to a vector over the nodes."""
+
+    def call(subject: Any, x: Any, out: Any) -> None:
+        of(subject.operators).apply(x, out=out)
+
+    return Operation(name, ("x",), _nodes, call, reference, at_first_q=True)
+
+
+_TABLE = (
+    _operator("phi", lambda ops: ops.phi, lambda d, x: d.phi @ x),
+    _operator("phi.T", lambda ops: ops.phi.T, lambda d, x: d.phi.T @ x),
+    _operator("psi", lambda ops: ops.psi, lambda d, x: d.psi @ x),
+    Operation(
+        "operators.update",
+        ("q", "x"),
+        _nodes,
+        lambda subject, q, x, out: subject.operators.update(q),
+        lambda d, q, x: d.psi @ x,
+        reveal=lambda subject, q, x, out: subject.operators.psi.apply(x, out=out),
+    ),
+    _method("forward_dynamics", "q qd tau", _dof, lambda d, q, qd, tau: d.forward_dynamics(qd, tau)),
+    _method("inverse_dynamics", "q qd qdd", _dof, lambda d, q, qd, qdd: d.inverse_dynamics(qd, qdd)),
+    _method("mass_matrix", "q", _square, lambda d, q: d.mass_matrix),
+    _method("mass_matrix_inverse", "q", _square, lambda d, q: np.linalg.inv(d.mass_matrix)),
+    _method("solve_mass_matrix", "q b", _dof, lambda d, q, b: np.linalg.solve(d.mass_matrix, b)),
+    _method("bias_force", "q qd", _dof, lambda d, q, qd: d.bias_force(qd), scale=_weight_floor),
+    _method("gravity_force", "q", _dof, lambda d, q: d.gravity_force, scale=_weight_floor),
+    _method("passive_force", "q qd", _dof, lambda d, q, qd: d.passive_force(qd)),
+    # absolute: the relative error of the determinant
+    _method("log_det_mass_matrix", "q", lambda scene: (), lambda d, q: d.log_det, scale=lambda d, expected: 1.0),
+    _method(
+        "body_poses",
+        "q",
+        lambda scene: (scene.body_count, 7),
+        lambda d, q: d.body_poses,
+        quaternions=lambda scene: [7 * body + 3 for body in range(len(scene.hinges))],
+    ),
+    _method("body_velocities", "q qd", lambda scene: (scene.body_count, 6), lambda d, q, qd: d.body_velocities(qd)),
+    _method(
+        "jacobian",
+        "q",
+        lambda scene: (2, 6, scene.dof_count),
+        lambda d, q: d.jacobian(two_frames(d.scene)),
+        two_frames,
+    ),
+    _method(
+        "operational_inertia_inverse",
+        "q",
+        lambda scene: (12, 12),
+        lambda d, q: d.operational_inertia_inverse(two_frames(d.scene)),
+        two_frames,
+    ),
+    _method(
+        "integrate",
+        "q qd",
+        lambda scene: (scene.coord_count,),
+        lambda d, q, qd: d.integrate(qd, DT),
+        DT,
+        quaternions=rotations,
+    ),
+)
+OPERATIONS = {operation.name: operation for operation in _TABLE}
+"""Name -> operation, in the order of the tables that show them."""

@@ -1,0 +1,179 @@
+"""Trials: one operation in all worlds, compared with the dense reference, then timed on the same inputs."""
+
+from __future__ import annotations
+
+import functools
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from .dynamics import Dynamics
+from .operations import Inputs, Operation
+from .spatial_operators import SpatialOperators
+
+SAMPLE = 8  # worlds that the reference computes; it takes 10 to 100 ms for one
+WARM_UP = 0.2  # [s]: clocks rise and caches fill
+GRAPH_ROUNDS = 8  # times that a graph goes through all sets of inputs: its launch (5 us) is spread over them
+GRAPH_SECONDS = 0.05  # fewer rounds where they would take longer
+
+
+class Subject:
+    """A Dynamics under trial, with random inputs on its device that all its trials share.
+
+    Args:
+        dyn: the Dynamics.
+        inputs: sets of inputs for its scene and worlds; evaluations in a row take them in turn.
+    """
+
+    def __init__(self, dyn: Dynamics, inputs: list[Inputs]):
+        self.dyn, self.inputs = dyn, inputs
+        self._arrays: dict[tuple[str, int], wp.array] = {}
+
+    def array(self, name: str, index: int) -> wp.array:
+        """Input ``name`` of set ``index`` on the device [world, n]."""
+        key = name, index
+        if key not in self._arrays:
+            host = self.inputs[index].array(name)
+            self._arrays[key] = wp.array(host, dtype=self.dyn.dtype, device=self.dyn.device)
+        return self._arrays[key]
+
+    @functools.cached_property
+    def operators(self) -> SpatialOperators:
+        """phi, psi and their kin."""
+        return self.dyn.operators(self.array("q", 0))
+
+
+class Timing(NamedTuple):
+    """Run time of one evaluation of all worlds [s]: median, and the 10th and 90th percentiles."""
+
+    median: float
+    low: float
+    high: float
+
+
+class Trial:
+    """One operation of a subject.
+
+    Attributes:
+        first_call: wall time of the first evaluation [s]: kernels that no earlier trial brought are compiled, or loaded
+            from Warp's cache, and the workspace is allocated.
+        bytes: of the caller's arrays that one evaluation reads and writes; None where the result is inside.
+    """
+
+    def __init__(self, subject: Subject, operation: Operation):
+        self.subject, self.operation = subject, operation
+        dyn, self.sets = subject.dyn, len(subject.inputs)
+        shape = (dyn.worlds, *operation.shape(dyn.scene))
+        self.out = wp.empty(shape, dtype=dyn.dtype, device=dyn.device)
+        self._inputs = [[subject.array(name, i) for name in operation.reads] for i in range(self.sets)]
+        arrays = [self.out, *self._inputs[0]]
+        size = sum(array.size for array in arrays) * wp.types.type_size_in_bytes(dyn.dtype)
+        self.bytes = None if operation.reveal else size
+        wp.synchronize_device(dyn.device)
+        start = time.perf_counter()
+        if operation.at_first_q:
+            subject.operators.update(subject.array("q", 0))
+        self.evaluate(0)
+        wp.synchronize_device(dyn.device)
+        self.first_call = time.perf_counter() - start
+
+    def evaluate(self, index: int) -> None:
+        """Launch one evaluation at set ``index`` of the inputs."""
+        self.operation.call(self.subject, *self._inputs[index], out=self.out)
+
+    def poison(self) -> None:
+        """Fill what an evaluation writes with NaN."""
+        self.out.fill_(float("nan"))
+        if self.operation.reveal:
+            self.subject.operators.E_psi.weights.fill_(float("nan"))
+
+    def error(self, index: int) -> float:
+        """Largest relative error of a sample of worlds, after an evaluation at set ``index``; NaN if any world has one.
+
+        See :meth:`warp_spo.operations.Operation.error`.
+        """
+        operation, subject, worlds = self.operation, self.subject, self.subject.dyn.worlds
+        if operation.reveal:
+            operation.reveal(subject, *self._inputs[index], out=self.out)
+        result = self.out.numpy()
+        if not np.isfinite(result).all():
+            return float("nan")
+        inputs = subject.inputs[index]
+        at = subject.inputs[0] if operation.at_first_q else inputs
+        errors = [
+            operation.error(at.dense(world), [inputs.array(name)[world] for name in operation.reads], result[world])
+            for world in np.unique(np.linspace(0, worlds - 1, SAMPLE).astype(int)).tolist()
+        ]
+        return float(np.max(errors))
+
+    def check(self) -> float:
+        """Evaluate every set of inputs, each into a poisoned result; return the largest error."""
+        errors = []
+        for index in range(self.sets):
+            self.poison()
+            self.evaluate(index)
+            errors.append(self.error(index))
+        return float(np.max(errors))
+
+    def measure(self, repeats: int = 20, warm_up: float = WARM_UP, budget: float = 1.0) -> tuple[Timing, float]:
+        """Time evaluations in a row, at the sets of inputs in turn, and check what the timed run left.
+
+        CUDA: the evaluations are captured into one graph, replayed, and timed by events. CPU: wall time of calls.
+
+        Args:
+            repeats: how often the row is timed.
+            warm_up: [s] of evaluations before.
+            budget: on the CPU, fewer repeats, 3 at least, where they would take longer [s].
+
+        Returns:
+            run time of one evaluation; error, as :meth:`error`.
+        """
+        device = self.subject.dyn.device
+        once = self._warm_up(self._row, warm_up) / self.sets
+        rounds = int(np.clip(GRAPH_SECONDS / (once * self.sets), 1, GRAPH_ROUNDS))
+        count = rounds * self.sets
+        if device.is_cuda:
+            with wp.ScopedCapture(device) as capture:
+                for _ in range(rounds):
+                    self._row()
+            self._warm_up(lambda: wp.capture_launch(capture.graph), warm_up)
+            self.poison()
+            seconds = self._replay(capture.graph, repeats)
+        else:
+            self.poison()
+            seconds = []
+            while len(seconds) < 3 or (len(seconds) < repeats and sum(seconds) < budget):
+                start = time.perf_counter()
+                for _ in range(rounds):
+                    self._row()
+                seconds.append(time.perf_counter() - start)
+        low, median, high = np.percentile(np.array(seconds) / count, [10, 50, 90])
+        return Timing(float(median), float(low), float(high)), self.error(self.sets - 1)
+
+    def _row(self) -> None:
+        for index in range(self.sets):
+            self.evaluate(index)
+
+    def _warm_up(self, run: Any, seconds: float) -> float:
+        """Run for some time; return the wall time of the last run [s]."""
+        device, begin = self.subject.dyn.device, time.perf_counter()
+        while True:
+            start = time.perf_counter()
+            run()
+            wp.synchronize_device(device)
+            end = time.perf_counter()
+            if end - begin >= seconds:
+                return end - start
+
+    def _replay(self, graph: Any, repeats: int) -> list[float]:
+        """Seconds of each of ``repeats`` replays."""
+        device = self.subject.dyn.device
+        events = [[wp.Event(device, enable_timing=True) for _ in range(2)] for _ in range(repeats)]
+        for start, end in events:
+            device.stream.record_event(start)
+            wp.capture_launch(graph)
+            device.stream.record_event(end)
+        wp.synchronize_device(device)
+        return [1e-3 * wp.get_event_elapsed_time(start, end) for start, end in events]
