@@ -20,8 +20,8 @@ def factor(T) -> wp.Kernel:
     """Inward, one level: P(k) = M(k) + sum over children phi P+ phi*, U = P H*, D = H U + Delta, P+ = P - U D^-1 U*.
 
     A pivot that rounding may have invented becomes NaN: whatever depends on it is lost, and says so. That is one of at
-    most 4 eps times the size of what cancels in it: |H| |P| |H*| + |Delta|, entry by entry, and what the hinge's columns
-    that are eliminated before it bring along. Along an axis of the node frame nothing cancels: any D > 0 is kept.
+    most 4 eps times the size of what cancels in it: |H| |P| |H*| + |Delta|, entry by entry, and what the columns of the
+    hinge that are eliminated before it bring along. Along an axis of the node frame nothing cancels: any D > 0 is kept.
     """
     s = spatial(T)
     least = T(4.0 * EPSILON[T])

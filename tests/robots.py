@@ -1,4 +1,4 @@
-"""Robots from files that come with Newton, and two that are built here."""
+"""Robots from files that come with Newton, and some that are built here."""
 
 import functools
 
@@ -35,11 +35,35 @@ def tall_humanoid():
     return spo.Scene(bodies, hinges)
 
 
+def arm():
+    """An arm on a pedestal: ball shoulder, elbow, a D6 wrist that slides and turns about two oblique axes, a gripper.
+
+    All anchors are turned and offset on both sides; hinges are listed from the tip inwards.
+    """
+    rng = np.random.default_rng(41)
+    kinds = {
+        "pedestal": ("fixed", {}),
+        "upper_arm": ("ball", {}),
+        "forearm": ("revolute", {"axis": zoo.unit(rng, 3)}),
+        "hand": ("d6", {"linear": [(0, 0, 1)], "angular": [(1, 0, 0), (0.48, 0.6, 0.64)]}),
+        "finger": ("prismatic", {"axis": zoo.unit(rng, 3)}),
+        "thumb": ("cylindrical", {"axis": zoo.unit(rng, 3)}),
+    }
+    parents = [-1, 0, 1, 2, 3, 3]
+    hinges = [
+        spo.Hinge(kind, parent, k, parent_pose=zoo.random_pose(rng), child_pose=zoo.random_pose(rng, 0.2),
+                  armature=0.02, label=f"{name}_joint", **axes)
+        for k, (parent, (name, (kind, axes))) in enumerate(zip(parents, kinds.items(), strict=True))
+    ]  # fmt: skip
+    return spo.Scene([zoo.random_body(rng, name) for name in kinds], hinges[::-1], gravity=(0.3, -0.2, -9.81))
+
+
 ROBOTS = {
     "humanoid": functools.partial(spo.load, shipped("humanoid")),
     "ant": functools.partial(spo.load, shipped("ant")),
     "quadruped": functools.partial(spo.load, shipped("quadruped"), floating=True),
     "cartpole": functools.partial(spo.load, shipped("cartpole")),
     "tall_humanoid": tall_humanoid,
+    "arm": arm,
 }
 """Name -> scene factory without arguments."""

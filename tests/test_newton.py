@@ -406,9 +406,17 @@ def tendon():
     return builder
 
 
+def d6(*angular):
+    """One D6 joint that turns about the given axes, and slides along z."""
+    angular_axes, slide = [Axis(axis=wp.vec3(*axis)) for axis in angular], [Axis(axis=wp.vec3(0, 0, 1))]
+    return arm(joints=1, kind="d6", linear_axes=slide, angular_axes=angular_axes)
+
+
 @pytest.mark.parametrize(
     ("build", "words"),
     [
+        (lambda: d6((1, 0, 0), (0.6, 0.8, 0)), "D6 joint 'arm_joint0' with oblique angular axes .*0.6, 0.8.*Hinge"),
+        (lambda: d6((1, 0, 0), (0, 1, 0), (0, 2e-3, 1)), "D6 joint 'arm_joint0' with oblique angular axes"),
         (rod, "ROD joint: 'cable'"),
         (global_body, "'table'.*global beside 2 worlds"),
         (lost_body, "child of no joint .'lost'.*add_joint_free"),
@@ -469,6 +477,13 @@ def _with_mimic():
     builder = arm()
     builder.set_joint_mimic(1, 0)
     return builder
+
+
+def test_right_angles_up_to_a_files_digits():
+    """Axes that a file writes with three digits, and a left-handed triple, are Newton's as they are."""
+    axes = np.array([(1, 0, 0), (5e-4, 0, 1), (0, 1, 0)])
+    scene = from_newton(finalize(d6(*axes)))
+    np.testing.assert_allclose(scene.dof_axis, [(0, 0, 1), *axes], atol=FLOAT32)
 
 
 # -- files -------------------------------------------------------------------------------------------------------------

@@ -123,7 +123,7 @@ def test_velocities_are_phi_T_H_T(name, device):
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-@pytest.mark.parametrize("name", ["humanoid", "tall_humanoid", "tree20"])
+@pytest.mark.parametrize("name", ["humanoid", pytest.param("tall_humanoid", marks=pytest.mark.slow), "tree20"])
 def test_sweeps_equal_the_dense_resolvent_at_4096_worlds(name, dtype, device):
     """phi x, phi* x, psi x and psi* x of every one of 4096 different worlds."""
     _, ops, _ = operators(name, 4096, dtype, device)

@@ -216,6 +216,10 @@ class Call:
         self._check(name, array, kind, array.shape, shape, meaning, dtype, torch.has_dtype(array, dtype))
         if not torch.is_on(array, self.device) or not array.is_contiguous():
             self._refuse_place(name, array, kind, array.is_contiguous())
+        if array.is_neg():  # the memory holds the numbers with the other sign
+            raise ValueError(
+                f"{self.name}: {name} is a lazy negative view; expected plain memory; pass {name}.resolve_neg()"
+            )
         if array.requires_grad and torch.is_grad_enabled():
             self._refuse_grad(name, "requires grad", f"pass {name}.detach(), or call inside torch.no_grad()")
         if self.device.is_cuda:

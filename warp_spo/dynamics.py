@@ -86,11 +86,8 @@ class Dynamics:
         _check_loops(scene, loops)
         self.plan = plans.choose(scene.tree, self.worlds, granularity)
         self.granularity = self.plan.granularity
-        self.recursions = self._make_recursions()
+        self.recursions = Recursions(scene, self.plan, self.device, self.dtype, self.variable)
         self._frames = Frames(scene, self.device, self.dtype)
-
-    def _make_recursions(self) -> Recursions:
-        return Recursions(self.scene, self.plan, self.device, self.dtype, self.variable)
 
     # -- values ----------------------------------------------------------------------------------------------------
     def set(self, **values: Any) -> None:
@@ -109,7 +106,10 @@ class Dynamics:
                 if name not in VARIABLE:
                     raise ValueError(f"Dynamics.set: unknown value {name!r}; expected one of {', '.join(VARIABLE)}")
                 if not hasattr(value, "shape"):
-                    value = np.asarray(value, dtype=np.float64)
+                    try:
+                        value = np.asarray(value, dtype=np.float64)
+                    except (TypeError, ValueError):
+                        raise TypeError(f"Dynamics.set: {name} is {value!r}; expected an array of numbers") from None
                 shape = self.scene.values[name].shape[1:]
                 if len(shape_of(value)) > len(shape):
                     shape = (self.worlds, *shape)
@@ -117,18 +117,20 @@ class Dynamics:
                 if name in self.variable:
                     taken[name] = array
                 else:
-                    folded[name] = array
+                    folded[name] = value if isinstance(value, np.ndarray) else array
             if folded and self.device.is_capturing:
                 raise ValueError(
                     f"Dynamics.set: {', '.join(folded)} inside a graph capture; expected variable values only; build "
                     f"Dynamics with variable=({', '.join(map(repr, folded))},)"
                 )
+            host = {name: value if isinstance(value, np.ndarray) else value.numpy() for name, value in folded.items()}
+            checked = {name: self.scene.check_value("Dynamics.set", name, value) for name, value in host.items()}
             parameters = self.recursions.parameters
             for name, array in taken.items():
                 parameters.copy_in(name, array)
             parameters.refresh(taken)
             if folded:
-                self._rebuild({name: array.numpy() for name, array in folded.items()})
+                self._rebuild(checked)
 
     def _rebuild(self, folded: dict[str, np.ndarray]) -> None:
         warnings.warn(
@@ -136,9 +138,8 @@ class Dynamics:
             f"before are out of date; name it in variable= to set it without rebuilding",
             stacklevel=3,
         )
-        before, self.scene = self.recursions, self.scene.with_values(**folded)
-        self.recursions = self._make_recursions()
-        self.recursions.parameters.adopt_variable(before.parameters)
+        self.scene = self.scene.with_values(**folded)
+        self.recursions.replace_values(self.scene)
 
     def prepare(self, operation: str, **options: Any) -> None:
         """Compile and allocate all that ``operation`` needs, so that its next call only launches.
@@ -171,8 +172,8 @@ class Dynamics:
             columns = options.pop("columns", None)
             if columns is not None and (not isinstance(columns, int) or columns < 0):
                 raise ValueError(f"Dynamics.prepare: columns is {columns!r}; expected how many right-hand sides")
-            shape = (self.worlds, self.scene.dof_count) + (() if columns is None else (columns,))
-            given = (q, wp.zeros(shape, dtype=self.dtype, device=self.device))
+            sides = () if columns is None else (columns,)
+            given = (q, wp.zeros((*rate.shape, *sides), dtype=self.dtype, device=self.device))
         if operation in ("jacobian", "operational_inertia_inverse"):
             extra["frames"] = options.pop("frames", [0])
         if options:
@@ -377,7 +378,7 @@ class Dynamics:
     # -- operators -------------------------------------------------------------------------------------------------
     def operators(self, q: Any) -> SpatialOperators:
         """The paper's operators at ``q``: phi, psi, H, K, D, G, M, P, Delta ...; their ``update(q)`` refills them."""
-        operators = SpatialOperators(self)
+        operators = SpatialOperators(self.recursions)
         operators.update(q)
         return operators
 

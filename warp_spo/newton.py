@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import os
 import warnings
-import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import ParseError
 
 import newton
 import numpy as np
 from newton import JointType
 
 from .errors import DirectedLoopError, UnsupportedError
+from .robot_files import mjcf_gravity, mjcf_tree, mjcf_weighs_by_mesh, robot_format, urdf_source
 from .scene import DOF_VALUES, UNLIMITED, Body, Coupling, Hinge, Loop, Scene
 
 KINDS = {
@@ -31,9 +32,9 @@ KINDS = {
 }
 ROUNDING = 1e-3  # relative: a quaternion or axis nearer than this to unit length is a rounded unit vector
 ASYMMETRY = 1e-6  # relative: R I R^T in float32 leaves a few 1e-7
+OBLIQUE = 1e-3  # cosine: D6 axes nearer than this to a right angle are orthogonal up to a file's digits
 REPAIR = 1e-5  # relative: an inertia that finalize moved by more was repaired, not rounded
 
-FILES = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf"} | dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "usd")
 SHIPPED = {
     "humanoid": "nv_humanoid.xml",
     "ant": "nv_ant.xml",
@@ -72,8 +73,8 @@ def from_newton(model: newton.Model) -> Scene:
         TypeError: not a Newton model.
         UnsupportedError: worlds that differ in more than values, naming the first world and what differs in it; global
             bodies beside worlds; bodies without a joint; kinematic bodies that can move; ROD joints; disabled tree
-            joints; joints that leave their articulation or world; tendons; MuJoCo equality constraints without a
-            Newton counterpart.
+            joints; joints that leave their articulation or world; D6 joints with oblique angular axes; tendons;
+            MuJoCo equality constraints without a Newton counterpart.
         DirectedLoopError: joints outside every articulation that carry each other in a circle.
         ValueError: values that no scene has.
     """
@@ -330,13 +331,26 @@ class _Worlds:
         if kind in ("revolute", "prismatic"):
             arguments["axis"] = axes[0]
         if kind == "d6":
-            arguments |= {"linear": axes[:linear], "angular": axes[linear:]}
+            arguments |= {"linear": axes[:linear], "angular": self._orthogonal(axes[linear:], joint)}
         return arguments | {
             "parent": int(self.body_slot[self.parent[joint]]),
             "child": int(self.body_slot[self.child[joint]]),
             "parent_pose": _unit_pose(self.X_p[joint].astype(np.float64)),
             "child_pose": _unit_pose(self.X_c[joint].astype(np.float64)),
         }
+
+    def _orthogonal(self, axes: np.ndarray, joint: int) -> np.ndarray:
+        """``axes`` of rotation of a D6, refused if oblique: Newton 1.8's eval_fk turns two such axes into others (it
+        reads a quaternion from a matrix that is no rotation), and eval_ik three, so q would not mean what it says."""
+        cosine = np.abs(axes @ axes.T - np.eye(len(axes))).max(initial=0.0)
+        if cosine > OBLIQUE:
+            raise UnsupportedError(
+                "from_newton",
+                f"D6 joint {self.model.joint_label[joint]!r} with oblique angular axes {axes.round(6).tolist()}",
+                "make them orthogonal, put a revolute joint on an intermediate body for each, or build the Scene by "
+                "hand, where Hinge('d6', angular=...) takes any axes",
+            )
+        return axes
 
     def couplings(self) -> list[tuple[int, int, np.ndarray]]:
         """(hinge, reference hinge, (offset, ratio)) of world 0's mimics."""
@@ -436,17 +450,10 @@ def load(path: str | os.PathLike, floating: bool | None = None) -> Scene:
         UserWarning: Newton replaced a mass or an inertia that no rigid body has; names the bodies.
     """
     file = Path(path)
-    importer = FILES.get(file.suffix.lower())
-    if importer is None:
-        raise ValueError(f"load: {str(file)!r} ends in {file.suffix!r}; expected one of {', '.join(FILES)}")
-    if not file.is_file():
-        raise FileNotFoundError(
-            f"load: no file {str(file)!r} (from {os.getcwd()!r}); expected a path to a "
-            f"{importer.upper()} file, or shipped(name) for one of Newton's"
-        )
+    importer = robot_format(file)
     try:
         builder = {"urdf": _read_urdf, "mjcf": _read_mjcf, "usd": _read_usd}[importer](file, floating)
-    except ET.ParseError as error:
+    except ParseError as error:
         raise ValueError(f"load: {str(file)!r} is not XML: {error}; expected {importer.upper()}") from None
     except ImportError as error:
         extra = "usd" if importer == "usd" else "meshes"
@@ -482,38 +489,13 @@ def _finalize(builder: newton.ModelBuilder) -> newton.Model:
 
 
 def _read_urdf(file: Path, floating: bool | None) -> newton.ModelBuilder:
-    robot = ET.parse(file).getroot()
-    held_by: dict[str | None, str | None] = {}  # link -> the link that holds it fast, None if it can move
-    for joint in robot.findall("joint"):
-        parent, child = joint.find("parent"), joint.find("child")
-        if parent is not None and child is not None:
-            held_by[child.get("link")] = parent.get("link") if joint.get("type") == "fixed" else None
-
-    def moves(name: str | None) -> bool:
-        while name in held_by:
-            name = held_by[name]
-            if name is None:
-                return True
-        return bool(floating)
-
-    for link in robot.findall("link"):
-        inertial = link.find("inertial")
-        weighed = inertial is not None and inertial.find("mass") is not None and inertial.find("inertia") is not None
-        for shape in [*link.findall("visual"), *link.findall("collision")]:
-            weightless = shape.tag == "visual" or weighed
-            if weightless or (shape.find(".//mesh") is not None and not moves(link.get("name"))):
-                link.remove(shape)
     builder = newton.ModelBuilder()
-    # text has no folder, so that meshes must be read from the file itself
-    source = str(file) if robot.find(".//mesh") is not None else ET.tostring(robot, encoding="unicode")
-    builder.add_urdf(source, floating=floating)
+    builder.add_urdf(urdf_source(file, floating), floating=floating)
     return builder
 
 
 def _read_mjcf(file: Path, floating: bool | None) -> newton.ModelBuilder:
-    root = _included(file, file.parent)
-    if root.tag not in ("mujoco", "mujocoinclude"):
-        raise ValueError(f"load: {str(file)!r} holds <{root.tag}>; expected <mujoco>, or a suffix that fits")
+    root = mjcf_tree(file)
 
     def import_with(parse_mujoco_options: bool) -> newton.ModelBuilder:
         builder = newton.ModelBuilder()
@@ -521,7 +503,7 @@ def _read_mjcf(file: Path, floating: bool | None) -> newton.ModelBuilder:
             str(file),
             floating=floating,
             parse_visuals=False,
-            parse_meshes=_weighs_by_mesh(root),
+            parse_meshes=mjcf_weighs_by_mesh(root),
             parse_mujoco_options=parse_mujoco_options,
         )
         return builder
@@ -534,36 +516,10 @@ def _read_mjcf(file: Path, floating: bool | None) -> newton.ModelBuilder:
             builder = import_with(parse_mujoco_options=False)
         except ValueError:
             raise error from None
-    for option in root.findall("option[@gravity]"):  # which Newton 1.8 does not read
-        builder.gravity = [float(g) for g in option.get("gravity", "").split()]
-    if root.find("option/flag[@gravity='disable']") is not None:
-        builder.gravity = [0.0, 0.0, 0.0]
+    gravity = mjcf_gravity(root)  # which Newton 1.8 does not read
+    if gravity is not None:
+        builder.gravity = gravity
     return builder
-
-
-def _included(file: Path, folder: Path, above: tuple[Path, ...] = ()) -> ET.Element:
-    """The MJCF tree of ``file`` with the files that it includes pasted in; paths are relative to ``folder``."""
-    root = ET.parse(file).getroot()
-    for parent in list(root.iter()):
-        for index, child in reversed(list(enumerate(parent))):
-            included = folder / child.get("file", "") if child.tag == "include" else None
-            if included is not None and included.is_file() and included not in above:
-                parent[index : index + 1] = list(_included(included, folder, (*above, included)))
-    return root
-
-
-def _weighs_by_mesh(root: ET.Element) -> bool:
-    """Whether a body of the MJCF tree takes its mass from meshes: it has some and no <inertial>."""
-
-    def shapes(element: ET.Element) -> list[ET.Element]:
-        frames = [shape for frame in element.findall("frame") for shape in shapes(frame)]
-        return element.findall("geom") + frames
-
-    always = any(compiler.get("inertiafromgeom") == "true" for compiler in root.findall("compiler"))
-    return any(
-        (always or body.find("inertial") is None) and any(shape.get("mesh") for shape in shapes(body))
-        for body in root.iter("body")
-    )
 
 
 def _read_usd(file: Path, floating: bool | None) -> newton.ModelBuilder:

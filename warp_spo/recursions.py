@@ -40,6 +40,13 @@ class Recursions:
         self.parameters = Parameters(scene, self.topology, self.worlds, device, dtype, variable)
         self._workspace: dict[Any, wp.array] = {}
 
+    def replace_values(self, scene: Scene) -> None:
+        """Take the values of ``scene``, the same topology; variable values stay as they were set."""
+        before, variable = self.parameters, self.parameters.variable
+        self.scene = scene
+        self.parameters = Parameters(scene, self.topology, self.worlds, self.device, self.dtype, variable)
+        self.parameters.adopt_variable(before)
+
     # -- launching -------------------------------------------------------------------------------------------------
     @property
     def nodes(self) -> tuple[int, int]:

@@ -15,7 +15,7 @@ Every hinge is one of three kinds of motion from its parent anchor to its child 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -133,7 +133,10 @@ def _axes(call: str, kind: str, axis: Any, linear: Any, angular: Any, pitch: flo
     """The screws of a hinge, inboard first."""
 
     def rows(name: str, value: Any, counts: Sequence[int]) -> np.ndarray:
-        array = np.atleast_2d(np.asarray(() if value is None else value, dtype=np.float64))
+        try:
+            array = np.atleast_2d(np.array(() if value is None else value, dtype=np.float64))
+        except (TypeError, ValueError):
+            raise ValueError(f"{call}: {name} is {value!r}; expected vector(s) of 3 numbers") from None
         if array.size == 0:
             array = array.reshape(0, 3)
         if array.shape[0] not in counts or array.shape[1:] != (3,):
@@ -147,6 +150,7 @@ def _axes(call: str, kind: str, axis: Any, linear: Any, angular: Any, pitch: flo
     slide = lambda vector: (vector, 0.0, 1.0)  # noqa: E731
     if kind != "d6" and (linear is not None or angular is not None):
         raise ValueError(f"{call}: linear= and angular= belong to a d6; a {kind} hinge has axis=")
+    pitch = float(_array(call, "pitch [m/rad]", pitch, ()))
     if kind != "helical" and pitch != 0.0:
         raise ValueError(f"{call}: pitch= belongs to a helical hinge")
     if kind in ("fixed", "ball", "free"):
@@ -178,7 +182,7 @@ def _axes(call: str, kind: str, axis: Any, linear: Any, angular: Any, pitch: flo
     return {
         "revolute": [turn(vector)],
         "prismatic": [slide(vector)],
-        "helical": [(vector, 1.0, float(pitch))],
+        "helical": [(vector, 1.0, pitch)],
         "cylindrical": [slide(vector), turn(vector)],
     }[kind]
 
@@ -263,7 +267,8 @@ class Hinge:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
         if self.rotor is not None:
             raise UnsupportedError(call, "a rotor (rotor=)", "put its reflected inertia into armature")
-        put("kind", ALIASES.get(self.kind, self.kind))
+        if isinstance(self.kind, str):
+            put("kind", ALIASES.get(self.kind, self.kind))
         if self.kind not in KINDS:
             raise ValueError(f"{call}: unknown kind; expected one of {', '.join(KINDS)}")
         put("screws", tuple(_axes(call, self.kind, self.axis, self.linear, self.angular, self.pitch)))
@@ -272,14 +277,14 @@ class Hinge:
         for name, default in DOF_VALUES.items():
             field = name.removeprefix("joint_")
             value = getattr(self, field)
-            value = np.asarray(default if value is None else value, dtype=np.float64)
-            put(field, _array(call, field, np.broadcast_to(value, (self.dof_count,)) if value.ndim == 0 else value,
-                              (self.dof_count,)))
-        rest = np.zeros(self.coord_count) if self.rest is None else np.asarray(self.rest, dtype=np.float64)
+            value = default if value is None else value
+            value = _array(call, field, value, () if np.ndim(value) == 0 else (self.dof_count,))
+            put(field, np.broadcast_to(value, (self.dof_count,)))
+        rest = np.zeros(self.coord_count) if self.rest is None else self.rest
         if self.rest is None and self.motion != SCREWS:
             rest[-1] = 1.0  # the identity quaternion
-        rest = _array(call, "rest", np.broadcast_to(rest, (self.coord_count,)) if rest.ndim == 0 else rest,
-                      (self.coord_count,))
+        rest = _array(call, "rest", rest, () if np.ndim(rest) == 0 else (self.coord_count,))
+        rest = np.broadcast_to(rest, (self.coord_count,))
         if self.motion != SCREWS:
             _unit(call, "the quaternion (xyzw) of rest", rest[-4:])
         put("rest", rest)
@@ -342,6 +347,14 @@ class Coupling:
     offset: float = 0.0
 
 
+def _parts(name: str, given: Any, kind: type) -> tuple:
+    parts = tuple(given) if isinstance(given, Iterable) else (given,)
+    if not isinstance(given, Iterable) or not all(isinstance(part, kind) for part in parts):
+        came = ", ".join(sorted({type(part).__name__ for part in parts}))
+        raise TypeError(f"Scene: {name} holds {came}; expected a list of {kind.__name__}")
+    return parts
+
+
 class Scene:
     """A multibody system: a forest of bodies, and the values that kernels read.
 
@@ -372,8 +385,8 @@ class Scene:
 
     def __init__(self, bodies: Sequence[Body], hinges: Sequence[Hinge], gravity: Any = (0.0, 0.0, -9.81),
                  loops: Sequence[Loop] = (), couplings: Sequence[Coupling] = ()):
-        self.bodies, self.hinges = tuple(bodies), tuple(hinges)
-        self.loops, self.couplings = tuple(loops), tuple(couplings)
+        self.bodies, self.hinges = _parts("bodies", bodies, Body), _parts("hinges", hinges, Hinge)
+        self.loops, self.couplings = _parts("loops", loops, Loop), _parts("couplings", couplings, Coupling)
         self._check_indices()
         self.hinge_of = np.empty(len(self.bodies), dtype=np.int32)
         for index, hinge in enumerate(self.hinges):
@@ -421,6 +434,8 @@ class Scene:
         edges: list[Any] = [*self.hinges, *self.loops]
         for index, hinge in enumerate(edges):
             name = f"hinge {index} {hinge.label!r}" if index < len(self.hinges) else f"loop {hinge.label!r}"
+            if not all(isinstance(body, int | np.integer) for body in (hinge.parent, hinge.child)):
+                raise TypeError(f"Scene: {name} joins body {hinge.parent!r} to body {hinge.child!r}; expected integers")
             if not (-1 <= hinge.parent < count and 0 <= hinge.child < count) or hinge.parent == hinge.child:
                 raise ValueError(f"Scene: {name} joins body {hinge.parent} to body {hinge.child}; expected two of "
                                  f"{count} bodies, -1 being the inertial frame as parent")
@@ -514,7 +529,10 @@ class Scene:
         if name not in self.values:
             raise ValueError(f"{call}: unknown value {name!r}; expected one of {', '.join(sorted(self.values))}")
         shape = self.values[name].shape[1:]
-        array = np.array(value, dtype=np.float64)
+        try:
+            array = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(f"{call}: {name} is {value!r}; expected numbers of shape {shape}") from None
         if array.shape == shape:
             array = array[None]
         if array.shape[1:] != shape or array.ndim != len(shape) + 1 or array.shape[0] == 0:
@@ -528,7 +546,7 @@ class Scene:
             array = checked_inertia(call, array)
         if name == "body_mass" and array.min() < 0.0:
             raise ValueError(f"{call}: body_mass has {array.min()} kg; expected zero or more")
-        return array
+        return _read_only(array)
 
     def __repr__(self) -> str:
         return (f"Scene({self.body_count} bodies, {self.dof_count} dof, depth {self.tree.depth}, "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import warp as wp
 
@@ -12,13 +12,11 @@ from .blocks import Blocks
 from .factorization import Factorization
 from .kernels import kinematics, rigid_blocks
 from .operators import BWA
-
-if TYPE_CHECKING:
-    from .dynamics import Dynamics
+from .recursions import Recursions
 
 
 class SpatialOperators:
-    """phi, psi and their kin for all worlds of a :class:`Dynamics`; made by ``dyn.operators(q)``.
+    """phi, psi and their kin for all worlds; made by ``dyn.operators(q)``.
 
     Vectors over nodes are [world, sum of node sizes], body after body, each [omega; v] or [n; f] in the node frame (the
     child anchor of the body's hinge) about its origin. Vectors over hinges are [world, dof], in the order of qd.
@@ -30,9 +28,9 @@ class SpatialOperators:
         P, D, D_inverse, G, K, E_psi, psi: see :class:`Factorization`.
     """
 
-    def __init__(self, dynamics: Dynamics):
-        self._dynamics = dynamics
-        scene, worlds = dynamics.scene, dynamics.worlds
+    def __init__(self, recursions: Recursions):
+        self._recursions = recursions
+        scene, worlds, device, dtype = recursions.scene, recursions.worlds, recursions.device, recursions.dtype
         tree, nodes = scene.tree, range(scene.body_count)
         m, r = scene.node_sizes, scene.hinge_sizes
         start = [0, *accumulate(m)]
@@ -40,7 +38,7 @@ class SpatialOperators:
 
         def packed(sizes: list[int]) -> tuple[wp.array, list[int]]:
             offsets = list(accumulate(sizes, initial=0))
-            weights = wp.zeros((worlds, max(1, offsets[-1])), dtype=dynamics.dtype, device=dynamics.device)
+            weights = wp.zeros((worlds, max(1, offsets[-1])), dtype=dtype, device=device)
             return weights, offsets[:-1]
 
         N, dofs = start[-1], scene.dof_count
@@ -56,16 +54,14 @@ class SpatialOperators:
         self.E_phi, self.phi, self.H, self.M, self.Delta = E_phi, f.phi, H, M, Delta
         self.P, self.D, self.D_inverse, self.G, self.K = f.P, f.D, f.D_inverse, f.G, f.K
         self.E_psi, self.psi = f.E_psi, f.psi
-        self._frames = wp.empty((worlds, scene.body_count, 7), dtype=dynamics.dtype, device=dynamics.device)
+        self._frames = wp.empty((worlds, scene.body_count, 7), dtype=dtype, device=device)
         self._kind: str | None = WARP
 
     def update(self, q: Any) -> None:
         """Refill every operator for the coordinates ``q`` [world, coordinate]; launches only."""
-        dynamics = self._dynamics
-        scene = dynamics.scene
-        with Call("operators.update", dynamics.device, dynamics.dtype) as call:
-            q = call.read("q", q, (dynamics.worlds, scene.coord_count), "[world, coordinate]")
-            run, f = dynamics.recursions, self._factorization
+        run, f = self._recursions, self._factorization
+        with Call("operators.update", run.device, run.dtype) as call:
+            q = call.read("q", q, (run.worlds, run.scene.coord_count), "[world, coordinate]")
             run.hinges(q)
             armature = run.parameters.field("joint_armature")
             inputs = [run.topology, f.tables, run.array("pose"), run.array("axis"), run.parameters.rigid, armature]
@@ -82,6 +78,6 @@ class SpatialOperators:
     @property
     def frames(self) -> Any:
         """Pose of every node frame in the inertial frame, x, y, z, quaternion xyzw [world, node, 7]; the kind of q."""
-        with Call("operators.frames", self._dynamics.device, self._dynamics.dtype, kind=self._kind) as call:
+        with Call("operators.frames", self._recursions.device, self._recursions.dtype, kind=self._kind) as call:
             wp.copy(call.write(None, self._frames.shape), self._frames)
         return call.result
