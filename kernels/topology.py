@@ -9,7 +9,7 @@ class Topology:
     parent: wp.array[int]  # [node], -1 = the inertial frame
     child_start: wp.array[int]  # [node + 1], into children
     children: wp.array[int]
-    motion: wp.array[int]  # [node], warp_spo.scene.SCREWS, BALL or FREE
+    motion: wp.array[int]  # [node], warp_spo.parts.SCREWS, BALL or FREE
     q_start: wp.array[int]  # [node], first coordinate of the node's hinge
     qd_start: wp.array[int]  # [node], first degree of freedom of the node's hinge
     dof_count: wp.array[int]  # [node]

@@ -2,9 +2,9 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # many small matrices: threads only wait for each other
 
-import numpy as np  # noqa: E402
-import pytest  # noqa: E402
-import warp as wp  # noqa: E402
+import numpy as np
+import pytest
+import warp as wp
 
 wp.config.log_level = wp.LOG_WARNING
 

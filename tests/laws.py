@@ -7,8 +7,8 @@ import numpy as np
 import warp as wp
 import zoo
 
-import warp_spo as spo
 from warp_spo import reference
+from warp_spo.parts import SCREWS
 
 FRAMES = [0, (-1, (0.1, -0.2, 0.3, 0.0, 0.6, 0.0, 0.8))]  # -1: the scene's last body
 STEP = 0.05
@@ -80,7 +80,7 @@ def same_quaternion_sign(name, scene, got, wanted):
         got[:, 3:] *= np.where((got[:, 3:] * wanted[:, 3:]).sum(-1, keepdims=True) < 0, -1, 1)
     if name == "integrate":
         for hinge, start in zip(scene.hinges, scene.q_start, strict=False):
-            if hinge.motion != spo.scene.SCREWS:
+            if hinge.motion != SCREWS:
                 part = slice(start + hinge.coord_count - 4, start + hinge.coord_count)
                 got[part] *= np.where(got[part] @ wanted[part] < 0, -1, 1)
     return got

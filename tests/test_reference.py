@@ -10,8 +10,9 @@ import warp as wp
 import zoo
 
 from warp_spo.newton import from_newton, load, shipped
+from warp_spo.parts import Body, Hinge
 from warp_spo.reference import Dense, homogeneous, quaternion, rotation, rotation_exp, rotation_vector, skew
-from warp_spo.scene import Body, Hinge, Scene
+from warp_spo.scene import Scene
 
 # Relative to the largest entry of the expected array unless said otherwise.
 ORACLE = 1e-11  # float64 against float64, forward dynamics loses cond(M) eps; measured 4e-13, cond up to 5e3

@@ -10,7 +10,8 @@ from .dynamics import Dynamics
 from .errors import DirectedLoopError, UnsupportedError
 from .factorization import Factorization
 from .operators import BWA, Blocks, Identity, Operator
-from .scene import Body, Coupling, Hinge, Loop, Scene
+from .parts import Body, Coupling, Hinge, Loop
+from .scene import Scene
 from .tree import Digraph, Tree
 
 if TYPE_CHECKING:

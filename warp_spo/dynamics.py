@@ -49,7 +49,7 @@ class Dynamics:
     Arrays are torch tensors, Warp arrays or NumPy arrays, [world, ...] and C-contiguous; the kind of the first one is
     the kind of the result, and ``out=`` is filled and returned. torch and Warp arrays must have this object's dtype and
     device; NumPy arrays are cast and copied. Coordinates, velocities and forces are those of the scene, see
-    :mod:`warp_spo.scene`. One object serves one stream at a time.
+    :mod:`warp_spo.parts`. One object serves one stream at a time.
 
     Args:
         scene: what to simulate.

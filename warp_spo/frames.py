@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .scene import IDENTITY_POSE, Scene
+from .parts import IDENTITY_POSE
+from .scene import Scene
 
 Frame = Any  # a body (index or label), or (body, pose in the body)
 

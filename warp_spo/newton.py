@@ -18,8 +18,9 @@ import numpy as np
 from newton import JointType
 
 from .errors import DirectedLoopError, UnsupportedError
+from .parts import DOF_VALUES, UNLIMITED, Body, Coupling, Hinge, Loop
 from .robot_files import mjcf_gravity, mjcf_tree, mjcf_weighs_by_mesh, robot_format, urdf_source
-from .scene import DOF_VALUES, UNLIMITED, Body, Coupling, Hinge, Loop, Scene
+from .scene import Scene
 
 KINDS = {
     JointType.FIXED: "fixed",

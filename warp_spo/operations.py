@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from .parts import SCREWS
 from .reference import Dense
-from .scene import SCREWS, Scene
+from .scene import Scene
 
 DT = 0.01  # time step of integrate [s]
 FRAME_POSE = (0.1, -0.05, 0.2, 0.0, 0.0, 0.0, 1.0)  # of the second of the two frames, in its body [m]

@@ -27,14 +27,15 @@ def _index(call: str, what: str, value: Any, low: int, high: int) -> int:
 
 
 def _checked_edges(call: str, edges: Iterable, nodes: Any, lowest_parent: int) -> tuple[list[tuple[int, int]], int]:
+    if not isinstance(edges, Iterable):
+        raise TypeError(f"{call}: edges is {edges!r}; expected a list of (parent, child)")
     pairs = []
     for index, edge in enumerate(edges):
         if np.shape(edge) != (2,):
             raise ValueError(f"{call}: edge {index} is {edge!r}; expected (parent, child)")
         pairs.append(tuple(edge))
-    if nodes is None:
-        nodes = 1 + max((max(pair) for pair in pairs), default=-1)
-    count = _index(call, "nodes", nodes, 1, 2**31)
+    ends = [_index(call, f"an end of edge {i}", end, -(2**31), 2**31) for i, pair in enumerate(pairs) for end in pair]
+    count = _index(call, "nodes", 1 + max(ends, default=-1) if nodes is None else nodes, 1, 2**31)
     return [
         (
             _index(call, f"the parent of edge {index}", parent, lowest_parent, count),
@@ -140,18 +141,34 @@ class Tree:
     """
 
     def __init__(self, parent: Sequence[int]):
+        if not hasattr(parent, "__len__"):
+            raise TypeError(f"Tree: parent is {parent!r}; expected a list with the parent of each node, -1 for a root")
         count = len(parent)
         if count == 0:
             raise ValueError("Tree: parent is empty; expected one entry a node, -1 for a root")
-        self.parent = tuple(_index("Tree", f"the parent of node {k}", p, -1, count) for k, p in enumerate(parent))
-        self.node_count = count
-        self.roots = tuple(k for k, p in enumerate(self.parent) if p < 0)
-        self.edges = tuple((p, k) for k, p in enumerate(self.parent) if p >= 0)
-        self.levels = _levels("Tree", self.edges, count)
+        parents = tuple(_index("Tree", f"the parent of node {k}", p, -1, count) for k, p in enumerate(parent))
+        edges = tuple((p, k) for k, p in enumerate(parents) if p >= 0)
         children: list[list[int]] = [[] for _ in range(count)]
-        for p, k in self.edges:
+        for p, k in edges:
             children[p].append(k)
-        self.children = tuple(tuple(c) for c in children)
+        self.__dict__.update(
+            parent=parents,
+            node_count=count,
+            roots=tuple(k for k, p in enumerate(parents) if p < 0),
+            edges=edges,
+            levels=_levels("Tree", edges, count),
+            children=tuple(tuple(c) for c in children),
+        )
+
+    parent: tuple[int, ...]
+    node_count: int
+    roots: tuple[int, ...]
+    edges: tuple[tuple[int, int], ...]
+    levels: tuple[tuple[int, ...], ...]
+    children: tuple[tuple[int, ...], ...]
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise AttributeError(f"Tree.{name} cannot be set: a tree is frozen; build a new one")
 
     @classmethod
     def from_edges(cls, edges: Iterable, nodes: int | None = None) -> tuple[Tree, list[int]]:
