@@ -1,4 +1,4 @@
-"""The README's Markdown table, from the JSON file of a run."""
+"""The README's Markdown tables, from the JSON file of a run."""
 
 import json
 from pathlib import Path
@@ -30,38 +30,33 @@ def read(path: Path | None = None) -> dict:
 
 
 def markdown(data: dict) -> str:
-    """A heading line, then one table a precision: lines are scenes and operations, columns are world counts."""
+    """Where the numbers come from, then a table for each precision and world count: operations by robots.
+
+    A cell is the run time of one evaluation of all worlds [µs]; the last column is the largest error of the line, NaN if
+    any is.
+    """
     rows = data["rows"]
-    machine, found = data["machine"], data["versions"]
-    text = [
-        f"{machine['device']}, commit {data['commit'][:12]}, {data['date'][:10]}, "
-        + ", ".join(f"{name} {version}" for name, version in found.items())
-        + ". Run time of one evaluation of all worlds [µs], evaluations per second, and the largest relative error "
-        "against dense float64."
-    ]
-    for dtype in dict.fromkeys(row["dtype"] for row in rows):
-        mine = [row for row in rows if row["dtype"] == dtype]
-        counts = sorted({row["worlds"] for row in mine})
-        heads = ["robot", "dof", "operation", *(f"{count} worlds" for count in counts), "error"]
-        text += ["", f"**{dtype}**", "", "| " + " | ".join(heads) + " |"]
-        text.append("|---|---:|---|" + "---:|" * (len(counts) + 1))
-        for name in dict.fromkeys(row["name"] for row in mine):
-            group = {row["worlds"]: row for row in mine if row["name"] == name}
-            first = next(iter(group.values()))
-            errors = [row["error"] for row in group.values()]
+    found = ", ".join(f"{name} {version}" for name, version in data["versions"].items())
+    text = [f"{data['machine']['device']}, commit {data['commit'][:12]}, {data['date'][:10]}, {found}."]
+    for dtype, worlds in dict.fromkeys((row["dtype"], row["worlds"]) for row in rows):
+        mine = [row for row in rows if (row["dtype"], row["worlds"]) == (dtype, worlds)]
+        robots = {row["scene"]: row["dof"] for row in mine}
+        heads = [f"µs, {dtype}, {worlds} worlds", *(f"{robot} ({dof} dof)" for robot, dof in robots.items()), "error"]
+        text += ["", "| " + " | ".join(heads) + " |", "|---|" + "---:|" * (len(robots) + 1)]
+        for op in dict.fromkeys(row["op"] for row in mine):
+            line = {row["scene"]: row for row in mine if row["op"] == op}
+            errors = [row["error"] for row in line.values()]
             error = max(errors) if all(e == e for e in errors) else float("nan")
-            cells = [first["scene"], str(first["dof"]), f"`{first['op']}`"]
-            cells += [_time(group.get(count)) for count in counts] + [f"{error:.1e}"]
+            cells = [f"`{op}`", *(_time(line.get(robot)) for robot in robots), f"{error:.1e}"]
             text.append("| " + " | ".join(cells) + " |")
     return "\n".join(text) + "\n"
 
 
 def _time(row: dict | None) -> str:
+    """Three digits, such as 3.17, 21.6 or 1363."""
     if row is None or "us" not in row:
         return "–"
-    rate = row["evals_per_s"]
-    power, letter = next(((p, s) for p, s in ((1e9, "G"), (1e6, "M"), (1e3, "k")) if rate >= p), (1.0, ""))
-    return f"{row['us']:.{max(0, 2 - len(str(int(row['us']))) + 1)}f} ({rate / power:.3g} {letter}/s)"
+    return f"{row['us']:.{max(0, 3 - len(str(int(row['us']))))}f}"
 
 
 def rewrite(readme: Path, data: dict) -> None:

@@ -93,16 +93,16 @@ def _data():
                 versions=versions, rows=rows)  # fmt: skip
 
 
-def test_table_has_a_line_an_operation_and_a_column_a_world_count():
+def test_table_has_a_line_an_operation_and_a_column_a_robot():
     text = table.markdown(_data())
     assert text.startswith("GPU X, commit 0123456789ab, 2026-01-02, python 3.11.7, warp-lang 1.19.0.")
-    assert "| robot | dof | operation | 64 worlds | 4096 worlds | error |" in text
-    assert "| ant | 14 | `phi` | 16.0 (4 M/s) | 1024 (4 M/s) | 8.2e-04 |" in text  # the larger of the errors
-    assert text.count("| ant |") == 2
+    assert "| µs, float32, 64 worlds | ant (14 dof) | error |" in text
+    assert "| `phi` | 16.0 | 1.3e-05 |" in text and "| `phi` | 1024 | 8.2e-04 |" in text
+    assert text.count("| `phi` |") == 4  # two precisions, two world counts
     missing = _data()
     missing["rows"][0]["error"] = float("nan")
     del missing["rows"][0]["us"]
-    assert "| ant | 14 | `phi` | – | 1024 (4 M/s) | nan |" in table.markdown(missing)
+    assert "| `phi` | – | nan |" in table.markdown(missing)
 
 
 def test_readme_is_rewritten_between_the_markers(tmp_path, monkeypatch, capsys):

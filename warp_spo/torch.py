@@ -41,7 +41,7 @@ def empty(shape: tuple, dtype: type, device: wp.Device) -> torch.Tensor:
 
 def device_name(device: torch.device) -> str:
     """Return the name of a device; a CUDA device without a number is torch's current one."""
-    return str(device) if device.type == "cpu" or device.index is not None else f"cuda:{torch.cuda.current_device()}"
+    return f"cuda:{torch.cuda.current_device()}" if device.type == "cuda" and device.index is None else str(device)
 
 
 def stream(device: wp.Device) -> wp.Stream:
