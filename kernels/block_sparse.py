@@ -41,7 +41,7 @@ def row_times(
 
 @functools.cache
 def gather(T):
-    """``out = alpha B x``, or ``out += alpha B x``. Launch over (world, row, column)."""
+    """``out = alpha B x``, or ``out += alpha B x``. Launch over (row, column, world)."""
 
     @wp.kernel(module=f"warp_spo_block_sparse_{T.__name__}", enable_backward=False)
     def block_gather(
@@ -53,7 +53,7 @@ def gather(T):
         x: wp.array3d(dtype=T),
         y_out: wp.array3d(dtype=T),
     ):
-        world, index, column = wp.tid()
+        index, column, world = wp.tid()
         row = rows[index]
         total = alpha * row_times(weights, entries, row, world, column, x)
         if accumulate:
@@ -67,7 +67,7 @@ def gather(T):
 def sweep(T):
     """One level of ``y = alpha x + B y``, that is y = alpha (I - B)^-1 x (Jain, eq. 9).
 
-    Launch over (world, row of the level, column), levels in the order in which B y meets finished rows only.
+    Launch over (row of the level, column, world), levels in the order in which B y meets finished rows only.
     """
 
     @wp.kernel(module=f"warp_spo_block_sparse_{T.__name__}", enable_backward=False)
@@ -80,7 +80,7 @@ def sweep(T):
         x: wp.array3d(dtype=T),
         y_out: wp.array3d(dtype=T),
     ):
-        world, index, column = wp.tid()
+        index, column, world = wp.tid()
         row = rows[first + index]
         total = row_times(weights, entries, row, world, column, y_out)
         y_out[world, row[0], column] = alpha * x[world, row[0], column] + total

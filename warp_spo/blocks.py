@@ -53,7 +53,7 @@ class Table:
         """Launch ``out = alpha B x``, or ``out += alpha B x``."""
         wp.launch(
             block_sparse.gather(x.dtype),
-            dim=out.shape,
+            dim=(out.shape[1], out.shape[2], out.shape[0]),
             inputs=[weights, self.rows, self.entries, alpha, add, x],
             outputs=[out],
             device=x.device,
@@ -64,7 +64,7 @@ class Table:
         for first, count in self.levels:
             wp.launch(
                 block_sparse.sweep(x.dtype),
-                dim=(out.shape[0], count, out.shape[2]),
+                dim=(count, out.shape[2], out.shape[0]),
                 inputs=[weights, self.rows, self.entries, first, alpha, x],
                 outputs=[out],
                 device=x.device,
@@ -126,6 +126,14 @@ class Blocks(Operator):
         self._transposed.gather(self.weights, x, out, alpha, accumulate)
 
 
+def storage(worlds: int, scalars: int, dtype: type, device: wp.Device) -> wp.array:
+    """Zeros [world, scalar] for the blocks of an operator, one scalar or more; worlds are neighbours in memory.
+
+    Kernels have one thread a world side by side, whether they write the blocks or apply them.
+    """
+    return wp.zeros((max(1, scalars), worlds), dtype=dtype, device=device).transpose()
+
+
 def matrix_size(call: str, name: str, array) -> tuple[int, int]:
     """Return (rows, columns) of an array [world, rows, columns] or [rows, columns], of any kind."""
     kind_of(array, call, name)
@@ -170,7 +178,7 @@ def pack(
         )
     worlds = counts.pop() if counts else 1
     total = sum(rows * columns for rows, columns in sizes)
-    weights = wp.empty((worlds, total), dtype=dtype, device=device)
+    weights = storage(worlds, total, dtype, device)
     scalar = wp.types.type_size_in_bytes(dtype)
     with Call(call, device, dtype) as border:
         offset = 0
@@ -180,17 +188,16 @@ def pack(
             source = border.read(name, array, (*axis, rows, columns), meaning)
             if weights.size and rows * columns:
                 step = rows * columns * scalar if axis and axis[0] > 1 else 0
-                shape, inner = (worlds, rows, columns), (columns * scalar, scalar)
-                wp.copy(
-                    wp.array(
-                        ptr=weights.ptr + offset * scalar,
-                        shape=shape,
-                        strides=(total * scalar, *inner),
-                        dtype=dtype,
-                        device=device,
-                    ),
-                    wp.array(ptr=source.ptr, shape=shape, strides=(step, *inner), dtype=dtype, device=device),
+                first, next_scalar = weights.strides
+                block: Any = wp.array(
+                    ptr=weights.ptr + offset * next_scalar,
+                    shape=(worlds, rows, columns),
+                    strides=(first, columns * next_scalar, next_scalar),
+                    dtype=dtype,
+                    device=device,
                 )
+                strides = (step, columns * scalar, scalar)
+                wp.copy(block, wp.array(ptr=source.ptr, shape=block.shape, strides=strides, dtype=dtype, device=device))
             offset += rows * columns
         if device.is_cuda and not device.is_capturing:
             wp.synchronize_stream(device.stream)  # later calls may come on another stream

@@ -11,7 +11,7 @@ from itertools import accumulate
 import numpy as np
 import warp as wp
 
-from .blocks import Blocks
+from .blocks import Blocks, storage
 from .kernels import factorization as kernels
 from .operators import BWA
 from .parameters import spread
@@ -58,11 +58,11 @@ class Factorization:
         self.device, self.dtype = E_phi.device, E_phi.dtype
 
         def packed(scalars: int) -> wp.array:
-            return wp.zeros((self.worlds, max(1, scalars)), dtype=self.dtype, device=self.device)
+            return storage(self.worlds, scalars, self.dtype, self.device)
 
         N, dofs, kind = E_phi.shape[0], H.shape[0], E_phi.kind
         if Delta is None:
-            zero = wp.zeros((1, max(1, pivot_offsets[-1])), dtype=self.dtype, device=self.device)
+            zero = storage(1, pivot_offsets[-1], self.dtype, self.device)
             Delta = Blocks((dofs, dofs), pivot_places, zero, pivot_offsets[:-1], kind)
         _check_places("Delta", Delta, pivot_places)
         self.E_phi, self.H, self.M, self.Delta = E_phi, H, M, Delta

@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from .arrays import WARP, Call
-from .blocks import Blocks
+from .blocks import Blocks, storage
 from .factorization import Factorization
 from .kernels import kinematics, rigid_blocks
 from .operators import BWA
@@ -38,8 +38,7 @@ class SpatialOperators:
 
         def packed(sizes: list[int]) -> tuple[wp.array, list[int]]:
             offsets = list(accumulate(sizes, initial=0))
-            weights = wp.zeros((worlds, max(1, offsets[-1])), dtype=dtype, device=device)
-            return weights, offsets[:-1]
+            return storage(worlds, offsets[-1], dtype, device), offsets[:-1]
 
         N, dofs = start[-1], scene.dof_count
         weights, offsets = packed([m[p] * m[k] for p, k in tree.edges])
