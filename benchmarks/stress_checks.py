@@ -1,0 +1,260 @@
+"""What the stress suite asserts without an error bound: flags, NaN in one world alone, equal bits, limits.
+
+A check is a function of (device, dtype) that raises AssertionError; ``CHECKS`` names them with the line of theory.md
+section 4.3 or of issue 3 that they come from.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+import warp_spo as spo
+
+from . import stress_scenes as scenes
+from .exact import Sweep
+from .stress_scenes import GRAVITY, NONE, Problem, draw, problem
+
+EPS = {"float32": 2.0**-23, "float64": 2.0**-52}
+HINGE = 3  # of an 8-link chain, that a check spoils
+SPOILED = 5  # world that a check spoils
+
+
+def run(p: Problem, device: Any, dtype: str, **body_f: Any) -> tuple[np.ndarray, np.ndarray]:
+    """qdd [world, dof] and status [world] of forward dynamics."""
+    status = np.full(p.worlds, -1, dtype=np.int32)
+    dyn = spo.Dynamics(p.scene, p.worlds, device, dtype)
+    return dyn.forward_dynamics(p.q, p.qd, p.tau, status=status, **body_f), status
+
+
+def only_flagged(p: Problem, clean: Problem, word: int, device: Any, dtype: str) -> None:
+    """World SPOILED of ``p`` is NaN with the status word; every other world has the bits that it has in ``clean``."""
+    (qdd, status), (wanted, zero) = run(p, device, dtype), run(clean, device, dtype)
+    others = np.arange(p.worlds) != SPOILED
+    assert not zero.any(), f"the clean problem is flagged: {zero}"
+    assert np.isnan(qdd[SPOILED]).any() and status[SPOILED] == word, f"status {status[SPOILED]}, qdd {qdd[SPOILED]}"
+    assert not status[others].any(), f"other worlds are flagged: {status}"
+    np.testing.assert_array_equal(qdd[others], wanted[others])
+
+
+def in_one_world(p: Problem, name: str, value: Any) -> tuple[Problem, Problem]:
+    """``p`` with one of the scene's values replaced in world SPOILED alone; and with it the same in all worlds."""
+    values = np.repeat(p.scene.values[name][:1], p.worlds, axis=0)
+    clean = Problem(p.scene.with_values(**{name: values}), p.q, p.tau, p.qd)
+    values = values.copy()
+    values[SPOILED] = value
+    return Problem(p.scene.with_values(**{name: values}), p.q, p.tau, p.qd), clean
+
+
+def closed_form(device: Any, dtype: str) -> None:
+    """D of the straight chain of thin rods, tip to base; it tends to 1/3 + 12^-1/2."""
+    p, n = scenes.straight(6), 6
+    p = Problem(p.scene.with_values(body_inertia=[np.diag([0.0, 1.0, 1.0]) / 12.0] * n), p.q, p.tau)  # not rounded
+    dyn = spo.Dynamics(p.scene, p.worlds, device, dtype)
+    dyn.forward_dynamics(p.q, None, p.tau)
+    D = dyn.recursions.array("pivot").numpy()[::-1, 0]
+    wanted = [Fraction(*pair) for pair in ((1, 3), (7, 12), (13, 21), (97, 156), (181, 291), (1351, 2172))]
+    error = max(abs(Fraction(float(D[i])) / wanted[i] - 1) for i in range(n))
+    assert error <= 10 * 4 * EPS[dtype], f"error {float(error):.1e}"
+
+
+def condition_slope(device: Any, dtype: str) -> None:
+    """cond of the mass matrix of straight rods grows with the 4th power of their number."""
+    low, high = 64, 128
+    cond = []
+    for n in (low, high):
+        p = scenes.straight(n)
+        mass = spo.Dynamics(p.scene, p.worlds, device, "float64").mass_matrix(p.q)
+        cond.append(np.linalg.cond(mass[0]))
+    slope = np.log2(cond[1] / cond[0])
+    assert abs(slope - 4.0) <= 0.1, f"slope {slope:.3f}, cond {cond}"
+
+
+def massless_leaf(device: Any, dtype: str) -> None:
+    p = scenes.chain_rand(8)
+    mass, inertia = p.scene.values["body_mass"][0].copy(), p.scene.values["body_inertia"][0].copy()
+    mass[-1], inertia[-1] = 0.0, 0.0
+    bad, clean = in_one_world(p, "body_mass", mass)
+    both, _ = in_one_world(bad, "body_inertia", inertia)
+    only_flagged(both, clean, 1, device, dtype)
+
+
+def negative_mass(device: Any, dtype: str) -> None:
+    """A scene refuses it; in a variable value, which nobody inspects, it is flagged where a pivot turns negative."""
+    p = scenes.chain_rand(8)
+    mass = np.repeat(p.scene.values["body_mass"], p.worlds, axis=0)
+    mass[SPOILED, -1] = -1.0
+    try:
+        p.scene.with_values(body_mass=mass)
+    except ValueError:
+        pass
+    else:
+        raise AssertionError("Scene.with_values takes a negative mass")
+    dyn = spo.Dynamics(p.scene, p.worlds, device, dtype, variable=("body_mass",))
+    dyn.set(body_mass=mass)
+    status = np.zeros(p.worlds, dtype=np.int32)
+    qdd = dyn.forward_dynamics(p.q, None, p.tau, status=status)
+    assert status[SPOILED] == 1 and np.isnan(qdd[SPOILED]).any(), f"status {status}"
+    assert np.isfinite(np.delete(qdd, SPOILED, 0)).all() and status.sum() == 1
+
+
+def zero_inertia_axis(device: Any, dtype: str) -> None:
+    """A rod without inertia about its own axis, on a hinge about it: along an axis of its frame, and across."""
+    for axis in ((1.0, 0.0, 0.0), (0.36, 0.48, 0.8)):
+        along = np.array(axis)
+        thin = (np.eye(3) - np.outer(along, along)) / 12.0
+        bodies = [scenes.rod(), spo.Body(1.0, 0.5 * along, np.eye(3) / 12.0)]
+        hinges = [spo.Hinge("revolute", -1, 0, axis=(0, 0, 1)), spo.Hinge("revolute", 0, 1, axis=axis)]
+        q, tau = draw(2, scenes.WORLDS, 2, 0.6), draw(3, scenes.WORLDS, 2)
+        p = problem(spo.Scene(bodies, hinges, gravity=GRAVITY), q, tau)
+        inertia = p.scene.values["body_inertia"][0].copy()
+        inertia[1] = scenes.rounded(thin)
+        only_flagged(*in_one_world(p, "body_inertia", inertia), 1, device, dtype)
+
+
+def unit_powers_of_two(device: Any, dtype: str) -> None:
+    """Mass by 2^7 and length by 2^-5 change no bit of qdd."""
+    p = scenes.chain_gravity(16)
+    p = Problem(p.scene, p.q, scenes.rounded(draw(3, p.worlds, 16)), scenes.rounded(draw(5, p.worlds, 16)))
+    mass, length = 2.0**7, 2.0**-5
+    v = p.scene.values
+    X = v["joint_X_p"] * np.array([length] * 3 + [1.0] * 4)
+    other = p.scene.with_values(body_mass=v["body_mass"] * mass, body_com=v["body_com"] * length, joint_X_p=X,
+                                body_inertia=v["body_inertia"] * mass * length**2, gravity=v["gravity"] * length)
+    scaled = Problem(other, p.q, p.tau * mass * length**2, p.qd)
+    np.testing.assert_array_equal(run(scaled, device, dtype)[0], run(p, device, dtype)[0])
+
+
+def stiff_is_locked(device: Any, dtype: str) -> None:
+    """Armature to infinity is a fixed hinge: the difference falls as 1/s, to rounding."""
+    n, level = 16, {}
+    for s in (1e6, 1e8, 1e12):
+        p = scenes.stiff_armature(s, n)
+        free = np.arange(0, n, 2)
+        hinges = list(p.scene.hinges)
+        for k in range(1, n, 2):  # the angle goes into the anchor, so every world is a scene of its own
+            hinges[k] = spo.Hinge("fixed", k - 1, k, parent_pose=hinges[k].parent_pose)
+        locked = spo.Scene(p.scene.bodies, hinges, gravity=NONE)
+        X = np.repeat(locked.values["joint_X_p"], p.worlds, axis=0)
+        X[:, 1::2, 3:] = np.stack([np.zeros_like(p.q[:, 1::2])] * 3 + [np.ones_like(p.q[:, 1::2])], -1)
+        X[:, 1::2, 4], X[:, 1::2, 6] = np.sin(p.q[:, 1::2] / 2), np.cos(p.q[:, 1::2] / 2)
+        bodies = {name: p.scene.values[name] for name in ("body_mass", "body_com", "body_inertia")}
+        locked = Problem(locked.with_values(joint_X_p=X, **bodies), p.q[:, free], p.tau[:, free])
+        got, wanted = run(p, device, dtype)[0][:, free], run(locked, device, dtype)[0]
+        level[s] = float(np.abs(got - wanted).max() / np.abs(wanted).max())
+    rounding = 10 * 4.2 * EPS[dtype]
+    assert level[1e8] <= 0.011 * level[1e6] + rounding and level[1e12] <= 1.1e-6 * level[1e6] + rounding, f"{level}"
+
+
+def negative_armature(device: Any, dtype: str) -> None:
+    """Delta = -1.01 H P H* on one hinge is flagged. -0.99 of it on the root hinge leaves M positive: 100 times S1."""
+    base = scenes.chain_rand(8)
+    D = np.asarray(Sweep(base.scene, base.q[:1], "extended").D, dtype=np.float64)[0]
+    p = Problem(base.scene, np.repeat(base.q[:1], base.worlds, axis=0), base.tau)
+    for hinge in (0, HINGE):
+        armature = -1.01 * D * (np.arange(8) == hinge)
+        only_flagged(*in_one_world(p, "joint_armature", scenes.rounded(armature)), 1, device, dtype)
+    p, _ = in_one_world(p, "joint_armature", scenes.rounded(-0.99 * D * (np.arange(8) == 0)))
+    qdd, status = run(p, device, dtype)
+    wanted = Sweep(p.scene, p.q, "extended").forward(p.tau)[SPOILED].astype(np.float64)
+    error = np.linalg.norm(qdd[SPOILED] - wanted) / np.linalg.norm(wanted)
+    assert not status.any(), "a positive D is flagged"
+    assert error <= 10 * 100 * 5e-7 * EPS[dtype] / EPS["float32"], f"error {error:.1e}"
+
+
+def lost_directions(device: Any, dtype: str) -> None:
+    """Where no digit of D is left, in oblique axes, a world is flagged: a ball, a d6 at the middle angle 90 degrees."""
+    for p in [scenes.weak_ball(weak, False) for weak in (1e-8, 1e-9, 0.0)] + [scenes.three_angles(0.0)]:
+        if dtype == "float64":  # its own smallest numbers
+            p = scenes.weak_ball(1e-18, False) if p.q.shape[1] == 4 else Problem(
+                p.scene, np.where(np.arange(3) == 1, np.pi / 2.0, p.q), p.tau)
+        qdd, status = run(p, device, dtype)
+        assert (status == 1).all() and np.isnan(qdd).any(1).all(), f"status {status}, q {p.q[0]}"
+
+
+def lost_outboard(device: Any, dtype: str) -> None:
+    """A gimbal in oblique axes: D(0) is what is left when the arm's inertia cancels outboard: rounding, flagged."""
+    qdd, status = run(scenes.gimbal(1e-20, 1e-10, oblique=True), device, dtype)
+    assert (status == 1).all(), f"status {status}, qdd {qdd[0]}"
+
+
+def non_finite_input(device: Any, dtype: str) -> None:
+    """NaN and infinity in any input of one world: status 2 there, other worlds keep their bits."""
+    p = scenes.far_origin(0.0, floating=True)
+    p = Problem(p.scene, p.q, p.tau, scenes.rounded(draw(5, p.worlds, p.scene.dof_count)))
+    dyn = spo.Dynamics(p.scene, p.worlds, device, dtype)
+    given = dict(q=p.q, qd=p.qd, tau=p.tau, body_f=draw(9, p.worlds, 6 * p.scene.body_count))
+    given["body_f"] = scenes.rounded(given["body_f"].reshape(p.worlds, -1, 6))
+    wanted, others = dyn.forward_dynamics(**given), np.arange(p.worlds) != SPOILED
+    for name in given:
+        for spoil in (np.nan, np.inf, -np.inf):
+            for entry in (0, -1):
+                bad, status = {key: value.copy() for key, value in given.items()}, np.zeros(p.worlds, dtype=np.int32)
+                bad[name].reshape(p.worlds, -1)[SPOILED, entry] = spoil
+                qdd = dyn.forward_dynamics(**bad, status=status)
+                where = f"{name}[{SPOILED}, {entry}] = {spoil}"
+                assert status[SPOILED] == 2 and status.sum() == 2, f"{where}: status {status}"
+                assert not np.isfinite(qdd[SPOILED]).all(), f"{where}: the result hides it"
+                np.testing.assert_array_equal(qdd[others], wanted[others], err_msg=where)
+
+
+def same_bits(device: Any, dtype: str, worlds: int = 64) -> None:
+    """Three runs, worlds permuted, one world alone, bodies renumbered with the order of siblings kept."""
+    n = 15
+    p = scenes.binary_tree(n)
+    q, tau = (np.resize(x, (worlds, n)) + 0.0 for x in (p.q, p.tau))
+    first = run(Problem(p.scene, q, tau), device, dtype)[0]
+    for _ in range(2):
+        np.testing.assert_array_equal(run(Problem(p.scene, q, tau), device, dtype)[0], first)
+    order = np.random.default_rng(0).permutation(worlds)
+    np.testing.assert_array_equal(run(Problem(p.scene, q[order], tau[order]), device, dtype)[0], first[order])
+    np.testing.assert_array_equal(run(Problem(p.scene, q[:1], tau[:1]), device, dtype)[0], first[:1])
+
+    def depth_first(k: int) -> list[int]:
+        return [k, *depth_first(2 * k + 1), *depth_first(2 * k + 2)] if k < n else []
+
+    old = np.array(depth_first(0))
+    new = np.argsort(old)
+    hinges = []
+    for k in old:
+        h = p.scene.hinges[k]
+        hinges.append(spo.Hinge("revolute", -1 if h.parent < 0 else int(new[h.parent]), int(new[k]), axis=h.axis,
+                                parent_pose=h.parent_pose))
+    renumbered = problem(spo.Scene([p.scene.bodies[k] for k in old], hinges, gravity=NONE), q[:, old], tau[:, old])
+    np.testing.assert_array_equal(run(renumbered, device, dtype)[0], first[:, old])
+
+
+def worlds_against_closed_form(device: Any, dtype: str, worlds: int = 1) -> None:
+    """A double pendulum of uniform rods in any number of worlds against its 2 x 2 mass matrix (theory.md 5.2, O1)."""
+    rng = np.random.default_rng(0)
+    q, tau = rng.uniform(-1.0, 1.0, (worlds, 2)), rng.normal(size=(worlds, 2))
+    rods = [spo.Body(1.0, (0.5, 0.0, 0.0), np.diag([0.0, 1.0, 1.0]) / 12.0)] * 2
+    p = problem(scenes.tree([-1, 0], rods, [0.0, 1.0], [0, 0]), q, tau)
+    qdd, status = run(p, device, dtype)
+    c = np.cos(p.q[:, 1])
+    J = p.scene.values["body_inertia"][0, 0, 2, 2] + 0.25  # about the end, of 1/12 as float32 has it
+    M = np.array([[1.0 + 2.0 * J + c, J + c / 2.0], [J + c / 2.0, np.full(worlds, J)]])
+    det = M[0, 0] * M[1, 1] - M[0, 1] ** 2
+    wanted = np.stack([M[1, 1] * p.tau[:, 0] - M[0, 1] * p.tau[:, 1], M[0, 0] * p.tau[:, 1] - M[0, 1] * p.tau[:, 0]])
+    error = np.linalg.norm(qdd - (wanted / det).T, axis=1) / np.linalg.norm(wanted / det, axis=0)
+    assert not status.any() and error.max() <= 10 * 5e-7 * EPS[dtype] / EPS["float32"], f"error {error.max():.1e}"
+
+
+CHECKS = {
+    "S5.closed_form": (closed_form, "theory.md 4.3 S5"),
+    "S6.cond_law": (condition_slope, "theory.md 4.3 S6"),
+    "S14.massless_leaf": (massless_leaf, "theory.md 4.3 S14"),
+    "S19.unit_pow2": (unit_powers_of_two, "theory.md 4.3 S19"),
+    "S20.stiff_is_locked": (stiff_is_locked, "theory.md 4.3 S20"),
+    "S21.negative_delta": (negative_armature, "theory.md 4.3 S21"),
+    "S32.determinism": (same_bits, "theory.md 4.3 S32"),
+    "negative_mass": (negative_mass, "issue 3, item 4"),
+    "zero_inertia_axis": (zero_inertia_axis, "issue 3, item 4"),
+    "lost_directions": (lost_directions, "theory.md 4.2 (4)"),
+    "lost_outboard": (lost_outboard, "theory.md 4.2 (4)"),
+    "non_finite_input": (non_finite_input, "issue 3, item 4"),
+    "one_world": (worlds_against_closed_form, "theory.md 5.2 O1"),
+}
+"""Name -> (check, where it stands)."""

@@ -1,0 +1,203 @@
+"""Measure one stress case in one precision: errors, law, status word and run time."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import warp_spo as spo
+
+from . import contrast
+from .exact import Sweep
+from .stress_cases import ALLOWED, EPS32, EPS64, Case
+from .stress_scenes import Problem
+
+PRECISIONS = ("float32", "refined", "float64")  # refined: float32 and one step with a float64 residual
+EPS = {"float32": EPS32, "float64": EPS64}
+MP_BODIES = 32  # larger scenes are compared with extended precision, whose eps is 1/2048 of float64's
+POWER_STEPS = 8  # of the power iteration for the norm of the mass matrix
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def residual(tau: wp.array2d[wp.float64], force: wp.array2d[wp.float64], out: wp.array2d[wp.float32]):
+    """tau - force, rounded once; tau absent is zero."""
+    world, dof = wp.tid()
+    wanted = wp.float64(0.0)
+    if tau:
+        wanted = tau[world, dof]
+    out[world, dof] = wp.float32(wanted - force[world, dof])
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def correct(step: wp.array2d[wp.float32], out: wp.array2d[wp.float64]):
+    world, dof = wp.tid()
+    out[world, dof] += wp.float64(step[world, dof])
+
+
+class Subject:
+    """A problem on a device in both precisions.
+
+    Args:
+        problem: scene and states.
+        device: Warp device; None: the current one.
+    """
+
+    def __init__(self, problem: Problem, device: Any = None):
+        self.problem = problem
+        self.dyn = {name: spo.Dynamics(problem.scene, problem.worlds, device, name) for name in EPS}
+        self.device = self.dyn["float32"].device
+        self._inputs: dict[str, tuple] = {}
+
+    def inputs(self, dtype: str) -> tuple:
+        """q, qd and tau on the device."""
+        if dtype not in self._inputs:
+            p = self.problem
+            self._inputs[dtype] = tuple(None if x is None else wp.array(x, dtype=getattr(wp, dtype), device=self.device)
+                                        for x in (p.q, p.qd, p.tau))
+        return self._inputs[dtype]
+
+    @functools.cached_property
+    def status(self) -> wp.array:
+        return wp.zeros(self.problem.worlds, dtype=wp.int32, device=self.device)
+
+    def forward(self, dtype: str, steps: int = 0) -> wp.array:
+        """qdd; in float32 with ``steps`` times qdd += Mass32^-1 (tau - inverse_dynamics64(q, qd, qdd))."""
+        q, qd, tau = self.inputs(dtype)
+        qdd = self.dyn[dtype].forward_dynamics(q, qd, tau, status=self.status)
+        if not steps:
+            return qdd
+        q64, qd64, tau64 = self.inputs("float64")
+        total = wp.zeros(qdd.shape, dtype=wp.float64, device=self.device)
+        wp.launch(correct, qdd.shape, [qdd], [total], device=self.device)
+        for _ in range(steps):
+            force = self.dyn["float64"].inverse_dynamics(q64, qd64, total)
+            wp.launch(residual, qdd.shape, [tau64, force], [qdd], device=self.device)
+            step = self.dyn["float32"].solve_mass_matrix(q, qdd)
+            wp.launch(correct, qdd.shape, [step], [total], device=self.device)
+        return total
+
+    def pivots(self, dtype: str) -> np.ndarray:
+        """D [world, dof] of the last forward dynamics in that precision."""
+        return self.dyn[dtype].recursions.array("pivot").numpy().T
+
+    def value(self, quantity: str, dtype: str, steps: int) -> np.ndarray:
+        """A case's quantity, [world, ...]."""
+        qdd = self.forward(dtype, steps).numpy()
+        if quantity in ("pivots", "root_pivot"):
+            D = self.pivots(dtype)
+            return D if quantity == "pivots" else D[:, :1]
+        if quantity == "log_det":
+            return self.dyn[dtype].log_det_mass_matrix(self.inputs(dtype)[0]).numpy()[:, None]
+        if quantity == "dense":
+            q, qd, tau = self.problem.q, self.problem.qd, self.problem.tau
+            dyn = self.dyn[dtype]
+            return contrast.cholesky(dyn.mass_matrix(q), tau - dyn.bias_force(q, qd), np.dtype(dtype))
+        return qdd
+
+    def mass_norm(self) -> np.ndarray:
+        """An estimate from below of the 2-norm of the mass matrix [world, 1], matrix-free."""
+        dyn = self.dyn["float64"]
+        x = np.random.default_rng(0).normal(size=(self.problem.worlds, self.problem.scene.dof_count))
+        still = dyn.gravity_force(self.problem.q)
+        for _ in range(POWER_STEPS):
+            x /= np.linalg.norm(x, axis=1, keepdims=True)
+            x = dyn.inverse_dynamics(self.problem.q, None, x) - still
+        return np.linalg.norm(x, axis=1, keepdims=True)
+
+    def backward_error(self, qdd: np.ndarray) -> np.ndarray:
+        """|tau - inverse dynamics| over |Mass| |qdd| + |tau| + |bias| [world], all in float64."""
+        p, dyn = self.problem, self.dyn["float64"]
+        tau = np.zeros_like(qdd, dtype=np.float64) if p.tau is None else p.tau
+        norm = functools.partial(np.linalg.norm, axis=1, keepdims=True)
+        force, bias = dyn.inverse_dynamics(p.q, p.qd, qdd.astype(np.float64)), dyn.bias_force(p.q, p.qd)
+        with np.errstate(invalid="ignore"):
+            return (norm(tau - force) / (self.mass_norm() * norm(qdd) + norm(tau) + norm(bias)))[:, 0]
+
+    def microseconds(self, run: Callable, budget: float = 0.1) -> float:
+        """Median run time per world [µs], at least 3 runs after one to warm up."""
+        run()
+        times: list[float] = []
+        while len(times) < 3 or (sum(times) < budget and len(times) < 50):
+            wp.synchronize_device(self.device)
+            start = time.perf_counter()
+            run()
+            wp.synchronize_device(self.device)
+            times.append(time.perf_counter() - start)
+        return 1e6 * float(np.median(times)) / self.problem.worlds
+
+
+@functools.lru_cache(maxsize=16)
+def exact(case: Case) -> tuple[Sweep, np.ndarray]:
+    """The sweep in an arithmetic that is good enough, and the case's quantity [world, ...]."""
+    p = case.problem
+    sweep = Sweep(p.scene, p.q, "mp50" if p.scene.body_count <= MP_BODIES else "extended")
+    if case.quantity in ("pivots", "root_pivot"):
+        return sweep, sweep.D if case.quantity == "pivots" else sweep.D[:, :1]
+    return sweep, sweep.log_det()[:, None] if case.quantity == "log_det" else sweep.forward(p.tau, p.qd)
+
+
+def distance(case: Case, value: np.ndarray) -> np.ndarray:
+    """Error by world, in the case's metric; infinite where the value is not a number."""
+    sweep, wanted = exact(case)
+    finite = np.isfinite(value.astype(np.float64)).all(1)
+    difference = (sweep.arithmetic.number(np.where(np.isfinite(value), value, 0.0)) - wanted).astype(np.float64)
+    size = wanted.astype(np.float64)
+    if case.metric == "norm":
+        error = np.linalg.norm(difference, axis=1) / np.linalg.norm(size, axis=1)
+    else:
+        error = np.abs(difference if case.metric == "absolute" else difference / size).max(1)
+    return np.where(finite, error, 1.0 if case.quantity == "dense" else np.inf)
+
+
+def law_of(case: Case, eps: float) -> np.ndarray:
+    """The law's error by world."""
+    given = dict(cond=lambda: _cond(case), D_cond=lambda: exact(case)[0].D_cond)
+    return np.broadcast_to(case.law(eps=eps, **given, **case.parameters), case.problem.worlds)
+
+
+@functools.lru_cache(maxsize=64)
+def _cond(case: Case) -> np.ndarray:
+    mass = spo.Dynamics(case.problem.scene, case.problem.worlds, "cpu", "float64").mass_matrix(case.problem.q)
+    return np.linalg.cond(mass)
+
+
+def row(case: Case, subject: Subject, precision: str, timed: bool = False) -> dict:
+    """One line of the table: numbers of a case in a precision of ``PRECISIONS``."""
+    dtype = "float64" if precision == "float64" else "float32"
+    steps = case.steps if precision != "refined" else max(1, case.steps)
+    value = subject.value(case.quantity, dtype, steps)
+    status, error = subject.status.numpy(), distance(case, value)
+    sweep = exact(case)[0]
+    judged = precision in case.precisions
+    law = law_of(case, EPS[dtype]) if judged else np.full(case.problem.worlds, np.nan)
+    ratio = float((error / law).max()) if judged else float("nan")
+    found = dict(case=case.name, parameters=case.parameters, precision=precision, quantity=case.quantity,
+                 metric=case.metric, reference=sweep.arithmetic.name, max_error=float(error.max()),
+                 median_error=float(np.median(error)), law=float(law[np.argmax(error / law)]) if judged else None,
+                 formula=case.formula, source=f"theory.md {case.source}", ratio=ratio,
+                 pivot=float((np.abs(sweep.D) / sweep.P_trace).astype(np.float64).min()),
+                 status=sorted({int(word) for word in status}), flagged=int((status != 0).sum()),
+                 verdict="" if not judged else "ok" if ratio <= ALLOWED else "FAILS")
+    qdd = value if case.quantity in ("qdd", "dense") else subject.forward(dtype, steps).numpy()
+    found["backward_error"] = float(subject.backward_error(qdd).max())
+    if timed:
+        found["us"] = subject.microseconds(lambda: subject.forward(dtype, steps))
+    return found
+
+
+def contrasts(case: Case) -> list[dict]:
+    """Errors of the forms that the library does not offer."""
+    found, p = [], case.problem
+    for name in case.contrast:
+        with np.errstate(all="ignore"):
+            qdd, D = contrast.FORMS[name](p.scene, p.q, p.tau)
+        value = {"qdd": qdd, "pivots": D, "root_pivot": D[:, :1]}[case.quantity]
+        error = distance(case, value)
+        found.append(dict(case=case.name, parameters=case.parameters, precision=name, quantity=case.quantity,
+                          max_error=float(error.max()), median_error=float(np.median(error)), verdict="contrast"))
+    return found
