@@ -32,8 +32,8 @@ def read(path: Path | None = None) -> dict:
 def markdown(data: dict) -> str:
     """Where the numbers come from, then a table for each precision and world count: operations by robots.
 
-    A cell is the run time of one evaluation of all worlds [µs]; the last column is the largest error of the line, NaN if
-    any is.
+    A cell is the run time of one evaluation of all worlds [µs]; the last column is the largest error of the line, NaN
+    if any is.
     """
     rows = data["rows"]
     found = ", ".join(f"{name} {version}" for name, version in data["versions"].items())
@@ -41,7 +41,8 @@ def markdown(data: dict) -> str:
     for dtype, worlds in dict.fromkeys((row["dtype"], row["worlds"]) for row in rows):
         mine = [row for row in rows if (row["dtype"], row["worlds"]) == (dtype, worlds)]
         robots = {row["scene"]: row["dof"] for row in mine}
-        heads = [f"µs, {dtype}, {worlds} worlds", *(f"{robot} ({dof} dof)" for robot, dof in robots.items()), "error"]
+        names = [f"{robot} ({dof} dof)" for robot, dof in robots.items()]
+        heads = [f"µs, {dtype}, {worlds} worlds", *names, "error"]
         text += ["", "| " + " | ".join(heads) + " |", "|---|" + "---:|" * (len(robots) + 1)]
         for op in dict.fromkeys(row["op"] for row in mine):
             line = {row["scene"]: row for row in mine if row["op"] == op}

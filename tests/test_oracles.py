@@ -21,8 +21,8 @@ from warp_spo.newton import shipped
 WORLDS = 3
 
 # Relative to the largest entry of the expected array, worst world.
-BUILT = 1e-12  # float64 against float64; measured 4e-14 of forward dynamics (cond(Mass) 1e4), 1e-14 of the others
-PARSED = 1e-6  # Newton keeps a file's numbers in float32, 6e-8 each; measured 4e-7
+BUILT = 1e-12  # float64 against float64; measured 1e-13 of forward dynamics (cond(Mass) 1e4), 1e-14 of the rest
+PARSED = 1e-6  # Newton keeps a file's numbers in float32, 6e-8 each; measured 4e-7 of forward dynamics, 3e-7 otherwise
 
 URDF_HUMANOID = shipped("humanoid").parents[2] / "tests" / "assets" / "humanoid.urdf"
 
@@ -131,6 +131,10 @@ class ParsedMjcf(oracles.MujocoModel):
     The joints of a body, in the file's order, are the degrees of freedom of its one hinge, whose label joins their
     names. Springs and dampers are switched off: forward and inverse dynamics contain none. Sensors are left out:
     nv_humanoid.xml has some on sites that it lacks, for which MuJoCo refuses the file.
+
+    Raises:
+        ValueError: a free joint with armature, which MuJoCo adds to the velocity of the body's origin, and a scene to
+            that of its CoM.
     """
 
     def __init__(self, scene, path):
@@ -150,8 +154,11 @@ class ParsedMjcf(oracles.MujocoModel):
             coords, dofs = self.entries(h)
             body = self.bodies[hinge.child]
             joints = [self.model.joint(body.jntadr[0] + i) for i in range(body.jntnum[0])]
-            assert not joints or name_in_file(hinge.label) == "_".join(joint.name for joint in joints)
             if joints:
+                if name_in_file(hinge.label) != "_".join(joint.name for joint in joints):
+                    raise ValueError(f"ParsedMjcf: hinge {hinge.label!r} has the joints {[j.name for j in joints]}")
+                if hinge.kind == "free" and joints[0].armature.any():
+                    raise ValueError(f"ParsedMjcf: the free joint {joints[0].name!r} has armature")
                 self.v_of[dofs] = joints[0].dofadr[0] + np.arange(len(dofs))
                 self.q_from[coords] = joints[0].qposadr[0] + np.arange(hinge.coord_count)
 
@@ -176,7 +183,8 @@ class ParsedUrdf(oracles.PinocchioModel):
         assert self.model.check(self.data), "Pinocchio: joints not in depth-first order"
         self.outer_armature = np.zeros(scene.dof_count)  # a URDF has none
         self.frames = [self.model.getFrameId(name_in_file(label), pin.FrameType.BODY) for label in scene.body_labels]
-        self.joints, self.v_of = {}, np.empty(scene.dof_count, dtype=int)
+        self.joints: dict[int, pin.JointModel] = {}  # by hinge
+        self.v_of = np.empty(scene.dof_count, dtype=int)
         for h, hinge in enumerate(scene.hinges):
             dofs = self.entries(h)[1]
             if len(dofs):
@@ -219,7 +227,9 @@ MJCF = """<mujoco model="probe">
         <body name="tip" pos="0.1 0 0.1">
           <joint name="nod" type="hinge" axis="1 2 -1" pos="0 0.05 0"/>
           <inertial pos="0 0.02 0.05" quat="0.9 0.1 -0.2 0.3" mass="0.4" diaginertia="0.004 0.003 0.002"/>
-          <body name="pin" pos="0.05 0.05 0" euler="0 0 1"><geom type="capsule" fromto="0 0 0 .1 .1 .05" size="0.02"/></body>
+          <body name="pin" pos="0.05 0.05 0" euler="0 0 1">
+            <geom type="capsule" fromto="0 0 0 0.1 0.1 0.05" size="0.02"/>
+          </body>
         </body>
       </body>
     </body>
@@ -239,7 +249,8 @@ URDF = """<robot name="probe">
   <link name="bracket"><inertial><origin xyz="0 .02 .05"/><mass value="1"/>
     <inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>
   <joint name="push" type="prismatic"><parent link="bracket"/><child link="rod"/>
-    <origin xyz=".2 0 0" rpy="0 -.3 .9"/><axis xyz="0 -1 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+    <origin xyz=".2 0 0" rpy="0 -.3 .9"/><axis xyz="0 -1 1"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
   <link name="rod"><inertial><origin xyz="0 0 .1" rpy=".1 .2 .3"/><mass value=".5"/>
     <inertia ixx=".01" iyy=".012" izz=".013" ixy=".001" ixz="0" iyz="0"/></inertial></link>
   <joint name="bend" type="revolute"><parent link="bracket"/><child link="flap"/>
