@@ -10,7 +10,7 @@ from warp_spo.newton import shipped
 
 
 def tall_humanoid():
-    """A floating robot of 43 degrees of freedom: ball neck and waist, arms and legs of seven, human masses."""
+    """A floating robot of 40 degrees of freedom: ball neck and waist, arms and legs of seven, human masses."""
     rng = np.random.default_rng(40)
     bodies, hinges = [], []
 

@@ -1,7 +1,9 @@
 """Scenes from Newton models and robot files, against Newton's own forward kinematics and arrays."""
 
+import re
 import sys
 import warnings
+from pathlib import Path
 
 import newton
 import numpy as np
@@ -613,6 +615,92 @@ def test_mjcf_gravity_that_is_switched_off(tmp_path):
     file.write_text("""<mujoco><option gravity="0 1 0"><flag gravity="disable"/></option><worldbody><body><freejoint/>
         <geom size=".1"/></body></worldbody></mujoco>""")
     np.testing.assert_array_equal(load(file).values["gravity"], [[0, 0, 0]])
+
+
+@pytest.mark.filterwarnings("ignore::newton.NewtonWarning")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "examples/assets/nv_humanoid.xml",
+        "examples/assets/nv_ant.xml",
+        "tests/assets/constraints.xml",
+        "tests/assets/mjcf_exclude_test.xml",
+        "tests/assets/mjcf_exclude_hyphen_test.xml",
+    ],
+)
+def test_newtons_mjcf_files_are_not_misread(name):
+    assert load(Path(newton.__file__).parent / name).body_count > 0
+
+
+MISREAD = """<mujoco><compiler{compiler}/>
+  <default><joint{main}/><default class="c"><joint{c}/><geom{c_geom}/></default></default>
+  <worldbody><body name="root"><joint{root}/><geom size=".1"/><frame childclass="c"><body name="tip"><joint{tip}/>{more}
+  <geom size=".1"{geom}/></body></frame></body></worldbody></mujoco>"""
+EMPTY = dict.fromkeys(("compiler", "main", "c", "c_geom", "root", "tip", "more", "geom"), "")
+INERTIA = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+SLIDE = '<joint type="slide"/>'
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ({"root": ' ref="1"'}, "a joint's ref (body 'root')"),
+        ({"main": ' ref="1"'}, "a joint's ref (body 'root', 'tip')"),
+        ({"c": ' ref="1"'}, "a joint's ref (body 'tip')"),
+        ({"c": ' ref="1"', "tip": ' class="main"'}, None),
+        ({"c": ' ref="1"', "tip": ' ref="0"'}, None),
+        ({"c": ' ref="1"', "root": ' class="c"', "tip": ' type="ball"'}, "a joint's ref (body 'root')"),
+        ({"more": SLIDE}, "a slide after a hinge or ball (body 'tip')"),
+        ({"tip": ' type="ball"', "more": SLIDE}, "a slide after a hinge or ball (body 'tip')"),
+        ({"tip": ' type="slide"', "more": SLIDE + "<joint/>"}, None),
+        ({"c": ' type="slide"', "more": '<joint type="hinge"/>'}, None),
+        ({"root": ' pos="1 0 0"'}, None),
+        ({"c": ' pos="0 0 1"', "more": '<joint axis="1 0 0"/>'}, None),
+        ({"c": ' pos="0 0 1"', "more": '<joint axis="1 0 0" pos="0 0 0"/>'}, "joints with different pos (body 'tip')"),
+        ({"tip": ' type="slide" pos="0 0 1"', "more": "<joint/>"}, "joints with different pos (body 'tip')"),
+        ({"tip": ' type="slide"', "more": '<joint type="slide" pos="0 0 1" axis="1 0 0"/>'}, None),
+        ({"c_geom": ' shellinertia="true"'}, "a geom's shellinertia (body 'tip')"),
+        ({"geom": ' shellinertia="true"', "more": INERTIA}, None),
+        (
+            {"geom": ' shellinertia="true"', "more": INERTIA, "compiler": ' inertiafromgeom="true"'},
+            "a geom's shellinertia (body 'tip')",
+        ),
+        ({"geom": ' shellinertia="true" mass="0"', "more": '<geom size=".1"/>'}, None),
+        (
+            {
+                "geom": ' shellinertia="true" group="3"',
+                "more": '<geom size=".1"/>',
+                "compiler": ' inertiagrouprange="0 2"',
+            },
+            None,
+        ),
+        ({"compiler": ' settotalmass="2"'}, "<compiler settotalmass> (body 'root', 'tip')"),
+        ({"compiler": ' settotalmass="-1"'}, None),
+    ],
+)
+def test_mjcf_that_newton_misreads(text, found, tmp_path):
+    """By default class, childclass and frame, and only where it changes the robot."""
+    file = tmp_path / "robot.xml"
+    file.write_text(MISREAD.format(**EMPTY | text))
+    if found is None:
+        assert load(file).body_labels[-1].endswith("tip")
+    else:
+        with pytest.raises(UnsupportedError, match=re.escape(f"load: {str(file)!r} with {found} is not supported; ")):
+            load(file)
+
+
+def test_mjcf_that_newton_misreads_in_an_include(tmp_path):
+    """Each finding and each way out once. Joints of a root body do not count where ``floating`` replaces them."""
+    joints = '<joint ref="1"/><joint type="slide" pos="1 0 0"/>'
+    (tmp_path / "tip.xml").write_text(f"<mujocoinclude>{joints}</mujocoinclude>")
+    file = tmp_path / "robot.xml"
+    file.write_text('<mujoco><worldbody><body><geom size=".1"/><include file="tip.xml"/></body></worldbody></mujoco>')
+    with pytest.raises(UnsupportedError) as caught:
+        load(file)
+    where = "(body 'world/(no name)')"
+    assert f"with a slide after a hinge or ball {where}, a joint's ref {where} is" in str(caught.value)
+    assert str(caught.value).count("; ") == 2
+    assert load(file, floating=True).dof_count == 6
 
 
 @pytest.mark.filterwarnings("ignore::newton.NewtonWarning")

@@ -319,36 +319,71 @@ def test_newton_weighs_a_link_without_inertial_by_its_shapes(device):
 
 
 LIFT, YAW = (line for line in MJCF.splitlines() if 'name="lift"' in line or 'name="yaw"' in line)
-IMPORTER_DEFECTS = {
-    "a D6 slides before it turns, whatever the order of a body's joints": (f"{LIFT}\n{YAW}", f"{YAW}\n{LIFT}"),
-    "a D6 has one anchor, the joints of a body have one each": (
-        f"{LIFT}\n{YAW}",
-        f"{YAW}\n{YAW}".replace('"yaw"', '"roll"', 1).replace("0 1 0", "1 0 0", 1).replace("0.03", "0.1", 1),
+MISREAD = {
+    "hinge_before_slide": (
+        (f"{LIFT}\n{YAW}", f"{YAW}\n{LIFT}"),
+        "a slide after a hinge or ball (body 'mast')",
+        "of its own",
     ),
-    "a joint's ref, the coordinate at which the file draws it, is not read": ('name="nod"', 'name="nod" ref="0.5"'),
-    "shellinertia, which spreads a shape's mass over its surface, is not read": (
-        'name="box"',
-        'name="box" shellinertia="true"',
+    "two_anchors": (
+        (
+            f"{LIFT}\n{YAW}",
+            f"{YAW}\n{YAW}".replace('"yaw"', '"roll"', 1).replace("0 1 0", "1 0 0", 1).replace("0.03", "0.1", 1),
+        ),
+        "joints with different pos (body 'mast')",
+        "give each joint a body of its own",
+    ),
+    "ref": (('name="nod"', 'name="nod" ref="0.5"'), "a joint's ref (body 'tip')", "subtract it from range"),
+    "shell": (
+        ('name="box"', 'name="box" shellinertia="true"'),
+        "a geom's shellinertia (body 'base')",
+        "write the <inertial> of its body",
+    ),
+    "total": (
+        ("<compiler ", '<compiler settotalmass="2" '),
+        "<compiler settotalmass> (body 'base', 'mast', 'head', 'tip', 'pin')",
+        "Scene.with_values",
     ),
 }
-"""What Newton 1.8 makes of MJCF without a word -> the part of the probe and what shows it."""
+"""Name -> a change of the probe that Newton 1.8 misreads without a word, the refusal, and a part of its way out."""
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        pytest.param(*change, marks=pytest.mark.xfail(strict=True, raises=AssertionError, reason=reason))
-        for reason, change in IMPORTER_DEFECTS.items()
-    ],
-    ids=["hinge_before_slide", "two_anchors", "ref", "shell"],
-)
-def test_newton_misreads(old, new, tmp_path, device):
-    """An expected failure each; one that passes says that Newton has learnt it and its line can go."""
-    path = tmp_path / "probe.xml"
+def changed_probe(folder, old, new):
     if old not in MJCF:
         pytest.fail(f"the probe lacks {old!r}", pytrace=False)
+    path = folder / "probe.xml"
     path.write_text(MJCF.replace(old, new))
+    return path
+
+
+@pytest.mark.parametrize("name", MISREAD)
+def test_what_newton_misreads_is_refused(name, tmp_path):
+    change, feature, way_out = MISREAD[name]
+    path = changed_probe(tmp_path, *change)
+    with pytest.raises(spo.UnsupportedError) as caught:
+        spo.load(path)
+    assert str(caught.value).startswith(f"load: {str(path)!r} with {feature} is not supported; ")
+    assert way_out in str(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
+@pytest.mark.parametrize("name", MISREAD)
+def test_newton_misreads(name, tmp_path, monkeypatch, device):
+    """Without the refusal the scene is another robot. A failure says that Newton has learnt it: the refusal can go."""
+    path = changed_probe(tmp_path, *MISREAD[name][0])
+    monkeypatch.setattr("warp_spo.newton.mjcf_misread", lambda root, floating: {})
     scene = spo.load(path)
+    with pytest.raises(AssertionError):
+        file_agrees(scene, ParsedMjcf(scene, path), device)
+
+
+def test_a_hinge_on_a_body_of_its_own_before_a_slide(tmp_path, device):
+    """The way out. MuJoCo wants a mass of every body that moves."""
+    weight = '<inertial pos="0 0 0" mass="1e-6" diaginertia="1e-6 1e-6 1e-6"/>'
+    path = changed_probe(tmp_path, f"{LIFT}\n{YAW}", f'{YAW}{weight}<body name="upper">\n{LIFT}')
+    path.write_text(path.read_text().replace("</worldbody>", "</body></worldbody>"))
+    scene = spo.load(path)
+    assert scene.body_count == 6
     file_agrees(scene, ParsedMjcf(scene, path), device)
 
 

@@ -19,7 +19,15 @@ from newton import JointType
 
 from .errors import DirectedLoopError, UnsupportedError
 from .parts import DOF_VALUES, UNLIMITED, Body, Coupling, Hinge, Loop
-from .robot_files import mjcf_gravity, mjcf_tree, mjcf_weighs_by_mesh, robot_format, urdf_source
+from .robot_files import (
+    MISREAD,
+    mjcf_gravity,
+    mjcf_misread,
+    mjcf_tree,
+    mjcf_weighs_by_mesh,
+    robot_format,
+    urdf_source,
+)
 from .scene import Scene
 
 KINDS = {
@@ -446,6 +454,8 @@ def load(path: str | os.PathLike, floating: bool | None = None) -> Scene:
         ValueError: a suffix, or contents, that no importer reads.
         ImportError: a package for meshes or USD is missing; names the extra that installs it.
         UnsupportedError, DirectedLoopError: as :func:`from_newton`.
+        UnsupportedError: MJCF that Newton 1.8 misreads: in one body a slide after a hinge or joints with different
+            ``pos``, a joint's ``ref``, ``shellinertia`` where shapes give the mass, ``settotalmass``.
 
     Warns:
         UserWarning: Newton replaced a mass or an inertia that no rigid body has; names the bodies.
@@ -497,6 +507,11 @@ def _read_urdf(file: Path, floating: bool | None) -> newton.ModelBuilder:
 
 def _read_mjcf(file: Path, floating: bool | None) -> newton.ModelBuilder:
     root = mjcf_tree(file)
+    misread = mjcf_misread(root, floating)
+    if misread:
+        features = [f"{feature} (body {_names(bodies)})" for feature, bodies in misread.items()]
+        ways_out = dict.fromkeys(MISREAD[feature] for feature in misread)
+        raise UnsupportedError("load", f"{str(file)!r} with {', '.join(features)}", "; ".join(ways_out))
 
     def import_with(parse_mujoco_options: bool) -> newton.ModelBuilder:
         builder = newton.ModelBuilder()

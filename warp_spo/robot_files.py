@@ -2,13 +2,14 @@
 
 A scene has masses and hinges, no pictures and no contacts. URDF text is stripped of shapes that weigh nothing, so that
 neither their meshes nor a mesh library is asked for; an MJCF tree, its includes pasted in, is asked whether masses come
-from meshes, and for the gravity that Newton's importer does not read. Nothing here knows Newton.
+from meshes, for the gravity that Newton's importer does not read, and for what it misreads. Nothing here imports it.
 """
 
 from __future__ import annotations
 
 import os
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from pathlib import Path
 
 FORMATS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf"} | dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "usd")
@@ -119,3 +120,98 @@ def mjcf_gravity(root: ET.Element) -> list[float] | None:
         return [0.0, 0.0, 0.0]
     options = root.findall("option[@gravity]")
     return [float(g) for g in options[-1].get("gravity", "").split()] if options else None
+
+
+SOLIDS = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
+APART = "give each joint a body of its own, nested in the order of the joints"
+MISREAD = {
+    "a slide after a hinge or ball": APART,
+    "joints with different pos": APART,
+    "a joint's ref": "remove ref and subtract it from range and springref (0 if absent): q then counts from the "
+    "pose that the file draws",
+    "a geom's shellinertia": "write the <inertial> of its body",
+    "<compiler settotalmass>": "remove settotalmass and scale body_mass and body_inertia (Scene.with_values)",
+}
+"""What Newton 1.8's importer reads wrongly without a word -> a way out."""
+
+
+def mjcf_misread(root: ET.Element, floating: bool | None) -> dict[str, list[str]]:
+    """The keys of :data:`MISREAD` that change the robot of the MJCF tree -> the bodies that use them.
+
+    One hinge stands for all joints of a body: it slides before it turns, and about the first joint's ``pos``. A slide's
+    own ``pos`` changes nothing, nor do the joints of a root body if ``floating`` replaces them.
+    """
+    compiler = {name: value for element in root.iter("compiler") for name, value in element.items()}
+    by_geom = compiler.get("inertiafromgeom", "auto")
+    low, high = (int(group) for group in compiler.get("inertiagrouprange", "0 5").split())
+    classes = _mjcf_classes(root)
+    found: dict[str, list[str]] = {feature: [] for feature in MISREAD}
+    slide_after, anchors, ref, shell, total = found.values()
+    rescaled = float(compiler.get("settotalmass", -1)) > 0.0
+
+    def weighs(geom: dict[str, str]) -> bool:
+        solid = geom.get("type", "sphere") in SOLIDS and low <= int(geom.get("group", 0)) <= high
+        return solid and float(geom.get("mass", geom.get("density", 1000))) != 0.0
+
+    def visit(holder: ET.Element, childclass: str, label: str, replaced: bool) -> None:
+        members = list(_mjcf_members(holder, childclass))
+        tags = {child.tag for child, _ in members}
+        if holder.tag == "body":
+            joints, geoms = (
+                [
+                    classes.get(child.get("class", default), {}).get(tag, {}) | child.attrib
+                    for child, default in members
+                    if child.tag == tag
+                ]
+                for tag in ("joint", "geom")
+            )
+            kinds = [joint.get("type", "hinge") for joint in joints if not replaced]
+            turns = [i for i, kind in enumerate(kinds) if kind in ("hinge", "ball")]
+            pos = [[float(x) for x in joint.get("pos", "0 0 0").split()] for joint in joints]
+            if turns and "slide" in kinds[turns[0] :]:
+                slide_after.append(label)
+            if any(pos[i] != pos[0] for i in turns):
+                anchors.append(label)
+            if any(k in ("hinge", "slide") and float(j.get("ref", 0)) for k, j in zip(kinds, joints, strict=False)):
+                ref.append(label)
+            if by_geom == "true" or (by_geom == "auto" and "inertial" not in tags):
+                if any(geom.get("shellinertia") == "true" and weighs(geom) for geom in geoms):
+                    shell.append(label)
+            if rescaled:
+                total.append(label)
+        for child, default in members:
+            if child.tag == "body":
+                name = child.get("name", f"{label}/(no name)")
+                visit(child, default, name, holder.tag == "worldbody" and floating is not None)
+
+    for world in root.findall("worldbody"):
+        visit(world, "main", "world", False)
+    return {feature: bodies for feature, bodies in found.items() if bodies}
+
+
+def _mjcf_classes(root: ET.Element) -> dict[str, dict[str, dict[str, str]]]:
+    """Default class, "main" for the outermost -> tag -> attributes."""
+    classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
+
+    def read(default: ET.Element, name: str, outer: str) -> None:
+        own = dict(classes[outer])
+        for element in default:
+            if element.tag != "default":
+                own[element.tag] = own.get(element.tag, {}) | element.attrib
+        classes[name] = own
+        for element in default.findall("default"):
+            read(element, element.get("class", name), name)
+
+    for default in root.findall("default"):
+        read(default, "main", "main")
+    return classes
+
+
+def _mjcf_members(holder: ET.Element, childclass: str) -> Iterator[tuple[ET.Element, str]]:
+    """Children of a body, those of its frames included, and the default class that they inherit."""
+    childclass = holder.get("childclass", childclass)
+    for child in holder:
+        if child.tag == "frame":
+            yield from _mjcf_members(child, childclass)
+        else:
+            yield child, childclass
