@@ -623,6 +623,7 @@ def test_mjcf_gravity_that_is_switched_off(tmp_path):
     [
         "examples/assets/nv_humanoid.xml",
         "examples/assets/nv_ant.xml",
+        "examples/assets/tabletop.xml",
         "tests/assets/constraints.xml",
         "tests/assets/mjcf_exclude_test.xml",
         "tests/assets/mjcf_exclude_hyphen_test.xml",
