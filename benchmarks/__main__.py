@@ -1,66 +1,162 @@
-"""Run ``python -m benchmarks [FILTER]``: check against the dense reference, time, print ``case.metric value``."""
+"""Run ``python -m benchmarks [FILTER]``: check against the dense reference, time, print ``case.metric value``.
+
+``--all --json benchmarks/results/`` measures everything that the README shows, ``--readme`` puts it there, ``--report``
+writes one HTML page.
+"""
 
 import argparse
+import itertools
 import sys
 from pathlib import Path
+from typing import Any
 
 import warp as wp
 
+from warp_spo import report as pages
 from warp_spo.__main__ import find_device
-from warp_spo.operations import TOLERANCE
 
-from . import runner, table
-from .cases import DTYPES, WORLDS, case_name, cases
+from . import cases as data
+from . import evidence, pictures, report, roofline, runner, table
+from .cases import case_name
+from .precisions import PRECISIONS
+
+ALLOWED = 0.05  # two runs on one machine differ by less, for cases of 20 us or more
+SHOWN = 10  # differences that --compare prints
 
 
 def parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    text = argparse.RawDescriptionHelpFormatter
+    p = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__, formatter_class=text)
     p.add_argument("filter", nargs="?", default="", help="regular expression, such as humanoid.forward or phi.*float32")
     p.add_argument("--device", help="Warp device; default: the current one")
-    p.add_argument("--worlds", type=int, nargs="+", default=WORLDS, metavar="N", help="world counts")
-    p.add_argument("--dtype", nargs="+", default=DTYPES, choices=DTYPES, help="precisions")
+    p.add_argument(
+        "--worlds", type=int, nargs="+", metavar="N", help=f"world counts; default: {data.WORLDS[0]}, or on a CPU "
+        f"{data.CPU_WORLDS[0]}"
+    )  # fmt: skip
+    p.add_argument("--dtype", nargs="+", choices=PRECISIONS, metavar="P", help=f"precisions: {', '.join(PRECISIONS)}")
+    names = [name for name in data.GRANULARITIES if name]
+    p.add_argument("--granularity", nargs="+", choices=names, metavar="G", help="default: what the plan chooses")
+    p.add_argument(
+        "--all", action="store_true", help="every precision and granularity, growing sizes, and the stress suite"
+    )
     p.add_argument("--check", action="store_true", help="compare with the reference, time nothing")
     p.add_argument("--json", type=Path, metavar="OUT", help="write the run to this file, or by date into this folder")
+    p.add_argument("--report", type=Path, metavar="DIR", help="write the run as one page, DIR/report.html")
+    p.add_argument(
+        "--from", type=Path, nargs="+", dest="source", metavar="JSON", help="report these files or folders, run nothing"
+    )
     p.add_argument("--table", type=Path, metavar="JSON", help="print the Markdown table of a run, and run nothing")
+    p.add_argument("--compare", type=Path, nargs=2, metavar=("A", "B"), help="how far two runs lie apart; run nothing")
     p.add_argument(
         "--readme",
         nargs="?",
         type=Path,
-        const=table.RESULTS,
+        const=evidence.RESULTS,
         metavar="JSON",
-        help="put the table of a run (default: the newest in benchmarks/results) into README.md, and run nothing",
+        help="put tables and pictures of a file or folder (default: benchmarks/results) into README.md; run nothing",
     )
     return p
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Returns 0; 1 if an error is beyond its tolerance, 2 for a mistake of the caller."""
+    """Returns 0; 1 if an error is beyond its tolerance or two runs differ, 2 for a mistake of the caller."""
     options = parser().parse_args(argv)
     wp.config.log_level = wp.LOG_WARNING
     try:
         if options.table:
-            print(table.markdown(table.read(options.table)), end="")
+            (one,) = evidence.gather([evidence.read(options.table)])
+            print(*one.sources, table.markdown(one), sep="\n\n", end="")
             return 0
+        if options.compare:
+            return compare(*options.compare)
+        pyplot = pages.load_pyplot() if options.report or options.readme else None
         if options.readme:
-            newest = options.readme == table.RESULTS
-            table.rewrite(table.ROOT / "README.md", table.read(None if newest else options.readme))
+            write_readme(pyplot, options.readme)
             return 0
-        chosen, rows = cases(options.filter, options.worlds, options.dtype), []
-        find_device(options.device)
-    except (ValueError, RuntimeError) as error:
+        if options.source:
+            if not options.report:
+                raise ValueError("benchmarks: --from reports files that are there; say where to with --report DIR")
+            runs = [evidence.read(file) for file in evidence.files(options.source)]
+            print(f"wrote {report.write(pyplot, evidence.gather(runs), options.report)}", file=sys.stderr)
+            return 0
+        device = find_device(options.device)
+        chosen = choose(options, device.is_cuda)
+    except (ValueError, RuntimeError, ImportError) as error:
         print(error, file=sys.stderr)
         return 2
+    return measure(chosen, options, device, pyplot)
+
+
+def choose(options: Any, cuda: bool) -> list[dict]:
+    """The cases that are asked for.
+
+    Raises:
+        ValueError: there are none.
+    """
+    worlds = options.worlds or (data.WORLDS if cuda else data.CPU_WORLDS)
+    dtypes = options.dtype or (tuple(PRECISIONS) if options.all else data.DTYPES)
+    granularities = options.granularity or (data.GRANULARITIES if options.all else (None,))
+    return data.cases(options.filter, worlds, dtypes, granularities, options.all, cuda)
+
+
+def measure(chosen: list[dict], options: Any, device: wp.Device, pyplot: Any) -> int:
+    """Run, print, write; returns the exit code."""
+    roof = None if options.check else roofline.measure(device)
+    rows: list[dict] = []
+    stressed: list[dict] = []
     try:
-        for row in runner.run(chosen, options.device, options.check):
+        for row in runner.run(chosen, device, options.check, roof):
             rows.append(row)
             print("\n".join(runner.lines(row)), flush=True)
+        if options.all:
+            stressed += stress_rows(options.filter, device, not options.check)
     finally:  # what was measured before an interrupt or an error is kept
+        run = runner.record(rows, device, roof) | (dict(stress=stressed) if stressed else {})
         if options.json and rows:
-            print(f"wrote {runner.save(runner.record(rows, options.device), options.json)}", file=sys.stderr)
-    failed = [case_name(row) for row in rows if not row["error"] <= TOLERANCE[row["dtype"]]]
+            print(f"wrote {runner.save(run, options.json)}", file=sys.stderr)
+        if options.report and rows:
+            print(f"wrote {report.write(pyplot, evidence.gather([run]), options.report)}", file=sys.stderr)
+    failed = [case_name(row) for row in rows if not row["error"] <= runner.tolerance(row)]
     if failed:
         print(f"benchmarks: the error is NaN or beyond its tolerance in {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0
+
+
+def stress_rows(pattern: str, device: wp.Device, timed: bool) -> list[dict]:
+    """Rows of the stress suite; its verdicts are shown, ``python -m benchmarks.stress`` is who fails for them."""
+    try:
+        from . import stress
+        from .stress_cases import choose
+    except ImportError as error:
+        print(f"skipped the stress suite: {error}; pip install warp_spo[test]", file=sys.stderr)
+        return []
+    found = itertools.chain(stress.rows(choose(pattern, slow=False), device, timed), stress.check_rows(pattern, device))
+    return list(found)
+
+
+def write_readme(pyplot: Any, source: Path) -> None:
+    """Tables into README.md, pictures beside the results.
+
+    Raises:
+        ValueError: there is no run, or no place in the README.
+    """
+    found = evidence.gather(evidence.read(file) for file in evidence.files([source]))
+    table.rewrite(table.ROOT / "README.md", table.readme(found))
+    for name, figure in zip(table.PICTURES, (pictures.headline, pictures.scaling), strict=True):
+        drawn = figure(pyplot, found[0])
+        if drawn is not None:
+            (table.RESULTS / name).write_text(pages.svg(drawn))
+            pyplot.close(drawn)
+
+
+def compare(a: Path, b: Path) -> int:
+    """Print the largest differences of two runs; 1 if one is beyond ``ALLOWED``."""
+    found = evidence.compare(evidence.read(a), evidence.read(b))
+    for difference, x, y in found[:SHOWN]:
+        print(f"{difference:6.1%}  {x['us']:10.4g} us  {y['us']:10.4g} us  {case_name(x)}")
+    beyond = sum(difference > ALLOWED for difference, _, _ in found)
+    print(f"{len(found)} cases of 20 us or more; {beyond} differ by more than {ALLOWED:.0%}")
+    return 1 if beyond else 0
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
-"""Benchmark cases are data: a scene, an operation, a number of worlds and a precision."""
+"""Benchmark cases are data: a scene, an operation, a number of worlds, a precision and a granularity."""
 
+import dataclasses
 import functools
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,8 +11,14 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.operations import OPERATIONS
 
+from . import robots
+from .precisions import PRECISIONS
+from .shapes import SHAPES
+
 WORLDS = (4096,)
+CPU_WORLDS = (1024,)  # one core works on them one after the other
 DTYPES = ("float32", "float64")
+GRANULARITIES = (None, "node", "segment", "tree")  # None: what the plan chooses
 
 
 def arm() -> spo.Scene:
@@ -34,25 +42,84 @@ SCENES = {
     "ant": functools.partial(_shipped, "ant"),
     "quadruped": functools.partial(_shipped, "quadruped", floating=True),
     "humanoid": functools.partial(_shipped, "humanoid"),
-}
-"""Name -> scene factory."""
+} | {name: functools.partial(robots.scene, name) for name in robots.ROBOTS}
+"""Name -> scene factory. Released robots raise ImportError where the extra ``robots`` is not installed."""
 
 
-def cases(pattern: str = "", worlds: Any = WORLDS, dtypes: Any = DTYPES) -> list[dict]:
+FACTORIES = SCENES | SHAPES
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """Scenes or world counts that grow, in float32.
+
+    Attributes:
+        name: of what grows.
+        scenes: names.
+        worlds: world counts on a GPU.
+        cpu_worlds: on a CPU.
+        granularity: None is the plan's choice.
+    """
+
+    name: str
+    scenes: Sequence[str]
+    worlds: Sequence[int]
+    cpu_worlds: Sequence[int]
+    granularity: str | None = None
+
+
+def _family(name: str) -> list[str]:
+    return [scene for scene in SHAPES if scene.startswith(f"{name}_")]
+
+
+SWEEPS = (
+    Sweep("worlds", ("arm7", "humanoid"), [4**k for k in range(11)], [4**k for k in range(7)]),
+    # node: the one granularity that needs no compilation for a scene, however large
+    *(Sweep(name, _family(name), (1024,), (4,), "node") for name in ("chain", "tree", "deep", "branching")),
+)
+SWEPT = ("forward_dynamics", "inverse_dynamics")
+PEERS_WORLDS = (1, 128, 65536), (1, 128)  # on a GPU, on a CPU: where peers are measured too, beside the usual count
+SAMPLE, FEWER = 16, 4  # worlds of each set of inputs that are compared with the reference: usually, and beside it
+PEERS_OPERATIONS = ("forward_dynamics", "inverse_dynamics", "mass_matrix")
+
+
+def cases(
+    pattern: str = "",
+    worlds: Any = WORLDS,
+    dtypes: Any = DTYPES,
+    granularities: Any = (None,),
+    sweeps: bool = False,
+    cuda: bool = True,
+) -> list[dict]:
     """Cases of all scenes and operations whose ``case_name`` holds a match of the regular expression ``pattern``.
+
+    A released robot that is not at hand is left out unless ``pattern`` names it. With ``sweeps`` there follow the world
+    counts at which peers are measured, and the cases of :data:`SWEEPS`, at the sizes for a GPU or a CPU.
 
     Raises:
         ValueError: no case does, naming what there is; or a world count below one.
     """
     if min(worlds) < 1:
         raise ValueError(f"benchmarks: --worlds has {min(worlds)}; expected one or more")
+    further = [count for count in PEERS_WORLDS[not cuda] if sweeps and count not in worlds]
     every = [
-        dict(name=f"{scene}.{op}", scene=scene, worlds=count, op=op, dtype=dtype)
+        _case(scene, count, op, dtype, granularity, FEWER if count in further else SAMPLE)
         for scene in SCENES
-        for count in worlds
+        if scene not in robots.ROBOTS or scene in pattern or robots.at_hand(scene)
+        for count in [*worlds, *(further if scene in robots.ROBOTS else [])]
         for dtype in dtypes
-        for op in OPERATIONS
+        for granularity in granularities
+        for op in PRECISIONS[dtype].operations
+        if count not in further or op in PEERS_OPERATIONS
     ]
+    if sweeps:
+        every += [
+            _case(scene, count, op, "float32", sweep.granularity, FEWER) | dict(sweep=sweep.name)
+            for sweep in SWEEPS
+            for scene in sweep.scenes
+            for count in (sweep.worlds if cuda else sweep.cpu_worlds)
+            for op in SWEPT
+        ]
     try:
         chosen = [case for case in every if re.search(pattern, case_name(case))]
     except re.error as error:
@@ -66,6 +133,12 @@ def cases(pattern: str = "", worlds: Any = WORLDS, dtypes: Any = DTYPES) -> list
     return chosen
 
 
+def _case(scene: str, worlds: int, op: str, dtype: str, granularity: str | None, sample: int) -> dict:
+    case = dict(name=f"{scene}.{op}", scene=scene, worlds=worlds, op=op, dtype=dtype, granularity=granularity)
+    return case | dict(sample=sample)
+
+
 def case_name(case: dict) -> str:
-    """Such as ``humanoid.forward_dynamics.float32.w4096``."""
-    return f"{case['name']}.{case['dtype']}.w{case['worlds']}"
+    """Such as ``humanoid.forward_dynamics.float32.w4096``, and behind it ``.node`` where that was asked for."""
+    asked = case.get("granularity") and not case.get("chosen")
+    return f"{case['name']}.{case['dtype']}.w{case['worlds']}" + (f".{case['granularity']}" if asked else "")

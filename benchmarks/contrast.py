@@ -117,4 +117,5 @@ FORMS: dict[str, Callable] = {
     "subtracted offsets": functools.partial(_sweep, change=subtracted),
     "world origin": functools.partial(_sweep, change=world_origin),
     "square root": square_root,
+    "float32 sum": _sweep,
 }

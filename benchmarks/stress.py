@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import re
 import sys
 from collections.abc import Iterable, Iterator
@@ -13,34 +14,42 @@ import warp as wp
 
 from . import runner
 from .stress_cases import Case, choose
-from .stress_checks import CHECKS
+from .stress_checks import CHECKS, READS_PIVOTS
 from .stress_measure import Subject, contrasts, row
+from .stress_scenes import Setting
 
-HEADS = ("case", "precision", "max error", "median", "law", "x law", "backward", "min D/tr P", "status", "us/world",
+HEADS = ("case", "precision", "max error", "median", "law", "x law", "backward", "min D/tr P", "status", "ns/world",
          "verdict", "law is", "from", "against")
 WIDTHS = (36, 18, 9, 8, 8, 7, 8, 10, 10, 8, 8, 22, 26, 8)
 
 
-def rows(cases: Iterable[Case], device: Any = None, timed: bool = True) -> Iterator[dict]:
-    """Yield a row for each case and precision, and for each form for contrast."""
+def rows(cases: Iterable[Case], device: Any = None, timed: bool = True, granularity: str | None = None) -> Iterator[dict]:
+    """Yield a row for each case and precision, and for each form for contrast.
+
+    A case that reads D where the recursions leave it runs at granularity "node" alone.
+    """
     for case in cases:
-        subject = Subject(case.problem, device)
+        if case.reads_pivots and granularity not in (None, "node"):
+            continue
+        subject = Subject(case.problem, device, "node" if case.reads_pivots else granularity)
         for precision in case.shown:
             yield row(case, subject, precision, timed)
         yield from contrasts(case)
 
 
-def check_rows(pattern: str, device: Any = None) -> Iterator[dict]:
+def check_rows(pattern: str, device: Any = None, granularity: str | None = None) -> Iterator[dict]:
     """Yield a row for each check whose name holds a match, and precision."""
     for name, (check, source) in CHECKS.items():
+        if not re.search(pattern, name) or (name in READS_PIVOTS and granularity not in (None, "node")):
+            continue
         for dtype in ("float32", "float64"):
-            if re.search(pattern, name):
-                try:
-                    check(device, dtype)
-                    verdict, why = "ok", ""
-                except AssertionError as error:
-                    verdict, why = "FAILS", str(error).strip()
-                yield dict(case=name, parameters={}, precision=dtype, source=source, verdict=verdict, why=why)
+            try:
+                check(Setting(device, dtype, "node" if name in READS_PIVOTS else granularity))
+                verdict, why = "ok", ""
+            except AssertionError as error:
+                verdict, why = "FAILS", str(error).strip()
+            yield dict(case=name, parameters={}, precision=dtype, granularity=granularity, source=source,
+                       verdict=verdict, why=why)
 
 
 def line(found: dict) -> str:
@@ -53,7 +62,7 @@ def line(found: dict) -> str:
     if "status" in found:
         status = "0" if not found["flagged"] else f"{max(found['status'])} in {found['flagged']}"
     cells = (name, found["precision"], number("max_error"), number("median_error"), number("law"),
-             number("ratio", ".2g"), number("backward_error"), number("pivot"), status, number("us", ".3g"),
+             number("ratio", ".2g"), number("backward_error"), number("pivot"), status, number("ns", ".3g"),
              found["verdict"], found.get("formula", ""), found.get("source", ""), found.get("reference", ""))
     return "  ".join(f"{cell:<{width}}" for cell, width in zip(cells, WIDTHS, strict=True)).rstrip()
 
@@ -63,6 +72,7 @@ def main(argv: list[str] | None = None) -> int:
     p = argparse.ArgumentParser(prog="python -m benchmarks.stress", description=__doc__)
     p.add_argument("filter", nargs="?", default="", help="regular expression, such as S1[1-3] or gimbal.*delta0.001")
     p.add_argument("--device", help="Warp device; default: the current one")
+    p.add_argument("--granularity", help="of the library's recursions; default: what the plan chooses")
     p.add_argument("--slow", action="store_true", help="the long sizes too")
     p.add_argument("--check", action="store_true", help="time nothing")
     p.add_argument("--json", type=Path, metavar="OUT", help="write the run to this file, or by date into this folder")
@@ -76,10 +86,14 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     found: list[dict] = []
     print("  ".join(f"{head:<{width}}" for head, width in zip(HEADS, WIDTHS, strict=True)))
-    for one in (r for part in (rows(cases, options.device, not options.check),
-                               check_rows(options.filter, options.device)) for r in part):
-        found.append(one)
-        print(line(one), flush=True)
+    where = options.device, options.granularity
+    try:
+        for one in itertools.chain(rows(cases, where[0], not options.check, where[1]), check_rows(options.filter, *where)):
+            found.append(one)
+            print(line(one), flush=True)
+    except ValueError as error:  # of --granularity
+        print(error, file=sys.stderr)
+        return 2
     if not found:
         print(f"stress: no case matches {options.filter!r}", file=sys.stderr)
         return 2

@@ -37,6 +37,22 @@ class Problem:
         return len(self.q)
 
 
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """Where a check runs: Warp device, "float32" or "float64", and granularity, None being what the plan chooses."""
+
+    device: Any = None
+    dtype: str = "float32"
+    granularity: str | None = None
+
+    @property
+    def eps(self) -> float:
+        return {"float32": 2.0**-23, "float64": 2.0**-52}[self.dtype]
+
+    def dynamics(self, scene: spo.Scene, worlds: int, **options: Any) -> spo.Dynamics:
+        return spo.Dynamics(scene, worlds, self.device, self.dtype, granularity=self.granularity, **options)
+
+
 def rounded(array: Any) -> np.ndarray:
     return np.asarray(array, dtype=np.float32).astype(np.float64)
 

@@ -1,67 +1,84 @@
-"""The README's Markdown tables, from the JSON file of a run."""
+"""The README's tables, from the JSON files of runs."""
 
-import json
+from __future__ import annotations
+
+from collections.abc import Sequence
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
-RESULTS = ROOT / "benchmarks" / "results"
+from warp_spo.operations import OPERATIONS
+
+from .cases import SCENES
+from .evidence import RESULTS, ROOT, Evidence, usual_worlds
+
 BEGIN, END = "<!-- benchmarks:begin -->", "<!-- benchmarks:end -->"
+PICTURES = {"error-time.svg": "error against run time", "scaling.svg": "run time against size"}
+HEADLINE = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "solve_mass_matrix")
 
 
-def read(path: Path | None = None) -> dict:
-    """The run in a JSON file; None: the newest under benchmarks/results.
+def plain(evidence: Evidence) -> list[dict]:
+    """Rows of the tables: robots, in one scalar type, at the granularity that the plan chose, or else the fastest."""
+    best: dict[tuple, dict] = {}
+    for row in evidence.rows:
+        key = tuple(row[name] for name in ("scene", "op", "worlds", "dtype"))
+        if not row.get("sweep") and row["dtype"] in ("float32", "float64"):
+            best[key] = min(best.get(key, row), row, key=lambda row: (not row.get("chosen", True), row.get("us", 0.0)))
+    order = {name: i for i, name in enumerate([*SCENES, *OPERATIONS])}
+    return sorted(best.values(), key=lambda row: [order.get(row[name], len(order)) for name in ("scene", "op")])
 
-    Raises:
-        ValueError: no such file, or one that no run wrote.
+
+def markdown(evidence: Evidence, operations: Sequence[str] | None = None) -> str:
+    """A table for each world count: operations (default: all) by robots.
+
+    A cell is the run time of one evaluation of all worlds [us], in float32 and in float64; then come the largest error
+    of the line in each, NaN if any is, and the largest share of the roof in float32.
     """
-    if path is None:
-        found = sorted(RESULTS.glob("*.json"))
-        if not found:
-            raise ValueError(f"benchmarks: no JSON in {RESULTS}; python -m benchmarks --json {RESULTS} makes one")
-        path = found[-1]
-    try:
-        data = json.loads(Path(path).read_text())
-        data["rows"], data["machine"]["device"]
-    except OSError as error:
-        raise ValueError(f"benchmarks: cannot read {str(path)!r}: {error.strerror}; expected a run's JSON") from None
-    except (ValueError, KeyError, TypeError):
-        raise ValueError(f"benchmarks: {str(path)!r} is not the JSON of a run, as --json writes it") from None
-    return data
-
-
-def markdown(data: dict) -> str:
-    """Where the numbers come from, then a table for each precision and world count: operations by robots.
-
-    A cell is the run time of one evaluation of all worlds [µs]; the last column is the largest error of the line, NaN
-    if any is.
-    """
-    rows = data["rows"]
-    found = ", ".join(f"{name} {version}" for name, version in data["versions"].items())
-    text = [f"{data['machine']['device']}, commit {data['commit'][:12]}, {data['date'][:10]}, {found}."]
-    for dtype, worlds in dict.fromkeys((row["dtype"], row["worlds"]) for row in rows):
-        mine = [row for row in rows if (row["dtype"], row["worlds"]) == (dtype, worlds)]
+    rows = [row for row in plain(evidence) if operations is None or row["op"] in operations]
+    text: list[str] = []
+    for worlds in dict.fromkeys(row["worlds"] for row in rows):
+        mine = [row for row in rows if row["worlds"] == worlds]
+        dtypes = list(dict.fromkeys(row["dtype"] for row in mine))
         robots = {row["scene"]: row["dof"] for row in mine}
         names = [f"{robot} ({dof} dof)" for robot, dof in robots.items()]
-        heads = [f"µs, {dtype}, {worlds} worlds", *names, "error"]
-        text += ["", "| " + " | ".join(heads) + " |", "|---|" + "---:|" * (len(robots) + 1)]
+        heads = [f"µs, {worlds} worlds, {' / '.join(dtypes)}", *names, "largest error", "of the roof"]
+        text += ["", "| " + " | ".join(heads) + " |", "|---|" + "---:|" * (len(heads) - 1)]
         for op in dict.fromkeys(row["op"] for row in mine):
-            line = {row["scene"]: row for row in mine if row["op"] == op}
-            errors = [row["error"] for row in line.values()]
-            error = max(errors) if all(e == e for e in errors) else float("nan")
-            cells = [f"`{op}`", *(_time(line.get(robot)) for robot in robots), f"{error:.1e}"]
+            line = {(row["scene"], row["dtype"]): row for row in mine if row["op"] == op}
+            times = [" / ".join(time(line.get((robot, dtype))) for dtype in dtypes) for robot in robots]
+            errors = [[row["error"] for row in line.values() if row["dtype"] == dtype] for dtype in dtypes]
+            shares = [row["roof"] for (_, dtype), row in line.items() if "roof" in row and dtype == dtypes[0]]
+            roof = f"{100.0 * max(shares):.2g} %" if shares else "–"
+            cells = [f"`{op}`", *times, " / ".join(f"{worst(each):.1e}" for each in errors), roof]
             text.append("| " + " | ".join(cells) + " |")
-    return "\n".join(text) + "\n"
+    return "\n".join(text[1:]) + "\n" if text else ""
 
 
-def _time(row: dict | None) -> str:
+def worst(errors: Sequence[float]) -> float:
+    """The largest, NaN if any is, or if there is none."""
+    return max(errors) if errors and all(error == error for error in errors) else float("nan")
+
+
+def time(row: dict | None) -> str:
     """Three digits, such as 3.17, 21.6 or 1363."""
     if row is None or "us" not in row:
         return "–"
     return f"{row['us']:.{max(0, 3 - len(str(int(row['us']))))}f}"
 
 
-def rewrite(readme: Path, data: dict) -> None:
-    """Put the table between the two marker comments of ``readme``.
+def readme(everything: Sequence[Evidence]) -> str:
+    """What stands between the markers: every machine with its table, under the first one the pictures."""
+    text = []
+    for evidence in everything:
+        worlds = usual_worlds(plain(evidence))
+        shown = evidence._replace(rows=[row for row in evidence.rows if row["worlds"] == worlds])
+        text += [*evidence.sources, "", markdown(shown, None if evidence is everything[0] else HEADLINE)]
+        if evidence is everything[0]:
+            folder = RESULTS.relative_to(ROOT).as_posix()
+            text += [f"![{what}]({folder}/{name})" for name, what in PICTURES.items()] + [""]
+    return "\n".join(text).rstrip("\n") + "\n"
+
+
+def rewrite(readme: Path, block: str) -> None:
+    """Put ``block`` between the two marker comments of ``readme``.
 
     Raises:
         ValueError: no such file, or not one of each marker, in order.
@@ -73,4 +90,4 @@ def rewrite(readme: Path, data: dict) -> None:
     _, end, tail = rest.partition(END)
     if not (begin and end) or BEGIN in tail or END in tail:
         raise ValueError(f"benchmarks: {str(readme)!r} does not hold {BEGIN} and then {END}, once; put them there")
-    readme.write_text(f"{head}{BEGIN}\n{markdown(data)}{END}{tail}")
+    readme.write_text(f"{head}{BEGIN}\n{block}{END}{tail}")

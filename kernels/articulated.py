@@ -233,41 +233,4 @@ def weighted_product(T) -> wp.Kernel:
     return kernel
 
 
-@functools.cache
-def status(T) -> wp.Kernel:
-    """A word for each world: 1 = some pivot of D is not positive, 2 = an input is not finite."""
-
-    @wp.kernel(module=f"warp_spo_articulated_{T.__name__}", enable_backward=False)
-    def kernel(
-        pivot: wp.array2d[T],
-        q: wp.array2d[T],
-        qd: wp.array2d[T],
-        tau: wp.array2d[T],
-        body_f: wp.array3d[T],
-        status_out: wp.array[wp.int32],
-    ):
-        world = wp.tid()
-        finite = bool(True)
-        for i in range(q.shape[1]):
-            finite = finite and wp.isfinite(q[world, i])
-        for dof in range(pivot.shape[0]):
-            if qd:
-                finite = finite and wp.isfinite(qd[world, dof])
-            if tau:
-                finite = finite and wp.isfinite(tau[world, dof])
-        if body_f:
-            for body in range(body_f.shape[1]):
-                for c in range(6):
-                    finite = finite and wp.isfinite(body_f[world, body, c])
-        word = int(0)
-        if not finite:
-            word = 2
-        else:
-            for dof in range(pivot.shape[0]):
-                if wp.isnan(pivot[dof, world]):
-                    word = 1
-        status_out[world] = word
-
-    return kernel
-
-KERNELS = (factor, reduce, expand, log_determinant, weighted_product, status)
+KERNELS = (factor, reduce, expand, log_determinant, weighted_product)

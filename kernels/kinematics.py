@@ -14,8 +14,9 @@ SCREWS, BALL, FREE = wp.constant(0), wp.constant(1), wp.constant(2)
 def hinge(T) -> wp.Kernel:
     """Pose of node k in its parent's node frame, columns of H*(k), and with ``qd`` the hinge's velocity and bias.
 
-    One thread for each (node, world). ``velocity = H* qd`` and ``bias = dH*/dt qd``, both in the node frame. A chain of
-    screws is built inboard to outboard: each new screw carries what came before into its own frame.
+    One thread for each (node, world), all in the node frame: ``velocity = H* qd``, and ``bias``, the angular
+    acceleration of the node and the acceleration of its origin as seen from the hinge's parent, qd being constant. A
+    chain of screws is built inboard to outboard: each new screw carries what came before into its own frame.
     """
     s = spatial(T)
     vec3 = s.vec3
@@ -59,11 +60,11 @@ def hinge(T) -> wp.Kernel:
                 p += R * p_i
                 R = R * R_i
                 if velocity_out:
-                    w, v = s.motion_to_child(R_i, p_i, w, v)
-                    dw, dv = s.motion_to_child(R_i, p_i, dw, dv)
                     rate = qd[world, first + i]
+                    dw, dv = s.acceleration_to_child(R_i, p_i, w, dw, dv)
+                    w, v = s.motion_to_child(R_i, p_i, w, v)
                     dw += wp.cross(w, turn) * rate
-                    dv += (wp.cross(v, turn) + wp.cross(w, slide)) * rate
+                    dv += wp.cross(w, slide) * (T(2.0) * rate)
                     w += turn * rate
                     v += slide * rate
         else:
@@ -89,9 +90,8 @@ def hinge(T) -> wp.Kernel:
                 w = Rt * vec3(qd[world, angular], qd[world, angular + 1], qd[world, angular + 2])
                 v = wp.cross(r, w)
                 if motion == FREE:
-                    v_com = Rt * vec3(qd[world, first], qd[world, first + 1], qd[world, first + 2])
-                    v += v_com
-                    dv = -wp.cross(w, v_com)
+                    dv = wp.cross(w, v)  # about the CoM, which moves straight
+                    v += Rt * vec3(qd[world, first], qd[world, first + 1], qd[world, first + 2])
 
         R_tree = s.load_matrix(tree, node, 0, world)
         s.store_matrix(pose_out, node, 0, world, R_tree * R)
@@ -109,8 +109,12 @@ def hinge(T) -> wp.Kernel:
 def motion(T) -> wp.Kernel:
     """Outward, one level: V(k) = phi* V(p) + H* qd, alpha(k) = phi* alpha(p) + H* qdd + a(k); what is absent is zero.
 
-    a(k) = crm(V(k)) H* qd + dH*/dt qd. ``velocity_out`` comes in as H* qd and leaves as V; gravity is the acceleration
-    -g of the inertial frame. Without ``acceleration_out`` only V is computed.
+    ``velocity_out`` comes in as H* qd and leaves as V; gravity is the acceleration -g of the inertial frame. Without
+    ``acceleration_out`` only V is computed.
+
+    ``acceleration_out`` is (d omega/dt; dv/dt) of the node's origin as an observer at rest sees it, alpha + (0; omega x
+    v): Jain's alpha and V's linear part both grow with the distance from the root, and what they add to the force
+    cancels. From this form v is gone: a(k) consists of omega and of what lies between k and p alone.
     """
     s = spatial(T)
 
@@ -130,27 +134,28 @@ def motion(T) -> wp.Kernel:
         node = topology.order[level + i]
         parent = topology.parent[node]
         R, l = s.load_matrix(pose, node, 0, world), s.load(pose, node, 9, world)
-        aw, av = s.vec3(), s.vec3()  # what velocities contribute to alpha
+        w_p, w_j, v_j = s.vec3(), s.vec3(), s.vec3()
         if velocity_out:
             w_j, v_j = s.load(velocity_out, node, 0, world), s.load(velocity_out, node, 3, world)
             w, v = s.vec3(), s.vec3()
             if parent >= 0:
-                w, v = s.load(velocity_out, parent, 0, world), s.load(velocity_out, parent, 3, world)
-                w, v = s.motion_to_child(R, l, w, v)
+                w_p, v = s.load(velocity_out, parent, 0, world), s.load(velocity_out, parent, 3, world)
+                w, v = s.motion_to_child(R, l, w_p, v)
             s.store(velocity_out, node, 0, world, w + w_j)
             s.store(velocity_out, node, 3, world, v + v_j)
-            # crm(V) H* qd = crm(phi* V(p)) H* qd: a motion does not act on itself
-            aw = s.load(bias, node, 0, world) + wp.cross(w, w_j)
-            av = s.load(bias, node, 3, world) + wp.cross(v, w_j) + wp.cross(w, v_j)
         if acceleration_out:
             dw, dv = s.vec3(), s.vec3()
             if parent >= 0:
                 dw, dv = s.load(acceleration_out, parent, 0, world), s.load(acceleration_out, parent, 3, world)
             elif gravity:
                 dv = -s.vec3(gravity[0, world], gravity[1, world], gravity[2, world])
-            dw, dv = s.motion_to_child(R, l, dw, dv)
-            dw += aw
-            dv += av
+            if velocity_out:
+                dw, dv = s.acceleration_to_child(R, l, w_p, dw, dv)
+                w = wp.transpose(R) * w_p
+                dw += s.load(bias, node, 0, world) + wp.cross(w, w_j)
+                dv += s.load(bias, node, 3, world) + T(2.0) * wp.cross(w, v_j)
+            else:
+                dw, dv = s.motion_to_child(R, l, dw, dv)
             if qdd:
                 first = topology.qd_start[node]
                 for dof in range(first, first + topology.dof_count[node]):

@@ -12,6 +12,8 @@ from .topology import Topology
 def body_force(T) -> wp.Kernel:
     """M alpha + crf(V) M V - (external wrench) of every node, in its frame; one thread for each (node, world).
 
+    With alpha as the kernel ``motion`` gives it, (d omega/dt; dv/dt) of the node's origin, crf(V) M V loses its linear
+    velocity: (omega x J omega; omega x (omega x m c)).
     ``body_f`` is force, then torque, in inertial axes at the CoM; ``world_pose`` belongs to it.
     """
     s = spatial(T)
@@ -36,10 +38,9 @@ def body_force(T) -> wp.Kernel:
                 mass, moment, inertia, s.load(acceleration, node, 0, world), s.load(acceleration, node, 3, world)
             )
         if velocity:
-            w, v = s.load(velocity, node, 0, world), s.load(velocity, node, 3, world)
-            n_v, f_v = s.rigid_apply(mass, moment, inertia, w, v)
-            n += wp.cross(w, n_v) + wp.cross(v, f_v)
-            f += wp.cross(w, f_v)
+            w = s.load(velocity, node, 0, world)
+            n += wp.cross(w, inertia * w)
+            f += wp.cross(w, wp.cross(w, moment))
         if body_f:
             Rt = wp.transpose(s.load_matrix(world_pose, node, 0, world))
             external = Rt * s.vec3(body_f[world, node, 0], body_f[world, node, 1], body_f[world, node, 2])

@@ -90,6 +90,12 @@ def spatial(T) -> types.SimpleNamespace:
         return Rt * w, Rt * (v + wp.cross(w, l))
 
     @wp.func
+    def acceleration_to_child(R: mat33, l: vec3, w: vec3, dw: vec3, dv: vec3):
+        """(d omega/dt; dv/dt) of a frame at (R, l) fixed to a body with angular velocity w, as an observer sees it."""
+        Rt = wp.transpose(R)
+        return Rt * dw, Rt * (dv + wp.cross(dw, l) + wp.cross(w, wp.cross(w, l)))
+
+    @wp.func
     def rigid_apply(mass: T, moment: vec3, inertia: mat33, w: vec3, v: vec3):
         """(n; f) = M (omega; v)"""
         return inertia * w + wp.cross(moment, v), mass * v - wp.cross(moment, w)

@@ -1,7 +1,9 @@
 """The main job, ``python -m warp_spo``: its table, its report, its exit codes."""
 
+import base64
 import dataclasses
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -35,9 +37,13 @@ def test_reports_every_operation_in_both_precisions(tmp_path, capsys, device):
     assert [tuple(line[:3:2]) for line in lines] == [(op, dtype) for op in OPERATIONS for dtype in TOLERANCE]
     for _, _, dtype, error, *_ in lines:
         assert 0.0 <= float(error) <= TOLERANCE[dtype]
-    assert (tmp_path / "error-runtime.png").read_bytes().startswith(b"\x89PNG")
-    text = (tmp_path / "table.md").read_text()
-    assert text.count("| phi.T |") == 2 and "(error-runtime.png)" in text
+    (page,) = tmp_path.iterdir()
+    text = page.read_text()
+    assert text.startswith("<!doctype html>") and text.count("<td>phi.T</td>") == 2
+    assert [line[3] for line in lines] == re.findall(r"<td>float\d\d</td><td>(.*?)</td>", text)
+    (picture,) = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', text)
+    assert "largest relative error" in base64.b64decode(picture).decode()
+    assert "http" not in text.replace(picture, "")  # nothing to fetch
 
 
 def test_a_wrong_result_fails_and_is_named(capsys, monkeypatch, device):

@@ -690,6 +690,84 @@ def test_mjcf_that_newton_misreads(text, found, tmp_path):
             load(file)
 
 
+LOST = """<mujoco>{default}<worldbody>{before}<body name="root"><joint name="j"{pos}/><geom size=".1"/>{root}
+  <body name="tip" childclass="c"><joint{tip}/><geom size=".1"/>{more}</body></body></worldbody></mujoco>"""
+PLAIN = dict(default='<default><default class="c"/></default>', before="", pos="", root="", tip="", more="")
+
+
+@pytest.mark.parametrize(
+    ("text", "floating", "found"),
+    [
+        ({"more": "<frame><joint/></frame>"}, None, "a joint or inertial in a <frame> (body 'tip')"),
+        ({"more": f"<frame><frame>{INERTIA}</frame></frame>"}, None, "a joint or inertial in a <frame> (body 'tip')"),
+        ({"root": "<frame><freejoint/></frame>"}, None, "a joint or inertial in a <frame> (body 'root')"),
+        ({"root": "<frame><freejoint/></frame>"}, True, None),
+        ({"more": '<frame><geom size=".1"/><site/></frame>'}, None, None),
+        ({"before": '<replicate count="2"><body><geom size=".1"/></body></replicate>'}, None, "a <replicate> (body 'world')"),
+        ({"before": '<replicate count="2"><geom size=".1"/></replicate>'}, None, None),
+        ({"more": '<replicate count="2"><geom size=".1"/></replicate>'}, None, "a <replicate> (body 'tip')"),
+        ({"more": f'{INERTIA}<frame><replicate count="2"><geom size=".1"/></replicate></frame>'}, None, None),
+        ({"more": '<frame><replicate count="2"><body/></replicate></frame>'}, None, "a <replicate> (body 'tip')"),
+        ({"pos": ' pos="1 0 0"'}, False, "a root joint's pos under floating=False (body 'root')"),
+        ({"pos": ' pos="1 0 0"'}, None, None),
+        ({"pos": ' pos="1 0 0"'}, True, None),
+        ({"tip": ' pos="1 0 0"'}, False, None),
+        (
+            {"default": '<default class="robot"><default class="c"/></default>'},
+            None,
+            "an outermost <default> with a class of its own (class 'robot')",
+        ),
+    ],
+)
+def test_mjcf_that_newton_loses(text, floating, found, tmp_path):
+    """In frames, copies and a fixed base, and only where it changes the robot."""
+    file = tmp_path / "robot.xml"
+    file.write_text(LOST.format(**PLAIN | text))
+    if found is None:
+        assert load(file, floating=floating).body_labels[-1].endswith("tip")
+    else:
+        with pytest.raises(UnsupportedError, match=re.escape(f"load: {str(file)!r} with {found} is not supported; ")):
+            load(file, floating=floating)
+
+
+ELEMENTS = '<joint armature="2"/><geom density="10"/>'
+INNER = '<default class="c"><joint armature="7"/></default>'
+
+
+@pytest.mark.parametrize(
+    "default",
+    [
+        f"<default>{ELEMENTS}{INNER}</default>",
+        f'<default class="main">{ELEMENTS}{INNER}</default>',
+        f'<default class="main"><joint armature="2"/></default><default><geom density="10"/>{INNER}</default>',
+        f'<default><joint armature="1" damping="3"/></default><default class="main">{ELEMENTS}{INNER}</default>',
+    ],
+)
+def test_mjcf_default_class_main(default, tmp_path):
+    """Outermost defaults are everybody's whatever they are called, and an element steps out of its childclass by "main".
+
+    As in MuJoCo, whose numbers these are.
+    """
+    mujoco = pytest.importorskip("mujoco")
+    file = tmp_path / "robot.xml"
+    file.write_text(LOST.format(**PLAIN | {"default": default, "tip": ' class="main"', "more": '<joint axis="1 0 0"/>'}))
+    model, scene = mujoco.MjModel.from_xml_path(str(file)), load(file)
+    np.testing.assert_allclose(model.dof_armature, [2, 2, 7])
+    np.testing.assert_allclose(scene.values["joint_armature"], [model.dof_armature])
+    np.testing.assert_allclose(scene.values["joint_damping"], [model.dof_damping])
+    np.testing.assert_allclose(scene.values["body_mass"][0], model.body_mass[1:], rtol=FLOAT32)
+
+
+def test_mjcf_default_class_main_beside_meshes(tmp_path):
+    """Text has no folder to find them in."""
+    file, asset = tmp_path / "robot.xml", '<asset><mesh name="m" file="no.stl"/></asset><default class="main"/>'
+    file.write_text(MJCF.format(asset=asset, tip='<geom type="mesh" mesh="m"/>'))
+    with pytest.raises(UnsupportedError, match="default class 'main' beside masses from meshes.*remove class='main'"):
+        load(file)
+    file.write_text(MJCF.format(asset=asset, tip=INERTIA + '<geom type="mesh" mesh="m"/>'))
+    np.testing.assert_allclose(load(file).values["body_mass"][0, 1], 1.0)
+
+
 def test_mjcf_that_newton_misreads_in_an_include(tmp_path):
     """Each finding and each way out once. Joints of a root body do not count where ``floating`` replaces them."""
     joints = '<joint ref="1"/><joint type="slide" pos="1 0 0"/>'

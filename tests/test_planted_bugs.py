@@ -79,8 +79,8 @@ def test_a_wrong_gyroscopic_sign(plant, device):
     plant(
         recursions,
         "newton_euler",
-        "            n += wp.cross(w, n_v) + wp.cross(v, f_v)\n            f += wp.cross(w, f_v)",
-        "            n -= wp.cross(w, n_v) + wp.cross(v, f_v)\n            f -= wp.cross(w, f_v)",
+        "            n += wp.cross(w, inertia * w)\n            f += wp.cross(w, wp.cross(w, moment))",
+        "            n -= wp.cross(w, inertia * w)\n            f -= wp.cross(w, wp.cross(w, moment))",
     )
     dyn, arrays = dynamics(device, "screw_tree")
     laws.forward_undoes_inverse_dynamics(dyn, arrays, TOLERANCE["float64"])  # blind, as theory says

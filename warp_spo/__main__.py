@@ -26,7 +26,7 @@ from .trial import SAMPLE, Subject, Trial
 WORLDS = {False: 1024, True: 4096}  # on a CPU, on a GPU
 WARM_UP, BUDGET = 0.05, 0.3  # [s] for each operation: all of them in well under a minute
 SETS = {False: 1, True: 4}  # sets of inputs; one graph goes through them in turn
-FILES = "error-runtime.png", "table.md"
+REPORT = "report.html"
 
 
 class Parser(argparse.ArgumentParser):
@@ -43,7 +43,7 @@ def parser() -> Parser:
     p.add_argument("--worlds", type=int, metavar="N", help="default: 1024 on a CPU, 4096 on a GPU")
     p.add_argument("--device", metavar="D", help="Warp device, such as cpu or cuda:0; default: the current one")
     p.add_argument("--dtype", choices=("float32", "float64", "both"), default="both", help="default: both")
-    p.add_argument("--report", type=Path, metavar="DIR", help=f"write {' and '.join(FILES)} there")
+    p.add_argument("--report", type=Path, metavar="DIR", help=f"write {REPORT} there: table and picture")
     return p
 
 
@@ -52,7 +52,7 @@ def main(argv: list[str] | None = None) -> int:
     options = parser().parse_args(argv)
     wp.config.log_level = wp.LOG_WARNING  # before newton is imported
     try:
-        pyplot = report.load_pyplot() if options.report else None
+        pyplot: Any = report.load_pyplot() if options.report else None
         if options.report:
             options.report.mkdir(parents=True, exist_ok=True)
         scene = load(options.robot)
@@ -76,15 +76,18 @@ def main(argv: list[str] | None = None) -> int:
             raise
         return refuse(f"{worlds} worlds do not fit into the memory of {device.alias}; pass fewer with --worlds")
     print(report.text_table(rows))
-    print(
+    meaning = (
         f"error: largest relative error of {min(SAMPLE, worlds)} worlds against dense float64 (log_det: absolute); "
         f"tolerance {', '.join(f'{dtype} {TOLERANCE[dtype]:.0e}' for dtype in dtypes)}"
     )
+    print(meaning)
     if options.report:
-        paths = [options.report / name for name in FILES]
-        report.picture(pyplot, title, rows, TOLERANCE, paths[0])
-        paths[1].write_text(report.markdown(title, rows, FILES[0]))
-        print(f"wrote {', '.join(map(str, paths))}")
+        figure = report.picture(pyplot, title, rows, TOLERANCE)
+        table = report.table(report.HEADS, [report.cells(row) for row in rows])
+        path = options.report / REPORT
+        path.write_text(report.page(title, [report.embedded(figure), table, report.paragraph(meaning)]))
+        pyplot.close(figure)
+        print(f"wrote {path}")
     failed = [row for row in rows if not row["error"] <= TOLERANCE[row["dtype"]]]
     for row in failed:
         lost = row["error"] != row["error"]

@@ -14,13 +14,15 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from . import nodes
 from . import plan as plans
+from . import status as words
 from .arrays import Call, parse_device, parse_dtype, shape_of
 from .errors import UnsupportedError
-from .frames import Frame, Frames
-from .kernels import articulated, kinematics, passive
+from .frames import Frame, checked
+from .levels import Recursions
 from .parameters import VARIABLE
-from .recursions import Recursions
+from .programs import Programs
 from .scene import Scene
 from .spatial_operators import SpatialOperators
 
@@ -87,7 +89,7 @@ class Dynamics:
         self.plan = plans.choose(scene.tree, self.worlds, granularity)
         self.granularity = self.plan.granularity
         self.recursions = Recursions(scene, self.plan, self.device, self.dtype, self.variable)
-        self._frames = Frames(scene, self.device, self.dtype)
+        self.programs = Programs(self.recursions) if self.granularity == "tree" else None
 
     # -- values ----------------------------------------------------------------------------------------------------
     def set(self, **values: Any) -> None:
@@ -140,6 +142,8 @@ class Dynamics:
         )
         self.scene = self.scene.with_values(**folded)
         self.recursions.replace_values(self.scene)
+        if self.programs is not None:
+            self.programs.forget()
 
     def prepare(self, operation: str, **options: Any) -> None:
         """Compile and allocate all that ``operation`` needs, so that its next call only launches.
@@ -191,9 +195,22 @@ class Dynamics:
             qd: velocities [world, dof]; None is zero and costs nothing.
             tau: forces dual to qd [world, dof]; None is zero.
             body_f: wrench on each body, force [N] then torque [N m], inertial axes, at the CoM [world, body, 6].
-            status: int32 [world], written: 0, or 1 = Mass is not positive definite to working precision (a massless
-                leaf, a singular hinge), 2 = an input is not finite. Such a world's result is NaN; the others' is not
-                touched.
+            status: int32 [world], written with the worst that is true of the world; None costs nothing. Worst first:
+
+                * 2 = an input, or a value of the scene, is NaN or infinite in this dtype. The result is not finite (but
+                  for infinite armature, which locks a hinge). Look for it where the number comes from.
+                * 1 = Mass is not positive definite to working precision: a massless leaf, a singular hinge (three angles
+                  at 90 degrees, a point mass on a ball). The result is NaN. Give that hinge armature, or its body
+                  inertia; a ball instead of three angles.
+                * 4 = out of range: D, or what it is made of, is too small or too large for the dtype's normal numbers,
+                  or the result overflows or is subnormal. Change units (mass, length) or use float64.
+                * 3 = digits lost: an estimate from above says that D keeps fewer than half of the dtype's digits,
+                  perhaps none. The result stands: use float64 for such worlds, give light links armature, and lay
+                  hinge axes along the axes of the anchors.
+                * 0 = none of these. A pair of tau and gravity that nearly cancel can still lose digits, as in any
+                  subtraction: let gravity and wrenches enter by the scene and body_f, not by tau.
+
+                Worlds do not touch each other's result, whatever the word.
             out: the result.
 
         Returns:
@@ -205,17 +222,9 @@ class Dynamics:
             body_f = self._read_body_f(call, body_f)
             status = call.update("status", status, (self.worlds,), "[world]", dtype=wp.int32)
             out = call.write(out, (self.worlds, self.scene.dof_count), "[world, dof]")
-            run, moves = self.recursions, qd is not None
-            run.hinges(q, qd)
-            force = None
-            if moves or body_f is not None:
-                # gravity stays out of the velocity terms: as the frame's acceleration it meets nothing to cancel
-                alpha, velocity = run.accelerations(None, moves, gravity=False) if moves else (None, None)
-                force = run.body_forces(alpha, velocity, body_f)
-            pivot = run.factor()
-            run.solve(tau, out, force, gravity=True)
+            swept = self._run("forward_dynamics", out, q=q, qd=qd, tau=tau, body_f=body_f)
             if status is not None:
-                run.launch(articulated.status, self.worlds, [pivot, q, qd, tau, body_f], [status])
+                words.write(self.recursions, q, qd, tau, body_f, out, status, factored=swept)
         return call.result
 
     def inverse_dynamics(self, q: Any, qd: Any = None, qdd: Any = None, body_f: Any = None, out: Any = None) -> Any:
@@ -242,10 +251,7 @@ class Dynamics:
             qdd = self._read_rate(call, "qdd", qdd)
             body_f = self._read_body_f(call, body_f)
             out = call.write(out, (self.worlds, self.scene.dof_count), "[world, dof]")
-            run, moves = self.recursions, qd is not None
-            run.hinges(q, qd)
-            force = run.body_forces(*run.accelerations(qdd, moves, gravity=True), body_f)
-            run.hinge_forces(qdd, force, out)
+            self._run("inverse_dynamics", out, q=q, qd=qd, qdd=qdd, body_f=body_f)
         return call.result
 
     def mass_matrix(self, q: Any, out: Any = None) -> Any:
@@ -254,8 +260,7 @@ class Dynamics:
             q, _ = self._read_state(call, q, None)
             dofs = self.scene.dof_count
             out = call.write(out, (self.worlds, dofs, dofs), "[world, dof, dof]")
-            self.recursions.hinges(q)
-            self.recursions.mass_matrix(out)
+            self._run("mass_matrix", out, q=q)
         return call.result
 
     def mass_matrix_inverse(self, q: Any, out: Any = None) -> Any:
@@ -264,9 +269,7 @@ class Dynamics:
             q, _ = self._read_state(call, q, None)
             dofs = self.scene.dof_count
             out = call.write(out, (self.worlds, dofs, dofs), "[world, dof, dof]")
-            self.recursions.hinges(q)
-            self.recursions.factor()
-            self.recursions.sandwich(None, dofs, out)
+            self._run("mass_matrix_inverse", out, q=q)
         return call.result
 
     def solve_mass_matrix(self, q: Any, b: Any, out: Any = None) -> Any:
@@ -278,9 +281,7 @@ class Dynamics:
                 shape = (*shape, b.shape[2])
             b = call.read("b", b, shape, "[world, dof] or [world, dof, columns]")
             out = call.write(out, shape, "like b")
-            self.recursions.hinges(q)
-            self.recursions.factor()
-            self.recursions.solve(b, out)
+            self._run("solve_mass_matrix", out, q=q, b=b)
         return call.result
 
     def log_det_mass_matrix(self, q: Any, out: Any = None) -> Any:
@@ -288,9 +289,7 @@ class Dynamics:
         with self._call("log_det_mass_matrix") as call:
             q, _ = self._read_state(call, q, None)
             out = call.write(out, (self.worlds,), "[world]")
-            run = self.recursions
-            run.hinges(q)
-            run.launch(articulated.log_determinant, self.worlds, [run.factor()], [out])
+            self._run("log_det_mass_matrix", out, q=q)
         return call.result
 
     def passive_force(self, q: Any, qd: Any = None, out: Any = None) -> Any:
@@ -302,9 +301,7 @@ class Dynamics:
         with self._call("passive_force") as call:
             q, qd = self._read_state(call, q, qd)
             out = call.write(out, (self.worlds, self.scene.dof_count), "[world, dof]")
-            run = self.recursions
-            fields = [run.parameters.field(name) for name in ("joint_damping", "joint_stiffness", "joint_rest_q")]
-            run.launch(passive.passive_force, run.nodes, [run.topology, *fields, q, qd], [out])
+            self._run("passive_force", out, q=q, qd=qd)
         return call.result
 
     # -- kinematics ------------------------------------------------------------------------------------------------
@@ -313,9 +310,7 @@ class Dynamics:
         with self._call("body_poses") as call:
             q, _ = self._read_state(call, q, None)
             out = call.write(out, (self.worlds, self.scene.body_count, 7), "[world, body, 7]")
-            run = self.recursions
-            run.hinges(q)
-            run.launch(kinematics.body_poses, run.nodes, [run.world_poses(), run.parameters.anchor], [out])
+            self._run("body_poses", out, q=q)
         return call.result
 
     def body_velocities(self, q: Any, qd: Any, out: Any = None) -> Any:
@@ -323,10 +318,7 @@ class Dynamics:
         with self._call("body_velocities") as call:
             q, qd = self._read_state(call, q, qd, optional=False)
             out = call.write(out, (self.worlds, self.scene.body_count, 6), "[world, body, 6]")
-            run = self.recursions
-            run.hinges(q, qd)
-            inputs = [run.world_poses(), run.parameters.com, run.velocities()]
-            run.launch(kinematics.body_velocities, run.nodes, inputs, [out])
+            self._run("body_velocities", out, q=q, qd=qd)
         return call.result
 
     def jacobian(self, q: Any, frames: Sequence[Frame], out: Any = None) -> Any:
@@ -341,25 +333,19 @@ class Dynamics:
         """
         with self._call("jacobian") as call:
             q, _ = self._read_state(call, q, None)
-            nodes, origins = self._frames.tables(call.name, frames)
-            out = call.write(out, (self.worlds, len(nodes), 6, self.scene.dof_count), "[world, frame, 6, dof]")
-            self.recursions.hinges(q)
-            self.recursions.jacobian(nodes, origins, out)
+            where = checked(self.scene, call.name, frames)
+            out = call.write(out, (self.worlds, len(where), 6, self.scene.dof_count), "[world, frame, 6, dof]")
+            self._run("jacobian", out, q=q, frames=where)
         return call.result
 
     def operational_inertia_inverse(self, q: Any, frames: Sequence[Frame], out: Any = None) -> Any:
         """J Mass^-1 J* for the frames of :meth:`jacobian` [world, 6 frames, 6 frames]."""
         with self._call("operational_inertia_inverse") as call:
             q, _ = self._read_state(call, q, None)
-            nodes, origins = self._frames.tables(call.name, frames)
-            rows, dofs = 6 * len(nodes), self.scene.dof_count
+            where = checked(self.scene, call.name, frames)
+            rows = 6 * len(where)
             out = call.write(out, (self.worlds, rows, rows), "[world, 6 frames, 6 frames]")
-            run = self.recursions
-            run.hinges(q)
-            J = run.array(("jacobian", len(nodes)), self.worlds, len(nodes), 6, dofs)
-            run.jacobian(nodes, origins, J)
-            run.factor()
-            run.sandwich(J.reshape((self.worlds, rows, dofs)).transpose((0, 2, 1)), rows, out)
+            self._run("operational_inertia_inverse", out, q=q, frames=where)
         return call.result
 
     def integrate(self, q: Any, qd: Any, dt: float, out: Any = None) -> Any:
@@ -370,9 +356,7 @@ class Dynamics:
         with self._call("integrate") as call:
             q, qd = self._read_state(call, q, qd, optional=False)
             out = call.write(out, (self.worlds, self.scene.coord_count), "[world, coordinate]")
-            run = self.recursions
-            inputs = [run.topology, run.parameters.com, q, qd, _seconds(call.name, dt)]
-            run.launch(kinematics.integrate, run.nodes, inputs, [out])
+            self._run("integrate", out, q=q, qd=qd, dt=_seconds(call.name, dt))
         return call.result
 
     # -- operators -------------------------------------------------------------------------------------------------
@@ -403,6 +387,24 @@ class Dynamics:
         )
 
     # -- steps -----------------------------------------------------------------------------------------------------
+    def _run(self, operation: str, out: wp.array, **given: Any) -> bool:
+        """Launch an operation on what is given; None is not. Arrays [world, ...]; the rest are options.
+
+        Returns:
+            Whether it ran as sweeps, which leave what they found in the workspace.
+        """
+        arrays = {name: value for name, value in given.items() if isinstance(value, wp.array)}
+        options = {name: value for name, value in given.items() if value is not None and name not in arrays}
+        program = None
+        if self.programs is not None:
+            shapes = {name: array.shape for name, array in arrays.items()}
+            program = self.programs.find(operation, shapes, out.shape, **options)
+        if program is not None:
+            self.programs.launch(program, arrays, out)  # type: ignore[union-attr]
+        else:
+            getattr(nodes, operation)(self.recursions, out, **arrays, **options)
+        return program is None
+
     def _call(self, name: str) -> Call:
         return Call(f"Dynamics.{name}", self.device, self.dtype)
 

@@ -23,6 +23,7 @@ from .robot_files import (
     MISREAD,
     mjcf_gravity,
     mjcf_misread,
+    mjcf_source,
     mjcf_tree,
     mjcf_weighs_by_mesh,
     robot_format,
@@ -509,17 +510,28 @@ def _read_mjcf(file: Path, floating: bool | None) -> newton.ModelBuilder:
     root = mjcf_tree(file)
     misread = mjcf_misread(root, floating)
     if misread:
-        features = [f"{feature} (body {_names(bodies)})" for feature, bodies in misread.items()]
+        features = [
+            f"{feature} ({'class' if '<default>' in feature else 'body'} {_names(where)})"
+            for feature, where in misread.items()
+        ]
         ways_out = dict.fromkeys(MISREAD[feature] for feature in misread)
         raise UnsupportedError("load", f"{str(file)!r} with {', '.join(features)}", "; ".join(ways_out))
+
+    source, weighs_by_mesh = mjcf_source(file, root), mjcf_weighs_by_mesh(root)
+    if weighs_by_mesh and source != str(file):
+        raise UnsupportedError(
+            "load",
+            f"{str(file)!r} with a default class 'main' beside masses from meshes",
+            "remove class='main', which is what the outermost <default> is, or write the <inertial> of each body",
+        )
 
     def import_with(parse_mujoco_options: bool) -> newton.ModelBuilder:
         builder = newton.ModelBuilder()
         builder.add_mjcf(
-            str(file),
+            source,
             floating=floating,
             parse_visuals=False,
-            parse_meshes=mjcf_weighs_by_mesh(root),
+            parse_meshes=weighs_by_mesh,
             parse_mujoco_options=parse_mujoco_options,
         )
         return builder

@@ -43,6 +43,8 @@ class Operation:
         reveal: ``reveal(subject, *inputs, out)`` writes a result that shows what ``call`` did, where that is not out.
         quaternions: first entry of each quaternion of a flat result; q and -q are the same rotation.
         scale: ``scale(dense, expected)``, what the error is divided by: the 2-norm of the expected result unless given.
+        solves: ``solves(dense, *inputs)``, the matrix A and right-hand side b of the equation A x = b that the result
+            solves, if it solves one.
     """
 
     name: str
@@ -54,19 +56,46 @@ class Operation:
     reveal: Callable[..., Any] | None = None
     quaternions: Callable[[Scene], list[int]] = lambda scene: []
     scale: Callable[[Dense, np.ndarray], float] = lambda dense, expected: float(np.linalg.norm(expected))
+    solves: Callable[..., tuple[np.ndarray, np.ndarray]] | None = None
 
-    def error(self, dense: Dense, inputs: list[np.ndarray], result: np.ndarray) -> float:
-        """``|result - expected| / |expected|`` in one world, 2-norms; NaN if the reference cannot be computed."""
+    def expected(self, dense: Dense, inputs: list[np.ndarray]) -> tuple[np.ndarray, float]:
+        """The result in one world, flat, and what an error is divided by; NaN if the reference cannot compute it."""
         try:
             expected = np.ravel(self.reference(dense, *inputs))
-            scale = self.scale(dense, expected)
+            return expected, self.scale(dense, expected)
         except np.linalg.LinAlgError:  # a hinge that moves no inertia
+            return np.full(1, np.nan), float("nan")
+
+    def error(
+        self,
+        dense: Dense,
+        inputs: list[np.ndarray],
+        result: np.ndarray,
+        expected: tuple[np.ndarray, float] | None = None,
+    ) -> float:
+        """``|result - expected| / |expected|`` in one world, 2-norms; NaN if the reference cannot be computed.
+
+        ``expected``: what :meth:`expected` returns, where it is known already.
+        """
+        wanted, scale = expected or self.expected(dense, inputs)
+        if not np.isfinite(scale):
             return float("nan")
         result = result.astype(np.float64).ravel()
         for first in self.quaternions(dense.scene):
-            if result[first : first + 4] @ expected[first : first + 4] < 0.0:
+            if result[first : first + 4] @ wanted[first : first + 4] < 0.0:
                 result[first : first + 4] *= -1.0
-        return float(np.linalg.norm(result - expected) / (scale if scale > 0.0 else 1.0))
+        return float(np.linalg.norm(result - wanted) / (scale if scale > 0.0 else 1.0))
+
+    def backward_error(self, dense: Dense, inputs: list[np.ndarray], result: np.ndarray) -> float:
+        """``|A x - b| / (|A| |x| + |b|)`` in one world, in float64: 2-norms, Frobenius where x is a matrix.
+
+        How much the equation would have to change for the result to be exact; it does not grow with the condition of A.
+        """
+        assert self.solves is not None, f"{self.name} solves no equation"
+        A, b = self.solves(dense, *inputs)
+        x, b = result.astype(np.float64).reshape(len(A), -1), b.reshape(len(A), -1)
+        size = np.linalg.norm(A, 2) * np.linalg.norm(x) + np.linalg.norm(b)
+        return float(np.linalg.norm(A @ x - b) / (size if size > 0.0 else 1.0))
 
 
 class Inputs:
@@ -78,12 +107,14 @@ class Inputs:
         scene: whose inputs.
         worlds: how many.
         seed: equal seeds, equal inputs; each input has its own stream.
+        reference: ``reference(scene, q, world=world)``, the reference at q of one world.
     """
 
-    def __init__(self, scene: Scene, worlds: int, seed: int = 0):
-        self.scene, self.worlds, self.seed = scene, worlds, seed
+    def __init__(self, scene: Scene, worlds: int, seed: int = 0, reference: Callable[..., Any] = Dense):
+        self.scene, self.worlds, self.seed, self.reference = scene, worlds, seed, reference
         self._arrays: dict[str, np.ndarray] = {}
         self._dense: dict[int, Dense] = {}
+        self._expected: dict[tuple, tuple[np.ndarray, float]] = {}
 
     def array(self, name: str) -> np.ndarray:
         """Input ``name`` [world, n], float32."""
@@ -105,8 +136,16 @@ class Inputs:
     def dense(self, world: int) -> Dense:
         """The reference at q of one world; what it computed is kept."""
         if world not in self._dense:
-            self._dense[world] = Dense(self.scene, self.array("q")[world], world=world)
+            self._dense[world] = self.reference(self.scene, self.array("q")[world], world=world)
         return self._dense[world]
+
+    def expected(self, operation: Operation, at: Inputs, world: int) -> tuple[np.ndarray, float]:
+        """What ``operation`` gives in one world for these inputs at q of ``at``; kept, for every precision to meet."""
+        key = operation.name, operation.reference, at.seed, world
+        if key not in self._expected:
+            inputs = [self.array(name)[world] for name in operation.reads]
+            self._expected[key] = operation.expected(at.dense(world), inputs)
+        return self._expected[key]
 
 
 def rotations(scene: Scene) -> list[int]:
@@ -170,11 +209,29 @@ _TABLE = (
         lambda d, q, x: d.psi @ x,
         reveal=lambda subject, q, x, out: subject.operators.psi.apply(x, out=out),
     ),
-    _method("forward_dynamics", "q qd tau", _dof, lambda d, q, qd, tau: d.forward_dynamics(qd, tau)),
+    _method(
+        "forward_dynamics",
+        "q qd tau",
+        _dof,
+        lambda d, q, qd, tau: d.forward_dynamics(qd, tau),
+        solves=lambda d, q, qd, tau: (d.mass_matrix, tau - d.bias_force(qd)),
+    ),
     _method("inverse_dynamics", "q qd qdd", _dof, lambda d, q, qd, qdd: d.inverse_dynamics(qd, qdd)),
     _method("mass_matrix", "q", _square, lambda d, q: d.mass_matrix),
-    _method("mass_matrix_inverse", "q", _square, lambda d, q: np.linalg.inv(d.mass_matrix)),
-    _method("solve_mass_matrix", "q b", _dof, lambda d, q, b: np.linalg.solve(d.mass_matrix, b)),
+    _method(
+        "mass_matrix_inverse",
+        "q",
+        _square,
+        lambda d, q: np.linalg.inv(d.mass_matrix),
+        solves=lambda d, q: (d.mass_matrix, np.eye(len(d.mass_matrix))),
+    ),
+    _method(
+        "solve_mass_matrix",
+        "q b",
+        _dof,
+        lambda d, q, b: np.linalg.solve(d.mass_matrix, b),
+        solves=lambda d, q, b: (d.mass_matrix, b),
+    ),
     _method("bias_force", "q qd", _dof, lambda d, q, qd: d.bias_force(qd), scale=_weight_floor),
     _method("gravity_force", "q", _dof, lambda d, q: d.gravity_force, scale=_weight_floor),
     _method("passive_force", "q qd", _dof, lambda d, q, qd: d.passive_force(qd)),

@@ -82,6 +82,13 @@ class Parameters:
             device=self.device,
         )
 
+    def array(self, name: str) -> wp.array:
+        """tree, anchor, com, rigid or a field, as [item, component, world]."""
+        if name in ("tree", "anchor", "com", "rigid"):
+            return getattr(self, name)
+        field = self.field(name)
+        return field.reshape((field.shape[0], 1, field.shape[1]))
+
     def field(self, name: str) -> wp.array:
         """``values[name]`` as [dof, coordinate or component, world], rounded; made at the first request."""
         if name not in self._fields:

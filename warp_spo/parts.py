@@ -79,6 +79,11 @@ def _pose(call: str, name: str, value: Any) -> np.ndarray:
 class Body:
     """A rigid body.
 
+    An inertia whose largest principal moment exceeds the sum of the others is accepted, though no distribution of
+    positive mass has it: robot files are full of them, Mass stays positive definite and every formula holds as it is.
+    What is refused is what would make a kinetic energy negative. ``spo.load`` passes files through Newton, which repairs
+    such inertias, and names the bodies.
+
     Args:
         mass: [kg], not negative.
         com: centre of mass in the body frame [m], shape (3,).
@@ -109,7 +114,7 @@ class Body:
 
 
 def checked_inertia(call: str, inertia: np.ndarray) -> np.ndarray:
-    """``inertia`` [..., 3, 3] less the rounding that its two triangles differ by.
+    """``inertia`` [..., 3, 3] less the rounding that its two triangles differ by; see :class:`Body` for what it may be.
 
     Raises:
         ValueError: it is not symmetric, or has a negative eigenvalue.

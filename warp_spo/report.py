@@ -1,10 +1,16 @@
-"""What the main job shows: a progress bar, one table (as text or Markdown), and error against run time as a picture."""
+"""What the main job shows: a progress bar, a table, and with error against run time as a picture one HTML page.
+
+A page holds all that it shows, pictures too: one file to send, to open anywhere.
+"""
 
 from __future__ import annotations
 
+import base64
+import html
+import io
+import re
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 HEADS = ("operation", "granularity", "precision", "error", "time", "evaluations/s")
@@ -77,11 +83,56 @@ def text_table(rows: Sequence[dict]) -> str:
     )
 
 
-def markdown(title: str, rows: Sequence[dict], picture: str) -> str:
-    """The table as Markdown, under ``title``, with the picture."""
-    lines = ["| " + " | ".join(line) + " |" for line in (HEADS, *map(cells, rows))]
-    lines.insert(1, "|---|---|---|---:|---:|---:|")
-    return f"{title}\n\n" + "\n".join(lines) + f"\n\n![error against run time]({picture})\n"
+STYLE = """body { font: 15px/1.45 sans-serif; margin: 2em auto; max-width: 1250px; padding: 0 1em; }
+table { border-collapse: collapse; font-size: 12px; margin: 1em 0; }
+th, td { padding: 1px 7px; text-align: right; white-space: nowrap; border-bottom: 1px solid #ddd; }
+th:first-child, td:first-child { text-align: left; } th { position: sticky; top: 0; background: #fff; }
+td.bad { color: #c00; font-weight: bold; } img { max-width: 100%; }"""
+BAD = ("nan", "FAILS")  # cells that are coloured
+
+
+def page(title: str, parts: Sequence[str]) -> str:
+    """An HTML page of parts that the functions below make."""
+    head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{STYLE}</style>'
+    return "\n".join([f"<!doctype html>{head}", heading(title, 1), *filter(None, parts)]) + "\n"
+
+
+def heading(text: str, level: int = 2) -> str:
+    return f"<h{level}>{html.escape(text)}</h{level}>"
+
+
+def paragraph(text: str) -> str:
+    return f"<p>{html.escape(text)}</p>"
+
+
+def table(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """Cells that say NaN or FAILS are coloured."""
+    rows = ["<tr>" + "".join(f"<th>{html.escape(head)}</th>" for head in heads) + "</tr>"]
+    for line in lines:
+        marked = ((' class="bad"' if cell in BAD else "", html.escape(cell)) for cell in line)
+        rows.append("<tr>" + "".join(f"<td{mark}>{cell}</td>" for mark, cell in marked) + "</tr>")
+    return "<table>\n" + "\n".join(rows) + "\n</table>"
+
+
+def folded(summary: str, part: str) -> str:
+    """A part that shows after a click."""
+    return f"<details><summary>{html.escape(summary)}</summary>\n{part}\n</details>"
+
+
+def svg(figure: Any) -> str:
+    """A figure as SVG text: labels as text in the reader's font, no date, so that equal rows give equal files."""
+    import matplotlib
+
+    out = io.StringIO()
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "warp_spo"}):
+        figure.savefig(out, format="svg", metadata={"Date": None})
+    text = re.sub(r"font-family: [^;]*", "font-family: sans-serif", out.getvalue())  # a line of names for each label
+    return re.sub(r"\n\s+", "\n", text)
+
+
+def embedded(figure: Any) -> str:
+    """A figure inside the page."""
+    return f'<img src="data:image/svg+xml;base64,{base64.b64encode(svg(figure).encode()).decode()}">'
 
 
 def load_pyplot() -> Any:
@@ -102,8 +153,8 @@ def load_pyplot() -> Any:
     return pyplot
 
 
-def picture(pyplot: Any, title: str, rows: Sequence[dict], tolerance: dict[str, float], path: Path) -> None:
-    """Draw error against run time, both logarithmic, a numbered point a row; write a PNG to ``path``.
+def picture(pyplot: Any, title: str, rows: Sequence[dict], tolerance: dict[str, float]) -> Any:
+    """A figure of error against run time, both logarithmic, a numbered point a row.
 
     An error of exactly zero is drawn at the bottom; one that is NaN is left out, and the legend says how many are.
     """
@@ -125,5 +176,4 @@ def picture(pyplot: Any, title: str, rows: Sequence[dict], tolerance: dict[str, 
     axes.set_title(title, fontsize=9)
     axes.grid(True, which="major", alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", title="dotted: tolerance", fontsize=8)
-    figure.savefig(path, dpi=150)
-    pyplot.close(figure)
+    return figure

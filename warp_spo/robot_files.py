@@ -2,11 +2,13 @@
 
 A scene has masses and hinges, no pictures and no contacts. URDF text is stripped of shapes that weigh nothing, so that
 neither their meshes nor a mesh library is asked for; an MJCF tree, its includes pasted in, is asked whether masses come
-from meshes, for the gravity that Newton's importer does not read, and for what it misreads. Nothing here imports it.
+from meshes, for the gravity that Newton's importer does not read, and for what it misreads, and is written anew where the
+importer would lose the default class "main". Nothing here imports it.
 """
 
 from __future__ import annotations
 
+import copy
 import os
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
@@ -122,6 +124,33 @@ def mjcf_gravity(root: ET.Element) -> list[float] | None:
     return [float(g) for g in options[-1].get("gravity", "").split()] if options else None
 
 
+def mjcf_source(file: Path, root: ET.Element) -> str:
+    """What to hand to an MJCF importer: the path of the file, or its text with "main" as a class like others.
+
+    Newton 1.8 takes the outermost <default> for everybody's only if it has no class, and then knows no class "main" by
+    which an element may step out of its childclass. In the text there is one outermost <default> without a class, in
+    which everything is that stands in those of the file, and an empty class "main" in it. Text has no folder to find
+    meshes in.
+    """
+    named = any(default.get("class") == "main" for default in root.findall("default"))
+    asked = any("main" in (element.get("class"), element.get("childclass")) for element in root.iter())
+    if not named and not (asked and root.findall("default")):
+        return str(file)
+    root = copy.deepcopy(root)
+    outermost = ET.Element("default")
+    for default in root.findall("default"):
+        root.remove(default)
+        for element in default:
+            earlier = None if element.tag == "default" else outermost.find(element.tag)
+            if earlier is None:
+                outermost.append(element)
+            else:
+                earlier.attrib.update(element.attrib)
+    ET.SubElement(outermost, "default", {"class": "main"})
+    root.insert(0, outermost)
+    return ET.tostring(root, encoding="unicode")
+
+
 SOLIDS = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
 APART = "give each joint a body of its own, nested in the order of the joints"
 MISREAD = {
@@ -131,22 +160,28 @@ MISREAD = {
     "pose that the file draws",
     "a geom's shellinertia": "write the <inertial> of its body",
     "<compiler settotalmass>": "remove settotalmass and scale body_mass and body_inertia (Scene.with_values)",
+    "a joint or inertial in a <frame>": "write it beside the frame, with the frame's pos and orientation worked in",
+    "a <replicate>": "write out the copies (mujoco.mj_saveLastXML does)",
+    "a root joint's pos under floating=False": "load it with floating=None, and make the root's hinge fixed",
+    "an outermost <default> with a class of its own": "remove its class, or name it main",
 }
 """What Newton 1.8's importer reads wrongly without a word -> a way out."""
 
 
 def mjcf_misread(root: ET.Element, floating: bool | None) -> dict[str, list[str]]:
-    """The keys of :data:`MISREAD` that change the robot of the MJCF tree -> the bodies that use them.
+    """The keys of :data:`MISREAD` that change the robot of the MJCF tree -> the bodies, or classes, that use them.
 
     One hinge stands for all joints of a body: it slides before it turns, and about the first joint's ``pos``. A slide's
-    own ``pos`` changes nothing, nor do the joints of a root body if ``floating`` replaces them.
+    own ``pos`` changes nothing, nor do the joints of a root body if ``floating`` replaces them, but that a fixed base
+    stands at the first joint's ``pos``. Joints and inertials in a frame, and what a <replicate> holds, are lost.
     """
     compiler = {name: value for element in root.iter("compiler") for name, value in element.items()}
     by_geom = compiler.get("inertiafromgeom", "auto")
     low, high = (int(group) for group in compiler.get("inertiagrouprange", "0 5").split())
     classes = _mjcf_classes(root)
     found: dict[str, list[str]] = {feature: [] for feature in MISREAD}
-    slide_after, anchors, ref, shell, total = found.values()
+    slide_after, anchors, ref, shell, total, framed, replicated, fixed_at, renamed = found.values()
+    renamed += [d.get("class", "") for d in root.findall("default") if d.get("class", "main") != "main"]
     rescaled = float(compiler.get("settotalmass", -1)) > 0.0
 
     def weighs(geom: dict[str, str]) -> bool:
@@ -156,7 +191,15 @@ def mjcf_misread(root: ET.Element, floating: bool | None) -> dict[str, list[str]
     def visit(holder: ET.Element, childclass: str, label: str, replaced: bool) -> None:
         members = list(_mjcf_members(holder, childclass))
         tags = {child.tag for child, _ in members}
+        copies = [child for child, _ in members if child.tag == "replicate"]
+        weighed_by_geoms = by_geom == "true" or (by_geom == "auto" and "inertial" not in tags)
+        weighed_by_copies = holder.tag == "body" and weighed_by_geoms and any(c.find(".//geom") is not None for c in copies)
+        if weighed_by_copies or any(c.find(".//body") is not None or c.find(".//joint") is not None for c in copies):
+            replicated.append(label)
         if holder.tag == "body":
+            lost = {child.tag for frame in holder.findall("frame") for child, _ in _mjcf_members(frame, childclass)}
+            if (lost & {"joint", "freejoint"} and not replaced) or ("inertial" in lost and by_geom != "true"):
+                framed.append(label)
             joints, geoms = (
                 [
                     classes.get(child.get("class", default), {}).get(tag, {}) | child.attrib
@@ -168,13 +211,15 @@ def mjcf_misread(root: ET.Element, floating: bool | None) -> dict[str, list[str]
             kinds = [joint.get("type", "hinge") for joint in joints if not replaced]
             turns = [i for i, kind in enumerate(kinds) if kind in ("hinge", "ball")]
             pos = [[float(x) for x in joint.get("pos", "0 0 0").split()] for joint in joints]
+            if replaced and floating is False and pos and any(pos[0]):
+                fixed_at.append(label)
             if turns and "slide" in kinds[turns[0] :]:
                 slide_after.append(label)
             if any(pos[i] != pos[0] for i in turns):
                 anchors.append(label)
             if any(k in ("hinge", "slide") and float(j.get("ref", 0)) for k, j in zip(kinds, joints, strict=False)):
                 ref.append(label)
-            if by_geom == "true" or (by_geom == "auto" and "inertial" not in tags):
+            if weighed_by_geoms:
                 if any(geom.get("shellinertia") == "true" and weighs(geom) for geom in geoms):
                     shell.append(label)
             if rescaled:

@@ -11,8 +11,8 @@ from .arrays import WARP, Call
 from .blocks import Blocks, storage
 from .factorization import Factorization
 from .kernels import kinematics, rigid_blocks
+from .levels import Recursions
 from .operators import BWA
-from .recursions import Recursions
 
 
 class SpatialOperators:

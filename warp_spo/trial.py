@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,14 +57,23 @@ class Timing(NamedTuple):
 class Trial:
     """One operation of a subject.
 
+    Args:
+        subject: on what.
+        operation: which.
+        sample: worlds that are compared with the reference, spread evenly.
+
     Attributes:
+        forward_errors: relative errors of all worlds compared so far, NaN for a result that is not finite.
+        backward_errors: their backward errors, if the operation solves an equation.
         first_call: wall time of the first evaluation [s]: kernels that no earlier trial brought are compiled, or loaded
             from Warp's cache, and the workspace is allocated.
         bytes: of the caller's arrays that one evaluation reads and writes; None where the result is inside.
     """
 
-    def __init__(self, subject: Subject, operation: Operation):
-        self.subject, self.operation = subject, operation
+    def __init__(self, subject: Subject, operation: Operation, sample: int = SAMPLE):
+        self.subject, self.operation, self.sample = subject, operation, sample
+        self.forward_errors: list[float] = []
+        self.backward_errors: list[float] = []
         dyn, self.sets = subject.dyn, len(subject.inputs)
         shape = (dyn.worlds, *operation.shape(dyn.scene))
         self.out = wp.empty(shape, dtype=dyn.dtype, device=dyn.device)
@@ -99,13 +109,17 @@ class Trial:
             operation.reveal(subject, *self._inputs[index], out=self.out)
         result = self.out.numpy()
         if not np.isfinite(result).all():
+            self.forward_errors.append(float("nan"))
             return float("nan")
-        inputs = subject.inputs[index]
+        inputs, errors = subject.inputs[index], []
         at = subject.inputs[0] if operation.at_first_q else inputs
-        errors = [
-            operation.error(at.dense(world), [inputs.array(name)[world] for name in operation.reads], result[world])
-            for world in np.unique(np.linspace(0, worlds - 1, SAMPLE).astype(int)).tolist()
-        ]
+        for world in np.unique(np.linspace(0, worlds - 1, self.sample).astype(int)).tolist():
+            expected = inputs.expected(operation, at, world)
+            given = [inputs.array(name)[world] for name in operation.reads]
+            errors.append(operation.error(at.dense(world), given, result[world], expected))
+            if operation.solves:
+                self.backward_errors.append(operation.backward_error(at.dense(world), given, result[world]))
+        self.forward_errors += errors
         return float(np.max(errors))
 
     def check(self) -> float:
@@ -151,6 +165,31 @@ class Trial:
                 seconds.append(time.perf_counter() - start)
         low, median, high = np.percentile(np.array(seconds) / count, [10, 50, 90])
         return Timing(float(median), float(low), float(high)), self.error(self.sets - 1)
+
+    def eager(self, convert: Callable[[wp.array], Any] | None = None, repeats: int = 20, budget: float = 0.2) -> Timing:
+        """Wall time of single calls, each waited for: what a user pays who captures nothing.
+
+        Args:
+            convert: makes of a Warp array what the calls are given, such as ``wp.to_torch``; it is not timed.
+            repeats: how many calls are timed, after one round to warm up.
+            budget: fewer, 3 at least, where they would take longer [s].
+        """
+        device, calls = self.subject.dyn.device, []
+        out = self.out if convert is None else convert(self.out)
+        for inputs in self._inputs:
+            given = inputs if convert is None else [convert(array) for array in inputs]
+            calls.append(functools.partial(self.operation.call, self.subject, *given, out=out))
+        seconds: list[float] = []
+        for count in range(len(calls) + repeats):
+            start = time.perf_counter()
+            calls[count % len(calls)]()
+            wp.synchronize_device(device)
+            if count >= len(calls):
+                seconds.append(time.perf_counter() - start)
+            if len(seconds) >= 3 and sum(seconds) >= budget:
+                break
+        low, median, high = np.percentile(seconds, [10, 50, 90])
+        return Timing(float(median), float(low), float(high))
 
     def _row(self) -> None:
         for index in range(self.sets):

@@ -1,4 +1,4 @@
-"""The recursions of a scene on a device: what Dynamics composes, one method for each.
+"""The sweeps of a scene at node granularity, a launch a level, one method for each.
 
 A method launches its kernels and leaves the results in the workspace, [node or dof, component, world]; later methods
 read what earlier ones left. The workspace is allocated at first use and kept.
@@ -39,6 +39,7 @@ class Recursions:
         self._screw: Any = wp.array(screw, dtype=dtype, device=device)
         self.parameters = Parameters(scene, self.topology, self.worlds, device, dtype, variable)
         self._workspace: dict[Any, wp.array] = {}
+        self._frames: dict[tuple, tuple[wp.array, wp.array]] = {}
 
     def replace_values(self, scene: Scene) -> None:
         """Take the values of ``scene``, the same topology; variable values stay as they were set."""
@@ -120,6 +121,14 @@ class Recursions:
         world_pose = self._per_node("world_pose", POSE)
         self._sweep(kinematics.poses, self.plan.outward, [self.array("pose")], [world_pose])
         return world_pose
+
+    def frames(self, frames: tuple) -> tuple[wp.array, wp.array]:
+        """Bodies [frame] and origins in the body frame [frame, 3] on the device; the same arrays for equal frames."""
+        if frames not in self._frames:
+            bodies: Any = wp.array([body for body, _ in frames], dtype=int, device=self.device)
+            origins: Any = wp.array(np.array([origin for _, origin in frames]), dtype=self.dtype, device=self.device)
+            self._frames[frames] = (bodies, origins)
+        return self._frames[frames]
 
     def jacobian(self, frame_nodes: wp.array, frame_offsets: wp.array, out: wp.array) -> None:
         """Jacobians of frames, [world, frame, 6, dof]."""

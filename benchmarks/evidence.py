@@ -1,0 +1,128 @@
+"""What is known of each machine, gathered from the JSON files of runs: our rows, peers' rows, the stress suite's."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "benchmarks" / "results"
+IDENTITY = ("scene", "op", "worlds", "dtype", "granularity", "peer", "variant", "sweep")
+"""Keys that tell one measurement from another; a row may lack the last three and the granularity."""
+
+
+class Evidence(NamedTuple):
+    """Rows of one machine, each kind from the newest commit that has it (of every peer: its newest).
+
+    Files of one commit complete each other; where they have the same row, the newer one counts.
+
+    Attributes:
+        machine: what the newest file says of it, its peaks too.
+        rows: ours; ``peers``: with "peer", its name; ``stress``: with "case" and "verdict".
+        sources: a line for each file that rows come from: machine, what, commit, date, versions.
+    """
+
+    machine: dict
+    rows: list[dict]
+    peers: list[dict]
+    stress: list[dict]
+    sources: list[str]
+
+    @property
+    def is_gpu(self) -> bool:
+        return "device_memory_GiB" in self.machine
+
+
+def identity(row: dict) -> tuple:
+    """What two runs of the same measurement have in common."""
+    return tuple(row.get(key) for key in IDENTITY)
+
+
+def read(path: Path) -> dict:
+    """The run in a JSON file.
+
+    Raises:
+        ValueError: no such file, or one that no run wrote.
+    """
+    try:
+        data = json.loads(Path(path).read_text())
+        data["rows"], data["machine"]["device"], data["date"], data["commit"], data["versions"]
+    except OSError as error:
+        raise ValueError(f"benchmarks: cannot read {str(path)!r}: {error.strerror}; expected a run's JSON") from None
+    except (ValueError, KeyError, TypeError):
+        raise ValueError(f"benchmarks: {str(path)!r} is not the JSON of a run, as --json writes it") from None
+    return data
+
+
+def files(paths: Iterable[Path]) -> list[Path]:
+    """The files named, and every JSON file of the folders named.
+
+    Raises:
+        ValueError: there is none.
+    """
+    found = [file for path in paths for file in (sorted(path.glob("*.json")) if path.is_dir() else [path])]
+    if not found:
+        folders = ", ".join(map(str, paths))
+        raise ValueError(f"benchmarks: no JSON in {folders}; python -m benchmarks --json {RESULTS} makes one")
+    return found
+
+
+def gather(runs: Iterable[dict]) -> list[Evidence]:
+    """Evidence of every machine among the runs, GPUs first."""
+    machines: dict[str, list[dict]] = {}
+    for data in sorted(runs, key=lambda data: data["date"], reverse=True):
+        machines.setdefault(data["machine"]["device"], []).append(data)
+    found = [_of_machine(mine) for mine in machines.values()]
+    return sorted(found, key=lambda evidence: not evidence.is_gpu)
+
+
+def _of_machine(runs: list[dict]) -> Evidence:
+    """Evidence of one machine; ``runs`` come newest first."""
+    newest: dict[tuple, str] = {}  # kind of rows -> commit that they come from
+    rows: dict[str, list[dict]] = {"ours": [], "peers": [], "stress": []}
+    used: dict[int, dict[str, None]] = {}
+    seen: set[tuple] = set()
+    for index, data in enumerate(runs):
+        for row in [*data["rows"], *data.get("stress", [])]:
+            kind = "stress" if "verdict" in row else "peers" if row.get("peer") else "ours"
+            of_newest = newest.setdefault((kind, row.get("peer")), data["commit"]) == data["commit"]
+            key = identity(row) if kind != "stress" else (row["case"], str(row["parameters"]), row.get("precision"))
+            if of_newest and key not in seen:
+                seen.add(key)
+                rows[kind].append(row)
+                used.setdefault(index, {})[row.get("peer") or kind] = None
+    machine = {key: value for data in runs[::-1] for key, value in data["machine"].items()}
+    lines = [_source(data, list(used[index])) for index, data in enumerate(runs) if index in used]
+    return Evidence(machine, rows["ours"], rows["peers"], rows["stress"], list(dict.fromkeys(lines)))
+
+
+def _source(data: dict, kinds: list[str]) -> str:
+    named = [kind for kind in kinds if kind != "ours"]
+    what = "" if "ours" in kinds else f" ({', '.join(named)})"
+    versions = ", ".join(f"{name} {version}" for name, version in data["versions"].items())
+    return f"{data['machine']['device']}{what}, commit {data['commit'][:12]}, {data['date'][:10]}, {versions}."
+
+
+def usual_worlds(rows: Iterable[dict]) -> int:
+    """The world count that most rows have; 0 without rows."""
+    counts = [row["worlds"] for row in rows]
+    return max(counts, key=lambda worlds: (counts.count(worlds), worlds), default=0)
+
+
+def compare(a: dict, b: dict, least: float = 20.0) -> list[tuple[float, dict, dict]]:
+    """How far two runs lie apart, largest difference first: (|us_a - us_b| / the smaller, row of a, row of b).
+
+    Rows that only one run has, or that take less than ``least`` us in both, are left out.
+
+    Raises:
+        ValueError: no row is left.
+    """
+    others = {identity(row): row for row in b["rows"] if "us" in row}
+    pairs = [(row, others[identity(row)]) for row in a["rows"] if "us" in row and identity(row) in others]
+    pairs = [(x, y) for x, y in pairs if max(x["us"], y["us"]) >= least]
+    if not pairs:
+        raise ValueError(f"benchmarks: the two runs have no timed case of {least:g} us or more in common")
+    found = [(abs(x["us"] - y["us"]) / min(x["us"], y["us"]), x, y) for x, y in pairs]
+    return sorted(found, key=lambda one: one[0], reverse=True)

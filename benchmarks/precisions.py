@@ -1,0 +1,42 @@
+"""Precisions are data: what a case's ``dtype`` means to the runner."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import warp_spo as spo
+from warp_spo.operations import OPERATIONS, TOLERANCE, Inputs, Operation
+from warp_spo.trial import Subject
+
+from .refinement import REFINED, Refined
+
+
+@dataclasses.dataclass(frozen=True)
+class Precision:
+    """How a scene is computed.
+
+    Attributes:
+        subject: ``subject(scene, worlds, device, granularity, inputs)``.
+        operations: name -> operation, those that it has.
+        tolerance: largest error that counts as correct.
+        scalar: whose peak bounds it; None where two are mixed.
+    """
+
+    subject: Callable[..., Subject]
+    operations: dict[str, Operation]
+    tolerance: float
+    scalar: str | None
+
+
+def plain(dtype: str, scene: spo.Scene, worlds: int, device: Any, granularity: str | None, inputs: list[Inputs]):
+    """A subject in one scalar type throughout."""
+    return Subject(spo.Dynamics(scene, worlds, device, dtype, granularity=granularity), inputs)
+
+
+PRECISIONS = {
+    "float32": Precision(functools.partial(plain, "float32"), OPERATIONS, TOLERANCE["float32"], "float32"),
+    # a step takes the error of float32 once more; without it nothing is under 1e-8
+    "refined": Precision(Refined, REFINED, 1e-8, None),
+    "float64": Precision(functools.partial(plain, "float64"), OPERATIONS, TOLERANCE["float64"], "float64"),
+}

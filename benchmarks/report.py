@@ -1,0 +1,102 @@
+"""The whole evidence as one HTML page: tables, pictures, and the stress suite with law and verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from warp_spo import report as pages
+
+from . import pictures
+from .evidence import Evidence
+from .table import time
+
+FILE = "report.html"
+COLUMNS = {
+    # head -> (key of a row, format)
+    "scene": ("scene", ""), "operation": ("op", ""), "worlds": ("worlds", ""), "precision": ("dtype", ""),
+    "by": ("", ""), "µs": ("us", ""), "eager µs": ("eager_us", ".3g"), "torch µs": ("torch_us", ".3g"),
+    "spread": ("spread", ".1%"), "evals/s": ("evals_per_s", ".3g"), "flops": ("flops", ""), "bytes": ("bytes", ""),
+    "of the roof": ("roof", ".2%"), "error": ("error", ".1e"), "median": ("error_median", ".1e"),
+    "p99": ("error_p99", ".1e"), "backward": ("backward_error", ".1e"), "against": ("reference", ""),
+    "first call s": ("compile_s", ".2g"), "MiB": ("memory_MiB", ".4g"), "launches": ("launches", ""),
+    "registers": ("registers", ""), "local B": ("local_bytes", ""),
+}  # fmt: skip
+STRESS = {
+    "case": ("case", ""), "precision": ("precision", ""), "largest error": ("max_error", ".1e"),
+    "median": ("median_error", ".1e"), "law": ("law", ".1e"), "error / law": ("ratio", ".2g"),
+    "backward": ("backward_error", ".1e"), "µs a world": ("us", ".3g"), "verdict": ("verdict", ""),
+    "law is": ("formula", ""), "from": ("source", ""), "against": ("reference", ""),
+}  # fmt: skip
+NOTES = (
+    "Times: one evaluation of all worlds, the median of replays of a CUDA graph of many evaluations with changing "
+    "inputs, divided by their number (on a CPU: of calls in a row); eager and torch: one call, from the host's call to "
+    "the result. Errors: |y - y64| / |y64| over a sample of worlds; backward: |A x - b| / (|A| |x| + |b|). Share of "
+    "the roof: the larger of counted operations at the measured peak and the caller's bytes at the measured copy "
+    "bandwidth, over the time. NaN: a result that is not finite."
+)
+
+
+def write(pyplot: Any, everything: Sequence[Evidence], folder: Path) -> Path:
+    """Write the page into ``folder`` and return its file."""
+    parts = [pages.paragraph(NOTES)]
+    for evidence in everything:
+        parts += _machine(pyplot, evidence)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / FILE
+    path.write_text(pages.page("warp_spo: error and run time", parts))
+    return path
+
+
+def _machine(pyplot: Any, evidence: Evidence) -> list[str]:
+    found = evidence.machine
+    parts = [pages.heading(found["device"]), *(pages.paragraph(line) for line in evidence.sources)]
+    if "copy_GBps" in found:
+        peaks = ", ".join(f"{name} {peak:.4g} GFLOP/s" for name, peak in found["peak_GFLOPs"].items())
+        parts.append(pages.paragraph(f"Measured: {peaks}; copy {found['copy_GBps']:.4g} GB/s read and written."))
+    parts.append(drawn(pyplot, pictures.scaling(pyplot, evidence), "run time against size"))
+    rows = [*evidence.rows, *evidence.peers]
+    for operation in dict.fromkeys(row["op"] for row in rows):
+        for worlds in pictures.world_counts(evidence):
+            figure = pictures.error_time(pyplot, evidence, operation, worlds)
+            parts.append(drawn(pyplot, figure, f"{operation}: error against run time"))
+    if rows:
+        heads = [head for head, (key, _) in COLUMNS.items() if not key or any(key in row for row in rows)]
+        lines = [[_cell(row, *COLUMNS[head]) for head in heads] for row in rows]
+        parts.append(pages.folded(f"All {len(rows)} rows", pages.table(heads, lines)))
+    if evidence.stress:
+        parts.append(pages.heading("Stress suite"))
+        failed = [row for row in evidence.stress if row["verdict"] == "FAILS"]
+        judged = sum(row["verdict"] in ("ok", "FAILS") for row in evidence.stress)
+        parts.append(pages.paragraph(f"{judged - len(failed)} of {judged} within 10 times their law."))
+        lines = [[_stress_cell(row, *column) for column in STRESS.values()] for row in evidence.stress]
+        parts.append(pages.table(list(STRESS), lines))
+    return parts
+
+
+def drawn(pyplot: Any, figure: Any, title: str) -> str:
+    """The figure in the page, and closed; nothing for None."""
+    if figure is None:
+        return ""
+    text = pages.heading(title, 3) + pages.embedded(figure)
+    pyplot.close(figure)
+    return text
+
+
+def _cell(row: dict, key: str, form: str) -> str:
+    if not key:
+        return pictures.who(row)
+    if key == "us":
+        return time(row)
+    value = row.get(key)
+    return "" if value is None else f"{value:{form}}"
+
+
+def _stress_cell(row: dict, key: str, form: str) -> str:
+    if key == "case":
+        return " ".join([row["case"], *(f"{name}={value:g}" for name, value in row["parameters"].items())])
+    value = row.get(key)
+    if key in ("law", "ratio") and value != value:  # not judged
+        return ""
+    return "" if value is None else f"{value:{form}}"

@@ -1,0 +1,89 @@
+"""Scenes by shape, to see how run time and error grow: chains, random trees, and fixed size in growing depth or width.
+
+Every body is the rod of the 7-dof arm, every hinge revolute, about z and y in turn. These scenes grow beyond what the
+dense reference can hold: their errors are against the float64 recursions, which the robots' rows and the tests compare
+with the dense reference.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+import warp_spo as spo
+
+FIXED = 256  # bodies of the scenes of growing depth or branching
+
+
+def tree(parents: Sequence[int]) -> spo.Scene:
+    """Links of 0.25 m and 2 kg, link k on the tip of link ``parents[k]``, each with armature 0.01 kg m^2."""
+    inertia, up = np.diag([0.012, 0.012, 0.002]), (0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0)
+    bodies = [spo.Body(2.0, (0.0, 0.0, 0.125), inertia, label=f"link_{k}") for k in range(len(parents))]
+    axes, depth, hinges = np.eye(3)[[2, 1]], [0] * len(parents), []
+    for k, parent in enumerate(parents):
+        depth[k] = 0 if parent < 0 else depth[parent] + 1
+        hinges.append(spo.Hinge("revolute", int(parent), k, axis=axes[depth[k] % 2], parent_pose=up, armature=0.01))
+    return spo.Scene(bodies, hinges)
+
+
+def chain(n: int) -> spo.Scene:
+    return tree(range(-1, n - 1))
+
+
+def random_tree(n: int) -> spo.Scene:
+    """Every body hangs on any one before it: depth grows with log n."""
+    rng = np.random.default_rng(n)
+    return tree([-1, *(int(rng.integers(k)) for k in range(1, n))])
+
+
+def deep(depth: int) -> spo.Scene:
+    """``FIXED`` bodies in equal chains of ``depth`` bodies, side by side on the ground."""
+    width = FIXED // depth
+    return tree([k - width if k >= width else -1 for k in range(FIXED)])
+
+
+def branching(children: int) -> spo.Scene:
+    """``FIXED`` bodies, each with ``children`` children until there are no more; 1 is a chain."""
+    return tree([-1, *((k - 1) // children for k in range(1, FIXED))])
+
+
+SHAPES = {
+    f"{name}_{size}": functools.partial(make, size)
+    for name, make, sizes in (
+        ("chain", chain, [2**k for k in range(1, 11)]),
+        ("tree", random_tree, [2**k for k in range(1, 11)]),
+        ("deep", deep, [2**k for k in range(2, 9)]),
+        ("branching", branching, [1, 2, 4, 16, 64]),
+    )
+    for size in sizes
+}
+"""Name -> scene factory."""
+
+
+class Recursive:
+    """Stands in for the dense reference: the float64 recursions at node granularity, on the CPU.
+
+    ``Recursive(scene)`` is a ``reference`` of :class:`warp_spo.operations.Inputs`.
+    """
+
+    def __init__(self, scene: spo.Scene):
+        self.dyn = spo.Dynamics(scene, 1, "cpu", "float64", granularity="node")
+
+    def __call__(self, scene: spo.Scene, q: np.ndarray, world: int = 0) -> Configuration:
+        return Configuration(self.dyn, q)
+
+
+class Configuration:
+    """One world of a :class:`Recursive` reference, named as :class:`warp_spo.reference.Dense` is."""
+
+    def __init__(self, dyn: spo.Dynamics, q: np.ndarray):
+        self.dyn, self.scene, self.q = dyn, dyn.scene, np.asarray(q, dtype=np.float64)[None]
+
+    def forward_dynamics(self, qd: Any, tau: Any) -> np.ndarray:
+        return self.dyn.forward_dynamics(self.q, qd[None], tau[None])[0]
+
+    def inverse_dynamics(self, qd: Any, qdd: Any) -> np.ndarray:
+        return self.dyn.inverse_dynamics(self.q, qd[None], qdd[None])[0]

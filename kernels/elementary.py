@@ -1,0 +1,147 @@
+"""Elementary functions for emitted code: branch-free, so that the compiler can reorder around them.
+
+Sine and cosine reduce by three parts of pi / 2 and evaluate a polynomial, to about one unit in the last place while
+|x| is below ``reach``; larger angles have turns taken off in float64 before. The reciprocal is the hardware's, refined
+once (twice in float64).
+"""
+
+NATIVE = {
+    "float": r"""
+struct on
+{
+    static CUDA_CALLABLE inline float reach() { return 1.0e5f; }
+
+    static CUDA_CALLABLE inline float fused(float a, float b, float c)
+    {
+#if defined(__CUDA_ARCH__)
+        return fmaf(a, b, c);
+#elif defined(__FMA__) || defined(__ARM_FEATURE_FMA)
+        return __builtin_fmaf(a, b, c);
+#else
+        return (float)((double)a * (double)b + (double)c);
+#endif
+    }
+
+    static CUDA_CALLABLE inline void sincos(float x, float& sine, float& cosine)
+    {
+        const float magic = 12582912.0f;
+        const float t = fused(x, 0.636619772f, magic);
+        int quadrant;
+        memcpy(&quadrant, &t, 4);
+        const float k = t - magic;
+        float r = fused(k, -1.57079601e+0f, x);
+        r = fused(k, -3.13916473e-7f, r);
+        r = fused(k, -5.39030253e-15f, r);
+        const float rr = r * r;
+        float s = fused(rr, -1.95152959e-4f, 8.33216087e-3f);
+        s = fused(s, rr, -1.66666546e-1f);
+        s = fused(s * rr, r, r);
+        float c = fused(rr, 2.44331571e-5f, -1.38873162e-3f);
+        c = fused(c, rr, 4.16666456e-2f);
+        c = fused(c, rr, -0.5f);
+        c = fused(c, rr, 1.0f);
+        const bool odd = quadrant & 1;
+        const float a = odd ? c : s, b = odd ? s : c;
+        sine = quadrant & 2 ? -a : a;
+        cosine = (quadrant + 1) & 2 ? -b : b;
+    }
+
+    static CUDA_CALLABLE inline float reciprocal(float x)
+    {
+#if defined(__CUDA_ARCH__)
+        float r;
+        asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
+        return fused(r, fused(-x, r, 1.0f), r);
+#else
+        return 1.0f / x;
+#endif
+    }
+
+    static CUDA_CALLABLE inline float sqrt(float x) { return sqrtf(x); }
+    static CUDA_CALLABLE inline float absolute(float x) { return x < 0.0f ? -x : x; }
+    static CUDA_CALLABLE inline double log(double x) { return ::log(x); }
+
+    static CUDA_CALLABLE inline float reduced(float x)
+    {
+        const double turns = ::floor((double)x * 0.15915494309189535 + 0.5);
+        return (float)(((double)x - turns * 6.283185307179586) - turns * 2.4492935982947064e-16);
+    }
+};
+const float nan = NAN, infinity = INFINITY;
+""",
+    "double": r"""
+struct on
+{
+    static CUDA_CALLABLE inline double reach() { return 1.0e8; }
+
+    static CUDA_CALLABLE inline double fused(double a, double b, double c)
+    {
+#if defined(__CUDA_ARCH__)
+        return fma(a, b, c);
+#elif defined(__FMA__) || defined(__ARM_FEATURE_FMA)
+        return __builtin_fma(a, b, c);
+#else
+        return a * b + c;
+#endif
+    }
+
+    static CUDA_CALLABLE inline void sincos(double x, double& sine, double& cosine)
+    {
+#if defined(__CUDA_ARCH__) || defined(__FMA__) || defined(__ARM_FEATURE_FMA)
+        const double magic = 6755399441055744.0;
+        const double t = fused(x, 0.63661977236758134308, magic);
+        long long quadrant;
+        memcpy(&quadrant, &t, 8);
+        const double k = t - magic;
+        double r = fused(k, -1.57079632679489655800, x);
+        r = fused(k, -6.12323399573676603587e-17, r);
+        r = fused(k, 1.49738490485916983e-33, r);
+        const double rr = r * r;
+        double s = fused(rr, 1.58969099521155010221e-10, -2.50507602534068634195e-08);
+        s = fused(s, rr, 2.75573137070700676789e-06);
+        s = fused(s, rr, -1.98412698298579493134e-04);
+        s = fused(s, rr, 8.33333333332248946124e-03);
+        s = fused(s, rr, -1.66666666666666324348e-01);
+        s = fused(s * rr, r, r);
+        double c = fused(rr, -1.13596475577881948265e-11, 2.08757232129817482790e-09);
+        c = fused(c, rr, -2.75573143513906633035e-07);
+        c = fused(c, rr, 2.48015872894767294178e-05);
+        c = fused(c, rr, -1.38888888888741095749e-03);
+        c = fused(c, rr, 4.16666666666666019037e-02);
+        c = fused(c, rr, -0.5);
+        c = fused(c, rr, 1.0);
+        const bool odd = quadrant & 1;
+        const double a = odd ? c : s, b = odd ? s : c;
+        sine = quadrant & 2 ? -a : a;
+        cosine = (quadrant + 1) & 2 ? -b : b;
+#else
+        sine = ::sin(x);
+        cosine = ::cos(x);
+#endif
+    }
+
+    static CUDA_CALLABLE inline double reciprocal(double x)
+    {
+#if defined(__CUDA_ARCH__)
+        double r;
+        asm("rcp.approx.ftz.f64 %0, %1;" : "=d"(r) : "d"(x));
+        r = fused(r, fused(-x, r, 1.0), r);
+        return fused(r, fused(-x, r, 1.0), r);
+#else
+        return 1.0 / x;
+#endif
+    }
+
+    static CUDA_CALLABLE inline double sqrt(double x) { return ::sqrt(x); }
+    static CUDA_CALLABLE inline double absolute(double x) { return x < 0.0 ? -x : x; }
+    static CUDA_CALLABLE inline double log(double x) { return ::log(x); }
+
+    static CUDA_CALLABLE inline double reduced(double x)
+    {
+        const double turns = ::floor(x * 0.15915494309189535 + 0.5);
+        return fused(turns, -2.4492935982947064e-16, fused(turns, -6.283185307179586, x));
+    }
+};
+const double nan = NAN, infinity = INFINITY;
+""",
+}

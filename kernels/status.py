@@ -1,0 +1,245 @@
+"""Whether forward dynamics of a world can be trusted: what rounding left of D, and one word a world. Jain's eq. 1.
+
+Only launched when a caller asks for the word. The estimate carries S(k), positive semidefinite, with -eps S <= dP <= eps
+S for the error dP that rounding leaves in P(k). It obeys the recursion of P with psi in place of phi,
+
+    S(k) = sum over children phi [(I - G H) S (I - G H)* + L] phi* + L
+
+driven by L, diagonal, the size of what the node itself rounds. First order, constants of the order of one: an estimate.
+"""
+
+import functools
+
+import warp as wp
+
+from .kinematics import SCREWS
+from .spatial import spatial
+from .topology import Topology
+
+FINE, NOT_POSITIVE, NOT_FINITE, DIGITS_LOST, OUT_OF_RANGE = range(5)  # the words
+EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
+NORMAL = {wp.float32: (2.0**-126, 2.0**127), wp.float64: (2.0**-1022, 2.0**1023)}  # smallest, and a largest, normal number
+
+
+@functools.cache
+def digits(T) -> wp.Kernel:
+    """Inward, one level, after ``factor``: lost = (H S H* + |H| |P| |H*| + |Delta|) / D, the error of D in units of eps.
+
+    In place of the number: -NOT_POSITIVE where D is NaN for want of a positive pivot, -OUT_OF_RANGE where D or what it
+    is made of leaves the normal range of T, NaN where D is NaN because of another node.
+
+    L has the squares of ``d = diag(P)^1/2`` for its entries, since |P(i, j)| <= d(i) d(j): what is small stays small where
+    nothing mixes it with the large. A hinge along one axis of the node frame reads P without rounding, and cancels its
+    own row to zero without; an oblique one multiplies by how far |H| |P| |H*| lies above D. A rotation about a frame axis
+    keeps small entries, any other rounds like ones.
+    """
+    s = spatial(T)
+    vec3, mat33 = s.vec3, s.mat33
+    smallest = T(NORMAL[T][0] / EPSILON[T])  # below, products that carry the last digit of D are subnormal
+    largest = T(NORMAL[T][1])
+
+    @wp.func
+    def absolute(a: mat33):
+        return wp.matrix_from_rows(wp.abs(a[0]), wp.abs(a[1]), wp.abs(a[2]))
+
+    @wp.func
+    def root_of_diagonal(a: mat33):
+        zero = T(0.0)
+        return vec3(wp.sqrt(wp.max(a[0, 0], zero)), wp.sqrt(wp.max(a[1, 1], zero)), wp.sqrt(wp.max(a[2, 2], zero)))
+
+    @wp.func
+    def mixing(R: mat33, R_tree: mat33, screws: int):
+        """|R| as far as its small entries are exact, to what absolute errors of eps make of them elsewhere: |2 R|^1/2.
+
+        Exact are zeros, and the sines of a turn about one axis of a frame whose anchor turns by right angles.
+        """
+        one_axis, right_angles = bool(False), bool(True)
+        for i in range(3):
+            for j in range(3):
+                one_axis = one_axis or wp.abs(R[i, j]) == T(1.0)
+                right_angles = right_angles and (R_tree[i, j] == T(0.0) or wp.abs(R_tree[i, j]) == T(1.0))
+        a = mat33()
+        for i in range(3):
+            for j in range(3):
+                r = wp.abs(R[i, j])
+                exact = r == T(0.0) or (one_axis and right_angles and screws == 1 and R_tree[i, j] == T(0.0))
+                a[i, j] = wp.where(exact, r, wp.sqrt(wp.min(T(2.0) * r, T(1.0))))
+        return a
+
+    @wp.func
+    def rounded(h: vec3, u: vec3, d: vec3, after: mat33, D: T, own: T):
+        """L after eliminating a hinge along one axis of the frame: ``own`` in its row, P+ and what was taken elsewhere."""
+        found = vec3()
+        for i in range(3):
+            found[i] = wp.where(h[i] == T(0.0), wp.abs(after[i, i]) + T(2.0) * u[i] * u[i] / D, own * d[i] * d[i])
+        return found
+
+    @wp.kernel(module=f"warp_spo_status_{T.__name__}", enable_backward=False)
+    def kernel(
+        topology: Topology,
+        level: int,
+        tree: wp.array3d[T],
+        pose: wp.array3d[T],
+        axis: wp.array3d[T],
+        rigid: wp.array3d[T],
+        armature: wp.array2d[T],
+        articulated: wp.array3d[T],
+        pivot: wp.array2d[T],
+        rounding_out: wp.array3d[T],  # S of P+ in the parent's frame
+        lost_out: wp.array2d[T],
+    ):
+        i, world = wp.tid()
+        node = topology.order[level + i]
+        mass = rigid[node, 0, world]
+        J = s.load_symmetric(rigid, node, 4, world)
+        C = s.skew(s.load(rigid, node, 1, world))
+        m = wp.diag(vec3(mass, mass, mass))
+        S_J, S_C, S_m = mat33(), mat33(), mat33()
+        for c in range(topology.child_start[node], topology.child_start[node + 1]):
+            child = topology.children[c]
+            J += s.load_symmetric(articulated, child, 0, world)
+            C += s.load_matrix(articulated, child, 6, world)
+            m += s.load_symmetric(articulated, child, 15, world)
+            S_J += s.load_symmetric(rounding_out, child, 0, world)
+            S_C += s.load_matrix(rounding_out, child, 6, world)
+            S_m += s.load_symmetric(rounding_out, child, 15, world)
+        terms = wp.sqrt(T(1 + topology.child_start[node + 1] - topology.child_start[node]))
+        d_n, d_f = root_of_diagonal(J), root_of_diagonal(m)
+        S_J += terms * wp.diag(wp.cw_mul(d_n, d_n))
+        S_m += terms * wp.diag(wp.cw_mul(d_f, d_f))
+
+        first = topology.qd_start[node]
+        count = topology.dof_count[node]
+        for e in range(count):
+            dof = first + count - 1 - e
+            w, v = s.load(axis, dof, 0, world), s.load(axis, dof, 3, world)
+            n, f = J * w + C * v, wp.transpose(C) * w + m * v
+            D, delta = pivot[dof, world], wp.abs(armature[dof, world])
+            w_a, v_a = wp.abs(w), wp.abs(v)
+            n_a = absolute(J) * w_a + absolute(C) * v_a
+            f_a = wp.transpose(absolute(C)) * w_a + absolute(m) * v_a
+            entries = int(0)
+            for c in range(3):
+                entries += wp.where(w[c] == T(0.0), 0, 1) + wp.where(v[c] == T(0.0), 0, 1)
+                if count > 1 and w[c] != T(0.0):
+                    w_a[c] = T(1.0)  # a turned axis has absolute errors
+            along = entries == 1
+            size = wp.dot(w_a, n_a) + wp.dot(v_a, f_a)
+
+            n_S, f_S = S_J * w + S_C * v, wp.transpose(S_C) * w + S_m * v
+            error = wp.dot(w, n_S) + wp.dot(v, f_S)
+            lost = (error + delta + wp.where(along, T(0.0), size)) / D
+            whole = size + delta
+            if whole > largest or (whole > T(0.0) and whole < smallest) or (D > T(0.0) and D < smallest):
+                lost = T(-float(OUT_OF_RANGE))
+            elif wp.isnan(D) and not wp.isnan(whole):
+                lost = T(-float(NOT_POSITIVE))
+            lost_out[dof, world] = lost
+
+            n_D, f_D = n / D, f / D
+            d_n, d_f = root_of_diagonal(J), root_of_diagonal(m)
+            S_J += wp.outer(n_D, error * n_D - n_S) - wp.outer(n_S, n_D)
+            S_C += wp.outer(n_D, error * f_D - f_S) - wp.outer(n_S, f_D)
+            S_m += wp.outer(f_D, error * f_D - f_S) - wp.outer(f_S, f_D)
+            J -= wp.outer(n, n_D)
+            C -= wp.outer(n, f_D)
+            m -= wp.outer(f, f_D)
+            if along:
+                own = T(0.0)
+                if delta > T(0.0):  # which leaves P Delta / D of the row, as the difference of two larger numbers
+                    own = T(2.0)
+                S_J += wp.diag(rounded(w, n, d_n, J, D, own))
+                S_m += wp.diag(rounded(v, f, d_f, m, D, own))
+            else:
+                scale = T(1.0) + wp.sqrt(size / D)
+                S_J += scale * scale * wp.diag(wp.cw_mul(d_n, d_n))
+                S_m += scale * scale * wp.diag(wp.cw_mul(d_f, d_f))
+        if topology.parent[node] >= 0:
+            R, l = s.load_matrix(pose, node, 0, world), s.load(pose, node, 9, world)
+            R_a = mixing(R, s.load_matrix(tree, node, 0, world), wp.where(topology.motion[node] == SCREWS, 1, 0))
+            f_d = R_a * root_of_diagonal(m)
+            n_d = R_a * root_of_diagonal(J) + absolute(s.skew(l)) * f_d
+            S_J, S_C, S_m = s.articulated_to_parent(R, l, S_J, S_C, S_m)
+            S_J += wp.diag(wp.cw_mul(n_d, n_d))
+            S_m += wp.diag(wp.cw_mul(f_d, f_d))
+            s.store_symmetric(rounding_out, node, 0, world, S_J)
+            s.store_matrix(rounding_out, node, 6, world, S_C)
+            s.store_symmetric(rounding_out, node, 15, world, S_m)
+
+    return kernel
+
+
+@functools.cache
+def word(T) -> wp.Kernel:
+    """The worst of what is true of a world, one thread for each: NOT_FINITE, NOT_POSITIVE, OUT_OF_RANGE, DIGITS_LOST.
+
+    DIGITS_LOST: D may have lost half of the digits of T, lost > 2 eps^-1/2: measured errors are .02 to .8 of ``lost``.
+    NOT_POSITIVE takes a result that is not finite as well: a form of the recursion that resolves D where the sweeps do
+    not has a result to show. OUT_OF_RANGE also where the result overflows, or all of it is subnormal.
+    """
+    most = T(2.0 * EPSILON[T] ** -0.5)
+    none = T(0.1 / EPSILON[T])
+    tiny = T(NORMAL[T][0])
+
+    @wp.func
+    def finite(a: wp.array3d[T], world: int):
+        for i in range(a.shape[0]):
+            for c in range(a.shape[1]):
+                if not wp.isfinite(a[i, c, world]):
+                    return False
+        return True
+
+    @wp.kernel(module=f"warp_spo_status_{T.__name__}", enable_backward=False)
+    def kernel(
+        q: wp.array2d[T],
+        qd: wp.array2d[T],
+        tau: wp.array2d[T],
+        body_f: wp.array3d[T],
+        tree: wp.array3d[T],
+        com: wp.array3d[T],
+        rigid: wp.array3d[T],
+        armature: wp.array2d[T],
+        gravity: wp.array2d[T],
+        lost: wp.array2d[T],
+        qdd: wp.array2d[T],
+        status_out: wp.array[wp.int32],
+    ):
+        world = wp.tid()
+        given = finite(tree, world) and finite(com, world) and finite(rigid, world)
+        if gravity:
+            for c in range(3):
+                given = given and wp.isfinite(gravity[c, world])
+        for i in range(q.shape[1]):
+            given = given and wp.isfinite(q[world, i])
+        if body_f:
+            for body in range(body_f.shape[1]):
+                for c in range(6):
+                    given = given and wp.isfinite(body_f[world, body, c])
+        positive, in_range, resolved, overflow = bool(True), bool(True), bool(True), bool(False)
+        largest = T(0.0)
+        for dof in range(qdd.shape[1]):
+            given = given and wp.isfinite(armature[dof, world])
+            if qd:
+                given = given and wp.isfinite(qd[world, dof])
+            if tau:
+                given = given and wp.isfinite(tau[world, dof])
+            positive = positive and lost[dof, world] != T(-float(NOT_POSITIVE)) and not lost[dof, world] > none
+            in_range = in_range and lost[dof, world] != T(-float(OUT_OF_RANGE))
+            resolved = resolved and not lost[dof, world] > most
+            overflow = overflow or not wp.isfinite(qdd[world, dof])
+            largest = wp.max(largest, wp.abs(qdd[world, dof]))
+        found = int(FINE)
+        if not given:
+            found = int(NOT_FINITE)
+        elif overflow and not positive:
+            found = int(NOT_POSITIVE)
+        elif overflow or not in_range or (largest > T(0.0) and largest < tiny):
+            found = int(OUT_OF_RANGE)
+        elif not (resolved and positive):
+            found = int(DIGITS_LOST)
+        status_out[world] = found
+
+    return kernel
+
+
+KERNELS = (digits, word)

@@ -1,0 +1,168 @@
+"""Articulated bodies: Mass = [I + H phi K] D [I + H phi K]*, inward, and its inverse applied, outward (eq. 1).
+
+H is a unit vector in the link's axes, so that U = P H* is a column of P and the row and column of P+ = P - U D^-1 U*
+that belong to it are known without a difference: U Delta / D, which is nothing where there is no armature. A pivot that
+is not positive becomes NaN.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+from ..trace.graph import Value, guarded, is_constant, reciprocal
+from ..trace.spatial import ZERO, Articulated, Matrix, Rigid, Vector, cross, dot, magnitude, symmetric
+from .links import BALL, FREE, HELIX, SLIDE, TURN, Link, Links, Placed
+from .motion import NONE, Motion, carried, in_hinge, in_link
+
+LEAST = 4.0  # pivots of less than this many roundings of what cancels in them may be rounding alone
+NO_INERTIA = Articulated(NONE, NONE, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+UNIT = {TURN: [2], SLIDE: [5], BALL: [0, 1, 2], FREE: [3, 4, 5, 0, 1, 2]}  # entry of (omega; v) that each dof moves
+
+
+class Pivot(NamedTuple):
+    """One eliminated column: H*, or the entry where it is 1; U = P H*; 1 / D; Delta."""
+
+    unit: int | None
+    column: Vector
+    U: Vector
+    D: Value
+    inverse: Value
+
+
+@dataclasses.dataclass
+class Factor:
+    """What a link leaves behind going in.
+
+    Attributes:
+        pivots: in the order of elimination, the reverse of the hinge's dofs.
+        P: P+ in the link's frame. in_parent: phi P+ phi*.
+        whole: the hinge is free and has no armature: D = P, and the parent feels nothing.
+        turned: the hinge's dofs are eliminated in the link's axes, not in the hinge's.
+    """
+
+    pivots: list[Pivot]
+    P: Articulated
+    in_parent: Articulated
+    whole: bool
+    turned: bool
+
+
+def factor(links: Links, link: Link, place: Placed, carried_on: list[Articulated], epsilon: float) -> Factor:
+    """Eliminate the dofs of a link from its articulated inertia, with those of its children in its own frame."""
+    P = NO_INERTIA if link.inertia is None else link.inertia.articulated
+    for other in carried_on:
+        P = P + other
+    triples = [link.armature[i : i + 3] for i in range(0, len(link.armature), 3)]
+    alike = all(map(is_constant, link.armature)) and all(len(set(triple)) == 1 for triple in triples)
+    turned = link.motion in (BALL, FREE) and alike
+    whole = link.motion == FREE and alike and not any(link.armature)
+    pivots = []
+    if turned or link.motion in (TURN, SLIDE):
+        for unit, armature in zip(UNIT[link.motion][::-1], link.armature[::-1], strict=True):
+            pivot, P = _eliminate_unit(P, unit, armature)
+            pivots.append(pivot)
+    else:
+        columns = _columns(link, place)
+        for column, armature in zip(columns[::-1], link.armature[::-1], strict=True):
+            pivot, P = _eliminate(P, column, armature, LEAST * epsilon)
+            pivots.append(pivot)
+    if link.parent is None or whole:
+        return Factor(pivots, P, NO_INERTIA, whole, turned)
+    return Factor(pivots, P, place.pose.articulated_to_parent(P), whole, turned)
+
+
+def _columns(link: Link, place: Placed) -> list[Vector]:
+    """Columns of H*, (omega; v) in the link's axes."""
+    columns = []
+    for dof in link.dofs:
+        w, v = in_link(link, place, lambda other, dof=dof: 1.0 if other == dof else 0.0)
+        columns.append(Vector((*w, *v)))
+    return columns
+
+
+def _eliminate_unit(P: Articulated, unit: int, armature: Value) -> tuple[Pivot, Articulated]:
+    U = Vector(P.entry(unit, j) for j in range(6))
+    D = U[unit] + armature
+    inverse = reciprocal(guarded(D, 0.0))
+    scaled, kept = U * inverse, armature * inverse
+
+    def entry(i: int, j: int) -> Value:
+        if unit in (i, j):
+            return U[j if i == unit else i] * kept
+        return P.entry(i, j) - U[i] * scaled[j]
+
+    column = Vector(1.0 if i == unit else 0.0 for i in range(6))
+    return Pivot(unit, column, U, D, inverse), Articulated.build(entry)
+
+
+def _eliminate(P: Articulated, column: Vector, armature: Value, least: float) -> tuple[Pivot, Articulated]:
+    n, f = P.apply(Vector(column[:3]), Vector(column[3:]))
+    U = Vector((*n, *f))
+    D = dot(column, U) + armature
+    size = magnitude(column, P, column) + armature
+    inverse = reciprocal(guarded(guarded(D, least * size), 0.0))
+    return Pivot(None, column, U, D, inverse), P.less(U, U * inverse)
+
+
+def reduced(
+    link: Link, place: Placed, done: Factor, motion: Motion, force: Vector, tau: Any
+) -> tuple[list[Value], Vector]:
+    """eps = tau - H z of each pivot, and z+ in the parent's frame; ``force`` is z: (n; f) in the link's frame."""
+    eps, z = [], force
+    if done.turned:
+        given = [*place.turned.T @ Vector(tau[-3:])]  # type: ignore[union-attr]
+        if link.motion == FREE:
+            given = [*(place.turned.T @ Vector(tau[:3])), *given]  # type: ignore[union-attr]
+    else:
+        given = list(tau)
+    for pivot, b in zip(done.pivots, given[::-1], strict=True):
+        e = b - (z[pivot.unit] if pivot.unit is not None else dot(pivot.column, z))
+        rate = e * pivot.inverse
+        eps.append(rate)
+        z = z + pivot.U * rate
+    if link.parent is None:
+        return eps, ZERO
+    if done.whole:  # nothing but the force that the hinge itself transmits
+        z = Vector((*place.turned.T @ Vector(tau[3:]), *place.turned.T @ Vector(tau[:3])))  # type: ignore[union-attr]
+    else:
+        n, f = done.P.apply(motion.bias_w, motion.bias_v)
+        z = z + Vector((*n, *f))
+    n, f = place.pose.force_to_parent(Vector(z[:3]), Vector(z[3:]))
+    if not done.whole:
+        n_l, f_l = done.in_parent.apply(ZERO, motion.bias_l)
+        n, f = n + n_l, f + f_l
+    return eps, Vector((*n, *f))
+
+
+def expanded(
+    link: Link, place: Placed, done: Factor, rates: list[Value], motion: Motion, acceleration: tuple[Vector, Vector]
+) -> tuple[list[Value], tuple[Vector, Vector]]:
+    """qdd of the link's dofs and its acceleration, for D^-1 eps and the ``acceleration`` of its parent."""
+    w, v = carried(place, motion, acceleration)
+    bias = (*motion.bias_w, *motion.bias_v)
+    alpha = [0.0] * 6 if done.whole else [a + b for a, b in zip((*w, *v), bias, strict=True)]
+    qdd = []
+    for pivot, rate in zip(done.pivots[::-1], rates[::-1], strict=True):
+        qdd.append(rate - pivot.inverse * dot(pivot.U, alpha))
+        if pivot.unit is not None:
+            alpha[pivot.unit] = alpha[pivot.unit] + qdd[-1]
+        else:
+            alpha = [a + h * qdd[-1] for a, h in zip(alpha, pivot.column, strict=True)]
+    w, v = Vector(alpha[:3]), Vector(alpha[3:])
+    if done.whole:  # the body's acceleration less its parent's, in the hinge's axes
+        back = (lambda a: a) if link.matrix is None else (lambda a: link.matrix.T @ a)
+        w_p, v_p = acceleration
+        v_p = v_p + cross(w_p, place.pose.l) + motion.bias_l
+        relative = in_hinge(link, place, w - motion.bias_w, v - motion.bias_v)
+        qdd = [a - b for a, b in zip(relative, (*back(v_p), *back(w_p)), strict=True)]
+    elif done.turned:
+        qdd = in_hinge(link, place, Vector(qdd[-3:]), Vector(qdd[:3]))
+    return qdd, (w, v)
+
+
+def gyroscopic(inertia: Rigid | None, motion: Motion) -> Vector:
+    """(n; f) that keeps a body on its way at omega' = 0 and a = 0: omega x J omega; omega~ omega~ h."""
+    if inertia is None:
+        return Vector((*ZERO, *ZERO))
+    return Vector((*cross(motion.spin, inertia.inertia @ motion.spin), *(motion.whirl @ inertia.moment)))

@@ -1,0 +1,89 @@
+"""Velocities and accelerations, outward: omega(k) = omega(p) + H* qd, and what each hinge adds.
+
+Accelerations are classical, those of a material point: a(k) = a(p) + (omega'~ + omega~ omega~) l. Linear velocities then
+enter nowhere, and float32 does not lose what a fast chain's large velocities would cancel (eq. 20 with the Coriolis
+terms moved into a).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from ..trace.graph import Value
+from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, symmetric
+from .links import BALL, FREE, HELIX, SLIDE, TURN, Link, Placed
+
+NONE = Matrix.of([[0.0] * 3] * 3)
+
+
+class Motion(NamedTuple):
+    """How a link moves, in its own axes.
+
+    Attributes:
+        spin: omega. whirl: omega~ omega~.
+        bias_w, bias_v: acceleration of its frame relative to its parent's that is there at qdd = 0.
+        bias_l: the parent's omega~ omega~ l, in the parent's axes.
+    """
+
+    spin: Vector
+    whirl: Matrix
+    bias_w: Vector
+    bias_v: Vector
+    bias_l: Vector
+
+
+STILL = Motion(ZERO, NONE, ZERO, ZERO, ZERO)
+
+
+def whirl(w: Vector) -> Matrix:
+    """omega~ omega~"""
+    xx, yy, zz = w[0] * w[0], w[1] * w[1], w[2] * w[2]
+    return symmetric(-(yy + zz), -(xx + zz), -(xx + yy), w[0] * w[1], w[0] * w[2], w[1] * w[2])
+
+
+def in_link(link: Link, place: Placed, rate: Any) -> tuple[Vector, Vector]:
+    """(omega; v) of the hinge in the link's axes, H* rate, for ``rate(dof)``."""
+    z = IDENTITY[2]
+    rates = [rate(dof) for dof in link.dofs]
+    if link.motion == TURN:
+        return z * rates[0], ZERO
+    if link.motion == SLIDE:
+        return ZERO, z * rates[0]
+    if link.motion == HELIX:
+        return z * rates[0], z * (link.pitch * rates[0])
+    back = place.turned.T  # type: ignore[union-attr]
+    if link.motion == BALL:
+        return back @ Vector(rates), ZERO
+    return back @ Vector(rates[3:]), back @ Vector(rates[:3])
+
+
+def in_hinge(link: Link, place: Placed, w: Vector, v: Vector) -> list[Value]:
+    """(n; f) or (omega'; v') of the link as the entries that belong to the link's dofs: H (w; v)."""
+    if link.motion == TURN:
+        return [w[2]]
+    if link.motion == SLIDE:
+        return [v[2]]
+    if link.motion == HELIX:
+        return [w[2] + link.pitch * v[2]]
+    w = place.turned @ w  # type: ignore[operator]
+    return list(w) if link.motion == BALL else [*(place.turned @ v), *w]  # type: ignore[operator]
+
+
+def moved(link: Link, place: Placed, parent: Motion | None, qd: Any) -> Motion:
+    """Motion of ``link`` on a parent that moves as ``parent`` (None: the inertial frame) with rates ``qd(dof)``."""
+    if qd is None:
+        return STILL
+    parent = parent or STILL
+    carried = place.pose.to_child(parent.spin)
+    w, v = in_link(link, place, qd)
+    spin = carried + w
+    return Motion(spin, whirl(spin), cross(carried, w), 2.0 * cross(carried, v), parent.whirl @ place.pose.l)
+
+
+def carried(place: Placed, motion: Motion, acceleration: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    """What the parent's ``acceleration`` makes of the link's, without its own bias and qdd."""
+    w, v = acceleration
+    return place.pose.to_child(w), place.pose.to_child(v + cross(w, place.pose.l) + motion.bias_l)
+
+
+__all__ = ["FREE", "STILL", "Motion", "carried", "in_hinge", "in_link", "moved", "whirl"]

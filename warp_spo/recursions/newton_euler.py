@@ -1,0 +1,32 @@
+"""Newton-Euler: tau = H phi (M alpha + b) + Delta qdd; the force relation dual to eq. 20."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..trace.graph import Value
+from ..trace.spatial import Matrix, Rigid, Vector, cross, skew
+from .links import Link, Placed
+from .motion import Motion, carried, in_hinge, in_link
+
+
+def accelerated(
+    link: Link, place: Placed, motion: Motion, acceleration: tuple[Vector, Vector], qdd: Any
+) -> tuple[Vector, Vector]:
+    """Acceleration of the link for that of its parent and ``qdd(dof)``."""
+    w, v = carried(place, motion, acceleration)
+    w_j, v_j = in_link(link, place, qdd)
+    return w + motion.bias_w + w_j, v + motion.bias_v + v_j
+
+
+def body_force(inertia: Rigid, motion: Motion, w: Vector, v: Vector) -> tuple[Vector, Vector]:
+    """(n; f) that gives a body the acceleration (w; v): classical, at its frame's origin."""
+    rotation: Matrix = skew(w) + motion.whirl
+    n = inertia.inertia @ w + cross(inertia.moment, v) + cross(motion.spin, inertia.inertia @ motion.spin)
+    return n, inertia.mass * v + rotation @ inertia.moment
+
+
+def hinge_force(link: Link, place: Placed, n: Vector, f: Vector, qdd: Any) -> list[Value]:
+    """tau of the link's dofs for the force (n; f) that its hinge transmits."""
+    forces = in_hinge(link, place, n, f)
+    return [force + a * qdd(dof) for force, a, dof in zip(forces, link.armature, link.dofs, strict=True)]

@@ -1,0 +1,309 @@
+"""The recursions of a scene as traces: each operation as the values that it stores.
+
+``step`` names say in the emitted code which link and which letter of the paper a value belongs to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from ..trace.emit import Store
+from ..trace.graph import Value, sum_of_logarithms
+from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, total
+from . import articulated, composite, kinematics, motion, newton_euler
+from .links import Link, Links, Placed, placed
+from .motion import STILL, Motion
+
+EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}
+
+
+class Trace:
+    """One evaluation of a scene: what is shared between the operations on it.
+
+    Args:
+        links: the scene's links.
+        dtype: whose rounding the pivots are compared with.
+        given: names of the arrays that are there: "qd", "tau", "qdd", "body_f", "b"; the others are zero.
+    """
+
+    def __init__(self, links: Links, dtype: str, given: tuple[str, ...]):
+        self.links, self.graph, self.epsilon, self.given = links, links.graph, EPSILON[dtype], given
+        self.places: dict[int, Placed] = {}
+        self.motions: dict[int, Motion] = {}
+        self.axes: dict[int, Matrix] = {}  # of every link, in the inertial frame
+        self.bodies: dict[int, list[int]] = {}  # by link: the bodies that sit on it
+        for body, seat in links.seats.items():
+            if seat.link is not None:
+                self.bodies.setdefault(id(seat.link), []).append(body)
+
+    # -- inputs ----------------------------------------------------------------------------------------------------
+    def vector(self, name: str) -> Callable[[int], Value]:
+        """``entry(i)`` of an array, or zero if it is not given."""
+        if name not in self.given:
+            return lambda i: 0.0
+        return lambda i: self.graph.input(name, i)
+
+    def at(self, link: Link, letter: str) -> None:
+        self.graph.step = f"{link.label}|{letter}"
+
+    def place(self, link: Link, moves: bool = False) -> None:
+        self.at(link, "x")
+        self.places[id(link)] = place = placed(link, self.vector("q"))
+        self.at(link, "w")
+        parent = None if link.parent is None else self.motions[id(link.parent)]
+        qd = self.vector("qd") if moves else None
+        self.motions[id(link)] = motion.moved(link, place, parent, qd) if moves else STILL
+        if "body_f" in self.given:
+            R = IDENTITY if link.parent is None else self.axes[id(link.parent)]
+            self.axes[id(link)] = R @ place.pose.rotation
+
+    def external(self, link: Link) -> Vector:
+        """(n; f) of the external wrenches on the bodies of a link, in its frame."""
+        n, f = ZERO, ZERO
+        if "body_f" not in self.given:
+            return Vector((*n, *f))
+        back = self.axes[id(link)].T
+        for body in self.bodies.get(id(link), ()):
+            seat = self.links.seats[body]
+            force = back @ Vector(self.graph.input("body_f", body, c) for c in range(3))
+            torque = back @ Vector(self.graph.input("body_f", body, c) for c in range(3, 6))
+            com = seat.offset + seat.matrix @ self.links.com(body)
+            n, f = n + torque + cross(com, force), f + force
+        return Vector((*n, *f))
+
+    @property
+    def base(self) -> tuple[Vector, Vector]:
+        """Acceleration of the inertial frame: gravity's, the other way."""
+        return ZERO, -self.links.gravity
+
+    # -- operations ------------------------------------------------------------------------------------------------
+    def forward_dynamics(self, right: str = "tau", bias: bool = True, column: int | None = None) -> list[Store]:
+        """out = Mass^-1 (tau - bias_force); without ``bias`` Mass^-1 times the array ``right``, or a unit vector."""
+        moves = bias and "qd" in self.given
+        tau = self.vector(right) if column is None else (lambda i: 1.0 if i == column else 0.0)
+        done, rates = self.reduce(tau, moves, bias)
+        return self.expand(done, rates, self.base if bias else (ZERO, ZERO))
+
+    def factor(self) -> dict[int, articulated.Factor]:
+        done: dict[int, articulated.Factor] = {}
+        for link, outward in self.links.traversal():
+            if outward:
+                self.place(link)
+            else:
+                self.at(link, "P")
+                inner = [done[id(child)].in_parent for child in link.children]
+                done[id(link)] = articulated.factor(self.links, link, self.places[id(link)], inner, self.epsilon)
+        return done
+
+    def reduce(self, tau: Callable[[int], Value], moves: bool, loads: bool) -> tuple[dict, dict]:
+        """Factors of every link, and D^-1 [I - H psi K] (tau - ...)."""
+        done: dict[int, articulated.Factor] = {}
+        rates: dict[int, list[Value]] = {}
+        forces: dict[int, Vector] = {}
+        for link, outward in self.links.traversal():
+            if outward:
+                self.place(link, moves)
+                continue
+            self.at(link, "P")
+            place, move = self.places[id(link)], self.motions[id(link)]
+            inner = [done[id(child)].in_parent for child in link.children]
+            done[id(link)] = factor = articulated.factor(self.links, link, place, inner, self.epsilon)
+            self.at(link, "z")
+            z = articulated.gyroscopic(link.inertia, move)
+            if loads:
+                z = z - self.external(link)
+            for child in link.children:
+                z = z + forces[id(child)]
+            right = [tau(dof) for dof in link.dofs]
+            rates[id(link)], forces[id(link)] = articulated.reduced(link, place, factor, move, z, right)
+        return done, rates
+
+    def expand(self, done: dict, rates: dict, base: tuple[Vector, Vector]) -> list[Store]:
+        alpha: dict[int, tuple[Vector, Vector]] = {}
+        stores = []
+        for link in self.links.links:
+            self.at(link, "a")
+            above = base if link.parent is None else alpha[id(link.parent)]
+            key = id(link)
+            qdd, alpha[key] = articulated.expanded(
+                link, self.places[key], done[key], rates[key], self.motions[key], above
+            )
+            stores += [Store("out", (dof,), value) for dof, value in zip(link.dofs, qdd, strict=True)]
+        return stores
+
+    def inverse_dynamics(self) -> list[Store]:
+        """out = Mass qdd + bias_force"""
+        qdd, moves = self.vector("qdd"), "qd" in self.given
+        alpha: dict[int, tuple[Vector, Vector]] = {}
+        forces: dict[int, tuple[Vector, Vector]] = {}
+        stores = []
+        for link, outward in self.links.traversal():
+            key = id(link)
+            if outward:
+                self.place(link, moves)
+                self.at(link, "a")
+                above = self.base if link.parent is None else alpha[id(link.parent)]
+                alpha[key] = newton_euler.accelerated(link, self.places[key], self.motions[key], above, qdd)
+                continue
+            self.at(link, "f")
+            external = self.external(link)
+            n, f = -Vector(external[:3]), -Vector(external[3:])
+            if link.inertia is not None:
+                own = newton_euler.body_force(link.inertia, self.motions[key], *alpha[key])
+                n, f = n + own[0], f + own[1]
+            for child in link.children:
+                n, f = n + forces[id(child)][0], f + forces[id(child)][1]
+            tau = newton_euler.hinge_force(link, self.places[key], n, f, qdd)
+            stores += [Store("out", (dof,), value) for dof, value in zip(link.dofs, tau, strict=True)]
+            if link.parent is not None:
+                forces[key] = self.places[key].pose.force_to_parent(n, f)
+        return stores
+
+    def mass_matrix(self) -> list[Store]:
+        """out = Mass, both triangles"""
+        for link in self.links.links:
+            self.place(link)
+        entries = composite.mass_matrix(self.links, self.places)
+        return self._both(entries)
+
+    def _both(self, entries: dict[tuple[int, int], Value]) -> list[Store]:
+        return [Store("out", place, value) for (i, j), entry in entries.items() for place, value in _mirrored(i, j, entry)]
+
+    def solve_mass_matrix(self) -> list[Store]:
+        return self.forward_dynamics("b", bias=False)
+
+    def log_det_mass_matrix(self) -> list[Store]:
+        done = self.factor()
+        return [Store("out", (), sum_of_logarithms(p.D for f in done.values() for p in f.pivots))]
+
+    def mass_matrix_inverse(self) -> list[Store]:
+        """out = Y* D Y, Y = D^-1 [I - H psi K]: column j of Y ends at the root, so only common ancestors meet."""
+        done = self.factor()
+        halves = {}
+        for link in self.links.links:
+            for i, dof in enumerate(link.dofs):
+                self.at(link, f"y{dof}_")
+                unit = [1.0 if j == i else 0.0 for j in range(len(link.dofs))]
+                halves[dof] = self.inward(done, link, Vector((*ZERO, *ZERO)), unit)
+        return self._both(self._sandwich(done, halves))
+
+    def inward(self, done: dict, link: Link, force: Vector, right: list[Value]) -> dict[int, list[Value]]:
+        """D^-1 [I - H psi K] of ``right`` at a link's dofs and a ``force`` on it: by link, on the way to the root."""
+        rates, over = {}, link
+        while True:
+            key = id(over)
+            rates[key], force = articulated.reduced(over, self.places[key], done[key], STILL, force, right)
+            if over.parent is None:
+                return rates
+            over = over.parent
+            right = [0.0] * len(over.dofs)
+
+    def _sandwich(self, done: dict, halves: dict) -> dict[tuple[int, int], Value]:
+        """Y* D Y; entries of columns without a common ancestor are absent."""
+        entries: dict[tuple[int, int], Value] = {}
+        names = list(halves)
+        for at, i in enumerate(names):
+            self.graph.step = f"column {i}|m"
+            weighted = {
+                key: [rate * pivot.D for rate, pivot in zip(rates, done[key].pivots, strict=True)]
+                for key, rates in halves[i].items()
+            }
+            for j in names[: at + 1]:
+                both = [key for key in halves[j] if key in weighted]
+                if both:
+                    entries[j, i] = total(a * b for key in both for a, b in zip(weighted[key], halves[j][key], strict=True))
+        return entries
+
+    # -- kinematics ------------------------------------------------------------------------------------------------
+    def place_axes(self, link: Link) -> None:
+        """Place a link and find its axes in the inertial frame."""
+        self.place(link)
+        self.at(link, "R")
+        parent = IDENTITY if link.parent is None else self.axes[id(link.parent)]
+        self.axes[id(link)] = parent @ self.places[id(link)].pose.rotation
+
+    def frame(self, body: int, origin: tuple) -> tuple[Link | None, Vector]:
+        """The link that carries a frame of a body, and the frame's origin in the link's frame."""
+        seat = self.links.seats[body]
+        R, p = self.links.anchor(body)
+        return seat.link, seat.offset + seat.matrix @ (R.T @ (Vector(origin) - p))
+
+    def jacobian(self, frames: tuple) -> list[Store]:
+        """out [frame, 6, dof]: velocity of each frame's origin, then angular velocity, in inertial axes, per unit qd."""
+        for link in self.links.links:
+            self.place_axes(link)
+        stores = []
+        for index, (body, origin) in enumerate(frames):
+            link, arm = self.frame(body, origin)
+            while link is not None:
+                self.at(link, f"j{index}_")
+                parent = IDENTITY if link.parent is None else self.axes[id(link.parent)]
+                for dof, (w, v) in zip(
+                    link.dofs, kinematics.columns(link, parent, self.axes[id(link)], arm), strict=True
+                ):
+                    stores += [Store("out", (index, c, dof), value) for c, value in enumerate((*v, *w))]
+                pose = self.places[id(link)].pose
+                arm, link = pose.l + pose.to_parent(arm), link.parent
+        return stores
+
+    def operational_inertia_inverse(self, frames: tuple) -> list[Store]:
+        """out [6 frames, 6 frames] = J Mass^-1 J*: a unit wrench on a frame, sent inward, is a column of Y."""
+        for link in self.links.links:
+            self.place_axes(link)
+        done = self.factor()
+        halves = {}
+        for index, (body, origin) in enumerate(frames):
+            link, arm = self.frame(body, origin)
+            for c in range(6):
+                if link is None:
+                    halves[6 * index + c] = {}
+                    continue
+                self.at(link, f"y{index}{c}_")
+                axis = self.axes[id(link)][c % 3]
+                wrench = (*cross(arm, axis), *axis) if c < 3 else (*axis, *ZERO)
+                halves[6 * index + c] = self.inward(done, link, Vector(wrench), [0.0] * len(link.dofs))
+        entries = self._sandwich(done, halves)
+        return [Store("out", place, value) for i, j in entries for place, value in _mirrored(i, j, entries[i, j])]
+
+    def body_poses(self) -> list[Store]:
+        """out [body, 7] = position, quaternion xyzw"""
+        q, at, turns = self.vector("q"), {None: ZERO}, {None: Vector((0.0, 0.0, 0.0, 1.0))}
+        for link in self.links.links:
+            self.at(link, "p")
+            over = None if link.parent is None else id(link.parent)
+            self.places[id(link)] = place = placed(link, q)
+            at[id(link)] = at[over] + kinematics.turned(turns[over], place.pose.l)
+            turns[id(link)] = kinematics.multiplied(turns[over], kinematics.relative_quaternion(link, q))
+        stores = []
+        for body, seat in self.links.seats.items():
+            R, p = self.links.anchor(body)
+            key = None if seat.link is None else id(seat.link)
+            axes = seat.matrix @ R.T
+            position = at[key] + kinematics.turned(turns[key], seat.offset - axes @ p)
+            pose = (*position, *kinematics.multiplied(turns[key], kinematics.constant_quaternion(axes)))
+            stores += [Store("out", (body, c), value) for c, value in enumerate(pose)]
+        return stores
+
+    def body_velocities(self) -> list[Store]:
+        """out [body, 6] = velocity of the CoM, angular velocity, in inertial axes"""
+        velocity = {None: (ZERO, ZERO)}
+        for link in self.links.links:
+            self.place_axes(link)
+            self.at(link, "v")
+            key, over = id(link), None if link.parent is None else id(link.parent)
+            hinge = motion.in_link(link, self.places[key], self.vector("qd"))
+            velocity[key] = kinematics.carried_velocity(link, self.places[key], velocity[over], hinge)
+        stores = []
+        for body, seat in self.links.seats.items():
+            key = None if seat.link is None else id(seat.link)
+            w, v = velocity[key]
+            R = IDENTITY if key is None else self.axes[key]
+            com = seat.offset + seat.matrix @ self.links.com(body)
+            values = (*(R @ (v + cross(w, com))), *(R @ w))
+            stores += [Store("out", (body, c), value) for c, value in enumerate(values)]
+        return stores
+
+
+def _mirrored(i: int, j: int, value: Value) -> list[tuple[tuple[int, int], Value]]:
+    return [((i, j), value)] if i == j else [((i, j), value), ((j, i), value)]

@@ -1,0 +1,36 @@
+"""A trace evaluated by NumPy, in any precision: what the emitted code must agree with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from .graph import Value, is_constant, ordered
+
+FUNCTIONS: dict[str, Callable] = {
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "neg": lambda a: -a,
+    "sin": np.sin,
+    "cos": np.cos,
+    "sqrt": np.sqrt,
+    "reciprocal": lambda a: 1.0 / a,
+    "absolute": np.abs,
+    "guarded": lambda a, least: np.where(a > least, a, np.nan),
+    "sum_of_logarithms": lambda *terms: sum(np.log(term.astype(np.float64)) for term in terms),
+}
+
+
+def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype: Any = np.float64) -> list[np.ndarray]:
+    """The outputs, for ``load(array, index)`` a number or an array over worlds."""
+    outputs, values = list(outputs), {}
+    for scalar in ordered(outputs):
+        if scalar.op == "input":
+            values[scalar.key] = np.asarray(load(scalar.args[0], scalar.args[1:]), dtype=dtype)
+        else:
+            args = [np.asarray(a, dtype=dtype) if is_constant(a) else values[a.key] for a in scalar.args]
+            values[scalar.key] = np.asarray(FUNCTIONS[scalar.op](*args), dtype=dtype)
+    return [np.asarray(o, dtype=dtype) if is_constant(o) else values[o.key] for o in outputs]

@@ -1,0 +1,215 @@
+"""Scalars of a trace: a hash-consed graph in which constants fold and equal expressions are one node.
+
+A constant is a plain Python float, so arithmetic among constants is Python's own, in float64. What meets a symbol is
+simplified on the spot: 0 x, 1 x, -1 x, x + 0, -(-x), c (d x); signs move outward and into sums, where they cost
+nothing. Structural zeros thus vanish with everything that they multiply (0 times NaN is 0 here, by intent).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+COMMUTATIVE = ("add", "mul")
+FUNCTIONS = {"sin": math.sin, "cos": math.cos, "sqrt": math.sqrt, "reciprocal": lambda x: 1.0 / x if x else math.nan}
+
+Value = Any  # a Scalar, or a float: a constant
+
+
+class Graph:
+    """The scalars of one trace.
+
+    Attributes:
+        step: what is being computed; new scalars are named after it.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[tuple, Scalar] = {}
+        self.step = "v"
+
+    def input(self, array: str, *index: int) -> Scalar:
+        """An element of an array that is given at run time."""
+        return self.make("input", array, *index)
+
+    def make(self, op: str, *args: Any) -> Scalar:
+        key = (op, *[a if a.__class__ is not Scalar else a.key for a in args])
+        found = self._known.get(key)
+        if found is None:
+            found = self._known[key] = Scalar(self, op, args, len(self._known))
+        return found
+
+
+class Scalar:
+    """One value of a trace: an operation and what it takes."""
+
+    __slots__ = ("args", "graph", "key", "op", "step")
+
+    def __init__(self, graph: Graph, op: str, args: tuple, key: int):
+        self.graph, self.op, self.args = graph, op, args
+        self.key = (key,)  # a tuple, so that it never equals a constant
+        self.step = graph.step
+
+    @property
+    def number(self) -> int:
+        return self.key[0]
+
+    def __repr__(self) -> str:
+        return f"{self.op}({', '.join(map(repr, self.args))})"
+
+    def __add__(self, other: Value) -> Value:
+        return add(self, other)
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Value) -> Value:
+        return add(self, negative(other))
+
+    def __rsub__(self, other: Value) -> Value:
+        return add(other, negative(self))
+
+    def __mul__(self, other: Any) -> Value:
+        return NotImplemented if isinstance(other, tuple) else multiply(self, other)
+
+    __rmul__ = __mul__
+
+    def __neg__(self) -> Value:
+        return negative(self)
+
+    def __bool__(self) -> bool:
+        raise TypeError("a traced scalar has no truth value: what a step does may depend on the scene, not on the state")
+
+
+def is_constant(x: Value) -> bool:
+    return x.__class__ is not Scalar
+
+
+def negative(x: Value) -> Value:
+    if is_constant(x):
+        return -x
+    if x.op == "neg":
+        return x.args[0]
+    if x.op == "sub":
+        return x.graph.make("sub", x.args[1], x.args[0])
+    if x.op == "mul" and is_constant(x.args[0]):
+        return x.graph.make("mul", -x.args[0], x.args[1])
+    return x.graph.make("neg", x)
+
+
+def add(x: Value, y: Value) -> Value:
+    if is_constant(x):
+        x, y = y, x
+    if is_constant(x):
+        return x + y
+    graph = x.graph
+    if is_constant(y):
+        if y == 0.0:
+            return x
+        if x.op == "add" and is_constant(x.args[1]):
+            return add(x.args[0], x.args[1] + y)
+        return graph.make("add", x, y)
+    if y.op == "neg":
+        return 0.0 if y.args[0] is x else graph.make("sub", x, y.args[0])
+    if x.op == "neg":
+        return 0.0 if x.args[0] is y else graph.make("sub", y, x.args[0])
+    if x.op == "mul" and y.op == "mul" and x.args[1] is y.args[1] and is_constant(x.args[0]) and is_constant(y.args[0]):
+        return multiply(x.args[0] + y.args[0], x.args[1])
+    return graph.make("add", x, y) if x.key < y.key else graph.make("add", y, x)
+
+
+def multiply(x: Value, y: Value) -> Value:
+    """Constants come first; otherwise the older scalar does."""
+    if is_constant(y):
+        x, y = y, x
+    if is_constant(y):
+        return x * y
+    graph = y.graph
+    if is_constant(x):
+        if x == 0.0:
+            return 0.0
+        if x == 1.0:
+            return y
+        if x == -1.0:
+            return negative(y)
+        if y.op == "mul" and is_constant(y.args[0]):
+            return multiply(x * y.args[0], y.args[1])
+        if y.op == "neg":
+            return graph.make("mul", -x, y.args[0])
+        return graph.make("mul", float(x), y)
+    sign = (x.op == "neg") != (y.op == "neg")
+    x, y = (x.args[0] if x.op == "neg" else x), (y.args[0] if y.op == "neg" else y)
+    product = graph.make("mul", x, y) if x.key < y.key else graph.make("mul", y, x)
+    return negative(product) if sign else product
+
+
+def function(name: str, x: Value) -> Value:
+    """sin, cos, sqrt or reciprocal of ``x``; the sign of an argument moves outward."""
+    if is_constant(x):
+        return FUNCTIONS[name](x)
+    if x.op == "neg" and name in ("sin", "cos", "reciprocal"):
+        value = x.graph.make(name, x.args[0])
+        return value if name == "cos" else negative(value)
+    return x.graph.make(name, x)
+
+
+def sin(x: Value) -> Value:
+    return function("sin", x)
+
+
+def cos(x: Value) -> Value:
+    return function("cos", x)
+
+
+def sqrt(x: Value) -> Value:
+    return function("sqrt", x)
+
+
+def reciprocal(x: Value) -> Value:
+    """1 / x; of a constant zero, NaN."""
+    return function("reciprocal", x)
+
+
+def guarded(x: Value, least: Value) -> Value:
+    """``x``, or NaN if it is not above ``least``."""
+    if is_constant(x) and is_constant(least):
+        return x if x > least else math.nan
+    graph = x.graph if not is_constant(x) else least.graph
+    return graph.make("guarded", x, least)
+
+
+def absolute(x: Value) -> Value:
+    if is_constant(x):
+        return abs(x)
+    if x.op in ("neg", "absolute"):
+        return absolute(x.args[0]) if x.op == "neg" else x
+    return x.graph.make("absolute", x)
+
+
+def sum_of_logarithms(terms: Iterable[Value]) -> Value:
+    """log of each term, added in float64."""
+    terms = list(terms)
+    symbols = [term for term in terms if not is_constant(term)]
+    constant = sum(math.log(term) if term > 0.0 else math.nan for term in terms if is_constant(term))
+    return add(symbols[0].graph.make("sum_of_logarithms", *symbols), constant) if symbols else float(constant)
+
+
+def ordered(outputs: Iterable[Value]) -> list[Scalar]:
+    """Every scalar that the outputs need, depth first: each just before what needs it first, so that few live at once."""
+    seen: set[tuple] = set()
+    order: list[Scalar] = []
+    for output in outputs:
+        if is_constant(output) or output.key in seen:
+            continue
+        stack: list[tuple[Scalar, Any]] = [(output, iter(output.args))]
+        seen.add(output.key)
+        while stack:
+            scalar, rest = stack[-1]
+            for argument in rest:
+                if argument.__class__ is Scalar and argument.key not in seen:
+                    seen.add(argument.key)
+                    stack.append((argument, iter(argument.args)))
+                    break
+            else:
+                order.append(scalar)
+                stack.pop()
+    return order

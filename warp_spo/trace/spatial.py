@@ -1,0 +1,243 @@
+"""Spatial algebra over traced scalars, in the paper's order: V = (omega; v), f = (n; f).
+
+Vectors and matrices are tuples of values, so that a structural zero is simply 0.0. A pose maps a link's axes into its
+parent's in up to two turns: first about the link's own z axis, by the hinge, then by a matrix, the scene's. Kept apart
+they cost less than their product.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from .graph import Value, absolute, is_constant
+
+
+def total(values: Iterable[Value]) -> Value:
+    result: Value = 0.0
+    for value in values:
+        result = result + value
+    return result
+
+
+class Vector(tuple):
+    """Three or more values."""
+
+    __slots__ = ()
+
+    def __add__(self, other: Any) -> Vector:
+        return Vector(a + b for a, b in zip(self, other, strict=True))
+
+    def __sub__(self, other: Any) -> Vector:
+        return Vector(a - b for a, b in zip(self, other, strict=True))
+
+    def __neg__(self) -> Vector:
+        return Vector(-a for a in self)
+
+    def __mul__(self, scale: Any) -> Vector:
+        return Vector(a * scale for a in self)
+
+    __rmul__ = __mul__
+
+    @property
+    def vanishes(self) -> bool:
+        """All entries are the constant zero."""
+        return all(is_constant(a) and a == 0.0 for a in self)
+
+
+ZERO = Vector((0.0, 0.0, 0.0))
+
+
+def dot(a: Any, b: Any) -> Value:
+    return total(x * y for x, y in zip(a, b, strict=True))
+
+
+def cross(a: Any, b: Any) -> Vector:
+    return Vector((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
+
+
+class Matrix(tuple):
+    """Rows of values; ``@`` multiplies by a matrix or a vector."""
+
+    __slots__ = ()
+
+    @classmethod
+    def of(cls, rows: Any) -> Matrix:
+        return cls(Vector(row) for row in rows)
+
+    @property
+    def T(self) -> Matrix:
+        return Matrix.of(zip(*self, strict=True))
+
+    def __matmul__(self, other: Any) -> Any:
+        if isinstance(other, Matrix):
+            columns = other.T
+            return Matrix.of([dot(row, column) for column in columns] for row in self)
+        return Vector(dot(row, other) for row in self)
+
+    def __add__(self, other: Any) -> Matrix:
+        return Matrix(a + b for a, b in zip(self, other, strict=True))
+
+    def __sub__(self, other: Any) -> Matrix:
+        return Matrix(a - b for a, b in zip(self, other, strict=True))
+
+    def __neg__(self) -> Matrix:
+        return Matrix(-row for row in self)
+
+
+IDENTITY = Matrix.of([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def skew(v: Any) -> Matrix:
+    """v~, with v~ a = v x a."""
+    return Matrix.of([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def symmetric(xx: Value, yy: Value, zz: Value, xy: Value, xz: Value, yz: Value) -> Matrix:
+    return Matrix.of([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def upper(entry: Any) -> Matrix:
+    """The symmetric matrix with ``entry(row, column)``, asked for row <= column only."""
+    found = {(i, j): entry(i, j) for i in range(3) for j in range(i, 3)}
+    return Matrix.of([[found[min(i, j), max(i, j)] for j in range(3)] for i in range(3)])
+
+
+class Rigid(NamedTuple):
+    """A rigid inertia about a frame's origin: mass, first moment, inertia."""
+
+    mass: Value
+    moment: Vector
+    inertia: Matrix
+
+    def __add__(self, other: Any) -> Rigid:
+        return Rigid(self.mass + other.mass, self.moment + other.moment, self.inertia + other.inertia)
+
+    def apply(self, w: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """M (omega; v)."""
+        return self.inertia @ w + cross(self.moment, v), self.mass * v - cross(self.moment, w)
+
+    @property
+    def articulated(self) -> Articulated:
+        mass = self.mass
+        return Articulated(self.inertia, skew(self.moment), symmetric(mass, mass, mass, 0.0, 0.0, 0.0))
+
+
+class Articulated(NamedTuple):
+    """P = [[J, C], [C*, m]], J and m symmetric."""
+
+    J: Matrix
+    C: Matrix
+    m: Matrix
+
+    def __add__(self, other: Any) -> Articulated:
+        return Articulated(self.J + other.J, self.C + other.C, self.m + other.m)
+
+    def apply(self, w: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """P (omega; v)."""
+        return self.J @ w + self.C @ v, self.C.T @ w + self.m @ v
+
+    def entry(self, i: int, j: int) -> Value:
+        if i < 3:
+            return self.J[i][j] if j < 3 else self.C[i][j - 3]
+        return self.C[j][i - 3] if j < 3 else self.m[i - 3][j - 3]
+
+    @classmethod
+    def build(cls, entry: Any) -> Articulated:
+        """From ``entry(i, j)``, asked for i <= j only."""
+        C = Matrix.of([[entry(i, j + 3) for j in range(3)] for i in range(3)])
+        return cls(upper(entry), C, upper(lambda i, j: entry(i + 3, j + 3)))
+
+    def less(self, U: Any, scaled: Any) -> Articulated:
+        """P - U scaled*, for ``scaled`` a multiple of U: the result is symmetric."""
+        return Articulated.build(lambda i, j: self.entry(i, j) - U[i] * scaled[j])
+
+
+class Pose(NamedTuple):
+    """Where a link's frame sits in its parent's: turned about z by (cos, sin), then by ``matrix``; origin at ``l``.
+
+    Where either turn is None there is none.
+    """
+
+    turn: tuple[Value, Value] | None
+    matrix: Matrix | None
+    l: Vector
+
+    def to_parent(self, v: Any) -> Vector:
+        """The components of a free vector in the parent's axes."""
+        if self.turn is not None:
+            c, s = self.turn
+            v = Vector((c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]))
+        return Vector(v) if self.matrix is None else self.matrix @ v
+
+    def to_child(self, v: Any) -> Vector:
+        """The components of the parent's free vector in the link's axes."""
+        if self.matrix is not None:
+            v = self.matrix.T @ v
+        if self.turn is not None:
+            c, s = self.turn
+            v = Vector((c * v[0] + s * v[1], c * v[1] - s * v[0], v[2]))
+        return Vector(v)
+
+    @property
+    def rotation(self) -> Matrix:
+        """The product of the turns: the link's axes in the parent's."""
+        columns = [self.to_parent(axis) for axis in IDENTITY]
+        return Matrix(columns).T
+
+    def force_to_parent(self, n: Vector, f: Vector) -> tuple[Vector, Vector]:
+        """phi(p, k) (n; f)"""
+        f = self.to_parent(f)
+        return self.to_parent(n) + cross(self.l, f), f
+
+    def motion_to_child(self, w: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """phi*(p, k) (omega; v)"""
+        return self.to_child(w), self.to_child(v + cross(w, self.l))
+
+    def _turned_symmetric(self, S: Matrix) -> Matrix:
+        if self.turn is not None:
+            c, s = self.turn
+            cc, ss, cs = c * c, s * s, c * s
+            k = (cs + cs) * S[0][1]
+            e, f = c * S[0][2] - s * S[1][2], s * S[0][2] + c * S[1][2]
+            xy = cs * (S[0][0] - S[1][1]) + (cc - ss) * S[0][1]
+            S = symmetric(cc * S[0][0] + (ss * S[1][1] - k), ss * S[0][0] + (cc * S[1][1] + k), S[2][2], xy, e, f)
+        if self.matrix is not None:
+            half = self.matrix @ S
+            S = upper(lambda i, j: dot(half[i], self.matrix[j]))  # type: ignore[index]
+        return S
+
+    def _turned(self, C: Matrix) -> Matrix:
+        """R C R*"""
+        rows = Matrix(self.to_parent(row) for row in C)  # C R*
+        return Matrix(self.to_parent(column) for column in rows.T).T
+
+    def rigid_to_parent(self, body: Rigid) -> Rigid:
+        """phi M phi* of a rigid inertia."""
+        h = self.to_parent(body.moment)
+        moment = h + self.l * body.mass
+        inertia = self._turned_symmetric(body.inertia)
+        l = self.l
+        cross_terms = upper(lambda i, j: _double(l, h, i, j) + _double(moment, l, i, j))
+        return Rigid(body.mass, moment, inertia - cross_terms)
+
+    def articulated_to_parent(self, P: Articulated) -> Articulated:
+        """phi P phi*, block by block."""
+        m, C_r, J = self._turned_symmetric(P.m), self._turned(P.C), self._turned_symmetric(P.J)
+        L = skew(self.l)
+        C = C_r + L @ m
+        first, second = L @ C_r.T, C @ L
+        return Articulated(upper(lambda i, j: J[i][j] + first[i][j] - second[i][j]), C, m)
+
+
+def _double(a: Any, b: Any, i: int, j: int) -> Value:
+    """Entry of a~ b~ = b a* - (a . b) I."""
+    if i != j:
+        return b[i] * a[j]
+    return -total(a[k] * b[k] for k in range(3) if k != i)
+
+
+def magnitude(a: Any, P: Articulated, b: Any) -> Value:
+    """|a|* |P| |b|, entry by entry: the size of what cancels in a* P b."""
+    terms = ((absolute(a[i]) * absolute(P.entry(i, j))) * absolute(b[j]) for i in range(6) for j in range(6))
+    return total(terms)
