@@ -23,7 +23,9 @@ HEADS = ("case", "precision", "max error", "median", "law", "x law", "backward",
 WIDTHS = (36, 18, 9, 8, 8, 7, 8, 10, 10, 8, 8, 22, 26, 8)
 
 
-def rows(cases: Iterable[Case], device: Any = None, timed: bool = True, granularity: str | None = None) -> Iterator[dict]:
+def rows(
+    cases: Iterable[Case], device: Any = None, timed: bool = True, granularity: str | None = None
+) -> Iterator[dict]:
     """Yield a row for each case and precision, and for each form for contrast.
 
     A case that reads D where the recursions leave it runs at granularity "node" alone.
@@ -88,7 +90,8 @@ def main(argv: list[str] | None = None) -> int:
     print("  ".join(f"{head:<{width}}" for head, width in zip(HEADS, WIDTHS, strict=True)))
     where = options.device, options.granularity
     try:
-        for one in itertools.chain(rows(cases, where[0], not options.check, where[1]), check_rows(options.filter, *where)):
+        measured = rows(cases, where[0], not options.check, where[1])
+        for one in itertools.chain(measured, check_rows(options.filter, *where)):
             found.append(one)
             print(line(one), flush=True)
     except ValueError as error:  # of --granularity

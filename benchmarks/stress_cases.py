@@ -36,8 +36,8 @@ class Case:
             "absolute".
         steps: refinement steps with a float64 residual before the error is taken.
         contrast: forms of :mod:`contrast` to print beside it.
-        words: precision -> the status word that every world has there. Elsewhere a world has 0; or 3, digits lost, where
-            the law lets more than half of the digits go.
+        words: precision -> the status word that every world has there. Elsewhere a world has 0; or 3, digits lost,
+            where the law lets more than half of the digits go.
     """
 
     name: str

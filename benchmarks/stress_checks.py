@@ -83,7 +83,7 @@ def massless_leaf(where: Setting) -> None:
 
 
 def negative_mass(where: Setting) -> None:
-    """Body and Scene refuse it; in a variable value, which nobody inspects, it is flagged where a pivot turns negative."""
+    """Body and Scene refuse it; in a variable value, which nobody inspects, a pivot that turns negative is flagged."""
     p = scenes.chain_rand(8)
     try:
         spo.Body(-1.0)
@@ -172,13 +172,24 @@ def negative_armature(where: Setting) -> None:
 
 
 def lost_directions(where: Setting) -> None:
-    """Where no digit of D is left, in oblique axes, a world is flagged: a ball, a d6 at the middle angle 90 degrees."""
+    """Where no digit of D is left, in oblique axes, a world is flagged: a ball, a d6 at the middle angle 90 degrees.
+
+    At node granularity no digit is: word 1, NaN. A form that turns its frames onto the axes may be right to half of its
+    digits instead; the word, which judges by the node's form, is not 0 all the same.
+    """
     for p in [scenes.weak_ball(weak, False) for weak in (1e-8, 1e-9, 0.0)] + [scenes.three_angles(0.0)]:
         if where.dtype == "float64":  # its own smallest numbers
             p = scenes.weak_ball(1e-18, False) if p.q.shape[1] == 4 else Problem(
                 p.scene, np.where(np.arange(3) == 1, np.pi / 2.0, p.q), p.tau)
         qdd, status = run(p, where)
-        assert (status == 1).all() and np.isnan(qdd).any(1).all(), f"status {status}, q {p.q[0]}"
+        lost = np.isnan(qdd).any(1)
+        assert (status == np.where(lost, 1, 3)).all(), f"status {status}, q {p.q[0]}, qdd {qdd[0]}"
+        if where.granularity == "node":
+            assert lost.all(), f"q {p.q[0]}, qdd {qdd[0]}"
+        elif not lost.all():
+            wanted = Sweep(p.scene, p.q, "mp50").forward(p.tau).astype(np.float64)
+            error = (np.linalg.norm(qdd - wanted, axis=1) / np.linalg.norm(wanted, axis=1))[~lost]
+            assert error.max() <= where.eps**0.5, f"error {error.max():.1e}, q {p.q[0]}"
 
 
 def lost_outboard(where: Setting) -> None:
@@ -249,9 +260,10 @@ def floating_chain(worlds: int) -> Problem:
 
 
 def non_finite_input(where: Setting) -> None:
-    """NaN and infinity in every entry of every input, each in a world of its own: status 2; other worlds keep their bits.
+    """NaN and infinity in every entry of every input, each in a world of its own: status 2, and the others' bits.
 
-    Worlds with odd numbers are spoiled, by one entry each.
+    Worlds with odd numbers are spoiled, by one entry each. An entry that a form of the recursion does not read, the
+    place of a free root, changes nothing but the word.
     """
     scene = floating_chain(1).scene
     sizes = dict(q=scene.coord_count, qd=scene.dof_count, tau=scene.dof_count, body_f=6 * scene.body_count)
@@ -268,7 +280,7 @@ def non_finite_input(where: Setting) -> None:
             label = f"{name} = {spoil}"
             np.testing.assert_array_equal(status, np.where(odd, 2, 0), err_msg=label)
             np.testing.assert_array_equal(qdd[~odd], wanted[~odd], err_msg=label)
-            hidden = np.flatnonzero(np.isfinite(qdd[odd]).all(1))
+            hidden = np.flatnonzero(np.isfinite(qdd[odd]).all(1) & (qdd[odd] != wanted[odd]).any(1))
             assert not len(hidden), f"{label}: entries {hidden} leave a finite result"
 
 
@@ -296,8 +308,8 @@ def non_finite_value(where: Setting) -> None:
             label = f"{name} = {spoil}"
             np.testing.assert_array_equal(status, np.where(odd, 2, 0), err_msg=label)
             np.testing.assert_array_equal(qdd[~odd], wanted[~odd], err_msg=label)
-            hidden = np.flatnonzero(np.isfinite(qdd[odd]).all(1))
-            assert not len(hidden) or label == "joint_armature = inf", f"{label}: entries {hidden} leave a finite result"
+            hidden = np.flatnonzero(np.isfinite(qdd[odd]).all(1) & (qdd[odd] != wanted[odd]).any(1))
+            assert not len(hidden) or label == "joint_armature = inf", f"{label}: entries {hidden} give a finite result"
         dyn.set(**{name: scene.values[name][0]})
         np.testing.assert_array_equal(dyn.forward_dynamics(p.q, p.qd, p.tau), wanted, err_msg=f"{name} set back")
 

@@ -164,8 +164,8 @@ def law_of(case: Case, eps: float) -> np.ndarray:
 
 @functools.lru_cache(maxsize=64)
 def _cond(case: Case) -> np.ndarray:
-    mass = spo.Dynamics(case.problem.scene, case.problem.worlds, "cpu", "float64").mass_matrix(case.problem.q)
-    return np.linalg.cond(mass)
+    p = case.problem
+    return np.linalg.cond(spo.Dynamics(p.scene, p.worlds, "cpu", "float64", granularity="node").mass_matrix(p.q))
 
 
 def row(case: Case, subject: Subject, precision: str, timed: bool = False) -> dict:

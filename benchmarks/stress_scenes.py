@@ -116,7 +116,7 @@ def chain_coriolis(n: int) -> Problem:
 def chain_gravity_torque(n: int) -> Problem:
     """Gravity as the forces tau = -C that do the same, in float64 before rounding."""
     one = chain_gravity(n)
-    force = spo.Dynamics(one.scene, one.worlds, "cpu", "float64").gravity_force(one.q)
+    force = spo.Dynamics(one.scene, one.worlds, "cpu", "float64", granularity="node").gravity_force(one.q)
     return problem(one.scene.with_values(gravity=NONE), one.q, -force)
 
 

@@ -1,8 +1,8 @@
 """A stiff arm stepped a great many times: springs and dampers implicit through Delta, one period of steps in a graph.
 
-Linearly implicit Euler, (Mass + dt kd + dt^2 ke) qdd = tau - bias - ke (q + dt qd) - kd qd, contracts, and so it forgets
-what it rounds: under a force of a period of whole steps the states one period apart become the same to a few eps, after
-10^6 steps as after 10^4, and float32 stays as near to float64.
+Linearly implicit Euler, (Mass + dt kd + dt^2 ke) qdd = tau - bias - ke (q + dt qd) - kd qd, contracts, and so it
+forgets what it rounds: under a force of a period of whole steps the states one period apart become the same to a few
+eps, after 10^6 steps as after 10^4, and float32 stays as near to float64.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Elementary functions for emitted code: branch-free, so that the compiler can reorder around them.
 
 Sine and cosine reduce by three parts of pi / 2 and evaluate a polynomial, to about one unit in the last place while
-|x| is below ``reach``; larger angles have turns taken off in float64 before. The reciprocal is the hardware's, refined
+|x| is below ``reach``. On CUDA the caller of ``sincos`` sees to that, with ``reduced``, which takes off turns in float64;
+``sincos_any`` looks for itself. The reciprocal is the hardware's, refined
 once (twice in float64).
 """
 
@@ -24,6 +25,9 @@ struct on
 
     static CUDA_CALLABLE inline void sincos(float x, float& sine, float& cosine)
     {
+#if !defined(__CUDA_ARCH__)
+        if (!(absolute(x) <= reach())) x = reduced(x);
+#endif
         const float magic = 12582912.0f;
         const float t = fused(x, 0.636619772f, magic);
         int quadrant;
@@ -44,6 +48,12 @@ struct on
         const float a = odd ? c : s, b = odd ? s : c;
         sine = quadrant & 2 ? -a : a;
         cosine = (quadrant + 1) & 2 ? -b : b;
+    }
+
+    static CUDA_CALLABLE inline void sincos_any(float x, float& sine, float& cosine)
+    {
+        if (!(absolute(x) <= reach())) x = reduced(x);
+        sincos(x, sine, cosine);
     }
 
     static CUDA_CALLABLE inline float reciprocal(float x)
@@ -87,6 +97,9 @@ struct on
 
     static CUDA_CALLABLE inline void sincos(double x, double& sine, double& cosine)
     {
+#if !defined(__CUDA_ARCH__)
+        if (!(absolute(x) <= reach())) x = reduced(x);
+#endif
 #if defined(__CUDA_ARCH__) || defined(__FMA__) || defined(__ARM_FEATURE_FMA)
         const double magic = 6755399441055744.0;
         const double t = fused(x, 0.63661977236758134308, magic);
@@ -118,6 +131,12 @@ struct on
         sine = ::sin(x);
         cosine = ::cos(x);
 #endif
+    }
+
+    static CUDA_CALLABLE inline void sincos_any(double x, double& sine, double& cosine)
+    {
+        if (!(absolute(x) <= reach())) x = reduced(x);
+        sincos(x, sine, cosine);
     }
 
     static CUDA_CALLABLE inline double reciprocal(double x)

@@ -1,7 +1,7 @@
 """Whether forward dynamics of a world can be trusted: what rounding left of D, and one word a world. Jain's eq. 1.
 
-Only launched when a caller asks for the word. The estimate carries S(k), positive semidefinite, with -eps S <= dP <= eps
-S for the error dP that rounding leaves in P(k). It obeys the recursion of P with psi in place of phi,
+Only launched when a caller asks for the word. The estimate carries S(k), positive semidefinite, with
+-eps S <= dP <= eps S for the error dP that rounding leaves in P(k). It obeys the recursion of P with psi for phi,
 
     S(k) = sum over children phi [(I - G H) S (I - G H)* + L] phi* + L
 
@@ -18,20 +18,20 @@ from .topology import Topology
 
 FINE, NOT_POSITIVE, NOT_FINITE, DIGITS_LOST, OUT_OF_RANGE = range(5)  # the words
 EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
-NORMAL = {wp.float32: (2.0**-126, 2.0**127), wp.float64: (2.0**-1022, 2.0**1023)}  # smallest, and a largest, normal number
+NORMAL = {wp.float32: (2.0**-126, 2.0**127), wp.float64: (2.0**-1022, 2.0**1023)}  # smallest and large numbers
 
 
 @functools.cache
 def digits(T) -> wp.Kernel:
-    """Inward, one level, after ``factor``: lost = (H S H* + |H| |P| |H*| + |Delta|) / D, the error of D in units of eps.
+    """Inward, one level, after ``factor``: lost = (H S H* + |H| |P| |H*| + |Delta|) / D, the error of D in eps.
 
     In place of the number: -NOT_POSITIVE where D is NaN for want of a positive pivot, -OUT_OF_RANGE where D or what it
     is made of leaves the normal range of T, NaN where D is NaN because of another node.
 
-    L has the squares of ``d = diag(P)^1/2`` for its entries, since |P(i, j)| <= d(i) d(j): what is small stays small where
-    nothing mixes it with the large. A hinge along one axis of the node frame reads P without rounding, and cancels its
-    own row to zero without; an oblique one multiplies by how far |H| |P| |H*| lies above D. A rotation about a frame axis
-    keeps small entries, any other rounds like ones.
+    L has the squares of ``d = diag(P)^1/2`` for its entries, since |P(i, j)| <= d(i) d(j): what is small stays small
+    where nothing mixes it with the large. A hinge along one axis of the node frame reads P without rounding, and
+    cancels its own row to zero without; an oblique one multiplies by how far |H| |P| |H*| lies above D. A rotation
+    about a frame axis keeps small entries, any other does not.
     """
     s = spatial(T)
     vec3, mat33 = s.vec3, s.mat33
@@ -68,7 +68,7 @@ def digits(T) -> wp.Kernel:
 
     @wp.func
     def rounded(h: vec3, u: vec3, d: vec3, after: mat33, D: T, own: T):
-        """L after eliminating a hinge along one axis of the frame: ``own`` in its row, P+ and what was taken elsewhere."""
+        """L after eliminating a hinge along a frame axis: ``own`` d^2 in its row, P+ and what was taken elsewhere."""
         found = vec3()
         for i in range(3):
             found[i] = wp.where(h[i] == T(0.0), wp.abs(after[i, i]) + T(2.0) * u[i] * u[i] / D, own * d[i] * d[i])

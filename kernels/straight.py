@@ -1,7 +1,7 @@
-"""Kernels around emitted straight-line code: one thread a world, rows of arrays staged through shared memory.
+"""Kernels around emitted straight-line code: one thread, or one of a team of warps, a world.
 
-The callers' arrays are [world, entry]. A warp reads the rows of its 32 worlds as one stretch of memory and writes its
-results so; a thread then works on its own row. On the CPU a thread works on the arrays themselves.
+The callers' arrays are [world, entry]. A team reads the rows of its 32 worlds as one stretch of memory into shared memory
+and writes its results so; each thread then works on its own world's row. On the CPU a thread works on the arrays.
 """
 
 import hashlib
@@ -46,114 +46,158 @@ def pitch(entries: int) -> int:
     return entries | 1
 
 
-def shared_scalars(rows: list[Row], result: Result) -> int:
-    """Scalars of shared memory that a warp takes."""
-    extra = {STAGED: result.array.entries, MAPPED: result.slots}.get(result.way)
-    return WARP * (sum(pitch(row.entries) for row in rows) + (0 if extra is None else pitch(extra)))
+class Frame(NamedTuple):
+    """What surrounds the statements of a kernel.
 
-
-def assemble(rows: list[Row], fields: list[str], angles: list[int], result: Result, body: str, T, block: int) -> str:
-    """The native code of one thread.
-
-    Args:
-        rows: arrays to read, by entry: ``name_row[i]``.
+    Attributes:
+        rows: arrays to read, by entry: ``name_row[i]``. staged: they are copied to shared memory first.
         fields: arrays [item, component, world] to read: ``name_at[i * name_item + c * name_part]``.
         angles: entries of q whose sine and cosine are taken.
-        result: where ``result_row[i]`` goes.
-        body: statements.
+        result: how ``result_row[i]`` leaves.
+        sent: values that warps send each other, ``SENT(i)``.
+        warps: how many work on 32 worlds.
+        block: threads of a block.
     """
-    c, out = C_TYPE[T], result.array
-    offset, at = {}, 0
-    for row in rows:
-        offset[row.name] = at
-        at += WARP * pitch(row.entries)
+
+    rows: list[Row]
+    staged: bool
+    fields: list[str]
+    angles: list[int]
+    result: Result
+    sent: int
+    warps: int
+    block: int
+
+    @property
+    def groups(self) -> int:
+        """Groups of 32 worlds in a block."""
+        return self.block // (WARP * self.warps)
+
+    @property
+    def scalars(self) -> int:
+        """Scalars of shared memory that a group takes."""
+        rows = sum(pitch(row.entries) for row in self.rows) if self.staged else 0
+        extra = {STAGED: self.result.array.entries, MAPPED: self.result.slots}.get(self.result.way)
+        return WARP * (rows + (0 if extra is None else pitch(extra)) + self.sent)
+
+    def fits(self, T) -> bool:
+        """Shared memory holds what is staged."""
+        return self.scalars * self.groups * wp.types.type_size_in_bytes(T) <= SHARED_BYTES
+
+
+def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
+    """The native code of one thread around statements for CUDA and for the CPU."""
+    c, result, out = C_TYPE[T], frame.result, frame.result.array
+    team, at, offset = WARP * frame.warps, 0, {}
+    sync = "__syncwarp();" if frame.warps == 1 else "__syncthreads();"
     text = [NATIVE[c], "#if defined(__CUDA_ARCH__)"]
-    total = shared_scalars(rows, result)
-    if total:
-        text += [f"__shared__ {c} staged[{block // WARP * total}];"]
-        text += [f"{c}* stage = staged + (threadIdx.x >> 5) * {total};"]
-    text += ["const int lane = threadIdx.x & 31;", "const long long first = (long long)thread - lane;"]
+    text += [f"const int lane = threadIdx.x & 31, member = threadIdx.x % {team}, warp = member >> 5;"]
+    text += [f"const long long first = (long long)(thread - member) / {frame.warps};"]
     text += ["const int present = worlds - first < 32 ? (int)(worlds - first) : 32;"]
-    text += [_stage_in(row, offset[row.name], c) for row in rows]
-    text += ["__syncwarp();"]
-    text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};" for row in rows]
-    if angles:
-        text += [f"{c} farthest = 0;"]
-        text += [f"farthest = max(farthest, on::absolute(q_row[{i}]));" for i in angles]
-        text += ["if (farthest > on::reach()) {", *(f"q_row[{i}] = on::reduced(q_row[{i}]);" for i in angles), "}"]
+    text += ["const bool mine = lane < present;", "const long long world = first + (mine ? lane : 0);"]
+    if frame.scalars:
+        text += [f"__shared__ {c} shared[{frame.groups * frame.scalars}];"]
+        text += [f"{c}* stage = shared + (threadIdx.x / {team}) * {frame.scalars};"]
+    for row in frame.rows:
+        if frame.staged:
+            offset[row.name], at = at, at + WARP * pitch(row.entries)
+            text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
+        else:
+            text += [f"const {c}* {row.name}_row = {row.name}.data + world * {row.entries};"]
+    if frame.staged:
+        text += [_stage_in(row, offset[row.name], c, team) for row in frame.rows]
+        text += [sync]
+        if frame.angles:
+            text += [_near(frame.angles, c, frame.warps)]
     if result.way == IN_PLACE:
-        text += [f"{c}* result_row = {result.row}_row;"]
-    elif result.way == DIRECT:
-        text += [f"{c}* result_row = out.data + (long long)thread * {out.entries};", "const bool mine = thread < worlds;"]
+        start, width = offset[result.row], pitch(next(row.entries for row in frame.rows if row.name == result.row))
     else:
-        width = out.entries if result.way == STAGED else result.slots
-        text += [f"{c}* result_row = stage + {at} + lane * {pitch(width)};"]
-    text += ["#else"]
-    text += [f"const {c}* {row.name}_row = {row.name}.data + (long long)thread * {row.entries};" for row in rows]
+        width = pitch(result.slots if result.way == MAPPED else out.entries)
+        start, at = at, at + (0 if result.way == DIRECT else WARP * width)
+    if result.way == DIRECT:
+        text += [f"{c}* result_row = out.data + world * {out.entries};"]
+    else:
+        text += [f"{c}* result_row = stage + {start} + lane * {width};"]
+    if frame.sent:
+        text += [f"{c}* sent = stage + {at} + lane;", "#define SENT(i) sent[(i) * 32]"]
+    text += [*_fields(frame.fields, c), cuda]
+    if result.way in (IN_PLACE, STAGED):
+        text += [sync, _stage_out(out, start, width, c, team)]
+    if result.way == MAPPED:
+        text += [sync, _spread_out(result, start, c, team)]
+    text += ["#else", "const long long world = thread;", "const bool mine = true;"]
+    text += [f"const {c}* {row.name}_row = {row.name}.data + world * {row.entries};" for row in frame.rows]
     if result.way == MAPPED:
         text += [f"{c} result_row[{result.slots}];"]
     else:
-        text += [f"{c}* result_row = out.data + (long long)thread * {out.entries};", "const bool mine = true;"]
-    text += ["#endif"]
-    if fields:
-        text += ["const long long world = thread < worlds ? thread : worlds - 1;"]
-    for name in fields:
-        text += [
-            f"const {c}* {name}_at = (const {c}*)((const char*){name}.data + world * {name}.strides[2]);",
-            f"const long long {name}_item = {name}.strides[0] / (long long)sizeof({c});",
-            f"const long long {name}_part = {name}.strides[1] / (long long)sizeof({c});",
-        ]
-    text += [body, "#if defined(__CUDA_ARCH__)"]
+        text += [f"{c}* result_row = out.data + world * {out.entries};"]
+    if frame.sent:
+        text += [f"{c} sent[{frame.sent}];", "#define SENT(i) sent[i]"]
+    text += [*_fields(frame.fields, c), cpu]
     if result.way == MAPPED:
-        text += ["__syncwarp();", _spread_out(result, at, c)]
-    elif result.way != DIRECT:
-        start, width = (offset[result.row], next(r for r in rows if r.name == result.row).entries) if (
-            result.way == IN_PLACE
-        ) else (at, out.entries)
-        text += ["__syncwarp();", _stage_out(out, start, pitch(width), c)]
-    if result.way == MAPPED:
-        text += ["#else", f"for (int i = 0; i < {out.entries}; ++i) {{",
-                 f"    out.data[(long long)thread * {out.entries} + i] = place.data[i] < 0 ? 0 : result_row[place.data[i]];",
-                 "}"]
-    text += ["#endif", ""]
+        text += [f"for (int i = 0; i < {out.entries}; ++i) {{", "    const int slot = place.data[i];",
+                 f"    out.data[world * {out.entries} + i] = slot < 0 ? 0 : result_row[slot];", "}"]
+    text += ["#endif", *(["#undef SENT"] if frame.sent else []), ""]
     return "\n".join(text)
 
 
-def _stage_in(row: Row, offset: int, c: str) -> str:
+def _fields(names: list[str], c: str) -> list[str]:
+    return [
+        line
+        for name in names
+        for line in (
+            f"const {c}* {name}_at = (const {c}*)((const char*){name}.data + world * {name}.strides[2]);",
+            f"const long long {name}_item = {name}.strides[0] / (long long)sizeof({c});",
+            f"const long long {name}_part = {name}.strides[1] / (long long)sizeof({c});",
+        )
+    ]
+
+
+def _near(angles: list[int], c: str, warps: int) -> str:
+    """Take turns off angles that are too far for the branch-free sine; it never happens, so it is one branch."""
+    lines = [f"{c} farthest = 0;", *(f"farthest = max(farthest, on::absolute(q_row[{i}]));" for i in angles)]
+    if warps > 1:  # every warp looks, one changes them
+        lines += ["if (__syncthreads_or(farthest > on::reach())) {", "    if (warp == 0) {"]
+        lines += [*(f"        q_row[{i}] = on::reduced(q_row[{i}]);" for i in angles), "    }", "    __syncthreads();", "}"]
+    else:
+        lines += ["if (farthest > on::reach()) {", *(f"    q_row[{i}] = on::reduced(q_row[{i}]);" for i in angles), "}"]
+    return "\n".join(lines)
+
+
+def _each(n: int, team: int, statement: str) -> str:
+    """``statement`` for every entry i of the rows of 32 worlds, the whole team side by side."""
+    turns = -(-WARP * n // team)
+    full = f"for (int k = 0; k < {turns}; ++k) {{ const int i = member + {team} * k;"
+    some = f"if (i < {WARP * n}) " if turns * team != WARP * n else ""
+    return f"""if (present == 32) {{
+    #pragma unroll
+    {full} {some}{statement} }}
+}} else {{
+    {full} if (i < present * {n}) {statement} }}
+}}"""
+
+
+def _stage_in(row: Row, offset: int, c: str, team: int) -> str:
     n = row.entries
-    return f"""{{
-    const {c}* from = {row.name}.data + first * {n};
-    {c}* to = stage + {offset};
-    #pragma unroll
-    for (int k = 0; k < {n}; ++k) {{
-        const int i = lane + 32 * k;
-        if (i < present * {n}) to[{_slot("i", n, pitch(n))}] = from[i];
-    }}
-}}"""
+    copy = _each(n, team, f"to[{_slot('i', n, pitch(n))}] = __ldg(from + i);")
+    return f"{{\nconst {c}* from = {row.name}.data + first * {n};\n{c}* to = stage + {offset};\n{copy}\n}}"
 
 
-def _stage_out(out: Row, offset: int, distance: int, c: str) -> str:
+def _stage_out(out: Row, offset: int, width: int, c: str, team: int) -> str:
     n = out.entries
-    return f"""{{
-    {c}* to = out.data + first * {n};
-    const {c}* from = stage + {offset};
-    #pragma unroll
-    for (int k = 0; k < {n}; ++k) {{
-        const int i = lane + 32 * k;
-        if (i < present * {n}) to[i] = from[{_slot("i", n, distance)}];
-    }}
-}}"""
+    copy = _each(n, team, f"to[i] = from[{_slot('i', n, width)}];")
+    return f"{{\n{c}* to = out.data + first * {n};\nconst {c}* from = stage + {offset};\n{copy}\n}}"
 
 
-def _spread_out(result: Result, offset: int, c: str) -> str:
-    n, distance = result.array.entries, pitch(result.slots)
+def _spread_out(result: Result, offset: int, c: str, team: int) -> str:
+    n, width = result.array.entries, pitch(result.slots)
     return f"""{{
     {c}* to = out.data + first * {n};
-    for (int i = lane; i < {n}; i += 32) {{
+    for (int i = member; i < {n}; i += {team}) {{
         const int slot = place.data[i];
         const {c}* from = stage + {offset} + (slot < 0 ? 0 : slot);
         #pragma unroll 8
-        for (int k = 0; k < present; ++k) to[(long long)k * {n} + i] = slot < 0 ? ({c})0 : from[k * {distance}];
+        for (int k = 0; k < present; ++k) to[(long long)k * {n} + i] = slot < 0 ? ({c})0 : from[k * {width}];
     }}
 }}"""
 
@@ -165,10 +209,10 @@ def _slot(i: str, entries: int, distance: int) -> str:
 def kernel(name: str, native: str, arrays: list[tuple[str, int]], T, registers: int | None = None) -> wp.Kernel:
     """A kernel of ``worlds``, then ``arrays`` (name, axes) of scalars ``T``, that runs ``native`` in each thread.
 
-    The array ``place`` holds integers.
+    The arrays ``place`` and ``shifts`` hold integers.
     """
     key = f"{name}_{hashlib.sha256(native.encode()).hexdigest()[:16]}"
-    declared = ", ".join(f"{array}: {'table' if array == 'place' else f'array{axes}'}" for array, axes in arrays)
+    declared = ", ".join(f"{array}: {'table' if array in ('place', 'shifts') else f'array{axes}'}" for array, axes in arrays)
     source = f"""def native(thread: int, worlds: int, {declared}): ...
 
 

@@ -703,7 +703,7 @@ PLAIN = dict(default='<default><default class="c"/></default>', before="", pos="
         ({"root": "<frame><freejoint/></frame>"}, None, "a joint or inertial in a <frame> (body 'root')"),
         ({"root": "<frame><freejoint/></frame>"}, True, None),
         ({"more": '<frame><geom size=".1"/><site/></frame>'}, None, None),
-        ({"before": '<replicate count="2"><body><geom size=".1"/></body></replicate>'}, None, "a <replicate> (body 'world')"),
+        ({"before": '<replicate count="2"><body/></replicate>'}, None, "a <replicate> (body 'world')"),
         ({"before": '<replicate count="2"><geom size=".1"/></replicate>'}, None, None),
         ({"more": '<replicate count="2"><geom size=".1"/></replicate>'}, None, "a <replicate> (body 'tip')"),
         ({"more": f'{INERTIA}<frame><replicate count="2"><geom size=".1"/></replicate></frame>'}, None, None),
@@ -744,13 +744,11 @@ INNER = '<default class="c"><joint armature="7"/></default>'
     ],
 )
 def test_mjcf_default_class_main(default, tmp_path):
-    """Outermost defaults are everybody's whatever they are called, and an element steps out of its childclass by "main".
-
-    As in MuJoCo, whose numbers these are.
-    """
+    """Outermost defaults are everybody's, and an element steps out of its childclass by "main", as in MuJoCo."""
     mujoco = pytest.importorskip("mujoco")
     file = tmp_path / "robot.xml"
-    file.write_text(LOST.format(**PLAIN | {"default": default, "tip": ' class="main"', "more": '<joint axis="1 0 0"/>'}))
+    text = {"default": default, "tip": ' class="main"', "more": '<joint axis="1 0 0"/>'}
+    file.write_text(LOST.format(**PLAIN | text))
     model, scene = mujoco.MjModel.from_xml_path(str(file)), load(file)
     np.testing.assert_allclose(model.dof_armature, [2, 2, 7])
     np.testing.assert_allclose(scene.values["joint_armature"], [model.dof_armature])
@@ -762,7 +760,7 @@ def test_mjcf_default_class_main_beside_meshes(tmp_path):
     """Text has no folder to find them in."""
     file, asset = tmp_path / "robot.xml", '<asset><mesh name="m" file="no.stl"/></asset><default class="main"/>'
     file.write_text(MJCF.format(asset=asset, tip='<geom type="mesh" mesh="m"/>'))
-    with pytest.raises(UnsupportedError, match="default class 'main' beside masses from meshes.*remove class='main'"):
+    with pytest.raises(UnsupportedError, match=r"default class 'main' beside masses from meshes.*remove class='main'"):
         load(file)
     file.write_text(MJCF.format(asset=asset, tip=INERTIA + '<geom type="mesh" mesh="m"/>'))
     np.testing.assert_allclose(load(file).values["body_mass"][0, 1], 1.0)

@@ -11,11 +11,12 @@ import warp_spo as spo
 from warp_spo.kernels import status as status_kernels
 
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
+from granularities import GRANULARITIES, skip_unless_served
+
 from benchmarks import stress, stress_checks, stress_measure, stress_steps
 from benchmarks.exact import Sweep
 from benchmarks.stress_cases import ALLOWED, CASES, choose
 from benchmarks.stress_scenes import Setting
-from granularities import GRANULARITIES, skip_unless_served
 from warp_spo import reference
 
 COMPONENT = ("{} times the law: an entry of qdd that nearly cancels carries the rounding of its neighbours; median "
@@ -74,7 +75,7 @@ class TestLong:
 
     def test_a_million_steps(self, dtype, granularity, device):
         if not device.is_cuda:
-            pytest.skip("a million steps need a graph: run with --device cuda:0; the check stiff_arm does 10 000 anywhere")
+            pytest.skip("a million steps need a graph: run with --device cuda:0; the check stiff_arm does 10 000")
         stress_steps.stiff_arm(Setting(device, dtype, granularity), steps=1_000_000)
 
 

@@ -89,7 +89,9 @@ class Dynamics:
         self.plan = plans.choose(scene.tree, self.worlds, granularity)
         self.granularity = self.plan.granularity
         self.recursions = Recursions(scene, self.plan, self.device, self.dtype, self.variable)
-        self.programs = Programs(self.recursions) if self.granularity == "tree" else None
+        self.programs = None
+        if self.granularity != "node":
+            self.programs = Programs(self.recursions, segments=self.granularity == "segment")
 
     # -- values ----------------------------------------------------------------------------------------------------
     def set(self, **values: Any) -> None:
@@ -197,11 +199,11 @@ class Dynamics:
             body_f: wrench on each body, force [N] then torque [N m], inertial axes, at the CoM [world, body, 6].
             status: int32 [world], written with the worst that is true of the world; None costs nothing. Worst first:
 
-                * 2 = an input, or a value of the scene, is NaN or infinite in this dtype. The result is not finite (but
-                  for infinite armature, which locks a hinge). Look for it where the number comes from.
-                * 1 = Mass is not positive definite to working precision: a massless leaf, a singular hinge (three angles
-                  at 90 degrees, a point mass on a ball). The result is NaN. Give that hinge armature, or its body
-                  inertia; a ball instead of three angles.
+                * 2 = an input, or a value of the scene, is NaN or infinite in this dtype. The result is not finite
+                  wherever that matters (infinite armature locks a hinge). Look where the number comes from.
+                * 1 = Mass is not positive definite to working precision: a massless leaf, a singular hinge (three
+                  angles at 90 degrees, a point mass on a ball). The result is NaN. Give that hinge armature, or its
+                  body inertia; a ball instead of three angles.
                 * 4 = out of range: D, or what it is made of, is too small or too large for the dtype's normal numbers,
                   or the result overflows or is subnormal. Change units (mass, length) or use float64.
                 * 3 = digits lost: an estimate from above says that D keeps fewer than half of the dtype's digits,

@@ -81,8 +81,8 @@ class Body:
 
     An inertia whose largest principal moment exceeds the sum of the others is accepted, though no distribution of
     positive mass has it: robot files are full of them, Mass stays positive definite and every formula holds as it is.
-    What is refused is what would make a kinetic energy negative. ``spo.load`` passes files through Newton, which repairs
-    such inertias, and names the bodies.
+    What is refused is what would make a kinetic energy negative. ``spo.load`` passes files through Newton, which
+    repairs such inertias, and names the bodies.
 
     Args:
         mass: [kg], not negative.

@@ -47,10 +47,6 @@ def choose(tree: Tree, worlds: int, granularity: str | None) -> Plan:
     if granularity is not None and granularity not in GRANULARITIES:
         names = ", ".join(GRANULARITIES)
         raise ValueError(f"Dynamics: granularity is {granularity!r}; expected None or one of {names}")
-    if granularity == "segment":
-        raise UnsupportedError(
-            "Dynamics", f"granularity={granularity!r}", "leave it out, or ask for 'tree' or 'node'"
-        )
     reason = "asked for" if granularity else "the one that serves every scene and needs no compilation for it"
     outward, first = [], 0
     for level in tree.levels:

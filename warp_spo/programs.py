@@ -1,4 +1,8 @@
-"""Programs: an operation of one scene as one kernel, traced, emitted, compiled at its first use and launched."""
+"""Programs: an operation of one scene as one kernel, traced, emitted, compiled at its first use and launched.
+
+At tree granularity a thread works on one world, in program order. At segment granularity a warp works on one serial chain
+of 32 worlds, a block on 32 worlds; limbs of equal structure run one text, in which what differs is read from a table.
+"""
 
 from __future__ import annotations
 
@@ -8,20 +12,22 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from .kernels import straight
-from .kernels.straight import DIRECT, IN_PLACE, MAPPED, SHARED_BYTES, STAGED, Result, Row
+from .kernels.straight import DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
 from .levels import Recursions
 from .recursions.links import Links
-from .recursions.traced import Trace
-from .trace.emit import Code, Store, emit
-from .trace.graph import Value
+from .recursions.pieces import Piece, Pieces
+from .recursions.traced import SENT, Trace
+from .teams import Team
+from .trace.emit import Emitter, Store, literals
+from .trace.graph import Value, ordered
 
 FIELDS = ("rigid", "tree", "anchor", "com", "joint_armature", "gravity")
+SEGMENTED = {"forward_dynamics": "Pza", "solve_mass_matrix": "Pza", "inverse_dynamics": "z"}
+"""Operations that have a segment granularity, and what the pieces send each other."""
 TRACED = (
-    "forward_dynamics",
-    "inverse_dynamics",
+    *SEGMENTED,
     "mass_matrix",
     "mass_matrix_inverse",
-    "solve_mass_matrix",
     "log_det_mass_matrix",
     "body_poses",
     "body_velocities",
@@ -29,6 +35,7 @@ TRACED = (
     "operational_inertia_inverse",
 )
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
+MOST_WARPS = 16
 
 
 class Program(NamedTuple):
@@ -36,16 +43,17 @@ class Program(NamedTuple):
 
     Attributes:
         rows: names of the callers' arrays that it reads. fields: of the parameters' arrays.
-        place: table of a MAPPED result.
-        code: what was emitted.
+        tables: arrays of its own.
+        operations: floating-point operations of one world.
     """
 
     kernel: wp.Kernel
     rows: tuple[str, ...]
     fields: tuple[str, ...]
-    place: Any
+    tables: tuple[wp.array, ...]
+    warps: int
     block: int
-    code: Code
+    operations: int
 
 
 class Programs:
@@ -53,12 +61,13 @@ class Programs:
 
     Args:
         run: its sweeps, whose parameters the programs read.
-        block: threads of a block on CUDA.
+        segments: segment granularity for the operations that have it, and tree granularity for the others.
+        block: threads of a block at tree granularity, on CUDA.
         registers: a cap on the registers of a thread.
     """
 
-    def __init__(self, run: Recursions, block: int = 32, registers: int | None = None):
-        self.run, self.block, self.registers = run, block, registers
+    def __init__(self, run: Recursions, segments: bool = False, block: int = WARP, registers: int | None = None):
+        self.run, self.segments, self.block, self.registers = run, segments, block, registers
         self._programs: dict[Any, Program | None] = {}
 
     def forget(self) -> None:
@@ -83,72 +92,143 @@ class Programs:
         return self._programs[key]
 
     def launch(self, program: Program, arrays: dict[str, wp.array], out: wp.array) -> None:
-        run, block = self.run, program.block
-        threads = -(-run.worlds // block) * block if run.device.is_cuda else run.worlds
+        run = self.run
+        threads, block = run.worlds, program.block
+        if run.device.is_cuda:
+            worlds = block // program.warps  # of one block
+            threads = -(-run.worlds // worlds) * block
         inputs = [run.worlds, *(arrays[name] for name in program.rows)]
         inputs += [run.parameters.array(name) for name in program.fields]
-        if program.place is not None:
-            inputs.append(program.place)
-        wp.launch(program.kernel, threads, inputs, [out], device=run.device, block_dim=block)
+        wp.launch(program.kernel, threads, [*inputs, *program.tables], [out], device=run.device, block_dim=block)
 
     # -- building --------------------------------------------------------------------------------------------------
+    def _links(self) -> Links:
+        return Links(self.run.scene, self.run.parameters.variable)
+
     def _build(self, operation: str, shapes: dict, out_shape: tuple, options: dict) -> Program | None:
-        run = self.run
-        links = Links(run.scene, run.parameters.variable)
-        if operation == "body_poses" and links.varies_tree:
+        links = self._links()
+        if operation == "body_poses" and links.varies_tree or not links.links:
             return None
-        trace = Trace(links, run.dtype.__name__, tuple(shapes))
-        stores = getattr(trace, operation)(**options)
-        out = Row("out", len(out_shape), math.prod(out_shape[1:]))
-        rows = {name: Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items()}
-        sizes = {name: shape[1:] for name, shape in shapes.items()}
-        used, angles = _reads(stores)
-        read = [row for name, row in rows.items() if name in used]
-        fields = [name for name in FIELDS if name in used]
-        result, entries, table = self._result(stores, read, out, out_shape[1:])
+        shapes = {**shapes, "out": out_shape}
+        if self.segments and operation in SEGMENTED:
+            pieces = Pieces(links)
+            if 1 < pieces.warps <= MOST_WARPS:
+                return self._segment_program(operation, shapes, pieces)
+        return self._tree_program(operation, links, shapes, options)
 
-        def load(array: str, index: tuple) -> str:
-            if array in FIELDS:
-                i, c = (*index, 0)[:2]
-                return f"{array}_at[{i} * {array}_item + {c} * {array}_part]"
-            return f"{array}_row[{_flat(index, sizes[array])}]"
+    def _tree_program(self, operation: str, links: Links, shapes: dict, options: dict) -> Program:
+        trace = Trace(links, self.run.dtype.__name__, tuple(shapes))
+        stores = [item._replace(index=(_flat(item.index, shapes["out"][1:]),))
+                  for item in getattr(trace, operation)(**options)]
+        frame = self._frame(stores, shapes, 0, 1, self.block)
+        stores, table = _placed(stores, frame.result)
+        emitter = self._emitter(shapes, frame.result)
+        body = literals(emitter.region(stores), self.run.dtype.__name__)
+        tables = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
+        return self._finished(operation, frame, body, body, tables, emitter.operations)
 
+    def _segment_program(self, operation: str, shapes: dict, pieces: Pieces) -> Program:
+        dtype, slots = self.run.dtype.__name__, _slots(pieces, SEGMENTED[operation])
+        slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
+        sent = sum(SENT[letter] for letter, _ in slots)
+        everything: list[Store] = []
+        traced: list[list[Store]] = []
+        for index in range(len(pieces.pieces)):
+            links = self._links()  # its own: pieces of equal structure then give equal text
+            trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
+            traced.append(getattr(trace, operation)())
+            everything += traced[-1]
+        frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
+                            WARP * pieces.warps, everything)
+        team = Team(pieces, dtype)
+        for piece, stores in zip(pieces.pieces, traced, strict=True):
+            emitter = self._emitter(shapes, frame.result)
+            inward = [item for item in stores if _goes_inward(item, slots, piece)]
+            if operation == "inverse_dynamics":
+                inward = stores
+            team.add(piece, emitter, emitter.region(inward), emitter.region([s for s in stores if s not in inward]))
+        cuda = team.cuda()  # fills the tables
+        tables = {name: wp.array(values, dtype=kind, device=self.run.device)
+                  for name, values, kind in (("table", team.table, self.run.dtype), ("shifts", team.shifts, int)) if values}
+        return self._finished(operation, frame, cuda, team.cpu(), tables, team.operations)
+
+    def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int) -> Program:
+        native = straight.assemble(frame, cuda, cpu, self.run.dtype)
+        rows, fields = tuple(row.name for row in frame.rows), tuple(frame.fields)
+        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 3) for name in fields]
+        arrays += [(name, 1) for name in tables] + [("out", frame.result.array.ndim)]
+        kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers)
+        return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations)
+
+    def _emitter(self, shapes: dict, result: Result) -> Emitter:
         guard = "if (mine) " if result.way == DIRECT else ""
-        code = emit(
-            entries, run.dtype.__name__, load, lambda array, index, value: f"{guard}result_row[{index[0]}] = {value};"
-        )
-        native = straight.assemble(read, fields, angles, result, code.text, run.dtype, self.block)
-        arrays = [(row.name, row.ndim) for row in read] + [(name, 3) for name in fields]
-        place = None
-        if table is not None:
-            place = wp.array(table, dtype=int, device=run.device)
-            arrays.append(("place", 1))
-        arrays.append((out.name, out.ndim))
-        kernel = straight.kernel(operation, native, arrays, run.dtype, self.registers)
-        return Program(kernel, tuple(row.name for row in read), tuple(fields), place, self.block, code)
 
-    def _result(self, stores: list[Store], read: list[Row], out: Row, shape: tuple) -> tuple[Result, list, Any]:
-        """How the result leaves; its stores by entry or slot; the table of a MAPPED one."""
-        flat = [Store("out", (_flat(store.index, shape),), store.value) for store in stores]
-        scalar = wp.types.type_size_in_bytes(self.run.dtype) * self.block // straight.WARP
-        fits = lambda result: straight.shared_scalars(read, result) * scalar <= SHARED_BYTES  # noqa: E731
-        if len(flat) == out.entries and all(store.index == (i,) for i, store in enumerate(sorted(flat))):
-            for row in reversed(read):
-                if row.entries == out.entries and row.name not in ("q", "body_f"):
-                    return Result(IN_PLACE, out, row.name), flat, None
-            if fits(Result(STAGED, out)):
-                return Result(STAGED, out), flat, None
+        def load(array: str, entry: str) -> str:
+            if array == "sent":
+                return f"SENT({entry})"
+            if array in FIELDS:
+                return f"{array}_at[({entry}) / 16 * {array}_item + ({entry}) % 16 * {array}_part]"
+            return f"{array}_row[{entry}]"
+
+        def store(array: str, entry: str, value: str) -> str:
+            return f"SENT({entry}) = {value};" if array == "sent" else f"{guard}result_row[{entry}] = {value};"
+
+        def flat(array: str, index: tuple) -> int:
+            if array in FIELDS:
+                return 16 * index[0] + (index[1] if len(index) > 1 else 0)
+            return index[0] if len(index) == 1 else _flat(index, shapes[array][1:])
+
+        return Emitter(self.run.dtype.__name__, load, store, flat)
+
+    def _frame(self, stores: list[Store], shapes: dict, sent: int, warps: int, block: int,
+               everything: list[Store] | None = None) -> Frame:
+        """How rows come in and the result, of flat ``stores``, goes out: through shared memory where it has room."""
+        used, angles = _reads(everything or stores)
+        rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used]
+        out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
+        dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
+        over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
+        slots = len({_name(item.value) for item in stores})
+        ways = [Result(IN_PLACE, out, over[-1])] if dense and over else []
+        ways += [Result(STAGED, out)] if dense else []
+        ways += [Result(MAPPED, out, slots=slots)] if warps == 1 and slots else []
+        fields = [name for name in FIELDS if name in used]
+        for staged, result in [*((True, way) for way in ways), (True, Result(DIRECT, out)), (False, Result(DIRECT, out))]:
+            frame = Frame(rows, staged, fields, angles, result, sent, warps, block)
+            if frame.fits(self.run.dtype):
+                return frame
+        return Frame(rows, False, fields, angles, Result(DIRECT, out), sent, warps, block)
+
+
+def _slots(pieces: Pieces, letters: str) -> dict[tuple[str, int], int]:
+    """Where what each piece sends begins."""
+    slots, at = {}, 0
+    for piece in pieces.pieces:
+        for letter in letters:
+            if piece.children if letter == "a" else piece.parent is not None:
+                slots[letter, piece.index] = at
+                at += SENT[letter]
+    return slots
+
+
+def _goes_inward(item: Store, slots: dict, piece: Piece) -> bool:
+    return item.array == "sent" and not (
+        ("a", piece.index) in slots and 0 <= item.index[0] - slots["a", piece.index] < SENT["a"]
+    )
+
+
+def _placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int] | None]:
+    """Flat stores as the result wants them, and the table of a MAPPED one."""
+    out = result.array
+    if result.way == MAPPED:
         slots: dict[Any, int] = {}
         table = [-1] * out.entries
-        for store in flat:
-            table[store.index[0]] = slots.setdefault(_name(store.value), len(slots))
-        by_slot = {table[store.index[0]]: store.value for store in flat}
-        mapped = Result(MAPPED, out, slots=max(1, len(slots)))
-        if fits(mapped):
-            return mapped, [Store("out", (slot,), value) for slot, value in sorted(by_slot.items())], table
-        done = {store.index for store in flat}
-        zeros = [Store("out", (i,), 0.0) for i in range(out.entries) if (i,) not in done]
-        return Result(DIRECT, out), flat + zeros, None
+        for item in stores:
+            table[item.index[0]] = slots.setdefault(_name(item.value), len(slots))
+        by_slot = {table[item.index[0]]: item.value for item in stores}
+        return [Store("out", (slot,), value) for slot, value in sorted(by_slot.items())], table
+    done = {item.index for item in stores}
+    return stores + [Store("out", (i,), 0.0) for i in range(out.entries) if (i,) not in done], None
 
 
 def _name(value: Value) -> Any:
@@ -164,12 +244,15 @@ def _flat(index: tuple, shape: tuple) -> int:
 
 def _reads(stores: list[Store]) -> tuple[set[str], list[int]]:
     """Names of the arrays that are read, and the entries of q whose sine is taken as they are."""
-    from .trace.graph import ordered
-
     used, angles = set(), set()
-    for scalar in ordered(store.value for store in stores):
-        if scalar.op == "input":
-            used.add(scalar.args[0])
-        elif scalar.op in ("sin", "cos") and scalar.args[0].op == "input":
-            angles.add(scalar.args[0].args[1])
+    graphs: dict[int, list[Value]] = {}
+    for item in stores:
+        if hasattr(item.value, "graph"):
+            graphs.setdefault(id(item.value.graph), []).append(item.value)
+    for values in graphs.values():
+        for scalar in ordered(values):
+            if scalar.op == "input":
+                used.add(scalar.args[0])
+            elif scalar.op in ("sin", "cos") and scalar.args[0].op == "input":
+                angles.add(scalar.args[0].args[1])
     return used, sorted(angles)

@@ -2,8 +2,8 @@
 
 A scene has masses and hinges, no pictures and no contacts. URDF text is stripped of shapes that weigh nothing, so that
 neither their meshes nor a mesh library is asked for; an MJCF tree, its includes pasted in, is asked whether masses come
-from meshes, for the gravity that Newton's importer does not read, and for what it misreads, and is written anew where the
-importer would lose the default class "main". Nothing here imports it.
+from meshes, for the gravity that Newton's importer does not read, and for what it misreads, and is written anew where
+the importer would lose the default class "main". Nothing here imports it.
 """
 
 from __future__ import annotations
@@ -193,8 +193,8 @@ def mjcf_misread(root: ET.Element, floating: bool | None) -> dict[str, list[str]
         tags = {child.tag for child, _ in members}
         copies = [child for child, _ in members if child.tag == "replicate"]
         weighed_by_geoms = by_geom == "true" or (by_geom == "auto" and "inertial" not in tags)
-        weighed_by_copies = holder.tag == "body" and weighed_by_geoms and any(c.find(".//geom") is not None for c in copies)
-        if weighed_by_copies or any(c.find(".//body") is not None or c.find(".//joint") is not None for c in copies):
+        counted = ["body", "joint", "geom"] if holder.tag == "body" and weighed_by_geoms else ["body", "joint"]
+        if any(c.find(f".//{tag}") is not None for c in copies for tag in counted):
             replicated.append(label)
         if holder.tag == "body":
             lost = {child.tag for frame in holder.findall("frame") for child, _ in _mjcf_members(frame, childclass)}

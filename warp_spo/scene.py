@@ -39,8 +39,8 @@ def _parts(name: str, given: Any, kind: type) -> tuple:
 class Scene:
     """A multibody system: a forest of bodies, and the values that kernels read.
 
-    Values are checked and never repaired. Masses and principal moments may be zero, of any ratio, and break the triangle
-    inequality (see :class:`Body`); below zero they are refused.
+    Values are checked and never repaired. Masses and principal moments may be zero, of any ratio, and break the
+    triangle inequality (see :class:`Body`); below zero they are refused.
 
     Args:
         bodies: body k is node k.

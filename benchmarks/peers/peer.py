@@ -19,10 +19,10 @@ from .coordinates import Coordinates, States, sample
 from .lumped import Robot
 
 WARM_UP = 0.05  # [s] of evaluations before anything is timed
-GRAPH_SECONDS = 0.03  # a graph goes through all sets of inputs up to ROUNDS times, fewer where that would take longer
+GRAPH_SECONDS = 0.02  # a graph goes through all sets of inputs up to ROUNDS times, fewer where that would take longer
 ROUNDS = 8
 REPEATS = 20
-BUDGET = 1.0  # [s]: fewer repeats, 3 at least, where they would take longer
+BUDGET = 0.4  # [s]: fewer repeats, 3 at least, where they would take longer
 SLOW = 0.2  # [s]: an operation that takes longer is not measured at more worlds
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..parts import BALL, FREE, SCREWS
 from ..scene import Scene
-from ..trace.graph import Graph, Value, cos, reciprocal, sin
+from ..trace.graph import Graph, Value, cos, reciprocal, reduced, sin
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
 
 TURN, SLIDE, HELIX = "turn", "slide", "helix"
@@ -222,7 +222,8 @@ def placed(link: Link, q: Any) -> Placed:
     if link.motion in (TURN, SLIDE, HELIX):
         x, turn = q(link.coordinate), None
         if link.motion != SLIDE:
-            turn = (cos(x), sin(x))
+            angle = x if link.motion == TURN else reduced(x)
+            turn = (cos(angle), sin(angle))
         if link.motion != TURN:
             axis = IDENTITY[2] if matrix is None else matrix.T[2]
             l = l + axis * (x if link.motion == SLIDE else link.pitch * x)

@@ -19,11 +19,11 @@ def accelerated(
     return w + motion.bias_w + w_j, v + motion.bias_v + v_j
 
 
-def body_force(inertia: Rigid, motion: Motion, w: Vector, v: Vector) -> tuple[Vector, Vector]:
+def body_force(inertia: Rigid, motion: Motion, w: Vector, v: Vector) -> Vector:
     """(n; f) that gives a body the acceleration (w; v): classical, at its frame's origin."""
     rotation: Matrix = skew(w) + motion.whirl
     n = inertia.inertia @ w + cross(inertia.moment, v) + cross(motion.spin, inertia.inertia @ motion.spin)
-    return n, inertia.mass * v + rotation @ inertia.moment
+    return Vector((*n, *(inertia.mass * v + rotation @ inertia.moment)))
 
 
 def hinge_force(link: Link, place: Placed, n: Vector, f: Vector, qdd: Any) -> list[Value]:

@@ -5,30 +5,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from ..trace.emit import Store
 from ..trace.graph import Value, sum_of_logarithms
-from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, total
+from ..trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Vector, cross, total
 from . import articulated, composite, kinematics, motion, newton_euler
 from .links import Link, Links, Placed, placed
 from .motion import STILL, Motion
+from .pieces import Piece
 
 EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}
 
 
+SENT = {"P": 21, "z": 6, "a": 6}  # values that pieces send each other: phi P+ phi* and z inward, alpha outward
+
+
 class Trace:
-    """One evaluation of a scene: what is shared between the operations on it.
+    """One evaluation of a scene, or of one piece of it: what is shared between the operations on it.
 
     Args:
         links: the scene's links.
         dtype: whose rounding the pivots are compared with.
         given: names of the arrays that are there: "qd", "tau", "qdd", "body_f", "b"; the others are zero.
+        piece: trace the work on this piece alone. How its ancestors move is worked out anew; what it takes from other
+            pieces and gives to them goes through the array "sent", ``slot(letter, piece)`` on.
+        slot: see there.
     """
 
-    def __init__(self, links: Links, dtype: str, given: tuple[str, ...]):
+    def __init__(
+        self,
+        links: Links,
+        dtype: str,
+        given: tuple[str, ...],
+        piece: Piece | None = None,
+        slot: Callable[[str, Piece], int] | None = None,
+    ):
         self.links, self.graph, self.epsilon, self.given = links, links.graph, EPSILON[dtype], given
+        self.piece, self.slot = piece, slot
+        self.own = set(map(id, links.links if piece is None else piece.links))
+        self.active = set(self.own)
+        above = None if piece is None else piece.links[0].parent
+        while above is not None:
+            self.active.add(id(above))
+            above = above.parent
         self.places: dict[int, Placed] = {}
         self.motions: dict[int, Motion] = {}
         self.axes: dict[int, Matrix] = {}  # of every link, in the inertial frame
@@ -72,73 +93,112 @@ class Trace:
             n, f = n + torque + cross(com, force), f + force
         return Vector((*n, *f))
 
+    # -- pieces ----------------------------------------------------------------------------------------------------
+    def traversal(self) -> Iterator[tuple[Link, bool]]:
+        """Out to every link that matters here, back from those of this piece."""
+        for link, outward in self.links.traversal():
+            if id(link) in self.active and (outward or id(link) in self.own):
+                yield link, outward
+
+    @property
+    def outward(self) -> list[Link]:
+        """The links of this piece, parents first."""
+        return [link for link in self.links.links if id(link) in self.own]
+
+    def send(self, letter: str, values: Iterable[Value]) -> list[Store]:
+        assert self.piece is not None and self.slot is not None
+        first = self.slot(letter, self.piece)
+        return [Store("sent", (first + i,), value) for i, value in enumerate(values)]
+
+    def receive(self, letter: str, piece: Piece) -> list[Value]:
+        assert self.slot is not None
+        first = self.slot(letter, piece)
+        return [self.graph.input("sent", first + i) for i in range(SENT[letter])]
+
+    def carried_on(self, link: Link, letter: str, found: dict[int, Any], build: Callable[[list], Any]) -> list[Any]:
+        """What the children of a link hand to it, of this piece or sent by others."""
+        if self.piece is None or id(link.children[0] if link.children else link) in self.own:
+            return [found[id(child)] for child in link.children]
+        return [build(self.receive(letter, piece)) for piece in self.piece.children]
+
+    def handed_on(self, letter: str, link: Link, values: Callable[[], Iterable[Value]]) -> list[Store]:
+        """Send what a link's parent needs of it, if another piece works on the parent."""
+        if self.piece is None or link is not self.piece.links[0] or link.parent is None:
+            return []
+        return self.send(letter, values())
+
     @property
     def base(self) -> tuple[Vector, Vector]:
         """Acceleration of the inertial frame: gravity's, the other way."""
         return ZERO, -self.links.gravity
 
     # -- operations ------------------------------------------------------------------------------------------------
-    def forward_dynamics(self, right: str = "tau", bias: bool = True, column: int | None = None) -> list[Store]:
-        """out = Mass^-1 (tau - bias_force); without ``bias`` Mass^-1 times the array ``right``, or a unit vector."""
+    def forward_dynamics(self, right: str = "tau", bias: bool = True) -> list[Store]:
+        """out = Mass^-1 (tau - bias_force); without ``bias`` Mass^-1 times the array ``right``."""
         moves = bias and "qd" in self.given
-        tau = self.vector(right) if column is None else (lambda i: 1.0 if i == column else 0.0)
-        done, rates = self.reduce(tau, moves, bias)
-        return self.expand(done, rates, self.base if bias else (ZERO, ZERO))
+        done, rates, stores = self.reduce(self.vector(right), moves, bias)
+        return stores + self.expand(done, rates, self.base if bias else (ZERO, ZERO))
 
     def factor(self) -> dict[int, articulated.Factor]:
-        done: dict[int, articulated.Factor] = {}
-        for link, outward in self.links.traversal():
-            if outward:
-                self.place(link)
-            else:
-                self.at(link, "P")
-                inner = [done[id(child)].in_parent for child in link.children]
-                done[id(link)] = articulated.factor(self.links, link, self.places[id(link)], inner, self.epsilon)
-        return done
+        return self.reduce(lambda dof: 0.0, moves=False, loads=False)[0]
 
-    def reduce(self, tau: Callable[[int], Value], moves: bool, loads: bool) -> tuple[dict, dict]:
-        """Factors of every link, and D^-1 [I - H psi K] (tau - ...)."""
+    def reduce(self, tau: Callable[[int], Value], moves: bool, loads: bool) -> tuple[dict, dict, list[Store]]:
+        """Factors of every link, D^-1 [I - H psi K] (tau - ...), and what other pieces need of them."""
         done: dict[int, articulated.Factor] = {}
         rates: dict[int, list[Value]] = {}
+        inner: dict[int, Articulated] = {}
         forces: dict[int, Vector] = {}
-        for link, outward in self.links.traversal():
+        stores: list[Store] = []
+        for link, outward in self.traversal():
+            key = id(link)
             if outward:
                 self.place(link, moves)
                 continue
             self.at(link, "P")
-            place, move = self.places[id(link)], self.motions[id(link)]
-            inner = [done[id(child)].in_parent for child in link.children]
-            done[id(link)] = factor = articulated.factor(self.links, link, place, inner, self.epsilon)
+            place, move = self.places[key], self.motions[key]
+            carried = self.carried_on(link, "P", inner, Articulated.unpacked)
+            done[key] = factor = articulated.factor(self.links, link, place, carried, self.epsilon)
+            inner[key] = factor.in_parent
             self.at(link, "z")
             z = articulated.gyroscopic(link.inertia, move)
             if loads:
                 z = z - self.external(link)
-            for child in link.children:
-                z = z + forces[id(child)]
+            for force in self.carried_on(link, "z", forces, Vector):
+                z = z + force
             right = [tau(dof) for dof in link.dofs]
-            rates[id(link)], forces[id(link)] = articulated.reduced(link, place, factor, move, z, right)
-        return done, rates
+            rates[key], forces[key] = articulated.reduced(link, place, factor, move, z, right)
+            stores += self.handed_on("P", link, lambda key=key: inner[key].packed)
+            stores += self.handed_on("z", link, lambda key=key: forces[key])
+        return done, rates, stores
 
     def expand(self, done: dict, rates: dict, base: tuple[Vector, Vector]) -> list[Store]:
         alpha: dict[int, tuple[Vector, Vector]] = {}
         stores = []
-        for link in self.links.links:
+        for link in self.outward:
             self.at(link, "a")
-            above = base if link.parent is None else alpha[id(link.parent)]
             key = id(link)
+            if link.parent is None:
+                above = base
+            elif id(link.parent) in self.own:
+                above = alpha[id(link.parent)]
+            else:
+                received = self.receive("a", self.piece.parent)  # type: ignore[union-attr, arg-type]
+                above = Vector(received[:3]), Vector(received[3:])
             qdd, alpha[key] = articulated.expanded(
                 link, self.places[key], done[key], rates[key], self.motions[key], above
             )
             stores += [Store("out", (dof,), value) for dof, value in zip(link.dofs, qdd, strict=True)]
+            if self.piece is not None and self.piece.children and link is self.piece.links[-1]:
+                stores += self.send("a", (*alpha[key][0], *alpha[key][1]))
         return stores
 
     def inverse_dynamics(self) -> list[Store]:
         """out = Mass qdd + bias_force"""
         qdd, moves = self.vector("qdd"), "qd" in self.given
         alpha: dict[int, tuple[Vector, Vector]] = {}
-        forces: dict[int, tuple[Vector, Vector]] = {}
+        forces: dict[int, Vector] = {}
         stores = []
-        for link, outward in self.links.traversal():
+        for link, outward in self.traversal():
             key = id(link)
             if outward:
                 self.place(link, moves)
@@ -147,17 +207,18 @@ class Trace:
                 alpha[key] = newton_euler.accelerated(link, self.places[key], self.motions[key], above, qdd)
                 continue
             self.at(link, "f")
-            external = self.external(link)
-            n, f = -Vector(external[:3]), -Vector(external[3:])
+            f = -self.external(link)
             if link.inertia is not None:
-                own = newton_euler.body_force(link.inertia, self.motions[key], *alpha[key])
-                n, f = n + own[0], f + own[1]
-            for child in link.children:
-                n, f = n + forces[id(child)][0], f + forces[id(child)][1]
+                f = f + newton_euler.body_force(link.inertia, self.motions[key], *alpha[key])
+            for other in self.carried_on(link, "z", forces, Vector):
+                f = f + other
+            n, f = Vector(f[:3]), Vector(f[3:])
             tau = newton_euler.hinge_force(link, self.places[key], n, f, qdd)
             stores += [Store("out", (dof,), value) for dof, value in zip(link.dofs, tau, strict=True)]
             if link.parent is not None:
-                forces[key] = self.places[key].pose.force_to_parent(n, f)
+                n, f = self.places[key].pose.force_to_parent(n, f)
+                forces[key] = Vector((*n, *f))
+                stores += self.handed_on("z", link, lambda key=key: forces[key])
         return stores
 
     def mass_matrix(self) -> list[Store]:

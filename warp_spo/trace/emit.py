@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
@@ -24,18 +25,6 @@ class Store(NamedTuple):
     value: Value
 
 
-class Code(NamedTuple):
-    """Emitted statements, and how many operations of each kind they hold."""
-
-    text: str
-    counts: Counter
-
-    @property
-    def operations(self) -> int:
-        """Floating-point operations, a multiplication and an addition one each."""
-        return sum(count * COST.get(op, COST_ELSE) for op, count in self.counts.items())
-
-
 def literal(x: float, dtype: str) -> str:
     if x != x:
         return "nan"
@@ -46,61 +35,125 @@ def literal(x: float, dtype: str) -> str:
     return f"{float(str(np.float32(x)))!r}f"
 
 
-def emit(
-    stores: Iterable[Store], dtype: str, load: Callable[[str, tuple], str], store: Callable[[str, tuple, str], str]
-) -> Code:
-    """Statements that compute and store what is asked for, in the order in which the steps made it.
+class Listing(NamedTuple):
+    """Statements in which what may differ between equal pieces of a robot is left open.
+
+    Two limbs of equal structure give equal ``text``; their numbers are in ``constants``, the entries of arrays that they
+    read and write in ``indices`` as (array, entry), the names of their links in ``labels``.
+    """
+
+    text: str
+    constants: list[float]
+    indices: list[tuple[str, int]]
+    labels: list[str]
+
+
+CONSTANT, INDEX, LABEL, PREFIX = "\x01", "\x02", "\x03", "\x05"
+OPEN = re.compile("([\x01\x02\x03])(\\d+)\x04")
+
+
+class Emitter:
+    """Emits the statements of one trace, region by region; what a region computes the later ones may use.
 
     Args:
         dtype: "float32" or "float64".
-        load, store: C++ for reading and for writing an element of an array.
+        load, store: C++ for reading and writing an entry of an array, given the array's name and the entry's text.
+        flat: entry of an array for the index of an input.
     """
-    stores = list(stores)
-    needed = sorted(ordered(store.value for store in stores), key=lambda scalar: scalar.number)
-    lines: list[str] = []
-    names: dict[tuple, str] = {}
-    counts: Counter = Counter()
-    due: dict[tuple, list[Store]] = {}
-    for item in stores:
-        if is_constant(item.value):
-            lines.append(store(item.array, item.index, literal(item.value, dtype)))
-        else:
-            due.setdefault(item.value.key, []).append(item)
-    T, place = C_TYPE[dtype], None
 
-    def text(value: Value) -> str:
-        return literal(value, dtype) if is_constant(value) else names[value.key]
+    def __init__(
+        self,
+        dtype: str,
+        load: Callable[[str, str], str],
+        store: Callable[[str, str, str], str],
+        flat: Callable[[str, tuple], int],
+    ):
+        self.dtype, self._load, self._store, self._flat = dtype, load, store, flat
+        self.counts: Counter = Counter()
+        self._names: dict[tuple, str] = {}
+        self._count = 0
+        self._constants: list[float] = []
+        self._indices: list[tuple[str, int]] = []
+        self._labels: list[str] = []
+        self._place: str | None = None
 
-    for scalar in needed:
-        where, _, step = scalar.step.rpartition("|")
-        if where != place:
-            place = where
-            lines.append(f"// {where}")
-        if scalar.key not in names:
-            lines += _statement(scalar, f"{step}{scalar.number}", T, text, load, names)
-            counts[scalar.op] += 1
-        lines += [store(item.array, item.index, names[scalar.key]) for item in due.get(scalar.key, ())]
-    return Code("\n".join(lines), counts)
+    def region(self, stores: Iterable[Store]) -> Listing:
+        """Statements that compute and store what is asked for, in the order in which the steps made it."""
+        self._constants, self._indices, self._labels, self._place = [], [], [], None
+        lines: list[str] = []
+        due: dict[tuple, list[Store]] = {}
+        values = []
+        for item in stores:
+            if is_constant(item.value) or item.value.key in self._names:
+                lines.append(self._stored(item))
+            else:
+                values.append(item.value)
+                due.setdefault(item.value.key, []).append(item)
+        needed = (scalar for scalar in ordered(values) if scalar.key not in self._names)
+        for scalar in sorted(needed, key=lambda scalar: scalar.number):
+            where, _, step = scalar.step.rpartition("|")
+            if where != self._place:
+                self._place = where
+                self._labels.append(where)
+                lines.append(f"// {LABEL}{len(self._labels) - 1}\x04")
+            if scalar.key not in self._names:
+                lines += self._statement(scalar, step)
+                self.counts[scalar.op] += 1
+            lines += [self._stored(item) for item in due.get(scalar.key, ())]
+        return Listing("\n".join(lines), self._constants, self._indices, self._labels)
+
+    @property
+    def operations(self) -> int:
+        """Floating-point operations so far, a multiplication and an addition one each."""
+        return sum(count * COST.get(op, COST_ELSE) for op, count in self.counts.items())
+
+    def _text(self, value: Value) -> str:
+        if not is_constant(value):
+            return self._names[value.key]
+        self._constants.append(float(value))
+        return f"{CONSTANT}{len(self._constants) - 1}\x04"
+
+    def _entry(self, array: str, index: tuple) -> str:
+        self._indices.append((array, self._flat(array, index)))
+        return f"{INDEX}{len(self._indices) - 1}\x04"
+
+    def _stored(self, item: Store) -> str:
+        return self._store(item.array, self._entry(item.array, item.index), self._text(item.value))
+
+    def _name(self, scalar: Scalar, step: str) -> str:
+        self._count += 1
+        self._names[scalar.key] = name = f"{PREFIX}{step}{self._count}"
+        return name
+
+    def _statement(self, scalar: Scalar, step: str) -> list[str]:
+        op, args, T = scalar.op, scalar.args, C_TYPE[self.dtype]
+        if op == "input":
+            return [f"const {T} {self._name(scalar, step)} = {self._load(args[0], self._entry(args[0], args[1:]))};"]
+        if op in ("sin", "cos"):
+            angle = self._text(args[0])
+            sine, cosine = (self._name(scalar.graph.make(name, *args), name) for name in ("sin", "cos"))
+            which = "sincos" if args[0].op == "input" else "sincos_any"  # a coordinate is known not to be far
+            return [f"{T} {sine}, {cosine};", f"on::{which}({angle}, {sine}, {cosine});"]
+        texts = [self._text(a) for a in args]
+        name = self._name(scalar, step)
+        if op in BINARY:
+            return [f"const {T} {name} = {texts[0]} {BINARY[op]} {texts[1]};"]
+        if op == "neg":
+            return [f"const {T} {name} = -{texts[0]};"]
+        if op == "guarded":
+            return [f"const {T} {name} = {texts[0]} > {texts[1]} ? {texts[0]} : nan;"]
+        if op == "sum_of_logarithms":
+            return [f"const {T} {name} = ({T})({' + '.join(f'on::log((double){a})' for a in texts)});"]
+        return [f"const {T} {name} = on::{op}({', '.join(texts)});"]
 
 
-def _statement(scalar: Scalar, name: str, T: str, text: Callable, load: Callable, names: dict) -> list[str]:
-    op, args = scalar.op, scalar.args
-    names[scalar.key] = name
-    if op in BINARY:
-        return [f"const {T} {name} = {text(args[0])} {BINARY[op]} {text(args[1])};"]
-    if op == "neg":
-        return [f"const {T} {name} = -{text(args[0])};"]
-    if op == "input":
-        return [f"const {T} {name} = {load(args[0], args[1:])};"]
-    if op in ("sin", "cos"):
-        pair = {"sin": f"sin{scalar.number}", "cos": f"cos{scalar.number}"}
-        for other, key in pair.items():
-            twin = scalar.graph.make(other, *args)
-            names[twin.key] = key
-        return [f"{T} {pair['sin']}, {pair['cos']};", f"on::sincos({text(args[0])}, {pair['sin']}, {pair['cos']});"]
-    if op == "guarded":
-        return [f"const {T} {name} = {text(args[0])} > {text(args[1])} ? {text(args[0])} : nan;"]
-    if op == "sum_of_logarithms":
-        terms = " + ".join(f"on::log((double){text(a)})" for a in args)
-        return [f"const {T} {name} = ({T})({terms});"]
-    return [f"const {T} {name} = on::{op}({', '.join(map(text, args))});"]
+def filled(listing: Listing, constants: list[str], indices: list[str], labels: list[str], prefix: str = "") -> str:
+    """The statements of a listing with what it leaves open filled in."""
+    given = {CONSTANT: constants, INDEX: indices, LABEL: labels}
+    return OPEN.sub(lambda found: given[found[1]][int(found[2])], listing.text).replace(PREFIX, prefix)
+
+
+def literals(listing: Listing, dtype: str, prefix: str = "") -> str:
+    """The statements of a listing as they are for itself."""
+    constants = [literal(x, dtype) for x in listing.constants]
+    return filled(listing, constants, [str(entry) for _, entry in listing.indices], listing.labels, prefix)

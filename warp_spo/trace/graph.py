@@ -160,6 +160,11 @@ def cos(x: Value) -> Value:
     return function("cos", x)
 
 
+def reduced(x: Value) -> Value:
+    """An angle less the full turns in it."""
+    return x if is_constant(x) else x.graph.make("reduced", x)
+
+
 def sqrt(x: Value) -> Value:
     return function("sqrt", x)
 

@@ -148,6 +148,16 @@ class Articulated(NamedTuple):
         C = Matrix.of([[entry(i, j + 3) for j in range(3)] for i in range(3)])
         return cls(upper(entry), C, upper(lambda i, j: entry(i + 3, j + 3)))
 
+    @property
+    def packed(self) -> list[Value]:
+        """The 21 numbers."""
+        return [self.entry(i, j) for i in range(6) for j in range(i, 6)]
+
+    @classmethod
+    def unpacked(cls, values: Any) -> Articulated:
+        places = {(i, j): k for k, (i, j) in enumerate((i, j) for i in range(6) for j in range(i, 6))}
+        return cls.build(lambda i, j: values[places[i, j]])
+
     def less(self, U: Any, scaled: Any) -> Articulated:
         """P - U scaled*, for ``scaled`` a multiple of U: the result is symmetric."""
         return Articulated.build(lambda i, j: self.entry(i, j) - U[i] * scaled[j])

@@ -1,0 +1,76 @@
+"""Pieces: a scene's links cut into serial chains that work side by side, and who waits for whom.
+
+A piece is a segment of the paper's strictly canonical tree: it ends where the tree branches. One warp works on each leaf
+piece; a piece further in is taken on by the warp of its deepest child. Work proceeds in stages with a barrier between
+them: a piece goes inward in the first stage in which all that it carries is done, and outward after its parent.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+from .links import Link, Links
+
+
+@dataclasses.dataclass
+class Piece:
+    """A chain of links.
+
+    Attributes:
+        index: its place in :attr:`Pieces.pieces`.
+        links: from the innermost out.
+        parent, children: the pieces that it moves on and that move on it.
+        warp: who works on it. inward, outward: in which stage.
+    """
+
+    index: int
+    links: list[Link]
+    parent: Piece | None
+    children: list[Piece] = dataclasses.field(default_factory=list)
+    warp: int = 0
+    inward: int = 0
+    outward: int = 0
+
+    @property
+    def weight(self) -> int:
+        return sum(len(link.dofs) for link in self.links)
+
+
+class Pieces:
+    """All pieces of a scene, parents first.
+
+    Attributes:
+        warps: how many work on a world. stages: how many there are, one barrier less.
+    """
+
+    def __init__(self, links: Links):
+        self.pieces: list[Piece] = []
+        self.of: dict[int, Piece] = {}  # by id of the link
+        for link in links.links:
+            above = None if link.parent is None else self.of[id(link.parent)]
+            if above is not None and len(link.parent.children) == 1:  # type: ignore[union-attr]
+                piece = above
+            else:
+                piece = Piece(len(self.pieces), [], above)
+                self.pieces.append(piece)
+                if above is not None:
+                    above.children.append(piece)
+            piece.links.append(link)
+            self.of[id(link)] = piece
+        self.warps = 0
+        for piece in reversed(self.pieces):
+            if not piece.children:
+                piece.warp, self.warps = self.warps, self.warps + 1
+                continue
+            heir = max(piece.children, key=lambda child: (child.inward, child.weight))
+            piece.warp = heir.warp
+            piece.inward = max(child.inward + (child is not heir) for child in piece.children)
+        for piece in self.pieces:
+            if piece.parent is not None:
+                piece.outward = piece.parent.outward + (piece.warp != piece.parent.warp)
+            piece.outward = max(piece.outward, piece.inward)
+        last = max(piece.outward for piece in self.pieces)
+        for piece in self.pieces:
+            if not piece.children:
+                piece.outward = last  # equal limbs share their code, so they come out together
+        self.stages = last + 1
