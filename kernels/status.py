@@ -174,8 +174,8 @@ def word(T) -> wp.Kernel:
     """The worst of what is true of a world, one thread for each: NOT_FINITE, NOT_POSITIVE, OUT_OF_RANGE, DIGITS_LOST.
 
     DIGITS_LOST: D may have lost half of the digits of T, lost > 2 eps^-1/2: measured errors are .02 to .8 of ``lost``.
-    NOT_POSITIVE takes a result that is not finite as well: a form of the recursion that resolves D where the sweeps do
-    not has a result to show. OUT_OF_RANGE also where the result overflows, or all of it is subnormal.
+    NOT_POSITIVE as the sweeps see it; and where a result is not finite and D may be rounding alone, since another form
+    of the recursion refuses other pivots. OUT_OF_RANGE also where the result overflows, or all of it is subnormal.
     """
     most = T(2.0 * EPSILON[T] ** -0.5)
     none = T(0.1 / EPSILON[T])
@@ -215,7 +215,8 @@ def word(T) -> wp.Kernel:
             for body in range(body_f.shape[1]):
                 for c in range(6):
                     given = given and wp.isfinite(body_f[world, body, c])
-        positive, in_range, resolved, overflow = bool(True), bool(True), bool(True), bool(False)
+        positive, in_range, resolved = bool(True), bool(True), bool(True)
+        overflow, hopeless = bool(False), bool(False)
         largest = T(0.0)
         for dof in range(qdd.shape[1]):
             given = given and wp.isfinite(armature[dof, world])
@@ -223,7 +224,8 @@ def word(T) -> wp.Kernel:
                 given = given and wp.isfinite(qd[world, dof])
             if tau:
                 given = given and wp.isfinite(tau[world, dof])
-            positive = positive and lost[dof, world] != T(-float(NOT_POSITIVE)) and not lost[dof, world] > none
+            positive = positive and lost[dof, world] != T(-float(NOT_POSITIVE))
+            hopeless = hopeless or lost[dof, world] > none
             in_range = in_range and lost[dof, world] != T(-float(OUT_OF_RANGE))
             resolved = resolved and not lost[dof, world] > most
             overflow = overflow or not wp.isfinite(qdd[world, dof])
@@ -231,11 +233,11 @@ def word(T) -> wp.Kernel:
         found = int(FINE)
         if not given:
             found = int(NOT_FINITE)
-        elif overflow and not positive:
+        elif not positive or (overflow and hopeless):
             found = int(NOT_POSITIVE)
         elif overflow or not in_range or (largest > T(0.0) and largest < tiny):
             found = int(OUT_OF_RANGE)
-        elif not (resolved and positive):
+        elif not resolved:
             found = int(DIGITS_LOST)
         status_out[world] = found
 

@@ -50,9 +50,10 @@ class Frame(NamedTuple):
     """What surrounds the statements of a kernel.
 
     Attributes:
-        rows: arrays to read, by entry: ``name_row[i]``. staged: they are copied to shared memory first.
+        rows: arrays to read, by entry: ``name_row[i]``. staged: they are copied to shared memory first, all worlds
+            together; otherwise each thread reads its world's row, which is faster while few worlds or few entries wait.
         fields: arrays [item, component, world] to read: ``name_at[i * name_item + c * name_part]``.
-        angles: entries of q whose sine and cosine are taken.
+        far: entries of q, if sines are taken: what is too far for the branch-free sine moves to a row of its own.
         result: how ``result_row[i]`` leaves.
         sent: values that warps send each other, ``SENT(i)``.
         warps: how many work on 32 worlds.
@@ -62,7 +63,7 @@ class Frame(NamedTuple):
     rows: list[Row]
     staged: bool
     fields: list[str]
-    angles: list[int]
+    far: int
     result: Result
     sent: int
     warps: int
@@ -76,7 +77,7 @@ class Frame(NamedTuple):
     @property
     def scalars(self) -> int:
         """Scalars of shared memory that a group takes."""
-        rows = sum(pitch(row.entries) for row in self.rows) if self.staged else 0
+        rows = sum(pitch(row.entries) for row in self.rows) if self.staged else pitch(self.far) if self.far else 0
         extra = {STAGED: self.result.array.entries, MAPPED: self.result.slots}.get(self.result.way)
         return WARP * (rows + (0 if extra is None else pitch(extra)) + self.sent)
 
@@ -106,9 +107,10 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
             text += [f"const {c}* {row.name}_row = {row.name}.data + world * {row.entries};"]
     if frame.staged:
         text += [_stage_in(row, offset[row.name], c, team) for row in frame.rows]
-        text += [sync]
-        if frame.angles:
-            text += [_near(frame.angles, c, frame.warps)]
+        text += [sync, "#define FAR_ROW q_row"]
+    elif frame.far:
+        text += [f"{c}* far_row = stage + {at} + lane * {pitch(frame.far)};", "#define FAR_ROW far_row"]
+        at += WARP * pitch(frame.far)
     if result.way == IN_PLACE:
         start, width = offset[result.row], pitch(next(row.entries for row in frame.rows if row.name == result.row))
     else:
@@ -137,7 +139,7 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     if result.way == MAPPED:
         text += [f"for (int i = 0; i < {out.entries}; ++i) {{", "    const int slot = place.data[i];",
                  f"    out.data[world * {out.entries} + i] = slot < 0 ? 0 : result_row[slot];", "}"]
-    text += ["#endif", *(["#undef SENT"] if frame.sent else []), ""]
+    text += ["#endif", "#undef SENT", "#undef FAR_ROW", ""]
     return "\n".join(text)
 
 
@@ -153,27 +155,27 @@ def _fields(names: list[str], c: str) -> list[str]:
     ]
 
 
-def _near(angles: list[int], c: str, warps: int) -> str:
-    """Take turns off angles that are too far for the branch-free sine; it never happens, so it is one branch."""
-    lines = [f"{c} farthest = 0;", *(f"farthest = max(farthest, on::absolute(q_row[{i}]));" for i in angles)]
-    if warps > 1:  # every warp looks, one changes them
-        lines += ["if (__syncthreads_or(farthest > on::reach())) {", "    if (warp == 0) {"]
-        lines += [*(f"        q_row[{i}] = on::reduced(q_row[{i}]);" for i in angles), "    }", "    __syncthreads();", "}"]
-    else:
-        lines += ["if (farthest > on::reach()) {", *(f"    q_row[{i}] = on::reduced(q_row[{i}]);" for i in angles), "}"]
+def near(entries: list[str], staged: bool, coordinates: int, c: str) -> str:
+    """Statements that take turns off the angles among ``entries`` of q which are too far for the branch-free sine.
+
+    It hardly ever happens, so it is one branch. Warps of a team may do it to one another's rows: twice changes nothing.
+    """
+    lines = ["#if defined(__CUDA_ARCH__)", "{", f"{c} farthest = 0;"]
+    lines += [f"farthest = max(farthest, on::absolute(q_row[{entry}]));" for entry in entries]
+    lines += ["if (farthest > on::reach()) {"]
+    if not staged:
+        lines += [f"    for (int i = 0; i < {coordinates}; ++i) far_row[i] = q_row[i];", "    q_row = far_row;"]
+    lines += [*(f"    FAR_ROW[{entry}] = on::reduced(FAR_ROW[{entry}]);" for entry in entries), "}", "}", "#endif"]
     return "\n".join(lines)
 
 
 def _each(n: int, team: int, statement: str) -> str:
-    """``statement`` for every entry i of the rows of 32 worlds, the whole team side by side."""
+    """``statement`` for every entry i of the rows of the worlds that are present, the whole team side by side."""
     turns = -(-WARP * n // team)
-    full = f"for (int k = 0; k < {turns}; ++k) {{ const int i = member + {team} * k;"
-    some = f"if (i < {WARP * n}) " if turns * team != WARP * n else ""
-    return f"""if (present == 32) {{
-    #pragma unroll
-    {full} {some}{statement} }}
-}} else {{
-    {full} if (i < present * {n}) {statement} }}
+    return f"""#pragma unroll
+for (int k = 0; k < {turns}; ++k) {{
+    const int i = member + {team} * k;
+    if (i < present * {n}) {statement}
 }}"""
 
 
@@ -191,13 +193,17 @@ def _stage_out(out: Row, offset: int, width: int, c: str, team: int) -> str:
 
 def _spread_out(result: Result, offset: int, c: str, team: int) -> str:
     n, width = result.array.entries, pitch(result.slots)
-    return f"""{{
-    {c}* to = out.data + first * {n};
-    for (int i = member; i < {n}; i += {team}) {{
-        const int slot = place.data[i];
-        const {c}* from = stage + {offset} + (slot < 0 ? 0 : slot);
-        #pragma unroll 8
-        for (int k = 0; k < present; ++k) to[(long long)k * {n} + i] = slot < 0 ? ({c})0 : from[k * {width}];
+    turns = min(8, -(-n // team))  # entries of the table that a thread fetches at once
+    return f"""for (int start = member; start < {n}; start += {turns * team}) {{
+    int slot[{turns}];
+    #pragma unroll
+    for (int u = 0; u < {turns}; ++u) slot[u] = start + {team} * u < {n} ? __ldg(place.data + start + {team} * u) : -1;
+    {c}* to = out.data + first * {n} + start;
+    const {c}* from = stage + {offset};
+    for (int k = 0; k < present; ++k, to += {n}, from += {width}) {{
+        #pragma unroll
+        for (int u = 0; u < {turns}; ++u)
+            if (start + {team} * u < {n}) to[{team} * u] = slot[u] < 0 ? ({c})0 : from[slot[u]];
     }}
 }}"""
 

@@ -202,8 +202,8 @@ class Dynamics:
                 * 2 = an input, or a value of the scene, is NaN or infinite in this dtype. The result is not finite
                   wherever that matters (infinite armature locks a hinge). Look where the number comes from.
                 * 1 = Mass is not positive definite to working precision: a massless leaf, a singular hinge (three
-                  angles at 90 degrees, a point mass on a ball). The result is NaN. Give that hinge armature, or its
-                  body inertia; a ball instead of three angles.
+                  angles at 90 degrees, a point mass on a ball). The result is NaN, or not to be trusted. Give that
+                  hinge armature, or its body inertia; a ball instead of three angles.
                 * 4 = out of range: D, or what it is made of, is too small or too large for the dtype's normal numbers,
                   or the result overflows or is subnormal. Change units (mass, length) or use float64.
                 * 3 = digits lost: an estimate from above says that D keeps fewer than half of the dtype's digits,

@@ -7,6 +7,7 @@ of 32 worlds, a block on 32 worlds; limbs of equal structure run one text, in wh
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -34,6 +35,7 @@ TRACED = (
     "jacobian",
     "operational_inertia_inverse",
 )
+LONG_ROW = 40  # entries of a result that go out together, worlds side by side
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 MOST_WARPS = 16
 
@@ -62,12 +64,21 @@ class Programs:
     Args:
         run: its sweeps, whose parameters the programs read.
         segments: segment granularity for the operations that have it, and tree granularity for the others.
+        staged: rows are read through shared memory, on CUDA.
         block: threads of a block at tree granularity, on CUDA.
         registers: a cap on the registers of a thread.
     """
 
-    def __init__(self, run: Recursions, segments: bool = False, block: int = WARP, registers: int | None = None):
-        self.run, self.segments, self.block, self.registers = run, segments, block, registers
+    def __init__(
+        self,
+        run: Recursions,
+        segments: bool = False,
+        staged: bool = False,
+        block: int = WARP,
+        registers: int | None = None,
+    ):
+        self.run, self.segments, self.staged = run, segments, staged
+        self.block, self.registers = block, registers
         self._programs: dict[Any, Program | None] = {}
 
     def forget(self) -> None:
@@ -123,9 +134,12 @@ class Programs:
         frame = self._frame(stores, shapes, 0, 1, self.block)
         stores, table = _placed(stores, frame.result)
         emitter = self._emitter(shapes, frame.result)
-        body = literals(emitter.region(stores), self.run.dtype.__name__)
+        listing = emitter.region(stores)
+        body = literals(listing, self.run.dtype.__name__)
+        angles = [str(listing.indices[k][1]) for k in listing.angles]
+        near = f"{self._near(frame)(angles)}\n" if angles else ""
         tables = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
-        return self._finished(operation, frame, body, body, tables, emitter.operations)
+        return self._finished(operation, frame, near + body, body, tables, emitter.operations)
 
     def _segment_program(self, operation: str, shapes: dict, pieces: Pieces) -> Program:
         dtype, slots = self.run.dtype.__name__, _slots(pieces, SEGMENTED[operation])
@@ -140,7 +154,7 @@ class Programs:
             everything += traced[-1]
         frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
                             WARP * pieces.warps, everything)
-        team = Team(pieces, dtype)
+        team = Team(pieces, dtype, self._near(frame))
         for piece, stores in zip(pieces.pieces, traced, strict=True):
             emitter = self._emitter(shapes, frame.result)
             inward = [item for item in stores if _goes_inward(item, slots, piece)]
@@ -159,6 +173,10 @@ class Programs:
         arrays += [(name, 1) for name in tables] + [("out", frame.result.array.ndim)]
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers)
         return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations)
+
+    def _near(self, frame: Frame) -> Callable[[list[str]], str]:
+        scene, c = self.run.scene, straight.C_TYPE[self.run.dtype]
+        return lambda entries: straight.near(entries, frame.staged, scene.coord_count, c)
 
     def _emitter(self, shapes: dict, result: Result) -> Emitter:
         guard = "if (mine) " if result.way == DIRECT else ""
@@ -183,21 +201,22 @@ class Programs:
     def _frame(self, stores: list[Store], shapes: dict, sent: int, warps: int, block: int,
                everything: list[Store] | None = None) -> Frame:
         """How rows come in and the result, of flat ``stores``, goes out: through shared memory where it has room."""
-        used, angles = _reads(everything or stores)
+        used, sines = _reads(everything or stores)
         rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used]
         out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
         dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
         over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
         slots = len({_name(item.value) for item in stores})
-        ways = [Result(IN_PLACE, out, over[-1])] if dense and over else []
-        ways += [Result(STAGED, out)] if dense else []
-        ways += [Result(MAPPED, out, slots=slots)] if warps == 1 and slots else []
         fields = [name for name in FIELDS if name in used]
-        for staged, result in [*((True, way) for way in ways), (True, Result(DIRECT, out)), (False, Result(DIRECT, out))]:
-            frame = Frame(rows, staged, fields, angles, result, sent, warps, block)
-            if frame.fits(self.run.dtype):
-                return frame
-        return Frame(rows, False, fields, angles, Result(DIRECT, out), sent, warps, block)
+        direct, mapped = Result(DIRECT, out), Result(MAPPED, out, slots=slots)
+        ways = [(False, direct)]
+        if self.staged and dense:
+            ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), (True, Result(STAGED, out)), *ways]
+        if out.entries > LONG_ROW:
+            ways = [(self.staged, mapped), (False, mapped), *ways]
+        far = self.run.scene.coord_count if sines else 0
+        frames = [Frame(rows, staged, fields, far, result, sent, warps, block) for staged, result in ways]
+        return next((frame for frame in frames if frame.fits(self.run.dtype)), frames[-1])
 
 
 def _slots(pieces: Pieces, letters: str) -> dict[tuple[str, int], int]:
@@ -242,9 +261,9 @@ def _flat(index: tuple, shape: tuple) -> int:
     return at
 
 
-def _reads(stores: list[Store]) -> tuple[set[str], list[int]]:
-    """Names of the arrays that are read, and the entries of q whose sine is taken as they are."""
-    used, angles = set(), set()
+def _reads(stores: list[Store]) -> tuple[set[str], bool]:
+    """Names of the arrays that are read, and whether sines of coordinates are taken."""
+    used, sines = set(), False
     graphs: dict[int, list[Value]] = {}
     for item in stores:
         if hasattr(item.value, "graph"):
@@ -253,6 +272,5 @@ def _reads(stores: list[Store]) -> tuple[set[str], list[int]]:
         for scalar in ordered(values):
             if scalar.op == "input":
                 used.add(scalar.args[0])
-            elif scalar.op in ("sin", "cos") and scalar.args[0].op == "input":
-                angles.add(scalar.args[0].args[1])
-    return used, sorted(angles)
+            sines = sines or (scalar.op in ("sin", "cos") and scalar.args[0].op == "input")
+    return used, sines

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from .recursions.pieces import Piece, Pieces
@@ -25,14 +26,18 @@ class Work(NamedTuple):
 class Team:
     """The work of all pieces of a scene.
 
+    Args:
+        pieces, dtype: of the scene.
+        near: statements before sines of the coordinates at these entries are taken.
+
     Attributes:
         table: constants in which equal pieces differ. shifts: likewise, distances of the entries that they read and
             write. Both as the kernel's arrays hold them.
         operations: floating-point operations of one world.
     """
 
-    def __init__(self, pieces: Pieces, dtype: str):
-        self.pieces, self.dtype = pieces, dtype
+    def __init__(self, pieces: Pieces, dtype: str, near: Callable[[list[str]], str]):
+        self.pieces, self.dtype, self._near = pieces, dtype, near
         self.table: list[float] = []
         self.shifts: list[int] = []
         self.operations = 0
@@ -118,7 +123,9 @@ class Team:
             listings = [getattr(work, which) for work in alike]
             numbers = [constant(values) for values in zip(*(x.constants for x in listings), strict=True)]
             entries = [entry(found) for found in zip(*(x.indices for x in listings), strict=True)]
-            texts.append(filled(listings[0], numbers, entries, labels, prefix))
+            angles = [entries[k] for k in listings[0].angles]
+            text = filled(listings[0], numbers, entries, labels, prefix)
+            texts.append(f"{self._near(angles)}\n{text}" if angles else text)
         head = []
         if constants.columns or shifts.columns:
             warps = [work.piece.warp for work in alike]

@@ -80,7 +80,7 @@ class Grid(Peer):
         with tempfile.TemporaryDirectory() as name:
             place = Path(name)
             exchange.write_states(place / "states", states)
-            command = [str(harness), str(place / "states"), str(place / "results"), repr(float(-self.robot.gravity[2])),
+            command = [str(harness), str(place / "states"), str(place / "results"), repr(float(self.robot.gravity[2])),
                        str(SECONDS), *map(str, worlds)]  # fmt: skip
             for row in exchange.rows(command, place / "results", states, timeout=200):
                 if wanted(row["op"], row["variant"]):

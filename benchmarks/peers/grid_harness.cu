@@ -1,7 +1,7 @@
 // GRiD's generated kernels of one robot, timed as the benchmarks time everything: K evaluations in one CUDA graph, input
 // sets in turn, median of replays. Build: nvcc -DGRID_HEADER='"panda.cuh"' (grid.py gives the whole command).
 //
-//   grid_harness STATES RESULTS GRAVITY SECONDS WORLDS...
+//   grid_harness STATES RESULTS GRAVITY SECONDS WORLDS...     GRAVITY along z, -9.81 on Earth
 //
 // STATES: see exchange.py. Prints one JSON line a case; results go to RESULTS: a block for each set, each evaluated
 // into poisoned memory, then what the timed run left; of a block, the worlds of sample().

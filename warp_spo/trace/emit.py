@@ -39,13 +39,15 @@ class Listing(NamedTuple):
     """Statements in which what may differ between equal pieces of a robot is left open.
 
     Two limbs of equal structure give equal ``text``; their numbers are in ``constants``, the entries of arrays that they
-    read and write in ``indices`` as (array, entry), the names of their links in ``labels``.
+    read and write in ``indices`` as (array, entry), the names of their links in ``labels``. ``angles`` says which of the
+    indices are coordinates whose sine is taken as they are.
     """
 
     text: str
     constants: list[float]
     indices: list[tuple[str, int]]
     labels: list[str]
+    angles: list[int]
 
 
 CONSTANT, INDEX, LABEL, PREFIX = "\x01", "\x02", "\x03", "\x05"
@@ -89,7 +91,7 @@ class Emitter:
             else:
                 values.append(item.value)
                 due.setdefault(item.value.key, []).append(item)
-        needed = (scalar for scalar in ordered(values) if scalar.key not in self._names)
+        needed = [scalar for scalar in ordered(values) if scalar.key not in self._names]
         for scalar in sorted(needed, key=lambda scalar: scalar.number):
             where, _, step = scalar.step.rpartition("|")
             if where != self._place:
@@ -100,7 +102,12 @@ class Emitter:
                 lines += self._statement(scalar, step)
                 self.counts[scalar.op] += 1
             lines += [self._stored(item) for item in due.get(scalar.key, ())]
-        return Listing("\n".join(lines), self._constants, self._indices, self._labels)
+        angles = []
+        for scalar in needed:
+            if scalar.op in ("sin", "cos") and scalar.args[0].op == "input":
+                index = scalar.args[0].args[0], self._flat(scalar.args[0].args[0], scalar.args[0].args[1:])
+                angles.append(self._indices.index(index))
+        return Listing("\n".join(lines), self._constants, self._indices, self._labels, sorted(set(angles)))
 
     @property
     def operations(self) -> int:
