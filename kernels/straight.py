@@ -13,7 +13,7 @@ import warp as wp
 from .elementary import NATIVE
 
 WARP = 32
-SHARED_BYTES = 47 * 1024  # that a block may declare, less what Warp takes
+SHARED_BYTES = 48 * 1024 - 512  # that a block may declare, less what Warp takes
 C_TYPE = {wp.float32: "float", wp.float64: "double"}
 IN_PLACE, STAGED, MAPPED, DIRECT = "in place", "staged", "mapped", "direct"
 

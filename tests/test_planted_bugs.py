@@ -8,7 +8,7 @@ from laws import TOLERANCE
 from mutants import mutant
 
 import warp_spo as spo
-from warp_spo import blocks, recursions
+from warp_spo import blocks, levels
 
 WORLDS = 3
 
@@ -25,7 +25,7 @@ def plant(monkeypatch, tmp_path):
 
 def dynamics(device, name="tree20"):
     scene = zoo.SCENES[name]()
-    return spo.Dynamics(scene, WORLDS, device=device, dtype="float64"), laws.states(scene, WORLDS)
+    return spo.Dynamics(scene, WORLDS, device=device, dtype="float64", granularity="node"), laws.states(scene, WORLDS)
 
 
 def resolvent(device):
@@ -48,7 +48,7 @@ def test_an_unwritten_output(plant, device):
     dyn, arrays = dynamics(device)
     laws.every_entry_is_written(dyn, "inverse_dynamics", arrays)
     plant(
-        recursions,
+        levels,
         "newton_euler",
         "            tau_out[world, dof] = tau",
         "            if dof > 0:\n                tau_out[world, dof] = tau",
@@ -62,7 +62,7 @@ def test_worlds_that_leak_into_each_other(plant, device):
     dyn, arrays = dynamics(device)
     laws.worlds_do_not_touch_each_other(dyn, "inverse_dynamics", arrays)
     plant(
-        recursions,
+        levels,
         "kinematics",
         "dw, dv = s.load(acceleration_out, parent, 0, world), ",
         "dw, dv = s.load(acceleration_out, parent, 0, wp.max(world - 1, 0)), ",
@@ -77,7 +77,7 @@ def test_a_wrong_gyroscopic_sign(plant, device):
     dyn, arrays = dynamics(device, "screw_tree")
     laws.bias_force_is_christoffel(dyn, arrays, 1e-6)
     plant(
-        recursions,
+        levels,
         "newton_euler",
         "            n += wp.cross(w, inertia * w)\n            f += wp.cross(w, wp.cross(w, moment))",
         "            n -= wp.cross(w, inertia * w)\n            f -= wp.cross(w, wp.cross(w, moment))",
@@ -99,7 +99,7 @@ def test_a_missing_child(plant, file, operation, device):
     dyn, arrays = dynamics(device)
     laws.equals_reference(dyn, operation, arrays, TOLERANCE["float64"])
     old = "for c in range(topology.child_start[node], topology.child_start[node + 1]):"
-    plant(recursions, file, old, old.replace("topology.child_start[node + 1]", "topology.child_start[node + 1] - 1"))
+    plant(levels, file, old, old.replace("topology.child_start[node + 1]", "topology.child_start[node + 1] - 1"))
     dyn, arrays = dynamics(device)
     with pytest.raises(AssertionError):
         laws.equals_reference(dyn, operation, arrays, TOLERANCE["float64"])

@@ -59,7 +59,7 @@ class Dynamics:
         device: Warp device; default: the current one.
         dtype: "float32" or "float64".
         variable: names of values that :meth:`set` changes without rebuilding, one row a world.
-        granularity: None (the plan chooses) or "node".
+        granularity: None (the plan chooses), "node", "segment" or "tree", see :class:`warp_spo.plan.Plan`.
         loops: what to do with the scene's loop joints: "raise" or "cut", which leaves them open.
 
     Raises:
@@ -86,12 +86,10 @@ class Dynamics:
         self.dtype = parse_dtype(dtype, "Dynamics")
         self.variable = _variable_names(variable)
         _check_loops(scene, loops)
-        self.plan = plans.choose(scene.tree, self.worlds, granularity)
+        self.plan = plans.choose(scene, self.worlds, self.device.is_cuda, self.dtype.__name__, granularity)
         self.granularity = self.plan.granularity
         self.recursions = Recursions(scene, self.plan, self.device, self.dtype, self.variable)
-        self.programs = None
-        if self.granularity != "node":
-            self.programs = Programs(self.recursions, segments=self.granularity == "segment")
+        self.programs = Programs(self.recursions, self.plan)
 
     # -- values ----------------------------------------------------------------------------------------------------
     def set(self, **values: Any) -> None:
@@ -144,8 +142,7 @@ class Dynamics:
         )
         self.scene = self.scene.with_values(**folded)
         self.recursions.replace_values(self.scene)
-        if self.programs is not None:
-            self.programs.forget()
+        self.programs.forget()
 
     def prepare(self, operation: str, **options: Any) -> None:
         """Compile and allocate all that ``operation`` needs, so that its next call only launches.
@@ -374,19 +371,22 @@ class Dynamics:
         widths = [count for _, count in self.plan.outward]
         memory = self.recursions.workspace_bytes / 2**20
         gravity = self.recursions.parameters.gravity
-        return "\n".join(
-            [
-                f"{scene!r}",
-                f"worlds       {self.worlds} on {self.device}, {self.dtype.__name__}",
-                f"granularity  {self.granularity}: {self.plan.reason}",
-                f"levels       {len(widths)} of {min(widths)} to {max(widths)} nodes, {len(tree.segments)} segments",
-                "launches     forward dynamics 4 a level + 2, inverse dynamics 2 + 2, mass matrix 1 + 2",
-                f"variable     {', '.join(self.variable) or 'nothing'}",
-                f"gravity      {'none' if gravity is None else 'acceleration of the inertial frame'}",
-                f"loops        {len(scene.loops)} left open" if scene.loops else "loops        none",
-                f"workspace    {memory:.1f} MiB so far",
-            ]
-        )
+        lines = [
+            f"{scene!r}",
+            f"worlds       {self.worlds} on {self.device}, {self.dtype.__name__}",
+            f"granularity  {plans.describe(self.plan)}",
+            f"levels       {len(widths)} of {min(widths)} to {max(widths)} nodes, {len(tree.segments)} segments",
+            f"variable     {', '.join(self.variable) or 'nothing'}",
+            f"gravity      {'none' if gravity is None else 'acceleration of the inertial frame'}",
+            f"loops        {len(scene.loops)} left open" if scene.loops else "loops        none",
+            f"workspace    {memory:.1f} MiB so far",
+        ]
+        return "\n".join(lines + self.programs.described())
+
+    @property
+    def operation_counts(self) -> dict[str, int]:
+        """Floating-point operations of one world, of the operations that have a kernel of their own so far."""
+        return self.programs.operation_counts
 
     # -- steps -----------------------------------------------------------------------------------------------------
     def _run(self, operation: str, out: wp.array, **given: Any) -> bool:
@@ -397,12 +397,10 @@ class Dynamics:
         """
         arrays = {name: value for name, value in given.items() if isinstance(value, wp.array)}
         options = {name: value for name, value in given.items() if value is not None and name not in arrays}
-        program = None
-        if self.programs is not None:
-            shapes = {name: array.shape for name, array in arrays.items()}
-            program = self.programs.find(operation, shapes, out.shape, **options)
+        shapes = {name: array.shape for name, array in arrays.items()}
+        program = self.programs.find(operation, shapes, out.shape, **options)
         if program is not None:
-            self.programs.launch(program, arrays, out)  # type: ignore[union-attr]
+            self.programs.launch(program, arrays, out)
         else:
             getattr(nodes, operation)(self.recursions, out, **arrays, **options)
         return program is None

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 
-from .errors import UnsupportedError
-from .tree import Tree
+from .recursions.links import Links
+from .recursions.pieces import Pieces
+from .scene import Scene
 
 GRANULARITIES = ("node", "segment", "tree")
 COLUMN_BYTES = 1 << 28  # workspace of a solve with many right-hand sides; more columns go in turns
+
+# Measured on an H200, 2026-11-21; see CONTRIBUTING.
+FEW_WORLDS = 32768  # so many leave a GPU waiting: a warp for each limb, and rows read where they are
+MOST_DOFS = 128  # straight-line code of more takes too long to compile
+FEW_ON_CPU = 256  # worlds that a CPU is done with before a kernel for the scene is compiled
+SPILLS = {"float32": 32, "float64": 15}  # dofs at which one thread no longer holds a whole tree in registers
+SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as through shared memory
+MOST_WARPS = 16
+SHORT = ("inverse_dynamics", "mass_matrix")  # little code: a thread for the whole tree does not spill
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,40 +26,82 @@ class Plan:
     """How the recursions of one scene are cut into kernels.
 
     Attributes:
-        granularity: "node": one thread works on one node of a level in one world, a launch a level.
+        granularity: "node": one thread works on one node of a level in one world, a launch a level. "segment": a warp
+            works on one serial chain of 32 worlds, a block on 32 worlds. "tree": one thread works on one world.
         reason: why.
+        forced: the user asked for it.
+        staged: rows of many worlds come in through shared memory.
         outward: (first, count) into the nodes ordered by level, roots first.
         worlds: number of worlds.
+        dtype: "float32" or "float64".
     """
 
     granularity: str
     reason: str
+    forced: bool
+    staged: bool
     outward: tuple[tuple[int, int], ...]
     worlds: int
+    dtype: str
 
     @property
     def inward(self) -> tuple[tuple[int, int], ...]:
         """The levels from the deepest to the roots."""
         return self.outward[::-1]
 
+    def of(self, operation: str) -> str:
+        """Granularity of one operation."""
+        if self.granularity == "segment" and not self.forced and operation in SHORT:
+            return "segment" if self.worlds <= FEW_WORLDS or self.dtype == "float64" else "tree"
+        return self.granularity
+
     def column_chunk(self, columns: int, bytes_per_column: int) -> int:
         """Right-hand sides that go through a solve at once."""
         return max(1, min(columns, COLUMN_BYTES // max(1, bytes_per_column)))
 
 
-def choose(tree: Tree, worlds: int, granularity: str | None) -> Plan:
-    """Return the plan for a tree and a world count; ``granularity`` forces one.
+def choose(scene: Scene, worlds: int, cuda: bool, dtype: str, granularity: str | None = None) -> Plan:
+    """Return the plan for a scene and a world count; ``granularity`` forces one.
 
     Raises:
         ValueError: no such granularity.
-        UnsupportedError: one that this version does not offer.
     """
     if granularity is not None and granularity not in GRANULARITIES:
         names = ", ".join(GRANULARITIES)
         raise ValueError(f"Dynamics: granularity is {granularity!r}; expected None or one of {names}")
-    reason = "asked for" if granularity else "the one that serves every scene and needs no compilation for it"
+    chosen, reason = (granularity, "asked for") if granularity else _chosen(scene, worlds, cuda, dtype)
+    staged = worlds > FEW_WORLDS and scene.dof_count > SHORT_ROWS
     outward, first = [], 0
-    for level in tree.levels:
+    for level in scene.tree.levels:
         outward.append((first, len(level)))
         first += len(level)
-    return Plan(granularity or "tree", reason, tuple(outward), worlds)
+    return Plan(chosen, reason, granularity is not None, staged, tuple(outward), worlds, dtype)
+
+
+def _chosen(scene: Scene, worlds: int, cuda: bool, dtype: str) -> tuple[str, str]:
+    dofs = scene.dof_count
+    if dofs == 0:
+        return "node", "nothing moves"
+    if dofs > MOST_DOFS:
+        return "node", f"more than {MOST_DOFS} dof take long to compile as straight-line code"
+    if not cuda:
+        if worlds < FEW_ON_CPU:
+            return "node", f"fewer than {FEW_ON_CPU} worlds on a CPU are done before a kernel is compiled for the scene"
+        return "tree", "one thread works through a world"
+    limbs = Pieces(Links(scene)).warps
+    if limbs == 1:
+        return "tree", "the scene is one chain"
+    if limbs > MOST_WARPS:
+        return "tree", f"more than {MOST_WARPS} limbs"
+    if worlds <= FEW_WORLDS:
+        return "segment", f"up to {FEW_WORLDS} worlds, {limbs} limbs side by side take less time"
+    if dofs > SPILLS[dtype]:
+        return "segment", f"{dofs} dof in {dtype} do not fit into one thread's registers"
+    return "tree", f"more than {FEW_WORLDS} worlds keep the GPU busy with a thread each"
+
+
+def describe(plan: Plan) -> str:
+    """One line: the choice, why, and what else there is."""
+    others = ", ".join(name for name in GRANULARITIES if name != plan.granularity)
+    rows = "through shared memory" if plan.staged else "each by its thread"
+    return f"{plan.granularity}: {plan.reason}; rows are read {rows}; granularity= can force {others}"

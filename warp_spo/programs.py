@@ -15,19 +15,19 @@ import warp as wp
 from .kernels import straight
 from .kernels.straight import DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
 from .levels import Recursions
+from .plan import MOST_WARPS, Plan
 from .recursions.links import Links
 from .recursions.pieces import Piece, Pieces
 from .recursions.traced import SENT, Trace
 from .teams import Team
 from .trace.emit import Emitter, Store, literals
-from .trace.graph import Value, ordered
+from .trace.graph import Value, is_constant, ordered
 
 FIELDS = ("rigid", "tree", "anchor", "com", "joint_armature", "gravity")
-SEGMENTED = {"forward_dynamics": "Pza", "solve_mass_matrix": "Pza", "inverse_dynamics": "z"}
+SEGMENTED = {"forward_dynamics": "Pza", "solve_mass_matrix": "Pza", "inverse_dynamics": "z", "mass_matrix": "R"}
 """Operations that have a segment granularity, and what the pieces send each other."""
 TRACED = (
     *SEGMENTED,
-    "mass_matrix",
     "mass_matrix_inverse",
     "log_det_mass_matrix",
     "body_poses",
@@ -37,7 +37,6 @@ TRACED = (
 )
 LONG_ROW = 40  # entries of a result that go out together, worlds side by side
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
-MOST_WARPS = 16
 
 
 class Program(NamedTuple):
@@ -63,22 +62,13 @@ class Programs:
 
     Args:
         run: its sweeps, whose parameters the programs read.
-        segments: segment granularity for the operations that have it, and tree granularity for the others.
-        staged: rows are read through shared memory, on CUDA.
+        plan: which granularity each operation has.
         block: threads of a block at tree granularity, on CUDA.
         registers: a cap on the registers of a thread.
     """
 
-    def __init__(
-        self,
-        run: Recursions,
-        segments: bool = False,
-        staged: bool = False,
-        block: int = WARP,
-        registers: int | None = None,
-    ):
-        self.run, self.segments, self.staged = run, segments, staged
-        self.block, self.registers = block, registers
+    def __init__(self, run: Recursions, plan: Plan, block: int = WARP, registers: int | None = None):
+        self.run, self.plan, self.block, self.registers = run, plan, block, registers
         self._programs: dict[Any, Program | None] = {}
 
     def forget(self) -> None:
@@ -93,7 +83,9 @@ class Programs:
             out: shape of the result, [world, ...].
             options: of the operation.
         """
-        if operation not in TRACED or (operation == "solve_mass_matrix" and len(out) > 2):
+        if self.plan.of(operation) == "node" or operation not in TRACED:
+            return None
+        if operation == "solve_mass_matrix" and len(out) > 2:
             return None
         key = operation, tuple(shapes), out[1:], *options.values()
         if key not in self._programs:
@@ -112,6 +104,25 @@ class Programs:
         inputs += [run.parameters.array(name) for name in program.fields]
         wp.launch(program.kernel, threads, [*inputs, *program.tables], [out], device=run.device, block_dim=block)
 
+    @property
+    def operation_counts(self) -> dict[str, int]:
+        """Floating-point operations of one world, by operation."""
+        return {key[0]: program.operations for key, program in self._programs.items() if program is not None}
+
+    def described(self) -> list[str]:
+        """A line for each kernel: its granularity, its operations in one world, and on CUDA what it takes."""
+        lines = []
+        for key, program in self._programs.items():
+            if program is None:
+                continue
+            granularity = f"segment, {program.warps} warps" if program.warps > 1 else "tree"
+            line = f"{key[0]}  {granularity}, {program.operations} operations a world"
+            if self.run.device.is_cuda:
+                found = wp.get_cuda_kernel_properties(program.kernel, self.run.device)
+                line += f", {found.num_regs} registers, {found.local_size_bytes} bytes spilled a thread"
+            lines.append(line)
+        return lines
+
     # -- building --------------------------------------------------------------------------------------------------
     def _links(self) -> Links:
         return Links(self.run.scene, self.run.parameters.variable)
@@ -121,27 +132,26 @@ class Programs:
         if operation == "body_poses" and links.varies_tree or not links.links:
             return None
         shapes = {**shapes, "out": out_shape}
-        if self.segments and operation in SEGMENTED:
+        if self.plan.of(operation) == "segment" and operation in SEGMENTED:
             pieces = Pieces(links)
-            if 1 < pieces.warps <= MOST_WARPS:
-                return self._segment_program(operation, shapes, pieces)
+            program = self._segment_program(operation, shapes, pieces) if 1 < pieces.warps <= MOST_WARPS else None
+            if program is not None:
+                return program
         return self._tree_program(operation, links, shapes, options)
 
     def _tree_program(self, operation: str, links: Links, shapes: dict, options: dict) -> Program:
         trace = Trace(links, self.run.dtype.__name__, tuple(shapes))
-        stores = [item._replace(index=(_flat(item.index, shapes["out"][1:]),))
-                  for item in getattr(trace, operation)(**options)]
+        stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         frame = self._frame(stores, shapes, 0, 1, self.block)
-        stores, table = _placed(stores, frame.result)
+        placed, table = _placed(stores, frame.result)
         emitter = self._emitter(shapes, frame.result)
-        listing = emitter.region(stores)
+        listing = emitter.region(placed)
         body = literals(listing, self.run.dtype.__name__)
-        angles = [str(listing.indices[k][1]) for k in listing.angles]
-        near = f"{self._near(frame)(angles)}\n" if angles else ""
+        near = self._near(frame)([str(listing.indices[k][1]) for k in listing.angles])
         tables = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
-        return self._finished(operation, frame, near + body, body, tables, emitter.operations)
+        return self._finished(operation, frame, f"{near}\n{body}", body, tables, emitter.operations)
 
-    def _segment_program(self, operation: str, shapes: dict, pieces: Pieces) -> Program:
+    def _segment_program(self, operation: str, shapes: dict, pieces: Pieces) -> Program | None:
         dtype, slots = self.run.dtype.__name__, _slots(pieces, SEGMENTED[operation])
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         sent = sum(SENT[letter] for letter, _ in slots)
@@ -150,21 +160,32 @@ class Programs:
         for index in range(len(pieces.pieces)):
             links = self._links()  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
-            traced.append(getattr(trace, operation)())
+            traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)()])
             everything += traced[-1]
         frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
                             WARP * pieces.warps, everything)
+        if frame.result.way == DIRECT and frame.result.array.entries > LONG_ROW:
+            return None  # no room for the result in shared memory, which matters more
         team = Team(pieces, dtype, self._near(frame))
-        for piece, stores in zip(pieces.pieces, traced, strict=True):
+        outs = [[item for item in stores if item.array == "out"] for stores in traced]
+        everything, table = _placed([item for items in outs for item in items], frame.result)
+        outs[0] += everything[sum(map(len, outs)) :] if table is None else []  # zeros
+        for piece, stores, items in zip(pieces.pieces, traced, outs, strict=True):
             emitter = self._emitter(shapes, frame.result)
-            inward = [item for item in stores if _goes_inward(item, slots, piece)]
-            if operation == "inverse_dynamics":
-                inward = stores
-            team.add(piece, emitter, emitter.region(inward), emitter.region([s for s in stores if s not in inward]))
+            placed = [item for item in stores if item.array == "sent"]
+            placed += items if table is None else _by_slot(items, table)
+            last = "a" in SEGMENTED[operation]  # results come on the way out
+            inward = [item for item in placed if (_goes_inward(item, slots, piece) if last else True)]
+            team.add(piece, emitter, emitter.region(inward), emitter.region(placed if last else []))
         cuda = team.cuda()  # fills the tables
         tables = {name: wp.array(values, dtype=kind, device=self.run.device)
-                  for name, values, kind in (("table", team.table, self.run.dtype), ("shifts", team.shifts, int)) if values}
+                  for name, values, kind in (("place", table, int), ("table", team.table, self.run.dtype),
+                                             ("shifts", team.shifts, int)) if values}
         return self._finished(operation, frame, cuda, team.cpu(), tables, team.operations)
+
+    @staticmethod
+    def _flattened(item: Store, shapes: dict) -> Store:
+        return item if item.array == "sent" else item._replace(index=(_flat(item.index, shapes["out"][1:]),))
 
     def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int) -> Program:
         native = straight.assemble(frame, cuda, cpu, self.run.dtype)
@@ -176,7 +197,7 @@ class Programs:
 
     def _near(self, frame: Frame) -> Callable[[list[str]], str]:
         scene, c = self.run.scene, straight.C_TYPE[self.run.dtype]
-        return lambda entries: straight.near(entries, frame.staged, scene.coord_count, c)
+        return lambda entries: straight.near(entries, frame.staged, scene.coord_count, c) if entries and frame.far else ""
 
     def _emitter(self, shapes: dict, result: Result) -> Emitter:
         guard = "if (mine) " if result.way == DIRECT else ""
@@ -196,7 +217,7 @@ class Programs:
                 return 16 * index[0] + (index[1] if len(index) > 1 else 0)
             return index[0] if len(index) == 1 else _flat(index, shapes[array][1:])
 
-        return Emitter(self.run.dtype.__name__, load, store, flat)
+        return Emitter(self.run.dtype.__name__, load, store, flat, any_angle=result.way == MAPPED)
 
     def _frame(self, stores: list[Store], shapes: dict, sent: int, warps: int, block: int,
                everything: list[Store] | None = None) -> Frame:
@@ -210,12 +231,16 @@ class Programs:
         fields = [name for name in FIELDS if name in used]
         direct, mapped = Result(DIRECT, out), Result(MAPPED, out, slots=slots)
         ways = [(False, direct)]
-        if self.staged and dense:
+        staged = self.plan.staged
+        if staged and dense:
             ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), (True, Result(STAGED, out)), *ways]
         if out.entries > LONG_ROW:
-            ways = [(self.staged, mapped), (False, mapped), *ways]
-        far = self.run.scene.coord_count if sines else 0
-        frames = [Frame(rows, staged, fields, far, result, sent, warps, block) for staged, result in ways]
+            ways = [(staged, mapped), (False, mapped), *ways]
+        coordinates = self.run.scene.coord_count if sines else 0
+        frames = []
+        for staged, result in ways:
+            far = 0 if result.way == MAPPED else coordinates  # the room goes to the result; its sines look themselves
+            frames.append(Frame(rows, staged, fields, far, result, sent, warps, block))
         return next((frame for frame in frames if frame.fits(self.run.dtype)), frames[-1])
 
 
@@ -244,14 +269,18 @@ def _placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int]
         table = [-1] * out.entries
         for item in stores:
             table[item.index[0]] = slots.setdefault(_name(item.value), len(slots))
-        by_slot = {table[item.index[0]]: item.value for item in stores}
-        return [Store("out", (slot,), value) for slot, value in sorted(by_slot.items())], table
+        return _by_slot(stores, table), table
     done = {item.index for item in stores}
     return stores + [Store("out", (i,), 0.0) for i in range(out.entries) if (i,) not in done], None
 
 
+def _by_slot(stores: list[Store], table: list[int]) -> list[Store]:
+    values = {table[item.index[0]]: item.value for item in stores}
+    return [Store("out", (slot,), value) for slot, value in sorted(values.items())]
+
+
 def _name(value: Value) -> Any:
-    return getattr(value, "key", value)
+    return value if is_constant(value) else (id(value.graph), value.key)
 
 
 def _flat(index: tuple, shape: tuple) -> int:

@@ -125,7 +125,8 @@ class Team:
             entries = [entry(found) for found in zip(*(x.indices for x in listings), strict=True)]
             angles = [entries[k] for k in listings[0].angles]
             text = filled(listings[0], numbers, entries, labels, prefix)
-            texts.append(f"{self._near(angles)}\n{text}" if angles else text)
+            near = self._near(angles)
+            texts.append(f"{near}\n{text}" if near else text)
         head = []
         if constants.columns or shifts.columns:
             warps = [work.piece.warp for work in alike]

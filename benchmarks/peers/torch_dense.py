@@ -38,6 +38,8 @@ class TorchDense(Peer):
         import torch
 
         self.torch, self.where = torch, torch.device(str(device))
+        if self.where.type == "cuda":  # MAGMA's batched solve allocates, and so cannot be captured
+            torch.backends.cuda.preferred_linalg_library("cusolver")
 
     def prepare(self, op: str, variant: str, states: States, worlds: int) -> None:
         torch = self.torch

@@ -8,11 +8,12 @@ is not positive becomes NaN.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from ..trace.graph import Value, guarded, is_constant, reciprocal
-from ..trace.spatial import ZERO, Articulated, Matrix, Rigid, Vector, cross, dot, magnitude, symmetric
-from .links import BALL, FREE, HELIX, SLIDE, TURN, Link, Links, Placed
+from ..trace.spatial import ZERO, Articulated, Pose, Rigid, Vector, cross, dot, magnitude, symmetric, total
+from .links import BALL, FREE, SLIDE, TURN, Link, Placed
 from .motion import NONE, Motion, carried, in_hinge, in_link
 
 LEAST = 4.0  # pivots of less than this many roundings of what cancels in them may be rounding alone
@@ -39,6 +40,7 @@ class Factor:
         P: P+ in the link's frame. in_parent: phi P+ phi*.
         whole: the hinge is free and has no armature: D = P, and the parent feels nothing.
         turned: the hinge's dofs are eliminated in the link's axes, not in the hinge's.
+        nothing: zero, or NaN where the link moves no inertia and has no armature: it takes its whole world with it.
     """
 
     pivots: list[Pivot]
@@ -46,10 +48,23 @@ class Factor:
     in_parent: Articulated
     whole: bool
     turned: bool
+    nothing: Value
 
 
-def factor(links: Links, link: Link, place: Placed, carried_on: list[Articulated], epsilon: float) -> Factor:
-    """Eliminate the dofs of a link from its articulated inertia, with those of its children in its own frame."""
+def factor(
+    link: Link,
+    place: Placed,
+    carried_on: list[Articulated],
+    through: list[tuple[Pose, Articulated]],
+    epsilon: float,
+) -> Factor:
+    """Eliminate the dofs of a link from its articulated inertia.
+
+    Args:
+        carried_on: P+ of its children, in its own frame.
+        through: the same in the children's frames, and how they sit; looked at if the link has no inertia.
+        epsilon: rounding of the dtype.
+    """
     P = NO_INERTIA if link.inertia is None else link.inertia.articulated
     for other in carried_on:
         P = P + other
@@ -59,32 +74,65 @@ def factor(links: Links, link: Link, place: Placed, carried_on: list[Articulated
     whole = link.motion == FREE and alike and not any(link.armature)
     pivots = []
     if turned or link.motion in (TURN, SLIDE):
-        for unit, armature in zip(UNIT[link.motion][::-1], link.armature[::-1], strict=True):
-            pivot, P = _eliminate_unit(P, unit, armature)
+        units = UNIT[link.motion][::-1]
+        sizes = _cancelling(link, P, units, through)
+        for at, (unit, armature) in enumerate(zip(units, link.armature[::-1], strict=True)):
+            pivot, P = _eliminate_unit(P, unit, armature, LEAST * epsilon * sizes[at])
             pivots.append(pivot)
+            for later in range(at + 1, len(units) if link.motion == BALL else 0):
+                share = pivot.U[units[later]] * pivot.inverse  # what D lost it loses again in what it is taken from
+                sizes[later] = sizes[later] + share * pivot.U[units[later]] * (2.0 + sizes[at] * pivot.inverse)
     else:
-        columns = _columns(link, place)
-        for column, armature in zip(columns[::-1], link.armature[::-1], strict=True):
+        H = columns(link, place)
+        for column, armature in zip(H[::-1], link.armature[::-1], strict=True):
             pivot, P = _eliminate(P, column, armature, LEAST * epsilon)
             pivots.append(pivot)
-    if link.parent is None or whole:
-        return Factor(pivots, P, NO_INERTIA, whole, turned)
-    return Factor(pivots, P, place.pose.articulated_to_parent(P), whole, turned)
+    nothing: Value = 0.0
+    if link.inertia is None and not link.children:  # it moves no inertia, so nobody would notice a lost pivot
+        nothing = total(lost(pivot.D) for pivot in pivots)
+        P = P + Articulated.build(lambda i, j: nothing if i == j else 0.0)
+    in_parent = NO_INERTIA if link.parent is None or whole else place.pose.articulated_to_parent(P)
+    return Factor(pivots, P, in_parent, whole, turned, nothing)
 
 
-def _columns(link: Link, place: Placed) -> list[Vector]:
+def columns(link: Link, place: Placed) -> list[Vector]:
     """Columns of H*, (omega; v) in the link's axes."""
-    columns = []
+    found = []
     for dof in link.dofs:
         w, v = in_link(link, place, lambda other, dof=dof: 1.0 if other == dof else 0.0)
-        columns.append(Vector((*w, *v)))
-    return columns
+        found.append(Vector((*w, *v)))
+    return found
 
 
-def _eliminate_unit(P: Articulated, unit: int, armature: Value) -> tuple[Pivot, Articulated]:
+def _cancelling(link: Link, P: Articulated, units: list[int], through: list[tuple[Pose, Articulated]]) -> list[Value]:
+    """What may cancel in each pivot; nothing does in the first one of a link with an inertia of its own.
+
+    The later pivots of a hinge are what the earlier ones leave of an entry of P. A link without inertia has only what its
+    children hand on, which vanishes along their own hinges: there it is the sum of what is turned into its axes.
+    """
+    if link.inertia is not None:
+        return [0.0, *(P.entry(unit, unit) for unit in units[1:])]
+    sizes = []
+    for unit in units:
+        terms = []
+        for pose, inner in through:
+            axis = [1.0 if i == unit else 0.0 for i in range(6)]
+            w, v = pose.motion_to_child(Vector(axis[:3]), Vector(axis[3:]))
+            terms.append(magnitude((*w, *v), inner, (*w, *v)))
+        sizes.append(total(terms))
+    return sizes
+
+
+def lost(D: Value) -> Value:
+    """Nothing, or NaN if D is not positive."""
+    D = guarded(D, 0.0)
+    return D - D if is_constant(D) else D.graph.make("lost", D)
+
+
+def _eliminate_unit(P: Articulated, unit: int, armature: Value, least: Value) -> tuple[Pivot, Articulated]:
     U = Vector(P.entry(unit, j) for j in range(6))
     D = U[unit] + armature
-    inverse = reciprocal(guarded(D, 0.0))
+    inverse = reciprocal(guarded(D, least))
     scaled, kept = U * inverse, armature * inverse
 
     def entry(i: int, j: int) -> Value:

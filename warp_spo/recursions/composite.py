@@ -3,46 +3,28 @@
 from __future__ import annotations
 
 from ..trace.graph import Value
-from ..trace.spatial import Rigid, Vector
-from .articulated import _columns
-from .links import Links, Placed
-from .motion import in_hinge
+from ..trace.spatial import ZERO, Rigid, Vector
+from .articulated import columns
+from .links import Link, Placed
+from .motion import NONE, in_hinge
+
+NOTHING = Rigid(0.0, ZERO, NONE)
 
 
-def composites(links: Links, places: dict[int, Placed]) -> dict[int, Rigid | None]:
-    """R of every link in its own frame, by its place in ``links.links``."""
-    found: dict[int, Rigid | None] = {}
-    for link in reversed(links.links):
-        R = link.inertia
-        for child in link.children:
-            other = found[id(child)]
-            if other is not None:
-                other = places[id(child)].pose.rigid_to_parent(other)
-                R = other if R is None else R + other
-        found[id(link)] = R
+def entries(link: Link, places: dict[int, Placed], body: Rigid) -> dict[tuple[int, int], Value]:
+    """(row, column) of Mass for the columns of a link that carries ``body`` = R, rows on the way to the root."""
+    found: dict[tuple[int, int], Value] = {}
+    for column, armature, H in zip(link.dofs, link.armature, columns(link, places[id(link)]), strict=True):
+        n, f = body.apply(Vector(H[:3]), Vector(H[3:]))
+        over = link
+        while True:
+            for row, force in zip(over.dofs, in_hinge(over, places[id(over)], n, f), strict=True):
+                if row == column:
+                    found[row, column] = force + armature
+                elif over is not link or row < column:
+                    found[row, column] = force
+            if over.parent is None:
+                break
+            n, f = places[id(over)].pose.force_to_parent(n, f)
+            over = over.parent
     return found
-
-
-def mass_matrix(links: Links, places: dict[int, Placed]) -> dict[tuple[int, int], Value]:
-    """Entries (row, column) with row on the way from column's link to the root; what is absent is zero."""
-    entries: dict[tuple[int, int], Value] = {}
-    R = composites(links, places)
-    for link in links.links:
-        body = R[id(link)]
-        for column, armature, H in zip(link.dofs, link.armature, _columns(link, places[id(link)]), strict=True):
-            entries[column, column] = armature
-            if body is None:
-                continue
-            n, f = body.apply(Vector(H[:3]), Vector(H[3:]))
-            over = link
-            while True:
-                for row, force in zip(over.dofs, in_hinge(over, places[id(over)], n, f), strict=True):
-                    if row == column:
-                        entries[row, column] = force + armature
-                    elif over is not link or row < column:
-                        entries[row, column] = force
-                if over.parent is None:
-                    break
-                n, f = places[id(over)].pose.force_to_parent(n, f)
-                over = over.parent
-    return entries

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..parts import BALL, FREE, SCREWS
 from ..scene import Scene
-from ..trace.graph import Graph, Value, cos, reciprocal, reduced, sin
+from ..trace.graph import Graph, Value, cos, is_constant, reciprocal, reduced, sin
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
 
 TURN, SLIDE, HELIX = "turn", "slide", "helix"
@@ -56,6 +56,8 @@ class Link:
     children: list = dataclasses.field(default_factory=list)
 
     def add(self, inertia: Rigid) -> None:
+        if all(is_constant(x) and x == 0.0 for x in inertia.packed):
+            return
         self.inertia = inertia if self.inertia is None else self.inertia + inertia
 
 
@@ -201,6 +203,8 @@ class Links:
 
     def _append(self, parent: Link | None, motion: Any, matrix: Matrix, offset: Vector, pitch: float,
                 dofs: tuple, coordinate: int, armature: tuple, node: int, label: str) -> Link:
+        if all(is_constant(entry) for row in matrix for entry in row):
+            matrix = _folded(np.array(matrix, dtype=float))
         still = None if matrix == IDENTITY else matrix
         link = Link(parent, motion, still, offset, pitch, dofs, coordinate, armature, node, label)
         self.links.append(link)

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from ..trace.emit import Store
-from ..trace.graph import Value, sum_of_logarithms
-from ..trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Vector, cross, total
+from ..trace.graph import Value, is_constant, sum_of_logarithms
+from ..trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Rigid, Vector, cross, total
 from . import articulated, composite, kinematics, motion, newton_euler
 from .links import Link, Links, Placed, placed
 from .motion import STILL, Motion
@@ -19,7 +19,8 @@ from .pieces import Piece
 EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}
 
 
-SENT = {"P": 21, "z": 6, "a": 6}  # values that pieces send each other: phi P+ phi* and z inward, alpha outward
+SENT = {"P": 21, "z": 6, "R": 10, "a": 6}
+"""Values that pieces send each other: inward phi P+ phi*, z or f, the composite inertia; outward alpha."""
 
 
 class Trace:
@@ -157,7 +158,8 @@ class Trace:
             self.at(link, "P")
             place, move = self.places[key], self.motions[key]
             carried = self.carried_on(link, "P", inner, Articulated.unpacked)
-            done[key] = factor = articulated.factor(self.links, link, place, carried, self.epsilon)
+            through = [(self.places[id(child)].pose, done[id(child)].P) for child in link.children if id(child) in done]
+            done[key] = factor = articulated.factor(link, place, carried, through, self.epsilon)
             inner[key] = factor.in_parent
             self.at(link, "z")
             z = articulated.gyroscopic(link.inertia, move)
@@ -223,10 +225,24 @@ class Trace:
 
     def mass_matrix(self) -> list[Store]:
         """out = Mass, both triangles"""
-        for link in self.links.links:
-            self.place(link)
-        entries = composite.mass_matrix(self.links, self.places)
-        return self._both(entries)
+        carried: dict[int, Rigid] = {}
+        entries: dict[tuple[int, int], Value] = {}
+        stores: list[Store] = []
+        for link, outward in self.traversal():
+            if outward:
+                self.place(link)
+                continue
+            key = id(link)
+            self.at(link, "R")
+            body = link.inertia or composite.NOTHING
+            for other in self.carried_on(link, "R", carried, Rigid.unpacked):
+                body = body + other
+            if link.parent is not None:
+                carried[key] = self.places[key].pose.rigid_to_parent(body)
+                stores += self.handed_on("R", link, lambda key=key: carried[key].packed)
+            self.at(link, "F")
+            entries |= composite.entries(link, self.places, body)
+        return stores + self._both(entries)
 
     def _both(self, entries: dict[tuple[int, int], Value]) -> list[Store]:
         return [Store("out", place, value) for (i, j), entry in entries.items() for place, value in _mirrored(i, j, entry)]
@@ -261,9 +277,9 @@ class Trace:
             right = [0.0] * len(over.dofs)
 
     def _sandwich(self, done: dict, halves: dict) -> dict[tuple[int, int], Value]:
-        """Y* D Y; entries of columns without a common ancestor are absent."""
+        """Y* D Y; entries of columns without a common ancestor are absent, unless a pivot may be lost."""
         entries: dict[tuple[int, int], Value] = {}
-        names = list(halves)
+        names, nothing = list(halves), total(factor.nothing for factor in done.values())
         for at, i in enumerate(names):
             self.graph.step = f"column {i}|m"
             weighted = {
@@ -272,8 +288,10 @@ class Trace:
             }
             for j in names[: at + 1]:
                 both = [key for key in halves[j] if key in weighted]
-                if both:
-                    entries[j, i] = total(a * b for key in both for a, b in zip(weighted[key], halves[j][key], strict=True))
+                pairs = (pair for key in both for pair in zip(weighted[key], halves[j][key], strict=True))
+                entry = total(a * b for a, b in pairs) + nothing
+                if both or not is_constant(nothing) or nothing != 0.0:
+                    entries[j, i] = entry
         return entries
 
     # -- kinematics ------------------------------------------------------------------------------------------------

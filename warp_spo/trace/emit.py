@@ -13,7 +13,7 @@ from .graph import Scalar, Value, is_constant, ordered
 
 C_TYPE = {"float32": "float", "float64": "double"}
 BINARY = {"add": "+", "sub": "-", "mul": "*"}
-COST = {"add": 1, "sub": 1, "mul": 1, "neg": 0, "absolute": 0, "guarded": 1, "input": 0}
+COST = {"add": 1, "sub": 1, "mul": 1, "neg": 0, "absolute": 0, "guarded": 1, "lost": 1, "input": 0}
 COST_ELSE = 8  # about what a sine, a root or a reciprocal takes in additions
 
 
@@ -61,6 +61,7 @@ class Emitter:
         dtype: "float32" or "float64".
         load, store: C++ for reading and writing an entry of an array, given the array's name and the entry's text.
         flat: entry of an array for the index of an input.
+        any_angle: nobody else takes care of angles that are too far for the branch-free sine.
     """
 
     def __init__(
@@ -69,8 +70,10 @@ class Emitter:
         load: Callable[[str, str], str],
         store: Callable[[str, str, str], str],
         flat: Callable[[str, tuple], int],
+        any_angle: bool = False,
     ):
         self.dtype, self._load, self._store, self._flat = dtype, load, store, flat
+        self._any_angle = any_angle
         self.counts: Counter = Counter()
         self._names: dict[tuple, str] = {}
         self._count = 0
@@ -139,7 +142,8 @@ class Emitter:
         if op in ("sin", "cos"):
             angle = self._text(args[0])
             sine, cosine = (self._name(scalar.graph.make(name, *args), name) for name in ("sin", "cos"))
-            which = "sincos" if args[0].op == "input" else "sincos_any"  # a coordinate is known not to be far
+            near = args[0].op == "input" and not self._any_angle  # then the coordinate has been looked at
+            which = "sincos" if near else "sincos_any"
             return [f"{T} {sine}, {cosine};", f"on::{which}({angle}, {sine}, {cosine});"]
         texts = [self._text(a) for a in args]
         name = self._name(scalar, step)
@@ -149,6 +153,8 @@ class Emitter:
             return [f"const {T} {name} = -{texts[0]};"]
         if op == "guarded":
             return [f"const {T} {name} = {texts[0]} > {texts[1]} ? {texts[0]} : nan;"]
+        if op == "lost":
+            return [f"const {T} {name} = {texts[0]} - {texts[0]};"]
         if op == "sum_of_logarithms":
             return [f"const {T} {name} = ({T})({' + '.join(f'on::log((double){a})' for a in texts)});"]
         return [f"const {T} {name} = on::{op}({', '.join(texts)});"]

@@ -20,6 +20,7 @@ FUNCTIONS: dict[str, Callable] = {
     "reciprocal": lambda a: 1.0 / a,
     "reduced": lambda a: a,
     "absolute": np.abs,
+    "lost": lambda a: a - a,
     "guarded": lambda a, least: np.where(a > least, a, np.nan),
     "sum_of_logarithms": lambda *terms: sum(np.log(term.astype(np.float64)) for term in terms),
 }

@@ -118,6 +118,16 @@ class Rigid(NamedTuple):
         return self.inertia @ w + cross(self.moment, v), self.mass * v - cross(self.moment, w)
 
     @property
+    def packed(self) -> list[Value]:
+        """The 10 numbers."""
+        J = self.inertia
+        return [self.mass, *self.moment, J[0][0], J[1][1], J[2][2], J[0][1], J[0][2], J[1][2]]
+
+    @classmethod
+    def unpacked(cls, values: Any) -> Rigid:
+        return cls(values[0], Vector(values[1:4]), symmetric(*values[4:]))
+
+    @property
     def articulated(self) -> Articulated:
         mass = self.mass
         return Articulated(self.inertia, skew(self.moment), symmetric(mass, mass, mass, 0.0, 0.0, 0.0))
