@@ -1,9 +1,8 @@
 """Elementary functions for emitted code: branch-free, so that the compiler can reorder around them.
 
 Sine and cosine reduce by three parts of pi / 2 and evaluate a polynomial, to about one unit in the last place while
-|x| is below ``reach``. On CUDA the caller of ``sincos`` sees to that, with ``reduced``, which takes off turns in float64;
-``sincos_any`` looks for itself. The reciprocal is the hardware's, refined
-once (twice in float64).
+|x| is below ``reach``. On CUDA the caller of ``sincos`` sees to that, with ``reduced``, which takes off turns in
+float64; ``sincos_any`` looks for itself. The reciprocal is the hardware's, refined once (twice in float64).
 """
 
 NATIVE = {

@@ -1,7 +1,8 @@
 """Kernels around emitted straight-line code: one thread, or one of a team of warps, a world.
 
-The callers' arrays are [world, entry]. A team reads the rows of its 32 worlds as one stretch of memory into shared memory
-and writes its results so; each thread then works on its own world's row. On the CPU a thread works on the arrays.
+The callers' arrays are [world, entry]. A team reads the rows of its 32 worlds as one stretch of memory into shared
+memory and writes its results so; each thread then works on its own world's row. On the CPU a thread works on the
+arrays.
 """
 
 import hashlib
@@ -13,8 +14,9 @@ import warp as wp
 from .elementary import NATIVE
 
 WARP = 32
-SHARED_BYTES = 48 * 1024 - 512  # that a block may declare, less what Warp takes
-C_TYPE = {wp.float32: "float", wp.float64: "double"}
+SHARED_BYTES = 46 * 1024  # that a block may declare: 48 KiB less what Warp takes
+C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
+MASKS = ("prescribed",)  # arrays of booleans
 IN_PLACE, STAGED, MAPPED, DIRECT = "in place", "staged", "mapped", "direct"
 
 
@@ -52,22 +54,22 @@ class Frame(NamedTuple):
     Attributes:
         rows: arrays to read, by entry: ``name_row[i]``. staged: they are copied to shared memory first, all worlds
             together; otherwise each thread reads its world's row, which is faster while few worlds or few entries wait.
-        fields: arrays [item, component, world] to read: ``name_at[i * name_item + c * name_part]``.
-        far: entries of q, if sines are taken: what is too far for the branch-free sine moves to a row of its own.
+        fields: arrays [item, component, world] to read: ``name_at[entry * name_part]``.
         result: how ``result_row[i]`` leaves.
         sent: values that warps send each other, ``SENT(i)``.
         warps: how many work on 32 worlds.
         block: threads of a block.
+        more: further results, ``name_row[i]``, each entry to memory by itself.
     """
 
     rows: list[Row]
     staged: bool
     fields: list[str]
-    far: int
     result: Result
     sent: int
     warps: int
     block: int
+    more: tuple[Row, ...] = ()
 
     @property
     def groups(self) -> int:
@@ -77,7 +79,7 @@ class Frame(NamedTuple):
     @property
     def scalars(self) -> int:
         """Scalars of shared memory that a group takes."""
-        rows = sum(pitch(row.entries) for row in self.rows) if self.staged else pitch(self.far) if self.far else 0
+        rows = sum(pitch(row.entries) for row in self.rows) if self.staged else 0
         extra = {STAGED: self.result.array.entries, MAPPED: self.result.slots}.get(self.result.way)
         return WARP * (rows + (0 if extra is None else pitch(extra)) + self.sent)
 
@@ -104,13 +106,11 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
             offset[row.name], at = at, at + WARP * pitch(row.entries)
             text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
         else:
-            text += [f"const {c}* {row.name}_row = {row.name}.data + world * {row.entries};"]
+            text += [_own_row(row, c)]
+    text += [f"{c}* {row.name}_row = {row.name}.data + world * {row.entries};" for row in frame.more]
     if frame.staged:
         text += [_stage_in(row, offset[row.name], c, team) for row in frame.rows]
-        text += [sync, "#define FAR_ROW q_row"]
-    elif frame.far:
-        text += [f"{c}* far_row = stage + {at} + lane * {pitch(frame.far)};", "#define FAR_ROW far_row"]
-        at += WARP * pitch(frame.far)
+        text += [sync]
     if result.way == IN_PLACE:
         start, width = offset[result.row], pitch(next(row.entries for row in frame.rows if row.name == result.row))
     else:
@@ -128,7 +128,8 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     if result.way == MAPPED:
         text += [sync, _spread_out(result, start, c, team)]
     text += ["#else", "const long long world = thread;", "const bool mine = true;"]
-    text += [f"const {c}* {row.name}_row = {row.name}.data + world * {row.entries};" for row in frame.rows]
+    text += [_own_row(row, c) for row in frame.rows]
+    text += [f"{c}* {row.name}_row = {row.name}.data + world * {row.entries};" for row in frame.more]
     if result.way == MAPPED:
         text += [f"{c} result_row[{result.slots}];"]
     else:
@@ -139,8 +140,18 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     if result.way == MAPPED:
         text += [f"for (int i = 0; i < {out.entries}; ++i) {{", "    const int slot = place.data[i];",
                  f"    out.data[world * {out.entries} + i] = slot < 0 ? 0 : result_row[slot];", "}"]
-    text += ["#endif", "#undef SENT", "#undef FAR_ROW", ""]
+    text += ["#endif", "#undef SENT", ""]
     return "\n".join(text)
+
+
+def _source(row: Row, c: str) -> tuple[str, str]:
+    """C type of an array's entries, and its first one."""
+    return ("unsigned char", f"(const unsigned char*){row.name}.data") if row.name in MASKS else (c, f"{row.name}.data")
+
+
+def _own_row(row: Row, c: str) -> str:
+    kind, first = _source(row, c)
+    return f"const {kind}* {row.name}_row = {first} + world * {row.entries};"
 
 
 def _fields(names: list[str], c: str) -> list[str]:
@@ -149,40 +160,29 @@ def _fields(names: list[str], c: str) -> list[str]:
         for name in names
         for line in (
             f"const {c}* {name}_at = (const {c}*)((const char*){name}.data + world * {name}.strides[2]);",
-            f"const long long {name}_item = {name}.strides[0] / (long long)sizeof({c});",
-            f"const long long {name}_part = {name}.strides[1] / (long long)sizeof({c});",
+            f"const int {name}_part = (int)({name}.strides[1] / (int)sizeof({c}));",
         )
     ]
-
-
-def near(entries: list[str], staged: bool, coordinates: int, c: str) -> str:
-    """Statements that take turns off the angles among ``entries`` of q which are too far for the branch-free sine.
-
-    It hardly ever happens, so it is one branch. Warps of a team may do it to one another's rows: twice changes nothing.
-    """
-    lines = ["#if defined(__CUDA_ARCH__)", "{", f"{c} farthest = 0;"]
-    lines += [f"farthest = max(farthest, on::absolute(q_row[{entry}]));" for entry in entries]
-    lines += ["if (farthest > on::reach()) {"]
-    if not staged:
-        lines += [f"    for (int i = 0; i < {coordinates}; ++i) far_row[i] = q_row[i];", "    q_row = far_row;"]
-    lines += [*(f"    FAR_ROW[{entry}] = on::reduced(FAR_ROW[{entry}]);" for entry in entries), "}", "}", "#endif"]
-    return "\n".join(lines)
 
 
 def _each(n: int, team: int, statement: str) -> str:
     """``statement`` for every entry i of the rows of the worlds that are present, the whole team side by side."""
     turns = -(-WARP * n // team)
-    return f"""#pragma unroll
-for (int k = 0; k < {turns}; ++k) {{
-    const int i = member + {team} * k;
-    if (i < present * {n}) {statement}
+    loop = f"for (int k = 0; k < {turns}; ++k) {{ const int i = member + {team} * k;"
+    some = "" if turns * team == WARP * n else f"if (i < {WARP * n}) "
+    return f"""if (present == 32) {{
+    #pragma unroll
+    {loop} {some}{statement} }}
+}} else {{
+    {loop} if (i < present * {n}) {statement} }}
 }}"""
 
 
 def _stage_in(row: Row, offset: int, c: str, team: int) -> str:
     n = row.entries
     copy = _each(n, team, f"to[{_slot('i', n, pitch(n))}] = __ldg(from + i);")
-    return f"{{\nconst {c}* from = {row.name}.data + first * {n};\n{c}* to = stage + {offset};\n{copy}\n}}"
+    kind, start = _source(row, c)
+    return f"{{\nconst {kind}* from = {start} + first * {n};\n{c}* to = stage + {offset};\n{copy}\n}}"
 
 
 def _stage_out(out: Row, offset: int, width: int, c: str, team: int) -> str:
@@ -198,12 +198,13 @@ def _spread_out(result: Result, offset: int, c: str, team: int) -> str:
     int slot[{turns}];
     #pragma unroll
     for (int u = 0; u < {turns}; ++u) slot[u] = start + {team} * u < {n} ? __ldg(place.data + start + {team} * u) : -1;
-    {c}* to = out.data + first * {n} + start;
-    const {c}* from = stage + {offset};
-    for (int k = 0; k < present; ++k, to += {n}, from += {width}) {{
-        #pragma unroll
-        for (int u = 0; u < {turns}; ++u)
-            if (start + {team} * u < {n}) to[{team} * u] = slot[u] < 0 ? ({c})0 : from[slot[u]];
+    #pragma unroll
+    for (int u = 0; u < {turns}; ++u) {{
+        if (start + {team} * u >= {n}) break;
+        {c}* to = out.data + first * {n} + start + {team} * u;
+        const {c}* from = stage + {offset} + (slot[u] < 0 ? 0 : slot[u]);
+        #pragma unroll 8
+        for (int k = 0; k < present; ++k) to[k * {n}] = slot[u] < 0 ? ({c})0 : from[k * {width}];
     }}
 }}"""
 
@@ -215,10 +216,12 @@ def _slot(i: str, entries: int, distance: int) -> str:
 def kernel(name: str, native: str, arrays: list[tuple[str, int]], T, registers: int | None = None) -> wp.Kernel:
     """A kernel of ``worlds``, then ``arrays`` (name, axes) of scalars ``T``, that runs ``native`` in each thread.
 
-    The arrays ``place`` and ``shifts`` hold integers.
+    The arrays ``place`` and ``shifts`` hold integers, those of MASKS booleans.
     """
     key = f"{name}_{hashlib.sha256(native.encode()).hexdigest()[:16]}"
-    declared = ", ".join(f"{array}: {'table' if array in ('place', 'shifts') else f'array{axes}'}" for array, axes in arrays)
+    types = {array: "table" if array in ("place", "shifts") else f"array{axes}" for array, axes in arrays}
+    types |= {array: "mask" for array in types if array in MASKS}
+    declared = ", ".join(f"{array}: {kind}" for array, kind in types.items())
     source = f"""def native(thread: int, worlds: int, {declared}): ...
 
 
@@ -229,7 +232,7 @@ def {key}(worlds: int, {declared}):
     file = f"<{key}>"
     linecache.cache[file] = len(source), None, source.splitlines(True), file  # where Warp looks for the source
     space = {f"array{axes}": wp.array(dtype=T, ndim=axes) for axes in range(1, 5)} | {
-        "table": wp.array(dtype=int, ndim=1), "wp": wp, "__name__": key
+        "table": wp.array(dtype=int, ndim=1), "mask": wp.array(dtype=wp.bool, ndim=2), "wp": wp, "__name__": key
     }
     exec(compile(source, file, "exec"), space)
     space["native"] = wp.func_native(native)(space["native"])

@@ -12,7 +12,8 @@ import warp_spo.kernels
 
 PACKAGE = pathlib.Path(warp_spo.__file__).parent
 KERNELS = pathlib.Path(warp_spo.kernels.__path__[0])
-HOST = sorted(PACKAGE.glob("*.py"))
+HOST = sorted(path for path in PACKAGE.rglob("*.py") if "kernels" not in path.parts)
+SYMBOLIC = sorted(path for folder in ("trace", "recursions") for path in (PACKAGE / folder).glob("*.py"))
 DEVICE = sorted(KERNELS.glob("*.py"))
 
 
@@ -28,20 +29,32 @@ def imports(path):
 
 
 def test_the_files_are_found():
-    assert len(HOST) > 10 and len(DEVICE) > 5
+    assert len(HOST) > 10 and len(DEVICE) > 5 and len(SYMBOLIC) > 10 and set(SYMBOLIC) < set(HOST)
 
 
-@pytest.mark.parametrize("path", DEVICE, ids=lambda path: path.name)
+def named(path):
+    return str(path.relative_to(PACKAGE)) if path in HOST else path.name
+
+
+@pytest.mark.parametrize("path", DEVICE, ids=named)
 def test_device_code_computes(path):
     assert "wp.launch" not in path.read_text()
-    assert imports(path) <= {"functools", "types", "typing", "warp"}
+    assert imports(path) <= sys.stdlib_module_names | {"warp"}
+    assert "from .." not in path.read_text()  # siblings only
 
 
-@pytest.mark.parametrize("path", HOST, ids=lambda path: path.name)
+@pytest.mark.parametrize("path", HOST, ids=named)
 def test_host_code_launches(path):
     assert "@wp.kernel" not in path.read_text() and "@wp.func" not in path.read_text()
     assert "torch" not in imports(path) or path.name in ("torch.py", "env.py")
     assert "newton" not in imports(path) or path.name == "newton.py"
+
+
+@pytest.mark.parametrize("path", SYMBOLIC, ids=named)
+def test_steps_know_no_device(path):
+    """Traces and the recursions that they come from are plain Python and NumPy."""
+    assert imports(path) <= sys.stdlib_module_names | {"numpy"}
+    assert "kernels" not in path.read_text()
 
 
 def test_the_reference_imports_numpy_alone():

@@ -1,13 +1,15 @@
 """The lazy algebra of operators: sums, products, multiples and transposes are written down, then applied.
 
 An operator maps ``x`` [world, columns] to [world, rows], each world by itself. ``H @ phi @ M @ phi.T @ H.T`` computes
-nothing; ``that @ x`` applies the factors from the right, each by its own kernels, and no matrix is formed.
+nothing; ``that @ x`` applies the factors from the right, each by its own kernels, and no matrix is formed. Where all
+letters belong to one :class:`Letters`, it may apply the whole in one kernel instead.
 """
 
 import abc
 import functools
 import itertools
 import numbers
+from typing import Any
 
 import warp as wp
 
@@ -35,6 +37,18 @@ class Workspace:
         return self._arrays[key][1]
 
 
+class Letters(abc.ABC):
+    """Whoever owns the numbers of operators that bear letters, and may know of faster ways to apply expressions."""
+
+    @abc.abstractmethod
+    def fill(self) -> None:
+        """Launch what brings the blocks of all letters up to date, where it is not done yet."""
+
+    @abc.abstractmethod
+    def run(self, expression: Any, x: wp.array, out: wp.array) -> bool:
+        """Launch ``out = expression x`` [world, row] as one kernel, or return False; see :attr:`Operator.expression`."""
+
+
 class Operator(abc.ABC):
     """A linear map of vectors, one matrix a world (or one for all).
 
@@ -46,8 +60,13 @@ class Operator(abc.ABC):
         worlds: number of worlds; 1 = the same matrix in every world, for any number of worlds.
         device, dtype: where and in what it computes; arrays it meets must agree.
         kind: kind of array that :meth:`dense` returns; None = NumPy.
+        letter: (:class:`Letters`, name), for operators that belong to one.
+        form, operands: what a composed operator is made of.
     """
 
+    letter: "tuple[Letters, str] | None" = None
+    form: tuple = ()
+    operands: "tuple[Operator, ...]" = ()
     __array_ufunc__ = None  # NumPy hands array @ op and array + op to the operator
 
     def __init__(self, shape: tuple[int, int], worlds: int, device: wp.Device, dtype: type, kind: str | None):
@@ -58,6 +77,28 @@ class Operator(abc.ABC):
         self.kind = kind
         self._workspaces: dict[tuple, Workspace] = {}
         declare(block_sparse, dtype)
+
+    @functools.cached_property
+    def expression(self) -> Any:
+        """The operator in letters, as nested tuples (form, operands); None where there is a part that bears none."""
+        if self.letter is not None:
+            return self.letter[1]
+        parts = [operand.expression for operand in self.operands]
+        return None if not self.form or None in parts else (*self.form, *parts)
+
+    @functools.cached_property
+    def letters(self) -> "tuple[Letters, ...]":
+        """Who owns the letters of the operator."""
+        own = () if self.letter is None else (self.letter[0],)
+        return tuple(dict.fromkeys([*own, *(owner for operand in self.operands for owner in operand.letters)]))
+
+    def _fused(self, x: wp.array, out: wp.array) -> bool:
+        """Launch ``out = op x`` [world, row] as one kernel, if there is one."""
+        return len(self.letters) == 1 and self.expression is not None and self.letters[0].run(self.expression, x, out)
+
+    def _fill(self) -> None:
+        for owner in self.letters:
+            owner.fill()
 
     @abc.abstractmethod
     def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
@@ -91,7 +132,8 @@ class Operator(abc.ABC):
             columns = x.shape[2] if many else 1
             shape = (worlds, self.shape[0], columns) if many else (worlds, self.shape[0])
             y = call.write(out, shape, "[world, row of the operator, any]" if many else "[world, row]")
-            if y.size:
+            if y.size and (many or not self._fused(x, y)):
+                self._fill()
                 key = call.kind, worlds, columns
                 if key not in self._workspaces:
                     self._workspaces[key] = Workspace(call, worlds, columns)
@@ -111,6 +153,7 @@ class Operator(abc.ABC):
                 x, whole = space.take(self, self.shape[1], "x"), y
                 if rows != self.shape[0]:
                     whole = space.take(self, self.shape[0], "y")
+                self._fill()
                 wp.launch(block_sparse.unit(self.dtype), x.shape, [first], [x], device=self.device)
                 self._apply(x, whole, 1.0, False, space)
                 if whole is not y:
@@ -179,6 +222,7 @@ class Identity(Operator):
 
     def __init__(self, size: int, device="cpu", dtype="float64", kind: str | None = None):
         super().__init__((size, size), 1, parse_device(device), parse_dtype(dtype, "Identity"), kind)
+        self.form = ("identity",)
 
     def _apply(self, x, out, alpha, accumulate, space):
         add_scaled(x, out, alpha, accumulate)
@@ -193,6 +237,7 @@ class Scaled(Operator):
         super().__init__(operand.shape, operand.worlds, operand.device, operand.dtype, operand.kind)
         self.factor = float(factor)
         self.operand = operand
+        self.form, self.operands = ("scaled", self.factor), (operand,)
 
     def _apply(self, x, out, alpha, accumulate, space):
         self.operand._apply(x, out, alpha * self.factor, accumulate, space)
@@ -207,6 +252,7 @@ class Transpose(Operator):
     def __init__(self, operand: Operator):
         super().__init__(operand.shape[::-1], operand.worlds, operand.device, operand.dtype, operand.kind)
         self.operand = operand
+        self.form, self.operands = ("transpose",), (operand,)
         self.__dict__["T"] = operand
 
     def _apply(self, x, out, alpha, accumulate, space):
@@ -228,6 +274,7 @@ class Sum(Operator):
                     f"which of them is missing a .T"
                 )
         super().__init__(self.terms[0].shape, *_common("sum", self.terms))
+        self.form, self.operands = ("sum",), self.terms
 
     def _apply(self, x, out, alpha, accumulate, space):
         for index, term in enumerate(self.terms):
@@ -250,6 +297,7 @@ class Product(Operator):
                     f"right; check which of them is missing a .T"
                 )
         super().__init__((self.factors[0].shape[0], self.factors[-1].shape[1]), *_common("product", self.factors))
+        self.form, self.operands = ("product",), self.factors
 
     def _apply(self, x, out, alpha, accumulate, space):
         for stage, factor in enumerate(self.factors[:0:-1]):

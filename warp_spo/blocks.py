@@ -4,6 +4,7 @@ The array, ``weights`` [world or 1, scalar], is all that changes after construct
 the device at any time, and the operator applies what it finds.
 """
 
+import functools
 from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any
@@ -14,6 +15,24 @@ import warp as wp
 from .algebra import Operator
 from .arrays import NUMPY, WARP, Call, kind_of, parse_device, parse_dtype
 from .kernels import block_sparse
+
+
+class Stored:
+    """Room for the blocks of an operator [world, scalar], taken when it is first asked for; see :func:`storage`."""
+
+    ndim = 2
+
+    def __init__(self, worlds: int, scalars: int, dtype: type, device: wp.Device):
+        self.shape, self.dtype, self.device = (worlds, max(1, scalars)), dtype, device
+
+    @functools.cached_property
+    def array(self) -> wp.array:
+        return storage(*self.shape, self.dtype, self.device)
+
+
+def memory(weights: Any) -> wp.array:
+    """The array of weights that may be :class:`Stored`."""
+    return weights.array if isinstance(weights, Stored) else weights
 
 
 class Table:
@@ -78,7 +97,7 @@ class Blocks(Operator):
         shape: (rows, columns).
         places: (row start, column start, rows, columns) of each block. Blocks that overlap add.
         weights: [world or 1, scalar], a Warp array on the device; the blocks lie in it row-major. Any strides. It is
-            kept, not copied: what is written into it later is what the operator applies.
+            kept, not copied: what is written into it later is what the operator applies. Or :class:`Stored`.
         offsets: first scalar of each block in ``weights``; one after the other unless given.
         kind: kind of array that :meth:`dense` returns.
 
@@ -104,7 +123,7 @@ class Blocks(Operator):
                 )
         super().__init__((shape[0], shape[1]), weights.shape[0], weights.device, weights.dtype, kind)
         blocks = [(*place, offset) for place, offset in zip(self.places, self.offsets, strict=True)]
-        self.weights = weights
+        self.stored = weights
         self._forward = Table([range(shape[0])], blocks, False, weights.device)
         self._transposed = Table([range(shape[1])], blocks, True, weights.device)
 
@@ -119,11 +138,17 @@ class Blocks(Operator):
         places = [(row, column, *size) for row, column, size in zip(rows, columns, sizes, strict=False)]
         return cls((rows[-1], columns[-1]), places, weights, kind=kind)
 
+    @property
+    def weights(self) -> wp.array:
+        """[world or 1, scalar], up to date."""
+        self._fill()
+        return memory(self.stored)
+
     def _apply(self, x, out, alpha, accumulate, space):
-        self._forward.gather(self.weights, x, out, alpha, accumulate)
+        self._forward.gather(memory(self.stored), x, out, alpha, accumulate)
 
     def _apply_transposed(self, x, out, alpha, accumulate, space):
-        self._transposed.gather(self.weights, x, out, alpha, accumulate)
+        self._transposed.gather(memory(self.stored), x, out, alpha, accumulate)
 
 
 def storage(worlds: int, scalars: int, dtype: type, device: wp.Device) -> wp.array:
@@ -206,7 +231,7 @@ def pack(
 
 def place_offsets(call: str, sizes: Sequence, weights: wp.array, offsets: Sequence[int] | None) -> tuple[int, ...]:
     """Return the first scalar of each block in ``weights``, checked."""
-    if not isinstance(weights, wp.array) or weights.ndim != 2 or weights.dtype not in (wp.float32, wp.float64):
+    if not isinstance(weights, wp.array | Stored) or weights.ndim != 2 or weights.dtype not in (wp.float32, wp.float64):
         raise ValueError(
             f"{call}: weights is {getattr(weights, 'shape', type(weights).__name__)}; expected a Warp array "
             f"[world or 1, scalar] of float32 or float64"

@@ -21,7 +21,7 @@ from .arrays import Call, parse_device, parse_dtype, shape_of
 from .errors import UnsupportedError
 from .frames import Frame, checked
 from .levels import Recursions
-from .parameters import VARIABLE
+from .parameters import RIGID_VALUES, VARIABLE
 from .programs import Programs
 from .scene import Scene
 from .spatial_operators import SpatialOperators
@@ -86,7 +86,8 @@ class Dynamics:
         self.dtype = parse_dtype(dtype, "Dynamics")
         self.variable = _variable_names(variable)
         _check_loops(scene, loops)
-        self.plan = plans.choose(scene, self.worlds, self.device.is_cuda, self.dtype.__name__, granularity)
+        varies = any(name in self.variable or scene.values[name].shape[0] > 1 for name in RIGID_VALUES)
+        self.plan = plans.choose(scene, self.worlds, self.device.is_cuda, self.dtype.__name__, granularity, varies)
         self.granularity = self.plan.granularity
         self.recursions = Recursions(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)

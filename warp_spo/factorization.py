@@ -6,12 +6,14 @@ invertible. It is what the paper's identities hold for.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import accumulate
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from .blocks import Blocks, storage
+from .blocks import Blocks, memory, storage
 from .kernels import factorization as kernels
 from .operators import BWA
 from .parameters import spread
@@ -26,6 +28,7 @@ class Factorization:
         H: one block r_k x m_k for each node, in the order of the nodes; its rows may lie anywhere.
         M: one symmetric block m_k x m_k for each node.
         Delta: one symmetric block r_k x r_k for each node, at the rows of H; None is zero.
+        store: ``store(scalars)`` makes the weights of the other operators; whoever gives it calls :meth:`update`.
 
     Attributes:
         phi: (I - E_phi)^-1.
@@ -39,7 +42,14 @@ class Factorization:
         ValueError: blocks that do not fit the tree.
     """
 
-    def __init__(self, E_phi: BWA, H: Blocks, M: Blocks, Delta: Blocks | None = None):
+    def __init__(
+        self,
+        E_phi: BWA,
+        H: Blocks,
+        M: Blocks,
+        Delta: Blocks | None = None,
+        store: Callable[[int], Any] | None = None,
+    ):
         if not isinstance(E_phi.graph, Tree):
             raise ValueError("Factorization: E_phi belongs to a Digraph; expected a Tree (Tree.from_edges cuts edges)")
         tree, m, nodes = E_phi.graph, E_phi.dims, range(E_phi.graph.node_count)
@@ -57,8 +67,7 @@ class Factorization:
         self.worlds = max(operator.worlds for operator in (E_phi, H, M, *([Delta] if Delta else [])))
         self.device, self.dtype = E_phi.device, E_phi.dtype
 
-        def packed(scalars: int) -> wp.array:
-            return storage(self.worlds, scalars, self.dtype, self.device)
+        packed = store or (lambda scalars: storage(self.worlds, scalars, self.dtype, self.device))
 
         N, dofs, kind = E_phi.shape[0], H.shape[0], E_phi.kind
         if Delta is None:
@@ -67,13 +76,13 @@ class Factorization:
         _check_places("Delta", Delta, pivot_places)
         self.E_phi, self.H, self.M, self.Delta = E_phi, H, M, Delta
         self.phi = E_phi.resolvent()
-        self.P = Blocks((N, N), M.places, packed(M.weights.shape[1]), M.offsets, kind)
-        self.D = Blocks((dofs, dofs), pivot_places, packed(Delta.weights.shape[1]), Delta.offsets, kind)
-        self.D_inverse = Blocks((dofs, dofs), pivot_places, packed(Delta.weights.shape[1]), Delta.offsets, kind)
+        self.P = Blocks((N, N), M.places, packed(M.stored.shape[1]), M.offsets, kind)
+        self.D = Blocks((dofs, dofs), pivot_places, packed(Delta.stored.shape[1]), Delta.offsets, kind)
+        self.D_inverse = Blocks((dofs, dofs), pivot_places, packed(Delta.stored.shape[1]), Delta.offsets, kind)
         gain_places = [(E_phi.starts[k], row[k], m[k], r[k]) for k in nodes]
-        self.G = Blocks((N, dofs), gain_places, packed(H.weights.shape[1]), H.offsets, kind)
+        self.G = Blocks((N, dofs), gain_places, packed(H.stored.shape[1]), H.offsets, kind)
         self.K = E_phi @ self.G
-        self.E_psi = BWA.packed(tree, m, packed(E_phi.weights.shape[1]), E_phi.offsets, kind)
+        self.E_psi = BWA.packed(tree, m, packed(E_phi.stored.shape[1]), E_phi.offsets, kind)
         self.psi = self.E_psi.resolvent()
 
         offset_of = dict(zip((child for _, child in tree.edges), E_phi.offsets, strict=True))
@@ -87,13 +96,14 @@ class Factorization:
             pivot=Delta.offsets,
             device=self.device,
         )
-        self._scratch = [packed(op.weights.shape[1]) for op in (H, Delta, E_phi)]
-        self.update()
+        self._scratch = [packed(op.stored.shape[1]) for op in (H, Delta, E_phi)]
+        if store is None:
+            self.update()
 
     def update(self) -> None:
         """Compute P, D, G and E_psi anew; launches only."""
-        inputs = [spread(op.weights, 0, self.worlds) for op in (self.E_phi, self.H, self.M, self.Delta)]
-        outputs = [op.weights for op in (self.P, self.D, self.D_inverse, self.G, self.E_psi)]
+        inputs = [spread(memory(op.stored), 0, self.worlds) for op in (self.E_phi, self.H, self.M, self.Delta)]
+        outputs = [memory(op.stored) for op in (self.P, self.D, self.D_inverse, self.G, self.E_psi)]
         first = self.E_phi.graph.node_count
         for level in reversed(self.E_phi.graph.levels):
             first -= len(level)
@@ -101,7 +111,7 @@ class Factorization:
                 kernels.factorize(self.dtype),
                 dim=(len(level), self.worlds),
                 inputs=[self.tables, first, *inputs],
-                outputs=[*outputs, *self._scratch],
+                outputs=[*outputs, *map(memory, self._scratch)],
                 device=self.device,
             )
 

@@ -13,7 +13,9 @@ from .kernels import articulated, kinematics, passive
 from .levels import Recursions
 
 
-def forward_dynamics(run: Recursions, out: wp.array, q: Any, qd: Any = None, tau: Any = None, body_f: Any = None) -> None:
+def forward_dynamics(
+    run: Recursions, out: wp.array, q: Any, qd: Any = None, tau: Any = None, body_f: Any = None
+) -> None:
     run.hinges(q, qd)
     force = None
     if qd is not None or body_f is not None:
@@ -24,7 +26,9 @@ def forward_dynamics(run: Recursions, out: wp.array, q: Any, qd: Any = None, tau
     run.solve(tau, out, force, gravity=True)
 
 
-def inverse_dynamics(run: Recursions, out: wp.array, q: Any, qd: Any = None, qdd: Any = None, body_f: Any = None) -> None:
+def inverse_dynamics(
+    run: Recursions, out: wp.array, q: Any, qd: Any = None, qdd: Any = None, body_f: Any = None
+) -> None:
     run.hinges(q, qd)
     force = run.body_forces(*run.accelerations(qdd, qd is not None, gravity=True), body_f)
     run.hinge_forces(qdd, force, out)

@@ -14,7 +14,7 @@ import warp as wp
 
 from .algebra import Identity, Operator, Product, Scaled, Sum, Transpose, add_scaled
 from .arrays import WARP
-from .blocks import Blocks, Table, choose_memory, matrix_size, pack, place_offsets
+from .blocks import Blocks, Table, choose_memory, matrix_size, memory, pack, place_offsets
 from .tree import Digraph, Tree
 
 __all__ = ["BWA", "Blocks", "Identity", "Operator", "Product", "Resolvent", "Scaled", "Sum", "Transpose"]
@@ -35,7 +35,6 @@ class BWA(Operator):
     Attributes:
         graph, dims: as given.
         starts: where each node begins in a vector; one more entry for the end.
-        weights: [world or 1, scalar], the blocks row-major.
         offsets: first scalar of each edge's block in ``weights``, in the order of ``graph.edges``.
 
     Raises:
@@ -81,7 +80,7 @@ class BWA(Operator):
         self.dims = dims
         self.starts = (0, *accumulate(dims))
         self.offsets = place_offsets("BWA", sizes, weights, offsets)
-        self.weights = weights
+        self.stored = weights
         super().__init__((self.starts[-1], self.starts[-1]), weights.shape[0], weights.device, weights.dtype, kind)
         blocks = [
             (self.starts[parent], self.starts[child], *size, offset)
@@ -91,14 +90,20 @@ class BWA(Operator):
         self._up = Table(outward[::-1], blocks, False, weights.device)
         self._down = Table(outward, blocks, True, weights.device)
 
+    @property
+    def weights(self) -> wp.array:
+        """[world or 1, scalar], the blocks row-major, up to date."""
+        self._fill()
+        return memory(self.stored)
+
     def _rows(self, node):
         return range(self.starts[node], self.starts[node + 1])
 
     def _apply(self, x, out, alpha, accumulate, space):
-        self._up.gather(self.weights, x, out, alpha, accumulate)
+        self._up.gather(memory(self.stored), x, out, alpha, accumulate)
 
     def _apply_transposed(self, x, out, alpha, accumulate, space):
-        self._down.gather(self.weights, x, out, alpha, accumulate)
+        self._down.gather(memory(self.stored), x, out, alpha, accumulate)
 
     def resolvent(self) -> "Resolvent":
         """A = (I - E)^-1."""
@@ -130,6 +135,7 @@ class Resolvent(Operator):
     def __init__(self, E: BWA):
         super().__init__(E.shape, E.worlds, E.device, E.dtype, E.kind)
         self.E = E
+        self.form, self.operands = ("resolvent",), (E,)
 
     def _apply(self, x, out, alpha, accumulate, space):
         self._sweep(self.E._up, x, out, alpha, accumulate, space)
@@ -140,7 +146,7 @@ class Resolvent(Operator):
     def _sweep(self, table, x, out, alpha, accumulate, space):
         # The sweep reads what it has written, so it cannot run on top of other terms of a sum.
         y = space.take(self, self.shape[0]) if accumulate else out
-        table.sweep(self.E.weights, x, y, alpha)
+        table.sweep(memory(self.E.stored), x, y, alpha)
         if accumulate:
             add_scaled(y, out, 1.0, True)
 

@@ -20,6 +20,19 @@ SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as throug
 MOST_WARPS = 16
 SHORT = ("inverse_dynamics", "mass_matrix")  # little code: a thread for the whole tree does not spill
 
+TREE_ONLY = (
+    "hybrid_dynamics",
+    "jacobian_bias",
+    "com_jacobian",
+    "centroidal_momentum_matrix",
+    "centroidal_momentum_bias",
+    "quasi_velocities",
+    "log_det_mass_matrix_gradient",
+    "fixman_torque",
+    "mass_matrix_packed",
+)
+"""Operations that exist as traces alone: each is a kernel of its scene, a thread a world, whatever the plan."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
@@ -51,6 +64,8 @@ class Plan:
 
     def of(self, operation: str) -> str:
         """Granularity of one operation."""
+        if operation in TREE_ONLY:
+            return "tree"
         if self.granularity == "segment" and not self.forced and operation in SHORT:
             return "segment" if self.worlds <= FEW_WORLDS or self.dtype == "float64" else "tree"
         return self.granularity
@@ -60,8 +75,12 @@ class Plan:
         return max(1, min(columns, COLUMN_BYTES // max(1, bytes_per_column)))
 
 
-def choose(scene: Scene, worlds: int, cuda: bool, dtype: str, granularity: str | None = None) -> Plan:
+def choose(
+    scene: Scene, worlds: int, cuda: bool, dtype: str, granularity: str | None = None, varies: bool = False
+) -> Plan:
     """Return the plan for a scene and a world count; ``granularity`` forces one.
+
+    ``varies``: inertias or hinge frames are inputs, which a thread has to keep too.
 
     Raises:
         ValueError: no such granularity.
@@ -69,7 +88,7 @@ def choose(scene: Scene, worlds: int, cuda: bool, dtype: str, granularity: str |
     if granularity is not None and granularity not in GRANULARITIES:
         names = ", ".join(GRANULARITIES)
         raise ValueError(f"Dynamics: granularity is {granularity!r}; expected None or one of {names}")
-    chosen, reason = (granularity, "asked for") if granularity else _chosen(scene, worlds, cuda, dtype)
+    chosen, reason = (granularity, "asked for") if granularity else _chosen(scene, worlds, cuda, dtype, varies)
     staged = worlds > FEW_WORLDS and scene.dof_count > SHORT_ROWS
     outward, first = [], 0
     for level in scene.tree.levels:
@@ -78,7 +97,7 @@ def choose(scene: Scene, worlds: int, cuda: bool, dtype: str, granularity: str |
     return Plan(chosen, reason, granularity is not None, staged, tuple(outward), worlds, dtype)
 
 
-def _chosen(scene: Scene, worlds: int, cuda: bool, dtype: str) -> tuple[str, str]:
+def _chosen(scene: Scene, worlds: int, cuda: bool, dtype: str, varies: bool) -> tuple[str, str]:
     dofs = scene.dof_count
     if dofs == 0:
         return "node", "nothing moves"
@@ -95,7 +114,7 @@ def _chosen(scene: Scene, worlds: int, cuda: bool, dtype: str) -> tuple[str, str
         return "tree", f"more than {MOST_WARPS} limbs"
     if worlds <= FEW_WORLDS:
         return "segment", f"up to {FEW_WORLDS} worlds, {limbs} limbs side by side take less time"
-    if dofs > SPILLS[dtype]:
+    if dofs > SPILLS[dtype] / (2 if varies else 1):
         return "segment", f"{dofs} dof in {dtype} do not fit into one thread's registers"
     return "tree", f"more than {FEW_WORLDS} worlds keep the GPU busy with a thread each"
 

@@ -1,13 +1,13 @@
 """Programs: an operation of one scene as one kernel, traced, emitted, compiled at its first use and launched.
 
-At tree granularity a thread works on one world, in program order. At segment granularity a warp works on one serial chain
-of 32 worlds, a block on 32 worlds; limbs of equal structure run one text, in which what differs is read from a table.
+At tree granularity a thread works on one world, in program order. At segment granularity a warp works on one serial
+chain of 32 worlds, a block on 32 worlds; limbs of equal structure run one text, in which what differs is read from a
+table.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -15,7 +15,8 @@ import warp as wp
 from .kernels import straight
 from .kernels.straight import DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
 from .levels import Recursions
-from .plan import MOST_WARPS, Plan
+from .plan import MOST_WARPS, TREE_ONLY, Plan
+from .recursions.applications import Applications
 from .recursions.links import Links
 from .recursions.pieces import Piece, Pieces
 from .recursions.traced import SENT, Trace
@@ -23,7 +24,8 @@ from .teams import Team
 from .trace.emit import Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
-FIELDS = ("rigid", "tree", "anchor", "com", "joint_armature", "gravity")
+FIELDS = {"rigid": 10, "tree": 12, "anchor": 12, "com": 3, "joint_armature": 1, "gravity": 1}
+"""The parameters' arrays, and how many components an item has."""
 SEGMENTED = {"forward_dynamics": "Pza", "solve_mass_matrix": "Pza", "inverse_dynamics": "z", "mass_matrix": "R"}
 """Operations that have a segment granularity, and what the pieces send each other."""
 TRACED = (
@@ -34,8 +36,10 @@ TRACED = (
     "body_velocities",
     "jacobian",
     "operational_inertia_inverse",
+    *TREE_ONLY,
 )
-LONG_ROW = 40  # entries of a result that go out together, worlds side by side
+SHORT_ROW = 36  # entries of a result that a thread writes by itself
+LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 
 
@@ -75,12 +79,19 @@ class Programs:
         """Drop all programs: values that they folded have changed."""
         self._programs.clear()
 
-    def find(self, operation: str, shapes: dict[str, tuple[int, ...]], out: tuple[int, ...], **options: Any) -> Any:
+    def find(
+        self,
+        operation: str,
+        shapes: dict[str, tuple[int, ...]],
+        out: tuple[int, ...],
+        more: dict[str, tuple[int, ...]] | None = None,
+        **options: Any,
+    ) -> Any:
         """The :class:`Program` for an operation on arrays of these shapes, or None if it has none.
 
         Args:
             shapes: of the arrays that are given, [world, ...].
-            out: shape of the result, [world, ...].
+            out: shape of the result, [world, ...]. more: of further results, by name.
             options: of the operation.
         """
         if self.plan.of(operation) == "node" or operation not in TRACED:
@@ -89,12 +100,13 @@ class Programs:
             return None
         key = operation, tuple(shapes), out[1:], *options.values()
         if key not in self._programs:
-            if options and sum(1 for other in self._programs if other[0] == operation) >= FRAME_LISTS:
+            lists = sum(1 for other in self._programs if other[0] == operation)
+            if options and lists >= FRAME_LISTS and operation not in TREE_ONLY:
                 return None
-            self._programs[key] = self._build(operation, shapes, out, options)
+            self._programs[key] = self._build(operation, shapes, out, more or {}, options)
         return self._programs[key]
 
-    def launch(self, program: Program, arrays: dict[str, wp.array], out: wp.array) -> None:
+    def launch(self, program: Program, arrays: dict[str, wp.array], out: wp.array, *more: wp.array) -> None:
         run = self.run
         threads, block = run.worlds, program.block
         if run.device.is_cuda:
@@ -102,7 +114,7 @@ class Programs:
             threads = -(-run.worlds // worlds) * block
         inputs = [run.worlds, *(arrays[name] for name in program.rows)]
         inputs += [run.parameters.array(name) for name in program.fields]
-        wp.launch(program.kernel, threads, [*inputs, *program.tables], [out], device=run.device, block_dim=block)
+        wp.launch(program.kernel, threads, [*inputs, *program.tables], [out, *more], device=run.device, block_dim=block)
 
     @property
     def operation_counts(self) -> dict[str, int]:
@@ -118,7 +130,7 @@ class Programs:
             granularity = f"segment, {program.warps} warps" if program.warps > 1 else "tree"
             line = f"{key[0]}  {granularity}, {program.operations} operations a world"
             if self.run.device.is_cuda:
-                found = wp.get_cuda_kernel_properties(program.kernel, self.run.device)
+                found: Any = wp.get_cuda_kernel_properties(program.kernel, self.run.device)
                 line += f", {found.num_regs} registers, {found.local_size_bytes} bytes spilled a thread"
             lines.append(line)
         return lines
@@ -127,9 +139,9 @@ class Programs:
     def _links(self) -> Links:
         return Links(self.run.scene, self.run.parameters.variable)
 
-    def _build(self, operation: str, shapes: dict, out_shape: tuple, options: dict) -> Program | None:
+    def _build(self, operation: str, shapes: dict, out_shape: tuple, more: dict, options: dict) -> Program | None:
         links = self._links()
-        if operation == "body_poses" and links.varies_tree or not links.links:
+        if (operation == "body_poses" and links.varies_tree) or not links.links:
             return None
         shapes = {**shapes, "out": out_shape}
         if self.plan.of(operation) == "segment" and operation in SEGMENTED:
@@ -137,19 +149,21 @@ class Programs:
             program = self._segment_program(operation, shapes, pieces) if 1 < pieces.warps <= MOST_WARPS else None
             if program is not None:
                 return program
-        return self._tree_program(operation, links, shapes, options)
+        return self._tree_program(operation, links, {**shapes, **more}, tuple(more), options)
 
-    def _tree_program(self, operation: str, links: Links, shapes: dict, options: dict) -> Program:
-        trace = Trace(links, self.run.dtype.__name__, tuple(shapes))
+    def _tree_program(self, operation: str, links: Links, shapes: dict, more: tuple, options: dict) -> Program:
+        trace = Applications(links, self.run.dtype.__name__, tuple(shapes))
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
-        frame = self._frame(stores, shapes, 0, 1, self.block)
-        placed, table = _placed(stores, frame.result)
+        apart = [item for item in stores if item.array in more]  # each straight to memory
+        frame = self._frame([item for item in stores if item.array == "out"], shapes, 0, 1, self.block, stores)
+        frame = frame._replace(more=tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more))
+        placed, table = _placed([item for item in stores if item.array == "out"], frame.result)
+        placed += apart
         emitter = self._emitter(shapes, frame.result)
         listing = emitter.region(placed)
         body = literals(listing, self.run.dtype.__name__)
-        near = self._near(frame)([str(listing.indices[k][1]) for k in listing.angles])
-        tables = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
-        return self._finished(operation, frame, f"{near}\n{body}", body, tables, emitter.operations)
+        tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
+        return self._finished(operation, frame, body, body, tables, emitter.operations)
 
     def _segment_program(self, operation: str, shapes: dict, pieces: Pieces) -> Program | None:
         dtype, slots = self.run.dtype.__name__, _slots(pieces, SEGMENTED[operation])
@@ -166,7 +180,7 @@ class Programs:
                             WARP * pieces.warps, everything)
         if frame.result.way == DIRECT and frame.result.array.entries > LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
-        team = Team(pieces, dtype, self._near(frame))
+        team = Team(pieces, dtype)
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
         everything, table = _placed([item for items in outs for item in items], frame.result)
         outs[0] += everything[sum(map(len, outs)) :] if table is None else []  # zeros
@@ -178,26 +192,24 @@ class Programs:
             inward = [item for item in placed if (_goes_inward(item, slots, piece) if last else True)]
             team.add(piece, emitter, emitter.region(inward), emitter.region(placed if last else []))
         cuda = team.cuda()  # fills the tables
-        tables = {name: wp.array(values, dtype=kind, device=self.run.device)
-                  for name, values, kind in (("place", table, int), ("table", team.table, self.run.dtype),
-                                             ("shifts", team.shifts, int)) if values}
+        lists = ("place", table, int), ("table", team.table, self.run.dtype), ("shifts", team.shifts, int)
+        tables: dict[str, Any] = {
+            name: wp.array(values, dtype=kind, device=self.run.device) for name, values, kind in lists if values
+        }
         return self._finished(operation, frame, cuda, team.cpu(), tables, team.operations)
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
-        return item if item.array == "sent" else item._replace(index=(_flat(item.index, shapes["out"][1:]),))
+        return item if item.array == "sent" else item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
 
     def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int) -> Program:
         native = straight.assemble(frame, cuda, cpu, self.run.dtype)
         rows, fields = tuple(row.name for row in frame.rows), tuple(frame.fields)
         arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 3) for name in fields]
         arrays += [(name, 1) for name in tables] + [("out", frame.result.array.ndim)]
+        arrays += [(row.name, row.ndim) for row in frame.more]
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers)
         return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations)
-
-    def _near(self, frame: Frame) -> Callable[[list[str]], str]:
-        scene, c = self.run.scene, straight.C_TYPE[self.run.dtype]
-        return lambda entries: straight.near(entries, frame.staged, scene.coord_count, c) if entries and frame.far else ""
 
     def _emitter(self, shapes: dict, result: Result) -> Emitter:
         guard = "if (mine) " if result.way == DIRECT else ""
@@ -206,41 +218,41 @@ class Programs:
             if array == "sent":
                 return f"SENT({entry})"
             if array in FIELDS:
-                return f"{array}_at[({entry}) / 16 * {array}_item + ({entry}) % 16 * {array}_part]"
+                return f"{array}_at[({entry}) * {array}_part]"
             return f"{array}_row[{entry}]"
 
         def store(array: str, entry: str, value: str) -> str:
-            return f"SENT({entry}) = {value};" if array == "sent" else f"{guard}result_row[{entry}] = {value};"
+            if array == "sent":
+                return f"SENT({entry}) = {value};"
+            if array == "out":
+                return f"{guard}result_row[{entry}] = {value};"
+            return f"if (mine) {array}_row[{entry}] = {value};"
 
         def flat(array: str, index: tuple) -> int:
             if array in FIELDS:
-                return 16 * index[0] + (index[1] if len(index) > 1 else 0)
+                return FIELDS[array] * index[0] + (index[1] if len(index) > 1 else 0)
             return index[0] if len(index) == 1 else _flat(index, shapes[array][1:])
 
-        return Emitter(self.run.dtype.__name__, load, store, flat, any_angle=result.way == MAPPED)
+        return Emitter(self.run.dtype.__name__, load, store, flat)
 
     def _frame(self, stores: list[Store], shapes: dict, sent: int, warps: int, block: int,
                everything: list[Store] | None = None) -> Frame:
         """How rows come in and the result, of flat ``stores``, goes out: through shared memory where it has room."""
-        used, sines = _reads(everything or stores)
+        used = _reads(everything or stores)
         rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used]
         out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
         dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
         over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
         slots = len({_name(item.value) for item in stores})
         fields = [name for name in FIELDS if name in used]
-        direct, mapped = Result(DIRECT, out), Result(MAPPED, out, slots=slots)
-        ways = [(False, direct)]
-        staged = self.plan.staged
-        if staged and dense:
-            ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), (True, Result(STAGED, out)), *ways]
+        staged, ways = self.plan.staged, [(False, Result(DIRECT, out))]
+        if dense and (staged or out.entries > SHORT_ROW):
+            ways = [(staged, Result(STAGED, out)), (False, Result(STAGED, out)), *ways]
+        if dense and staged:
+            ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), *ways]
         if out.entries > LONG_ROW:
-            ways = [(staged, mapped), (False, mapped), *ways]
-        coordinates = self.run.scene.coord_count if sines else 0
-        frames = []
-        for staged, result in ways:
-            far = 0 if result.way == MAPPED else coordinates  # the room goes to the result; its sines look themselves
-            frames.append(Frame(rows, staged, fields, far, result, sent, warps, block))
+            ways = [(staged, Result(MAPPED, out, slots=slots)), (False, Result(MAPPED, out, slots=slots)), *ways]
+        frames = [Frame(rows, staged, fields, result, sent, warps, block) for staged, result in ways]
         return next((frame for frame in frames if frame.fits(self.run.dtype)), frames[-1])
 
 
@@ -290,16 +302,10 @@ def _flat(index: tuple, shape: tuple) -> int:
     return at
 
 
-def _reads(stores: list[Store]) -> tuple[set[str], bool]:
-    """Names of the arrays that are read, and whether sines of coordinates are taken."""
-    used, sines = set(), False
+def _reads(stores: list[Store]) -> set[str]:
+    """Names of the arrays that are read."""
     graphs: dict[int, list[Value]] = {}
     for item in stores:
-        if hasattr(item.value, "graph"):
+        if not is_constant(item.value):
             graphs.setdefault(id(item.value.graph), []).append(item.value)
-    for values in graphs.values():
-        for scalar in ordered(values):
-            if scalar.op == "input":
-                used.add(scalar.args[0])
-            sines = sines or (scalar.op in ("sin", "cos") and scalar.args[0].op == "input")
-    return used, sines
+    return {scalar.args[0] for values in graphs.values() for scalar in ordered(values) if scalar.op == "input"}

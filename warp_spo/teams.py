@@ -1,8 +1,7 @@
-"""Teams: the statements of a scene's pieces put together, a warp for each leaf piece, with barriers between the stages."""
+"""Teams: the statements of a scene's pieces put together, a warp for each leaf piece, barriers between the stages."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 from .recursions.pieces import Piece, Pieces
@@ -28,7 +27,6 @@ class Team:
 
     Args:
         pieces, dtype: of the scene.
-        near: statements before sines of the coordinates at these entries are taken.
 
     Attributes:
         table: constants in which equal pieces differ. shifts: likewise, distances of the entries that they read and
@@ -36,8 +34,8 @@ class Team:
         operations: floating-point operations of one world.
     """
 
-    def __init__(self, pieces: Pieces, dtype: str, near: Callable[[list[str]], str]):
-        self.pieces, self.dtype, self._near = pieces, dtype, near
+    def __init__(self, pieces: Pieces, dtype: str):
+        self.pieces, self.dtype = pieces, dtype
         self.table: list[float] = []
         self.shifts: list[int] = []
         self.operations = 0
@@ -123,10 +121,7 @@ class Team:
             listings = [getattr(work, which) for work in alike]
             numbers = [constant(values) for values in zip(*(x.constants for x in listings), strict=True)]
             entries = [entry(found) for found in zip(*(x.indices for x in listings), strict=True)]
-            angles = [entries[k] for k in listings[0].angles]
-            text = filled(listings[0], numbers, entries, labels, prefix)
-            near = self._near(angles)
-            texts.append(f"{near}\n{text}" if near else text)
+            texts.append(filled(listings[0], numbers, entries, labels, prefix))
         head = []
         if constants.columns or shifts.columns:
             warps = [work.piece.warp for work in alike]
@@ -140,7 +135,8 @@ class Team:
         if shifts.columns:
             first, count = len(self.shifts), len(shifts.columns)
             head.append(f"int {prefix}shift[{count}];")
-            head += [f"{prefix}shift[{k}] = __ldg(shifts.data + {first + k} + {prefix}who * {count});" for k in range(count)]
+            read = "__ldg(shifts.data + {} + {}who * {})"
+            head += [f"{prefix}shift[{k}] = {read.format(first + k, prefix, count)};" for k in range(count)]
             self.shifts += [value for row in zip(*shifts.columns, strict=True) for value in row]
         return "\n".join([*head, texts[0]]), texts[1]
 

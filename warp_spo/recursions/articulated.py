@@ -8,11 +8,10 @@ is not positive becomes NaN.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from ..trace.graph import Value, guarded, is_constant, reciprocal
-from ..trace.spatial import ZERO, Articulated, Pose, Rigid, Vector, cross, dot, magnitude, symmetric, total
+from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Rigid, Vector, cross, dot, magnitude, symmetric, total
 from .links import BALL, FREE, SLIDE, TURN, Link, Placed
 from .motion import NONE, Motion, carried, in_hinge, in_link
 
@@ -75,9 +74,9 @@ def factor(
     pivots = []
     if turned or link.motion in (TURN, SLIDE):
         units = UNIT[link.motion][::-1]
-        sizes = _cancelling(link, P, units, through)
+        sizes = cancelling(link, P, units, through)
         for at, (unit, armature) in enumerate(zip(units, link.armature[::-1], strict=True)):
-            pivot, P = _eliminate_unit(P, unit, armature, LEAST * epsilon * sizes[at])
+            pivot, P = eliminate_unit(P, unit, armature, LEAST * epsilon * sizes[at])
             pivots.append(pivot)
             for later in range(at + 1, len(units) if link.motion == BALL else 0):
                 share = pivot.U[units[later]] * pivot.inverse  # what D lost it loses again in what it is taken from
@@ -85,7 +84,7 @@ def factor(
     else:
         H = columns(link, place)
         for column, armature in zip(H[::-1], link.armature[::-1], strict=True):
-            pivot, P = _eliminate(P, column, armature, LEAST * epsilon)
+            pivot, P = eliminate(P, column, armature, LEAST * epsilon)
             pivots.append(pivot)
     nothing: Value = 0.0
     if link.inertia is None and not link.children:  # it moves no inertia, so nobody would notice a lost pivot
@@ -104,11 +103,11 @@ def columns(link: Link, place: Placed) -> list[Vector]:
     return found
 
 
-def _cancelling(link: Link, P: Articulated, units: list[int], through: list[tuple[Pose, Articulated]]) -> list[Value]:
+def cancelling(link: Link, P: Articulated, units: list[int], through: list[tuple[Pose, Articulated]]) -> list[Value]:
     """What may cancel in each pivot; nothing does in the first one of a link with an inertia of its own.
 
-    The later pivots of a hinge are what the earlier ones leave of an entry of P. A link without inertia has only what its
-    children hand on, which vanishes along their own hinges: there it is the sum of what is turned into its axes.
+    The later pivots of a hinge are what the earlier ones leave of an entry of P. A link without inertia has only what
+    its children hand on, which vanishes along their own hinges: there it is the sum of what is turned into its axes.
     """
     if link.inertia is not None:
         return [0.0, *(P.entry(unit, unit) for unit in units[1:])]
@@ -129,7 +128,7 @@ def lost(D: Value) -> Value:
     return D - D if is_constant(D) else D.graph.make("lost", D)
 
 
-def _eliminate_unit(P: Articulated, unit: int, armature: Value, least: Value) -> tuple[Pivot, Articulated]:
+def eliminate_unit(P: Articulated, unit: int, armature: Value, least: Value) -> tuple[Pivot, Articulated]:
     U = Vector(P.entry(unit, j) for j in range(6))
     D = U[unit] + armature
     inverse = reciprocal(guarded(D, least))
@@ -144,7 +143,7 @@ def _eliminate_unit(P: Articulated, unit: int, armature: Value, least: Value) ->
     return Pivot(unit, column, U, D, inverse), Articulated.build(entry)
 
 
-def _eliminate(P: Articulated, column: Vector, armature: Value, least: float) -> tuple[Pivot, Articulated]:
+def eliminate(P: Articulated, column: Vector, armature: Value, least: float) -> tuple[Pivot, Articulated]:
     n, f = P.apply(Vector(column[:3]), Vector(column[3:]))
     U = Vector((*n, *f))
     D = dot(column, U) + armature
@@ -169,18 +168,23 @@ def reduced(
         rate = e * pivot.inverse
         eps.append(rate)
         z = z + pivot.U * rate
-    if link.parent is None:
-        return eps, ZERO
-    if done.whole:  # nothing but the force that the hinge itself transmits
+    if link.parent is not None and done.whole:  # nothing but the force that the hinge itself transmits
         z = Vector((*place.turned.T @ Vector(tau[3:]), *place.turned.T @ Vector(tau[:3])))  # type: ignore[union-attr]
-    else:
+    return eps, handed_to_parent(link, place, done, motion, z)
+
+
+def handed_to_parent(link: Link, place: Placed, done: Factor, motion: Motion, z: Vector) -> Vector:
+    """z+ of a link, its bias added, in the parent's frame; nothing at a root."""
+    if link.parent is None:
+        return ZERO
+    if not done.whole:
         n, f = done.P.apply(motion.bias_w, motion.bias_v)
         z = z + Vector((*n, *f))
     n, f = place.pose.force_to_parent(Vector(z[:3]), Vector(z[3:]))
     if not done.whole:
         n_l, f_l = done.in_parent.apply(ZERO, motion.bias_l)
         n, f = n + n_l, f + f_l
-    return eps, Vector((*n, *f))
+    return Vector((*n, *f))
 
 
 def expanded(
@@ -199,11 +203,11 @@ def expanded(
             alpha = [a + h * qdd[-1] for a, h in zip(alpha, pivot.column, strict=True)]
     w, v = Vector(alpha[:3]), Vector(alpha[3:])
     if done.whole:  # the body's acceleration less its parent's, in the hinge's axes
-        back = (lambda a: a) if link.matrix is None else (lambda a: link.matrix.T @ a)
+        matrix = IDENTITY if link.matrix is None else link.matrix
         w_p, v_p = acceleration
         v_p = v_p + cross(w_p, place.pose.l) + motion.bias_l
         relative = in_hinge(link, place, w - motion.bias_w, v - motion.bias_v)
-        qdd = [a - b for a, b in zip(relative, (*back(v_p), *back(w_p)), strict=True)]
+        qdd = [a - b for a, b in zip(relative, (*matrix.T @ v_p, *matrix.T @ w_p), strict=True)]
     elif done.turned:
         qdd = in_hinge(link, place, Vector(qdd[-3:]), Vector(qdd[:3]))
     return qdd, (w, v)

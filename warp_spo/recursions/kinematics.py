@@ -30,7 +30,7 @@ def turned(q: Quaternion, v: Any) -> Vector:
 def constant_quaternion(R: Matrix) -> Quaternion:
     """Of a constant rotation."""
     m = np.array(R, dtype=float)
-    values, vectors = np.linalg.eigh(_quaternion_form(m))
+    _, vectors = np.linalg.eigh(_quaternion_form(m))
     return Vector(np.where(np.abs(vectors[:, -1]) < 1e-15, 0.0, vectors[:, -1]).tolist())
 
 

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..parts import BALL, FREE, SCREWS
+from ..parts import BALL as BALL
+from ..parts import FREE, SCREWS
 from ..scene import Scene
 from ..trace.graph import Graph, Value, cos, is_constant, reciprocal, reduced, sin
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
@@ -115,7 +116,7 @@ class Links:
                 stack.extend((child, True) for child in reversed(link.children))
 
     # -- values ----------------------------------------------------------------------------------------------------
-    def _tree(self, node: int) -> tuple[Matrix, Vector]:
+    def tree(self, node: int) -> tuple[Matrix, Vector]:
         """Pose of the hinge's parent anchor in the parent's node frame."""
         if self.varies_tree:
             entries = [self.graph.input("tree", node, c) for c in range(12)]
@@ -143,7 +144,7 @@ class Links:
         R, p = self._poses["joint_X_c"][self.scene.hinge_of[node]]
         return Vector((R.T @ (self.scene.values["body_com"][0, node] - p)).tolist())
 
-    def _rigid(self, node: int) -> Rigid:
+    def rigid(self, node: int) -> Rigid:
         """Inertia of the body about the origin of its node frame."""
         if self._varies_rigid:
             e = [self.graph.input("rigid", node, c) for c in range(10)]
@@ -155,6 +156,13 @@ class Links:
         J = (0.5 * (inertia + inertia.T)).tolist()
         return Rigid(mass, Vector((mass * c).tolist()),
                      symmetric(J[0][0], J[1][1], J[2][2], J[0][1], J[0][2], J[1][2]))
+
+    def on_parent_node(self, link: Link) -> Link:
+        """The first link of a hinge as it sits in the parent's node frame, instead of in the parent's link."""
+        matrix, offset = self.tree(link.node)
+        if link.motion not in (BALL, FREE):
+            matrix = matrix @ _aligned(self.scene.dof_axis[link.dofs[0]])
+        return dataclasses.replace(link, matrix=_still(matrix), offset=offset)
 
     def _armature(self, dof: int) -> Value:
         if self._varies_armature:
@@ -173,7 +181,7 @@ class Links:
         scene = self.scene
         parent = scene.tree.parent[node]
         seat = self.seats[parent] if parent >= 0 else Seat(None, IDENTITY, ZERO)
-        R, l = self._tree(node)
+        R, l = self.tree(node)
         matrix, offset, link = seat.matrix @ R, seat.offset + seat.matrix @ l, seat.link
         index = scene.hinge_of[node]
         hinge, dof, coordinate = scene.hinges[index], int(scene.qd_start[index]), int(scene.q_start[index])
@@ -199,14 +207,11 @@ class Links:
             rest = Seat(link, IDENTITY, -link.com)
         self.seats[node] = rest
         if rest.link is not None:
-            rest.link.add(Pose(None, rest.matrix, rest.offset).rigid_to_parent(self._rigid(node)))
+            rest.link.add(Pose(None, rest.matrix, rest.offset).rigid_to_parent(self.rigid(node)))
 
     def _append(self, parent: Link | None, motion: Any, matrix: Matrix, offset: Vector, pitch: float,
                 dofs: tuple, coordinate: int, armature: tuple, node: int, label: str) -> Link:
-        if all(is_constant(entry) for row in matrix for entry in row):
-            matrix = _folded(np.array(matrix, dtype=float))
-        still = None if matrix == IDENTITY else matrix
-        link = Link(parent, motion, still, offset, pitch, dofs, coordinate, armature, node, label)
+        link = Link(parent, motion, _still(matrix), offset, pitch, dofs, coordinate, armature, node, label)
         self.links.append(link)
         if parent is not None:
             parent.children.append(link)
@@ -266,6 +271,13 @@ def _folded(rotation: np.ndarray) -> Matrix:
     """A constant rotation; entries that are 0 or 1 but for rounding become so, and fold."""
     near = np.round(rotation)
     return Matrix.of(np.where(np.abs(rotation - near) < ROUNDING, near, rotation).tolist())
+
+
+def _still(matrix: Matrix) -> Matrix | None:
+    """A link's matrix, folded where it is constant; None if it turns nothing."""
+    if all(is_constant(entry) for row in matrix for entry in row):
+        matrix = _folded(np.array(matrix, dtype=float))
+    return None if matrix == IDENTITY else matrix
 
 
 def _aligned(axis: np.ndarray) -> Matrix:

@@ -1,8 +1,8 @@
 """Velocities and accelerations, outward: omega(k) = omega(p) + H* qd, and what each hinge adds.
 
-Accelerations are classical, those of a material point: a(k) = a(p) + (omega'~ + omega~ omega~) l. Linear velocities then
-enter nowhere, and float32 does not lose what a fast chain's large velocities would cancel (eq. 20 with the Coriolis
-terms moved into a).
+Accelerations are classical, those of a material point: a(k) = a(p) + (omega'~ + omega~ omega~) l. Linear velocities
+then enter nowhere, and float32 does not lose what a fast chain's large velocities would cancel (eq. 20 with the
+Coriolis terms moved into a).
 """
 
 from __future__ import annotations

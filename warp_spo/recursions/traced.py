@@ -14,6 +14,7 @@ from ..trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Rigid, Vector, 
 from . import articulated, composite, kinematics, motion, newton_euler
 from .links import Link, Links, Placed, placed
 from .motion import STILL, Motion
+from .operators import Operators
 from .pieces import Piece
 
 EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}
@@ -122,11 +123,11 @@ class Trace:
             return [found[id(child)] for child in link.children]
         return [build(self.receive(letter, piece)) for piece in self.piece.children]
 
-    def handed_on(self, letter: str, link: Link, values: Callable[[], Iterable[Value]]) -> list[Store]:
+    def handed_on(self, letter: str, link: Link, values: Iterable[Value]) -> list[Store]:
         """Send what a link's parent needs of it, if another piece works on the parent."""
         if self.piece is None or link is not self.piece.links[0] or link.parent is None:
             return []
-        return self.send(letter, values())
+        return self.send(letter, values)
 
     @property
     def base(self) -> tuple[Vector, Vector]:
@@ -169,8 +170,8 @@ class Trace:
                 z = z + force
             right = [tau(dof) for dof in link.dofs]
             rates[key], forces[key] = articulated.reduced(link, place, factor, move, z, right)
-            stores += self.handed_on("P", link, lambda key=key: inner[key].packed)
-            stores += self.handed_on("z", link, lambda key=key: forces[key])
+            stores += self.handed_on("P", link, inner[key].packed)
+            stores += self.handed_on("z", link, forces[key])
         return done, rates, stores
 
     def expand(self, done: dict, rates: dict, base: tuple[Vector, Vector]) -> list[Store]:
@@ -220,7 +221,7 @@ class Trace:
             if link.parent is not None:
                 n, f = self.places[key].pose.force_to_parent(n, f)
                 forces[key] = Vector((*n, *f))
-                stores += self.handed_on("z", link, lambda key=key: forces[key])
+                stores += self.handed_on("z", link, forces[key])
         return stores
 
     def mass_matrix(self) -> list[Store]:
@@ -239,13 +240,14 @@ class Trace:
                 body = body + other
             if link.parent is not None:
                 carried[key] = self.places[key].pose.rigid_to_parent(body)
-                stores += self.handed_on("R", link, lambda key=key: carried[key].packed)
+                stores += self.handed_on("R", link, carried[key].packed)
             self.at(link, "F")
             entries |= composite.entries(link, self.places, body)
         return stores + self._both(entries)
 
     def _both(self, entries: dict[tuple[int, int], Value]) -> list[Store]:
-        return [Store("out", place, value) for (i, j), entry in entries.items() for place, value in _mirrored(i, j, entry)]
+        placed = (pair for (i, j), entry in entries.items() for pair in _mirrored(i, j, entry))
+        return [Store("out", place, value) for place, value in placed]
 
     def solve_mass_matrix(self) -> list[Store]:
         return self.forward_dynamics("b", bias=False)
@@ -294,6 +296,10 @@ class Trace:
                     entries[j, i] = entry
         return entries
 
+    def expression(self, expression: Any) -> list[Store]:
+        """out = an operator, or what is composed of several, times the array x; see :mod:`.operators`."""
+        return Operators(self).stores(expression)
+
     # -- kinematics ------------------------------------------------------------------------------------------------
     def place_axes(self, link: Link) -> None:
         """Place a link and find its axes in the inertial frame."""
@@ -309,9 +315,9 @@ class Trace:
         return seat.link, seat.offset + seat.matrix @ (R.T @ (Vector(origin) - p))
 
     def jacobian(self, frames: tuple) -> list[Store]:
-        """out [frame, 6, dof]: velocity of each frame's origin, then angular velocity, in inertial axes, per unit qd."""
-        for link in self.links.links:
-            self.place_axes(link)
+        """out [frame, 6, dof]: velocity of each frame's origin, then angular velocity, inertial axes, per unit qd."""
+        for each in self.links.links:
+            self.place_axes(each)
         stores = []
         for index, (body, origin) in enumerate(frames):
             link, arm = self.frame(body, origin)
@@ -328,10 +334,10 @@ class Trace:
 
     def operational_inertia_inverse(self, frames: tuple) -> list[Store]:
         """out [6 frames, 6 frames] = J Mass^-1 J*: a unit wrench on a frame, sent inward, is a column of Y."""
-        for link in self.links.links:
-            self.place_axes(link)
+        for each in self.links.links:
+            self.place_axes(each)
         done = self.factor()
-        halves = {}
+        halves: dict[int, dict] = {}
         for index, (body, origin) in enumerate(frames):
             link, arm = self.frame(body, origin)
             for c in range(6):
@@ -343,11 +349,13 @@ class Trace:
                 wrench = (*cross(arm, axis), *axis) if c < 3 else (*axis, *ZERO)
                 halves[6 * index + c] = self.inward(done, link, Vector(wrench), [0.0] * len(link.dofs))
         entries = self._sandwich(done, halves)
-        return [Store("out", place, value) for i, j in entries for place, value in _mirrored(i, j, entries[i, j])]
+        return self._both(entries)
 
     def body_poses(self) -> list[Store]:
         """out [body, 7] = position, quaternion xyzw"""
-        q, at, turns = self.vector("q"), {None: ZERO}, {None: Vector((0.0, 0.0, 0.0, 1.0))}
+        q = self.vector("q")
+        at: dict[int | None, Vector] = {None: ZERO}
+        turns: dict[int | None, Vector] = {None: Vector((0.0, 0.0, 0.0, 1.0))}
         for link in self.links.links:
             self.at(link, "p")
             over = None if link.parent is None else id(link.parent)
@@ -366,13 +374,13 @@ class Trace:
 
     def body_velocities(self) -> list[Store]:
         """out [body, 6] = velocity of the CoM, angular velocity, in inertial axes"""
-        velocity = {None: (ZERO, ZERO)}
+        velocity: dict[int | None, tuple[Vector, Vector]] = {None: (ZERO, ZERO)}
         for link in self.links.links:
             self.place_axes(link)
             self.at(link, "v")
-            key, over = id(link), None if link.parent is None else id(link.parent)
-            hinge = motion.in_link(link, self.places[key], self.vector("qd"))
-            velocity[key] = kinematics.carried_velocity(link, self.places[key], velocity[over], hinge)
+            place, over = self.places[id(link)], None if link.parent is None else id(link.parent)
+            hinge = motion.in_link(link, place, self.vector("qd"))
+            velocity[id(link)] = kinematics.carried_velocity(link, place, velocity[over], hinge)
         stores = []
         for body, seat in self.links.seats.items():
             key = None if seat.link is None else id(seat.link)

@@ -13,7 +13,7 @@ from .graph import Scalar, Value, is_constant, ordered
 
 C_TYPE = {"float32": "float", "float64": "double"}
 BINARY = {"add": "+", "sub": "-", "mul": "*"}
-COST = {"add": 1, "sub": 1, "mul": 1, "neg": 0, "absolute": 0, "guarded": 1, "lost": 1, "input": 0}
+COST = {"add": 1, "sub": 1, "mul": 1, "neg": 0, "absolute": 0, "guarded": 1, "select": 1, "lost": 1, "input": 0}
 COST_ELSE = 8  # about what a sine, a root or a reciprocal takes in additions
 
 
@@ -21,7 +21,7 @@ class Store(NamedTuple):
     """One output: an array, an index into it, and the value that goes there."""
 
     array: str
-    index: tuple[int, ...]
+    index: tuple[int, ...]  # type: ignore[assignment]  # a tuple's own method of that name is not needed
     value: Value
 
 
@@ -38,16 +38,15 @@ def literal(x: float, dtype: str) -> str:
 class Listing(NamedTuple):
     """Statements in which what may differ between equal pieces of a robot is left open.
 
-    Two limbs of equal structure give equal ``text``; their numbers are in ``constants``, the entries of arrays that they
-    read and write in ``indices`` as (array, entry), the names of their links in ``labels``. ``angles`` says which of the
-    indices are coordinates whose sine is taken as they are.
+    Two limbs of equal structure give equal ``text``; their numbers are in ``constants``, the entries of arrays that
+    they read and write in ``indices`` as (array, entry), the names of their links in ``labels``. ``angles`` says which
+    of the indices are coordinates whose sine is taken as they are.
     """
 
     text: str
     constants: list[float]
     indices: list[tuple[str, int]]
     labels: list[str]
-    angles: list[int]
 
 
 CONSTANT, INDEX, LABEL, PREFIX = "\x01", "\x02", "\x03", "\x05"
@@ -61,7 +60,6 @@ class Emitter:
         dtype: "float32" or "float64".
         load, store: C++ for reading and writing an entry of an array, given the array's name and the entry's text.
         flat: entry of an array for the index of an input.
-        any_angle: nobody else takes care of angles that are too far for the branch-free sine.
     """
 
     def __init__(
@@ -70,10 +68,8 @@ class Emitter:
         load: Callable[[str, str], str],
         store: Callable[[str, str, str], str],
         flat: Callable[[str, tuple], int],
-        any_angle: bool = False,
     ):
         self.dtype, self._load, self._store, self._flat = dtype, load, store, flat
-        self._any_angle = any_angle
         self.counts: Counter = Counter()
         self._names: dict[tuple, str] = {}
         self._count = 0
@@ -95,6 +91,7 @@ class Emitter:
                 values.append(item.value)
                 due.setdefault(item.value.key, []).append(item)
         needed = [scalar for scalar in ordered(values) if scalar.key not in self._names]
+        lines += self._near(needed)
         for scalar in sorted(needed, key=lambda scalar: scalar.number):
             where, _, step = scalar.step.rpartition("|")
             if where != self._place:
@@ -105,12 +102,28 @@ class Emitter:
                 lines += self._statement(scalar, step)
                 self.counts[scalar.op] += 1
             lines += [self._stored(item) for item in due.get(scalar.key, ())]
-        angles = []
-        for scalar in needed:
-            if scalar.op in ("sin", "cos") and scalar.args[0].op == "input":
-                index = scalar.args[0].args[0], self._flat(scalar.args[0].args[0], scalar.args[0].args[1:])
-                angles.append(self._indices.index(index))
-        return Listing("\n".join(lines), self._constants, self._indices, self._labels, sorted(set(angles)))
+        return Listing("\n".join(lines), self._constants, self._indices, self._labels)
+
+    def _near(self, needed: list[Scalar]) -> list[str]:
+        """Read the coordinates whose sines will be taken, and take turns off those too far for the branch-free sine.
+
+        That hardly ever happens, so it is one branch for all of them.
+        """
+        T = C_TYPE[self.dtype]
+        sines = (scalar.args[0] for scalar in needed if scalar.op in ("sin", "cos"))
+        angles = {scalar.key: scalar for scalar in sines if scalar.op == "input" and scalar.key not in self._names}
+        if not angles:
+            return []
+        lines = []
+        for scalar in angles.values():
+            entry = self._entry(scalar.args[0], scalar.args[1:])
+            lines.append(f"{T} {self._name(scalar, 'x')} = {self._load(scalar.args[0], entry)};")
+        names = [self._names[key] for key in angles]
+        farthest = f"{PREFIX}farthest"
+        lines += ["#if defined(__CUDA_ARCH__)", f"{T} {farthest} = 0;"]
+        lines += [f"{farthest} = max({farthest}, on::absolute({name}));" for name in names]
+        lines += [f"if ({farthest} > on::reach()) {{", *(f"    {name} = on::reduced({name});" for name in names), "}"]
+        return [*lines, "#endif"]
 
     @property
     def operations(self) -> int:
@@ -142,8 +155,7 @@ class Emitter:
         if op in ("sin", "cos"):
             angle = self._text(args[0])
             sine, cosine = (self._name(scalar.graph.make(name, *args), name) for name in ("sin", "cos"))
-            near = args[0].op == "input" and not self._any_angle  # then the coordinate has been looked at
-            which = "sincos" if near else "sincos_any"
+            which = "sincos" if args[0].op == "input" else "sincos_any"  # a coordinate has been looked at
             return [f"{T} {sine}, {cosine};", f"on::{which}({angle}, {sine}, {cosine});"]
         texts = [self._text(a) for a in args]
         name = self._name(scalar, step)
@@ -153,6 +165,8 @@ class Emitter:
             return [f"const {T} {name} = -{texts[0]};"]
         if op == "guarded":
             return [f"const {T} {name} = {texts[0]} > {texts[1]} ? {texts[0]} : nan;"]
+        if op == "select":
+            return [f"const {T} {name} = {texts[0]} != 0 ? {texts[1]} : {texts[2]};"]
         if op == "lost":
             return [f"const {T} {name} = {texts[0]} - {texts[0]};"]
         if op == "sum_of_logarithms":

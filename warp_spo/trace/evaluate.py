@@ -22,6 +22,7 @@ FUNCTIONS: dict[str, Callable] = {
     "absolute": np.abs,
     "lost": lambda a: a - a,
     "guarded": lambda a, least: np.where(a > least, a, np.nan),
+    "select": lambda mask, a, b: np.where(mask != 0.0, a, b),
     "sum_of_logarithms": lambda *terms: sum(np.log(term.astype(np.float64)) for term in terms),
 }
 

@@ -77,7 +77,7 @@ class Scalar:
         return negative(self)
 
     def __bool__(self) -> bool:
-        raise TypeError("a traced scalar has no truth value: what a step does may depend on the scene, not on the state")
+        raise TypeError("a traced scalar has no truth value: a step may depend on the scene, not on the state")
 
 
 def is_constant(x: Value) -> bool:
@@ -182,6 +182,15 @@ def guarded(x: Value, least: Value) -> Value:
     return graph.make("guarded", x, least)
 
 
+def select(mask: Value, x: Value, y: Value) -> Value:
+    """``x`` where ``mask`` is not zero, else ``y``, whatever the other one is; no branch."""
+    if is_constant(mask):
+        return x if mask else y
+    if x is y or (is_constant(x) and is_constant(y) and x == y):
+        return x
+    return mask.graph.make("select", mask, x, y)
+
+
 def absolute(x: Value) -> Value:
     if is_constant(x):
         return abs(x)
@@ -199,7 +208,7 @@ def sum_of_logarithms(terms: Iterable[Value]) -> Value:
 
 
 def ordered(outputs: Iterable[Value]) -> list[Scalar]:
-    """Every scalar that the outputs need, depth first: each just before what needs it first, so that few live at once."""
+    """Every scalar that the outputs need, depth first: each just before its first use, so that few live at once."""
     seen: set[tuple] = set()
     order: list[Scalar] = []
     for output in outputs:

@@ -1,0 +1,174 @@
+"""A machine that runs the CUDA text of a kernel's teams, so that what only a GPU would show shows without one.
+
+Statements become Python's, over all worlds at once in float64; each warp is a generator that stops at its barriers. The
+memory that warps share remembers who touched what between which barriers: reading what nobody has written, or what
+another warp writes between the same two barriers, is an error, as it is a matter of luck on a GPU.
+"""
+
+import re
+from typing import NamedTuple
+
+import numpy as np
+
+from warp_spo.kernels.straight import IN_PLACE, MAPPED, Frame
+from warp_spo.programs import Programs
+from warp_spo.teams import BARRIER
+
+
+class Race(AssertionError):
+    pass
+
+
+class Text(NamedTuple):
+    """What surrounds and what is in one kernel."""
+
+    operation: str
+    frame: Frame
+    cuda: str
+    cpu: str
+    tables: dict
+    operations: int
+
+
+def recorded(monkeypatch):
+    """A list that from here on receives the :class:`Text` of every kernel that is built."""
+    texts, finished = [], Programs._finished
+
+    def record(self, operation, frame, cuda, cpu, tables, operations):
+        held = {name: array.numpy() for name, array in tables.items()}
+        texts.append(Text(operation, frame, cuda, cpu, held, operations))
+        return finished(self, operation, frame, cuda, cpu, tables, operations)
+
+    monkeypatch.setattr(Programs, "_finished", record)
+    return texts
+
+
+class Shared:
+    """Entries that warps share, [entry] of [world]; given ones are there before the first barrier."""
+
+    def __init__(self, name, given=()):
+        self.name, self.values = name, dict(enumerate(given))
+        self.writer, self.readers = {}, {}  # entry -> (stretch between barriers, warp); stretch, {warps}
+        self.now = (0, 0)
+
+    def __getitem__(self, entry):
+        if entry not in self.values:
+            raise Race(f"{self.name}[{entry}] is read before it is written")
+        stretch, warp = self.writer.get(entry, (-1, -1))
+        if stretch == self.now[0] and warp != self.now[1]:
+            raise Race(f"{self.name}[{entry}]: warp {self.now[1]} reads what warp {warp} writes, no barrier between")
+        self.readers.setdefault((self.now[0], entry), set()).add(self.now[1])
+        return self.values[entry]
+
+    def __setitem__(self, entry, value):
+        others = self.readers.get((self.now[0], entry), set()) - {self.now[1]}
+        stretch, warp = self.writer.get(entry, (-1, -1))
+        if others or (stretch == self.now[0] and warp != self.now[1]):
+            raise Race(f"{self.name}[{entry}]: warps {others or warp} and {self.now[1]} meet, no barrier between")
+        self.values[entry], self.writer[entry] = value, self.now
+
+
+def run(text, arrays, backwards=False):
+    """The result of a kernel, [world, entry].
+
+    Args:
+        text: of the kernel.
+        arrays: by name: the callers' [world, ...], the parameters' [item, component, world].
+        backwards: between barriers the last warp goes first.
+    """
+    frame = text.frame
+    worlds = len(next(array for name, array in arrays.items() if name not in frame.fields))
+    rows = {f"{row.name}_row": Shared(row.name, arrays[row.name].reshape(worlds, -1).T) for row in frame.rows}
+    result = rows[f"{frame.result.row}_row"] if frame.result.way == IN_PLACE else Shared("result")
+    sent = Shared("sent")
+    fields = {f"{name}_at": arrays[name].reshape(-1, worlds) for name in frame.fields}
+    fields |= {f"{name}_part": 1 for name in frame.fields}
+    space = FUNCTIONS | rows | fields | {"result_row": result, "sent": sent}
+    space |= {name: text.tables.get(name) for name in ("table", "shifts")}
+    exec(translated(text.cuda), space)
+    stretch, going = 0, {warp: space["work"](warp) for warp in range(frame.warps)}
+    while going:
+        stopped = set()
+        for warp in sorted(going, reverse=backwards):
+            for memory in (*rows.values(), result, sent):
+                memory.now = (stretch, warp)
+            try:
+                next(going[warp])
+            except StopIteration:
+                stopped.add(warp)
+        if stopped and stopped != set(going):
+            raise Race(f"warps {sorted(stopped)} of {sorted(going)} end after {stretch} barriers, the others do not")
+        going = {} if stopped else going
+        stretch += 1
+    whole = np.zeros((frame.result.array.entries, worlds))
+    places = text.tables["place"] if frame.result.way == MAPPED else range(len(whole))
+    for entry, slot in enumerate(places):
+        whole[entry] = 0.0 if slot < 0 else result.values[slot]
+    return whole.T
+
+
+def _sincos(x):
+    return np.sin(x), np.cos(x)
+
+
+FUNCTIONS = {
+    "where": np.where, "nan": np.nan, "infinity": np.inf, "reciprocal": lambda x: 1.0 / x, "sqrt": np.sqrt,
+    "absolute": np.abs, "reduced": lambda x: x, "log": np.log, "sincos": _sincos, "sincos_any": _sincos, "mine": True,
+}  # fmt: skip
+
+
+FORMS = [
+    (r"^const \w+\* (\w+) = table\.data \+ (.*);$", r"\1 = \2"),
+    (r"^int (\w+)\[\d+\];$", r"\1 = {}"),
+    (r"^on::(sincos\w*)\((\w+), (\w+), (\w+)\);$", r"\3, \4 = \1(\2)"),
+    (r"^if \(mine\) (.*);$", r"\1"),
+    (r"^(?:const )?(?:float|double) (\w+) = (.*) (>|!=) (.*) \? (.*) : (.*);$", r"\1 = where(\2 \3 \4, \5, \6)"),
+    (r"^(?:const )?(?:float|double) (\w+ = .*);$", r"\1"),
+    (r"^(?:float|double) [\w, ]+;$", "pass"),
+    (r"^(.*);$", r"\1"),
+]
+
+
+def translated(cuda):
+    """``def work(warp)``: the statements for CUDA in Python."""
+    lines, depth = ["def work(warp):"], 1
+    for line in map(str.strip, cuda.split("\n")):
+        if not line or line.startswith(("//", "#")):
+            continue
+        if line == "}":
+            depth -= 1
+            continue
+        if line == BARRIER:
+            lines.append("    " * depth + "yield")
+            continue
+        branch = re.match(r"^(else )?(?:if \((.*)\) )?\{$", line)
+        if branch:
+            condition = "False" if "reach" in (branch[2] or "") else (branch[2] or "").replace("||", "or")
+            word = f"{'el' if branch[1] else ''}if {condition}" if branch[2] else "else"
+            lines += ["    " * depth + f"{word}:", "    " * (depth + 1) + "pass"]
+            depth += 1
+            continue
+        lines.append("    " * depth + _statement(line))
+    assert depth == 1, "a brace is missing"
+    return "\n".join([*lines, "    if False:", "        yield"])
+
+
+def _statement(line):
+    if "farthest" in line:
+        return "pass"  # turns are not taken off here
+    who = re.match(r"^const int (\w+) = (.*);$", line)
+    if who:
+        return f"{who[1]} = " + re.sub(r"warp == (\d+) \? (\d+) : ", r"\2 if warp == \1 else ", who[2])
+    for form, python in FORMS:
+        if re.match(form, line):
+            line = re.sub(form, python, line)
+            break
+    line = re.sub(r"\((?:float|double)\)", "", line).replace("on::", "")
+    line = re.sub(r"(?<![\w.])(\d+\.?\d*(?:e[-+]?\d+)?)f\b", r"\1", line)
+    line = re.sub(r"__ldg\(shifts\.data \+ (.*?)\)", r"int(shifts[\1])", line)
+    line = re.sub(r"__ldg\((\w+ \+ \d+)\)", r"table[\1]", line)
+    return _sent(line)
+
+
+def _sent(line):
+    return re.sub(r"SENT\(([^()]*)\)", r"sent[\1]", line)

@@ -1,0 +1,104 @@
+"""Hybrid dynamics: dofs that follow a given qdd are not eliminated, P+ = P and z+ = z + P H* qdd; the others are.
+
+Going out, T = H f + Delta qdd is the force that a prescribed dof needs, f = P alpha + z being what its hinge transmits.
+Featherstone, Rigid Body Dynamics Algorithms, 9.2; Jain 2011, ch. 9. A mask says which dofs are prescribed: the constants
+0 and 1 fold into the code; a symbol selects between both, whatever the one not wanted is.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from ..trace.graph import Value, is_constant, select
+from ..trace.spatial import Articulated, Pose, Vector, dot, total
+from . import articulated
+from .articulated import LEAST, NO_INERTIA, Factor, Pivot
+from .links import SLIDE, TURN, Link, Placed
+from .motion import Motion, carried
+
+
+class Given(NamedTuple):
+    """What is known of a link's dofs: where ``mask`` is not 0 its qdd, elsewhere its tau."""
+
+    mask: list[Value]
+    tau: list[Value]
+    qdd: list[Value]
+
+    @property
+    def free(self) -> bool:
+        return all(is_constant(m) and not m for m in self.mask)
+
+
+def factor(
+    link: Link,
+    place: Placed,
+    mask: list[Value],
+    carried_on: list[Articulated],
+    through: list[tuple[Pose, Articulated]],
+    epsilon: float,
+) -> Factor:
+    """As :func:`articulated.factor`, dof by dof in the coordinates of qd; a prescribed dof has a pivot with 1 / D = 0."""
+    P = NO_INERTIA if link.inertia is None else link.inertia.articulated
+    for other in carried_on:
+        P = P + other
+    unit = articulated.UNIT[link.motion][0] if link.motion in (TURN, SLIDE) else None
+    pivots = []
+    for column, armature, held in zip(
+        articulated.columns(link, place)[::-1], link.armature[::-1], mask[::-1], strict=True
+    ):
+        if is_constant(held) and held:
+            n, f = P.apply(Vector(column[:3]), Vector(column[3:]))
+            U = Vector((*n, *f))
+            pivots.append(Pivot(unit, column, U, dot(column, U) + armature, 0.0))
+            continue
+        if unit is not None:
+            (size,) = articulated.cancelling(link, P, [unit], through)
+            pivot, rest = articulated.eliminate_unit(P, unit, armature, LEAST * epsilon * size)
+        else:
+            pivot, rest = articulated.eliminate(P, column, armature, LEAST * epsilon)
+        pivots.append(pivot._replace(inverse=select(held, 0.0, pivot.inverse)))
+        P = Articulated.build(lambda i, j, P=P, rest=rest, held=held: select(held, P.entry(i, j), rest.entry(i, j)))
+    nothing: Value = 0.0
+    if link.inertia is None and not link.children:  # it moves no inertia, so nobody would notice a lost pivot
+        nothing = total(select(m, 0.0, articulated.lost(p.D)) for m, p in zip(mask[::-1], pivots, strict=True))
+        P = P + Articulated.build(lambda i, j: nothing if i == j else 0.0)
+    in_parent = NO_INERTIA if link.parent is None else place.pose.articulated_to_parent(P)
+    return Factor(pivots, P, in_parent, whole=False, turned=False, nothing=nothing)
+
+
+def reduced(
+    link: Link, place: Placed, done: Factor, motion: Motion, force: Vector, given: Given
+) -> tuple[list[Value], list[Value], Vector]:
+    """Of each pivot D^-1 (tau - H z), or qdd if it is prescribed; H z; and z+ in the parent's frame."""
+    rates, heads, z = [], [], force
+    for pivot, held, tau, qdd in zip(done.pivots, given.mask[::-1], given.tau[::-1], given.qdd[::-1], strict=True):
+        heads.append(dot(pivot.column, z))
+        rates.append(select(held, qdd, (tau - heads[-1]) * pivot.inverse))
+        z = z + pivot.U * rates[-1]
+    return rates, heads, articulated.handed_to_parent(link, place, done, motion, z)
+
+
+def expanded(
+    link: Link,
+    place: Placed,
+    done: Factor,
+    rates: list[Value],
+    heads: list[Value],
+    motion: Motion,
+    acceleration: tuple[Vector, Vector],
+    given: Given,
+) -> tuple[list[Value], list[Value], tuple[Vector, Vector]]:
+    """qdd and tau of the link's dofs and its acceleration, for the ``acceleration`` of its parent."""
+    w, v = carried(place, motion, acceleration)
+    alpha = Vector((*(w + motion.bias_w), *(v + motion.bias_v)))
+    qdd, tau = [], []
+    for pivot, rate, head, held, b in zip(
+        done.pivots[::-1], rates[::-1], heads[::-1], given.mask, given.tau, strict=True
+    ):
+        along = dot(pivot.U, alpha)
+        qdd.append(rate - pivot.inverse * along)
+        tau.append(select(held, along + pivot.D * qdd[-1] + head, b))
+        alpha = alpha + pivot.column * qdd[-1]
+    return qdd, tau, (Vector(alpha[:3]), Vector(alpha[3:]))
+
+

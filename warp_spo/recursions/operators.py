@@ -1,0 +1,490 @@
+"""The operators themselves, applied to traced vectors: phi, psi and their kin, and what is composed of them.
+
+A vector over nodes gives a node's (omega; v) or (n; f) in its node frame, a vector over hinges the entries of a node's
+hinge. Either is worked out node by node when it is first asked for, so that the factors of a product run into each
+other as the passes of a recursion do, and few values live at once.
+
+An expression is a letter, or a tuple: ``("resolvent", E)``, ``("transpose", A)``, ``("scaled", a, A)``, ``("sum", A,
+B, ...)``, ``("product", A, B, ...)``, ``("identity",)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from ..trace.emit import Store
+from ..trace.graph import Value
+from ..trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Pose, Vector, cross, dot
+from . import articulated
+from .links import FREE, Link, Placed, placed
+from .motion import in_hinge, in_link
+
+if TYPE_CHECKING:
+    from .traced import Trace
+
+Expression = Any
+Field = Callable[[int], Any]  # node -> Vector of its entries
+NODES, HINGES = "nodes", "hinges"
+SPACES = {
+    "E_phi": (NODES, NODES),
+    "E_psi": (NODES, NODES),
+    "H": (HINGES, NODES),
+    "M": (NODES, NODES),
+    "Delta": (HINGES, HINGES),
+    "P": (NODES, NODES),
+    "D": (HINGES, HINGES),
+    "D_inverse": (HINGES, HINGES),
+    "G": (NODES, HINGES),
+}
+"""Letter -> what its rows and its columns are."""
+RESOLVENTS = {"E_phi": "phi", "E_psi": "psi"}
+NONE: tuple[None, None] = (None, None)
+
+
+def spaces(expression: Expression) -> tuple[str | None, str | None]:
+    """What the rows and the columns of an expression are; None for any.
+
+    Raises:
+        ValueError: factors or terms that do not meet, even if their sizes happen to agree.
+    """
+    if isinstance(expression, str):
+        return SPACES[expression]
+    form, *operands = expression
+    if form == "identity":
+        return NONE
+    if form == "scaled":
+        return spaces(operands[1])
+    if form == "transpose":
+        rows, columns = spaces(operands[0])
+        return columns, rows
+    found = [pair for pair in map(spaces, operands) if pair != NONE]
+    if form == "product":
+        if any(left[1] != right[0] for left, right in zip(found, found[1:], strict=False)):
+            raise ValueError(f"{written(expression)}: nodes meet hinges")
+        return (found[0][0], found[-1][1]) if found else NONE
+    if len(set(found)) > 1 or (len(found) < len(operands) and found and found[0][0] != found[0][1]):
+        raise ValueError(f"{written(expression)}: nodes meet hinges")
+    return found[0] if found else NONE
+
+
+def written(expression: Expression) -> str:
+    """The expression as one would write it."""
+    if isinstance(expression, str):
+        return expression
+    form, *operands = expression
+    if form == "identity":
+        return "1"
+    if form == "resolvent":
+        return RESOLVENTS.get(operands[0], f"resolvent({written(operands[0])})")
+    if form == "scaled":
+        return f"{operands[0]:g} {_bracketed(operands[1])}"
+    if form == "transpose":
+        return f"{_bracketed(operands[0])}.T"
+    if form == "product":
+        return " @ ".join(map(_bracketed, operands))
+    return " + ".join(map(written, operands))
+
+
+def _bracketed(expression: Expression) -> str:
+    text = written(expression)
+    return f"({text})" if " " in text else text
+
+
+class Operators:
+    """The operators of the scene that a trace evaluates."""
+
+    def __init__(self, trace: Trace):
+        self.trace, self.links, self.graph = trace, trace.links, trace.graph
+        self.scene = trace.links.scene
+        self.parent = self.scene.tree.parent
+        self.q = trace.vector("q")
+        self.chains: dict[int, list[Link]] = {k: [] for k in range(self.scene.body_count)}
+        for link in self.links.links:
+            self.chains[link.node].append(link)
+        self._hops: dict[int, list[tuple[Link | None, Pose]]] = {}
+        self._places: dict[int, Placed] = {}
+        self._factors: dict[int, articulated.Factor] = {}
+        self._inertias: dict[int, Articulated] = {}
+
+    def stores(self, expression: Expression) -> list[Store]:
+        """out = expression x"""
+        rows, columns = spaces(expression)
+        result = self.applied(expression, self.given(columns or rows or NODES))
+        found = []
+        for node in self._finished():
+            values = result(node)
+            first = self._first(rows or columns or NODES, node)
+            found += [Store("out", (first + i,), value) for i, value in enumerate(values)]
+        return found
+
+    def given(self, space: str) -> Field:
+        """The array x."""
+
+        def at(node: int) -> Vector:
+            first = self._first(space, node)
+            self._at(node, "x")
+            return Vector(self.graph.input("x", first + i) for i in range(self._size(space, node)))
+
+        return at
+
+    def _first(self, space: str, node: int) -> int:
+        return 6 * node if space == NODES else int(self.scene.qd_start[self.scene.hinge_of[node]])
+
+    def _size(self, space: str, node: int) -> int:
+        return 6 if space == NODES else self.scene.hinge_sizes[node]
+
+    def _at(self, node: int, letter: str) -> None:
+        self.graph.step = f"{self.scene.body_labels[node]}|{letter}"
+
+    def _finished(self) -> Iterator[int]:
+        """Every node after all that it carries, limb by limb."""
+        stack = [(node, False) for node in reversed(self.scene.tree.roots)]
+        while stack:
+            node, carried = stack.pop()
+            if carried:
+                yield node
+                continue
+            stack.append((node, True))
+            stack += [(child, False) for child in reversed(self.scene.tree.children[node])]
+
+    # -- composing -------------------------------------------------------------------------------------------------
+    def applied(self, expression: Expression, x: Field, transposed: bool = False) -> Field:
+        """``expression x``, or its transpose's."""
+        if isinstance(expression, str):
+            return self._letter(expression, x, transposed)
+        form, *operands = expression
+        if form == "identity":
+            return x
+        if form == "transpose":
+            return self.applied(operands[0], x, not transposed)
+        if form == "scaled":
+            factor, y = operands[0], self.applied(operands[1], x, transposed)
+            return _once(lambda node: y(node) * factor)
+        if form == "resolvent":
+            weight = self._weight(operands[0] == "E_psi", transposed)
+            return self._outward(x, weight) if transposed else self._inward(x, weight)
+        if form == "product":
+            for factor in operands if transposed else reversed(operands):
+                x = self.applied(factor, x, transposed)
+            return x
+        terms = [self.applied(term, x, transposed) for term in operands]
+
+        def added(node: int) -> Vector:
+            result = terms[0](node)
+            for term in terms[1:]:
+                result = result + term(node)
+            return result
+
+        return _once(added)
+
+    def _letter(self, letter: str, x: Field, transposed: bool) -> Field:
+        if letter in ("E_phi", "E_psi"):
+            weight = self._weight(letter == "E_psi", transposed)
+            if transposed:
+                return _once(lambda node: self._from_parent(node, x, weight))
+            return _once(lambda node: self._from_children(node, x, weight))
+        if letter == "D":
+            lever = self.applied("H", self.applied("P", self.applied("H", x, True)))
+            offset = self.applied("Delta", x)
+            return _once(lambda node: lever(node) + offset(node))
+        steps: dict[str, Callable[[int, Vector], Vector]] = {
+            "H": self._spread if transposed else self._collected,
+            "M": self._momentum,
+            "P": self._carried,
+            "Delta": self._armature,
+            "D_inverse": self._solved,
+            "G": self._gain_transposed if transposed else self._gain,
+        }
+        return _once(lambda node: steps[letter](node, x(node)))
+
+    # -- sweeps ----------------------------------------------------------------------------------------------------
+    def _inward(self, x: Field, weight: Callable[[int, Vector], Vector]) -> Field:
+        """y(k) = x(k) + sum of w(k, j) y(j) over the children j"""
+        known: dict[int, Vector] = {}
+        sums: dict[int, Vector] = {}
+        waiting: set[int] = set()
+
+        def at(top: int) -> Vector:
+            stack = [top]
+            while stack:  # a loop, because a chain may be longer than Python's stack
+                node = stack[-1]
+                if node in known:
+                    stack.pop()
+                elif node in waiting:
+                    stack.pop()
+                    value = x(node)
+                    self._at(node, "y")
+                    known[node] = value + sums[node] if node in sums else value
+                    self._hand_on(node, known[node], weight, sums)
+                else:
+                    waiting.add(node)
+                    stack += [child for child in reversed(self.scene.tree.children[node]) if child not in known]
+            return known[top]
+
+        return at
+
+    def _hand_on(self, node: int, y: Vector, weight: Callable[[int, Vector], Vector], sums: dict) -> None:
+        parent = self.parent[node]
+        if parent >= 0:
+            handed = weight(node, y)
+            sums[parent] = sums[parent] + handed if parent in sums else handed
+
+    def _outward(self, x: Field, weight: Callable[[int, Vector], Vector]) -> Field:
+        """y(k) = x(k) + w*(p, k) y(p)"""
+        known: dict[int, Vector] = {}
+
+        def at(node: int) -> Vector:
+            path = []
+            while node >= 0 and node not in known:
+                path.append(node)
+                node = self.parent[node]
+            for below in reversed(path):
+                value = x(below)
+                self._at(below, "v")
+                if self.parent[below] >= 0:
+                    value = value + weight(below, known[self.parent[below]])
+                known[below] = value
+            return known[path[0] if path else node]
+
+        return at
+
+    def _from_children(self, node: int, x: Field, weight: Callable[[int, Vector], Vector]) -> Vector:
+        result = None
+        for child in self.scene.tree.children[node]:
+            handed = weight(child, x(child))
+            result = handed if result is None else result + handed
+        return Vector([0.0] * 6) if result is None else result
+
+    def _from_parent(self, node: int, x: Field, weight: Callable[[int, Vector], Vector]) -> Vector:
+        parent = self.parent[node]
+        return Vector([0.0] * 6) if parent < 0 else weight(node, x(parent))
+
+    def _weight(self, articulated_too: bool, transposed: bool) -> Callable[[int, Vector], Vector]:
+        """w(p, k) of phi or of psi, that is phi(p, k) (1 - G H), applied to a force; or its transpose, to a motion."""
+        if transposed:
+            return lambda node, v: self._motion(node, v, articulated_too)
+        return lambda node, z: self._force(node, z, articulated_too)
+
+    def _force(self, node: int, z: Vector, less: bool) -> Vector:
+        for link, pose in reversed(self.hops(node)):
+            if link is not None and less:
+                _, z = self._eliminated(link, z, [0.0] * len(link.dofs))
+            self._at(node, "z")
+            z = _joined(pose.force_to_parent(*_parts(z)))
+        return z
+
+    def _motion(self, node: int, v: Vector, less: bool) -> Vector:
+        for link, pose in self.hops(node):
+            self._at(node, "v")
+            v = _joined(pose.motion_to_child(*_parts(v)))
+            if link is not None and less:
+                _, v = self._released(link, v)
+        return v
+
+    # -- hinges ----------------------------------------------------------------------------------------------------
+    def _collected(self, node: int, z: Vector) -> Vector:
+        """H z"""
+        self._at(node, "h")
+        tau: list[Value] = []
+        for link, pose, first in self._inner(node):
+            if link is not None:
+                tau = [*in_hinge(link, self.place(link), *_parts(z)), *tau]
+            if not first:
+                z = _joined(pose.force_to_parent(*_parts(z)))
+        return Vector(tau)
+
+    def _spread(self, node: int, rates: Vector) -> Vector:
+        """H* rates"""
+        self._at(node, "h")
+        v, at = Vector((*ZERO, *ZERO)), 0
+        for link, pose, first in reversed(self._inner(node)):
+            if not first:
+                v = _joined(pose.motion_to_child(*_parts(v)))
+            if link is not None:
+                own = list(rates[at : at + len(link.dofs)])
+                at += len(own)
+                entries = dict(zip(link.dofs, own, strict=True))
+                v = v + _joined(in_link(link, self.place(link), lambda dof, entries=entries: entries[dof]))
+        return v
+
+    def _armature(self, node: int, x: Vector) -> Vector:
+        self._at(node, "d")
+        own = [a for link in self.chains[node] for a in link.armature]
+        return Vector(a * value for a, value in zip(own, x, strict=True))
+
+    def _gain(self, node: int, right: Vector) -> Vector:
+        """G right: what the hinge hands on inward when it gives ``right`` and nothing acts on the body."""
+        z, at = Vector((*ZERO, *ZERO)), len(right)
+        inner = self._inner(node)
+        for link, pose, first in inner:
+            if link is not None:
+                at -= len(link.dofs)
+                _, z = self._eliminated(link, z, list(right[at : at + len(link.dofs)]))
+            if not first:
+                z = _joined(pose.force_to_parent(*_parts(z)))
+        self._at(node, "g")
+        for _, pose, first in reversed(inner):
+            if not first:
+                n, f = _parts(z)
+                z = _joined((pose.to_child(n - cross(pose.l, f)), pose.to_child(f)))
+        return z
+
+    def _gain_transposed(self, node: int, v: Vector) -> Vector:
+        self._at(node, "g")
+        inner, rates = self._inner(node), []
+        for _, pose, first in inner:
+            if not first:
+                w, v = _parts(v)
+                w, v = pose.to_parent(w), pose.to_parent(v)
+                v = Vector((*w, *(v - cross(w, pose.l))))
+        for link, pose, first in reversed(inner):
+            if not first:
+                v = _joined(pose.motion_to_child(*_parts(v)))
+            if link is not None:
+                own, v = self._released(link, v)
+                rates += own
+        return Vector(rates)
+
+    def _solved(self, node: int, right: Vector) -> Vector:
+        """D^-1 right"""
+        z, at, reduced = Vector((*ZERO, *ZERO)), len(right), {}
+        inner = self._inner(node)
+        for link, pose, first in inner:
+            if link is not None:
+                at -= len(link.dofs)
+                reduced[id(link)], z = self._eliminated(link, z, list(right[at : at + len(link.dofs)]))
+            if not first:
+                z = _joined(pose.force_to_parent(*_parts(z)))
+        v, found = Vector((*ZERO, *ZERO)), []
+        for link, pose, first in reversed(inner):
+            if not first:
+                v = _joined(pose.motion_to_child(*_parts(v)))
+            if link is not None:
+                own, v = self._released(link, v, reduced[id(link)])
+                found += [-rate for rate in own]
+        return Vector(found)
+
+    def _eliminated(self, link: Link, z: Vector, right: list[Value]) -> tuple[list[Value], Vector]:
+        """D^-1 (right - H z), pivot by pivot, and z + G (right - H z), of one link, in its frame."""
+        done, place, rates = self.factor(link), self.place(link), []
+        self._at(link.node, "z")
+        if done.turned:
+            back: Matrix = place.turned.T  # type: ignore[union-attr]
+            linear = list(back @ Vector(right[:3])) if link.motion == FREE else []
+            right = [*linear, *(back @ Vector(right[-3:]))]
+        for pivot, b in zip(done.pivots, right[::-1], strict=True):
+            acting = z[pivot.unit] if pivot.unit is not None else dot(pivot.column, z)
+            rates.append((b - acting) * pivot.inverse)
+            z = z + pivot.U * rates[-1]
+        return rates, z
+
+    def _released(self, link: Link, v: Vector, given: list[Value] | None = None) -> tuple[list[Value], Vector]:
+        """The adjoint of :meth:`_eliminated`: G* v less what is ``given``, by dof, and v - H* of that."""
+        done, place, rates = self.factor(link), self.place(link), []
+        self._at(link.node, "v")
+        given = [0.0] * len(done.pivots) if given is None else given
+        for pivot, own in zip(done.pivots[::-1], given[::-1], strict=True):
+            rates.append(pivot.inverse * dot(pivot.U, v) - own)
+            v = v - pivot.column * rates[-1]
+        if done.turned:
+            rates = in_hinge(link, place, Vector(rates[-3:]), Vector(rates[:3]))
+        return rates, v
+
+    # -- bodies ----------------------------------------------------------------------------------------------------
+    def _momentum(self, node: int, v: Vector) -> Vector:
+        self._at(node, "m")
+        return _joined(self.links.rigid(node).apply(*_parts(v)))
+
+    def _carried(self, node: int, v: Vector) -> Vector:
+        P = self.inertia(node)
+        self._at(node, "p")
+        return _joined(P.apply(*_parts(v)))
+
+    def inertia(self, top: int) -> Articulated:
+        """P(k) in the node frame."""
+        below, stack = [], [top]
+        while stack:
+            below.append(stack.pop())
+            stack += [child for child in self.scene.tree.children[below[-1]] if child not in self._inertias]
+        for node in reversed(below):
+            P = self.links.rigid(node).articulated
+            for child in self.scene.tree.children[node]:
+                link, pose = self.hops(child)[0]
+                done = None if link is None else self.factor(link)
+                self._at(node, "P")
+                if done is None or not done.whole:  # a free hinge hands nothing on
+                    P = P + pose.articulated_to_parent(self._inertias[child] if done is None else done.P)
+            self._inertias[node] = P
+        return self._inertias[top]
+
+    # -- what is shared --------------------------------------------------------------------------------------------
+    def place(self, link: Link) -> Placed:
+        """A link where q puts it."""
+        if id(link) not in self._places:
+            self.graph.step = f"{link.label}|x"
+            self._places[id(link)] = placed(link, self.q)
+        return self._places[id(link)]
+
+    def hops(self, node: int) -> list[tuple[Link | None, Pose]]:
+        """From the parent's node frame to the node's: over the hinge's links, then to the seat on the last, if apart."""
+        if node not in self._hops:
+            chain, seat, found = self.chains[node], self.links.seats[node], []
+            if chain:
+                self.graph.step = f"{chain[0].label}|x"
+                found.append((chain[0], placed(self.links.on_parent_node(chain[0]), self.q).pose))
+                found += [(link, self.place(link).pose) for link in chain[1:]]
+                if seat.matrix != IDENTITY or not seat.offset.vanishes:
+                    found.append((None, Pose(None, None if seat.matrix == IDENTITY else seat.matrix, seat.offset)))
+            else:
+                matrix, offset = self.links.tree(node)
+                found.append((None, Pose(None, None if matrix == IDENTITY else matrix, offset)))
+            self._hops[node] = found
+        return self._hops[node]
+
+    def _inner(self, node: int) -> list[tuple[Link | None, Pose, bool]]:
+        """The hops from the node in, without the step to the parent, which the first link marks; none if it is fixed."""
+        if not self.chains[node]:
+            return []
+        return [(link, pose, link is self.chains[node][0]) for link, pose in reversed(self.hops(node))]
+
+    def factor(self, top: Link) -> articulated.Factor:
+        """What is left of a link, going in; see :func:`warp_spo.recursions.articulated.factor`."""
+        below, stack = [], [top]
+        while stack:
+            below.append(stack.pop())
+            stack += [child for child in below[-1].children if id(child) not in self._factors]
+        for link in reversed(below):
+            if id(link) in self._factors:
+                continue
+            place, children = self.place(link), [self._factors[id(child)] for child in link.children]
+            poses = [self.place(child).pose for child in link.children]
+            self.graph.step = f"{link.label}|P"
+            self._factors[id(link)] = articulated.factor(
+                link,
+                place,
+                [child.in_parent for child in children],
+                [(pose, child.P) for pose, child in zip(poses, children, strict=True)],
+                self.trace.epsilon,
+            )
+        return self._factors[id(top)]
+
+
+def _once(value: Field) -> Field:
+    """``value``, asked for at most once a node."""
+    known: dict[int, Vector] = {}
+
+    def at(node: int) -> Vector:
+        if node not in known:
+            known[node] = value(node)
+        return known[node]
+
+    return at
+
+
+def _parts(v: Vector) -> tuple[Vector, Vector]:
+    return Vector(v[:3]), Vector(v[3:])
+
+
+def _joined(parts: tuple[Vector, Vector]) -> Vector:
+    return Vector((*parts[0], *parts[1]))
