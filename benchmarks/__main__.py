@@ -24,6 +24,9 @@ ALLOWED = 0.05  # two runs on one machine differ by less, for cases of 20 us or 
 SHOWN = 10  # differences that --compare prints
 
 
+PLAN = "plan"  # the granularity that the plan chooses
+
+
 def parser() -> argparse.ArgumentParser:
     text = argparse.RawDescriptionHelpFormatter
     p = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__, formatter_class=text)
@@ -34,8 +37,8 @@ def parser() -> argparse.ArgumentParser:
         f"{data.CPU_WORLDS[0]}"
     )  # fmt: skip
     p.add_argument("--dtype", nargs="+", choices=PRECISIONS, metavar="P", help=f"precisions: {', '.join(PRECISIONS)}")
-    names = [name for name in data.GRANULARITIES if name]
-    p.add_argument("--granularity", nargs="+", choices=names, metavar="G", help="default: what the plan chooses")
+    names = [name or PLAN for name in data.GRANULARITIES]
+    p.add_argument("--granularity", nargs="+", choices=names, metavar="G", help=f"{', '.join(names)}; default: {PLAN}")
     p.add_argument(
         "--all", action="store_true", help="every precision and granularity, growing sizes, and the stress suite"
     )
@@ -95,7 +98,8 @@ def choose(options: Any, cuda: bool) -> list[dict]:
     """
     worlds = options.worlds or (data.WORLDS if cuda else data.CPU_WORLDS)
     dtypes = options.dtype or (tuple(PRECISIONS) if options.all else data.DTYPES)
-    granularities = options.granularity or (data.GRANULARITIES if options.all else (None,))
+    asked = options.granularity and [None if name == PLAN else name for name in options.granularity]
+    granularities = asked or (data.GRANULARITIES if options.all else (None,))
     return data.cases(options.filter, worlds, dtypes, granularities, options.all, cuda)
 
 

@@ -78,7 +78,7 @@ SWEEPS = (
     *(Sweep(name, _family(name), (1024,), (4,), "node") for name in ("chain", "tree", "deep", "branching")),
 )
 SWEPT = ("forward_dynamics", "inverse_dynamics")
-PEERS_WORLDS = (1, 128, 65536), (1, 128)  # on a GPU, on a CPU: where peers are measured too, beside the usual count
+PEERS_WORLDS = (1, 65536, 1048576), (1, 128)  # on a GPU, on a CPU: further counts for released robots
 SAMPLE, FEWER = 16, 4  # worlds of each set of inputs that are compared with the reference: usually, and beside it
 PEERS_OPERATIONS = ("forward_dynamics", "inverse_dynamics", "mass_matrix")
 

@@ -155,6 +155,7 @@ COUNTS: dict[str, Callable[[Count], int]] = {
     "phi": _weights,
     "phi.T": _weights,
     "psi": _weights,
+    "mass@v": lambda c: 2 * _weights(c) + sum(2 * m * m for m in c.scene.node_sizes) + 26 * c.dofs,
     "operators.update": _update,
     "forward_dynamics": _forward_dynamics,
     "inverse_dynamics": lambda c: _inverse_dynamics(c, True, True),

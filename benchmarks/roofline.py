@@ -40,9 +40,9 @@ def operations(dyn: spo.Dynamics, name: str) -> float | None:
     Straight-line code, in which constants of the scene are folded, knows its own (``dyn.operation_counts``); the
     algorithm's count is an upper bound there, so no share of the roof is made of it.
     """
-    own = getattr(dyn, "operation_counts", None)
+    own = dyn.operation_counts.get(name)
     if own is not None:
-        return own.get(name)
+        return own
     return count(dyn.scene, name) if dyn.granularity == "node" else None
 
 

@@ -9,6 +9,7 @@ from warp_spo.operations import OPERATIONS
 
 from .cases import SCENES
 from .evidence import RESULTS, ROOT, Evidence, usual_worlds
+from .robots import ROBOTS
 
 BEGIN, END = "<!-- benchmarks:begin -->", "<!-- benchmarks:end -->"
 PICTURES = {"error-time.svg": "error against run time", "scaling.svg": "run time against size"}
@@ -52,6 +53,34 @@ def markdown(evidence: Evidence, operations: Sequence[str] | None = None) -> str
     return "\n".join(text[1:]) + "\n" if text else ""
 
 
+def rates(evidence: Evidence) -> str:
+    """Released robots in float32: latency, throughput, and the fastest peer of the same work at the usual count."""
+    rows = [row for row in plain(evidence) if row["dtype"] == "float32" and row["scene"] in ROBOTS and "us" in row]
+    usual, most = usual_worlds(rows), max((row["worlds"] for row in rows), default=0)
+    lines = {(row["scene"], row["op"]): {} for row in rows if row["worlds"] == most and most > usual}
+    for row in rows:
+        lines.get((row["scene"], row["op"]), {})[row["worlds"]] = row
+    if not lines:
+        return ""
+    heads = ["float32", "µs, 1 world", f"µs, {usual:,} worlds", f"10⁹/s, {most:,} worlds", "error",
+             f"fastest other, {usual:,} worlds", "its error"]
+    text = ["| " + " | ".join(heads) + " |", "|---|" + "---:|" * (len(heads) - 1)]
+    for (scene, op), mine in lines.items():
+        same = scene, op, usual, "float32"
+        keys = ("scene", "op", "worlds", "dtype")
+        peers = [row for row in evidence.peers if tuple(row[key] for key in keys) == same and "us" in row]
+        other = min(peers, key=lambda row: row["us"], default=None)
+        theirs = ["–", "–"]
+        if other and usual in mine:
+            ratio = other["us"] / mine[usual]["us"]
+            theirs = [f"{other['peer']}: {time(other)}, {ratio:.0f} ×", f"{other['error']:.1e}"]
+        rate = f"{most / mine[most]['us'] / 1e3:.3g}"
+        error = f"{worst([row['error'] for row in mine.values()]):.1e}"
+        cells = [f"{scene}, `{op}`", time(mine.get(1)), time(mine.get(usual)), rate, error, *theirs]
+        text.append("| " + " | ".join(cells) + " |")
+    return "\n".join(text) + "\n\n"
+
+
 def worst(errors: Sequence[float]) -> float:
     """The largest, NaN if any is, or if there is none."""
     return max(errors) if errors and all(error == error for error in errors) else float("nan")
@@ -70,7 +99,8 @@ def readme(everything: Sequence[Evidence]) -> str:
     for evidence in everything:
         worlds = usual_worlds(plain(evidence))
         shown = evidence._replace(rows=[row for row in evidence.rows if row["worlds"] == worlds])
-        text += [*evidence.sources, "", markdown(shown, None if evidence is everything[0] else HEADLINE)]
+        operations = None if evidence is everything[0] else HEADLINE
+        text += [*evidence.sources, "", rates(evidence) + markdown(shown, operations)]
         if evidence is everything[0]:
             folder = RESULTS.relative_to(ROOT).as_posix()
             text += [f"![{what}]({folder}/{name})" for name, what in PICTURES.items()] + [""]

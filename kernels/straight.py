@@ -14,6 +14,10 @@ import warp as wp
 from .elementary import NATIVE
 
 WARP = 32
+LONG_COPY = 64  # entries of a row from which it is copied to shared memory without passing through registers
+ON_ITS_WAY = """\
+#define ON_ITS_WAY(to, from) asm volatile("cp.async.ca.shared.global [%0], [%1], %2;" \
+    :: "r"((unsigned)__cvta_generic_to_shared(to)), "l"(from), "n"(sizeof(*(to))) : "memory")"""
 SHARED_BYTES = 46 * 1024  # that a block may declare: 48 KiB less what Warp takes
 C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
 MASKS = ("prescribed",)  # arrays of booleans
@@ -109,7 +113,11 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
             text += [_own_row(row, c)]
     text += [f"{c}* {row.name}_row = {row.name}.data + world * {row.entries};" for row in frame.more]
     if frame.staged:
+        if any(row.entries >= LONG_COPY for row in frame.rows):
+            text += [ON_ITS_WAY]
         text += [_stage_in(row, offset[row.name], c, team) for row in frame.rows]
+        if any(row.entries >= LONG_COPY for row in frame.rows):
+            text += ['asm volatile("cp.async.wait_all;" ::: "memory");', "#undef ON_ITS_WAY"]
         text += [sync]
     if result.way == IN_PLACE:
         start, width = offset[result.row], pitch(next(row.entries for row in frame.rows if row.name == result.row))
@@ -180,7 +188,10 @@ def _each(n: int, team: int, statement: str) -> str:
 
 def _stage_in(row: Row, offset: int, c: str, team: int) -> str:
     n = row.entries
-    copy = _each(n, team, f"to[{_slot('i', n, pitch(n))}] = __ldg(from + i);")
+    if n >= LONG_COPY and row.name not in MASKS:
+        copy = _each(n, team, f"{{ ON_ITS_WAY(to + {_slot('i', n, pitch(n))}, from + i); }}")
+    else:
+        copy = _each(n, team, f"to[{_slot('i', n, pitch(n))}] = __ldg(from + i);")
     kind, start = _source(row, c)
     return f"{{\nconst {kind}* from = {start} + first * {n};\n{c}* to = stage + {offset};\n{copy}\n}}"
 

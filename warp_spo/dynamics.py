@@ -17,6 +17,7 @@ import warp as wp
 from . import nodes
 from . import plan as plans
 from . import status as words
+from .applications import Applications
 from .arrays import Call, parse_device, parse_dtype, shape_of
 from .errors import UnsupportedError
 from .frames import Frame, checked
@@ -41,11 +42,21 @@ OPERATIONS = (
     "jacobian",
     "operational_inertia_inverse",
     "integrate",
+    "hybrid_dynamics",
+    "operational_inertia",
+    "jacobian_bias",
+    "com_jacobian",
+    "centroidal_momentum_matrix",
+    "centroidal_momentum_bias",
+    "quasi_velocities",
+    "log_det_mass_matrix_gradient",
+    "fixman_torque",
+    "mass_matrix_packed",
 )
 LOOPS = ("raise", "cut", "embed", "multipliers")
 
 
-class Dynamics:
+class Dynamics(Applications):
     """Dynamics of one scene in many worlds.
 
     Arrays are torch tensors, Warp arrays or NumPy arrays, [world, ...] and C-contiguous; the kind of the first one is
@@ -150,15 +161,16 @@ class Dynamics:
 
         Args:
             operation: name of a method, such as "forward_dynamics".
-            options: ``frames=`` for operations that take frames, ``columns=`` for solve_mass_matrix, ``body_f=True``
-                and ``status=True`` if they will be given.
+            options: ``frames=`` for operations that take frames, ``columns=`` for solve_mass_matrix, ``prescribed=``
+                for hybrid_dynamics, ``body_f=True`` and ``status=True`` if they will be given.
         """
         if operation not in OPERATIONS:
             raise ValueError(f"Dynamics.prepare: no operation {operation!r}; expected one of {', '.join(OPERATIONS)}")
         q: Any = wp.array(np.tile(self.scene.neutral_q, (self.worlds, 1)), dtype=self.dtype, device=self.device)
         rate = wp.zeros((self.worlds, self.scene.dof_count), dtype=self.dtype, device=self.device)
         extra: dict[str, Any] = {}
-        if operation in ("forward_dynamics", "inverse_dynamics", "bias_force") and options.pop("body_f", False):
+        loaded = ("forward_dynamics", "inverse_dynamics", "bias_force", "hybrid_dynamics")
+        if operation in loaded and options.pop("body_f", False):
             shape = (self.worlds, self.scene.body_count, 6)
             extra["body_f"] = wp.zeros(shape, dtype=self.dtype, device=self.device)
         if operation == "forward_dynamics" and options.pop("status", False):
@@ -170,6 +182,10 @@ class Dynamics:
             "passive_force": (q, rate),
             "body_velocities": (q, rate),
             "integrate": (q, rate, 0.0),
+            "hybrid_dynamics": (q, rate, rate, rate),
+            "jacobian_bias": (q, rate),
+            "centroidal_momentum_bias": (q, rate),
+            "quasi_velocities": (q, rate),
         }
         given = arguments.get(operation, (q,))
         if operation == "solve_mass_matrix":
@@ -178,7 +194,9 @@ class Dynamics:
                 raise ValueError(f"Dynamics.prepare: columns is {columns!r}; expected how many right-hand sides")
             sides = () if columns is None else (columns,)
             given = (q, wp.zeros((*rate.shape, *sides), dtype=self.dtype, device=self.device))
-        if operation in ("jacobian", "operational_inertia_inverse"):
+        if operation == "hybrid_dynamics":
+            extra["prescribed"] = options.pop("prescribed", [False] * self.scene.dof_count)
+        if operation in ("jacobian", "operational_inertia_inverse", "operational_inertia", "jacobian_bias"):
             extra["frames"] = options.pop("frames", [0])
         if options:
             raise ValueError(f"Dynamics.prepare: {operation} has no option {', '.join(options)}")
@@ -362,7 +380,7 @@ class Dynamics:
     # -- operators -------------------------------------------------------------------------------------------------
     def operators(self, q: Any) -> SpatialOperators:
         """The paper's operators at ``q``: phi, psi, H, K, D, G, M, P, Delta ...; their ``update(q)`` refills them."""
-        operators = SpatialOperators(self.recursions)
+        operators = SpatialOperators(self.recursions, self.programs)
         operators.update(q)
         return operators
 

@@ -188,19 +188,22 @@ def _method(name: str, reads: str, shape: Shape, reference: Callable[..., Any], 
     return Operation(name, tuple(reads.split()), shape, call, reference, **more)
 
 
-def _operator(name: str, of: Callable[[Any], Any], reference: Callable[..., Any]) -> Operation:
-    """An operator of the scene, applied to a vector over the nodes."""
+def _operator(
+    name: str, of: Callable[[Any], Any], reference: Callable[..., Any], reads: str = "x", shape: Shape = _nodes
+) -> Operation:
+    """An operator of the scene, ``of(subject)``, applied to a vector over the nodes or another."""
 
     def call(subject: Any, x: Any, out: Any) -> None:
-        of(subject.operators).apply(x, out=out)
+        of(subject).apply(x, out=out)
 
-    return Operation(name, ("x",), _nodes, call, reference, at_first_q=True)
+    return Operation(name, (reads,), shape, call, reference, at_first_q=True)
 
 
 _TABLE = (
-    _operator("phi", lambda ops: ops.phi, lambda d, x: d.phi @ x),
-    _operator("phi.T", lambda ops: ops.phi.T, lambda d, x: d.phi.T @ x),
-    _operator("psi", lambda ops: ops.psi, lambda d, x: d.psi @ x),
+    _operator("phi", lambda subject: subject.operators.phi, lambda d, x: d.phi @ x),
+    _operator("phi.T", lambda subject: subject.operators.phi.T, lambda d, x: d.phi.T @ x),
+    _operator("psi", lambda subject: subject.operators.psi, lambda d, x: d.psi @ x),
+    _operator("mass@v", lambda subject: subject.mass, lambda d, v: d.mass_matrix @ v, "b", _dof),
     Operation(
         "operators.update",
         ("q", "x"),
@@ -270,3 +273,44 @@ _TABLE = (
 )
 OPERATIONS = {operation.name: operation for operation in _TABLE}
 """Name -> operation, in the order of the tables that show them."""
+
+
+def every_other(scene: Scene) -> np.ndarray:
+    """The mask of hybrid_dynamics in trials: dofs 1, 3, 5 ... are prescribed."""
+    return np.arange(scene.dof_count) % 2 == 1
+
+
+def _hybrid(subject: Any, q: Any, qd: Any, tau: Any, qdd: Any, out: Any) -> None:
+    dyn = subject.dyn
+    forces = dyn.recursions.array("trial of hybrid_dynamics", dyn.worlds, dyn.scene.dof_count)
+    dyn.hybrid_dynamics(q, qd, tau, qdd, prescribed=every_other(dyn.scene), out=(out, forces))
+
+
+_APPLICATIONS = (
+    Operation(
+        "hybrid_dynamics",
+        ("q", "qd", "tau", "qdd"),
+        _dof,
+        _hybrid,
+        lambda d, q, qd, tau, qdd: d.hybrid_dynamics(qd, tau, qdd, every_other(d.scene))[0],
+    ),
+    _method(
+        "jacobian_bias",
+        "q qd",
+        lambda scene: (2, 6),
+        lambda d, q, qd: d.jacobian_bias(qd, two_frames(d.scene)),
+        two_frames,
+    ),
+    _method("com_jacobian", "q", lambda scene: (3, scene.dof_count), lambda d, q: d.com_jacobian),
+    _method(
+        "centroidal_momentum_matrix",
+        "q",
+        lambda scene: (6, scene.dof_count),
+        lambda d, q: d.centroidal_momentum_matrix,
+    ),
+    _method("centroidal_momentum_bias", "q qd", lambda scene: (6,), lambda d, q, qd: d.centroidal_momentum_bias(qd)),
+    _method("quasi_velocities", "q qd", _dof, lambda d, q, qd: d.quasi_velocities(qd)),
+    _method("fixman_torque", "q", _dof, lambda d, q: d.fixman_torque, scale=lambda d, e: max(1.0, np.linalg.norm(e))),
+)
+APPLICATIONS = {operation.name: operation for operation in _APPLICATIONS}
+"""The operations of :mod:`warp_spo.applications` that every scene has, for the same tables; each compiles a kernel."""

@@ -14,7 +14,7 @@ import warp as wp
 
 from .algebra import Identity, Operator, Product, Scaled, Sum, Transpose, add_scaled
 from .arrays import WARP
-from .blocks import Blocks, Table, choose_memory, matrix_size, memory, pack, place_offsets
+from .blocks import Blocks, Stored, Table, choose_memory, matrix_size, memory, pack, place_offsets
 from .tree import Digraph, Tree
 
 __all__ = ["BWA", "Blocks", "Identity", "Operator", "Product", "Resolvent", "Scaled", "Sum", "Transpose"]
@@ -56,7 +56,7 @@ class BWA(Operator):
         cls,
         graph: Tree | Digraph,
         dims: Sequence[int],
-        weights: wp.array,
+        weights: wp.array | Stored,
         offsets: Sequence[int] | None = None,
         kind: str | None = WARP,
     ) -> "BWA":

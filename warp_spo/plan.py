@@ -16,9 +16,10 @@ FEW_WORLDS = 32768  # so many leave a GPU waiting: a warp for each limb, and row
 MOST_DOFS = 128  # straight-line code of more takes too long to compile
 FEW_ON_CPU = 256  # worlds that a CPU is done with before a kernel for the scene is compiled
 SPILLS = {"float32": 32, "float64": 15}  # dofs at which one thread no longer holds a whole tree in registers
-SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as through shared memory
+SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as through shared memory,
+LONG_ROWS = 24  # in segments; longer rows come in together already at fewer worlds
 MOST_WARPS = 16
-SHORT = ("inverse_dynamics", "mass_matrix")  # little code: a thread for the whole tree does not spill
+SHORT = ("inverse_dynamics",)  # little code: a thread for the whole tree does not spill
 
 TREE_ONLY = (
     "hybrid_dynamics",
@@ -89,7 +90,8 @@ def choose(
         names = ", ".join(GRANULARITIES)
         raise ValueError(f"Dynamics: granularity is {granularity!r}; expected None or one of {names}")
     chosen, reason = (granularity, "asked for") if granularity else _chosen(scene, worlds, cuda, dtype, varies)
-    staged = worlds > FEW_WORLDS and scene.dof_count > SHORT_ROWS
+    rows = SHORT_ROWS if chosen == "tree" else LONG_ROWS
+    staged = scene.dof_count > rows and worlds > (FEW_WORLDS if scene.dof_count <= LONG_ROWS else FEW_WORLDS // 16)
     outward, first = [], 0
     for level in scene.tree.levels:
         outward.append((first, len(level)))

@@ -18,6 +18,7 @@ from .levels import Recursions
 from .plan import MOST_WARPS, TREE_ONLY, Plan
 from .recursions.applications import Applications
 from .recursions.links import Links
+from .recursions.operators import meet, written
 from .recursions.pieces import Piece, Pieces
 from .recursions.traced import SENT, Trace
 from .teams import Team
@@ -36,11 +37,13 @@ TRACED = (
     "body_velocities",
     "jacobian",
     "operational_inertia_inverse",
+    "expression",
     *TREE_ONLY,
 )
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
+EXPRESSIONS = 64  # different expressions of operators that do
 
 
 class Program(NamedTuple):
@@ -101,7 +104,8 @@ class Programs:
         key = operation, tuple(shapes), out[1:], *options.values()
         if key not in self._programs:
             lists = sum(1 for other in self._programs if other[0] == operation)
-            if options and lists >= FRAME_LISTS and operation not in TREE_ONLY:
+            most = EXPRESSIONS if operation == "expression" else FRAME_LISTS
+            if options and lists >= most and operation not in TREE_ONLY:
                 return None
             self._programs[key] = self._build(operation, shapes, out, more or {}, options)
         return self._programs[key]
@@ -119,7 +123,7 @@ class Programs:
     @property
     def operation_counts(self) -> dict[str, int]:
         """Floating-point operations of one world, by operation."""
-        return {key[0]: program.operations for key, program in self._programs.items() if program is not None}
+        return {_title(key): program.operations for key, program in self._programs.items() if program is not None}
 
     def described(self) -> list[str]:
         """A line for each kernel: its granularity, its operations in one world, and on CUDA what it takes."""
@@ -128,7 +132,7 @@ class Programs:
             if program is None:
                 continue
             granularity = f"segment, {program.warps} warps" if program.warps > 1 else "tree"
-            line = f"{key[0]}  {granularity}, {program.operations} operations a world"
+            line = f"{_title(key)}  {granularity}, {program.operations} operations a world"
             if self.run.device.is_cuda:
                 found: Any = wp.get_cuda_kernel_properties(program.kernel, self.run.device)
                 line += f", {found.num_regs} registers, {found.local_size_bytes} bytes spilled a thread"
@@ -142,6 +146,8 @@ class Programs:
     def _build(self, operation: str, shapes: dict, out_shape: tuple, more: dict, options: dict) -> Program | None:
         links = self._links()
         if (operation == "body_poses" and links.varies_tree) or not links.links:
+            return None
+        if operation == "expression" and not meet(options["expression"]):
             return None
         shapes = {**shapes, "out": out_shape}
         if self.plan.of(operation) == "segment" and operation in SEGMENTED:
@@ -159,7 +165,7 @@ class Programs:
         frame = frame._replace(more=tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more))
         placed, table = _placed([item for item in stores if item.array == "out"], frame.result)
         placed += apart
-        emitter = self._emitter(shapes, frame.result)
+        emitter = self._emitter(shapes, frame.result, frame.staged)
         listing = emitter.region(placed)
         body = literals(listing, self.run.dtype.__name__)
         tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
@@ -185,7 +191,7 @@ class Programs:
         everything, table = _placed([item for items in outs for item in items], frame.result)
         outs[0] += everything[sum(map(len, outs)) :] if table is None else []  # zeros
         for piece, stores, items in zip(pieces.pieces, traced, outs, strict=True):
-            emitter = self._emitter(shapes, frame.result)
+            emitter = self._emitter(shapes, frame.result, frame.staged)
             placed = [item for item in stores if item.array == "sent"]
             placed += items if table is None else _by_slot(items, table)
             last = "a" in SEGMENTED[operation]  # results come on the way out
@@ -211,7 +217,7 @@ class Programs:
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers)
         return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations)
 
-    def _emitter(self, shapes: dict, result: Result) -> Emitter:
+    def _emitter(self, shapes: dict, result: Result, staged: bool) -> Emitter:
         guard = "if (mine) " if result.way == DIRECT else ""
 
         def load(array: str, entry: str) -> str:
@@ -233,7 +239,7 @@ class Programs:
                 return FIELDS[array] * index[0] + (index[1] if len(index) > 1 else 0)
             return index[0] if len(index) == 1 else _flat(index, shapes[array][1:])
 
-        return Emitter(self.run.dtype.__name__, load, store, flat)
+        return Emitter(self.run.dtype.__name__, load, store, flat, staged)
 
     def _frame(self, stores: list[Store], shapes: dict, sent: int, warps: int, block: int,
                everything: list[Store] | None = None) -> Frame:
@@ -243,17 +249,40 @@ class Programs:
         out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
         dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
         over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
+        over = [name for name in over if _read_before(stores, name)]
         slots = len({_name(item.value) for item in stores})
         fields = [name for name in FIELDS if name in used]
         staged, ways = self.plan.staged, [(False, Result(DIRECT, out))]
+        staged = staged or any(row.name == "x" and row.entries > SHORT_ROW for row in rows)
         if dense and (staged or out.entries > SHORT_ROW):
             ways = [(staged, Result(STAGED, out)), (False, Result(STAGED, out)), *ways]
         if dense and staged:
             ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), *ways]
-        if out.entries > LONG_ROW:
+        if out.entries > LONG_ROW and not (dense and staged and over == ["x"]):
             ways = [(staged, Result(MAPPED, out, slots=slots)), (False, Result(MAPPED, out, slots=slots)), *ways]
         frames = [Frame(rows, staged, fields, result, sent, warps, block) for staged, result in ways]
         return next((frame for frame in frames if frame.fits(self.run.dtype)), frames[-1])
+
+
+def _title(key: tuple) -> str:
+    """What the program of a key is called."""
+    return written(key[-1]) if key[0] == "expression" else key[0]
+
+
+def _read_before(stores: list[Store], row: str) -> bool:
+    """Every entry of ``row`` that is read at all is read before the same entry of the result is written over it."""
+    symbols = [item.value for item in stores if not is_constant(item.value)]
+    if len({id(value.graph) for value in symbols}) > 1:
+        return True  # pieces write when all have read
+    read = {s.args[1]: s.number for s in ordered(symbols) if s.op == "input" and s.args[0] == row}
+    done = {item.index[0]: -1 if is_constant(item.value) else item.value.number for item in stores}
+    return all(number <= done.get(entry, number) for entry, number in read.items())
+
+
+def _called(key: tuple) -> str:
+    """What the user calls the operation of a program."""
+    without_qdd = {("q",): "gravity_force", ("q", "qd"): "bias_force", ("q", "qd", "body_f"): "bias_force"}
+    return without_qdd.get(key[1], key[0]) if key[0] == "inverse_dynamics" else key[0]
 
 
 def _slots(pieces: Pieces, letters: str) -> dict[tuple[str, int], int]:

@@ -369,6 +369,108 @@ class Dense:
         tau = np.zeros(self.dof_count) if tau is None else self._vector("tau", tau, self.dof_count)
         return np.linalg.solve(self.mass_matrix, tau - self.bias_force(qd, body_f))
 
+    def hybrid_dynamics(self, qd, tau, qdd, prescribed, body_f=None):
+        """(qdd, tau), each [dof], of which the dofs under the bool mask ``prescribed`` [dof] follow qdd, the others tau.
+
+        The rows of mass_matrix qdd + bias = tau that are not prescribed, solved for what is not known of qdd.
+        """
+        qdd, held = np.array(qdd, dtype=np.float64), np.asarray(prescribed)
+        free, M = ~held, self.mass_matrix
+        right = np.asarray(tau, dtype=np.float64) - self.bias_force(qd, body_f) - M[:, held] @ qdd[held]
+        qdd[free] = np.linalg.solve(M[np.ix_(free, free)], right[free])
+        return qdd, np.where(held, self.inverse_dynamics(qd, qdd, body_f), tau)
+
+    # -- operational space, momentum, the determinant ----------------------------------------------------------------
+    def operational_inertia(self, frames):
+        """(J mass_matrix^-1 J^T)^-1 [6 frames, 6 frames]; LinAlgError where that is singular to working precision."""
+        inverse = self.operational_inertia_inverse(frames)
+        scale = np.sqrt(np.diag(inverse))
+        if not scale.all() or np.linalg.cond(inverse / np.outer(scale, scale)) > 1e13:
+            raise np.linalg.LinAlgError("reference.Dense.operational_inertia: the frames cannot move in all directions")
+        return np.linalg.inv(inverse)
+
+    def jacobian_bias(self, qd, frames):
+        """J' qd for J of :meth:`jacobian` [frame, 6]: acceleration of each frame's origin and its angular acceleration
+        at qdd = 0, without gravity, world axes, [m/s^2, rad/s^2]."""
+        W, _, A, AL = self._motion(self._qd(qd), np.zeros(self.dof_count))
+        rows = []
+        for frame in frames:
+            body, pose = frame if isinstance(frame, (tuple, list)) else (frame, (0, 0, 0, 0, 0, 0, 1))
+            point = (self.body_matrix[body] @ homogeneous(np.asarray(pose, dtype=np.float64)))[:3, 3]
+            r = point - self.node_matrix[body][:3, 3]
+            acceleration = A[body] + np.cross(AL[body], r) + np.cross(W[body], np.cross(W[body], r))
+            rows.append(np.concatenate([acceleration, AL[body]]))
+        return np.array(rows)
+
+    @cached_property
+    def _moving(self):
+        """Mass of every body, 0 for one that no hinge lets move [body]."""
+        moves = np.zeros(self.body_count + 1, dtype=bool)  # the last is the inertial frame
+        for k in self.outward:
+            moves[k] = moves[self.parent[k]] or len(self.dofs[k]) > 0
+        return np.where(moves[:-1], self.value("body_mass"), 0.0)
+
+    @property
+    def center_of_mass(self):
+        """Centre of mass of all that moves, in the world [3], [m]."""
+        return self._moving @ self.com / self._moving.sum()
+
+    @property
+    def com_jacobian(self):
+        """Velocity of :attr:`center_of_mass` per unit qd, world axes [3, dof]."""
+        return self.centroidal_momentum_matrix[:3] / self._moving.sum()
+
+    @property
+    def centroidal_momentum_matrix(self):
+        """Linear momentum, then angular momentum about :attr:`center_of_mass`, per unit qd, world axes [6, dof]: the sum
+        over bodies of m v, and of I omega + (c(k) - c) x m v."""
+        total, c = np.zeros((6, self.dof_count)), self.center_of_mass
+        for k, R in enumerate(self.body_matrix[:, :3, :3]):
+            J = self._jacobian_at(k, self.com[k])
+            momentum = self.value("body_mass")[k] * J[:3]
+            total[:3] += momentum
+            total[3:] += R @ self.value("body_inertia")[k] @ R.T @ J[3:] + skew(self.com[k] - c) @ momentum
+        return total
+
+    def centroidal_momentum_bias(self, qd=None):
+        """Rate of the momentum of :attr:`centroidal_momentum_matrix` at qdd = 0 [6], [N, N m]: the sum over bodies of
+        m a, and of I alpha + omega x I omega + (c(k) - c) x m a."""
+        W, _, A, AL = self._motion(self._qd(qd), np.zeros(self.dof_count))
+        total, c = np.zeros(6), self.center_of_mass
+        for k, R in enumerate(self.body_matrix[:, :3, :3]):
+            r, inertia = self.com[k] - self.node_matrix[k][:3, 3], R @ self.value("body_inertia")[k] @ R.T
+            a = A[k] + np.cross(AL[k], r) + np.cross(W[k], np.cross(W[k], r))
+            force = self.value("body_mass")[k] * a
+            total[:3] += force
+            total[3:] += inertia @ AL[k] + np.cross(W[k], inertia @ W[k]) + np.cross(self.com[k] - c, force)
+        return total
+
+    def quasi_velocities(self, qd=None):
+        """u^T qd [dof] for mass_matrix = u u^T, u upper triangular where dofs nearer to the root come first."""
+        order = np.concatenate([self.dofs[k] for k in self.outward]).astype(int)
+        u = np.linalg.cholesky(self.mass_matrix[np.ix_(order, order)][::-1, ::-1])[::-1, ::-1]
+        nu = np.empty(self.dof_count)
+        nu[order] = u.T @ self._qd(qd)[order]
+        return nu
+
+    @cached_property
+    def log_det_gradient(self):
+        """Derivative of :attr:`log_det` along unit qd of each dof [dof], by central differences of order 8."""
+        h, gradient = 0.01, np.zeros(self.dof_count)
+        for i, unit in enumerate(np.eye(self.dof_count)):
+            for step, weight in ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280)):
+                ahead, behind = (
+                    Dense(self.scene, self.integrate(unit, sign * step * h), world=self.world).log_det
+                    for sign in (1, -1)
+                )
+                gradient[i] += weight * (ahead - behind) / h
+        return gradient
+
+    @property
+    def fixman_torque(self):
+        """Force of the potential log_det / 2 [dof]."""
+        return -0.5 * self.log_det_gradient
+
     # -- what belongs to a step --------------------------------------------------------------------------------------
     def passive_force(self, qd=None):
         """-damping qd - stiffness deviation [dof].

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from .algebra import Operator
 from .dynamics import Dynamics
 from .operations import Inputs, Operation
 from .spatial_operators import SpatialOperators
@@ -44,6 +45,12 @@ class Subject:
     def operators(self) -> SpatialOperators:
         """phi, psi and their kin."""
         return self.dyn.operators(self.array("q", 0))
+
+    @functools.cached_property
+    def mass(self) -> Operator:
+        """The mass matrix as an expression of them."""
+        o = self.operators
+        return o.H @ o.phi @ o.M @ o.phi.T @ o.H.T + o.Delta
 
 
 class Timing(NamedTuple):
@@ -97,7 +104,8 @@ class Trial:
         """Fill what an evaluation writes with NaN."""
         self.out.fill_(float("nan"))
         if self.operation.reveal:
-            self.subject.operators.E_psi.weights.fill_(float("nan"))
+            nowhere: Any = wp.full(self._inputs[0][0].shape, float("nan"), self.out.dtype, self.out.device)
+            self.subject.operators.update(nowhere)
 
     def error(self, index: int) -> float:
         """Largest relative error of a sample of worlds, after an evaluation at set ``index``; NaN if any world has one.

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from ..trace.emit import Store
-from ..trace.graph import Value
-from ..trace.spatial import Articulated, Vector
-from . import articulated, hybrid
+from ..trace.graph import Value, reciprocal, sqrt
+from ..trace.spatial import ZERO, Articulated, Rigid, Vector, cross, dot
+from . import articulated, composite, determinant, hybrid, motion, newton_euler
 from .hybrid import Given
+from .links import Link
 from .traced import Trace
 
 
@@ -68,3 +69,193 @@ class Applications(Trace):
             for dof, a, force in zip(link.dofs, forward, inverse, strict=True):
                 stores += [Store("out", (dof,), a), Store("tau_out", (dof,), force)]
         return stores
+
+    # -- kinematics ------------------------------------------------------------------------------------------------
+    def place_all(self, moves: bool = False) -> dict[int, Vector]:
+        """Place every link and find its axes; its origin in inertial axes, from the origin of the first root's link."""
+        origins: dict[int, Vector] = {}
+        for link in self.links.links:
+            self.place(link, moves)
+            self.at(link, "R")
+            key, pose = id(link), self.places[id(link)].pose
+            if link.parent is None:
+                self.axes[key] = pose.rotation
+                first = self.places[id(self.links.links[0])].pose.l
+                origins[key] = pose.l - first if origins else ZERO  # what is far away cancels once
+            else:
+                over = id(link.parent)
+                self.axes[key] = self.axes[over] @ pose.rotation
+                origins[key] = origins[over] + self.axes[over] @ pose.l
+        return origins
+
+    def bias_accelerations(self) -> dict[int, tuple[Vector, Vector]]:
+        """Accelerations of the links at qdd = 0 without gravity: phi* a."""
+        alpha: dict[int, tuple[Vector, Vector]] = {}
+        for link in self.links.links:
+            self.at(link, "a")
+            above = (ZERO, ZERO) if link.parent is None else alpha[id(link.parent)]
+            place, move = self.places[id(link)], self.motions[id(link)]
+            alpha[id(link)] = newton_euler.accelerated(link, place, move, above, lambda dof: 0.0)
+        return alpha
+
+    def jacobian_bias(self, frames: tuple) -> list[Store]:
+        """out [frame, 6] = J' qd: acceleration of each frame's origin, angular acceleration, inertial axes, qdd = 0."""
+        self.place_all(moves=True)
+        alpha = self.bias_accelerations()
+        stores = []
+        for index, (body, origin) in enumerate(frames):
+            link, arm = self.frame(body, origin)
+            values = (*ZERO, *ZERO)
+            if link is not None:
+                self.at(link, f"j{index}_")
+                (w, v), R = alpha[id(link)], self.axes[id(link)]
+                values = (*(R @ (v + cross(w, arm) + self.motions[id(link)].whirl @ arm)), *(R @ w))
+            stores += [Store("out", (index, c), value) for c, value in enumerate(values)]
+        return stores
+
+    # -- momentum --------------------------------------------------------------------------------------------------
+    def composites(self) -> dict[int, Rigid]:
+        """R(k) of every placed link: the rigid inertia of all that it carries, in its frame."""
+        found: dict[int, Rigid] = {}
+        for link in reversed(self.links.links):
+            self.at(link, "R")
+            body = link.inertia or composite.NOTHING
+            for child in link.children:
+                body = body + self.places[id(child)].pose.rigid_to_parent(found[id(child)])
+            found[id(link)] = body
+        return found
+
+    def center(self, bodies: dict[int, Rigid], origins: dict[int, Vector]) -> tuple[Value, Vector]:
+        """1 / mass, and the CoM of all that moves, inertial axes, from the origin of the first root's link."""
+        self.graph.step = "whole|c"
+        mass: Value = 0.0
+        moment = ZERO
+        for link in self.links.links:
+            if link.parent is None:
+                body = bodies[id(link)]
+                mass = mass + body.mass
+                moment = moment + self.axes[id(link)] @ body.moment + origins[id(link)] * body.mass
+        inverse = reciprocal(mass)
+        return inverse, moment * inverse
+
+    def momenta(self, link: Link, body: Rigid) -> list[tuple[Vector, Vector]]:
+        """(n; f) = R(k) H* of each dof of a link, inertial axes, about the link's origin."""
+        R, found = self.axes[id(link)], []
+        for H in articulated.columns(link, self.places[id(link)]):
+            n, f = body.apply(Vector(H[:3]), Vector(H[3:]))
+            found.append((R @ n, R @ f))
+        return found
+
+    def com_jacobian(self) -> list[Store]:
+        """out [3, dof] = linear momentum per unit qd over the mass"""
+        origins, bodies = self.place_all(), self.composites()
+        inverse, _ = self.center(bodies, origins)
+        stores = []
+        for link in self.links.links:
+            self.at(link, "j")
+            for dof, (_, f) in zip(link.dofs, self.momenta(link, bodies[id(link)]), strict=True):
+                stores += [Store("out", (c, dof), value * inverse) for c, value in enumerate(f)]
+        return stores
+
+    def centroidal_momentum_matrix(self) -> list[Store]:
+        """out [6, dof] = linear momentum, angular momentum about the CoM, inertial axes, per unit qd"""
+        origins, bodies = self.place_all(), self.composites()
+        _, c = self.center(bodies, origins)
+        stores = []
+        for link in self.links.links:
+            self.at(link, "h")
+            arm = origins[id(link)] - c
+            for dof, (n, f) in zip(link.dofs, self.momenta(link, bodies[id(link)]), strict=True):
+                stores += [Store("out", (i, dof), value) for i, value in enumerate((*f, *(n + cross(arm, f))))]
+        return stores
+
+    def centroidal_momentum_bias(self) -> list[Store]:
+        """out [6] = A' qd: the force and the moment about the CoM that the motion takes at qdd = 0, without gravity"""
+        origins = self.place_all(moves=True)
+        alpha, bodies = self.bias_accelerations(), self.composites()
+        _, c = self.center(bodies, origins)
+        forces: dict[int, Vector] = {}
+        n, f = ZERO, ZERO
+        for link in reversed(self.links.links):
+            self.at(link, "f")
+            key = id(link)
+            force = Vector((*ZERO, *ZERO))
+            if link.inertia is not None:
+                force = newton_euler.body_force(link.inertia, self.motions[key], *alpha[key])
+            for child in link.children:
+                n_c, f_c = Vector(forces[id(child)][:3]), Vector(forces[id(child)][3:])
+                n_c, f_c = self.places[id(child)].pose.force_to_parent(n_c, f_c)
+                force = force + Vector((*n_c, *f_c))
+            forces[key] = force
+            if link.parent is None:
+                f_r = self.axes[key] @ Vector(force[3:])
+                n, f = n + self.axes[key] @ Vector(force[:3]) + cross(origins[key] - c, f_r), f + f_r
+        return [Store("out", (i,), value) for i, value in enumerate((*f, *n))]
+
+    # -- the factors' other uses -----------------------------------------------------------------------------------
+    def factor_by_dofs(self) -> dict[int, articulated.Factor]:
+        """Factors of every link in the coordinates of qd: Mass = U D U*, U unit upper triangular, parents first."""
+        done: dict[int, articulated.Factor] = {}
+        for link, outward in self.traversal():
+            if outward:
+                self.place(link)
+                continue
+            self.at(link, "P")
+            carried = [done[id(child)].in_parent for child in link.children]
+            through = [(self.places[id(child)].pose, done[id(child)].P) for child in link.children]
+            free = [0.0] * len(link.dofs)
+            done[id(link)] = hybrid.factor(link, self.places[id(link)], free, carried, through, self.epsilon)
+        return done
+
+    def quasi_velocities(self) -> list[Store]:
+        """out = sqrt(D) [I + H phi K]* qd"""
+        qd, done = self.vector("qd"), self.factor_by_dofs()
+        velocity: dict[int, Vector] = {}
+        stores = []
+        for link in self.links.links:
+            self.at(link, "v")
+            key, V = id(link), Vector((*ZERO, *ZERO))
+            if link.parent is not None:
+                above = velocity[id(link.parent)]
+                w, v = self.places[key].pose.motion_to_child(Vector(above[:3]), Vector(above[3:]))
+                V = Vector((*w, *v))
+            for dof, pivot in zip(link.dofs, done[key].pivots[::-1], strict=True):
+                eta = qd(dof) + pivot.inverse * dot(pivot.U, V)
+                stores.append(Store("out", (dof,), sqrt(pivot.D) * eta))
+                V = V + pivot.column * qd(dof)
+            velocity[key] = V
+        return stores
+
+    def log_det_mass_matrix_gradient(self, scale: float = 1.0) -> list[Store]:
+        """out = d log det Mass / dq, dual to qd"""
+        done = self.factor()
+        carried: dict[int, Articulated] = {}
+        stores = []
+        for link in self.links.links:
+            self.at(link, "u")
+            key, factor = id(link), done[id(link)]
+            place = self.places[key]
+            S = articulated.NO_INERTIA
+            if link.parent is not None:
+                S = determinant.to_child(place.pose, carried[id(link.parent)])
+            carried[key] = determinant.upsilon(factor, S)
+            w, v = determinant.generators(S, factor.P)
+            if factor.whole:
+                w, v = ZERO, ZERO
+            elif len(link.dofs) > 1 and not factor.turned:  # turning the link turns H: move P under it instead
+                P = articulated.NO_INERTIA if link.inertia is None else link.inertia.articulated
+                for child in link.children:
+                    P = P + done[id(child)].in_parent
+                w, _ = determinant.generators(carried[key], P)
+            values = motion.in_hinge(link, place, w, v)
+            stores += [Store("out", (dof,), 2.0 * scale * x) for dof, x in zip(link.dofs, values, strict=True)]
+        return stores
+
+    def fixman_torque(self) -> list[Store]:
+        """out = -1/2 d log det Mass / dq"""
+        return self.log_det_mass_matrix_gradient(-0.5)
+
+    def mass_matrix_packed(self) -> list[Store]:
+        """out = the entries of Mass that the tree allows, lower triangle, row after row"""
+        entries = {item.index: item.value for item in self.mass_matrix() if item.index[0] >= item.index[1]}
+        return [Store("out", (i,), entries[index]) for i, index in enumerate(sorted(entries))]

@@ -10,12 +10,15 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ..trace.graph import Value, guarded, is_constant, reciprocal
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Rigid, Vector, cross, dot, magnitude, symmetric, total
 from .links import BALL, FREE, SLIDE, TURN, Link, Placed
 from .motion import NONE, Motion, carried, in_hinge, in_link
 
 LEAST = 4.0  # pivots of less than this many roundings of what cancels in them may be rounding alone
+SOLID = 1e-2  # share of what it carries, and of itself, that a body's inertia must reach to vouch for its pivots
 NO_INERTIA = Articulated(NONE, NONE, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 UNIT = {TURN: [2], SLIDE: [5], BALL: [0, 1, 2], FREE: [3, 4, 5, 0, 1, 2]}  # entry of (omega; v) that each dof moves
 
@@ -110,7 +113,8 @@ def cancelling(link: Link, P: Articulated, units: list[int], through: list[tuple
     its children hand on, which vanishes along their own hinges: there it is the sum of what is turned into its axes.
     """
     if link.inertia is not None:
-        return [0.0, *(P.entry(unit, unit) for unit in units[1:])]
+        solid = len(units) == 1 or _is_solid(link, units)
+        return [0.0, *(0.0 if solid else P.entry(unit, unit) for unit in units[1:])]
     sizes = []
     for unit in units:
         terms = []
@@ -120,6 +124,27 @@ def cancelling(link: Link, P: Articulated, units: list[int], through: list[tuple
             terms.append(magnitude((*w, *v), inner, (*w, *v)))
         sizes.append(total(terms))
     return sizes
+
+
+def _is_solid(link: Link, units: list[int]) -> bool:
+    """The link's own constant inertia bounds every pivot from below: it is not small, nor nearly singular."""
+    own, carried = link.inertia, [link]
+    if own is None or not all(map(is_constant, own.packed)):
+        return False
+    mass: Value = 0.0
+    while carried:
+        other = carried.pop()
+        carried.extend(other.children)
+        mass = mass + (0.0 if other.inertia is None else other.inertia.mass)
+    if not is_constant(mass) or own.mass < SOLID * mass:
+        return False
+    M = np.array([[own.articulated.entry(i, j) for j in units] for i in units], dtype=float)
+    diagonal = M.diagonal().copy()
+    for k in range(len(units)):
+        if not M[k, k] > SOLID * diagonal[k]:
+            return False
+        M -= np.outer(M[:, k], M[k]) / M[k, k]
+    return True
 
 
 def lost(D: Value) -> Value:

@@ -37,7 +37,7 @@ def factor(
     through: list[tuple[Pose, Articulated]],
     epsilon: float,
 ) -> Factor:
-    """As :func:`articulated.factor`, dof by dof in the coordinates of qd; a prescribed dof has a pivot with 1 / D = 0."""
+    """As :func:`articulated.factor`, dof by dof, in the coordinates of qd; a prescribed dof's pivot has 1 / D = 0."""
     P = NO_INERTIA if link.inertia is None else link.inertia.articulated
     for other in carried_on:
         P = P + other

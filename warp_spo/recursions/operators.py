@@ -68,6 +68,15 @@ def spaces(expression: Expression) -> tuple[str | None, str | None]:
     return found[0] if found else NONE
 
 
+def meet(expression: Expression) -> bool:
+    """No vector over nodes is taken for one over hinges, even where their sizes agree."""
+    try:
+        spaces(expression)
+    except ValueError:
+        return False
+    return True
+
+
 def written(expression: Expression) -> str:
     """The expression as one would write it."""
     if isinstance(expression, str):
@@ -429,7 +438,8 @@ class Operators:
     def hops(self, node: int) -> list[tuple[Link | None, Pose]]:
         """From the parent's node frame to the node's: over the hinge's links, then to the seat on the last, if apart."""
         if node not in self._hops:
-            chain, seat, found = self.chains[node], self.links.seats[node], []
+            chain, seat = self.chains[node], self.links.seats[node]
+            found: list[tuple[Link | None, Pose]] = []
             if chain:
                 self.graph.step = f"{chain[0].label}|x"
                 found.append((chain[0], placed(self.links.on_parent_node(chain[0]), self.q).pose))
@@ -443,7 +453,7 @@ class Operators:
         return self._hops[node]
 
     def _inner(self, node: int) -> list[tuple[Link | None, Pose, bool]]:
-        """The hops from the node in, without the step to the parent, which the first link marks; none if it is fixed."""
+        """The hops from the node in, and whether it is the last, to the parent; none where the hinge is fixed."""
         if not self.chains[node]:
             return []
         return [(link, pose, link is self.chains[node][0]) for link, pose in reversed(self.hops(node))]

@@ -60,6 +60,7 @@ class Emitter:
         dtype: "float32" or "float64".
         load, store: C++ for reading and writing an entry of an array, given the array's name and the entry's text.
         flat: entry of an array for the index of an input.
+        staged: what ``load`` gives may be written to on CUDA.
     """
 
     def __init__(
@@ -68,8 +69,10 @@ class Emitter:
         load: Callable[[str, str], str],
         store: Callable[[str, str, str], str],
         flat: Callable[[str, tuple], int],
+        staged: bool = False,
     ):
         self.dtype, self._load, self._store, self._flat = dtype, load, store, flat
+        self._staged = staged
         self.counts: Counter = Counter()
         self._names: dict[tuple, str] = {}
         self._count = 0
@@ -105,24 +108,29 @@ class Emitter:
         return Listing("\n".join(lines), self._constants, self._indices, self._labels)
 
     def _near(self, needed: list[Scalar]) -> list[str]:
-        """Read the coordinates whose sines will be taken, and take turns off those too far for the branch-free sine.
+        """Take turns off the coordinates whose sines will be taken, where they are too far for the branch-free sine.
 
-        That hardly ever happens, so it is one branch for all of them.
+        That hardly ever happens, so it is one branch for all of them. Rows in shared memory are changed where they are;
+        warps of a team may do it to one another's rows: twice changes nothing. Otherwise the angles are read first.
         """
         T = C_TYPE[self.dtype]
         sines = (scalar.args[0] for scalar in needed if scalar.op in ("sin", "cos"))
         angles = {scalar.key: scalar for scalar in sines if scalar.op == "input" and scalar.key not in self._names}
         if not angles:
             return []
-        lines = []
+        places, lines = [], []
         for scalar in angles.values():
-            entry = self._entry(scalar.args[0], scalar.args[1:])
-            lines.append(f"{T} {self._name(scalar, 'x')} = {self._load(scalar.args[0], entry)};")
-        names = [self._names[key] for key in angles]
+            place = self._load(scalar.args[0], self._entry(scalar.args[0], scalar.args[1:]))
+            if not self._staged:
+                name = self._name(scalar, "x")
+                lines.append(f"{T} {name} = {place};")
+                place = name
+            places.append(place)
         farthest = f"{PREFIX}farthest"
         lines += ["#if defined(__CUDA_ARCH__)", f"{T} {farthest} = 0;"]
-        lines += [f"{farthest} = max({farthest}, on::absolute({name}));" for name in names]
-        lines += [f"if ({farthest} > on::reach()) {{", *(f"    {name} = on::reduced({name});" for name in names), "}"]
+        lines += [f"{farthest} = max({farthest}, on::absolute({place}));" for place in places]
+        reduced = (f"    {place} = on::reduced({place});" for place in places)
+        lines += [f"if ({farthest} > on::reach()) {{", *reduced, "}"]
         return [*lines, "#endif"]
 
     @property
