@@ -48,8 +48,8 @@ class Result(NamedTuple):
 
 
 def pitch(entries: int) -> int:
-    """Distance of rows in shared memory: odd, so that the threads of a warp meet different banks."""
-    return entries | 1
+    """Distance of rows in shared memory, at which at most two threads of a warp meet in a bank."""
+    return entries | 1 if entries % 4 == 0 else entries
 
 
 class Frame(NamedTuple):
@@ -60,6 +60,7 @@ class Frame(NamedTuple):
             together; otherwise each thread reads its world's row, which is faster while few worlds or few entries wait.
         fields: arrays [item, component, world] to read: ``name_at[entry * name_part]``.
         result: how ``result_row[i]`` leaves.
+        again: the statements run once more, with ``again`` set, if they left ``farthest`` beyond reach.
         sent: values that warps send each other, ``SENT(i)``.
         warps: how many work on 32 worlds.
         block: threads of a block.
@@ -74,6 +75,7 @@ class Frame(NamedTuple):
     warps: int
     block: int
     more: tuple[Row, ...] = ()
+    again: bool = False
 
     @property
     def groups(self) -> int:
@@ -130,6 +132,8 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
         text += [f"{c}* result_row = stage + {start} + lane * {width};"]
     if frame.sent:
         text += [f"{c}* sent = stage + {at} + lane;", "#define SENT(i) sent[(i) * 32]"]
+    if frame.again:
+        cuda = f"for (int again = 0;; ++again) {{\n{cuda}\nif (again || !(farthest > on::reach())) break;\n}}"
     text += [*_fields(frame.fields, c), cuda]
     if result.way in (IN_PLACE, STAGED):
         text += [sync, _stage_out(out, start, width, c, team)]

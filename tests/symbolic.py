@@ -1,4 +1,4 @@
-"""Traces evaluated by NumPy: what an operation's kernel computes, in every scene, without compiling it; and their bugs."""
+"""Traces evaluated by NumPy: what an operation's kernel computes, without compiling it; and bugs planted in them."""
 
 import inspect
 import textwrap

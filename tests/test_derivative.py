@@ -107,6 +107,7 @@ RULES = {
     "absolute": lambda x, y: g.absolute(x * y),
     "guarded": lambda x, y: g.guarded(x * x + 2.0, y * y) * y,
     "lost": lambda x, y: x.graph.make("lost", x) + x * y,
+    "select": lambda x, y: g.select(x, x * y, y) + g.select(x.graph.make("lost", x), x, y * y),
     "sum_of_logarithms": lambda x, y: g.sum_of_logarithms([x * x, x * x + y * y]),
 }
 

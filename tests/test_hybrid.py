@@ -28,8 +28,10 @@ def states(scene, dtype="float64"):
 
 
 def wanted(scene, a, mask):
-    dense = [reference.Dense(scene, a["q"][w], world=w) for w in range(WORLDS)]
-    rows = [d.hybrid_dynamics(a["qd"][w], a["tau"][w], a["qdd"][w], mask[w], a["body_f"][w]) for w, d in enumerate(dense)]
+    rows = []
+    for w in range(WORLDS):
+        dense = reference.Dense(scene, a["q"][w], world=w)
+        rows.append(dense.hybrid_dynamics(a["qd"][w], a["tau"][w], a["qdd"][w], mask[w], a["body_f"][w]))
     return [np.array(part) for part in zip(*rows, strict=True)]
 
 

@@ -169,8 +169,8 @@ BUGS = {
     "jacobian_bias": (Applications, "jacobian_bias", "+ self.motions[id(link)].whirl @ arm", ""),
     "com_jacobian": (Applications, "center", "mass = mass + body.mass", "mass = body.mass"),
     "centroidal_momentum_matrix": (Applications, "center", " + origins[id(link)] * body.mass", ""),
-    "centroidal_momentum_bias": (newton_euler, "body_force", " + cross(motion.spin, inertia.inertia @ motion.spin)", ""),
-    "quasi_velocities": (Applications, "quasi_velocities", "V = V + pivot.column * qd(dof)", "V = pivot.column * qd(dof)"),
+    "centroidal_momentum_bias": (newton_euler, "body_force", "cross(motion.spin, inertia", "-cross(motion.spin, inertia"),
+    "quasi_velocities": (Applications, "quasi_velocities", "V = V + pivot", "V = pivot"),
     "log_det_mass_matrix_gradient": (determinant, "upsilon", "dot(g, y) + pivot.inverse", "dot(g, y)"),
     "mass_matrix_packed": (Applications, "mass_matrix_packed", ">= item.index[1]", "<= item.index[1]"),
 }

@@ -226,7 +226,7 @@ def traced(scene, operator, x, q):
 def test_traces_equal_the_reference(name, device):
     """Every letter and its kin, and every transpose, in scenes with every kind of hinge."""
     scene = scene_of(name)
-    dyn, ops, q = fused(scene, 2, device)
+    _, ops, q = fused(scene, 2, device)
     dense = [reference.Dense(scene, q[world], world=world) for world in range(2)]
     for expression, (build, wanted) in EXPRESSIONS.items():
         for operator, turn in ((build(ops), lambda m: m), (build(ops).T, np.transpose)):
@@ -285,7 +285,7 @@ def test_an_expression_is_one_launch_and_allocates_nothing(device, monkeypatch):
 def test_long_rows_go_through_shared_memory(expression, device, monkeypatch):
     """The text for CUDA, whose result may be written over x."""
     texts = warp_machine.recorded(monkeypatch)
-    dyn, ops, q = fused("tree20", 3, "cpu")
+    _, ops, q = fused("tree20", 3, "cpu")
     for operator in (EXPRESSIONS[expression][0](ops), EXPRESSIONS[expression][0](ops).T):
         x = np.random.default_rng(5).normal(size=(3, operator.shape[1]))
         wanted = operator @ x
@@ -306,7 +306,7 @@ def test_no_result_is_written_over_what_is_still_to_be_read():
 def test_blocks_are_filled_on_request_and_follow_updates(device):
     """Columns, dense matrices, single blocks, weights and frames, before and after an update."""
     scene = scene_of("tree20")
-    dyn, ops, first = fused("tree20", 3, device)
+    _, ops, first = fused("tree20", 3, device)
     x = np.random.default_rng(6).normal(size=(3, ops.phi.shape[0], 2))
     for seed in (0, 1):
         q = first if seed == 0 else laws.states(scene, 3, seed)["q"]
@@ -345,7 +345,7 @@ def test_what_bears_no_letter_goes_by_the_blocks(device):
 
 def test_nodes_are_not_taken_for_hinges(device):
     """A single free body has six of both, in another order."""
-    dyn, ops, q = fused(zoo.SCENES["one_free"](), 3, device)
+    _, ops, _ = fused(zoo.SCENES["one_free"](), 3, device)
     x = np.random.default_rng(8).normal(size=(3, 6))
     got, H = (ops.H @ ops.H) @ x, ops.H.dense()
     close(got, np.einsum("wij,wjk,wk->wi", H, H, x), 1e-12)

@@ -46,7 +46,7 @@ class Letters(abc.ABC):
 
     @abc.abstractmethod
     def run(self, expression: Any, x: wp.array, out: wp.array) -> bool:
-        """Launch ``out = expression x`` [world, row] as one kernel, or return False; see :attr:`Operator.expression`."""
+        """Launch ``out = expression x`` [world, row] as one kernel, or return False; see Operator.expression."""
 
 
 class Operator(abc.ABC):

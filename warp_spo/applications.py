@@ -151,8 +151,9 @@ class Applications:
     def centroidal_momentum_matrix(self, q: Any, out: Any = None) -> Any:
         """Momentum per unit qd: linear [kg m/s], then angular about the centre of mass [kg m^2/s], inertial axes.
 
-        The order is that of :meth:`jacobian`: linear first. The centre of mass is that of :meth:`com_jacobian`; armature
-        is not in it. Column: R(k) H*, R(k) the composite inertia, seen from the centre of mass. Orin, Goswami, Lee 2013.
+        The order is that of :meth:`jacobian`: linear first. The centre of mass is that of :meth:`com_jacobian`;
+        armature is not in it. A column is R(k) H*, R(k) the composite inertia, seen from the centre of mass. Orin,
+        Goswami, Lee 2013.
 
         Returns:
             A [world, 6, dof]

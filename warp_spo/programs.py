@@ -22,7 +22,7 @@ from .recursions.operators import meet, written
 from .recursions.pieces import Piece, Pieces
 from .recursions.traced import SENT, Trace
 from .teams import Team
-from .trace.emit import Emitter, Store, literals
+from .trace.emit import Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
 FIELDS = {"rigid": 10, "tree": 12, "anchor": 12, "com": 3, "joint_armature": 1, "gravity": 1}
@@ -162,12 +162,14 @@ class Programs:
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         frame = self._frame([item for item in stores if item.array == "out"], shapes, 0, 1, self.block, stores)
+        frame = frame._replace(again=not frame.staged and frame.result.way == DIRECT)
         frame = frame._replace(more=tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more))
         placed, table = _placed([item for item in stores if item.array == "out"], frame.result)
         placed += apart
-        emitter = self._emitter(shapes, frame.result, frame.staged)
+        emitter = self._emitter(shapes, frame)
         listing = emitter.region(placed)
         body = literals(listing, self.run.dtype.__name__)
+        frame = frame._replace(again=frame.again and "farthest" in listing.text)
         tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
         return self._finished(operation, frame, body, body, tables, emitter.operations)
 
@@ -191,7 +193,7 @@ class Programs:
         everything, table = _placed([item for items in outs for item in items], frame.result)
         outs[0] += everything[sum(map(len, outs)) :] if table is None else []  # zeros
         for piece, stores, items in zip(pieces.pieces, traced, outs, strict=True):
-            emitter = self._emitter(shapes, frame.result, frame.staged)
+            emitter = self._emitter(shapes, frame)
             placed = [item for item in stores if item.array == "sent"]
             placed += items if table is None else _by_slot(items, table)
             last = "a" in SEGMENTED[operation]  # results come on the way out
@@ -217,7 +219,9 @@ class Programs:
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers)
         return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations)
 
-    def _emitter(self, shapes: dict, result: Result, staged: bool) -> Emitter:
+    def _emitter(self, shapes: dict, frame: Frame) -> Emitter:
+        result = frame.result
+        angles = Angles.IN_PLACE if frame.staged else Angles.AGAIN if frame.again else Angles.FIRST
         guard = "if (mine) " if result.way == DIRECT else ""
 
         def load(array: str, entry: str) -> str:
@@ -239,7 +243,7 @@ class Programs:
                 return FIELDS[array] * index[0] + (index[1] if len(index) > 1 else 0)
             return index[0] if len(index) == 1 else _flat(index, shapes[array][1:])
 
-        return Emitter(self.run.dtype.__name__, load, store, flat, staged)
+        return Emitter(self.run.dtype.__name__, load, store, flat, angles)
 
     def _frame(self, stores: list[Store], shapes: dict, sent: int, warps: int, block: int,
                everything: list[Store] | None = None) -> Frame:

@@ -370,7 +370,7 @@ class Dense:
         return np.linalg.solve(self.mass_matrix, tau - self.bias_force(qd, body_f))
 
     def hybrid_dynamics(self, qd, tau, qdd, prescribed, body_f=None):
-        """(qdd, tau), each [dof], of which the dofs under the bool mask ``prescribed`` [dof] follow qdd, the others tau.
+        """(qdd, tau), each [dof]: dofs under the bool mask ``prescribed`` [dof] follow qdd, the others tau.
 
         The rows of mass_matrix qdd + bias = tau that are not prescribed, solved for what is not known of qdd.
         """
@@ -422,7 +422,7 @@ class Dense:
 
     @property
     def centroidal_momentum_matrix(self):
-        """Linear momentum, then angular momentum about :attr:`center_of_mass`, per unit qd, world axes [6, dof]: the sum
+        """Linear momentum, then angular momentum about :attr:`center_of_mass`, per unit qd, world axes [6, dof]: sums
         over bodies of m v, and of I omega + (c(k) - c) x m v."""
         total, c = np.zeros((6, self.dof_count)), self.center_of_mass
         for k, R in enumerate(self.body_matrix[:, :3, :3]):

@@ -1,8 +1,8 @@
 """Hybrid dynamics: dofs that follow a given qdd are not eliminated, P+ = P and z+ = z + P H* qdd; the others are.
 
-Going out, T = H f + Delta qdd is the force that a prescribed dof needs, f = P alpha + z being what its hinge transmits.
-Featherstone, Rigid Body Dynamics Algorithms, 9.2; Jain 2011, ch. 9. A mask says which dofs are prescribed: the constants
-0 and 1 fold into the code; a symbol selects between both, whatever the one not wanted is.
+Going out, T = H f + Delta qdd is the force that a prescribed dof needs, f = P alpha + z being what its hinge
+transmits. Featherstone, Rigid Body Dynamics Algorithms, 9.2; Jain 2011, ch. 9. A mask says which dofs are prescribed:
+the constants 0 and 1 fold into the code; a symbol selects between both, whatever the one not wanted is.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ B, ...)``, ``("product", A, B, ...)``, ``("identity",)``.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -60,7 +61,7 @@ def spaces(expression: Expression) -> tuple[str | None, str | None]:
         return columns, rows
     found = [pair for pair in map(spaces, operands) if pair != NONE]
     if form == "product":
-        if any(left[1] != right[0] for left, right in zip(found, found[1:], strict=False)):
+        if any(left[1] != right[0] for left, right in itertools.pairwise(found)):
             raise ValueError(f"{written(expression)}: nodes meet hinges")
         return (found[0][0], found[-1][1]) if found else NONE
     if len(set(found)) > 1 or (len(found) < len(operands) and found and found[0][0] != found[0][1]):
@@ -436,7 +437,7 @@ class Operators:
         return self._places[id(link)]
 
     def hops(self, node: int) -> list[tuple[Link | None, Pose]]:
-        """From the parent's node frame to the node's: over the hinge's links, then to the seat on the last, if apart."""
+        """From the parent's node frame to the node's: over the hinge's links, then to the seat on the last if apart."""
         if node not in self._hops:
             chain, seat = self.chains[node], self.links.seats[node]
             found: list[tuple[Link | None, Pose]] = []

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from .graph import Scalar, Value, cos, is_constant, ordered, reciprocal, sin
+from .graph import Scalar, Value, cos, is_constant, ordered, reciprocal, select, sin
 
 UNIT = ("add", "reduced", "guarded")  # of each argument, a guard's limit excepted
 FLAT = ("input", "lost")  # a lost pivot is 0 or NaN, wherever it is
@@ -84,6 +84,8 @@ def partial(scalar: Scalar, at: int) -> Value:
         return -(scalar * scalar)
     if op == "absolute":
         return args[0] * reciprocal(scalar)
+    if op == "select":
+        return select(args[0], 1.0, 0.0) if at == 1 else select(args[0], 0.0, 1.0) if at == 2 else 0.0
     if op == "sum_of_logarithms":
         return reciprocal(args[at])
     raise AssertionError(f"no derivative of {op!r}: add its rule here")

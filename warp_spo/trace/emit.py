@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -49,6 +50,12 @@ class Listing(NamedTuple):
     labels: list[str]
 
 
+class Angles(enum.Enum):
+    """Where turns are taken off: in the rows, in shared memory; before the work; or, if need be, in a second try."""
+
+    IN_PLACE, FIRST, AGAIN = range(3)
+
+
 CONSTANT, INDEX, LABEL, PREFIX = "\x01", "\x02", "\x03", "\x05"
 OPEN = re.compile("([\x01\x02\x03])(\\d+)\x04")
 
@@ -60,7 +67,7 @@ class Emitter:
         dtype: "float32" or "float64".
         load, store: C++ for reading and writing an entry of an array, given the array's name and the entry's text.
         flat: entry of an array for the index of an input.
-        staged: what ``load`` gives may be written to on CUDA.
+        angles: what is done about angles that are too far for the branch-free sine, on CUDA.
     """
 
     def __init__(
@@ -69,10 +76,10 @@ class Emitter:
         load: Callable[[str, str], str],
         store: Callable[[str, str, str], str],
         flat: Callable[[str, tuple], int],
-        staged: bool = False,
+        angles: Angles = Angles.FIRST,
     ):
         self.dtype, self._load, self._store, self._flat = dtype, load, store, flat
-        self._staged = staged
+        self._angles = angles
         self.counts: Counter = Counter()
         self._names: dict[tuple, str] = {}
         self._count = 0
@@ -110,8 +117,9 @@ class Emitter:
     def _near(self, needed: list[Scalar]) -> list[str]:
         """Take turns off the coordinates whose sines will be taken, where they are too far for the branch-free sine.
 
-        That hardly ever happens, so it is one branch for all of them. Rows in shared memory are changed where they are;
-        warps of a team may do it to one another's rows: twice changes nothing. Otherwise the angles are read first.
+        That hardly ever happens. Rows in shared memory are changed where they are; warps of a team may do it to one
+        another's rows: twice changes nothing. Otherwise the angles are read first; a thread that works by itself then
+        goes on with them as they are, and starts ``again`` if one was too far.
         """
         T = C_TYPE[self.dtype]
         sines = (scalar.args[0] for scalar in needed if scalar.op in ("sin", "cos"))
@@ -121,17 +129,20 @@ class Emitter:
         places, lines = [], []
         for scalar in angles.values():
             place = self._load(scalar.args[0], self._entry(scalar.args[0], scalar.args[1:]))
-            if not self._staged:
+            if self._angles is not Angles.IN_PLACE:
                 name = self._name(scalar, "x")
                 lines.append(f"{T} {name} = {place};")
                 place = name
             places.append(place)
-        farthest = f"{PREFIX}farthest"
-        lines += ["#if defined(__CUDA_ARCH__)", f"{T} {farthest} = 0;"]
-        lines += [f"{farthest} = max({farthest}, on::absolute({place}));" for place in places]
-        reduced = (f"    {place} = on::reduced({place});" for place in places)
-        lines += [f"if ({farthest} > on::reach()) {{", *reduced, "}"]
-        return [*lines, "#endif"]
+        reduced = [*(f"    {place} = on::reduced({place});" for place in places), "}"]
+        farthest = "farthest" if self._angles is Angles.AGAIN else f"{PREFIX}farthest"
+        largest = [f"{T} {farthest} = 0;"]
+        largest += [f"{farthest} = max({farthest}, on::absolute({place}));" for place in places]
+        if self._angles is Angles.AGAIN:
+            guard = [*largest, "if (again) {", *reduced]
+        else:
+            guard = [*largest, f"if ({farthest} > on::reach()) {{", *reduced]
+        return [*lines, "#if defined(__CUDA_ARCH__)", *guard, "#endif"]
 
     @property
     def operations(self) -> int:
