@@ -86,7 +86,7 @@ class Frame(NamedTuple):
     def scalars(self) -> int:
         """Scalars of shared memory that a group takes."""
         rows = sum(pitch(row.entries) for row in self.rows) if self.staged else 0
-        extra = {STAGED: self.result.array.entries, MAPPED: self.result.slots}.get(self.result.way)
+        extra = {STAGED: self.result.array.entries, MAPPED: self.result.slots | 1}.get(self.result.way)
         return WARP * (rows + (0 if extra is None else pitch(extra)) + self.sent)
 
     def fits(self, T) -> bool:
@@ -124,7 +124,7 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     if result.way == IN_PLACE:
         start, width = offset[result.row], pitch(next(row.entries for row in frame.rows if row.name == result.row))
     else:
-        width = pitch(result.slots if result.way == MAPPED else out.entries)
+        width = pitch(result.slots | 1 if result.way == MAPPED else out.entries)
         start, at = at, at + (0 if result.way == DIRECT else WARP * width)
     if result.way == DIRECT:
         text += [f"{c}* result_row = out.data + world * {out.entries};"]
@@ -207,7 +207,7 @@ def _stage_out(out: Row, offset: int, width: int, c: str, team: int) -> str:
 
 
 def _spread_out(result: Result, offset: int, c: str, team: int) -> str:
-    n, width = result.array.entries, pitch(result.slots)
+    n, width = result.array.entries, result.slots | 1  # odd: its threads meet in no bank
     turns = min(8, -(-n // team))  # entries of the table that a thread fetches at once
     return f"""for (int start = member; start < {n}; start += {turns * team}) {{
     int slot[{turns}];

@@ -6,11 +6,24 @@ import numpy as np
 import pytest
 import warp as wp
 
+from warp_spo import plan
+
 wp.config.log_level = wp.LOG_WARNING
 
 
 def pytest_addoption(parser):
     parser.addoption("--device", default="cpu", help="Warp device that the kernels run on")
+    parser.addoption(
+        "--granularity",
+        default="node",
+        choices=["node", "segment", "tree", "plan"],
+        help="of tests that do not say; node needs no compilation for a scene, plan is what users get",
+    )
+
+
+def pytest_configure(config):
+    asked = config.getoption("--granularity")
+    plan.DEFAULT = None if asked == "plan" else asked
 
 
 @pytest.fixture(scope="session")

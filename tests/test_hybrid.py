@@ -18,7 +18,7 @@ TOLERANCE = {
     "float32": 3e-5,
 }
 GIVEN = ("q", "qd", "tau", "qdd", "body_f")
-LARGE = ("tree20", "trees25", "screw_tree", "every_d6")  # seconds
+LARGE = ("tree20", "trees25", "screw_tree", "every_d6", "floating_tree", "star")  # seconds
 
 
 def states(scene, dtype="float64"):

@@ -3,12 +3,16 @@
 import laws
 import numpy as np
 import pytest
+import symbolic
+import warp_machine
 import zoo
 from laws import TOLERANCE
 from mutants import mutant
 
 import warp_spo as spo
-from warp_spo import blocks, levels
+from warp_spo import blocks, levels, programs, teams
+from warp_spo.recursions import articulated, links, newton_euler, pieces, traced
+from warp_spo.trace import graph, spatial
 
 WORLDS = 3
 
@@ -116,3 +120,81 @@ def test_a_missing_child_of_the_operators(plant, device):
     )
     with pytest.raises(AssertionError):
         laws.sweep_is_the_dense_resolvent(resolvent(device), WORLDS, 1e-13)
+
+
+# -- the traced path ---------------------------------------------------------------------------------------------------
+def traced_error(operation, given, name="screw_tree", scale=1.0):
+    """Of an operation's trace, evaluated by NumPy, against the dense reference."""
+    scene = zoo.SCENES[name]()
+    arrays = laws.states(scene, WORLDS)
+    zero = {key: value if key in ("q", *given) else np.zeros_like(value) for key, value in arrays.items()}
+    zero["b"] = zero["b"][:, :, 0]
+    wanted = np.array([np.asarray(laws.OPERATIONS[operation][1](spo.reference.Dense(scene, zero["q"][w]), {
+        key: value[w] for key, value in zero.items()})) for w in range(WORLDS)])  # fmt: skip
+    got = symbolic.run(scene, operation, zero, ("q", *given), {"out": wanted.shape[1:]})["out"]
+    return laws.error(np.nan_to_num(got, nan=0.0 if operation == "mass_matrix" else np.nan), wanted)
+
+
+MUTANTS = {
+    "gyroscopic moment": (newton_euler, "body_force", "+ cross(motion.spin", "- cross(motion.spin",
+                          "inverse_dynamics", ("qd", "qdd")),
+    "gyroscopic moment of qdd": (articulated, "gyroscopic", "*cross(motion.spin, inertia.inertia @ motion.spin)",
+                                 "*(-cross(motion.spin, inertia.inertia @ motion.spin))", "forward_dynamics", ("qd",)),
+    "mirror of P": (spatial.Articulated, "entry", "self.C[j][i - 3]", "self.C[i - 3][j]", "forward_dynamics", ("tau",)),
+    "mirror of the output": (traced, "_mirrored", "((j, i), value)", "((j, i), -value)", "mass_matrix", ()),
+    "mirror of a symmetric matrix": (links, "symmetric", "[xz, yz, zz]", "[yz, xz, zz]", "inverse_dynamics", ("qd",)),
+    "turn the wrong way": (spatial.Pose, "to_child", "c * v[1] - s * v[0]", "c * v[1] + s * v[0]",
+                           "inverse_dynamics", ("qdd",)),
+    "a sign lost in folding": (graph, "multiply", "!= (y.op", "and (y.op", "inverse_dynamics", ("qd", "qdd")),
+    "a pivot out of order": (articulated, "reduced", "given[::-1]", "given", "forward_dynamics", ("tau",)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("bug", MUTANTS)
+def test_a_wrong_step(bug, monkeypatch):
+    owner, name, old, new, operation, given = MUTANTS[bug]
+    scene = "tree10"  # hinges of every kind
+    assert traced_error(operation, given, scene) <= TOLERANCE["float64"]
+    symbolic.plant(monkeypatch, owner, name, old, new)
+    assert not traced_error(operation, given, scene) <= TOLERANCE["float64"]
+
+
+def team_error(monkeypatch, operation="forward_dynamics", name="star"):
+    """Of the CUDA text of a scene's warps, against the dense reference; raises Race."""
+    texts = warp_machine.recorded(monkeypatch)
+    scene = zoo.SCENES[name]()
+    dyn = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="segment")
+    arrays = laws.states(scene, WORLDS)
+    given = ("q", "qd", "tau") if operation == "forward_dynamics" else ("q", "qd", "qdd")
+    rate = (WORLDS, scene.dof_count)
+    dyn.programs.find(operation, {name: arrays[name].shape for name in given}, rate)
+    arrays["body_f"][:] = 0.0
+    wanted = np.array([laws.expected(dyn, operation, arrays, w) for w in range(WORLDS)])
+    return laws.error(warp_machine.run(texts[-1], arrays), wanted)
+
+
+TEAM_MUTANTS = {
+    "a slot too near": (programs, "_slots", "at += SENT[letter]", "at += SENT[letter] - 1"),
+    "no barrier before the trunk": (pieces.Pieces, "__init__", "child.inward + (child is not heir)", "child.inward"),
+    "no barrier after the trunk": (pieces.Pieces, "__init__",
+                                   "piece.parent.outward + (piece.warp != piece.parent.warp)", "piece.parent.outward"),
+    "another limb's entries": (teams.Team, "_shared", "zip(*shifts.columns, strict=True)",
+                               "[*zip(*shifts.columns, strict=True)][::-1]"),
+    "another limb's constants": (teams.Team, "_shared", "zip(*constants.columns, strict=True)",
+                                 "[*zip(*constants.columns, strict=True)][::-1]"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("bug", TEAM_MUTANTS)
+def test_a_wrong_team(bug, monkeypatch):
+    """What warps send each other, when, and which numbers each of them takes."""
+    for name in ("star", "fork"):
+        assert team_error(monkeypatch, name=name) <= TOLERANCE["float64"]
+    symbolic.plant(monkeypatch, *TEAM_MUTANTS[bug])
+    seen = []
+    for name in ("star", "fork"):
+        try:
+            seen.append(not team_error(monkeypatch, name=name) <= TOLERANCE["float64"])
+        except warp_machine.Race:
+            seen.append(True)
+    assert any(seen)

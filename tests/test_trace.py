@@ -275,6 +275,15 @@ def test_sine_and_cosine(dtype, coordinate, device):
     assert np.isnan(lost).all()
 
 
+@pytest.mark.parametrize("c, old, new", [("float", "(quadrant + 1) & 2", "quadrant & 2"),
+                                         ("float", "-3.13916473e-7f", "-3.13916e-7f")])
+def test_a_wrong_sine_is_seen(c, old, new, device, monkeypatch):
+    assert straight.NATIVE[c].count(old) == 1
+    monkeypatch.setitem(straight.NATIVE, c, straight.NATIVE[c].replace(old, new))
+    with pytest.raises(AssertionError):
+        test_sine_and_cosine("float32", True, device)
+
+
 @pytest.mark.parametrize("dtype", TYPES)
 def test_turns_taken_off(dtype, device):
     """|x - reduced| is a number of full turns, and what is left is at most half of one."""

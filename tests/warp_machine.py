@@ -117,7 +117,8 @@ def _sincos(x):
 
 FUNCTIONS = {
     "where": np.where, "nan": np.nan, "infinity": np.inf, "reciprocal": lambda x: 1.0 / x, "sqrt": np.sqrt,
-    "absolute": np.abs, "reduced": lambda x: x, "log": np.log, "sincos": _sincos, "sincos_any": _sincos, "mine": True, "again": False,
+    "absolute": np.abs, "reduced": lambda x: x, "log": np.log, "sincos": _sincos, "sincos_any": _sincos, "mine": True,
+    "again": False,
 }  # fmt: skip
 
 

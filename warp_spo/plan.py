@@ -9,17 +9,18 @@ from .recursions.pieces import Pieces
 from .scene import Scene
 
 GRANULARITIES = ("node", "segment", "tree")
+DEFAULT: str | None = None  # granularity of who asks for none; None: chosen by the rules below
 COLUMN_BYTES = 1 << 28  # workspace of a solve with many right-hand sides; more columns go in turns
 
 # Measured on an H200, 2026-11-21; see CONTRIBUTING.
 FEW_WORLDS = 32768  # so many leave a GPU waiting: a warp for each limb, and rows read where they are
 MOST_DOFS = 128  # straight-line code of more takes too long to compile
-FEW_ON_CPU = 256  # worlds that a CPU is done with before a kernel for the scene is compiled
 SPILLS = {"float32": 32, "float64": 15}  # dofs at which one thread no longer holds a whole tree in registers
 SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as through shared memory,
 LONG_ROWS = 24  # in segments; longer rows come in together already at fewer worlds
 MOST_WARPS = 16
 SHORT = ("inverse_dynamics",)  # little code: a thread for the whole tree does not spill
+LONG_RESULTS = ("mass_matrix",)  # writing them is most of the work, and goes faster by many warps
 
 TREE_ONLY = (
     "hybrid_dynamics",
@@ -48,6 +49,7 @@ class Plan:
         outward: (first, count) into the nodes ordered by level, roots first.
         worlds: number of worlds.
         dtype: "float32" or "float64".
+        limbs: serial chains that end in a leaf; counted where it matters.
     """
 
     granularity: str
@@ -57,6 +59,7 @@ class Plan:
     outward: tuple[tuple[int, int], ...]
     worlds: int
     dtype: str
+    limbs: int = 1
 
     @property
     def inward(self) -> tuple[tuple[int, int], ...]:
@@ -67,7 +70,11 @@ class Plan:
         """Granularity of one operation."""
         if operation in TREE_ONLY:
             return "tree"
-        if self.granularity == "segment" and not self.forced and operation in SHORT:
+        if self.forced or self.granularity == "node" or self.limbs == 1 or self.limbs > MOST_WARPS:
+            return self.granularity
+        if operation in LONG_RESULTS:
+            return "segment"
+        if self.granularity == "segment" and operation in SHORT:
             return "segment" if self.worlds <= FEW_WORLDS or self.dtype == "float64" else "tree"
         return self.granularity
 
@@ -89,27 +96,26 @@ def choose(
     if granularity is not None and granularity not in GRANULARITIES:
         names = ", ".join(GRANULARITIES)
         raise ValueError(f"Dynamics: granularity is {granularity!r}; expected None or one of {names}")
-    chosen, reason = (granularity, "asked for") if granularity else _chosen(scene, worlds, cuda, dtype, varies)
+    asked = granularity or DEFAULT
+    side_by_side = cuda and not asked and 0 < scene.dof_count <= MOST_DOFS
+    limbs = Pieces(Links(scene)).warps if side_by_side else 1
+    chosen, reason = (asked, "asked for") if asked else _chosen(scene.dof_count, limbs, worlds, cuda, dtype, varies)
     rows = SHORT_ROWS if chosen == "tree" else LONG_ROWS
     staged = scene.dof_count > rows and worlds > (FEW_WORLDS if scene.dof_count <= LONG_ROWS else FEW_WORLDS // 16)
     outward, first = [], 0
     for level in scene.tree.levels:
         outward.append((first, len(level)))
         first += len(level)
-    return Plan(chosen, reason, granularity is not None, staged, tuple(outward), worlds, dtype)
+    return Plan(chosen, reason, asked is not None, staged, tuple(outward), worlds, dtype, limbs)
 
 
-def _chosen(scene: Scene, worlds: int, cuda: bool, dtype: str, varies: bool) -> tuple[str, str]:
-    dofs = scene.dof_count
+def _chosen(dofs: int, limbs: int, worlds: int, cuda: bool, dtype: str, varies: bool) -> tuple[str, str]:
     if dofs == 0:
         return "node", "nothing moves"
     if dofs > MOST_DOFS:
         return "node", f"more than {MOST_DOFS} dof take long to compile as straight-line code"
     if not cuda:
-        if worlds < FEW_ON_CPU:
-            return "node", f"fewer than {FEW_ON_CPU} worlds on a CPU are done before a kernel is compiled for the scene"
         return "tree", "one thread works through a world"
-    limbs = Pieces(Links(scene)).warps
     if limbs == 1:
         return "tree", "the scene is one chain"
     if limbs > MOST_WARPS:

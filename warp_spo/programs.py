@@ -123,7 +123,7 @@ class Programs:
     @property
     def operation_counts(self) -> dict[str, int]:
         """Floating-point operations of one world, by operation."""
-        return {_title(key): program.operations for key, program in self._programs.items() if program is not None}
+        return {_called(key): program.operations for key, program in self._programs.items() if program is not None}
 
     def described(self) -> list[str]:
         """A line for each kernel: its granularity, its operations in one world, and on CUDA what it takes."""
@@ -132,10 +132,10 @@ class Programs:
             if program is None:
                 continue
             granularity = f"segment, {program.warps} warps" if program.warps > 1 else "tree"
-            line = f"{_title(key)}  {granularity}, {program.operations} operations a world"
+            line = f"{_called(key)}  {granularity}, {program.operations} operations a world"
             if self.run.device.is_cuda:
-                found: Any = wp.get_cuda_kernel_properties(program.kernel, self.run.device)
-                line += f", {found.num_regs} registers, {found.local_size_bytes} bytes spilled a thread"
+                found = wp.get_cuda_kernel_properties(program.kernel, self.run.device, program.block)
+                line += f", {found['register_count']} registers, {found['local_memory_size']} bytes of stack a thread"
             lines.append(line)
         return lines
 
@@ -268,11 +268,6 @@ class Programs:
         return next((frame for frame in frames if frame.fits(self.run.dtype)), frames[-1])
 
 
-def _title(key: tuple) -> str:
-    """What the program of a key is called."""
-    return written(key[-1]) if key[0] == "expression" else key[0]
-
-
 def _read_before(stores: list[Store], row: str) -> bool:
     """Every entry of ``row`` that is read at all is read before the same entry of the result is written over it."""
     symbols = [item.value for item in stores if not is_constant(item.value)]
@@ -285,6 +280,8 @@ def _read_before(stores: list[Store], row: str) -> bool:
 
 def _called(key: tuple) -> str:
     """What the user calls the operation of a program."""
+    if key[0] == "expression":
+        return written(key[-1])
     without_qdd = {("q",): "gravity_force", ("q", "qd"): "bias_force", ("q", "qd", "body_f"): "bias_force"}
     return without_qdd.get(key[1], key[0]) if key[0] == "inverse_dynamics" else key[0]
 
