@@ -4,13 +4,18 @@ import pytest
 
 import warp_spo as spo
 from warp_spo.errors import UnsupportedError
+from warp_spo.plan import MOST_DOFS
 
-GRANULARITIES = ("node",)
+GRANULARITIES = ("node", "tree", "segment")
 """A granularity that Dynamics accepts belongs here: the stress suite then runs on it."""
+SLOW = ("tree", "segment")
+"""Those that compile a kernel for each scene."""
 
 
 def skip_unless_served(scene, granularity):
-    """Skip the test if Dynamics does not offer the granularity for the scene."""
+    """Skip the test if Dynamics does not offer the granularity for the scene, or would compile it for too long."""
+    if granularity in SLOW and scene.dof_count > MOST_DOFS:
+        pytest.skip(f"{scene.dof_count} dof: the plan leaves more than {MOST_DOFS} to node granularity")
     try:
         spo.Dynamics(scene, granularity=granularity)
     except UnsupportedError as error:

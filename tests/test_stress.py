@@ -11,7 +11,7 @@ import warp_spo as spo
 from warp_spo.kernels import status as status_kernels
 
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
-from granularities import GRANULARITIES, skip_unless_served
+from granularities import GRANULARITIES, SLOW, skip_unless_served
 
 from benchmarks import stress, stress_checks, stress_measure, stress_steps
 from benchmarks.exact import Sweep
@@ -35,7 +35,7 @@ KNOWN = {
 
 
 def marked(value, name, precision, granularity, slow=False):
-    marks = [pytest.mark.slow] if slow else []
+    marks = [pytest.mark.slow] if slow or granularity in SLOW else []
     if (name, precision) in KNOWN:
         marks.append(pytest.mark.xfail(strict=True, reason=KNOWN[name, precision]))
     return pytest.param(value, precision, granularity, marks=marks, id=f"{name}-{precision}-{granularity}")
