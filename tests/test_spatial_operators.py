@@ -15,8 +15,8 @@ from robots import ROBOTS
 import warp_spo as spo
 from warp_spo import reference
 from warp_spo.programs import _read_before
+from warp_spo.recursions.applications import Applications
 from warp_spo.recursions.links import Links
-from warp_spo.recursions.traced import Trace
 from warp_spo.trace.emit import Store
 from warp_spo.trace.evaluate import evaluate
 from warp_spo.trace.graph import Graph
@@ -214,7 +214,7 @@ def fused(name, worlds, device, dtype="float64", seed=0, granularity="tree", **o
 def traced(scene, operator, x, q):
     """``operator x`` as the trace has it, evaluated by NumPy: [world, row]."""
     arrays = {"q": q, "x": x}
-    stores = Trace(Links(scene), "float64", ("q", "x")).expression(operator.expression)
+    stores = Applications(Links(scene), "float64", ("q", "x")).expression(operator.expression)
     found = evaluate([item.value for item in stores], lambda name, index: arrays[name][:, index[0]])
     result = np.full((len(q), operator.shape[0]), np.nan)
     for item, value in zip(stores, found, strict=True):

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from ..trace.emit import Store
 from ..trace.graph import Value, reciprocal, sqrt
 from ..trace.spatial import ZERO, Articulated, Rigid, Vector, cross, dot
 from . import articulated, composite, determinant, hybrid, motion, newton_euler
 from .hybrid import Given
 from .links import Link
+from .operators import Operators
 from .traced import Trace
 
 
 class Applications(Trace):
     """The operations of :class:`Trace`, and those beyond them."""
+
+    def expression(self, expression: Any) -> list[Store]:
+        """out = an operator, or what is composed of several, times the array x; see :mod:`.operators`."""
+        return Operators(self).stores(expression)
 
     # -- hybrid dynamics -------------------------------------------------------------------------------------------
     def hybrid_dynamics(self, held: tuple[bool, ...] | None = None) -> list[Store]:

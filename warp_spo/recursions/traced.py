@@ -14,7 +14,6 @@ from ..trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Rigid, Vector, 
 from . import articulated, composite, kinematics, motion, newton_euler
 from .links import Link, Links, Placed, placed
 from .motion import STILL, Motion
-from .operators import Operators
 from .pieces import Piece
 
 EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}
@@ -295,10 +294,6 @@ class Trace:
                 if both or not is_constant(nothing) or nothing != 0.0:
                     entries[j, i] = entry
         return entries
-
-    def expression(self, expression: Any) -> list[Store]:
-        """out = an operator, or what is composed of several, times the array x; see :mod:`.operators`."""
-        return Operators(self).stores(expression)
 
     # -- kinematics ------------------------------------------------------------------------------------------------
     def place_axes(self, link: Link) -> None:
