@@ -43,7 +43,7 @@ def operations(dyn: spo.Dynamics, name: str) -> float | None:
     own = dyn.operation_counts.get(name)
     if own is not None:
         return own
-    return count(dyn.scene, name) if dyn.granularity == "node" else None
+    return count(dyn.scene, name) if dyn.plan.of(name) == "node" else None
 
 
 @functools.cache

@@ -72,10 +72,11 @@ def run(
                 subject = precision.subject(scene, case["worlds"], device, case["granularity"], inputs)
             if subject is None:  # refused before
                 continue
-            identity = (*key, case["op"], case["dtype"], subject.dyn.granularity, case.get("sweep"))
+            granularity = subject.dyn.plan.of(case["op"])
+            identity = (*key, case["op"], case["dtype"], granularity, case.get("sweep"))
             if identity not in done:
                 done.add(identity)
-                row = case | dict(granularity=subject.dyn.granularity, chosen=case["granularity"] is None)
+                row = case | dict(granularity=granularity, chosen=case["granularity"] is None)
                 yield row | dict(reference=name) | _measured(case, subject, name, check, roof)
         except spo.UnsupportedError as error:
             if str(error) not in skipped:

@@ -19,9 +19,13 @@ SPILLS = {"float32": 32, "float64": 15}  # dofs at which one thread no longer ho
 SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as through shared memory,
 LONG_ROWS = 24  # in segments; longer rows come in together already at fewer worlds
 MOST_WARPS = 16
-SHORT = ("inverse_dynamics",)  # little code: a thread for the whole tree does not spill
+SHORT = ("inverse_dynamics", "bias_force", "gravity_force")  # little code: a thread for the whole tree does not spill
 LONG_RESULTS = ("mass_matrix",)  # writing them is most of the work, and goes faster by many warps
 
+SEGMENTED = ("forward_dynamics", "solve_mass_matrix", "mass_matrix", *SHORT)
+"""Operations that a warp a limb can share; the others run with a thread a world where the plan says segment."""
+NODE_ONLY = ("passive_force", "integrate")
+"""Operations in which no body waits for another: one launch, a thread for each (node, world)."""
 TREE_ONLY = (
     "hybrid_dynamics",
     "jacobian_bias",
@@ -67,10 +71,16 @@ class Plan:
         return self.outward[::-1]
 
     def of(self, operation: str) -> str:
-        """Granularity of one operation."""
+        """Granularity of one operation: the plan's own where the operation has that form."""
+        if operation in NODE_ONLY:
+            return "node"
         if operation in TREE_ONLY:
             return "tree"
-        if self.forced or self.granularity == "node" or self.limbs == 1 or self.limbs > MOST_WARPS:
+        chosen = self.granularity if self.forced else self._rule(operation)
+        return "tree" if chosen == "segment" and operation not in SEGMENTED else chosen
+
+    def _rule(self, operation: str) -> str:
+        if self.granularity == "node" or self.limbs == 1 or self.limbs > MOST_WARPS:
             return self.granularity
         if operation in LONG_RESULTS:
             return "segment"

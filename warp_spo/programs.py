@@ -27,10 +27,10 @@ from .trace.graph import Value, is_constant, ordered
 
 FIELDS = {"rigid": 10, "tree": 12, "anchor": 12, "com": 3, "joint_armature": 1, "gravity": 1}
 """The parameters' arrays, and how many components an item has."""
-SEGMENTED = {"forward_dynamics": "Pza", "solve_mass_matrix": "Pza", "inverse_dynamics": "z", "mass_matrix": "R"}
-"""Operations that have a segment granularity, and what the pieces send each other."""
+SENDS = {"forward_dynamics": "Pza", "solve_mass_matrix": "Pza", "inverse_dynamics": "z", "mass_matrix": "R"}
+"""What the pieces of a robot send each other, by operation."""
 TRACED = (
-    *SEGMENTED,
+    *SENDS,
     "mass_matrix_inverse",
     "log_det_mass_matrix",
     "body_poses",
@@ -150,7 +150,7 @@ class Programs:
         if operation == "expression" and not meet(options["expression"]):
             return None
         shapes = {**shapes, "out": out_shape}
-        if self.plan.of(operation) == "segment" and operation in SEGMENTED:
+        if self.plan.of(operation) == "segment":
             pieces = Pieces(links)
             program = self._segment_program(operation, shapes, pieces) if 1 < pieces.warps <= MOST_WARPS else None
             if program is not None:
@@ -174,7 +174,7 @@ class Programs:
         return self._finished(operation, frame, body, body, tables, emitter.operations)
 
     def _segment_program(self, operation: str, shapes: dict, pieces: Pieces) -> Program | None:
-        dtype, slots = self.run.dtype.__name__, _slots(pieces, SEGMENTED[operation])
+        dtype, slots = self.run.dtype.__name__, _slots(pieces, SENDS[operation])
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         sent = sum(SENT[letter] for letter, _ in slots)
         everything: list[Store] = []
@@ -196,7 +196,7 @@ class Programs:
             emitter = self._emitter(shapes, frame)
             placed = [item for item in stores if item.array == "sent"]
             placed += items if table is None else _by_slot(items, table)
-            last = "a" in SEGMENTED[operation]  # results come on the way out
+            last = "a" in SENDS[operation]  # results come on the way out
             inward = [item for item in placed if (_goes_inward(item, slots, piece) if last else True)]
             team.add(piece, emitter, emitter.region(inward), emitter.region(placed if last else []))
         cuda = team.cuda()  # fills the tables

@@ -14,12 +14,12 @@ import numpy as np
 
 from .coordinates import States
 from .lumped import Robot, Unsupported, urdf
-from .peer import Absent, Peer
+from .peer import Absent, Stepped
 
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 
-class Frax(Peer):
+class Frax(Stepped):
     """An evaluation is one call of a compiled function; calls in a row are queued, and the last is waited for."""
 
     name = "frax"

@@ -9,12 +9,12 @@ import numpy as np
 from .coordinates import States
 from .lumped import Robot
 from .mujoco_model import model
-from .peer import Absent, Peer
+from .peer import Absent, Stepped
 
 CALL = "one core, one world after the other, a few Python calls each"
 
 
-class MujocoC(Peer):
+class MujocoC(Stepped):
     name = "MuJoCo C"
     dtypes = ("float64",)
     twist, scalar_first = "mixed", True

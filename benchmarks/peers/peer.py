@@ -6,6 +6,7 @@ program gives ``rows``. Both get the same robot and the same states.
 
 from __future__ import annotations
 
+import abc
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -30,7 +31,7 @@ class Absent(Exception):
     """The peer cannot run here; the reason."""
 
 
-class Peer:
+class Peer(abc.ABC):
     """One peer with one robot.
 
     Attributes:
@@ -49,13 +50,13 @@ class Peer:
     scalar_first = False
 
     @classmethod
+    @abc.abstractmethod
     def version(cls) -> str:
         """Version of the installed package.
 
         Raises:
             Absent: it is not installed, or lacks what it needs.
         """
-        raise NotImplementedError
 
     def __init__(self, robot: Robot, device: Any, dtype: str):
         """Build the peer's model.
@@ -66,24 +67,39 @@ class Peer:
         self.robot, self.device, self.dtype = robot, device, dtype
         self.coordinates = Coordinates(robot, self.twist, self.scalar_first)
 
+    @abc.abstractmethod
+    def rows(self, inputs: list[Inputs], worlds: list[int], wanted: Callable[[str, str], bool]) -> Iterator[dict]:
+        """Yield a row for each number of worlds and operation; ``skipped`` says why it, and what has more, was not run.
+
+        Args:
+            inputs: sets of inputs, of the largest number of worlds.
+            worlds: rising numbers of worlds.
+            wanted: of an operation and a variant.
+        """
+
+
+class Stepped(Peer):
+    """A peer that launches evaluations one by one, which are timed here."""
+
+    @abc.abstractmethod
     def prepare(self, op: str, variant: str, states: States, worlds: int) -> None:
         """Take the first ``worlds`` of all sets of states to the device, and compile."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def run(self, index: int) -> None:
         """Launch one evaluation at set ``index``."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def poison(self) -> None:
         """Fill what an evaluation writes with NaN."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def result(self, worlds: list[int]) -> np.ndarray:
         """Of the last evaluation: qdd or tau [len(worlds), dof], or the mass matrix [len(worlds), dof, dof]."""
-        raise NotImplementedError
 
     def synchronize(self) -> None:
-        """Wait for the device."""
+        """Wait for the device; on a CPU there is nothing to wait for."""
+        return
 
     def graph(self, run: Callable[[], None]) -> Callable[[], None] | None:
         """``run`` captured into a graph; None: there are none here, and calls are timed."""
@@ -100,13 +116,6 @@ class Peer:
         return seconds
 
     def rows(self, inputs: list[Inputs], worlds: list[int], wanted: Callable[[str, str], bool]) -> Iterator[dict]:
-        """Yield a row for each number of worlds and operation; ``skipped`` says why it, and what has more, was not run.
-
-        Args:
-            inputs: sets of inputs, of the largest number of worlds.
-            worlds: rising numbers of worlds.
-            wanted: of an operation and a variant.
-        """
         states = States(self.coordinates, inputs, self.dtype)
         works = [work for work in self.works if wanted(*work)]
         for count in worlds:
@@ -174,7 +183,7 @@ class Peer:
                 return end - start
 
 
-class WarpPeer(Peer):
+class WarpPeer(Stepped):
     """A peer made of Warp kernels: evaluations are captured into CUDA graphs and timed by events."""
 
     def synchronize(self) -> None:

@@ -12,10 +12,10 @@ import warp_spo as spo
 
 from .coordinates import States
 from .lumped import Robot
-from .peer import Absent, Peer
+from .peer import Absent, Stepped
 
 
-class TorchDense(Peer):
+class TorchDense(Stepped):
     """In the scene's own coordinates: mass matrix and bias force come from this library."""
 
     name = "torch"

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..trace.graph import Value, cos, is_constant, reciprocal, sin, sqrt
+from ..trace.graph import cos, reciprocal, sin, sqrt
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, total
 from .links import BALL, FREE, HELIX, SLIDE, TURN, Link, Placed
 
@@ -80,11 +80,3 @@ def columns(link: Link, parent_axes: Matrix, axes: Matrix, arm: Vector) -> list[
     arm = axes @ arm
     turns = [(axis, cross(axis, arm)) for axis in hinge.T]
     return turns if link.motion == BALL else [*((ZERO, axis) for axis in hinge.T), *turns]
-
-
-def all_constant(R: Matrix) -> bool:
-    return all(is_constant(entry) for row in R for entry in row)
-
-
-__all__ = ["Value", "all_constant", "carried_velocity", "columns", "constant_quaternion", "multiplied",
-           "relative_quaternion", "turned"]

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from ..trace.graph import Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, symmetric
-from .links import BALL, FREE, HELIX, SLIDE, TURN, Link, Placed
+from .links import BALL, HELIX, SLIDE, TURN, Link, Placed
 
 NONE = Matrix.of([[0.0] * 3] * 3)
 
@@ -84,6 +84,3 @@ def carried(place: Placed, motion: Motion, acceleration: tuple[Vector, Vector]) 
     """What the parent's ``acceleration`` makes of the link's, without its own bias and qdd."""
     w, v = acceleration
     return place.pose.to_child(w), place.pose.to_child(v + cross(w, place.pose.l) + motion.bias_l)
-
-
-__all__ = ["FREE", "STILL", "Motion", "carried", "in_hinge", "in_link", "moved", "whirl"]
