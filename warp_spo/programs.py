@@ -17,21 +17,20 @@ from .kernels.straight import COLUMNS, DIRECT, IN_PLACE, MAPPED, STAGED, WARP, F
 from .levels import Recursions
 from .plan import MOST_WARPS, TREE_ONLY, Plan
 from .recursions.applications import Applications
+from .recursions import messages
 from .recursions.links import Links
+from .recursions.messages import INWARD, OUTWARD, SENDS
 from .recursions.operators import meet, written
 from .recursions.pieces import Piece, Pieces
-from .recursions.traced import INWARD, OUTWARD, SENT, Trace
+from .recursions.traced import Trace
 from .teams import Team
 from .trace.emit import Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
 FIELDS = {"rigid": 10, "tree": 12, "anchor": 12, "com": 3, "joint_armature": 1, "gravity": 1}
 """The parameters' arrays, and how many components an item has."""
-SENDS = {"forward_dynamics": "Pza", "solve_mass_matrix": "Pza", "inverse_dynamics": "z", "mass_matrix": "R"}
-"""What the pieces of a robot send each other, by operation."""
 TRACED = (
     *SENDS,
-    "mass_matrix_inverse",
     "log_det_mass_matrix",
     "body_poses",
     "body_velocities",
@@ -208,30 +207,37 @@ class Programs:
         return self._finished(operation, frame, body, body, tables, emitter.operations)
 
     def _segment_program(self, operation: str, shapes: dict, pieces: Pieces) -> Program | None:
-        dtype, slots = self.run.dtype.__name__, _slots(pieces, SENDS[operation])
+        dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(operation, pieces)
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
-        sent = sum(SENT[letter] for letter, _ in slots)
         everything: list[Store] = []
         traced: list[list[Store]] = []
+        across: list[dict[int, list[Store]]] = []
         for index in range(len(pieces.pieces)):
             links = self._links()  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)()])
-            everything += traced[-1]
+            across.append({
+                other: [self._flattened(item, shapes) for item in stores] for other, stores in trace.across.items()
+            })
+            everything += traced[-1] + [item for stores in across[-1].values() for item in stores]
         frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
                             WARP * pieces.warps, everything)
         if frame.result.way == DIRECT and frame.result.array.entries > LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
         team = Team(pieces, dtype)
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
-        everything, table = _placed([item for items in outs for item in items], frame.result)
-        outs[0] += everything[sum(map(len, outs)) :] if table is None else []  # zeros
-        for piece, stores, items in zip(pieces.pieces, traced, outs, strict=True):
+        whole = [item for item in everything if item.array == "out"]
+        placed, table = _placed(whole, frame.result)
+        outs[0] += placed[len(whole) :] if table is None else []  # zeros
+        for piece, stores, items, others in zip(pieces.pieces, traced, outs, across, strict=True):
             emitter = self._emitter(shapes, frame)
             inward = [item for item in stores if item.array == INWARD]
             outward = [item for item in stores if item.array == OUTWARD]
-            (outward if "a" in SENDS[operation] else inward).extend(items if table is None else _by_slot(items, table))
-            team.add(piece, emitter, emitter.region(inward), emitter.region(outward))
+            last = outward if set(SENDS[operation]) & set(messages.OUTWARD_LETTERS) else inward
+            last += items if table is None else _by_slot(items, table)
+            meetings = {at: found if table is None else _by_slot(found, table) for at, found in others.items()}
+            regions = emitter.region(inward), emitter.region(outward)
+            team.add(piece, emitter, *regions, {at: emitter.branch(found) for at, found in meetings.items()})
         cuda = team.cuda()  # fills the tables
         lists = ("place", table, int), ("table", team.table, self.run.dtype), ("shifts", team.shifts, int)
         tables: dict[str, Any] = {
@@ -327,17 +333,6 @@ def _called(key: tuple) -> str:
         return written(key[-1])
     without_qdd = {("q",): "gravity_force", ("q", "qd"): "bias_force", ("q", "qd", "body_f"): "bias_force"}
     return without_qdd.get(key[1], key[0]) if key[0] == "inverse_dynamics" else key[0]
-
-
-def _slots(pieces: Pieces, letters: str) -> dict[tuple[str, int], int]:
-    """Where what each piece sends begins."""
-    slots, at = {}, 0
-    for piece in pieces.pieces:
-        for letter in letters:
-            if piece.children if letter == "a" else piece.parent is not None:
-                slots[letter, piece.index] = at
-                at += SENT[letter]
-    return slots
 
 
 def _placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int] | None]:
