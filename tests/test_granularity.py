@@ -11,6 +11,7 @@ import zoo
 from robots import ROBOTS
 
 import warp_spo as spo
+from warp_spo.kernels import straight
 
 GRANULARITIES = ("tree", "segment")
 DTYPES = ("float32", "float64")
@@ -200,10 +201,11 @@ def test_equals_reference(name, granularity, dtype, operation, device):
 
 
 @pytest.mark.parametrize("granularity", GRANULARITIES)
-def test_a_long_result_by_columns(granularity, device):
+def test_a_long_result_by_columns(granularity, device, monkeypatch):
     """Values that go through memory, [slot, world], some worlds at a time, and rows of parameters with them."""
     dyn = dynamics("two arms", granularity, MANY, "float64", device, varied=True)
-    dyn.programs.column_slots, dyn.programs.column_worlds = 1, 14
+    monkeypatch.setattr(straight, "SHARED_BYTES", 10_000)
+    dyn.programs.columns, dyn.programs.column_worlds = True, 14
     for operation in ("mass_matrix", "mass_matrix_inverse"):
         equals_reference(dyn, operation, states(dyn), laws.TOLERANCE["float64"])
     assert all(program.spread is not None for program in dyn.programs._programs.values())

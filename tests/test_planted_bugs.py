@@ -206,7 +206,7 @@ INVERSE_MUTANTS = {
     "another column": (inverse.Inverse, "_meet", "sent[heads * at : heads * at + common]", "sent[:common]"),
     "what lies further in": (inverse.Inverse, "_come_back", "[dot(row, force) for row in N]", "[0.0 for row in N]"),
     "parted too early": (pieces.Piece, "fork", "(other, *other.ancestors)", "reversed((other, *other.ancestors))"),
-    "no barrier before they meet": (teams.Team, "cuda", "[BARRIER, self._across(alike)]", "[self._across(alike)]"),
+    "no barrier before they meet": (teams.Team, "cuda", "BARRIER, self._across(alike)", "self._across(alike)"),
 }
 
 

@@ -16,14 +16,14 @@ from .kernels import straight
 from .kernels.straight import COLUMNS, DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
 from .levels import Recursions
 from .plan import MOST_WARPS, TREE_ONLY, Plan
-from .recursions.applications import Applications
 from .recursions import messages
+from .recursions.applications import Applications
 from .recursions.links import Links
 from .recursions.messages import INWARD, OUTWARD, SENDS
 from .recursions.operators import meet, written
-from .recursions.pieces import Piece, Pieces
+from .recursions.pieces import Pieces
 from .recursions.traced import Trace
-from .teams import Team
+from .teams import Team, Work
 from .trace.emit import Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
@@ -40,9 +40,7 @@ TRACED = (
     *TREE_ONLY,
 )
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
-COLUMN_SLOTS = 256  # values of a result that shared memory has no good place for; they go through memory,
-COLUMN_WORLDS = 1 << 16  # of so many worlds at a time
-NEVER = 1 << 30
+COLUMN_WORLDS = 1 << 18  # of so many at a time the values of a long result go through memory
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
@@ -87,13 +85,12 @@ class Programs:
         registers: a cap on the registers of a thread.
 
     Attributes:
-        column_slots: values of a result from which they go through memory, [slot, world]. column_worlds: at a time.
+        columns: a result that has no room in shared memory goes through memory. column_worlds: of so many at a time.
     """
 
     def __init__(self, run: Recursions, plan: Plan, block: int = WARP, registers: int | None = None):
         self.run, self.plan, self.block, self.registers = run, plan, block, registers
-        self.column_slots = COLUMN_SLOTS if run.device.is_cuda else NEVER
-        self.column_worlds = COLUMN_WORLDS
+        self.columns, self.column_worlds = run.device.is_cuda, COLUMN_WORLDS
         self._programs: dict[Any, Program | None] = {}
 
     def forget(self) -> None:
@@ -211,15 +208,14 @@ class Programs:
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         everything: list[Store] = []
         traced: list[list[Store]] = []
-        across: list[dict[int, list[Store]]] = []
+        apart: list[tuple[list[Store], dict[int, list[Store]]]] = []
         for index in range(len(pieces.pieces)):
             links = self._links()  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)()])
-            across.append({
-                other: [self._flattened(item, shapes) for item in stores] for other, stores in trace.across.items()
-            })
-            everything += traced[-1] + [item for stores in across[-1].values() for item in stores]
+            flat = {at: [self._flattened(item, shapes) for item in items] for at, items in trace.across.items()}
+            apart.append((trace.news, flat))
+            everything += traced[-1] + trace.news + [item for items in flat.values() for item in items]
         frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
                             WARP * pieces.warps, everything)
         if frame.result.way == DIRECT and frame.result.array.entries > LONG_ROW:
@@ -229,7 +225,7 @@ class Programs:
         whole = [item for item in everything if item.array == "out"]
         placed, table = _placed(whole, frame.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
-        for piece, stores, items, others in zip(pieces.pieces, traced, outs, across, strict=True):
+        for piece, stores, items, (news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
             emitter = self._emitter(shapes, frame)
             inward = [item for item in stores if item.array == INWARD]
             outward = [item for item in stores if item.array == OUTWARD]
@@ -237,7 +233,8 @@ class Programs:
             last += items if table is None else _by_slot(items, table)
             meetings = {at: found if table is None else _by_slot(found, table) for at, found in others.items()}
             regions = emitter.region(inward), emitter.region(outward)
-            team.add(piece, emitter, *regions, {at: emitter.branch(found) for at, found in meetings.items()})
+            branches = emitter.branch(news), {at: emitter.branch(found) for at, found in meetings.items()}
+            team.add(Work(piece, *regions, *branches), emitter.operations)
         cuda = team.cuda()  # fills the tables
         lists = ("place", table, int), ("table", team.table, self.run.dtype), ("shifts", team.shifts, int)
         tables: dict[str, Any] = {
@@ -247,7 +244,9 @@ class Programs:
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
-        return item if item.array in (INWARD, OUTWARD) else item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
+        if item.array in (INWARD, OUTWARD):
+            return item
+        return item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
 
     def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int) -> Program:
         native = straight.assemble(frame, cuda, cpu, self.run.dtype)
@@ -310,9 +309,10 @@ class Programs:
         if dense and staged:
             ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), *ways]
         if out.entries > LONG_ROW and not (dense and staged and over == ["x"]):
-            ways = [(staged, Result(MAPPED, out, slots=slots)), (False, Result(MAPPED, out, slots=slots)), *ways]
-        if slots >= self.column_slots and straight.tile(Result(COLUMNS, out, slots=slots), self.run.dtype):
-            ways = [(False, Result(COLUMNS, out, slots=slots))]
+            mapped, columns = Result(MAPPED, out, slots=slots), Result(COLUMNS, out, slots=slots)
+            ways = [(staged, mapped), (False, mapped), *ways]
+            if self.columns and straight.tile(columns, self.run.dtype):
+                ways.insert(-1, (False, columns))
         frames = [Frame(rows, staged, fields, result, sent, warps, block) for staged, result in ways]
         return next((frame for frame in frames if frame.fits(self.run.dtype)), frames[-1])
 

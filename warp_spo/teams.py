@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from .recursions.pieces import Piece, Pieces
-from .trace.emit import Emitter, Listing, filled, literal, literals
+from .trace.emit import Listing, filled, literal, literals
 
 BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
 
 
 class Work(NamedTuple):
-    """What one piece has to do: going in, coming out, and at the end together with other pieces."""
+    """What one piece has to do: going in, coming out, telling the others, and with each of those that it meets."""
 
     piece: Piece
     inward: Listing
     outward: Listing
+    news: Listing
     across: dict[int, Listing]
 
     @property
@@ -42,21 +44,19 @@ class Team:
         self.operations = 0
         self._work: dict[int, Work] = {}
 
-    def add(
-        self, piece: Piece, emitter: Emitter, inward: Listing, outward: Listing, across: dict[int, Listing]
-    ) -> None:
-        """The statements of a piece; those ``across`` to another one, by its index, may use what the others made."""
-        self._work[piece.index] = Work(piece, inward, outward, across)
-        self.operations += emitter.operations
+    def add(self, work: Work, operations: int) -> None:
+        """Take on the work of a piece; what is ``across``, by the other piece's index, may use all that others sent."""
+        self._work[work.piece.index] = work
+        self.operations += operations
 
     @property
     def _last(self) -> int:
         """The last stage in which there is something to do."""
         stages = [0]
-        for piece, inward, outward, across in self._work.values():
+        for piece, inward, outward, _, across in self._work.values():
             stages += [piece.inward] if inward.text else []
             stages += [piece.outward] if outward.text else []
-            stages += [self.pieces.stages - 1] if across else []  # those of pieces further in are met in the last one
+            stages += [self.pieces.stages - 1] if across else []  # pieces further in meet in the last one
         return max(stages)
 
     def cpu(self) -> str:
@@ -69,6 +69,7 @@ class Team:
             for piece in self.pieces.pieces:
                 if piece.outward == stage:
                     text.append(literals(self._work[piece.index].outward, self.dtype, f"p{piece.index}_"))
+                    text.append(literals(self._work[piece.index].news, self.dtype, f"p{piece.index}_"))
         for work in self._work.values():
             text += [literals(listing, self.dtype, f"p{work.piece.index}_") for listing in work.across.values()]
         return "\n".join(text)
@@ -85,7 +86,7 @@ class Team:
             inward, outward = self._shared(alike)
             text += [inward, self._inner([work.piece.warp for work in alike]), outward]
             if any(work.across for works in kinds.values() for work in works):
-                text += [BARRIER, self._across(alike)]
+                text += [self._apart(alike, [work.news for work in alike], "n_"), BARRIER, self._across(alike)]
             text.append("}")
         return "\n".join(text)
 
@@ -104,7 +105,9 @@ class Team:
                 text.append(BARRIER)
                 order = list(zip(chains[0], shared, strict=True))
                 text += [inward for work, (inward, _) in reversed(order) if work.piece.inward == stage]
-                text += [outward for work, (_, outward) in order if work.piece.outward == stage]
+                for at, (alike, (_, outward)) in enumerate(zip(zip(*chains, strict=True), shared, strict=True)):
+                    if alike[0].piece.outward == stage:
+                        text += [outward, self._apart(alike, [work.news for work in alike], f"i{at}_n_", f"i{at}_")]
             text += [self._across(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
             text.append("}")
         idle = [BARRIER] * self._last
@@ -112,29 +115,33 @@ class Team:
             text += ["else {", *idle, "}"]
         return "\n".join(text or idle)
 
-    def _across(self, alike: list[Work] | tuple[Work, ...], prefix: str = "") -> str:
-        """What pieces of equal structure have to do with others, a branch for those that do the same."""
+    def _across(self, alike: Sequence[Work], prefix: str = "") -> str:
+        """What pieces of equal structure have to do with each other piece."""
+        others = sorted({index for work in alike for index in work.across})
+        met = [(other, [work.across.get(other) for work in alike]) for other in others]
+        return "\n".join(self._apart(alike, listings, f"{prefix}x{other}_", prefix) for other, listings in met)
+
+    def _apart(self, alike: Sequence[Work], listings: list[Listing | None], tables: str, prefix: str = "") -> str:
+        """What some pieces of equal structure do, a branch for those that do the same."""
+        kinds: dict[str, list[tuple[Work, Listing]]] = {}
+        for work, listing in zip(alike, listings, strict=True):
+            if listing is not None and listing.text:
+                kinds.setdefault(listing.text, []).append((work, listing))
         text: list[str] = []
-        for other in sorted({index for work in alike for index in work.across}):
-            kinds: dict[str, list[Work]] = {}
-            for work in alike:
-                if other in work.across:
-                    kinds.setdefault(work.across[other].text, []).append(work)
-            for some in kinds.values():
-                tables = f"{prefix}x{len(text)}_"
-                head, (body,) = self._filled(some, [[work.across[other] for work in some]], prefix, tables)
-                whole = "\n".join(["{", head, body, "}"])
-                text.append(whole if len(some) == len(alike) else f"if ({_any_of([w.piece.warp for w in some])}) {whole}")
+        for some in kinds.values():
+            head, (body,) = self._filled([work for work, _ in some], [[listing for _, listing in some]], prefix, tables)
+            condition = "" if len(some) == len(alike) else f"if ({_any_of([work.piece.warp for work, _ in some])}) "
+            text.append("\n".join([f"{condition}{{", head, body, "}"]))
         return "\n".join(text)
 
-    def _shared(self, alike: list[Work] | tuple[Work, ...], prefix: str = "") -> tuple[str, str]:
+    def _shared(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str]:
         """One text, in and out, for pieces of equal structure."""
         both = [[work.inward for work in alike], [work.outward for work in alike]]
         head, (inward, outward) = self._filled(alike, both, prefix, prefix)
         return f"{head}\n{inward}" if head else inward, outward
 
     def _filled(
-        self, alike: list[Work] | tuple[Work, ...], regions: list[list[Listing]], prefix: str, tables: str
+        self, alike: Sequence[Work], regions: list[list[Listing]], prefix: str, tables: str
     ) -> tuple[str, list[str]]:
         """The text of each region, one listing for each of ``alike``; what differs comes from the tables.
 

@@ -31,7 +31,7 @@ class Inverse:
     Attributes:
         entries: by (row, column), one of the two triangles' entries each.
         across: by index of another piece: the entries that it has in common with the trace's own.
-        stores: what is sent.
+        stores: what is sent. news: likewise, to the pieces that meet this one.
     """
 
     def __init__(self, trace: Trace):
@@ -39,6 +39,7 @@ class Inverse:
         self.entries: dict[tuple[int, int], Value] = {}
         self.across: dict[int, dict[tuple[int, int], Value]] = {}
         self.done, self.stores = trace.factors()
+        self.news: list[Store] = []
         self._rates: dict[int, list[Value]] = {}  # the part of Y_j in j's own piece
         self._forces: dict[int, Vector] = {}  # F_j
         self._columns: dict[int, list[Value]] = {}  # Y_j
@@ -46,7 +47,7 @@ class Inverse:
         for piece in own:
             for at, link in enumerate(piece.links):
                 for i, dof in enumerate(link.dofs):
-                    trace.at(link, f"y{dof}_")
+                    trace.graph.step = f"column {dof}|y"
                     unit = [1.0 if j == i else 0.0 for j in range(len(link.dofs))]
                     self._rates[dof], self._forces[dof] = self._inward(piece.links[: at + 1], NO_FORCE, unit)
         for piece in own:
@@ -79,7 +80,7 @@ class Inverse:
             self._columns[j] = [dot(row, self._forces[j]) for row in N] + self._rates[j]
         if any(other.looks_at(piece) for other in self.pieces):
             heads = (self._columns[j][: len(N)] for j in piece.dofs)
-            self.stores += trace.post("Y", piece, [x for head in heads for x in head])
+            self.news += trace.post("Y", piece, [x for head in heads for x in head])
         weighted = {j: [d * y for d, y in zip(D, self._columns[j], strict=False)] for j in piece.dofs}
         for at, j in enumerate(piece.dofs):
             trace.graph.step = f"column {j}|m"

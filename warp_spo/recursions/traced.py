@@ -33,7 +33,8 @@ class Trace:
         slot: see there.
 
     Attributes:
-        across: what a piece has to store once all others are done, by the other piece that it is about.
+        news: what a piece sends to those that meet it, apart: pieces of equal structure do not all send it.
+        across: what a piece has to store after that, by the other piece that it is about.
     """
 
     def __init__(
@@ -46,6 +47,7 @@ class Trace:
     ):
         self.links, self.graph, self.epsilon, self.given = links, links.graph, EPSILON[dtype], given
         self.piece, self.slot = piece, slot
+        self.news: list[Store] = []
         self.across: dict[int, list[Store]] = {}
         self._mail: dict[tuple[str, int], list[Value]] = {}  # messages between pieces of this trace
         self.own = set(map(id, links.links if piece is None else piece.links))
@@ -287,7 +289,7 @@ class Trace:
         inverse = Inverse(self)
         across = {other: self._both(entries) for other, entries in inverse.across.items()}
         if self.piece is not None:
-            self.across, across = across, {}
+            self.across, self.news, across = across, inverse.news, {}
         return inverse.stores + self._both(inverse.entries) + [item for stores in across.values() for item in stores]
 
     def inward(self, done: dict, link: Link, force: Vector, right: list[Value]) -> dict[int, list[Value]]:
@@ -409,10 +411,6 @@ class Trace:
             values = (*(R @ (v + cross(w, com))), *(R @ w))
             stores += [Store("out", (body, c), value) for c, value in enumerate(values)]
         return stores
-
-
-def _way(letter: str) -> str:
-    return OUTWARD if letter == "a" else INWARD
 
 
 def _mirrored(i: int, j: int, value: Value) -> list[tuple[tuple[int, int], Value]]:
