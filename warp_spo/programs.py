@@ -148,7 +148,8 @@ class Programs:
     def _spread(self, spread: Spread, worlds: int, out: wp.array) -> None:
         device, block = self.run.device, straight.SPREAD_BLOCK
         threads = -(-worlds // spread.tile) * block if device.is_cuda else worlds
-        wp.launch(spread.kernel, threads, [worlds, spread.columns, spread.places], [out], device=device, block_dim=block)
+        inputs = [worlds, spread.columns, spread.places]
+        wp.launch(spread.kernel, threads, inputs, [out], device=device, block_dim=block)
 
     @property
     def operation_counts(self) -> dict[str, int]:
