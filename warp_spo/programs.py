@@ -12,12 +12,13 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from . import link_values
 from .kernels import straight
 from .kernels.straight import DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
 from .levels import Recursions
 from .plan import MOST_WARPS, TREE_ONLY, Plan
 from .recursions.applications import Applications
-from .recursions.links import Links
+from .recursions.links import TABLES, Links
 from .recursions.operators import meet, written
 from .recursions.pieces import Piece, Pieces
 from .recursions.traced import SENT, Trace
@@ -25,8 +26,6 @@ from .teams import Team
 from .trace.emit import Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
-FIELDS = {"rigid": 10, "tree": 12, "anchor": 12, "com": 3, "joint_armature": 1, "gravity": 1}
-"""The parameters' arrays, and how many components an item has."""
 SENDS = {"forward_dynamics": "Pza", "solve_mass_matrix": "Pza", "inverse_dynamics": "z", "mass_matrix": "R"}
 """What the pieces of a robot send each other, by operation."""
 TRACED = (
@@ -50,7 +49,7 @@ class Program(NamedTuple):
     """One kernel.
 
     Attributes:
-        rows: names of the callers' arrays that it reads. fields: of the parameters' arrays.
+        rows: names of the callers' arrays that it reads. fields: of the tables of what the links are made of.
         tables: arrays of its own.
         operations: floating-point operations of one world.
     """
@@ -77,10 +76,12 @@ class Programs:
     def __init__(self, run: Recursions, plan: Plan, block: int = WARP, registers: int | None = None):
         self.run, self.plan, self.block, self.registers = run, plan, block, registers
         self._programs: dict[Any, Program | None] = {}
+        self._links: Links | None = None
 
     def forget(self) -> None:
         """Drop all programs: values that they folded have changed."""
         self._programs.clear()
+        self._links = None
 
     def find(
         self,
@@ -117,8 +118,12 @@ class Programs:
             worlds = block // program.warps  # of one block
             threads = -(-run.worlds // worlds) * block
         inputs = [run.worlds, *(arrays[name] for name in program.rows)]
-        inputs += [run.parameters.array(name) for name in program.fields]
+        inputs += [self.table(name) for name in program.fields]
         wp.launch(program.kernel, threads, [*inputs, *program.tables], [out, *more], device=run.device, block_dim=block)
+
+    def table(self, name: str) -> wp.array:
+        """What the links are made of [entry, world]."""
+        return link_values.table(self.run.parameters, self.links, name)
 
     @property
     def operation_counts(self) -> dict[str, int]:
@@ -140,12 +145,15 @@ class Programs:
         return lines
 
     # -- building --------------------------------------------------------------------------------------------------
-    def _links(self) -> Links:
-        return Links(self.run.scene, self.run.parameters.variable)
+    @property
+    def links(self) -> Links:
+        if self._links is None:
+            self._links = Links(self.run.scene, self.run.parameters.variable)
+        return self._links
 
     def _build(self, operation: str, shapes: dict, out_shape: tuple, more: dict, options: dict) -> Program | None:
-        links = self._links()
-        if (operation == "body_poses" and links.varies_tree) or not links.links:
+        links = self.links.opened()
+        if (operation == "body_poses" and links.turns_vary) or not links.links:
             return None
         if operation == "expression" and not meet(options["expression"]):
             return None
@@ -180,7 +188,7 @@ class Programs:
         everything: list[Store] = []
         traced: list[list[Store]] = []
         for index in range(len(pieces.pieces)):
-            links = self._links()  # its own: pieces of equal structure then give equal text
+            links = self.links.opened()  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)()])
             everything += traced[-1]
@@ -213,7 +221,7 @@ class Programs:
     def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int) -> Program:
         native = straight.assemble(frame, cuda, cpu, self.run.dtype)
         rows, fields = tuple(row.name for row in frame.rows), tuple(frame.fields)
-        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 3) for name in fields]
+        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 2) for name in fields]
         arrays += [(name, 1) for name in tables] + [("out", frame.result.array.ndim)]
         arrays += [(row.name, row.ndim) for row in frame.more]
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers)
@@ -227,8 +235,8 @@ class Programs:
         def load(array: str, entry: str) -> str:
             if array == "sent":
                 return f"SENT({entry})"
-            if array in FIELDS:
-                return f"{array}_at[({entry}) * {array}_part]"
+            if array in TABLES:
+                return f"FIELD({array}, {entry})"
             return f"{array}_row[{entry}]"
 
         def store(array: str, entry: str, value: str) -> str:
@@ -239,11 +247,9 @@ class Programs:
             return f"if (mine) {array}_row[{entry}] = {value};"
 
         def flat(array: str, index: tuple) -> int:
-            if array in FIELDS:
-                return FIELDS[array] * index[0] + (index[1] if len(index) > 1 else 0)
             return index[0] if len(index) == 1 else _flat(index, shapes[array][1:])
 
-        return Emitter(self.run.dtype.__name__, load, store, flat, angles)
+        return Emitter(self.run.dtype.__name__, load, store, flat, angles, TABLES)
 
     def _frame(self, stores: list[Store], shapes: dict, sent: int, warps: int, block: int,
                everything: list[Store] | None = None) -> Frame:
@@ -255,7 +261,8 @@ class Programs:
         over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
         over = [name for name in over if _read_before(stores, name)]
         slots = len({_name(item.value) for item in stores})
-        fields = [name for name in FIELDS if name in used]
+        fields = {name: used[name] for name in TABLES if name in used}
+        held = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
         staged, ways = self.plan.staged, [(False, Result(DIRECT, out))]
         staged = staged or any(row.name == "x" and row.entries > SHORT_ROW for row in rows)
         if dense and (staged or out.entries > SHORT_ROW):
@@ -264,7 +271,11 @@ class Programs:
             ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), *ways]
         if out.entries > LONG_ROW and not (dense and staged and over == ["x"]):
             ways = [(staged, Result(MAPPED, out, slots=slots)), (False, Result(MAPPED, out, slots=slots)), *ways]
-        frames = [Frame(rows, staged, fields, result, sent, warps, block) for staged, result in ways]
+        frames = [
+            Frame(rows, staged, list(fields), result, sent, warps, block, held=entries)
+            for staged, result in ways
+            for entries in held[::-1]
+        ]
         return next((frame for frame in frames if frame.fits(self.run.dtype)), frames[-1])
 
 
@@ -332,10 +343,16 @@ def _flat(index: tuple, shape: tuple) -> int:
     return at
 
 
-def _reads(stores: list[Store]) -> set[str]:
-    """Names of the arrays that are read."""
+def _reads(stores: list[Store]) -> dict[str, int]:
+    """Names of the arrays that are read, and one more than the last index."""
     graphs: dict[int, list[Value]] = {}
     for item in stores:
         if not is_constant(item.value):
             graphs.setdefault(id(item.value.graph), []).append(item.value)
-    return {scalar.args[0] for values in graphs.values() for scalar in ordered(values) if scalar.op == "input"}
+    read: dict[str, int] = {}
+    for values in graphs.values():
+        for scalar in ordered(values):
+            if scalar.op == "input":
+                array, index = scalar.args[:2]
+                read[array] = max(index + 1, read.get(array, 0))
+    return read
