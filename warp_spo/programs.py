@@ -14,14 +14,14 @@ import warp as wp
 
 from . import link_values
 from .kernels import straight
-from .kernels.straight import DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
+from .kernels.straight import COLUMNS, DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
 from .levels import Recursions
 from .plan import MOST_WARPS, TREE_ONLY, Plan
 from .recursions.applications import Applications
 from .recursions.links import TABLES, Links
 from .recursions.operators import meet, written
 from .recursions.pieces import Piece, Pieces
-from .recursions.traced import SENT, Trace
+from .recursions.traced import INWARD, OUTWARD, SENT, Trace
 from .teams import Team
 from .trace.emit import Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
@@ -40,6 +40,9 @@ TRACED = (
     *TREE_ONLY,
 )
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
+COLUMN_SLOTS = 256  # values of a result that shared memory has no good place for; they go through memory,
+COLUMN_WORLDS = 1 << 16  # of so many worlds at a time
+NEVER = 1 << 30
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
@@ -52,6 +55,7 @@ class Program(NamedTuple):
         rows: names of the callers' arrays that it reads. fields: of the tables of what the links are made of.
         tables: arrays of its own.
         operations: floating-point operations of one world.
+        spread: a second kernel that brings the values of the first, [slot, world], to their ``places``; or None.
     """
 
     kernel: wp.Kernel
@@ -61,6 +65,16 @@ class Program(NamedTuple):
     warps: int
     block: int
     operations: int
+    spread: Spread | None = None
+
+
+class Spread(NamedTuple):
+    """The second half of a program with a long result: ``columns`` [slot, world] of some worlds at a time."""
+
+    kernel: wp.Kernel
+    columns: wp.array
+    places: wp.array
+    tile: int
 
 
 class Programs:
@@ -71,10 +85,15 @@ class Programs:
         plan: which granularity each operation has.
         block: threads of a block at tree granularity, on CUDA.
         registers: a cap on the registers of a thread.
+
+    Attributes:
+        column_slots: values of a result from which they go through memory, [slot, world]. column_worlds: at a time.
     """
 
     def __init__(self, run: Recursions, plan: Plan, block: int = WARP, registers: int | None = None):
         self.run, self.plan, self.block, self.registers = run, plan, block, registers
+        self.column_slots = COLUMN_SLOTS if run.device.is_cuda else NEVER
+        self.column_worlds = COLUMN_WORLDS
         self._programs: dict[Any, Program | None] = {}
         self._links: Links | None = None
 
@@ -112,14 +131,29 @@ class Programs:
         return self._programs[key]
 
     def launch(self, program: Program, arrays: dict[str, wp.array], out: wp.array, *more: wp.array) -> None:
-        run = self.run
-        threads, block = run.worlds, program.block
-        if run.device.is_cuda:
-            worlds = block // program.warps  # of one block
-            threads = -(-run.worlds // worlds) * block
-        inputs = [run.worlds, *(arrays[name] for name in program.rows)]
-        inputs += [self.table(name) for name in program.fields]
-        wp.launch(program.kernel, threads, [*inputs, *program.tables], [out, *more], device=run.device, block_dim=block)
+        rows = [arrays[name] for name in program.rows]
+        fields = [self.table(name) for name in program.fields]
+        if program.spread is None:
+            self._launch(program, self.run.worlds, [*rows, *fields], [out, *more])
+            return
+        some = program.spread.columns.shape[1]
+        for first in range(0, self.run.worlds, some):
+            part = slice(first, min(first + some, self.run.worlds))
+            inputs = [*(row[part] for row in rows), *(field[:, part] for field in fields)]
+            self._launch(program, part.stop - first, inputs, [program.spread.columns, *(array[part] for array in more)])
+            self._spread(program.spread, part.stop - first, out[part])
+
+    def _launch(self, program: Program, worlds: int, inputs: list, outputs: list) -> None:
+        device, block = self.run.device, program.block
+        of_block = block // program.warps
+        threads = -(-worlds // of_block) * block if device.is_cuda else worlds
+        inputs = [worlds, *inputs, *program.tables]
+        wp.launch(program.kernel, threads, inputs, outputs, device=device, block_dim=block)
+
+    def _spread(self, spread: Spread, worlds: int, out: wp.array) -> None:
+        device, block = self.run.device, straight.SPREAD_BLOCK
+        threads = -(-worlds // spread.tile) * block if device.is_cuda else worlds
+        wp.launch(spread.kernel, threads, [worlds, spread.columns, spread.places], [out], device=device, block_dim=block)
 
     def table(self, name: str) -> wp.array:
         """What the links are made of [entry, world]."""
@@ -202,11 +236,10 @@ class Programs:
         outs[0] += everything[sum(map(len, outs)) :] if table is None else []  # zeros
         for piece, stores, items in zip(pieces.pieces, traced, outs, strict=True):
             emitter = self._emitter(shapes, frame)
-            placed = [item for item in stores if item.array == "sent"]
-            placed += items if table is None else _by_slot(items, table)
-            last = "a" in SENDS[operation]  # results come on the way out
-            inward = [item for item in placed if (_goes_inward(item, slots, piece) if last else True)]
-            team.add(piece, emitter, emitter.region(inward), emitter.region(placed if last else []))
+            inward = [item for item in stores if item.array == INWARD]
+            outward = [item for item in stores if item.array == OUTWARD]
+            (outward if "a" in SENDS[operation] else inward).extend(items if table is None else _by_slot(items, table))
+            team.add(piece, emitter, emitter.region(inward), emitter.region(outward))
         cuda = team.cuda()  # fills the tables
         lists = ("place", table, int), ("table", team.table, self.run.dtype), ("shifts", team.shifts, int)
         tables: dict[str, Any] = {
@@ -216,16 +249,22 @@ class Programs:
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
-        return item if item.array == "sent" else item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
+        return item if item.array in (INWARD, OUTWARD) else item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
 
     def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int) -> Program:
         native = straight.assemble(frame, cuda, cpu, self.run.dtype)
         rows, fields = tuple(row.name for row in frame.rows), tuple(frame.fields)
         arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 2) for name in fields]
-        arrays += [(name, 1) for name in tables] + [("out", frame.result.array.ndim)]
+        result, spread = frame.result, None
+        if result.way == COLUMNS:
+            some = min(self.run.worlds, self.column_worlds)
+            columns = wp.empty((result.slots, some), dtype=self.run.dtype, device=self.run.device)
+            tile = straight.tile(result, self.run.dtype)
+            spread = Spread(straight.spread(result, self.run.dtype), columns, tables.pop("place"), tile)
+        arrays += [(name, 1) for name in tables] + [("out", 2 if spread else result.array.ndim)]
         arrays += [(row.name, row.ndim) for row in frame.more]
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers)
-        return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations)
+        return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations, spread)
 
     def _emitter(self, shapes: dict, frame: Frame) -> Emitter:
         result = frame.result
@@ -233,15 +272,17 @@ class Programs:
         guard = "if (mine) " if result.way == DIRECT else ""
 
         def load(array: str, entry: str) -> str:
-            if array == "sent":
+            if array in (INWARD, OUTWARD):
                 return f"SENT({entry})"
             if array in TABLES:
                 return f"FIELD({array}, {entry})"
             return f"{array}_row[{entry}]"
 
         def store(array: str, entry: str, value: str) -> str:
-            if array == "sent":
+            if array in (INWARD, OUTWARD):
                 return f"SENT({entry}) = {value};"
+            if array == "out" and result.way == COLUMNS:
+                return f"if (mine) RESULT({entry}) = {value};"
             if array == "out":
                 return f"{guard}result_row[{entry}] = {value};"
             return f"if (mine) {array}_row[{entry}] = {value};"
@@ -271,6 +312,8 @@ class Programs:
             ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), *ways]
         if out.entries > LONG_ROW and not (dense and staged and over == ["x"]):
             ways = [(staged, Result(MAPPED, out, slots=slots)), (False, Result(MAPPED, out, slots=slots)), *ways]
+        if slots >= self.column_slots and straight.tile(Result(COLUMNS, out, slots=slots), self.run.dtype):
+            ways = [(False, Result(COLUMNS, out, slots=slots))]
         frames = [
             Frame(rows, staged, list(fields), result, sent, warps, block, held=entries)
             for staged, result in ways
@@ -308,16 +351,10 @@ def _slots(pieces: Pieces, letters: str) -> dict[tuple[str, int], int]:
     return slots
 
 
-def _goes_inward(item: Store, slots: dict, piece: Piece) -> bool:
-    return item.array == "sent" and not (
-        ("a", piece.index) in slots and 0 <= item.index[0] - slots["a", piece.index] < SENT["a"]
-    )
-
-
 def _placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int] | None]:
-    """Flat stores as the result wants them, and the table of a MAPPED one."""
+    """Flat stores as the result wants them, and the table of a MAPPED one or of COLUMNS."""
     out = result.array
-    if result.way == MAPPED:
+    if result.way in (MAPPED, COLUMNS):
         slots: dict[Any, int] = {}
         table = [-1] * out.entries
         for item in stores:

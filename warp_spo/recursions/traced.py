@@ -21,6 +21,8 @@ EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}
 
 SENT = {"P": 21, "z": 6, "R": 10, "a": 6}
 """Values that pieces send each other: inward phi P+ phi*, z or f, the composite inertia; outward alpha."""
+INWARD, OUTWARD = "sent", "returned"
+"""The array that they go through, by either name."""
 
 
 class Trace:
@@ -31,7 +33,7 @@ class Trace:
         dtype: whose rounding the pivots are compared with.
         given: names of the arrays that are there: "qd", "tau", "qdd", "body_f", "b"; the others are zero.
         piece: trace the work on this piece alone. How its ancestors move is worked out anew; what it takes from other
-            pieces and gives to them goes through the array "sent", ``slot(letter, piece)`` on.
+            pieces and gives to them goes through the array "sent" or "returned", ``slot(letter, piece)`` on.
         slot: see there.
     """
 
@@ -109,12 +111,12 @@ class Trace:
     def send(self, letter: str, values: Iterable[Value]) -> list[Store]:
         assert self.piece is not None and self.slot is not None
         first = self.slot(letter, self.piece)
-        return [Store("sent", (first + i,), value) for i, value in enumerate(values)]
+        return [Store(_way(letter), (first + i,), value) for i, value in enumerate(values)]
 
     def receive(self, letter: str, piece: Piece) -> list[Value]:
         assert self.slot is not None
         first = self.slot(letter, piece)
-        return [self.graph.input("sent", first + i) for i in range(SENT[letter])]
+        return [self.graph.input(_way(letter), first + i) for i in range(SENT[letter])]
 
     def carried_on(self, link: Link, letter: str, found: dict[int, Any], build: Callable[[list], Any]) -> list[Any]:
         """What the children of a link hand to it, of this piece or sent by others."""
@@ -385,6 +387,10 @@ class Trace:
             values = (*(R @ (v + cross(w, com))), *(R @ w))
             stores += [Store("out", (body, c), value) for c, value in enumerate(values)]
         return stores
+
+
+def _way(letter: str) -> str:
+    return OUTWARD if letter == "a" else INWARD
 
 
 def _mirrored(i: int, j: int, value: Value) -> list[tuple[tuple[int, int], Value]]:
