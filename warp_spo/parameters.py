@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
 import warp as wp
 
 from .kernels import parameters as kernels
@@ -72,9 +71,11 @@ class Parameters:
         self._captured = False
         self._values: dict[str, wp.array] = {}
         for name, value in scene.values.items():
+            own: Any = wp.array(value, dtype=wp.float64, device=device)
             if name in variable:
-                value = np.broadcast_to(value, (worlds, *value.shape[1:]))
-            self._values[name] = wp.array(np.ascontiguousarray(value), dtype=wp.float64, device=device)
+                shared, own = own, wp.empty((worlds, *value.shape[1:]), dtype=wp.float64, device=device)
+                wp.copy(own, spread(shared, 0, worlds))
+            self._values[name] = own
 
     def derived(self, key: str, build: Callable[[], Derived]) -> list[wp.array]:
         """The arrays of that name; ``build()`` allocates them at the first request."""
