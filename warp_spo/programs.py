@@ -194,7 +194,8 @@ class Programs:
         shapes = {**shapes, "out": out_shape}
         if self.plan.of(operation) == "segment":
             pieces = Pieces(links)
-            program = self._segment_program(operation, shapes, pieces) if 1 < pieces.warps <= MOST_WARPS else None
+            several = 1 < pieces.warps <= MOST_WARPS
+            program = self._segment_program(operation, shapes, pieces, options) if several else None
             if program is not None:
                 return program
         return self._tree_program(operation, links, {**shapes, **more}, tuple(more), options)
@@ -215,7 +216,7 @@ class Programs:
         tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
         return self._finished(operation, frame, body, body, tables, emitter.operations)
 
-    def _segment_program(self, operation: str, shapes: dict, pieces: Pieces) -> Program | None:
+    def _segment_program(self, operation: str, shapes: dict, pieces: Pieces, options: dict) -> Program | None:
         dtype, slots = self.run.dtype.__name__, _slots(pieces, SENDS[operation])
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         sent = sum(SENT[letter] for letter, _ in slots)
@@ -224,7 +225,7 @@ class Programs:
         for index in range(len(pieces.pieces)):
             links = self.links.opened()  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
-            traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)()])
+            traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)(**options)])
             everything += traced[-1]
         frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
                             WARP * pieces.warps, everything)

@@ -196,8 +196,9 @@ class Trace:
                 stores += self.send("a", (*alpha[key][0], *alpha[key][1]))
         return stores
 
-    def inverse_dynamics(self) -> list[Store]:
+    def inverse_dynamics(self, gravity: bool = True) -> list[Store]:
         """out = Mass qdd + bias_force"""
+        base = self.base if gravity else (ZERO, ZERO)
         qdd, moves = self.vector("qdd"), "qd" in self.given
         alpha: dict[int, tuple[Vector, Vector]] = {}
         forces: dict[int, Vector] = {}
@@ -207,7 +208,7 @@ class Trace:
             if outward:
                 self.place(link, moves)
                 self.at(link, "a")
-                above = self.base if link.parent is None else alpha[id(link.parent)]
+                above = base if link.parent is None else alpha[id(link.parent)]
                 alpha[key] = newton_euler.accelerated(link, self.places[key], self.motions[key], above, qdd)
                 continue
             self.at(link, "f")
