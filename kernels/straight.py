@@ -18,6 +18,7 @@ LONG_COPY = 64  # entries of a row from which it is copied to shared memory with
 ON_ITS_WAY = """\
 #define ON_ITS_WAY(to, from) asm volatile("cp.async.ca.shared.global [%0], [%1], %2;" \
     :: "r"((unsigned)__cvta_generic_to_shared(to)), "l"(from), "n"(sizeof(*(to))) : "memory")"""
+ARRIVED = 'asm volatile("cp.async.wait_all;" ::: "memory");'
 SHARED_BYTES = 46 * 1024  # that a block may declare: 48 KiB less what Warp takes
 C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
 MASKS = ("prescribed",)  # arrays of booleans
@@ -60,13 +61,15 @@ class Frame(NamedTuple):
     Attributes:
         rows: arrays to read, by entry: ``name_row[i]``. staged: they are copied to shared memory first, all worlds
             together; otherwise each thread reads its world's row, which is faster while few worlds or few entries wait.
-        fields: arrays [item, component, world] to read: ``name_at[entry * name_part]``.
+        fields: arrays [entry, world] to read: ``FIELD(name, entry)``.
         result: how ``result_row[i]`` leaves.
         again: the statements run once more, with ``again`` set, if they left ``farthest`` beyond reach.
         sent: values that warps send each other, ``SENT(i)``.
         warps: how many work on 32 worlds.
         block: threads of a block.
         more: further results, ``name_row[i]``, each entry to memory by itself.
+        held: entries of each field, from the first on, that wait for their use in shared memory: a compiler that loads
+            them from memory does so long before, and has no registers left.
     """
 
     rows: list[Row]
@@ -78,6 +81,7 @@ class Frame(NamedTuple):
     block: int
     more: tuple[Row, ...] = ()
     again: bool = False
+    held: tuple[int, ...] = ()
 
     @property
     def groups(self) -> int:
@@ -89,7 +93,7 @@ class Frame(NamedTuple):
         """Scalars of shared memory that a group takes."""
         rows = sum(pitch(row.entries) for row in self.rows) if self.staged else 0
         extra = {STAGED: self.result.array.entries, MAPPED: self.result.slots | 1}.get(self.result.way)
-        return WARP * (rows + (0 if extra is None else pitch(extra)) + self.sent)
+        return WARP * (rows + (0 if extra is None else pitch(extra)) + self.sent + sum(self.held))
 
     def fits(self, T) -> bool:
         """Shared memory holds what is staged."""
@@ -116,12 +120,17 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
         else:
             text += [_own_row(row, c)]
     text += [f"{c}* {row.name}_row = {row.name}.data + world * {row.entries};" for row in frame.more]
+    if frame.held:
+        text += [ON_ITS_WAY, *_held(frame, c), "#undef ON_ITS_WAY"]
+        lines = cuda.split("\n")
+        lines.insert(next(i for i, line in enumerate(lines) if "FIELD(" in line), ARRIVED)
+        cuda = "\n".join(lines)
     if frame.staged:
         if any(row.entries >= LONG_COPY for row in frame.rows):
             text += [ON_ITS_WAY]
         text += [_stage_in(row, offset[row.name], c, team) for row in frame.rows]
         if any(row.entries >= LONG_COPY for row in frame.rows):
-            text += ['asm volatile("cp.async.wait_all;" ::: "memory");', "#undef ON_ITS_WAY"]
+            text += [ARRIVED, "#undef ON_ITS_WAY"]
         text += [sync]
     if result.way == IN_PLACE:
         start, width = offset[result.row], pitch(next(row.entries for row in frame.rows if row.name == result.row))
@@ -138,11 +147,12 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
         text += [f"{c}* sent = stage + {at} + lane;", "#define SENT(i) sent[(i) * 32]"]
     if frame.again:
         cuda = f"for (int again = 0;; ++again) {{\n{cuda}\nif (again || !(farthest > on::reach())) break;\n}}"
-    text += [*_fields(frame.fields, c), cuda]
+    text += [*([] if frame.held else _fields(frame.fields, c)), cuda]
     if result.way in (IN_PLACE, STAGED):
         text += [sync, _stage_out(out, start, width, c, team)]
     if result.way == MAPPED:
         text += [sync, _spread_out(result, start, c, team)]
+    text += ["#undef FIELD"] if frame.held else []
     text += ["#else", "const long long world = thread;", "const bool mine = true;"]
     text += [_own_row(row, c) for row in frame.rows]
     text += [f"{c}* {row.name}_row = {row.name}.data + world * {row.entries};" for row in frame.more]
@@ -158,7 +168,14 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     if result.way == MAPPED:
         text += [f"for (int i = 0; i < {out.entries}; ++i) {{", "    const int slot = place.data[i];",
                  f"    out.data[world * {out.entries} + i] = slot < 0 ? 0 : result_row[slot];", "}"]
-    text += ["#endif", "#undef SENT", "#undef RESULT", ""]
+    text += ["#endif", "#undef SENT", "#undef RESULT", *(["#undef FIELD"] if frame.fields else []), ""]
+    return "\n".join(text)
+
+
+def per_world(fields: list[str], statements: str) -> str:
+    """The native code of one thread, a world, around statements in float64."""
+    c = C_TYPE[wp.float64]
+    text = [NATIVE[c], "const long long world = thread;", *_fields(fields, c), statements, "#undef FIELD", ""]
     return "\n".join(text)
 
 
@@ -173,14 +190,36 @@ def _own_row(row: Row, c: str) -> str:
 
 
 def _fields(names: list[str], c: str) -> list[str]:
+    """FIELD for fields that are read where they are."""
+    if not names:
+        return []
     return [
-        line
-        for name in names
-        for line in (
-            f"const {c}* {name}_at = (const {c}*)((const char*){name}.data + world * {name}.strides[2]);",
-            f"const int {name}_part = (int)({name}.strides[1] / (int)sizeof({c}));",
-        )
+        "#if defined(__CUDA_ARCH__)",
+        "#define FIELD(name, entry) __ldg(name##_at + (entry) * name##_part)",
+        "#else",
+        "#define FIELD(name, entry) name##_at[(entry) * name##_part]",
+        "#endif",
+        *(
+            f"const {c}* {name}_at = (const {c}*)((const char*){name}.data + world * {name}.strides[1]);\n"
+            f"const long long {name}_part = {name}.strides[0] / (int)sizeof({c});"
+            for name in names
+        ),
     ]
+
+
+def _held(frame: Frame, c: str) -> list[str]:
+    """FIELD for fields in the last part of the shared memory; each thread fetches those of its world."""
+    text, at = ["#define FIELD(name, entry) name##_at[(entry) * 32]"], frame.scalars - WARP * sum(frame.held)
+    for name, entries in zip(frame.fields, frame.held, strict=True):
+        text += [
+            f"{c}* {name}_at = stage + {at} + lane;",
+            f"const char* {name}_from = (const char*){name}.data + world * {name}.strides[1];",
+            "#pragma unroll 8",
+            f"for (int k = 0; k < {entries}; ++k)",
+            f"    ON_ITS_WAY({name}_at + 32 * k, {name}_from + k * (long long){name}.strides[0]);",
+        ]
+        at += WARP * entries
+    return text
 
 
 def _columns(c: str) -> list[str]:
@@ -283,14 +322,16 @@ def _slot(i: str, entries: int, distance: int) -> str:
     return i if entries == distance else f"({i} / {entries}) * {distance} + {i} % {entries}"
 
 
-def kernel(name: str, native: str, arrays: list[tuple[str, int]], T, registers: int | None = None) -> wp.Kernel:
+def kernel(
+    name: str, native: str, arrays: list[tuple[str, int]], T, registers: int | None = None, wide: tuple = ()
+) -> wp.Kernel:
     """A kernel of ``worlds``, then ``arrays`` (name, axes) of scalars ``T``, that runs ``native`` in each thread.
 
-    The arrays ``place`` and ``shifts`` hold integers, those of MASKS booleans.
+    The arrays ``place`` and ``shifts`` hold integers, those of MASKS booleans, the ``wide`` [entry, world] float64.
     """
     key = f"{name}_{hashlib.sha256(native.encode()).hexdigest()[:16]}"
     types = {array: "table" if array in ("place", "shifts") else f"array{axes}" for array, axes in arrays}
-    types |= {array: "mask" for array in types if array in MASKS}
+    types |= {array: "mask" for array in types if array in MASKS} | {array: "wide" for array in wide}
     declared = ", ".join(f"{array}: {kind}" for array, kind in types.items())
     source = f"""def native(thread: int, worlds: int, {declared}): ...
 
@@ -302,7 +343,8 @@ def {key}(worlds: int, {declared}):
     file = f"<{key}>"
     linecache.cache[file] = len(source), None, source.splitlines(True), file  # where Warp looks for the source
     space = {f"array{axes}": wp.array(dtype=T, ndim=axes) for axes in range(1, 5)} | {
-        "table": wp.array(dtype=int, ndim=1), "mask": wp.array(dtype=wp.bool, ndim=2), "wp": wp, "__name__": key
+        "table": wp.array(dtype=int, ndim=1), "mask": wp.array(dtype=wp.bool, ndim=2),
+        "wide": wp.array(dtype=wp.float64, ndim=2), "wp": wp, "__name__": key
     }
     exec(compile(source, file, "exec"), space)
     space["native"] = wp.func_native(native)(space["native"])

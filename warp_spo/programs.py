@@ -12,13 +12,14 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from . import link_values
 from .kernels import straight
 from .kernels.straight import COLUMNS, DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
 from .levels import Recursions
 from .plan import MOST_WARPS, TREE_ONLY, Plan
 from .recursions import messages
 from .recursions.applications import Applications
-from .recursions.links import Links
+from .recursions.links import TABLES, Links
 from .recursions.messages import INWARD, OUTWARD, SENDS
 from .recursions.operators import meet, written
 from .recursions.pieces import Pieces
@@ -27,8 +28,6 @@ from .teams import Team, Work
 from .trace.emit import Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
-FIELDS = {"rigid": 10, "tree": 12, "anchor": 12, "com": 3, "joint_armature": 1, "gravity": 1}
-"""The parameters' arrays, and how many components an item has."""
 TRACED = (
     *SENDS,
     "log_det_mass_matrix",
@@ -50,7 +49,7 @@ class Program(NamedTuple):
     """One kernel.
 
     Attributes:
-        rows: names of the callers' arrays that it reads. fields: of the parameters' arrays.
+        rows: names of the callers' arrays that it reads. fields: of the tables of what the links are made of.
         tables: arrays of its own.
         operations: floating-point operations of one world.
         spread: a second kernel that brings the values of the first, [slot, world], to their ``places``; or None.
@@ -92,10 +91,12 @@ class Programs:
         self.run, self.plan, self.block, self.registers = run, plan, block, registers
         self.columns, self.column_worlds = run.device.is_cuda, COLUMN_WORLDS
         self._programs: dict[Any, Program | None] = {}
+        self._links: Links | None = None
 
     def forget(self) -> None:
         """Drop all programs: values that they folded have changed."""
         self._programs.clear()
+        self._links = None
 
     def find(
         self,
@@ -127,14 +128,14 @@ class Programs:
 
     def launch(self, program: Program, arrays: dict[str, wp.array], out: wp.array, *more: wp.array) -> None:
         rows = [arrays[name] for name in program.rows]
-        fields = [self.run.parameters.array(name) for name in program.fields]
+        fields = [self.table(name) for name in program.fields]
         if program.spread is None:
             self._launch(program, self.run.worlds, [*rows, *fields], [out, *more])
             return
         some = program.spread.columns.shape[1]
         for first in range(0, self.run.worlds, some):
             part = slice(first, min(first + some, self.run.worlds))
-            inputs = [*(row[part] for row in rows), *(field[:, :, part] for field in fields)]
+            inputs = [*(row[part] for row in rows), *(field[:, part] for field in fields)]
             self._launch(program, part.stop - first, inputs, [program.spread.columns, *(array[part] for array in more)])
             self._spread(program.spread, part.stop - first, out[part])
 
@@ -150,6 +151,10 @@ class Programs:
         threads = -(-worlds // spread.tile) * block if device.is_cuda else worlds
         inputs = [worlds, spread.columns, spread.places]
         wp.launch(spread.kernel, threads, inputs, [out], device=device, block_dim=block)
+
+    def table(self, name: str) -> wp.array:
+        """What the links are made of [entry, world]."""
+        return link_values.table(self.run.parameters, self.links, name)
 
     @property
     def operation_counts(self) -> dict[str, int]:
@@ -171,19 +176,23 @@ class Programs:
         return lines
 
     # -- building --------------------------------------------------------------------------------------------------
-    def _links(self) -> Links:
-        return Links(self.run.scene, self.run.parameters.variable)
+    @property
+    def links(self) -> Links:
+        if self._links is None:
+            self._links = Links(self.run.scene, self.run.parameters.variable)
+        return self._links
 
     def _build(self, operation: str, shapes: dict, out_shape: tuple, more: dict, options: dict) -> Program | None:
-        links = self._links()
-        if (operation == "body_poses" and links.varies_tree) or not links.links:
+        links = self.links.opened()
+        if (operation == "body_poses" and links.turns_vary) or not links.links:
             return None
         if operation == "expression" and not meet(options["expression"]):
             return None
         shapes = {**shapes, "out": out_shape}
         if self.plan.of(operation) == "segment":
             pieces = Pieces(links)
-            program = self._segment_program(operation, shapes, pieces) if 1 < pieces.warps <= MOST_WARPS else None
+            several = 1 < pieces.warps <= MOST_WARPS
+            program = self._segment_program(operation, shapes, pieces, options) if several else None
             if program is not None:
                 return program
         return self._tree_program(operation, links, {**shapes, **more}, tuple(more), options)
@@ -204,16 +213,16 @@ class Programs:
         tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
         return self._finished(operation, frame, body, body, tables, emitter.operations)
 
-    def _segment_program(self, operation: str, shapes: dict, pieces: Pieces) -> Program | None:
+    def _segment_program(self, operation: str, shapes: dict, pieces: Pieces, options: dict) -> Program | None:
         dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(operation, pieces)
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         everything: list[Store] = []
         traced: list[list[Store]] = []
         apart: list[tuple[list[Store], dict[int, list[Store]]]] = []
         for index in range(len(pieces.pieces)):
-            links = self._links()  # its own: pieces of equal structure then give equal text
+            links = self.links.opened()  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
-            traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)()])
+            traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)(**options)])
             flat = {at: [self._flattened(item, shapes) for item in items] for at, items in trace.across.items()}
             apart.append((trace.news, flat))
             everything += traced[-1] + trace.news + [item for items in flat.values() for item in items]
@@ -252,7 +261,7 @@ class Programs:
     def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int) -> Program:
         native = straight.assemble(frame, cuda, cpu, self.run.dtype)
         rows, fields = tuple(row.name for row in frame.rows), tuple(frame.fields)
-        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 3) for name in fields]
+        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 2) for name in fields]
         result, spread = frame.result, None
         if result.way == COLUMNS:
             some = min(self.run.worlds, self.column_worlds)
@@ -272,8 +281,8 @@ class Programs:
         def load(array: str, entry: str) -> str:
             if array in (INWARD, OUTWARD):
                 return f"SENT({entry})"
-            if array in FIELDS:
-                return f"{array}_at[({entry}) * {array}_part]"
+            if array in TABLES:
+                return f"FIELD({array}, {entry})"
             return f"{array}_row[{entry}]"
 
         def store(array: str, entry: str, value: str) -> str:
@@ -286,11 +295,9 @@ class Programs:
             return f"if (mine) {array}_row[{entry}] = {value};"
 
         def flat(array: str, index: tuple) -> int:
-            if array in FIELDS:
-                return FIELDS[array] * index[0] + (index[1] if len(index) > 1 else 0)
             return index[0] if len(index) == 1 else _flat(index, shapes[array][1:])
 
-        return Emitter(self.run.dtype.__name__, load, store, flat, angles)
+        return Emitter(self.run.dtype.__name__, load, store, flat, angles, TABLES)
 
     def _frame(self, stores: list[Store], shapes: dict, sent: int, warps: int, block: int,
                everything: list[Store] | None = None) -> Frame:
@@ -302,7 +309,8 @@ class Programs:
         over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
         over = [name for name in over if _read_before(stores, name)]
         slots = len({_name(item.value) for item in stores})
-        fields = [name for name in FIELDS if name in used]
+        fields = {name: used[name] for name in TABLES if name in used}
+        held = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
         staged, ways = self.plan.staged, [(False, Result(DIRECT, out))]
         staged = staged or any(row.name == "x" and row.entries > SHORT_ROW for row in rows)
         if dense and (staged or out.entries > SHORT_ROW):
@@ -314,7 +322,11 @@ class Programs:
             ways = [(staged, mapped), (False, mapped), *ways]
             if self.columns and straight.tile(columns, self.run.dtype):
                 ways.insert(-1, (False, columns))
-        frames = [Frame(rows, staged, fields, result, sent, warps, block) for staged, result in ways]
+        frames = [
+            Frame(rows, staged, list(fields), result, sent, warps, block, held=entries)
+            for staged, result in ways
+            for entries in held[::-1]
+        ]
         return next((frame for frame in frames if frame.fits(self.run.dtype)), frames[-1])
 
 
@@ -365,10 +377,16 @@ def _flat(index: tuple, shape: tuple) -> int:
     return at
 
 
-def _reads(stores: list[Store]) -> set[str]:
-    """Names of the arrays that are read."""
+def _reads(stores: list[Store]) -> dict[str, int]:
+    """Names of the arrays that are read, and one more than the last index."""
     graphs: dict[int, list[Value]] = {}
     for item in stores:
         if not is_constant(item.value):
             graphs.setdefault(id(item.value.graph), []).append(item.value)
-    return {scalar.args[0] for values in graphs.values() for scalar in ordered(values) if scalar.op == "input"}
+    read: dict[str, int] = {}
+    for values in graphs.values():
+        for scalar in ordered(values):
+            if scalar.op == "input":
+                array, index = scalar.args[:2]
+                read[array] = max(index + 1, read.get(array, 0))
+    return read

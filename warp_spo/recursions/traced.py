@@ -95,7 +95,7 @@ class Trace:
             seat = self.links.seats[body]
             force = back @ Vector(self.graph.input("body_f", body, c) for c in range(3))
             torque = back @ Vector(self.graph.input("body_f", body, c) for c in range(3, 6))
-            com = seat.offset + seat.matrix @ self.links.com(body)
+            com = seat.offset + seat.matrix @ self.links.nodes[body].com
             n, f = n + torque + cross(com, force), f + force
         return Vector((*n, *f))
 
@@ -223,8 +223,9 @@ class Trace:
                 stores += self.post("a", self.piece, (*alpha[key][0], *alpha[key][1]))
         return stores
 
-    def inverse_dynamics(self) -> list[Store]:
+    def inverse_dynamics(self, gravity: bool = True) -> list[Store]:
         """out = Mass qdd + bias_force"""
+        base = self.base if gravity else (ZERO, ZERO)
         qdd, moves = self.vector("qdd"), "qd" in self.given
         alpha: dict[int, tuple[Vector, Vector]] = {}
         forces: dict[int, Vector] = {}
@@ -234,7 +235,7 @@ class Trace:
             if outward:
                 self.place(link, moves)
                 self.at(link, "a")
-                above = self.base if link.parent is None else alpha[id(link.parent)]
+                above = base if link.parent is None else alpha[id(link.parent)]
                 alpha[key] = newton_euler.accelerated(link, self.places[key], self.motions[key], above, qdd)
                 continue
             self.at(link, "f")
@@ -332,7 +333,7 @@ class Trace:
     def frame(self, body: int, origin: tuple) -> tuple[Link | None, Vector]:
         """The link that carries a frame of a body, and the frame's origin in the link's frame."""
         seat = self.links.seats[body]
-        R, p = self.links.anchor(body)
+        R, p = self.links.nodes[body].anchor
         return seat.link, seat.offset + seat.matrix @ (R.T @ (Vector(origin) - p))
 
     def jacobian(self, frames: tuple) -> list[Store]:
@@ -385,7 +386,7 @@ class Trace:
             turns[id(link)] = kinematics.multiplied(turns[over], kinematics.relative_quaternion(link, q))
         stores = []
         for body, seat in self.links.seats.items():
-            R, p = self.links.anchor(body)
+            R, p = self.links.nodes[body].anchor
             key = None if seat.link is None else id(seat.link)
             axes = seat.matrix @ R.T
             position = at[key] + kinematics.turned(turns[key], seat.offset - axes @ p)
@@ -407,7 +408,7 @@ class Trace:
             key = None if seat.link is None else id(seat.link)
             w, v = velocity[key]
             R = IDENTITY if key is None else self.axes[key]
-            com = seat.offset + seat.matrix @ self.links.com(body)
+            com = seat.offset + seat.matrix @ self.links.nodes[body].com
             values = (*(R @ (v + cross(w, com))), *(R @ w))
             stores += [Store("out", (body, c), value) for c, value in enumerate(values)]
         return stores
