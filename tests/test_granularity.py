@@ -205,7 +205,7 @@ def test_a_long_result_by_columns(granularity, device, monkeypatch):
     """Values that go through memory, [slot, world], some worlds at a time, and rows of parameters with them."""
     dyn = dynamics("two arms", granularity, MANY, "float64", device, varied=True)
     monkeypatch.setattr(straight, "SHARED_BYTES", 10_000)
-    dyn.programs.columns, dyn.programs.column_worlds = True, 14
+    dyn.programs.columns, dyn.programs.column_worlds = True, 32
     for operation in ("mass_matrix", "mass_matrix_inverse"):
         equals_reference(dyn, operation, states(dyn), laws.TOLERANCE["float64"])
     assert all(program.spread is not None for program in dyn.programs._programs.values())

@@ -66,7 +66,7 @@ class Program(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """The second half of a program with a long result: ``columns`` [slot, world] of some worlds at a time."""
+    """The second half of a program with a long result: ``columns`` [group, slot, world of 32] of some worlds."""
 
     kernel: wp.Kernel
     columns: wp.array
@@ -84,7 +84,8 @@ class Programs:
         registers: a cap on the registers of a thread.
 
     Attributes:
-        columns: a result that has no room in shared memory goes through memory. column_worlds: of so many at a time.
+        columns: a result that has no room in shared memory goes through memory. column_worlds: of so many at a time,
+            a multiple of 32.
     """
 
     def __init__(self, run: Recursions, plan: Plan, block: int = WARP, registers: int | None = None):
@@ -132,7 +133,7 @@ class Programs:
         if program.spread is None:
             self._launch(program, self.run.worlds, [*rows, *fields], [out, *more])
             return
-        some = program.spread.columns.shape[1]
+        some = WARP * program.spread.columns.shape[0]
         for first in range(0, self.run.worlds, some):
             part = slice(first, min(first + some, self.run.worlds))
             inputs = [*(row[part] for row in rows), *(field[:, part] for field in fields)]
@@ -265,10 +266,10 @@ class Programs:
         result, spread = frame.result, None
         if result.way == COLUMNS:
             some = min(self.run.worlds, self.column_worlds)
-            columns = wp.empty((result.slots, some), dtype=self.run.dtype, device=self.run.device)
+            columns = wp.empty((-(-some // WARP), result.slots, WARP), dtype=self.run.dtype, device=self.run.device)
             tile = straight.tile(result, self.run.dtype)
             spread = Spread(straight.spread(result, self.run.dtype), columns, tables.pop("place"), tile)
-        arrays += [(name, 1) for name in tables] + [("out", 2 if spread else result.array.ndim)]
+        arrays += [(name, 1) for name in tables] + [("out", 3 if spread else result.array.ndim)]
         arrays += [(row.name, row.ndim) for row in frame.more]
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers)
         return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations, spread)
