@@ -288,10 +288,13 @@ const int member = threadIdx.x;
 const long long first = (long long)(thread / {SPREAD_BLOCK}) * {worlds};
 const int present = worlds - first < {worlds} ? (int)(worlds - first) : {worlds};
 const {c}* from = columns.data + (first / {WARP} * {result.slots}) * {WARP} + first % {WARP};
-#pragma unroll 8
-for (int k = member; k < {result.slots * worlds}; k += {SPREAD_BLOCK}) {{
-    const int slot = k / {worlds}, world = k % {worlds};
-    if (world < present) shared[world * {width} + slot] = __ldg(from + slot * {WARP} + world);
+if (present == {worlds}) {{
+    #pragma unroll 8
+    for (int k = member; k < {result.slots * worlds}; k += {SPREAD_BLOCK})
+        shared[(k % {worlds}) * {width} + k / {worlds}] = __ldg(from + k / {worlds} * {WARP} + k % {worlds});
+}} else {{
+    for (int k = member; k < {result.slots} * present; k += {SPREAD_BLOCK})
+        shared[(k % present) * {width} + k / present] = __ldg(from + k / present * {WARP} + k % present);
 }}
 __syncthreads();
 {c}* to = out.data + first * {n};

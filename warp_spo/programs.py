@@ -39,7 +39,8 @@ TRACED = (
     *TREE_ONLY,
 )
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
-COLUMN_WORLDS = 1 << 18  # of so many at a time the values of a long result go through memory
+COLUMN_SLOTS = 256  # different values of a result from which they go through memory, not through shared memory,
+COLUMN_WORLDS = 1 << 20  # of so many worlds at a time
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
@@ -84,7 +85,7 @@ class Programs:
         registers: a cap on the registers of a thread.
 
     Attributes:
-        columns: a result that has no room in shared memory goes through memory. column_worlds: of so many at a time,
+        columns: a result that is too long for shared memory goes through memory. column_worlds: of so many at a time,
             a multiple of 32.
     """
 
@@ -322,7 +323,7 @@ class Programs:
             mapped, columns = Result(MAPPED, out, slots=slots), Result(COLUMNS, out, slots=slots)
             ways = [(staged, mapped), (False, mapped), *ways]
             if self.columns and straight.tile(columns, self.run.dtype):
-                ways.insert(-1, (False, columns))
+                ways.insert(0 if slots >= COLUMN_SLOTS else -1, (False, columns))
         frames = [
             Frame(rows, staged, list(fields), result, sent, warps, block, held=entries)
             for staged, result in ways
