@@ -21,7 +21,8 @@ ON_ITS_WAY = """\
 SHARED_BYTES = 46 * 1024  # that a block may declare: 48 KiB less what Warp takes
 C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
 MASKS = ("prescribed",)  # arrays of booleans
-IN_PLACE, STAGED, MAPPED, DIRECT = "in place", "staged", "mapped", "direct"
+IN_PLACE, STAGED, MAPPED, DIRECT, TILED = "in place", "staged", "mapped", "direct", "tiled"
+TILE = 8  # worlds of a tile: an entry of theirs fills a sector of 32 bytes
 
 
 class Row(NamedTuple):
@@ -38,7 +39,8 @@ class Result(NamedTuple):
     Attributes:
         way: IN_PLACE: entry by entry over ``row``, which is read first; STAGED: through shared memory, as it is;
             MAPPED: through shared memory, ``slots`` values that a table ``place`` [entry] spreads, -1 being zero;
-            DIRECT: each entry to memory by itself, where shared memory is too small.
+            DIRECT: each entry to memory by itself, where shared memory is too small; TILED: ``slots`` values to memory
+            by themselves, as [tile, slot, world of the tile], for kernels that read them so (see .tiles).
     """
 
     way: str
@@ -125,9 +127,12 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
         start, width = offset[result.row], pitch(next(row.entries for row in frame.rows if row.name == result.row))
     else:
         width = pitch(result.slots | 1 if result.way == MAPPED else out.entries)
-        start, at = at, at + (0 if result.way == DIRECT else WARP * width)
-    if result.way == DIRECT:
-        text += [f"{c}* result_row = out.data + world * {out.entries};"]
+        start, at = at, at + (0 if result.way in (DIRECT, TILED) else WARP * width)
+    own_row = f"{c}* result_row = out.data + world * {out.entries};"
+    if result.way == TILED:
+        own_row = f"{c}* result_row = out.data + world / {TILE} * {result.slots * TILE} + world % {TILE};"
+    if result.way in (DIRECT, TILED):
+        text += [own_row]
     else:
         text += [f"{c}* result_row = stage + {start} + lane * {width};"]
     if frame.sent:
@@ -145,7 +150,7 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     if result.way == MAPPED:
         text += [f"{c} result_row[{result.slots}];"]
     else:
-        text += [f"{c}* result_row = out.data + world * {out.entries};"]
+        text += [own_row]
     if frame.sent:
         text += [f"{c} sent[{frame.sent}];", "#define SENT(i) sent[i]"]
     text += [*_fields(frame.fields, c), cpu]

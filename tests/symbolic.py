@@ -10,14 +10,14 @@ from warp_spo.recursions.links import Links
 from warp_spo.trace.evaluate import evaluate
 
 
-def run(scene, operation, arrays, given, shapes, dtype="float64", **options):
+def run(scene, operation, arrays, given, shapes, dtype="float64", trace=Applications, **options):
     """Results by name, [world, ...] of ``shapes``, NaN where nothing is stored.
 
     Args:
         arrays: inputs [world, ...] by name. given: those of them that the operation gets.
+        trace: the class that has the operation.
     """
-    trace = Applications(Links(scene), dtype, tuple(given))
-    stores = getattr(trace, operation)(**options)
+    stores = getattr(trace(Links(scene), dtype, tuple(given)), operation)(**options)
     values = evaluate([item.value for item in stores], lambda name, at: arrays[name][(slice(None), *at)], dtype)
     results = {name: np.full((len(arrays["q"]), *shape), np.nan) for name, shape in shapes.items()}
     for item, value in zip(stores, values, strict=True):

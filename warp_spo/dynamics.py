@@ -19,6 +19,7 @@ from . import plan as plans
 from . import status as words
 from .applications import Applications
 from .arrays import Call, parse_device, parse_dtype, shape_of
+from .derivatives import Derivatives
 from .errors import UnsupportedError
 from .frames import Frame, checked
 from .levels import Recursions
@@ -52,11 +53,14 @@ OPERATIONS = (
     "log_det_mass_matrix_gradient",
     "fixman_torque",
     "mass_matrix_packed",
+    "inverse_dynamics_derivatives",
+    "forward_dynamics_derivatives",
+    "mass_matrix_derivative",
 )
 LOOPS = ("raise", "cut", "embed", "multipliers")
 
 
-class Dynamics(Applications):
+class Dynamics(Applications, Derivatives):
     """Dynamics of one scene in many worlds.
 
     Arrays are torch tensors, Warp arrays or NumPy arrays, [world, ...] and C-contiguous; the kind of the first one is
@@ -169,7 +173,8 @@ class Dynamics(Applications):
         q: Any = wp.array(np.tile(self.scene.neutral_q, (self.worlds, 1)), dtype=self.dtype, device=self.device)
         rate = wp.zeros((self.worlds, self.scene.dof_count), dtype=self.dtype, device=self.device)
         extra: dict[str, Any] = {}
-        loaded = ("forward_dynamics", "inverse_dynamics", "bias_force", "hybrid_dynamics")
+        loaded = ("forward_dynamics", "inverse_dynamics", "bias_force", "hybrid_dynamics",
+                  "inverse_dynamics_derivatives", "forward_dynamics_derivatives")  # fmt: skip
         if operation in loaded and options.pop("body_f", False):
             shape = (self.worlds, self.scene.body_count, 6)
             extra["body_f"] = wp.zeros(shape, dtype=self.dtype, device=self.device)
@@ -186,6 +191,8 @@ class Dynamics(Applications):
             "jacobian_bias": (q, rate),
             "centroidal_momentum_bias": (q, rate),
             "quasi_velocities": (q, rate),
+            "inverse_dynamics_derivatives": (q, rate, rate),
+            "forward_dynamics_derivatives": (q, rate, rate),
         }
         given = arguments.get(operation, (q,))
         if operation == "solve_mass_matrix":

@@ -36,6 +36,9 @@ TREE_ONLY = (
     "log_det_mass_matrix_gradient",
     "fixman_torque",
     "mass_matrix_packed",
+    "inverse_dynamics_derivatives",
+    "mass_matrix_derivative",
+    "tiled_mass_matrix_inverse",
 )
 """Operations that exist as traces alone: each is a kernel of its scene, a thread a world, whatever the plan."""
 

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from .kernels import straight
-from .kernels.straight import DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
+from .kernels.straight import DIRECT, IN_PLACE, MAPPED, STAGED, TILE, TILED, WARP, Frame, Result, Row
 from .levels import Recursions
 from .plan import MOST_WARPS, TREE_ONLY, Plan
-from .recursions.applications import Applications
+from .recursions.derivatives import Derivatives
 from .recursions.links import Links
 from .recursions.operators import meet, written
 from .recursions.pieces import Piece, Pieces
@@ -40,6 +40,8 @@ TRACED = (
     "expression",
     *TREE_ONLY,
 )
+TILES = ("tiled_mass_matrix_inverse", "inverse_dynamics_derivatives", "mass_matrix_derivative")
+"""Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
@@ -53,6 +55,8 @@ class Program(NamedTuple):
         rows: names of the callers' arrays that it reads. fields: of the parameters' arrays.
         tables: arrays of its own.
         operations: floating-point operations of one world.
+        slots: values of one world in the tiles that it writes; entry: where each entry of the result is among them, -1
+            being zero. Programs whose results are tiles for other kernels, see :mod:`.kernels.tiles`.
     """
 
     kernel: wp.Kernel
@@ -62,6 +66,8 @@ class Program(NamedTuple):
     warps: int
     block: int
     operations: int
+    slots: int = 0
+    entry: Any = None
 
 
 class Programs:
@@ -158,11 +164,15 @@ class Programs:
         return self._tree_program(operation, links, {**shapes, **more}, tuple(more), options)
 
     def _tree_program(self, operation: str, links: Links, shapes: dict, more: tuple, options: dict) -> Program:
-        trace = Applications(links, self.run.dtype.__name__, tuple(shapes))
+        trace = Derivatives(links, self.run.dtype.__name__, tuple(shapes))
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         frame = self._frame([item for item in stores if item.array == "out"], shapes, 0, 1, self.block, stores)
-        frame = frame._replace(again=not frame.staged and frame.result.way == DIRECT)
+        if operation in TILES:
+            slots = len({_name(item.value) for item in stores if not _is_zero(item.value)})
+            result = Result(TILED, Row("out", 3, frame.result.array.entries), slots=slots)
+            frame = frame._replace(staged=self.plan.staged, result=result)
+        frame = frame._replace(again=not frame.staged and frame.result.way in (DIRECT, TILED))
         frame = frame._replace(more=tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more))
         placed, table = _placed([item for item in stores if item.array == "out"], frame.result)
         placed += apart
@@ -170,8 +180,10 @@ class Programs:
         listing = emitter.region(placed)
         body = literals(listing, self.run.dtype.__name__)
         frame = frame._replace(again=frame.again and "farthest" in listing.text)
-        tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
-        return self._finished(operation, frame, body, body, tables, emitter.operations)
+        place: Any = None if table is None else wp.array(table, dtype=int, device=self.run.device)
+        tables: dict[str, Any] = {"place": place} if frame.result.way == MAPPED else {}
+        program = self._finished(operation, frame, body, body, tables, emitter.operations)
+        return program._replace(slots=frame.result.slots, entry=place)
 
     def _segment_program(self, operation: str, shapes: dict, pieces: Pieces) -> Program | None:
         dtype, slots = self.run.dtype.__name__, _slots(pieces, SENDS[operation])
@@ -222,7 +234,8 @@ class Programs:
     def _emitter(self, shapes: dict, frame: Frame) -> Emitter:
         result = frame.result
         angles = Angles.IN_PLACE if frame.staged else Angles.AGAIN if frame.again else Angles.FIRST
-        guard = "if (mine) " if result.way == DIRECT else ""
+        tile = f" * {TILE}" if result.way == TILED else ""
+        guard = "if (mine) " if result.way in (DIRECT, TILED) else ""
 
         def load(array: str, entry: str) -> str:
             if array == "sent":
@@ -235,7 +248,7 @@ class Programs:
             if array == "sent":
                 return f"SENT({entry}) = {value};"
             if array == "out":
-                return f"{guard}result_row[{entry}] = {value};"
+                return f"{guard}result_row[{entry}{tile}] = {value};"
             return f"if (mine) {array}_row[{entry}] = {value};"
 
         def flat(array: str, index: tuple) -> int:
@@ -306,19 +319,24 @@ def _goes_inward(item: Store, slots: dict, piece: Piece) -> bool:
 def _placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int] | None]:
     """Flat stores as the result wants them, and the table of a MAPPED one."""
     out = result.array
-    if result.way == MAPPED:
+    if result.way in (MAPPED, TILED):
         slots: dict[Any, int] = {}
         table = [-1] * out.entries
         for item in stores:
-            table[item.index[0]] = slots.setdefault(_name(item.value), len(slots))
+            if result.way == MAPPED or not _is_zero(item.value):
+                table[item.index[0]] = slots.setdefault(_name(item.value), len(slots))
         return _by_slot(stores, table), table
     done = {item.index for item in stores}
     return stores + [Store("out", (i,), 0.0) for i in range(out.entries) if (i,) not in done], None
 
 
 def _by_slot(stores: list[Store], table: list[int]) -> list[Store]:
-    values = {table[item.index[0]]: item.value for item in stores}
+    values = {table[item.index[0]]: item.value for item in stores if table[item.index[0]] >= 0}
     return [Store("out", (slot,), value) for slot, value in sorted(values.items())]
+
+
+def _is_zero(value: Value) -> bool:
+    return is_constant(value) and value == 0.0
 
 
 def _name(value: Value) -> Any:

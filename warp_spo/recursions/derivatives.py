@@ -7,8 +7,6 @@ by q and by qd, H*(i) as a row of the composite inertia, and what it makes of an
 
 from __future__ import annotations
 
-from typing import Any
-
 from ..trace.emit import Store
 from ..trace.graph import Value
 from ..trace.spatial import ZERO, Rigid, Vector, cross, dot
@@ -16,7 +14,7 @@ from . import composite, motion, newton_euler, sensitivity
 from .applications import Applications
 from .links import BALL, FREE, Link
 from .motion import STILL, Motion
-from .sensitivity import Carried, Row, Sensitivity
+from .sensitivity import Carried, Sensitivity
 
 Q, QD, QDD = range(3)  # blocks of the result
 
@@ -81,7 +79,9 @@ class Derivatives(Applications):
                 found.append((com, back @ Vector(entries[:3]), back @ Vector(entries[3:])))
         return found
 
-    def _entries(self, link: Link, all_in: Carried, force: tuple[Vector, Vector], own: dict, drifts: dict) -> list[Store]:
+    def _entries(
+        self, link: Link, all_in: Carried, force: tuple[Vector, Vector], own: dict, drifts: dict[int, Vector]
+    ) -> list[Store]:
         """Entries of the three blocks in which a dof of the link meets one of its hinge or nearer to the root."""
         place, stores = self.places[id(link)], []
         by_q, by_qd = own[id(link)]
@@ -114,6 +114,10 @@ class Derivatives(Applications):
                         stores.append(Store("out", (block, dof, j), row.at(other)))
         return stores
 
+    def tiled_mass_matrix_inverse(self) -> list[Store]:
+        """out = Mass^-1; by another name, because its kernel leaves the result otherwise"""
+        return self.mass_matrix_inverse()
+
     def mass_matrix_derivative(self) -> list[Store]:
         """out [dof, dof, dof] = d Mass / d q along the tangent coordinates, the last index the coordinate.
 
@@ -135,7 +139,7 @@ class Derivatives(Applications):
                 heads[key] |= zip(link.dofs, sensitivity.columns(link, self.places[key]), strict=True)
                 continue
             self.at(link, "t")
-            body, below = link.inertia or composite.NOTHING, {}
+            body, below = link.inertia or composite.NOTHING, dict[int, tuple[Vector, Vector]]()
             for child in link.children:
                 pose = self.places[id(child)].pose
                 body = body + pose.rigid_to_parent(bodies[id(child)])
