@@ -21,6 +21,7 @@ from ..trace.graph import Graph, Value, cos, is_constant, reciprocal, reduced, s
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
 
 TURN, SLIDE, HELIX = "turn", "slide", "helix"
+SCREW_MOTIONS = (TURN, SLIDE, HELIX)
 ROUNDING = 1e-14  # a rotation's entry that is this close to 0 or 1 is meant to be
 
 
@@ -228,7 +229,7 @@ class Placed(NamedTuple):
 def placed(link: Link, q: Any) -> Placed:
     """``link`` where the coordinates put it; ``q(i)`` is entry i."""
     matrix, l = link.matrix, link.offset
-    if link.motion in (TURN, SLIDE, HELIX):
+    if link.motion in SCREW_MOTIONS:
         x, turn = q(link.coordinate), None
         if link.motion != SLIDE:
             angle = x if link.motion == TURN else reduced(x)

@@ -1,0 +1,137 @@
+"""Products with the Jacobians of the dynamics, J* y and J x, as traces.
+
+Backwards through forward dynamics is forward dynamics' own solve and one Newton-Euler recursion in reverse: with
+lambda = Mass^-1 y, J* y is lambda for tau and -(d tau / d x)* lambda at the accelerations for every other argument x.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from ..trace.derivative import forward, reverse
+from ..trace.emit import Store
+from ..trace.graph import Scalar, Value, ordered
+from ..trace.spatial import Vector, cross
+from .derivatives import Derivatives
+from .links import FREE, SCREW_MOTIONS, Link
+
+Entry = Callable[[int], Value]
+
+
+class Adjoints(Derivatives):
+    """The operations of :class:`Derivatives`, and products with Jacobians.
+
+    A result is "out" if it is the first of those asked for, and ``name_bar`` otherwise.
+    """
+
+    # -- backwards -------------------------------------------------------------------------------------------------
+    def inverse_dynamics_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
+        """J* cotangent of inverse dynamics for the arguments ``wrt``"""
+        return self._pulled_back(wrt, self.vector("cotangent"))
+
+    def forward_dynamics_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
+        """J* cotangent of forward dynamics for the arguments ``wrt``, at the accelerations "qdd\""""
+        solved = self.solved("cotangent")
+        stores = self._pulled_back(tuple(name for name in wrt if name != "tau"), lambda dof: -solved[dof], wrt)
+        return stores + [Store(_named("tau", wrt), (dof,), solved[dof]) for dof in solved if "tau" in wrt]
+
+    def solved(self, right: str | Entry) -> dict[int, Value]:
+        """Mass^-1 times an array, by dof."""
+        entry = self.vector(right) if isinstance(right, str) else right
+        done, rates, _ = self.reduce(entry, moves=False, loads=False)
+        zero = Vector((0.0, 0.0, 0.0))
+        return {item.index[0]: item.value for item in self.expand(done, rates, (zero, zero))}
+
+    def _pulled_back(self, wrt: tuple[str, ...], seed: Entry, names: tuple[str, ...] | None = None) -> list[Store]:
+        tau = self.inverse_dynamics()
+        outputs, seeds = [item.value for item in tau], [seed(item.index[0]) for item in tau]
+        inputs = [x for x in ordered(outputs) if x.op == "input"]
+        found = dict(zip((x.args for x in inputs), reverse(outputs, inputs, seeds), strict=True))
+        stores = []
+        for name in wrt:
+            entries = self.tangent(found) if name == "tangent" else self.entries(name, found)
+            stores += [Store(_named(name, names or wrt), index, value) for index, value in entries]
+        return stores
+
+    def entries(self, name: str, found: dict[tuple, Value]) -> Iterable[tuple[tuple[int, ...], Value]]:
+        """(index, gradient) of every entry of an argument; zero where it does not enter."""
+        scene = self.links.scene
+        if name == "body_f":
+            places = [(body, c) for body in range(scene.body_count) for c in range(6)]
+        else:
+            places = [(i,) for i in range(scene.coord_count if name == "q" else scene.dof_count)]
+        return [(place, found.get((name, *place), 0.0)) for place in places]
+
+    def tangent(self, found: dict[tuple, Value]) -> list[tuple[tuple[int, ...], Value]]:
+        """The gradient by q along the tangent coordinates."""
+        entries = []
+        for link in self.links.links:
+            self.at(link, "g")
+            first = link.coordinate
+            g = [found.get(("q", first + i), 0.0) for i in range(7)]
+            if link.motion in SCREW_MOTIONS:
+                entries.append(((link.dofs[0],), g[0]))
+                continue
+            at = first + (3 if link.motion == FREE else 0)
+            (*u, w), (*g_u, g_w) = self.quaternion(at), g[at - first : at - first + 4]
+            turn = (Vector(g_u) * w + cross(u, g_u) - Vector(u) * g_w) * 0.5
+            if link.motion == FREE:
+                turn = turn - cross(self.arm(link), g[:3])
+                entries += [((dof,), value) for dof, value in zip(link.dofs[:3], g[:3], strict=True)]
+            entries += [((dof,), value) for dof, value in zip(link.dofs[-3:], turn, strict=True)]
+        return entries
+
+    # -- forwards --------------------------------------------------------------------------------------------------
+    def inverse_dynamics_jvp(self) -> list[Store]:
+        """out = J x of inverse dynamics, x in the arrays "q_dot" (tangent), "qd_dot", "qdd_dot", "body_f_dot\""""
+        return [Store("out", (dof,), value) for dof, value in self._pushed_forward().items()]
+
+    def forward_dynamics_jvp(self) -> list[Store]:
+        """out = J x of forward dynamics at the accelerations "qdd", x with "tau_dot" for "qdd_dot\""""
+        rates, tau = self._pushed_forward(), self.vector("tau_dot")
+        solved = self.solved(lambda dof: tau(dof) - rates[dof])
+        return [Store("out", (dof,), value) for dof, value in solved.items()]
+
+    def _pushed_forward(self) -> dict[int, Value]:
+        tau = self.inverse_dynamics()
+        outputs = [item.value for item in tau]
+        inputs = [x for x in ordered(outputs) if x.op == "input"]
+        along = self.raw(self.vector("q_dot"))
+        seeds = [along.get(x.args[1], 0.0) if x.args[0] == "q" else self._seed(x) for x in inputs]
+        return {item.index[0]: rate for item, rate in zip(tau, forward(outputs, inputs, seeds), strict=True)}
+
+    def _seed(self, x: Scalar) -> Value:
+        name, *index = x.args
+        return self.graph.input(f"{name}_dot", *index) if f"{name}_dot" in self.given else 0.0
+
+    def raw(self, rate: Entry) -> dict[int, Value]:
+        """How the entries of q change along tangent coordinates."""
+        found = {}
+        for link in self.links.links:
+            self.at(link, "g")
+            x = Vector(rate(dof) for dof in link.dofs)
+            if link.motion in SCREW_MOTIONS:
+                found[link.coordinate] = x[0]
+                continue
+            at, turn = link.coordinate, Vector(x[-3:]) * 0.5
+            if link.motion == FREE:
+                moved = Vector(x[:3]) - cross(x[3:], self.arm(link))
+                found |= {at + i: value for i, value in enumerate(moved)}
+                at += 3
+            *u, w = self.quaternion(at)
+            turned = (*(turn * w + cross(turn, u)), -sum((a * b for a, b in zip(turn, u, strict=True)), 0.0))
+            found |= {at + i: value for i, value in enumerate(turned)}
+        return found
+
+    # -- hinges ----------------------------------------------------------------------------------------------------
+    def quaternion(self, first: int) -> list[Value]:
+        q = self.vector("q")
+        return [q(first + i) for i in range(4)]
+
+    def arm(self, link: Link) -> Vector:
+        """From the anchor of a free hinge to the centre of mass, in the parent anchor's axes."""
+        return self.places[id(link)].turned @ link.com  # type: ignore[operator]
+
+
+def _named(name: str, wrt: tuple[str, ...]) -> str:
+    return "out" if name == wrt[0] else f"{name}_bar"
