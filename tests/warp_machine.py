@@ -77,7 +77,7 @@ def run(text, arrays, backwards=False):
 
     Args:
         text: of the kernel.
-        arrays: by name: the callers' [world, ...], the parameters' [item, component, world].
+        arrays: by name: the callers' [world, ...], the tables of what the links are made of [entry, world].
         backwards: between barriers the last warp goes first.
     """
     frame = text.frame
@@ -85,8 +85,7 @@ def run(text, arrays, backwards=False):
     rows = {f"{row.name}_row": Shared(row.name, arrays[row.name].reshape(worlds, -1).T) for row in frame.rows}
     result = rows[f"{frame.result.row}_row"] if frame.result.way == IN_PLACE else Shared("result")
     sent = Shared("sent")
-    fields = {f"{name}_at": arrays[name].reshape(-1, worlds) for name in frame.fields}
-    fields |= {f"{name}_part": 1 for name in frame.fields}
+    fields = {name: arrays[name] for name in frame.fields}
     space = FUNCTIONS | rows | fields | {"result_row": result, "sent": sent}
     space |= {name: text.tables.get(name) for name in ("table", "shifts")}
     exec(translated(text.cuda), space)
@@ -170,6 +169,7 @@ def _statement(line):
             break
     line = re.sub(r"\((?:float|double)\)", "", line).replace("on::", "")
     line = re.sub(r"(?<![\w.])(\d+\.?\d*(?:e[-+]?\d+)?)f\b", r"\1", line)
+    line = re.sub(r"FIELD\((\w+), ([^()]*)\)", r"\1[\2]", line)
     line = re.sub(r"__ldg\(shifts\.data \+ (.*?)\)", r"int(shifts[\1])", line)
     line = re.sub(r"__ldg\((\w+ \+ \d+)\)", r"table[\1]", line)
     return _sent(line)

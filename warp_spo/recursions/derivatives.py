@@ -75,7 +75,7 @@ class Derivatives(Applications):
             for body in self.bodies.get(id(link), ()):
                 seat = self.links.seats[body]
                 entries = [self.graph.input("body_f", body, c) for c in range(6)]
-                com = seat.offset + seat.matrix @ self.links.com(body)
+                com = seat.offset + seat.matrix @ self.links.nodes[body].com
                 found.append((com, back @ Vector(entries[:3]), back @ Vector(entries[3:])))
         return found
 

@@ -21,6 +21,8 @@ EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}
 
 SENT = {"P": 21, "z": 6, "R": 10, "a": 6}
 """Values that pieces send each other: inward phi P+ phi*, z or f, the composite inertia; outward alpha."""
+INWARD, OUTWARD = "sent", "returned"
+"""The array that they go through, by either name."""
 
 
 class Trace:
@@ -31,7 +33,7 @@ class Trace:
         dtype: whose rounding the pivots are compared with.
         given: names of the arrays that are there: "qd", "tau", "qdd", "body_f", "b"; the others are zero.
         piece: trace the work on this piece alone. How its ancestors move is worked out anew; what it takes from other
-            pieces and gives to them goes through the array "sent", ``slot(letter, piece)`` on.
+            pieces and gives to them goes through the array "sent" or "returned", ``slot(letter, piece)`` on.
         slot: see there.
     """
 
@@ -90,7 +92,7 @@ class Trace:
             seat = self.links.seats[body]
             force = back @ Vector(self.graph.input("body_f", body, c) for c in range(3))
             torque = back @ Vector(self.graph.input("body_f", body, c) for c in range(3, 6))
-            com = seat.offset + seat.matrix @ self.links.com(body)
+            com = seat.offset + seat.matrix @ self.links.nodes[body].com
             n, f = n + torque + cross(com, force), f + force
         return Vector((*n, *f))
 
@@ -109,12 +111,12 @@ class Trace:
     def send(self, letter: str, values: Iterable[Value]) -> list[Store]:
         assert self.piece is not None and self.slot is not None
         first = self.slot(letter, self.piece)
-        return [Store("sent", (first + i,), value) for i, value in enumerate(values)]
+        return [Store(_way(letter), (first + i,), value) for i, value in enumerate(values)]
 
     def receive(self, letter: str, piece: Piece) -> list[Value]:
         assert self.slot is not None
         first = self.slot(letter, piece)
-        return [self.graph.input("sent", first + i) for i in range(SENT[letter])]
+        return [self.graph.input(_way(letter), first + i) for i in range(SENT[letter])]
 
     def carried_on(self, link: Link, letter: str, found: dict[int, Any], build: Callable[[list], Any]) -> list[Any]:
         """What the children of a link hand to it, of this piece or sent by others."""
@@ -306,7 +308,7 @@ class Trace:
     def frame(self, body: int, origin: tuple) -> tuple[Link | None, Vector]:
         """The link that carries a frame of a body, and the frame's origin in the link's frame."""
         seat = self.links.seats[body]
-        R, p = self.links.anchor(body)
+        R, p = self.links.nodes[body].anchor
         return seat.link, seat.offset + seat.matrix @ (R.T @ (Vector(origin) - p))
 
     def jacobian(self, frames: tuple) -> list[Store]:
@@ -359,7 +361,7 @@ class Trace:
             turns[id(link)] = kinematics.multiplied(turns[over], kinematics.relative_quaternion(link, q))
         stores = []
         for body, seat in self.links.seats.items():
-            R, p = self.links.anchor(body)
+            R, p = self.links.nodes[body].anchor
             key = None if seat.link is None else id(seat.link)
             axes = seat.matrix @ R.T
             position = at[key] + kinematics.turned(turns[key], seat.offset - axes @ p)
@@ -381,10 +383,14 @@ class Trace:
             key = None if seat.link is None else id(seat.link)
             w, v = velocity[key]
             R = IDENTITY if key is None else self.axes[key]
-            com = seat.offset + seat.matrix @ self.links.com(body)
+            com = seat.offset + seat.matrix @ self.links.nodes[body].com
             values = (*(R @ (v + cross(w, com))), *(R @ w))
             stores += [Store("out", (body, c), value) for c, value in enumerate(values)]
         return stores
+
+
+def _way(letter: str) -> str:
+    return OUTWARD if letter == "a" else INWARD
 
 
 def _mirrored(i: int, j: int, value: Value) -> list[tuple[tuple[int, int], Value]]:
