@@ -12,11 +12,9 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from .arrays import Call
-from .errors import UnsupportedError
 from .kernels import declare, tiles
 from .kernels.straight import TILE
 from .levels import Recursions
-from .plan import MOST_DOFS
 from .programs import Program, Programs
 from .scene import Scene
 
@@ -91,10 +89,8 @@ class Derivatives:
         """
         with self._call("forward_dynamics_derivatives") as call:
             arrays, outs = self._read_derivative(call, q, qd, "tau", tau, body_f, out)
-            if self.scene.dof_count:
-                qdd = self.recursions.array("qdd of derivatives", self.worlds, self.scene.dof_count)
-                self._run("forward_dynamics", qdd, **arrays)
-                arrays = {"q": arrays["q"], "qd": arrays["qd"], "qdd": qdd, "body_f": arrays["body_f"]}
+            qdd = self._accelerations(None, arrays)
+            arrays = {"q": arrays["q"], "qd": arrays["qd"], "qdd": qdd, "body_f": arrays["body_f"]}
             program, rates = self._tiled("inverse_dynamics_derivatives", (3, *self._square), **arrays)
             inverse, weights = self._tiled("tiled_mass_matrix_inverse", self._square, q=arrays["q"])
             if self.scene.dof_count:
@@ -143,11 +139,6 @@ class Derivatives:
         )
         return {"q": q, "qd": qd, name: third, "body_f": body_f}, outs
 
-    def _check_size(self, call: Call) -> None:
-        if self.scene.dof_count > MOST_DOFS:
-            what = f"a scene of {self.scene.dof_count} dof"
-            raise UnsupportedError(call.name, what, f"derivatives are straight-line code, of up to {MOST_DOFS} dof")
-
     def _tiled(self, operation: str, shape: tuple[int, ...], **given: Any) -> tuple[Any, Any]:
         """Run a program whose result, of ``shape`` in a world, is left in tiles."""
         if self.scene.dof_count == 0:
@@ -173,4 +164,5 @@ class Derivatives:
     _read_state: Any
     _read_rate: Any
     _read_body_f: Any
-    _run: Any
+    _accelerations: Any
+    _check_size: Any

@@ -17,6 +17,7 @@ import warp as wp
 from . import nodes
 from . import plan as plans
 from . import status as words
+from .adjoints import Adjoints
 from .applications import Applications
 from .arrays import Call, parse_device, parse_dtype, shape_of
 from .derivatives import Derivatives
@@ -60,7 +61,7 @@ OPERATIONS = (
 LOOPS = ("raise", "cut", "embed", "multipliers")
 
 
-class Dynamics(Applications, Derivatives):
+class Dynamics(Applications, Derivatives, Adjoints):
     """Dynamics of one scene in many worlds.
 
     Arrays are torch tensors, Warp arrays or NumPy arrays, [world, ...] and C-contiguous; the kind of the first one is

@@ -40,6 +40,13 @@ TREE_ONLY = (
     "inverse_dynamics_derivatives",
     "mass_matrix_derivative",
     "tiled_mass_matrix_inverse",
+    "forward_dynamics_vjp",
+    "inverse_dynamics_vjp",
+    "solve_mass_matrix_vjp",
+    "body_poses_vjp",
+    "body_velocities_vjp",
+    "forward_dynamics_jvp",
+    "inverse_dynamics_jvp",
 )
 """Operations that exist as traces alone: each is a kernel of its scene, a thread a world, whatever the plan."""
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from ..trace.derivative import forward, reverse
 from ..trace.emit import Store
 from ..trace.graph import Scalar, Value, ordered
-from ..trace.spatial import Vector, cross
+from ..trace.spatial import ZERO, Vector, cross
 from .derivatives import Derivatives
 from .links import FREE, SCREW_MOTIONS, Link
 
@@ -24,6 +24,12 @@ class Adjoints(Derivatives):
     A result is "out" if it is the first of those asked for, and ``name_bar`` otherwise.
     """
 
+    weightless = False
+
+    @property
+    def base(self) -> tuple[Vector, Vector]:
+        return (ZERO, ZERO) if self.weightless else super().base
+
     # -- backwards -------------------------------------------------------------------------------------------------
     def inverse_dynamics_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
         """J* cotangent of inverse dynamics for the arguments ``wrt``"""
@@ -35,31 +41,53 @@ class Adjoints(Derivatives):
         stores = self._pulled_back(tuple(name for name in wrt if name != "tau"), lambda dof: -solved[dof], wrt)
         return stores + [Store(_named("tau", wrt), (dof,), solved[dof]) for dof in solved if "tau" in wrt]
 
+    def solve_mass_matrix_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
+        """J* cotangent of Mass^-1 b, whose result is the array "qdd": lambda for b, -(d (Mass qdd) / d x)* lambda else"""
+        solved, self.weightless = self.solved("cotangent"), True
+        stores = self._pulled_back(tuple(name for name in wrt if name != "b"), lambda dof: -solved[dof], wrt)
+        return stores + [Store(_named("b", wrt), (dof,), solved[dof]) for dof in solved if "b" in wrt]
+
+    def body_poses_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
+        """J* cotangent of body_poses"""
+        return self._of_bodies(self.body_poses(), wrt)
+
+    def body_velocities_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
+        """J* cotangent of body_velocities"""
+        return self._of_bodies(self.body_velocities(), wrt)
+
+    def _of_bodies(self, results: list[Store], wrt: tuple[str, ...]) -> list[Store]:
+        seeds = [self.graph.input("cotangent", *item.index) for item in results]
+        return self._reversed([item.value for item in results], seeds, wrt, wrt)
+
     def solved(self, right: str | Entry) -> dict[int, Value]:
         """Mass^-1 times an array, by dof."""
         entry = self.vector(right) if isinstance(right, str) else right
         done, rates, _ = self.reduce(entry, moves=False, loads=False)
-        zero = Vector((0.0, 0.0, 0.0))
-        return {item.index[0]: item.value for item in self.expand(done, rates, (zero, zero))}
+        return {item.index[0]: item.value for item in self.expand(done, rates, (ZERO, ZERO))}
 
     def _pulled_back(self, wrt: tuple[str, ...], seed: Entry, names: tuple[str, ...] | None = None) -> list[Store]:
         tau = self.inverse_dynamics()
-        outputs, seeds = [item.value for item in tau], [seed(item.index[0]) for item in tau]
+        return self._reversed([item.value for item in tau], [seed(item.index[0]) for item in tau], wrt, names or wrt)
+
+    def _reversed(
+        self, outputs: list[Value], seeds: list[Value], wrt: tuple[str, ...], names: tuple[str, ...]
+    ) -> list[Store]:
         inputs = [x for x in ordered(outputs) if x.op == "input"]
         found = dict(zip((x.args for x in inputs), reverse(outputs, inputs, seeds), strict=True))
         stores = []
         for name in wrt:
             entries = self.tangent(found) if name == "tangent" else self.entries(name, found)
-            stores += [Store(_named(name, names or wrt), index, value) for index, value in entries]
+            stores += [Store(_named(name, names), index, value) for index, value in entries]
         return stores
 
     def entries(self, name: str, found: dict[tuple, Value]) -> Iterable[tuple[tuple[int, ...], Value]]:
-        """(index, gradient) of every entry of an argument; zero where it does not enter."""
+        """(index, gradient) of every entry of an argument, or of "value"; zero where it does not enter."""
         scene = self.links.scene
         if name == "body_f":
-            places = [(body, c) for body in range(scene.body_count) for c in range(6)]
+            places: list[tuple] = [(body, c) for body in range(scene.body_count) for c in range(6)]
         else:
-            places = [(i,) for i in range(scene.coord_count if name == "q" else scene.dof_count)]
+            sizes = {"q": scene.coord_count, "value": len(self.links.tables["value"])}
+            places = [(i,) for i in range(sizes.get(name, scene.dof_count))]
         return [(place, found.get((name, *place), 0.0)) for place in places]
 
     def tangent(self, found: dict[tuple, Value]) -> list[tuple[tuple[int, ...], Value]]:

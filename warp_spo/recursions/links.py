@@ -106,6 +106,7 @@ class Links:
         gravity: Vector.
         turns_vary: some joint's anchor is turned by what is no constant.
         tables: the scalars that an :meth:`opened` copy reads, by name, in order.
+        reverses: kernels that take gradients by the tables back to the values, see :mod:`warp_spo.link_values`.
     """
 
     def __init__(self, scene: Scene, variable: tuple[str, ...] = ()):
@@ -114,6 +115,7 @@ class Links:
         self.seats: dict[int, Seat] = {}
         self.nodes: dict[int, Node] = {}
         self.tables: dict[str, dict[Scalar, int]] = {table: {} for table in TABLES}
+        self.reverses: dict[Any, Any] = {}
         self._values = {name: self._symbols(name, name in variable) for name in LINK_VALUES}
         self.gravity = Vector(self._values["gravity"].tolist())
         self._poses = {name: [_pose(p) for p in self._values[name]] for name in ("joint_X_p", "joint_X_c")}
