@@ -5,14 +5,17 @@ No recording: the reverse of forward dynamics is its own solve and one Newton-Eu
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import inspect
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import warp as wp
 
 from . import link_values
-from .arrays import Call
+from .arrays import Call, Values, differentiated, recorded
 from .errors import UnsupportedError
 from .levels import Recursions
 from .plan import MOST_DOFS
@@ -23,11 +26,31 @@ from .scene import Scene
 ARGUMENTS = {
     "forward_dynamics": ("q", "qd", "tau", "body_f"),
     "inverse_dynamics": ("q", "qd", "qdd", "body_f"),
+    "bias_force": ("q", "qd", "body_f"),
+    "gravity_force": ("q",),
     "solve_mass_matrix": ("q", "b"),
     "body_poses": ("q",),
     "body_velocities": ("q", "qd"),
 }
 """What each operation can be differentiated by, besides the values of the scene that vary."""
+ANCHORS = ("joint_X_p", "joint_X_c")
+ENTERING = {"body_poses": (*ANCHORS, "body_com"), "body_velocities": (*ANCHORS, "body_com")}
+"""Values that enter an operation, where it is not all of them."""
+
+
+def differentiable(method: Callable) -> Callable:
+    """A method of Dynamics of which torch gets a result to go back through, where an input requires grad."""
+    operation, signature = method.__name__, inspect.signature(method)
+
+    @functools.wraps(method)
+    def call(self: Any, *args: Any, **more: Any) -> Any:
+        if not recorded((*args, *more.values()), self.values):
+            return method(self, *args, **more)
+        arguments = signature.bind(self, *args, **more).arguments
+        del arguments["self"]
+        return differentiated(self, operation, method, arguments, ARGUMENTS[operation], self.entering(operation))
+
+    return call
 
 
 class Adjoints:
@@ -40,6 +63,7 @@ class Adjoints:
     variable: tuple[str, ...]
     recursions: Recursions
     programs: Programs
+    values: Values
 
     # -- backwards -------------------------------------------------------------------------------------------------
     def forward_dynamics_vjp(
@@ -169,6 +193,70 @@ class Adjoints:
             given["body_f"] = self._read_body_f(call, body_f)
             self._push(call, "inverse_dynamics", given, dq, dqd, ("qdd", dqdd), dbody_f, out)
         return call.result
+
+    # -- torch -----------------------------------------------------------------------------------------------------
+    @property
+    def differentiable_values(self) -> tuple[str, ...]:
+        """Names of the values by which results can be differentiated: those that vary, of what links are made of."""
+        return tuple(name for name in LINK_VALUES if self._varies(name))
+
+    def entering(self, operation: str) -> tuple[str, ...]:
+        """Names of the values that enter an operation."""
+        return ENTERING.get(operation, LINK_VALUES)
+
+    def pulled_back(
+        self, operation: str, given: dict[str, Any], results: Sequence[Any], cotangents: Sequence[Any], wrt: Sequence[str]
+    ) -> dict[str, Any]:
+        """Gradients by name of a call with the arguments ``given``, for the ``cotangents`` of its ``results``."""
+        (result,), (cotangent,) = results, cotangents
+        if operation == "forward_dynamics":
+            return self.forward_dynamics_vjp(**given, cotangent=cotangent, qdd=result, wrt=wrt)
+        if operation in ("inverse_dynamics", "bias_force", "gravity_force"):
+            return self.inverse_dynamics_vjp(**given, cotangent=cotangent, wrt=wrt)
+        if operation == "solve_mass_matrix" and result.ndim == 3:
+            return self._of_columns(given, result, cotangent, wrt)
+        shape = tuple(result.shape)
+        with self._call(f"{operation}, backwards") as call:
+            q, qd = self._read_state(call, given["q"], given.get("qd"))
+            arrays = {"q": q, "qd": qd, "cotangent": call.read("cotangent", cotangent, shape)}
+            if operation == "solve_mass_matrix":
+                arrays["qdd"] = call.read("result", result, shape)
+            names, outs = self._gradients(call, operation, {}, wrt, None)
+            self._pull(operation, names, outs, arrays)
+        return _by_name(names, call.result)
+
+    def _of_columns(self, given: dict[str, Any], result: Any, cotangent: Any, wrt: Sequence[str]) -> dict[str, Any]:
+        """Gradients of solve_mass_matrix with several right-hand sides, torch tensors, one after the other."""
+        found: dict[str, Any] = {}
+        for c in range(result.shape[2]):
+            one = (result[..., c].contiguous(),), (cotangent[..., c].contiguous(),)
+            for name, gradient in self.pulled_back("solve_mass_matrix", given, *one, wrt).items():
+                if name != "b":
+                    found[name] = found[name] + gradient if name in found else gradient
+                else:
+                    found.setdefault("b", result.clone())[..., c] = gradient
+        return found
+
+    @contextlib.contextmanager
+    def held(self, values: dict[str, Any]) -> Iterator[None]:
+        """The scene's values are these inside the block, and what they were behind it."""
+        if not values:
+            yield
+            return
+        parameters = self.recursions.parameters
+        with Call("Dynamics.set", self.device, self.dtype) as call:
+            taken, before = {}, {}
+            for name, value in values.items():
+                shape = self.scene.values[name].shape[1:]
+                taken[name] = call.read(name, value, (self.worlds, *shape) if value.ndim > len(shape) else shape)
+            for name, array in taken.items():  # on the stream that read has entered
+                before[name] = wp.clone(parameters.value(name))
+                parameters.copy_in(name, array)
+            parameters.refresh(values)
+            yield
+            for name, value in before.items():
+                wp.copy(parameters.value(name), value)
+            parameters.refresh(values)
 
     # -- steps -----------------------------------------------------------------------------------------------------
     def _push(

@@ -68,6 +68,43 @@ def shape_of(array) -> tuple:
     return tuple(array.shape) + tuple(getattr(array.dtype, "_shape_", ()) if isinstance(array, wp.array) else ())
 
 
+class Values:
+    """The tensors, on record by torch, that values of a scene were set to, by name.
+
+    A value keeps its stamp as long as it is set to the same tensor, unchanged.
+    """
+
+    def __init__(self) -> None:
+        self.tensors: dict[str, Any] = {}
+        self.stamps: dict[str, int] = {}
+        self._versions: dict[str, int] = {}
+        self._count = 0
+
+    def set(self, name: str, value: Any) -> None:
+        """Take note of a value."""
+        tracked = recorded((value,))
+        if tracked and self.tensors.get(name) is value and self._versions[name] == value._version:
+            return
+        self._count += 1
+        self.stamps[name] = self._count
+        self.tensors.pop(name, None)
+        if tracked:
+            self.tensors[name], self._versions[name] = value, value._version
+
+
+def recorded(arguments: tuple, values: Values | None = None) -> bool:
+    """Whether torch is to go back through a call with these arguments, of an object with these values."""
+    if "torch" not in sys.modules:
+        return False
+    torch = _torch()
+    return torch.is_grad_enabled() and (bool(values and values.tensors) or any(map(torch.requires_grad, arguments)))
+
+
+def differentiated(*call: Any) -> Any:
+    """See :func:`warp_spo.torch.differentiated`."""
+    return _torch().differentiated(*call)
+
+
 class Call:
     """One call: takes the caller's arrays in, gives the result back in the caller's kind.
 

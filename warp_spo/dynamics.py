@@ -17,9 +17,9 @@ import warp as wp
 from . import nodes
 from . import plan as plans
 from . import status as words
-from .adjoints import Adjoints
+from .adjoints import Adjoints, differentiable
 from .applications import Applications
-from .arrays import Call, parse_device, parse_dtype, shape_of
+from .arrays import Call, Values, parse_device, parse_dtype, recorded, shape_of
 from .derivatives import Derivatives
 from .errors import UnsupportedError
 from .frames import Frame, checked
@@ -107,6 +107,7 @@ class Dynamics(Applications, Derivatives, Adjoints):
         self.granularity = self.plan.granularity
         self.recursions = Recursions(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)
+        self.values = Values()
 
     # -- values ----------------------------------------------------------------------------------------------------
     def set(self, **values: Any) -> None:
@@ -132,7 +133,9 @@ class Dynamics(Applications, Derivatives, Adjoints):
                 shape = self.scene.values[name].shape[1:]
                 if len(shape_of(value)) > len(shape):
                     shape = (self.worlds, *shape)
-                array = call.read(name, value, shape, "[world, ...] or [...] as Newton has it")
+                followed = name in self.variable and name in self.differentiable_values and recorded((value,))
+                plain = value.detach() if followed else value
+                array = call.read(name, plain, shape, "[world, ...] or [...] as Newton has it")
                 if name in self.variable:
                     taken[name] = array
                 else:
@@ -147,6 +150,7 @@ class Dynamics(Applications, Derivatives, Adjoints):
             parameters = self.recursions.parameters
             for name, array in taken.items():
                 parameters.copy_in(name, array)
+                self.values.set(name, values[name])
             parameters.refresh(taken)
             if folded:
                 self._rebuild(checked)
@@ -211,6 +215,7 @@ class Dynamics(Applications, Derivatives, Adjoints):
         getattr(self, operation)(*given, **extra)
 
     # -- dynamics --------------------------------------------------------------------------------------------------
+    @differentiable
     def forward_dynamics(
         self, q: Any, qd: Any = None, tau: Any = None, body_f: Any = None, status: Any = None, out: Any = None
     ) -> Any:
@@ -253,6 +258,7 @@ class Dynamics(Applications, Derivatives, Adjoints):
                 words.write(self.recursions, q, qd, tau, body_f, out, status, factored=swept)
         return call.result
 
+    @differentiable
     def inverse_dynamics(self, q: Any, qd: Any = None, qdd: Any = None, body_f: Any = None, out: Any = None) -> Any:
         """Forces that give the accelerations ``qdd``: tau = Mass qdd + bias_force, by the Newton-Euler recursion.
 
@@ -263,10 +269,12 @@ class Dynamics(Applications, Derivatives, Adjoints):
         """
         return self._newton_euler("inverse_dynamics", q, qd, qdd, body_f, out)
 
+    @differentiable
     def bias_force(self, q: Any, qd: Any = None, body_f: Any = None, out: Any = None) -> Any:
         """inverse_dynamics with qdd = 0: velocity terms, gravity and external wrenches [world, dof]."""
         return self._newton_euler("bias_force", q, qd, None, body_f, out)
 
+    @differentiable
     def gravity_force(self, q: Any, out: Any = None) -> Any:
         """bias_force with qd = 0: the force that holds the robot still, +dU/dq [world, dof]."""
         return self._newton_euler("gravity_force", q, None, None, None, out)
@@ -298,6 +306,7 @@ class Dynamics(Applications, Derivatives, Adjoints):
             self._run("mass_matrix_inverse", out, q=q)
         return call.result
 
+    @differentiable
     def solve_mass_matrix(self, q: Any, b: Any, out: Any = None) -> Any:
         """Mass^-1 b in O(dof) a column; b and the result [world, dof] or [world, dof, columns]."""
         with self._call("solve_mass_matrix") as call:
@@ -331,6 +340,7 @@ class Dynamics(Applications, Derivatives, Adjoints):
         return call.result
 
     # -- kinematics ------------------------------------------------------------------------------------------------
+    @differentiable
     def body_poses(self, q: Any, out: Any = None) -> Any:
         """Pose of every body in the inertial frame: x, y, z [m], quaternion xyzw [world, body, 7], Newton's body_q."""
         with self._call("body_poses") as call:
@@ -339,6 +349,7 @@ class Dynamics(Applications, Derivatives, Adjoints):
             self._run("body_poses", out, q=q)
         return call.result
 
+    @differentiable
     def body_velocities(self, q: Any, qd: Any, out: Any = None) -> Any:
         """CoM velocity [m/s], angular velocity [rad/s], inertial axes [world, body, 6], Newton's body_qd."""
         with self._call("body_velocities") as call:
@@ -433,6 +444,12 @@ class Dynamics(Applications, Derivatives, Adjoints):
         return program is None
 
     def _call(self, name: str) -> Call:
+        if self.values.tensors and recorded((), self.values):
+            names = ", ".join(self.values.tensors)
+            raise ValueError(
+                f"Dynamics.{name}: {names} was set to a tensor that requires grad; derivatives are not available through "
+                f"this call; call inside torch.no_grad(), or set {names} to detached tensors"
+            )
         return Call(f"Dynamics.{name}", self.device, self.dtype)
 
     def _read_state(self, call: Call, q: Any, qd: Any, optional: bool = True) -> tuple[wp.array, Any]:
