@@ -21,6 +21,8 @@ ON_ITS_WAY = """\
 SHARED_BYTES = 46 * 1024  # that a block may declare: 48 KiB less what Warp takes
 C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
 MASKS = ("prescribed",)  # arrays of booleans
+INTEGERS = ("place", "shifts", "status")  # arrays of whole numbers, one axis
+MOST_PASSES = 16  # of a loop; see CONTRIBUTING
 IN_PLACE, STAGED, MAPPED, DIRECT = "in place", "staged", "mapped", "direct"
 
 
@@ -65,6 +67,7 @@ class Frame(NamedTuple):
         warps: how many work on 32 worlds.
         block: threads of a block.
         more: further results, ``name_row[i]``, each entry to memory by itself.
+        numbers: numbers that all worlds share, ``name_row[0]``.
     """
 
     rows: list[Row]
@@ -76,6 +79,7 @@ class Frame(NamedTuple):
     block: int
     more: tuple[Row, ...] = ()
     again: bool = False
+    numbers: tuple[str, ...] = ()
 
     @property
     def groups(self) -> int:
@@ -99,7 +103,8 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     c, result, out = C_TYPE[T], frame.result, frame.result.array
     team, at, offset = WARP * frame.warps, 0, {}
     sync = "__syncwarp();" if frame.warps == 1 else "__syncthreads();"
-    text = [NATIVE[c], "#if defined(__CUDA_ARCH__)"]
+    text = [NATIVE[c], *(f"const {c} {name}_row[1] = {{{name}}};" for name in frame.numbers)]
+    text += ["#if defined(__CUDA_ARCH__)"]
     text += [f"const int lane = threadIdx.x & 31, member = threadIdx.x % {team}, warp = member >> 5;"]
     text += [f"const long long first = (long long)(thread - member) / {frame.warps};"]
     text += ["const int present = worlds - first < 32 ? (int)(worlds - first) : 32;"]
@@ -113,7 +118,7 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
             text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
         else:
             text += [_own_row(row, c)]
-    text += [f"{c}* {row.name}_row = {row.name}.data + world * {row.entries};" for row in frame.more]
+    text += [_own_result(row, c) for row in frame.more]
     if frame.staged:
         if any(row.entries >= LONG_COPY for row in frame.rows):
             text += [ON_ITS_WAY]
@@ -141,7 +146,7 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
         text += [sync, _spread_out(result, start, c, team)]
     text += ["#else", "const long long world = thread;", "const bool mine = true;"]
     text += [_own_row(row, c) for row in frame.rows]
-    text += [f"{c}* {row.name}_row = {row.name}.data + world * {row.entries};" for row in frame.more]
+    text += [_own_result(row, c) for row in frame.more]
     if result.way == MAPPED:
         text += [f"{c} result_row[{result.slots}];"]
     else:
@@ -164,6 +169,11 @@ def _source(row: Row, c: str) -> tuple[str, str]:
 def _own_row(row: Row, c: str) -> str:
     kind, first = _source(row, c)
     return f"const {kind}* {row.name}_row = {first} + world * {row.entries};"
+
+
+def _own_result(row: Row, c: str) -> str:
+    kind = "int" if row.name in INTEGERS else c
+    return f"{kind}* {row.name}_row = {row.name}.data + world * {row.entries};"
 
 
 def _fields(names: list[str], c: str) -> list[str]:
@@ -228,13 +238,25 @@ def _slot(i: str, entries: int, distance: int) -> str:
     return i if entries == distance else f"({i} / {entries}) * {distance} + {i} % {entries}"
 
 
+def looped(a_pass: str, last: str, names: tuple[str, str, str], entries: int, T) -> str:
+    """``a_pass`` until it leaves the last of the variables ``names`` at zero, then ``last``.
+
+    The variables are arrays of a thread, ``name_row[i]``, zero at first; their indices are constants, so that they
+    live in registers. In a warp, threads wait for the one that needs most passes.
+    """
+    c, missed = C_TYPE[T], names[-1]
+    declared = [f"{c} {name}_row[{entries}] = {{}};" for name in names[:-1]] + [f"{c} {missed}_row[1] = {{}};"]
+    loop = f"for (int pass = 0; pass < {MOST_PASSES}; ++pass) {{\n{a_pass}\nif (!({missed}_row[0] > 0)) break;\n}}"
+    return "\n".join([*declared, loop, last])
+
+
 def kernel(name: str, native: str, arrays: list[tuple[str, int]], T, registers: int | None = None) -> wp.Kernel:
     """A kernel of ``worlds``, then ``arrays`` (name, axes) of scalars ``T``, that runs ``native`` in each thread.
 
-    The arrays ``place`` and ``shifts`` hold integers, those of MASKS booleans.
+    The arrays of INTEGERS hold integers, those of MASKS booleans; without axes it is a number.
     """
     key = f"{name}_{hashlib.sha256(native.encode()).hexdigest()[:16]}"
-    types = {array: "table" if array in ("place", "shifts") else f"array{axes}" for array, axes in arrays}
+    types = {array: "table" if array in INTEGERS else f"array{axes}" for array, axes in arrays}
     types |= {array: "mask" for array in types if array in MASKS}
     declared = ", ".join(f"{array}: {kind}" for array, kind in types.items())
     source = f"""def native(thread: int, worlds: int, {declared}): ...
@@ -247,7 +269,8 @@ def {key}(worlds: int, {declared}):
     file = f"<{key}>"
     linecache.cache[file] = len(source), None, source.splitlines(True), file  # where Warp looks for the source
     space = {f"array{axes}": wp.array(dtype=T, ndim=axes) for axes in range(1, 5)} | {
-        "table": wp.array(dtype=int, ndim=1), "mask": wp.array(dtype=wp.bool, ndim=2), "wp": wp, "__name__": key
+        "array0": T, "table": wp.array(dtype=int, ndim=1), "mask": wp.array(dtype=wp.bool, ndim=2), "wp": wp,
+        "__name__": key,
     }
     exec(compile(source, file, "exec"), space)
     space["native"] = wp.func_native(native)(space["native"])

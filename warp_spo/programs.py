@@ -15,17 +15,20 @@ import warp as wp
 from .kernels import straight
 from .kernels.straight import DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
 from .levels import Recursions
+from .parts import DOF_VALUES
 from .plan import MOST_WARPS, TREE_ONLY, Plan
 from .recursions.applications import Applications
 from .recursions.links import Links
 from .recursions.operators import meet, written
 from .recursions.pieces import Piece, Pieces
+from .recursions.step import LOOPED
 from .recursions.traced import SENT, Trace
 from .teams import Team
 from .trace.emit import Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
-FIELDS = {"rigid": 10, "tree": 12, "anchor": 12, "com": 3, "joint_armature": 1, "gravity": 1}
+FIELDS = {"rigid": 10, "tree": 12, "anchor": 12, "com": 3, "gravity": 1, "joint_rest_q": 1}
+FIELDS |= dict.fromkeys(DOF_VALUES, 1)
 """The parameters' arrays, and how many components an item has."""
 SENDS = {"forward_dynamics": "Pza", "solve_mass_matrix": "Pza", "inverse_dynamics": "z", "mass_matrix": "R"}
 """What the pieces of a robot send each other, by operation."""
@@ -50,7 +53,7 @@ class Program(NamedTuple):
     """One kernel.
 
     Attributes:
-        rows: names of the callers' arrays that it reads. fields: of the parameters' arrays.
+        rows: names of the callers' arrays, and then numbers, that it reads. fields: of the parameters' arrays.
         tables: arrays of its own.
         operations: floating-point operations of one world.
     """
@@ -110,7 +113,7 @@ class Programs:
             self._programs[key] = self._build(operation, shapes, out, more or {}, options)
         return self._programs[key]
 
-    def launch(self, program: Program, arrays: dict[str, wp.array], out: wp.array, *more: wp.array) -> None:
+    def launch(self, program: Program, arrays: dict[str, Any], out: wp.array, *more: wp.array) -> None:
         run = self.run
         threads, block = run.worlds, program.block
         if run.device.is_cuda:
@@ -162,16 +165,23 @@ class Programs:
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         frame = self._frame([item for item in stores if item.array == "out"], shapes, 0, 1, self.block, stores)
-        frame = frame._replace(again=not frame.staged and frame.result.way == DIRECT)
+        alone = not any(item.array in LOOPED for item in stores)
+        frame = frame._replace(again=alone and not frame.staged and frame.result.way == DIRECT)
         frame = frame._replace(more=tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more))
         placed, table = _placed([item for item in stores if item.array == "out"], frame.result)
         placed += apart
         emitter = self._emitter(shapes, frame)
         listing = emitter.region(placed)
         body = literals(listing, self.run.dtype.__name__)
+        operations, looped = emitter.operations, [item for item in stores if item.array in LOOPED]
+        if looped:
+            emitter = self._emitter(shapes, frame)
+            a_pass = literals(emitter.region(looped), self.run.dtype.__name__)
+            body = straight.looped(a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
+            operations += emitter.operations
         frame = frame._replace(again=frame.again and "farthest" in listing.text)
         tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
-        return self._finished(operation, frame, body, body, tables, emitter.operations)
+        return self._finished(operation, frame, body, body, tables, operations)
 
     def _segment_program(self, operation: str, shapes: dict, pieces: Pieces) -> Program | None:
         dtype, slots = self.run.dtype.__name__, _slots(pieces, SENDS[operation])
@@ -208,12 +218,15 @@ class Programs:
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
-        return item if item.array == "sent" else item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
+        if item.array in ("sent", *LOOPED):
+            return item
+        return item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
 
     def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int) -> Program:
         native = straight.assemble(frame, cuda, cpu, self.run.dtype)
-        rows, fields = tuple(row.name for row in frame.rows), tuple(frame.fields)
-        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 3) for name in fields]
+        rows, fields = (*(row.name for row in frame.rows), *frame.numbers), tuple(frame.fields)
+        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 0) for name in frame.numbers]
+        arrays += [(name, 3) for name in fields]
         arrays += [(name, 1) for name in tables] + [("out", frame.result.array.ndim)]
         arrays += [(row.name, row.ndim) for row in frame.more]
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers)
@@ -249,7 +262,8 @@ class Programs:
                everything: list[Store] | None = None) -> Frame:
         """How rows come in and the result, of flat ``stores``, goes out: through shared memory where it has room."""
         used = _reads(everything or stores)
-        rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used]
+        rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used and shape]
+        numbers = tuple(name for name, shape in shapes.items() if name in used and not shape)
         out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
         dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
         over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
@@ -264,7 +278,7 @@ class Programs:
             ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), *ways]
         if out.entries > LONG_ROW and not (dense and staged and over == ["x"]):
             ways = [(staged, Result(MAPPED, out, slots=slots)), (False, Result(MAPPED, out, slots=slots)), *ways]
-        frames = [Frame(rows, staged, fields, result, sent, warps, block) for staged, result in ways]
+        frames = [Frame(rows, staged, fields, result, sent, warps, block, numbers=numbers) for staged, result in ways]
         return next((frame for frame in frames if frame.fits(self.run.dtype)), frames[-1])
 
 
