@@ -54,6 +54,8 @@ OPERATIONS = (
     "fixman_torque",
     "mass_matrix_packed",
     "step",
+    "body_accelerations",
+    "body_reactions",
 )
 LOOPS = ("raise", "cut", "embed", "multipliers")
 
@@ -164,21 +166,24 @@ class Dynamics(Applications, Steps):
         Args:
             operation: name of a method, such as "forward_dynamics".
             options: ``frames=`` for operations that take frames, ``columns=`` for solve_mass_matrix, ``prescribed=``
-                for hybrid_dynamics, ``integrator=`` for step, and ``body_f=True``, ``status=True``, ``target_q=True``,
-                ``target_qd=True`` if they will be given.
+                for hybrid_dynamics, ``integrator=`` for step, and ``body_f=True``, ``status=True``, ``qdd=True``,
+                ``target_q=True``, ``target_qd=True`` if they will be given.
         """
         if operation not in OPERATIONS:
             raise ValueError(f"Dynamics.prepare: no operation {operation!r}; expected one of {', '.join(OPERATIONS)}")
         q: Any = wp.array(np.tile(self.scene.neutral_q, (self.worlds, 1)), dtype=self.dtype, device=self.device)
         rate = wp.zeros((self.worlds, self.scene.dof_count), dtype=self.dtype, device=self.device)
         extra: dict[str, Any] = {}
-        loaded = ("forward_dynamics", "inverse_dynamics", "bias_force", "hybrid_dynamics", "step")
+        loaded = ("forward_dynamics", "inverse_dynamics", "bias_force", "hybrid_dynamics", "step",
+                  "body_reactions")
         if operation in loaded and options.pop("body_f", False):
             shape = (self.worlds, self.scene.body_count, 6)
             extra["body_f"] = wp.zeros(shape, dtype=self.dtype, device=self.device)
         if operation == "step":
             extra |= {name: array for name, array in (("target_q", q), ("target_qd", rate)) if options.pop(name, False)}
             extra["integrator"] = options.pop("integrator", "semi_implicit")
+        if operation == "step" and options.pop("qdd", False):
+            extra["qdd"] = wp.zeros_like(rate)
         if operation in ("forward_dynamics", "step") and options.pop("status", False):
             extra["status"] = wp.zeros(self.worlds, dtype=wp.int32, device=self.device)
         arguments: dict[str, tuple] = {
@@ -190,6 +195,8 @@ class Dynamics(Applications, Steps):
             "integrate": (q, rate, 0.0),
             "hybrid_dynamics": (q, rate, rate, rate),
             "step": (q, rate, rate, 1e-3),
+            "body_accelerations": (q, rate, rate),
+            "body_reactions": (q, rate, rate),
             "jacobian_bias": (q, rate),
             "centroidal_momentum_bias": (q, rate),
             "quasi_velocities": (q, rate),

@@ -39,6 +39,8 @@ TREE_ONLY = (
     "passive_force",
     "hinge_force",
     "coordinate_rates",
+    "body_accelerations",
+    "body_reactions",
 )
 """Operations that exist as traces alone: each is a kernel of its scene, a thread a world, whatever the plan."""
 

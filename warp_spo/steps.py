@@ -38,6 +38,7 @@ class Steps:
         target_q: Any = None,
         target_qd: Any = None,
         integrator: str = "semi_implicit",
+        qdd: Any = None,
         status: Any = None,
         out: Any = (None, None),
     ) -> tuple[Any, Any]:
@@ -67,6 +68,7 @@ class Steps:
                 velocity terms by six fixed-point iterations. "rk4": order 4, all explicit: stable only while
                 (damping dt + stiffness dt^2) / inertia stays below 2, and only for scenes without friction and velocity
                 limits.
+            qdd: [world, dof], written with (qd' - qd) / dt of the semi-implicit step, before rounding it into qd'.
             status: int32 [world], of the semi-implicit step, written with the worst that is true of the world:
 
                 * 2 = an input is NaN or infinite.
@@ -84,8 +86,9 @@ class Steps:
                 raise ValueError(f"{call.name}: integrator is {integrator!r}; expected one of {', '.join(INTEGRATORS)}")
             if not isinstance(out, tuple | list) or len(out) != 2:
                 raise TypeError(f"{call.name}: out is {out!r}; expected a pair of arrays or None, (q, qd)")
-            if status is not None and integrator != "semi_implicit":
-                raise ValueError(f"{call.name}: status with integrator={integrator!r}; expected 'semi_implicit'")
+            for name, array in (("status", status), ("qdd", qdd)):
+                if array is not None and integrator != "semi_implicit":
+                    raise ValueError(f"{call.name}: {name} with integrator={integrator!r}; expected 'semi_implicit'")
             dt = _seconds(call.name, dt)
             q, qd = self._read_state(call, q, qd, optional=False)
             forces = {
@@ -94,11 +97,12 @@ class Steps:
                 "target_q": call.read("target_q", target_q, q.shape, "[world, coordinate]", optional=True),
                 "target_qd": self._read_rate(call, "target_qd", target_qd),
             }
+            qdd = call.update("qdd", qdd, (self.worlds, self.scene.dof_count), "[world, dof]")
             status = call.update("status", status, (self.worlds,), "[world]", dtype=wp.int32)
             q_out = call.write(out[0], q.shape, "[world, coordinate]", name="out[0]", over="q")
             qd_out = call.write(out[1], qd.shape, "[world, dof]", name="out[1]", over="qd")
             if integrator == "semi_implicit":
-                self._step(q, qd, q_out, qd_out, dt, status, **forces)
+                self._step(q, qd, q_out, qd_out, dt, qdd, status, **forces)
             else:
                 getattr(self, f"_{integrator}")(call, q, qd, q_out, qd_out, dt, **forces)
         return call.result
@@ -115,6 +119,37 @@ class Steps:
             self._launch("passive_force", out, q=q, qd=qd)
         return call.result
 
+    def body_accelerations(self, q: Any, qd: Any, qdd: Any, out: Any = None) -> Any:
+        """Acceleration of every body's CoM [m/s^2], then angular acceleration [rad/s^2], inertial axes.
+
+        Returns:
+            [world, body, 6]: the time derivative of :meth:`body_velocities`.
+        """
+        with self._call("body_accelerations") as call:
+            q, qd = self._read_state(call, q, qd, optional=False)
+            qdd = self._read_rate(call, "qdd", qdd, optional=False)
+            out = call.write(out, (self.worlds, self.scene.body_count, 6), "[world, body, 6]")
+            self._launch("body_accelerations", out, q=q, qd=qd, qdd=qdd)
+        return call.result
+
+    def body_reactions(self, q: Any, qd: Any, qdd: Any, body_f: Any = None, out: Any = None) -> Any:
+        """Wrench that each body receives through its hinge: force [N], then moment about its CoM [N m], inertial axes.
+
+        It moves the body and all that it carries against gravity and ``body_f``, see :meth:`forward_dynamics`.
+
+        Returns:
+            [world, body, 6]
+        """
+        with self._call("body_reactions") as call:
+            q, qd = self._read_state(call, q, qd, optional=False)
+            qdd = self._read_rate(call, "qdd", qdd, optional=False)
+            body_f = self._read_body_f(call, body_f)
+            if self.scene.dof_count == 0:
+                raise UnsupportedError(call.name, "a scene that cannot move", "add up the weights of its bodies")
+            out = call.write(out, (self.worlds, self.scene.body_count, 6), "[world, body, 6]")
+            self._launch("body_reactions", out, q=q, qd=qd, qdd=qdd, body_f=body_f)
+        return call.result
+
     def integrate(self, q: Any, qd: Any, dt: float, out: Any = None) -> Any:
         """q moved along a constant qd for dt [s] on the manifold, quaternions renormalised [world, coordinate].
 
@@ -127,9 +162,12 @@ class Steps:
         return call.result
 
     # -- integrators -----------------------------------------------------------------------------------------------
-    def _step(self, q: Any, qd: Any, q_out: Any, qd_out: Any, dt: float, status: Any = None, **given: Any) -> None:
-        more = {"q_out": q_out} if status is None else {"q_out": q_out, "status": status}
-        option = {} if status is None else {"status": True}
+    def _step(
+        self, q: Any, qd: Any, q_out: Any, qd_out: Any, dt: float, qdd: Any = None, status: Any = None, **given: Any
+    ) -> None:
+        asked = {name: array for name, array in (("qdd_out", qdd), ("status", status)) if array is not None}
+        more = {"q_out": q_out, **asked}
+        option = {name.removesuffix("_out"): True for name in asked}
         if self.scene.dof_count == 0 and status is not None:
             status.zero_()
         self._launch("step", qd_out, more, q=q, qd=qd, dt=dt, **given, **option)

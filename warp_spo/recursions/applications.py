@@ -7,7 +7,7 @@ from typing import Any
 from ..trace.emit import Store
 from ..trace.graph import Value, reciprocal, sqrt
 from ..trace.spatial import ZERO, Articulated, Rigid, Vector, cross, dot
-from . import articulated, composite, determinant, hybrid, motion, newton_euler, step
+from . import articulated, composite, determinant, hybrid, motion, newton_euler, reactions, step
 from .hybrid import Given
 from .links import Link
 from .operators import Operators
@@ -22,9 +22,9 @@ class Applications(Trace):
         return Operators(self).stores(expression)
 
     # -- time steps ------------------------------------------------------------------------------------------------
-    def step(self, status: bool = False) -> list[Store]:
-        """out = qd', q_out = q', status"""
-        return step.Step(self).stores(status)
+    def step(self, qdd: bool = False, status: bool = False) -> list[Store]:
+        """out = qd', q_out = q', qdd_out, status"""
+        return step.Step(self).stores(qdd, status)
 
     def integrate(self) -> list[Store]:
         return step.integrate(self)
@@ -37,6 +37,12 @@ class Applications(Trace):
 
     def hinge_force(self) -> list[Store]:
         return step.hinge_force(self)
+
+    def body_accelerations(self) -> list[Store]:
+        return reactions.body_accelerations(self)
+
+    def body_reactions(self) -> list[Store]:
+        return reactions.body_reactions(self)
 
     # -- hybrid dynamics -------------------------------------------------------------------------------------------
     def hybrid_dynamics(self, held: tuple[bool, ...] | None = None) -> list[Store]:

@@ -200,6 +200,8 @@ class Impedance:
         if not laws:
             return []
         effort, law = self._bound("joint_effort_limit", dof, DEFAULT_BOUND), added(laws)
+        if effort is not None and _is(effort, 0.0):
+            return []
         return [law] if effort is None else [law._replace(least=-effort, most=effort)]
 
     def _limits(self, link: Link, i: int) -> list[Law]:

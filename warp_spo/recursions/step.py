@@ -11,7 +11,7 @@ import dataclasses
 from collections.abc import Callable
 
 from ..trace.emit import Store
-from ..trace.graph import Value, less, select
+from ..trace.graph import Value, less, reciprocal, select
 from ..trace.spatial import total
 from .impedance import Impedance, Law, added
 from .integration import coordinate_rates, moved
@@ -50,8 +50,8 @@ class Step:
         self.laws: dict[int, list[Law]] = {}  # by dof
         self.forces: dict[int, Value] = {}
 
-    def stores(self, status: bool) -> list[Store]:
-        """out = qd', q_out = q', and with ``status`` the word of each world."""
+    def stores(self, qdd: bool, status: bool) -> list[Store]:
+        """out = qd', q_out = q'; with ``qdd`` qdd_out = (qd' - qd) / h, with ``status`` the word of each world."""
         trace = self.trace
         trace.stiffened = self._stiffened
         tau = trace.vector("tau")
@@ -67,6 +67,8 @@ class Step:
             stores += [Store("out", (dof,), rates_after[dof]) for dof in link.dofs]
             coordinates = moved(link, self.q, rates_after.__getitem__, self.h)
             stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
+            if qdd:
+                stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
         if status:
             trace.graph.step = "status|s"
             stores.append(Store("status", (), self._word([item.value for item in stores], bool(looped))))
