@@ -198,9 +198,10 @@ class Call:
             self._staged.append((array, taken))
         return taken
 
-    def write(self, out, shape: tuple, meaning: str = "", *, name: str = "out", dtype=None):
+    def write(self, out, shape: tuple, meaning: str = "", *, name: str = "out", dtype=None, over: str = ""):
         """Return the array for a result: ``out`` itself, or a new one of the kind of the first array read.
 
+        It may be the very array that was read as ``over``.
         Its content is undefined. Raises as :meth:`read`, and TypeError if ``out`` is of another kind.
         """
         dtype = dtype or self.dtype
@@ -220,7 +221,7 @@ class Call:
                 self._staged.append((out, taken))
             else:
                 taken = self._take(name, out, shape, meaning, dtype, change=True)
-            self._add_output(name, out, taken)
+            self._add_output(name, out, taken, over)
         self._results.append((out, taken))
         return taken
 
@@ -312,8 +313,9 @@ class Call:
         if not array.flags.writeable:
             raise ValueError(f"{self.name}: {name} is a read-only NumPy array; expected one to write into; pass a copy")
 
-    def _add_output(self, name, array, taken):
-        self._check_apart(name, array, taken, self._inputs)
+    def _add_output(self, name, array, taken, over=""):
+        same = [other for other in self._inputs if other[0] == over and _same_memory(taken, other[2])]
+        self._check_apart(name, array, taken, [other for other in self._inputs if other not in same])
         self._check_apart(name, array, taken, self._outputs)
         self._outputs.append((name, array, taken))
 
@@ -366,6 +368,10 @@ def new(kind: str | None, shape: tuple, dtype: type, device: wp.Device) -> tuple
 def view(pointer: int, shape: tuple, dtype: type, device: str) -> wp.array:
     """Return a Warp array over memory that someone else owns. Cached, because making one takes 4 us."""
     return wp.array(ptr=pointer, shape=shape, dtype=dtype, device=device)
+
+
+def _same_memory(a, b) -> bool:
+    return a.ptr == b.ptr and a.shape == b.shape
 
 
 def _bytes_meet(a, b) -> bool:

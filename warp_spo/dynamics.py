@@ -28,6 +28,7 @@ from .parameters import RIGID_VALUES, VARIABLE
 from .programs import Programs
 from .scene import Scene
 from .spatial_operators import SpatialOperators
+from .steps import Steps
 
 OPERATIONS = (
     "forward_dynamics",
@@ -57,11 +58,14 @@ OPERATIONS = (
     "inverse_dynamics_derivatives",
     "forward_dynamics_derivatives",
     "mass_matrix_derivative",
+    "step",
+    "body_accelerations",
+    "body_reactions",
 )
 LOOPS = ("raise", "cut", "embed", "multipliers")
 
 
-class Dynamics(Applications, Derivatives, Adjoints):
+class Dynamics(Applications, Steps, Derivatives, Adjoints):
     """Dynamics of one scene in many worlds.
 
     Arrays are torch tensors, Warp arrays or NumPy arrays, [world, ...] and C-contiguous; the kind of the first one is
@@ -171,19 +175,25 @@ class Dynamics(Applications, Derivatives, Adjoints):
         Args:
             operation: name of a method, such as "forward_dynamics".
             options: ``frames=`` for operations that take frames, ``columns=`` for solve_mass_matrix, ``prescribed=``
-                for hybrid_dynamics, ``body_f=True`` and ``status=True`` if they will be given.
+                for hybrid_dynamics, ``integrator=`` for step, and ``body_f=True``, ``status=True``, ``qdd=True``,
+                ``target_q=True``, ``target_qd=True`` if they will be given.
         """
         if operation not in OPERATIONS:
             raise ValueError(f"Dynamics.prepare: no operation {operation!r}; expected one of {', '.join(OPERATIONS)}")
         q: Any = wp.array(np.tile(self.scene.neutral_q, (self.worlds, 1)), dtype=self.dtype, device=self.device)
         rate = wp.zeros((self.worlds, self.scene.dof_count), dtype=self.dtype, device=self.device)
         extra: dict[str, Any] = {}
-        loaded = ("forward_dynamics", "inverse_dynamics", "bias_force", "hybrid_dynamics",
+        loaded = ("forward_dynamics", "inverse_dynamics", "bias_force", "hybrid_dynamics", "step", "body_reactions",
                   "inverse_dynamics_derivatives", "forward_dynamics_derivatives")  # fmt: skip
         if operation in loaded and options.pop("body_f", False):
             shape = (self.worlds, self.scene.body_count, 6)
             extra["body_f"] = wp.zeros(shape, dtype=self.dtype, device=self.device)
-        if operation == "forward_dynamics" and options.pop("status", False):
+        if operation == "step":
+            extra |= {name: array for name, array in (("target_q", q), ("target_qd", rate)) if options.pop(name, False)}
+            extra["integrator"] = options.pop("integrator", "semi_implicit")
+        if operation == "step" and options.pop("qdd", False):
+            extra["qdd"] = wp.zeros_like(rate)
+        if operation in ("forward_dynamics", "step") and options.pop("status", False):
             extra["status"] = wp.zeros(self.worlds, dtype=wp.int32, device=self.device)
         arguments: dict[str, tuple] = {
             "forward_dynamics": (q, rate, rate),
@@ -193,6 +203,9 @@ class Dynamics(Applications, Derivatives, Adjoints):
             "body_velocities": (q, rate),
             "integrate": (q, rate, 0.0),
             "hybrid_dynamics": (q, rate, rate, rate),
+            "step": (q, rate, rate, 1e-3),
+            "body_accelerations": (q, rate, rate),
+            "body_reactions": (q, rate, rate),
             "jacobian_bias": (q, rate),
             "centroidal_momentum_bias": (q, rate),
             "quasi_velocities": (q, rate),
@@ -327,18 +340,6 @@ class Dynamics(Applications, Derivatives, Adjoints):
             self._run("log_det_mass_matrix", out, q=q)
         return call.result
 
-    def passive_force(self, q: Any, qd: Any = None, out: Any = None) -> Any:
-        """-damping qd - stiffness (q - rest) [world, dof].
-
-        For ball and free hinges, q - rest of the rotation is the rotation vector of R(q) R(rest)^T in the parent
-        anchor's axes.
-        """
-        with self._call("passive_force") as call:
-            q, qd = self._read_state(call, q, qd)
-            out = call.write(out, (self.worlds, self.scene.dof_count), "[world, dof]")
-            self._run("passive_force", out, q=q, qd=qd)
-        return call.result
-
     # -- kinematics ------------------------------------------------------------------------------------------------
     @differentiable
     def body_poses(self, q: Any, out: Any = None) -> Any:
@@ -383,17 +384,6 @@ class Dynamics(Applications, Derivatives, Adjoints):
             rows = 6 * len(where)
             out = call.write(out, (self.worlds, rows, rows), "[world, 6 frames, 6 frames]")
             self._run("operational_inertia_inverse", out, q=q, frames=where)
-        return call.result
-
-    def integrate(self, q: Any, qd: Any, dt: float, out: Any = None) -> Any:
-        """q moved along a constant qd for dt [s] on the manifold, quaternions renormalised [world, coordinate].
-
-        A free hinge's CoM moves straight while the body turns about it.
-        """
-        with self._call("integrate") as call:
-            q, qd = self._read_state(call, q, qd, optional=False)
-            out = call.write(out, (self.worlds, self.scene.coord_count), "[world, coordinate]")
-            self._run("integrate", out, q=q, qd=qd, dt=_seconds(call.name, dt))
         return call.result
 
     # -- operators -------------------------------------------------------------------------------------------------
@@ -461,15 +451,6 @@ class Dynamics(Applications, Derivatives, Adjoints):
 
     def _read_body_f(self, call: Call, body_f: Any) -> Any:
         return call.read("body_f", body_f, (self.worlds, self.scene.body_count, 6), "[world, body, 6]", optional=True)
-
-
-def _seconds(call: str, dt: Any) -> float:
-    if getattr(dt, "requires_grad", False):
-        raise ValueError(f"{call}: dt requires grad; derivatives are not available through this call; pass float(dt)")
-    try:
-        return float(dt)
-    except (TypeError, ValueError):
-        raise TypeError(f"{call}: dt is {dt!r}; expected a number of seconds, the same in all worlds") from None
 
 
 def _world_count(scene: Scene, worlds: Any) -> int:

@@ -25,8 +25,6 @@ LONG_RESULTS = ("mass_matrix",)  # writing them is most of the work, and goes fa
 
 SEGMENTED = ("forward_dynamics", "solve_mass_matrix", "mass_matrix", *SHORT)
 """Operations that a warp a limb can share; the others run with a thread a world where the plan says segment."""
-NODE_ONLY = ("passive_force", "integrate")
-"""Operations in which no body waits for another: one launch, a thread for each (node, world)."""
 TREE_ONLY = (
     "hybrid_dynamics",
     "jacobian_bias",
@@ -47,6 +45,13 @@ TREE_ONLY = (
     "body_velocities_vjp",
     "forward_dynamics_jvp",
     "inverse_dynamics_jvp",
+    "step",
+    "integrate",
+    "passive_force",
+    "hinge_force",
+    "coordinate_rates",
+    "body_accelerations",
+    "body_reactions",
 )
 """Operations that exist as traces alone: each is a kernel of its scene, a thread a world, whatever the plan."""
 
@@ -83,8 +88,6 @@ class Plan:
 
     def of(self, operation: str) -> str:
         """Granularity of one operation: the plan's own where the operation has that form."""
-        if operation in NODE_ONLY:
-            return "node"
         if operation in TREE_ONLY:
             return "tree"
         chosen = self.granularity if self.forced else self._rule(operation)

@@ -16,16 +16,20 @@ from . import link_values
 from .kernels import straight
 from .kernels.straight import COLUMNS, DIRECT, IN_PLACE, MAPPED, STAGED, TILE, TILED, WARP, Frame, Result, Row
 from .levels import Recursions
+from .parts import DOF_VALUES
 from .plan import MOST_WARPS, TREE_ONLY, Plan
 from .recursions.adjoints import Adjoints
 from .recursions.links import TABLES, Links
 from .recursions.operators import meet, written
 from .recursions.pieces import Piece, Pieces
+from .recursions.step import LOOPED
 from .recursions.traced import INWARD, OUTWARD, SENT, Trace
 from .teams import Team
 from .trace.emit import Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
+FIELDS = (*TABLES, *DOF_VALUES, "joint_rest_q")
+"""Values of the scene as kernels read them, [entry, world]: what links are made of, and Newton's own."""
 SENDS = {"forward_dynamics": "Pza", "solve_mass_matrix": "Pza", "inverse_dynamics": "z", "mass_matrix": "R"}
 """What the pieces of a robot send each other, by operation."""
 TRACED = (
@@ -54,7 +58,7 @@ class Program(NamedTuple):
     """One kernel.
 
     Attributes:
-        rows: names of the callers' arrays that it reads. fields: of the tables of what the links are made of.
+        rows: names of the callers' arrays, and then numbers, that it reads. fields: of FIELDS.
         tables: arrays of its own.
         operations: floating-point operations of one world.
         spread: a second kernel that brings the values of the first, [slot, world], to their ``places``; or None.
@@ -136,16 +140,16 @@ class Programs:
             self._programs[key] = self._build(operation, shapes, out, more or {}, options)
         return self._programs[key]
 
-    def launch(self, program: Program, arrays: dict[str, wp.array], out: wp.array, *more: wp.array) -> None:
+    def launch(self, program: Program, arrays: dict[str, Any], out: wp.array, *more: wp.array) -> None:
         rows = [arrays[name] for name in program.rows]
-        fields = [self.table(name) for name in program.fields]
+        fields = [self.field(name) for name in program.fields]
         if program.spread is None:
             self._launch(program, self.run.worlds, [*rows, *fields], [out, *more])
             return
         some = program.spread.columns.shape[1]
         for first in range(0, self.run.worlds, some):
             part = slice(first, min(first + some, self.run.worlds))
-            inputs = [*(row[part] for row in rows), *(field[:, part] for field in fields)]
+            inputs = [*(row[part] if isinstance(row, wp.array) else row for row in rows), *(field[:, part] for field in fields)]
             self._launch(program, part.stop - first, inputs, [program.spread.columns, *(array[part] for array in more)])
             self._spread(program.spread, part.stop - first, out[part])
 
@@ -161,8 +165,10 @@ class Programs:
         threads = -(-worlds // spread.tile) * block if device.is_cuda else worlds
         wp.launch(spread.kernel, threads, [worlds, spread.columns, spread.places], [out], device=device, block_dim=block)
 
-    def table(self, name: str) -> wp.array:
-        """What the links are made of [entry, world]."""
+    def field(self, name: str) -> wp.array:
+        """One of FIELDS."""
+        if name not in TABLES:
+            return self.run.parameters.field(name)
         return link_values.table(self.run.parameters, self.links, name)
 
     @property
@@ -210,21 +216,28 @@ class Programs:
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         frame = self._frame([item for item in stores if item.array == "out"], shapes, 0, 1, self.block, stores)
+        alone = not any(item.array in LOOPED for item in stores)
         if operation in TILES:
             slots = len({_name(item.value) for item in stores if not _is_zero(item.value)})
             result = Result(TILED, Row("out", 3, frame.result.array.entries), slots=slots)
             frame = frame._replace(staged=self.plan.staged, result=result)
-        frame = frame._replace(again=not frame.staged and frame.result.way in (DIRECT, TILED))
+        frame = frame._replace(again=alone and not frame.staged and frame.result.way in (DIRECT, TILED))
         frame = frame._replace(more=tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more))
         placed, table = _placed([item for item in stores if item.array == "out"], frame.result)
         placed += apart
         emitter = self._emitter(shapes, frame)
         listing = emitter.region(placed)
         body = literals(listing, self.run.dtype.__name__)
+        operations, looped = emitter.operations, [item for item in stores if item.array in LOOPED]
+        if looped:
+            emitter = self._emitter(shapes, frame)
+            a_pass = literals(emitter.region(looped), self.run.dtype.__name__)
+            body = straight.looped(a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
+            operations += emitter.operations
         frame = frame._replace(again=frame.again and "farthest" in listing.text)
         place: Any = None if table is None else wp.array(table, dtype=int, device=self.run.device)
         tables = {} if place is None or frame.result.way == TILED else {"place": place}
-        program = self._finished(operation, frame, body, body, tables, emitter.operations)
+        program = self._finished(operation, frame, body, body, tables, operations)
         return program._replace(slots=frame.result.slots, entry=place) if frame.result.way == TILED else program
 
     def _segment_program(self, operation: str, shapes: dict, pieces: Pieces) -> Program | None:
@@ -261,12 +274,15 @@ class Programs:
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
-        return item if item.array in (INWARD, OUTWARD) else item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
+        if item.array in (INWARD, OUTWARD, *LOOPED):
+            return item
+        return item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
 
     def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int) -> Program:
         native = straight.assemble(frame, cuda, cpu, self.run.dtype)
-        rows, fields = tuple(row.name for row in frame.rows), tuple(frame.fields)
-        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 2) for name in fields]
+        rows, fields = (*(row.name for row in frame.rows), *frame.numbers), tuple(frame.fields)
+        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 0) for name in frame.numbers]
+        arrays += [(name, 2) for name in fields]
         result, spread = frame.result, None
         if result.way == COLUMNS:
             some = min(self.run.worlds, self.column_worlds)
@@ -287,7 +303,7 @@ class Programs:
         def load(array: str, entry: str) -> str:
             if array in (INWARD, OUTWARD):
                 return f"SENT({entry})"
-            if array in TABLES:
+            if array in FIELDS:
                 return f"FIELD({array}, {entry})"
             return f"{array}_row[{entry}]"
 
@@ -303,20 +319,21 @@ class Programs:
         def flat(array: str, index: tuple) -> int:
             return index[0] if len(index) == 1 else _flat(index, shapes[array][1:])
 
-        return Emitter(self.run.dtype.__name__, load, store, flat, angles, TABLES)
+        return Emitter(self.run.dtype.__name__, load, store, flat, angles, FIELDS)
 
     def _frame(self, stores: list[Store], shapes: dict, sent: int, warps: int, block: int,
                everything: list[Store] | None = None) -> Frame:
         """How rows come in and the result, of flat ``stores``, goes out: through shared memory where it has room."""
         used = _reads(everything or stores)
-        rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used]
+        rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used and shape]
+        numbers = tuple(name for name, shape in shapes.items() if name in used and not shape)
         out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
         dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
         over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
         over = [name for name in over if _read_before(stores, name)]
         slots = len({_name(item.value) for item in stores})
-        fields = {name: used[name] for name in TABLES if name in used}
-        held = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
+        fields = {name: used[name] for name in FIELDS if name in used}
+        held = ((), tuple(fields.values())) if fields and warps == 1 and set(fields) <= set(TABLES) else ((),)
         staged, ways = self.plan.staged, [(False, Result(DIRECT, out))]
         staged = staged or any(row.name == "x" and row.entries > SHORT_ROW for row in rows)
         if dense and (staged or out.entries > SHORT_ROW):
@@ -328,7 +345,7 @@ class Programs:
         if slots >= self.column_slots and straight.tile(Result(COLUMNS, out, slots=slots), self.run.dtype):
             ways = [(False, Result(COLUMNS, out, slots=slots))]
         frames = [
-            Frame(rows, staged, list(fields), result, sent, warps, block, held=entries)
+            Frame(rows, staged, list(fields), result, sent, warps, block, held=entries, numbers=numbers)
             for staged, result in ways
             for entries in held[::-1]
         ]

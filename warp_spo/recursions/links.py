@@ -101,7 +101,7 @@ class Links:
         variable: names whose entries are inputs, all of them.
 
     Attributes:
-        graph: the trace's graph.
+        scene, variable: as given. graph: the trace's graph.
         links: the links. seats, nodes: by body.
         gravity: Vector.
         turns_vary: some joint's anchor is turned by what is no constant.
@@ -110,7 +110,7 @@ class Links:
     """
 
     def __init__(self, scene: Scene, variable: tuple[str, ...] = ()):
-        self.scene, self.graph = scene, Graph()
+        self.scene, self.variable, self.graph = scene, variable, Graph()
         self.links: list[Link] = []
         self.seats: dict[int, Seat] = {}
         self.nodes: dict[int, Node] = {}

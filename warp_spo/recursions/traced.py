@@ -56,6 +56,7 @@ class Trace:
         self.places: dict[int, Placed] = {}
         self.motions: dict[int, Motion] = {}
         self.axes: dict[int, Matrix] = {}  # of every link, in the inertial frame
+        self.stiffened: Callable[[Link], Link] = lambda link: link  # with all that its pivots feel beside its inertia
         self.bodies: dict[int, list[int]] = {}  # by link: the bodies that sit on it
         for body, seat in links.seats.items():
             if seat.link is not None:
@@ -161,7 +162,7 @@ class Trace:
             place, move = self.places[key], self.motions[key]
             carried = self.carried_on(link, "P", inner, Articulated.unpacked)
             through = [(self.places[id(child)].pose, done[id(child)].P) for child in link.children if id(child) in done]
-            done[key] = factor = articulated.factor(link, place, carried, through, self.epsilon)
+            done[key] = factor = articulated.factor(self.stiffened(link), place, carried, through, self.epsilon)
             inner[key] = factor.in_parent
             self.at(link, "z")
             z = articulated.gyroscopic(link.inertia, move)
