@@ -31,11 +31,15 @@ ARGUMENTS = {
     "solve_mass_matrix": ("q", "b"),
     "body_poses": ("q",),
     "body_velocities": ("q", "qd"),
+    "integrate": ("q", "qd"),
+    "step": ("q", "qd", "tau", "body_f", "target_q", "target_qd"),
 }
 """What each operation can be differentiated by, besides the values of the scene that vary."""
 ANCHORS = ("joint_X_p", "joint_X_c")
-ENTERING = {"body_poses": (*ANCHORS, "body_com"), "body_velocities": (*ANCHORS, "body_com")}
-"""Values that enter an operation, where it is not all of them."""
+GAINS = ("joint_damping", "joint_stiffness", "joint_friction", "joint_target_ke", "joint_target_kd")
+ENTERING = dict.fromkeys(("body_poses", "body_velocities", "integrate"), (*ANCHORS, "body_com"))
+ENTERING["step"] = (*LINK_VALUES, *GAINS)
+"""Values that enter an operation, where they are not those that links are made of."""
 
 
 def differentiable(method: Callable) -> Callable:
@@ -197,17 +201,25 @@ class Adjoints:
     # -- torch -----------------------------------------------------------------------------------------------------
     @property
     def differentiable_values(self) -> tuple[str, ...]:
-        """Names of the values by which results can be differentiated: those that vary, of what links are made of."""
-        return tuple(name for name in LINK_VALUES if self._varies(name))
+        """Names of the variable values by which results can be differentiated."""
+        return tuple(name for name in ENTERING["step"] if name in self.variable)
 
     def entering(self, operation: str) -> tuple[str, ...]:
         """Names of the values that enter an operation."""
         return ENTERING.get(operation, LINK_VALUES)
 
     def pulled_back(
-        self, operation: str, given: dict[str, Any], results: Sequence[Any], cotangents: Sequence[Any], wrt: Sequence[str]
+        self,
+        operation: str,
+        given: dict[str, Any],
+        options: dict[str, Any],
+        results: Sequence[Any],
+        cotangents: Sequence[Any],
+        wrt: Sequence[str],
     ) -> dict[str, Any]:
         """Gradients by name of a call with the arguments ``given``, for the ``cotangents`` of its ``results``."""
+        if operation == "step":
+            return self._step_pulled_back(given, options, results, cotangents, wrt)
         (result,), (cotangent,) = results, cotangents
         if operation == "forward_dynamics":
             return self.forward_dynamics_vjp(**given, cotangent=cotangent, qdd=result, wrt=wrt)
@@ -219,10 +231,29 @@ class Adjoints:
         with self._call(f"{operation}, backwards") as call:
             q, qd = self._read_state(call, given["q"], given.get("qd"))
             arrays = {"q": q, "qd": qd, "cotangent": call.read("cotangent", cotangent, shape)}
+            if operation == "integrate":
+                arrays["dt"] = float(options["dt"])
             if operation == "solve_mass_matrix":
                 arrays["qdd"] = call.read("result", result, shape)
             names, outs = self._gradients(call, operation, {}, wrt, None)
             self._pull(operation, names, outs, arrays)
+        return _by_name(names, call.result)
+
+    def _step_pulled_back(
+        self, given: dict[str, Any], options: dict[str, Any], results: Sequence[Any], cotangents: Sequence[Any],
+        wrt: Sequence[str],
+    ) -> dict[str, Any]:
+        """Of a step; ``results`` are the new state and the accelerations."""
+        with self._call("step, backwards") as call:
+            arrays: dict[str, Any] = {"dt": float(options["dt"])}
+            for name, array in given.items():
+                arrays[name] = call.read(name, array, self._shape_of(name))
+            arrays["qdd"] = self._read_rate(call, "qdd", results[2], False)
+            for name, like, array in zip(("q_cotangent", "qd_cotangent"), ("q", "qd"), cotangents, strict=True):
+                arrays[name] = call.read(name, array, self._shape_of(like))
+            names, outs = self._gradients(call, "step", arrays, wrt, None)
+            arrays.pop("tau", None)
+            self._pull("step", names, outs, arrays)
         return _by_name(names, call.result)
 
     def _of_columns(self, given: dict[str, Any], result: Any, cotangent: Any, wrt: Sequence[str]) -> dict[str, Any]:
@@ -230,7 +261,7 @@ class Adjoints:
         found: dict[str, Any] = {}
         for c in range(result.shape[2]):
             one = (result[..., c].contiguous(),), (cotangent[..., c].contiguous(),)
-            for name, gradient in self.pulled_back("solve_mass_matrix", given, *one, wrt).items():
+            for name, gradient in self.pulled_back("solve_mass_matrix", given, {}, *one, wrt).items():
                 if name != "b":
                     found[name] = found[name] + gradient if name in found else gradient
                 else:
@@ -287,9 +318,10 @@ class Adjoints:
         self._check_size(call)
         names, out = (wrt,) if isinstance(wrt, str) else tuple(wrt), out or {}
         arguments = ARGUMENTS[operation]
-        known = (*arguments[:1], "tangent", *arguments[1:], *(name for name in LINK_VALUES if self._varies(name)))
+        entering = self.entering(operation)
+        known = (*arguments[:1], "tangent", *arguments[1:], *(name for name in entering if self._varies(name)))
         for name in names:
-            if name in LINK_VALUES and name not in known:
+            if name in entering and name not in known:
                 way = f"build Dynamics with variable=({name!r},)"
                 raise ValueError(f"{call.name}: wrt names {name!r}, which is folded into the kernels; {way}")
             if name not in known:
@@ -306,9 +338,10 @@ class Adjoints:
 
     def _shape_of(self, name: str) -> tuple[int, ...]:
         scene = self.scene
-        if name in LINK_VALUES:
+        if name in (*LINK_VALUES, *GAINS):
             return self.worlds, *scene.values[name].shape[1:]
-        shapes: dict[str, tuple] = {"q": (scene.coord_count,), "body_f": (scene.body_count, 6)}
+        q = (scene.coord_count,)
+        shapes: dict[str, tuple] = {"q": q, "target_q": q, "body_f": (scene.body_count, 6)}
         return self.worlds, *shapes.get(name, (scene.dof_count,))
 
     def _pull(self, operation: str, names: tuple[str, ...], outs: Sequence[wp.array], given: dict[str, Any]) -> None:

@@ -41,6 +41,8 @@ TREE_ONLY = (
     "forward_dynamics_vjp",
     "inverse_dynamics_vjp",
     "solve_mass_matrix_vjp",
+    "integrate_vjp",
+    "step_vjp",
     "body_poses_vjp",
     "body_velocities_vjp",
     "forward_dynamics_jvp",

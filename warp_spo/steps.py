@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from .adjoints import differentiable
 from .arrays import Call
 from .errors import UnsupportedError
 from .kernels import combination
@@ -28,6 +29,7 @@ class Steps:
     dtype: type
     recursions: Recursions
 
+    @differentiable
     def step(
         self,
         q: Any,
@@ -150,6 +152,7 @@ class Steps:
             self._launch("body_reactions", out, q=q, qd=qd, qdd=qdd, body_f=body_f)
         return call.result
 
+    @differentiable
     def integrate(self, q: Any, qd: Any, dt: float, out: Any = None) -> Any:
         """q moved along a constant qd for dt [s] on the manifold, quaternions renormalised [world, coordinate].
 

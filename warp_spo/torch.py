@@ -74,7 +74,7 @@ def differentiated(dyn: Any, operation: str, method: Any, arguments: dict[str, A
     given = {name: arguments.pop(name) for name in by if arguments.get(name) is not None}
     tensors = {**given, **sources}
     if not any(map(requires_grad, tensors.values())):
-        with torch.no_grad():
+        with torch.set_grad_enabled(any(map(requires_grad, arguments.values()))):  # which the call then refuses
             return method(dyn, **given, **arguments)
     call = f"Dynamics.{operation}"
     for name, x in tensors.items():
@@ -84,7 +84,13 @@ def differentiated(dyn: Any, operation: str, method: Any, arguments: dict[str, A
                 f"{call}: {wanting} requires grad and {name} is of type {type(x).__name__}; expected torch tensors only; "
                 f"pass torch.as_tensor({name}), or call inside torch.no_grad()"
             )
-    if arguments.pop("out", None) is not None:
+    if arguments.get("integrator", "semi_implicit") != "semi_implicit" or arguments.get("qdd") is not None:
+        raise ValueError(
+            f"{call}: an input requires grad; expected integrator='semi_implicit' and no qdd=, of which gradients are "
+            f"known; call inside torch.no_grad()"
+        )
+    out = arguments.pop("out", None)
+    if any(x is not None for x in (out if isinstance(out, tuple | list) else (out,))):
         raise ValueError(
             f"{call}: out is given and an input requires grad; a result that gradients flow through is a new tensor; "
             f"leave out=, or call inside torch.no_grad()"
@@ -101,8 +107,13 @@ class _Plain:
         self.arguments, self.values = arguments, values
         self.stamps = dict(dyn.values.stamps)
 
-    def run(self, tensors: Sequence[torch.Tensor]) -> Any:
-        return self.method(self.dyn, **dict(zip(self.arguments, tensors, strict=False)), **self.options)
+    def run(self, tensors: Sequence[torch.Tensor]) -> tuple[Any, tuple]:
+        """The result; all that the way back needs of it."""
+        more = {}
+        if self.operation == "step":
+            more["qdd"] = torch.empty_like(tensors[self.arguments.index("qd")])
+        result = self.method(self.dyn, **dict(zip(self.arguments, tensors, strict=False)), **self.options, **more)
+        return result, (*(result if isinstance(result, tuple) else (result,)), *more.values())
 
     def gradients(self, wanted: list[str], tensors: Sequence[torch.Tensor], results: tuple, cotangents: tuple) -> dict:
         """By name; where a value has been set anew since the call, at the value of the call."""
@@ -117,7 +128,7 @@ class _Plain:
             )
         arrays = {name: given[name] for name in self.arguments}
         with self.dyn.held({name: given[name] for name in anew if name in self.values}):
-            return self.dyn.pulled_back(self.operation, arrays, results, cotangents, wanted)
+            return self.dyn.pulled_back(self.operation, arrays, self.options, results, cotangents, wanted)
 
 
 class _Operation(torch.autograd.Function):
@@ -126,10 +137,9 @@ class _Operation(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, plain: _Plain, *tensors: torch.Tensor) -> Any:
         ctx.plain = plain
-        results = plain.run([x.detach() for x in tensors])
-        several = isinstance(results, tuple)
-        ctx.save_for_backward(*tensors, *(results if several else (results,)))
-        return results
+        result, kept = plain.run([x.detach() for x in tensors])
+        ctx.save_for_backward(*tensors, *kept)
+        return result
 
     @staticmethod
     def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple:
@@ -208,6 +218,7 @@ class Module(torch.nn.Module):
     inverse_dynamics = functools.partialmethod(_called, "inverse_dynamics")
     bias_force = functools.partialmethod(_called, "bias_force")
     gravity_force = functools.partialmethod(_called, "gravity_force")
+    step = functools.partialmethod(_called, "step")
     solve_mass_matrix = functools.partialmethod(_called, "solve_mass_matrix")
     body_poses = functools.partialmethod(_called, "body_poses")
     body_velocities = functools.partialmethod(_called, "body_velocities")

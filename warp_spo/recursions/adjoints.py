@@ -6,13 +6,16 @@ lambda = Mass^-1 y, J* y is lambda for tau and -(d tau / d x)* lambda at the acc
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable
 
 from ..trace.derivative import forward, reverse
 from ..trace.emit import Store
 from ..trace.graph import Scalar, Value, ordered
-from ..trace.spatial import ZERO, Vector, cross
+from ..trace.spatial import ZERO, Vector, cross, total
 from .derivatives import Derivatives
+from .impedance import Impedance
+from .integration import moved
 from .links import FREE, SCREW_MOTIONS, Link
 
 Entry = Callable[[int], Value]
@@ -59,6 +62,57 @@ class Adjoints(Derivatives):
         seeds = [self.graph.input("cotangent", *item.index) for item in results]
         return self._reversed([item.value for item in results], seeds, wrt, wrt)
 
+    def integrate_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
+        """J* cotangent of integrate"""
+        return self._of_bodies(self.integrate(), wrt)
+
+    def step_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
+        """J* (q_cotangent; qd_cotangent) of a step whose accelerations are "qdd".
+
+        qd' = qd + dt qdd, and q' moves along qd'. qdd solves Mass qdd + bias_force = tau + f(dt qdd), f the forces of
+        the hinges; so its cotangent goes through (Mass + dt R)^-1, R the slope of f in the pieces that held, and then
+        through the equation, in which qdd stays.
+        """
+        qdd, qd, h = self.vector("qdd"), self.vector("qd"), self.graph.input("dt", 0)
+        pushed = self.vector("q_cotangent"), self.vector("qd_cotangent")
+        links = self.links.links
+        dofs = [dof for link in links for dof in link.dofs]
+        after = {dof: qd(dof) + h * qdd(dof) for dof in dofs}
+        coordinates, seeds = [], []
+        for link in links:
+            self.at(link, "q")
+            values = moved(link, self.vector("q"), after.__getitem__, h)
+            coordinates += values
+            seeds += [pushed[0](link.coordinate + c) for c in range(len(values))]
+        ends = [x for x in ordered(coordinates) if x.op == "input" and x.args[0] not in ("qd", "qdd", "dt")]
+        back = reverse(coordinates, [*after.values(), *ends], seeds)
+        along, found = back[: len(dofs)], dict(zip((x.args for x in ends), back[len(dofs) :], strict=True))
+        rates = {dof: pushed[1](dof) + value for dof, value in zip(dofs, along, strict=True)}
+        impedance = Impedance(self.links, h, self.vector("q"), qd, None,
+                              self.vector("target_q") if "target_q" in self.given else None, self.vector("target_qd"))
+        forces: dict[int, Value] = {}
+
+        def stiffened(link: Link) -> Link:
+            armature = []
+            for dof, laws, inertia in zip(link.dofs, impedance.laws(link), link.armature, strict=True):
+                u = h * qdd(dof)
+                forces[dof] = total(law.at(u) for law in laws)
+                armature.append(inertia + h * total(law.piece(u).resistance for law in laws))
+            return dataclasses.replace(link, armature=tuple(armature))
+
+        self.stiffened = stiffened
+        solved = self.solved(lambda dof: h * rates[dof])
+        tau = self.inverse_dynamics()
+        missing = [item.value - forces[item.index[0]] for item in tau]
+        inputs = [x for x in ordered(missing) if x.op == "input"]
+        seeds = [-solved[item.index[0]] for item in tau]
+        for x, value in zip(inputs, reverse(missing, inputs, seeds), strict=True):
+            found[x.args] = found.get(x.args, 0.0) + value
+        for dof in dofs:
+            found["qd", dof] = found.get(("qd", dof), 0.0) + rates[dof]
+            found["tau", dof] = solved[dof]
+        return [Store(_named(name, wrt), index, value) for name in wrt for index, value in self.entries(name, found)]
+
     def solved(self, right: str | Entry) -> dict[int, Value]:
         """Mass^-1 times an array, by dof."""
         entry = self.vector(right) if isinstance(right, str) else right
@@ -86,7 +140,7 @@ class Adjoints(Derivatives):
         if name == "body_f":
             places: list[tuple] = [(body, c) for body in range(scene.body_count) for c in range(6)]
         else:
-            sizes = {"q": scene.coord_count, "value": len(self.links.tables["value"])}
+            sizes = {"q": scene.coord_count, "target_q": scene.coord_count, "value": len(self.links.tables["value"])}
             places = [(i,) for i in range(sizes.get(name, scene.dof_count))]
         return [(place, found.get((name, *place), 0.0)) for place in places]
 

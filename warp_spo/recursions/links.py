@@ -106,7 +106,7 @@ class Links:
         gravity: Vector.
         turns_vary: some joint's anchor is turned by what is no constant.
         tables: the scalars that an :meth:`opened` copy reads, by name, in order.
-        reverses: kernels that take gradients by the tables back to the values, see :mod:`warp_spo.link_values`.
+        reverses: what takes gradients by the tables back to the values, see :mod:`warp_spo.link_values`.
     """
 
     def __init__(self, scene: Scene, variable: tuple[str, ...] = ()):
