@@ -12,8 +12,8 @@ import zoo
 from laws import OPERATIONS, TOLERANCE
 
 import warp_spo as spo
-from warp_spo.adjoints import ARGUMENTS
 from warp_spo import reference
+from warp_spo.adjoints import ARGUMENTS
 
 WORLDS = 3
 KINDS = ["torch", "warp", "numpy"]
@@ -175,7 +175,7 @@ def test_refused_in_words(operation, name, device):
     call = f"Dynamics.{operation}"
 
     def run(kind, value):
-        laws.call(dyn, operation, given(kind, dyn) | {name: value})
+        return laws.call(dyn, operation, given(kind, dyn) | {name: value})
 
     for kind, title in (("torch", "torch"), ("warp", "Warp"), ("numpy", "NumPy")):
         good = laws.states(dyn.scene, WORLDS)[name]

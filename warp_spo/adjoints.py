@@ -37,8 +37,10 @@ ARGUMENTS = {
 """What each operation can be differentiated by, besides the values of the scene that vary."""
 ANCHORS = ("joint_X_p", "joint_X_c")
 GAINS = ("joint_damping", "joint_stiffness", "joint_friction", "joint_target_ke", "joint_target_kd")
-ENTERING = dict.fromkeys(("body_poses", "body_velocities", "integrate"), (*ANCHORS, "body_com"))
-ENTERING["step"] = (*LINK_VALUES, *GAINS)
+ENTERING: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("body_poses", "body_velocities", "integrate"), (*ANCHORS, "body_com")),
+    "step": (*LINK_VALUES, *GAINS),
+}
 """Values that enter an operation, where they are not those that links are made of."""
 
 
@@ -130,7 +132,7 @@ class Adjoints:
         wrt: Sequence[str] = ("q", "qd", "qdd"),
         out: dict[str, Any] | None = None,
     ) -> dict[str, Any]:
-        """Gradients of cotangent . tau: J* cotangent of :meth:`inverse_dynamics`, one recursion forwards, one in reverse.
+        """Gradients of cotangent . tau: J* cotangent of :meth:`inverse_dynamics`, a recursion forwards, one in reverse.
 
         Args and returns: as :meth:`forward_dynamics_vjp`, with "qdd" for "tau"; it must be given if it is in ``wrt``.
         """
@@ -330,8 +332,8 @@ class Adjoints:
                 raise ValueError(f"{call.name}: wrt names {name!r}, which is None; pass zeros to differentiate by it")
         if not names or len(set(names)) < len(names) or set(out) - set(names):
             raise ValueError(f"{call.name}: wrt is {names!r} and out has {tuple(out)!r}; expected names, each once")
-        return names, [call.write(out.get(name), self._shape_of(name), f"[world, ...] like {name}", name=f"out[{name!r}]")
-                       for name in names]  # fmt: skip
+        shapes = {name: self._shape_of(name) for name in names}
+        return names, [call.write(out.get(n), shapes[n], f"[world, ...] like {n}", name=f"out[{n!r}]") for n in names]
 
     def _varies(self, name: str) -> bool:
         return name in self.variable or self.scene.values[name].shape[0] > 1

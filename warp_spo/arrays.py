@@ -83,8 +83,9 @@ class Values:
     def set(self, name: str, value: Any) -> None:
         """Take note of a value."""
         tracked = recorded((value,))
-        if tracked and self.tensors.get(name) is value and self._versions[name] == value._version:
-            return
+        if tracked and name in self.tensors and self.tensors[name] is value:
+            if self._versions[name] == value._version:
+                return
         self._count += 1
         self.stamps[name] = self._count
         self.tensors.pop(name, None)

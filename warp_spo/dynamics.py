@@ -157,6 +157,8 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
                 self.values.set(name, values[name])
             parameters.refresh(taken)
             if folded:
+                for name in folded:
+                    self.values.set(name, None)
                 self._rebuild(checked)
 
     def _rebuild(self, folded: dict[str, np.ndarray]) -> None:
@@ -437,8 +439,8 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
         if self.values.tensors and recorded((), self.values):
             names = ", ".join(self.values.tensors)
             raise ValueError(
-                f"Dynamics.{name}: {names} was set to a tensor that requires grad; derivatives are not available through "
-                f"this call; call inside torch.no_grad(), or set {names} to detached tensors"
+                f"Dynamics.{name}: {names} was set to a tensor that requires grad; derivatives are not available "
+                f"through this call; call inside torch.no_grad(), or set {names} to detached tensors"
             )
         return Call(f"Dynamics.{name}", self.device, self.dtype)
 

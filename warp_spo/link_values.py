@@ -47,7 +47,7 @@ def _kernel(name: str, values: list, sources: list[str], T: type) -> wp.Kernel:
 
 
 def pull_back(parameters: Parameters, links: Links, cotangent: wp.array, gradients: dict[str, wp.array]) -> None:
-    """``gradients[name]`` [world, entry] by Newton's values, of those by the table "value" ``cotangent`` [world, entry].
+    """``gradients[name]`` [world, entry] by Newton's values, of those by the table "value" ``cotangent``.
 
     In float64, rounded once.
     """

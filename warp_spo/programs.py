@@ -21,7 +21,7 @@ from .plan import MOST_WARPS, TREE_ONLY, Plan
 from .recursions.adjoints import Adjoints
 from .recursions.links import TABLES, Links
 from .recursions.operators import meet, written
-from .recursions.pieces import Piece, Pieces
+from .recursions.pieces import Pieces
 from .recursions.step import LOOPED
 from .recursions.traced import INWARD, OUTWARD, SENT, Trace
 from .teams import Team
@@ -149,7 +149,8 @@ class Programs:
         some = program.spread.columns.shape[1]
         for first in range(0, self.run.worlds, some):
             part = slice(first, min(first + some, self.run.worlds))
-            inputs = [*(row[part] if isinstance(row, wp.array) else row for row in rows), *(field[:, part] for field in fields)]
+            inputs = [row[part] if isinstance(row, wp.array) else row for row in rows]
+            inputs += [field[:, part] for field in fields]
             self._launch(program, part.stop - first, inputs, [program.spread.columns, *(array[part] for array in more)])
             self._spread(program.spread, part.stop - first, out[part])
 
@@ -163,7 +164,8 @@ class Programs:
     def _spread(self, spread: Spread, worlds: int, out: wp.array) -> None:
         device, block = self.run.device, straight.SPREAD_BLOCK
         threads = -(-worlds // spread.tile) * block if device.is_cuda else worlds
-        wp.launch(spread.kernel, threads, [worlds, spread.columns, spread.places], [out], device=device, block_dim=block)
+        inputs = [worlds, spread.columns, spread.places]
+        wp.launch(spread.kernel, threads, inputs, [out], device=device, block_dim=block)
 
     def field(self, name: str) -> wp.array:
         """One of FIELDS."""

@@ -79,9 +79,9 @@ def differentiated(dyn: Any, operation: str, method: Any, arguments: dict[str, A
     call = f"Dynamics.{operation}"
     for name, x in tensors.items():
         if not is_tensor(x):
-            wanting = next(n for n, y in tensors.items() if requires_grad(y))
+            other = next(n for n, y in tensors.items() if requires_grad(y))
             raise TypeError(
-                f"{call}: {wanting} requires grad and {name} is of type {type(x).__name__}; expected torch tensors only; "
+                f"{call}: {other} requires grad and {name} is of type {type(x).__name__}; expected torch tensors only; "
                 f"pass torch.as_tensor({name}), or call inside torch.no_grad()"
             )
     if arguments.get("integrator", "semi_implicit") != "semi_implicit" or arguments.get("qdd") is not None:
@@ -169,8 +169,8 @@ class _Once(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple:
         raise RuntimeError(
-            f"Dynamics.{ctx.operation}: its gradient is differentiated once more; expected first derivatives only, which "
-            f"are analytic and not recorded; take finite differences of gradients for second ones"
+            f"Dynamics.{ctx.operation}: its gradient is differentiated once more; expected first derivatives only, "
+            f"which are analytic and not recorded; take finite differences of gradients for second ones"
         )
 
 

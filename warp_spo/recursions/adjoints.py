@@ -45,7 +45,7 @@ class Adjoints(Derivatives):
         return stores + [Store(_named("tau", wrt), (dof,), solved[dof]) for dof in solved if "tau" in wrt]
 
     def solve_mass_matrix_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
-        """J* cotangent of Mass^-1 b, whose result is the array "qdd": lambda for b, -(d (Mass qdd) / d x)* lambda else"""
+        """J* cotangent of Mass^-1 b, which is "qdd": lambda for b, -(d (Mass qdd) / d x)* lambda for the others"""
         solved, self.weightless = self.solved("cotangent"), True
         stores = self._pulled_back(tuple(name for name in wrt if name != "b"), lambda dof: -solved[dof], wrt)
         return stores + [Store(_named("b", wrt), (dof,), solved[dof]) for dof in solved if "b" in wrt]
@@ -146,7 +146,7 @@ class Adjoints(Derivatives):
 
     def tangent(self, found: dict[tuple, Value]) -> list[tuple[tuple[int, ...], Value]]:
         """The gradient by q along the tangent coordinates."""
-        entries = []
+        entries: list[tuple[tuple[int, ...], Value]] = []
         for link in self.links.links:
             self.at(link, "g")
             first = link.coordinate
