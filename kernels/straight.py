@@ -22,8 +22,11 @@ ARRIVED = 'asm volatile("cp.async.wait_all;" ::: "memory");'
 SHARED_BYTES = 46 * 1024  # that a block may declare: 48 KiB less what Warp takes
 C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
 MASKS = ("prescribed",)  # arrays of booleans
-IN_PLACE, STAGED, MAPPED, COLUMNS, DIRECT = "in place", "staged", "mapped", "columns", "direct"
+INTEGERS = ("place", "shifts", "status")  # arrays of whole numbers, one axis
+MOST_PASSES = 16  # of a loop; see CONTRIBUTING
+IN_PLACE, STAGED, MAPPED, COLUMNS, TILED, DIRECT = "in place", "staged", "mapped", "columns", "tiled", "direct"
 SPREAD_BLOCK = 256
+TILE = 8  # worlds of a tile: an entry of theirs fills a sector of 32 bytes
 
 
 class Row(NamedTuple):
@@ -41,7 +44,8 @@ class Result(NamedTuple):
         way: IN_PLACE: entry by entry over ``row``, which is read first; STAGED: through shared memory, as it is;
             MAPPED: through shared memory, ``slots`` values that a table ``place`` [entry] spreads, -1 being zero;
             COLUMNS: the same values to memory, [group, slot, world of 32], whence the kernel :func:`spread` takes them;
-            DIRECT: each entry to memory by itself, where shared memory is too small.
+            TILED: as [tile, slot, world of the tile], for kernels that read them so (see .tiles); DIRECT: each entry to
+            memory by itself, where shared memory is too small.
     """
 
     way: str
@@ -70,6 +74,7 @@ class Frame(NamedTuple):
         more: further results, ``name_row[i]``, each entry to memory by itself.
         held: entries of each field, from the first on, that wait for their use in shared memory: a compiler that loads
             them from memory does so long before, and has no registers left.
+        numbers: numbers that all worlds share, ``name_row[0]``.
     """
 
     rows: list[Row]
@@ -82,6 +87,7 @@ class Frame(NamedTuple):
     more: tuple[Row, ...] = ()
     again: bool = False
     held: tuple[int, ...] = ()
+    numbers: tuple[str, ...] = ()
 
     @property
     def groups(self) -> int:
@@ -105,7 +111,8 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     c, result, out = C_TYPE[T], frame.result, frame.result.array
     team, at, offset = WARP * frame.warps, 0, {}
     sync = "__syncwarp();" if frame.warps == 1 else "__syncthreads();"
-    text = [NATIVE[c], "#if defined(__CUDA_ARCH__)"]
+    text = [NATIVE[c], *(f"const {c} {name}_row[1] = {{{name}}};" for name in frame.numbers)]
+    text += ["#if defined(__CUDA_ARCH__)"]
     text += [f"const int lane = threadIdx.x & 31, member = threadIdx.x % {team}, warp = member >> 5;"]
     text += [f"const long long first = (long long)(thread - member) / {frame.warps};"]
     text += ["const int present = worlds - first < 32 ? (int)(worlds - first) : 32;"]
@@ -119,7 +126,7 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
             text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
         else:
             text += [_own_row(row, c)]
-    text += [f"{c}* {row.name}_row = {row.name}.data + world * {row.entries};" for row in frame.more]
+    text += [_own_result(row, c) for row in frame.more]
     if frame.held:
         text += [ON_ITS_WAY, *_held(frame, c), "#undef ON_ITS_WAY"]
         lines = cuda.split("\n")
@@ -136,9 +143,12 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
         start, width = offset[result.row], pitch(next(row.entries for row in frame.rows if row.name == result.row))
     else:
         width = pitch(result.slots | 1 if result.way == MAPPED else out.entries)
-        start, at = at, at + (0 if result.way in (DIRECT, COLUMNS) else WARP * width)
-    if result.way == DIRECT:
-        text += [f"{c}* result_row = out.data + world * {out.entries};"]
+        start, at = at, at + (0 if result.way in (DIRECT, COLUMNS, TILED) else WARP * width)
+    own_row = f"{c}* result_row = out.data + world * {out.entries};"
+    if result.way == TILED:
+        own_row = f"{c}* result_row = out.data + world / {TILE} * {result.slots * TILE} + world % {TILE};"
+    if result.way in (DIRECT, TILED):
+        text += [own_row]
     elif result.way == COLUMNS:
         text += _columns(result, c)
     else:
@@ -155,13 +165,13 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     text += ["#undef FIELD"] if frame.held else []
     text += ["#else", "const long long world = thread;", "const bool mine = true;"]
     text += [_own_row(row, c) for row in frame.rows]
-    text += [f"{c}* {row.name}_row = {row.name}.data + world * {row.entries};" for row in frame.more]
+    text += [_own_result(row, c) for row in frame.more]
     if result.way == MAPPED:
         text += [f"{c} result_row[{result.slots}];"]
     elif result.way == COLUMNS:
         text += _columns(result, c)
     else:
-        text += [f"{c}* result_row = out.data + world * {out.entries};"]
+        text += [own_row]
     if frame.sent:
         text += [f"{c} sent[{frame.sent}];", "#define SENT(i) sent[i]"]
     text += [*_fields(frame.fields, c), cpu]
@@ -187,6 +197,11 @@ def _source(row: Row, c: str) -> tuple[str, str]:
 def _own_row(row: Row, c: str) -> str:
     kind, first = _source(row, c)
     return f"const {kind}* {row.name}_row = {first} + world * {row.entries};"
+
+
+def _own_result(row: Row, c: str) -> str:
+    kind = "int" if row.name in INTEGERS else c
+    return f"{kind}* {row.name}_row = {row.name}.data + world * {row.entries};"
 
 
 def _fields(names: list[str], c: str) -> list[str]:
@@ -324,15 +339,28 @@ def _slot(i: str, entries: int, distance: int) -> str:
     return i if entries == distance else f"({i} / {entries}) * {distance} + {i} % {entries}"
 
 
+def looped(a_pass: str, last: str, names: tuple[str, str, str], entries: int, T) -> str:
+    """``a_pass`` until it leaves the last of the variables ``names`` at zero, then ``last``.
+
+    The variables are arrays of a thread, ``name_row[i]``, zero at first; their indices are constants, so that they
+    live in registers. In a warp, threads wait for the one that needs most passes.
+    """
+    c, missed = C_TYPE[T], names[-1]
+    declared = [f"{c} {name}_row[{entries}] = {{}};" for name in names[:-1]] + [f"{c} {missed}_row[1] = {{}};"]
+    loop = f"for (int pass = 0; pass < {MOST_PASSES}; ++pass) {{\n{a_pass}\nif (!({missed}_row[0] > 0)) break;\n}}"
+    return "\n".join([*declared, loop, last])
+
+
 def kernel(
     name: str, native: str, arrays: list[tuple[str, int]], T, registers: int | None = None, wide: tuple = ()
 ) -> wp.Kernel:
     """A kernel of ``worlds``, then ``arrays`` (name, axes) of scalars ``T``, that runs ``native`` in each thread.
 
-    The arrays ``place`` and ``shifts`` hold integers, those of MASKS booleans, the ``wide`` [entry, world] float64.
+    The arrays of INTEGERS hold integers, those of MASKS booleans, the ``wide`` [entry, world] float64; what has no axes
+    is a number.
     """
     key = f"{name}_{hashlib.sha256(native.encode()).hexdigest()[:16]}"
-    types = {array: "table" if array in ("place", "shifts") else f"array{axes}" for array, axes in arrays}
+    types = {array: "table" if array in INTEGERS else f"array{axes}" for array, axes in arrays}
     types |= {array: "mask" for array in types if array in MASKS} | {array: "wide" for array in wide}
     declared = ", ".join(f"{array}: {kind}" for array, kind in types.items())
     source = f"""def native(thread: int, worlds: int, {declared}): ...
@@ -345,7 +373,7 @@ def {key}(worlds: int, {declared}):
     file = f"<{key}>"
     linecache.cache[file] = len(source), None, source.splitlines(True), file  # where Warp looks for the source
     space = {f"array{axes}": wp.array(dtype=T, ndim=axes) for axes in range(1, 5)} | {
-        "table": wp.array(dtype=int, ndim=1), "mask": wp.array(dtype=wp.bool, ndim=2),
+        "array0": T, "table": wp.array(dtype=int, ndim=1), "mask": wp.array(dtype=wp.bool, ndim=2),
         "wide": wp.array(dtype=wp.float64, ndim=2), "wp": wp, "__name__": key
     }
     exec(compile(source, file, "exec"), space)

@@ -14,20 +14,24 @@ import warp as wp
 
 from . import link_values
 from .kernels import straight
-from .kernels.straight import COLUMNS, DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
+from .kernels.straight import COLUMNS, DIRECT, IN_PLACE, MAPPED, STAGED, TILE, TILED, WARP, Frame, Result, Row
 from .levels import Recursions
+from .parts import DOF_VALUES
 from .plan import MOST_WARPS, TREE_ONLY, Plan
 from .recursions import messages
-from .recursions.applications import Applications
+from .recursions.adjoints import Adjoints
 from .recursions.links import TABLES, Links
 from .recursions.messages import INWARD, OUTWARD, SENDS
 from .recursions.operators import meet, written
 from .recursions.pieces import Pieces
+from .recursions.step import LOOPED
 from .recursions.traced import Trace
 from .teams import Team, Work
 from .trace.emit import Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
+FIELDS = (*TABLES, *DOF_VALUES, "joint_rest_q")
+"""Values of the scene as kernels read them, [entry, world]: what links are made of, and Newton's own."""
 TRACED = (
     *SENDS,
     "log_det_mass_matrix",
@@ -38,6 +42,8 @@ TRACED = (
     "expression",
     *TREE_ONLY,
 )
+TILES = ("tiled_mass_matrix_inverse", "inverse_dynamics_derivatives", "mass_matrix_derivative")
+"""Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
 COLUMN_SLOTS = 256  # different values of a result from which they go through memory, not through shared memory,
 COLUMN_WORLDS = 1 << 20  # of so many worlds at a time
@@ -50,10 +56,12 @@ class Program(NamedTuple):
     """One kernel.
 
     Attributes:
-        rows: names of the callers' arrays that it reads. fields: of the tables of what the links are made of.
+        rows: names of the callers' arrays, and then numbers, that it reads. fields: of FIELDS.
         tables: arrays of its own.
         operations: floating-point operations of one world.
         spread: a second kernel that brings the values of the first, [slot, world], to their ``places``; or None.
+        slots: values of one world in the tiles that it writes; entry: where each entry of the result is among them, -1
+            being zero. Programs whose results are tiles for other kernels, see :mod:`.kernels.tiles`.
     """
 
     kernel: wp.Kernel
@@ -64,6 +72,8 @@ class Program(NamedTuple):
     block: int
     operations: int
     spread: Spread | None = None
+    slots: int = 0
+    entry: Any = None
 
 
 class Spread(NamedTuple):
@@ -128,16 +138,17 @@ class Programs:
             self._programs[key] = self._build(operation, shapes, out, more or {}, options)
         return self._programs[key]
 
-    def launch(self, program: Program, arrays: dict[str, wp.array], out: wp.array, *more: wp.array) -> None:
+    def launch(self, program: Program, arrays: dict[str, Any], out: wp.array, *more: wp.array) -> None:
         rows = [arrays[name] for name in program.rows]
-        fields = [self.table(name) for name in program.fields]
+        fields = [self.field(name) for name in program.fields]
         if program.spread is None:
             self._launch(program, self.run.worlds, [*rows, *fields], [out, *more])
             return
         some = WARP * program.spread.columns.shape[0]
         for first in range(0, self.run.worlds, some):
             part = slice(first, min(first + some, self.run.worlds))
-            inputs = [*(row[part] for row in rows), *(field[:, part] for field in fields)]
+            inputs = [row[part] if isinstance(row, wp.array) else row for row in rows]
+            inputs += [field[:, part] for field in fields]
             self._launch(program, part.stop - first, inputs, [program.spread.columns, *(array[part] for array in more)])
             self._spread(program.spread, part.stop - first, out[part])
 
@@ -154,8 +165,10 @@ class Programs:
         inputs = [worlds, spread.columns, spread.places]
         wp.launch(spread.kernel, threads, inputs, [out], device=device, block_dim=block)
 
-    def table(self, name: str) -> wp.array:
-        """What the links are made of [entry, world]."""
+    def field(self, name: str) -> wp.array:
+        """One of FIELDS."""
+        if name not in TABLES:
+            return self.run.parameters.field(name)
         return link_values.table(self.run.parameters, self.links, name)
 
     @property
@@ -200,20 +213,33 @@ class Programs:
         return self._tree_program(operation, links, {**shapes, **more}, tuple(more), options)
 
     def _tree_program(self, operation: str, links: Links, shapes: dict, more: tuple, options: dict) -> Program:
-        trace = Applications(links, self.run.dtype.__name__, tuple(shapes))
+        trace = Adjoints(links, self.run.dtype.__name__, tuple(shapes))
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         frame = self._frame([item for item in stores if item.array == "out"], shapes, 0, 1, self.block, stores)
-        frame = frame._replace(again=not frame.staged and frame.result.way == DIRECT)
+        alone = not any(item.array in LOOPED for item in stores)
+        if operation in TILES:
+            slots = len({_name(item.value) for item in stores if not _is_zero(item.value)})
+            result = Result(TILED, Row("out", 3, frame.result.array.entries), slots=slots)
+            frame = frame._replace(staged=self.plan.staged, result=result)
+        frame = frame._replace(again=alone and not frame.staged and frame.result.way in (DIRECT, TILED))
         frame = frame._replace(more=tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more))
         placed, table = _placed([item for item in stores if item.array == "out"], frame.result)
         placed += apart
         emitter = self._emitter(shapes, frame)
         listing = emitter.region(placed)
         body = literals(listing, self.run.dtype.__name__)
+        operations, looped = emitter.operations, [item for item in stores if item.array in LOOPED]
+        if looped:
+            emitter = self._emitter(shapes, frame)
+            a_pass = literals(emitter.region(looped), self.run.dtype.__name__)
+            body = straight.looped(a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
+            operations += emitter.operations
         frame = frame._replace(again=frame.again and "farthest" in listing.text)
-        tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
-        return self._finished(operation, frame, body, body, tables, emitter.operations)
+        place: Any = None if table is None else wp.array(table, dtype=int, device=self.run.device)
+        tables = {} if place is None or frame.result.way == TILED else {"place": place}
+        program = self._finished(operation, frame, body, body, tables, operations)
+        return program._replace(slots=frame.result.slots, entry=place) if frame.result.way == TILED else program
 
     def _segment_program(self, operation: str, shapes: dict, pieces: Pieces, options: dict) -> Program | None:
         dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(operation, pieces)
@@ -256,14 +282,15 @@ class Programs:
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
-        if item.array in (INWARD, OUTWARD):
+        if item.array in (INWARD, OUTWARD, *LOOPED):
             return item
         return item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
 
     def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int) -> Program:
         native = straight.assemble(frame, cuda, cpu, self.run.dtype)
-        rows, fields = tuple(row.name for row in frame.rows), tuple(frame.fields)
-        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 2) for name in fields]
+        rows, fields = (*(row.name for row in frame.rows), *frame.numbers), tuple(frame.fields)
+        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 0) for name in frame.numbers]
+        arrays += [(name, 2) for name in fields]
         result, spread = frame.result, None
         if result.way == COLUMNS:
             some = min(self.run.worlds, self.column_worlds)
@@ -278,12 +305,13 @@ class Programs:
     def _emitter(self, shapes: dict, frame: Frame) -> Emitter:
         result = frame.result
         angles = Angles.IN_PLACE if frame.staged else Angles.AGAIN if frame.again else Angles.FIRST
-        guard = "if (mine) " if result.way == DIRECT else ""
+        tile = f" * {TILE}" if result.way == TILED else ""
+        guard = "if (mine) " if result.way in (DIRECT, TILED) else ""
 
         def load(array: str, entry: str) -> str:
             if array in (INWARD, OUTWARD):
                 return f"SENT({entry})"
-            if array in TABLES:
+            if array in FIELDS:
                 return f"FIELD({array}, {entry})"
             return f"{array}_row[{entry}]"
 
@@ -293,26 +321,27 @@ class Programs:
             if array == "out" and result.way == COLUMNS:
                 return f"if (mine) RESULT({entry}) = {value};"
             if array == "out":
-                return f"{guard}result_row[{entry}] = {value};"
+                return f"{guard}result_row[{entry}{tile}] = {value};"
             return f"if (mine) {array}_row[{entry}] = {value};"
 
         def flat(array: str, index: tuple) -> int:
             return index[0] if len(index) == 1 else _flat(index, shapes[array][1:])
 
-        return Emitter(self.run.dtype.__name__, load, store, flat, angles, TABLES)
+        return Emitter(self.run.dtype.__name__, load, store, flat, angles, FIELDS)
 
     def _frame(self, stores: list[Store], shapes: dict, sent: int, warps: int, block: int,
                everything: list[Store] | None = None) -> Frame:
         """How rows come in and the result, of flat ``stores``, goes out: through shared memory where it has room."""
         used = _reads(everything or stores)
-        rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used]
+        rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used and shape]
+        numbers = tuple(name for name, shape in shapes.items() if name in used and not shape)
         out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
         dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
         over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
         over = [name for name in over if _read_before(stores, name)]
         slots = len({_name(item.value) for item in stores})
-        fields = {name: used[name] for name in TABLES if name in used}
-        held = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
+        fields = {name: used[name] for name in FIELDS if name in used}
+        held = ((), tuple(fields.values())) if fields and warps == 1 and set(fields) <= set(TABLES) else ((),)
         staged, ways = self.plan.staged, [(False, Result(DIRECT, out))]
         staged = staged or any(row.name == "x" and row.entries > SHORT_ROW for row in rows)
         if dense and (staged or out.entries > SHORT_ROW):
@@ -325,7 +354,7 @@ class Programs:
             if self.columns and straight.tile(columns, self.run.dtype):
                 ways.insert(0 if slots >= COLUMN_SLOTS else -1, (False, columns))
         frames = [
-            Frame(rows, staged, list(fields), result, sent, warps, block, held=entries)
+            Frame(rows, staged, list(fields), result, sent, warps, block, held=entries, numbers=numbers)
             for staged, result in ways
             for entries in held[::-1]
         ]
@@ -353,19 +382,24 @@ def _called(key: tuple) -> str:
 def _placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int] | None]:
     """Flat stores as the result wants them, and the table of a MAPPED one or of COLUMNS."""
     out = result.array
-    if result.way in (MAPPED, COLUMNS):
+    if result.way in (MAPPED, COLUMNS, TILED):
         slots: dict[Any, int] = {}
         table = [-1] * out.entries
         for item in stores:
-            table[item.index[0]] = slots.setdefault(_name(item.value), len(slots))
+            if result.way != TILED or not _is_zero(item.value):
+                table[item.index[0]] = slots.setdefault(_name(item.value), len(slots))
         return _by_slot(stores, table), table
     done = {item.index for item in stores}
     return stores + [Store("out", (i,), 0.0) for i in range(out.entries) if (i,) not in done], None
 
 
 def _by_slot(stores: list[Store], table: list[int]) -> list[Store]:
-    values = {table[item.index[0]]: item.value for item in stores}
+    values = {table[item.index[0]]: item.value for item in stores if table[item.index[0]] >= 0}
     return [Store("out", (slot,), value) for slot, value in sorted(values.items())]
+
+
+def _is_zero(value: Value) -> bool:
+    return is_constant(value) and value == 0.0
 
 
 def _name(value: Value) -> Any:
