@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from . import link_values
-from .kernels import straight
-from .kernels.straight import COLUMNS, DIRECT, IN_PLACE, MAPPED, STAGED, TILE, TILED, WARP, Frame, Result, Row
+from .kernels import straight, tiles
+from .kernels.straight import DIRECT, IN_PLACE, MAPPED, STAGED, TILE, TILED, WARP, Frame, Result, Row
 from .levels import Recursions
 from .parts import DOF_VALUES
 from .plan import MOST_WARPS, TREE_ONLY, Plan
@@ -45,8 +45,8 @@ TRACED = (
 TILES = ("tiled_mass_matrix_inverse", "inverse_dynamics_derivatives", "mass_matrix_derivative")
 """Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
-COLUMN_SLOTS = 256  # different values of a result from which they go through memory, not through shared memory,
-COLUMN_WORLDS = 1 << 20  # of so many worlds at a time
+TILED_SLOTS = 256  # different values of a result from which they go through memory, not through shared memory,
+TILED_WORLDS = 1 << 20  # of so many worlds at a time
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
@@ -59,9 +59,9 @@ class Program(NamedTuple):
         rows: names of the callers' arrays, and then numbers, that it reads. fields: of FIELDS.
         tables: arrays of its own.
         operations: floating-point operations of one world.
-        spread: a second kernel that brings the values of the first, [slot, world], to their ``places``; or None.
         slots: values of one world in the tiles that it writes; entry: where each entry of the result is among them, -1
-            being zero. Programs whose results are tiles for other kernels, see :mod:`.kernels.tiles`.
+            being zero. See :mod:`.kernels.tiles`.
+        tiles: those of some worlds at a time, if they are to be spread at once.
     """
 
     kernel: wp.Kernel
@@ -71,18 +71,9 @@ class Program(NamedTuple):
     warps: int
     block: int
     operations: int
-    spread: Spread | None = None
     slots: int = 0
     entry: Any = None
-
-
-class Spread(NamedTuple):
-    """The second half of a program with a long result: ``columns`` [group, slot, world of 32] of some worlds."""
-
-    kernel: wp.Kernel
-    columns: wp.array
-    places: wp.array
-    tile: int
+    tiles: Any = None
 
 
 class Programs:
@@ -95,13 +86,13 @@ class Programs:
         registers: a cap on the registers of a thread.
 
     Attributes:
-        columns: a result that is too long for shared memory goes through memory. column_worlds: of so many at a time,
-            a multiple of 32.
+        tiled: a result that is too long for shared memory goes through memory. tiled_worlds: of so many at a time,
+            a multiple of 8.
     """
 
     def __init__(self, run: Recursions, plan: Plan, block: int = WARP, registers: int | None = None):
         self.run, self.plan, self.block, self.registers = run, plan, block, registers
-        self.columns, self.column_worlds = run.device.is_cuda, COLUMN_WORLDS
+        self.tiled, self.tiled_worlds = run.device.is_cuda, TILED_WORLDS
         self._programs: dict[Any, Program | None] = {}
         self._links: Links | None = None
 
@@ -141,16 +132,18 @@ class Programs:
     def launch(self, program: Program, arrays: dict[str, Any], out: wp.array, *more: wp.array) -> None:
         rows = [arrays[name] for name in program.rows]
         fields = [self.field(name) for name in program.fields]
-        if program.spread is None:
+        if program.tiles is None:
             self._launch(program, self.run.worlds, [*rows, *fields], [out, *more])
             return
-        some = WARP * program.spread.columns.shape[0]
+        some, size = program.tiles.shape[0] * TILE, out.size // self.run.worlds
         for first in range(0, self.run.worlds, some):
             part = slice(first, min(first + some, self.run.worlds))
             inputs = [row[part] if isinstance(row, wp.array) else row for row in rows]
             inputs += [field[:, part] for field in fields]
-            self._launch(program, part.stop - first, inputs, [program.spread.columns, *(array[part] for array in more)])
-            self._spread(program.spread, part.stop - first, out[part])
+            worlds = part.stop - first
+            self._launch(program, worlds, inputs, [program.tiles, *(array[part] for array in more)])
+            dim, result = (-(-worlds // TILE), size), out[part].reshape((worlds, size))
+            self.run.launch(tiles.spread, dim, [program.tiles, program.entry, 0], [result])
 
     def _launch(self, program: Program, worlds: int, inputs: list, outputs: list) -> None:
         device, block = self.run.device, program.block
@@ -158,12 +151,6 @@ class Programs:
         threads = -(-worlds // of_block) * block if device.is_cuda else worlds
         inputs = [worlds, *inputs, *program.tables]
         wp.launch(program.kernel, threads, inputs, outputs, device=device, block_dim=block)
-
-    def _spread(self, spread: Spread, worlds: int, out: wp.array) -> None:
-        device, block = self.run.device, straight.SPREAD_BLOCK
-        threads = -(-worlds // spread.tile) * block if device.is_cuda else worlds
-        inputs = [worlds, spread.columns, spread.places]
-        wp.launch(spread.kernel, threads, inputs, [out], device=device, block_dim=block)
 
     def field(self, name: str) -> wp.array:
         """One of FIELDS."""
@@ -219,8 +206,7 @@ class Programs:
         frame = self._frame([item for item in stores if item.array == "out"], shapes, 0, 1, self.block, stores)
         alone = not any(item.array in LOOPED for item in stores)
         if operation in TILES:
-            slots = len({_name(item.value) for item in stores if not _is_zero(item.value)})
-            result = Result(TILED, Row("out", 3, frame.result.array.entries), slots=slots)
+            result = Result(TILED, frame.result.array, slots=_solid(stores))
             frame = frame._replace(staged=self.plan.staged, result=result)
         frame = frame._replace(again=alone and not frame.staged and frame.result.way in (DIRECT, TILED))
         frame = frame._replace(more=tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more))
@@ -236,10 +222,8 @@ class Programs:
             body = straight.looped(a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
             operations += emitter.operations
         frame = frame._replace(again=frame.again and "farthest" in listing.text)
-        place: Any = None if table is None else wp.array(table, dtype=int, device=self.run.device)
-        tables = {} if place is None or frame.result.way == TILED else {"place": place}
-        program = self._finished(operation, frame, body, body, tables, operations)
-        return program._replace(slots=frame.result.slots, entry=place) if frame.result.way == TILED else program
+        tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
+        return self._finished(operation, frame, body, body, tables, operations)
 
     def _segment_program(self, operation: str, shapes: dict, pieces: Pieces, options: dict) -> Program | None:
         dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(operation, pieces)
@@ -291,22 +275,22 @@ class Programs:
         rows, fields = (*(row.name for row in frame.rows), *frame.numbers), tuple(frame.fields)
         arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 0) for name in frame.numbers]
         arrays += [(name, 2) for name in fields]
-        result, spread = frame.result, None
-        if result.way == COLUMNS:
-            some = min(self.run.worlds, self.column_worlds)
-            columns = wp.empty((-(-some // WARP), result.slots, WARP), dtype=self.run.dtype, device=self.run.device)
-            tile = straight.tile(result, self.run.dtype)
-            spread = Spread(straight.spread(result, self.run.dtype), columns, tables.pop("place"), tile)
-        arrays += [(name, 1) for name in tables] + [("out", 3 if spread else result.array.ndim)]
+        result, entry, tiles = frame.result, None, None
+        if result.way == TILED:
+            entry = tables.pop("place")
+            if operation not in TILES:
+                shape = -(-min(self.run.worlds, self.tiled_worlds) // TILE), max(result.slots, 1), TILE
+                tiles = wp.empty(shape, dtype=self.run.dtype, device=self.run.device)
+        arrays += [(name, 1) for name in tables] + [("out", result.array.ndim if entry is None else 3)]
         arrays += [(row.name, row.ndim) for row in frame.more]
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers)
-        return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations, spread)
+        return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations, result.slots,
+                       entry, tiles)
 
     def _emitter(self, shapes: dict, frame: Frame) -> Emitter:
         result = frame.result
         angles = Angles.IN_PLACE if frame.staged else Angles.AGAIN if frame.again else Angles.FIRST
-        tile = f" * {TILE}" if result.way == TILED else ""
-        guard = "if (mine) " if result.way in (DIRECT, TILED) else ""
+        guard = "if (mine) " if result.way == DIRECT else ""
 
         def load(array: str, entry: str) -> str:
             if array in (INWARD, OUTWARD):
@@ -318,10 +302,10 @@ class Programs:
         def store(array: str, entry: str, value: str) -> str:
             if array in (INWARD, OUTWARD):
                 return f"SENT({entry}) = {value};"
-            if array == "out" and result.way == COLUMNS:
-                return f"if (mine) RESULT({entry}) = {value};"
+            if array == "out" and result.way == TILED:
+                return f"if (mine) result_row[({entry}) * {TILE}] = {value};"
             if array == "out":
-                return f"{guard}result_row[{entry}{tile}] = {value};"
+                return f"{guard}result_row[{entry}] = {value};"
             return f"if (mine) {array}_row[{entry}] = {value};"
 
         def flat(array: str, index: tuple) -> int:
@@ -349,10 +333,10 @@ class Programs:
         if dense and staged:
             ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), *ways]
         if out.entries > LONG_ROW and not (dense and staged and over == ["x"]):
-            mapped, columns = Result(MAPPED, out, slots=slots), Result(COLUMNS, out, slots=slots)
+            mapped = Result(MAPPED, out, slots=slots)
             ways = [(staged, mapped), (False, mapped), *ways]
-            if self.columns and straight.tile(columns, self.run.dtype):
-                ways.insert(0 if slots >= COLUMN_SLOTS else -1, (False, columns))
+            if self.tiled:
+                ways.insert(0 if slots >= TILED_SLOTS else -1, (False, Result(TILED, out, slots=_solid(stores))))
         frames = [
             Frame(rows, staged, list(fields), result, sent, warps, block, held=entries, numbers=numbers)
             for staged, result in ways
@@ -380,9 +364,9 @@ def _called(key: tuple) -> str:
 
 
 def _placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int] | None]:
-    """Flat stores as the result wants them, and the table of a MAPPED one or of COLUMNS."""
+    """Flat stores as the result wants them, and the table of a MAPPED or TILED one."""
     out = result.array
-    if result.way in (MAPPED, COLUMNS, TILED):
+    if result.way in (MAPPED, TILED):
         slots: dict[Any, int] = {}
         table = [-1] * out.entries
         for item in stores:
@@ -396,6 +380,11 @@ def _placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int]
 def _by_slot(stores: list[Store], table: list[int]) -> list[Store]:
     values = {table[item.index[0]]: item.value for item in stores if table[item.index[0]] >= 0}
     return [Store("out", (slot,), value) for slot, value in sorted(values.items())]
+
+
+def _solid(stores: list[Store]) -> int:
+    """Different values that are not the constant zero."""
+    return len({_name(item.value) for item in stores if not _is_zero(item.value)})
 
 
 def _is_zero(value: Value) -> bool:
