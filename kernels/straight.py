@@ -40,8 +40,8 @@ class Result(NamedTuple):
     Attributes:
         way: IN_PLACE: entry by entry over ``row``, which is read first; STAGED: through shared memory, as it is;
             MAPPED: through shared memory, ``slots`` values that a table ``place`` [entry] spreads, -1 being zero;
-            COLUMNS: the same values as [slot, world] to memory, whence the kernel :func:`spread` takes them; DIRECT:
-            each entry to memory by itself, where shared memory is too small.
+            COLUMNS: the same values to memory, [group, slot, world of 32], whence the kernel :func:`spread` takes them;
+            DIRECT: each entry to memory by itself, where shared memory is too small.
     """
 
     way: str
@@ -140,7 +140,7 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     if result.way == DIRECT:
         text += [f"{c}* result_row = out.data + world * {out.entries};"]
     elif result.way == COLUMNS:
-        text += _columns(c)
+        text += _columns(result, c)
     else:
         text += [f"{c}* result_row = stage + {start} + lane * {width};"]
     if frame.sent:
@@ -159,7 +159,7 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     if result.way == MAPPED:
         text += [f"{c} result_row[{result.slots}];"]
     elif result.way == COLUMNS:
-        text += _columns(c)
+        text += _columns(result, c)
     else:
         text += [f"{c}* result_row = out.data + world * {out.entries};"]
     if frame.sent:
@@ -222,11 +222,10 @@ def _held(frame: Frame, c: str) -> list[str]:
     return text
 
 
-def _columns(c: str) -> list[str]:
+def _columns(result: Result, c: str) -> list[str]:
     return [
-        f"{c}* result_row = out.data + world;",
-        f"const long long result_part = out.strides[0] / (long long)sizeof({c});",
-        "#define RESULT(i) result_row[(i) * result_part]",
+        f"{c}* result_row = out.data + (world / {WARP} * {result.slots}) * {WARP} + world % {WARP};",
+        f"#define RESULT(i) result_row[(i) * {WARP}]",
     ]
 
 
@@ -278,7 +277,7 @@ def _spread_out(result: Result, offset: int, c: str, team: int) -> str:
 
 
 def spread(result: Result, T) -> wp.Kernel:
-    """A kernel (worlds, columns [slot, world], place [entry]) -> out, all worlds of a tile side by side.
+    """A kernel (worlds, columns [group, slot, world of 32], place [entry]) -> out, the worlds of a tile side by side.
 
     On CUDA it takes SPREAD_BLOCK threads for each :func:`tile` worlds, on the CPU a thread a world.
     """
@@ -288,11 +287,14 @@ __shared__ {c} shared[{worlds * width}];
 const int member = threadIdx.x;
 const long long first = (long long)(thread / {SPREAD_BLOCK}) * {worlds};
 const int present = worlds - first < {worlds} ? (int)(worlds - first) : {worlds};
-const long long part = columns.strides[0] / (long long)sizeof({c});
-#pragma unroll 4
-for (int k = member; k < {result.slots * worlds}; k += {SPREAD_BLOCK}) {{
-    const int slot = k / {worlds}, world = k % {worlds};
-    if (world < present) shared[world * {width} + slot] = __ldg(columns.data + slot * part + first + world);
+const {c}* from = columns.data + (first / {WARP} * {result.slots}) * {WARP} + first % {WARP};
+if (present == {worlds}) {{
+    #pragma unroll 8
+    for (int k = member; k < {result.slots * worlds}; k += {SPREAD_BLOCK})
+        shared[(k % {worlds}) * {width} + k / {worlds}] = __ldg(from + k / {worlds} * {WARP} + k % {worlds});
+}} else {{
+    for (int k = member; k < {result.slots} * present; k += {SPREAD_BLOCK})
+        shared[(k % present) * {width} + k / present] = __ldg(from + k / present * {WARP} + k % present);
 }}
 __syncthreads();
 {c}* to = out.data + first * {n};
@@ -302,14 +304,14 @@ for (int i = member; i < present * {n}; i += {SPREAD_BLOCK}) {{
     to[i] = slot < 0 ? ({c})0 : shared[(i / {n}) * {width} + slot];
 }}
 #else
-const long long part = columns.strides[0] / (long long)sizeof({c});
+const {c}* from = columns.data + ((long long)thread / {WARP} * {result.slots}) * {WARP} + thread % {WARP};
 for (int i = 0; i < {n}; ++i) {{
     const int slot = place.data[i];
-    out.data[(long long)thread * {n} + i] = slot < 0 ? 0 : columns.data[slot * part + thread];
+    out.data[(long long)thread * {n} + i] = slot < 0 ? 0 : from[slot * {WARP}];
 }}
 #endif
 """
-    return kernel("spread", native, [("columns", 2), ("place", 1), ("out", result.array.ndim)], T)
+    return kernel("spread", native, [("columns", 3), ("place", 1), ("out", result.array.ndim)], T)
 
 
 def tile(result: Result, T) -> int:

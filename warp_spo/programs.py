@@ -17,20 +17,19 @@ from .kernels import straight
 from .kernels.straight import COLUMNS, DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
 from .levels import Recursions
 from .plan import MOST_WARPS, TREE_ONLY, Plan
+from .recursions import messages
 from .recursions.applications import Applications
 from .recursions.links import TABLES, Links
+from .recursions.messages import INWARD, OUTWARD, SENDS
 from .recursions.operators import meet, written
-from .recursions.pieces import Piece, Pieces
-from .recursions.traced import INWARD, OUTWARD, SENT, Trace
-from .teams import Team
+from .recursions.pieces import Pieces
+from .recursions.traced import Trace
+from .teams import Team, Work
 from .trace.emit import Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
-SENDS = {"forward_dynamics": "Pza", "solve_mass_matrix": "Pza", "inverse_dynamics": "z", "mass_matrix": "R"}
-"""What the pieces of a robot send each other, by operation."""
 TRACED = (
     *SENDS,
-    "mass_matrix_inverse",
     "log_det_mass_matrix",
     "body_poses",
     "body_velocities",
@@ -40,9 +39,8 @@ TRACED = (
     *TREE_ONLY,
 )
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
-COLUMN_SLOTS = 256  # values of a result that shared memory has no good place for; they go through memory,
-COLUMN_WORLDS = 1 << 16  # of so many worlds at a time
-NEVER = 1 << 30
+COLUMN_SLOTS = 256  # different values of a result from which they go through memory, not through shared memory,
+COLUMN_WORLDS = 1 << 20  # of so many worlds at a time
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
@@ -69,7 +67,7 @@ class Program(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """The second half of a program with a long result: ``columns`` [slot, world] of some worlds at a time."""
+    """The second half of a program with a long result: ``columns`` [group, slot, world of 32] of some worlds."""
 
     kernel: wp.Kernel
     columns: wp.array
@@ -87,13 +85,13 @@ class Programs:
         registers: a cap on the registers of a thread.
 
     Attributes:
-        column_slots: values of a result from which they go through memory, [slot, world]. column_worlds: at a time.
+        columns: a result that is too long for shared memory goes through memory. column_worlds: of so many at a time,
+            a multiple of 32.
     """
 
     def __init__(self, run: Recursions, plan: Plan, block: int = WARP, registers: int | None = None):
         self.run, self.plan, self.block, self.registers = run, plan, block, registers
-        self.column_slots = COLUMN_SLOTS if run.device.is_cuda else NEVER
-        self.column_worlds = COLUMN_WORLDS
+        self.columns, self.column_worlds = run.device.is_cuda, COLUMN_WORLDS
         self._programs: dict[Any, Program | None] = {}
         self._links: Links | None = None
 
@@ -136,7 +134,7 @@ class Programs:
         if program.spread is None:
             self._launch(program, self.run.worlds, [*rows, *fields], [out, *more])
             return
-        some = program.spread.columns.shape[1]
+        some = WARP * program.spread.columns.shape[0]
         for first in range(0, self.run.worlds, some):
             part = slice(first, min(first + some, self.run.worlds))
             inputs = [*(row[part] for row in rows), *(field[:, part] for field in fields)]
@@ -153,7 +151,8 @@ class Programs:
     def _spread(self, spread: Spread, worlds: int, out: wp.array) -> None:
         device, block = self.run.device, straight.SPREAD_BLOCK
         threads = -(-worlds // spread.tile) * block if device.is_cuda else worlds
-        wp.launch(spread.kernel, threads, [worlds, spread.columns, spread.places], [out], device=device, block_dim=block)
+        inputs = [worlds, spread.columns, spread.places]
+        wp.launch(spread.kernel, threads, inputs, [out], device=device, block_dim=block)
 
     def table(self, name: str) -> wp.array:
         """What the links are made of [entry, world]."""
@@ -217,30 +216,37 @@ class Programs:
         return self._finished(operation, frame, body, body, tables, emitter.operations)
 
     def _segment_program(self, operation: str, shapes: dict, pieces: Pieces, options: dict) -> Program | None:
-        dtype, slots = self.run.dtype.__name__, _slots(pieces, SENDS[operation])
+        dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(operation, pieces)
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
-        sent = sum(SENT[letter] for letter, _ in slots)
         everything: list[Store] = []
         traced: list[list[Store]] = []
+        apart: list[tuple[list[Store], dict[int, list[Store]]]] = []
         for index in range(len(pieces.pieces)):
             links = self.links.opened()  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)(**options)])
-            everything += traced[-1]
+            flat = {at: [self._flattened(item, shapes) for item in items] for at, items in trace.across.items()}
+            apart.append((trace.news, flat))
+            everything += traced[-1] + trace.news + [item for items in flat.values() for item in items]
         frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
                             WARP * pieces.warps, everything)
         if frame.result.way == DIRECT and frame.result.array.entries > LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
         team = Team(pieces, dtype)
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
-        everything, table = _placed([item for items in outs for item in items], frame.result)
-        outs[0] += everything[sum(map(len, outs)) :] if table is None else []  # zeros
-        for piece, stores, items in zip(pieces.pieces, traced, outs, strict=True):
+        whole = [item for item in everything if item.array == "out"]
+        placed, table = _placed(whole, frame.result)
+        outs[0] += placed[len(whole) :] if table is None else []  # zeros
+        for piece, stores, items, (news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
             emitter = self._emitter(shapes, frame)
             inward = [item for item in stores if item.array == INWARD]
             outward = [item for item in stores if item.array == OUTWARD]
-            (outward if "a" in SENDS[operation] else inward).extend(items if table is None else _by_slot(items, table))
-            team.add(piece, emitter, emitter.region(inward), emitter.region(outward))
+            last = outward if set(SENDS[operation]) & set(messages.OUTWARD_LETTERS) else inward
+            last += items if table is None else _by_slot(items, table)
+            meetings = {at: found if table is None else _by_slot(found, table) for at, found in others.items()}
+            regions = emitter.region(inward), emitter.region(outward)
+            branches = emitter.branch(news), {at: emitter.branch(found) for at, found in meetings.items()}
+            team.add(Work(piece, *regions, *branches), emitter.operations)
         cuda = team.cuda()  # fills the tables
         lists = ("place", table, int), ("table", team.table, self.run.dtype), ("shifts", team.shifts, int)
         tables: dict[str, Any] = {
@@ -250,7 +256,9 @@ class Programs:
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
-        return item if item.array in (INWARD, OUTWARD) else item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
+        if item.array in (INWARD, OUTWARD):
+            return item
+        return item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
 
     def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int) -> Program:
         native = straight.assemble(frame, cuda, cpu, self.run.dtype)
@@ -259,10 +267,10 @@ class Programs:
         result, spread = frame.result, None
         if result.way == COLUMNS:
             some = min(self.run.worlds, self.column_worlds)
-            columns = wp.empty((result.slots, some), dtype=self.run.dtype, device=self.run.device)
+            columns = wp.empty((-(-some // WARP), result.slots, WARP), dtype=self.run.dtype, device=self.run.device)
             tile = straight.tile(result, self.run.dtype)
             spread = Spread(straight.spread(result, self.run.dtype), columns, tables.pop("place"), tile)
-        arrays += [(name, 1) for name in tables] + [("out", 2 if spread else result.array.ndim)]
+        arrays += [(name, 1) for name in tables] + [("out", 3 if spread else result.array.ndim)]
         arrays += [(row.name, row.ndim) for row in frame.more]
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers)
         return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations, spread)
@@ -312,9 +320,10 @@ class Programs:
         if dense and staged:
             ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), *ways]
         if out.entries > LONG_ROW and not (dense and staged and over == ["x"]):
-            ways = [(staged, Result(MAPPED, out, slots=slots)), (False, Result(MAPPED, out, slots=slots)), *ways]
-        if slots >= self.column_slots and straight.tile(Result(COLUMNS, out, slots=slots), self.run.dtype):
-            ways = [(False, Result(COLUMNS, out, slots=slots))]
+            mapped, columns = Result(MAPPED, out, slots=slots), Result(COLUMNS, out, slots=slots)
+            ways = [(staged, mapped), (False, mapped), *ways]
+            if self.columns and straight.tile(columns, self.run.dtype):
+                ways.insert(0 if slots >= COLUMN_SLOTS else -1, (False, columns))
         frames = [
             Frame(rows, staged, list(fields), result, sent, warps, block, held=entries)
             for staged, result in ways
@@ -339,17 +348,6 @@ def _called(key: tuple) -> str:
         return written(key[-1])
     without_qdd = {("q",): "gravity_force", ("q", "qd"): "bias_force", ("q", "qd", "body_f"): "bias_force"}
     return without_qdd.get(key[1], key[0]) if key[0] == "inverse_dynamics" else key[0]
-
-
-def _slots(pieces: Pieces, letters: str) -> dict[tuple[str, int], int]:
-    """Where what each piece sends begins."""
-    slots, at = {}, 0
-    for piece in pieces.pieces:
-        for letter in letters:
-            if piece.children if letter == "a" else piece.parent is not None:
-                slots[letter, piece.index] = at
-                at += SENT[letter]
-    return slots
 
 
 def _placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int] | None]:
