@@ -242,8 +242,8 @@ class Trace:
                 continue
             self.at(link, "f")
             f = -self.external(link)
-            if link.inertia is not None:
-                f = f + newton_euler.body_force(link.inertia, self.motions[key], *alpha[key])
+            if link.grouped is not None:
+                f = f + newton_euler.body_force(link.grouped, self.motions[key], *alpha[key])
             for other in self.carried_on(link, "z", forces, Vector):
                 f = f + other
             n, f = Vector(f[:3]), Vector(f[3:])
@@ -266,7 +266,7 @@ class Trace:
                 continue
             key = id(link)
             self.at(link, "R")
-            body = link.inertia or composite.NOTHING
+            body = link.grouped or composite.NOTHING
             for other in self.carried_on(link, "R", carried, Rigid.unpacked):
                 body = body + other
             if link.parent is not None:
