@@ -13,7 +13,7 @@ from warp_spo.kernels import status as status_kernels
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
 from granularities import GRANULARITIES, SLOW, skip_unless_served
 
-from benchmarks import stress, stress_checks, stress_measure, stress_steps
+from benchmarks import stress, stress_checks, stress_measure
 from benchmarks.exact import Sweep
 from benchmarks.stress_cases import ALLOWED, CASES, choose
 from benchmarks.stress_scenes import Setting
@@ -66,17 +66,11 @@ def test_check(name, dtype, granularity, device):
 @pytest.mark.slow
 @pytest.mark.parametrize("granularity", GRANULARITIES)
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-class TestLong:
-    def test_bits_do_not_depend_on_the_number_of_worlds(self, dtype, granularity, device):
-        stress_checks.same_bits(Setting(device, dtype, granularity), worlds=4096)
-
-    def test_a_million_worlds(self, dtype, granularity, device):
-        stress_checks.worlds_against_closed_form(Setting(device, dtype, granularity), worlds=2**20)
-
-    def test_a_million_steps(self, dtype, granularity, device):
-        if not device.is_cuda:
-            pytest.skip("a million steps need a graph: run with --device cuda:0; the check stiff_arm does 10 000")
-        stress_steps.stiff_arm(Setting(device, dtype, granularity), steps=1_000_000)
+@pytest.mark.parametrize("name", stress_checks.LONG)
+def test_long_check(name, dtype, granularity, device):
+    if name == "stiff_arm_million_steps" and not device.is_cuda:
+        pytest.skip("a million steps need a graph: run with --device cuda:0; the check stiff_arm does 10 000")
+    stress_checks.LONG[name][0](Setting(device, dtype, granularity))
 
 
 # -- words -------------------------------------------------------------------------------------------------------------
