@@ -5,7 +5,6 @@
 """
 
 import argparse
-import itertools
 import sys
 from pathlib import Path
 from typing import Any
@@ -39,9 +38,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--dtype", nargs="+", choices=PRECISIONS, metavar="P", help=f"precisions: {', '.join(PRECISIONS)}")
     names = [name or PLAN for name in data.GRANULARITIES]
     p.add_argument("--granularity", nargs="+", choices=names, metavar="G", help=f"{', '.join(names)}; default: {PLAN}")
-    p.add_argument(
-        "--all", action="store_true", help="every precision and granularity, growing sizes, and the stress suite"
-    )
+    p.add_argument("--sweeps", action="store_true", help="growing world counts, chains and trees instead of robots")
     p.add_argument(
         "--everything", action="store_true", help="ours, the peers that are there, and the stress suite, part by part; "
         "FILTER is of parts' names; goes on where an earlier run of this commit stopped"
@@ -113,10 +110,8 @@ def choose(options: Any, cuda: bool) -> list[dict]:
         ValueError: there are none.
     """
     worlds = options.worlds or (data.WORLDS if cuda else data.CPU_WORLDS)
-    dtypes = options.dtype or (tuple(PRECISIONS) if options.all else data.DTYPES)
-    asked = options.granularity and [None if name == PLAN else name for name in options.granularity]
-    granularities = asked or (data.GRANULARITIES if options.all else (None,))
-    return data.cases(options.filter, worlds, dtypes, granularities, options.all, cuda)
+    granularities = [None if name == PLAN else name for name in options.granularity or [PLAN]]
+    return data.cases(options.filter, worlds, options.dtype or data.DTYPES, granularities, options.sweeps, cuda)
 
 
 def measure(chosen: list[dict], options: Any, device: wp.Device, pyplot: Any) -> int:
@@ -132,10 +127,6 @@ def measure(chosen: list[dict], options: Any, device: wp.Device, pyplot: Any) ->
         print("\n".join(runner.lines(row)), flush=True)
         if options.json:  # after each row: what was measured before an interrupt is kept
             file = runner.save(whole, options.json)
-    if options.all:
-        whole = runner.record(rows, device, roof) | dict(stress=stress_rows(options.filter, device, not options.check))
-        if options.json:
-            file = runner.save(whole, file or options.json)
     if file:
         print(f"wrote {file}", file=sys.stderr)
     if options.report:
@@ -144,18 +135,6 @@ def measure(chosen: list[dict], options: Any, device: wp.Device, pyplot: Any) ->
     if failed:
         print(f"benchmarks: the error is NaN or beyond its tolerance in {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0
-
-
-def stress_rows(pattern: str, device: wp.Device, timed: bool) -> list[dict]:
-    """Rows of the stress suite; its verdicts are shown, ``python -m benchmarks.stress`` is who fails for them."""
-    try:
-        from . import stress
-        from .stress_cases import choose
-    except ImportError as error:
-        print(f"skipped the stress suite: {error}; pip install warp_spo[test]", file=sys.stderr)
-        return []
-    found = itertools.chain(stress.rows(choose(pattern, slow=False), device, timed), stress.check_rows(pattern, device))
-    return list(found)
 
 
 def write_readme(pyplot: Any, source: Path) -> None:

@@ -164,7 +164,8 @@ def run(parts: Sequence[Part], device: Any, budget: float, jobs: int | None, out
     os.environ.setdefault(PEERS_FOLDER, str(FOLDER / "peers"))
     Path(os.environ[PEERS_FOLDER]).mkdir(parents=True, exist_ok=True)
     lanes = Lanes(folder, budget, jobs or os.cpu_count() or 1, alone=not cuda)
-    lanes.say(f"{found['device']}: {len(parts)} parts, at most {sum(part.seconds for part in parts):.0f} s of measuring")
+    most = sum(part.seconds for part in parts)
+    lanes.say(f"{found['device']}: {len(parts)} parts, at most {most:.0f} s of measuring")
     left_out = lanes.run(parts)
     files = [folder / f"{part.name}.json" for part in parts if (folder / f"{part.name}.json").exists()]
     if not files:

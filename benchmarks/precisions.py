@@ -29,14 +29,28 @@ class Precision:
     scalar: str | None
 
 
-def plain(dtype: str, scene: spo.Scene, worlds: int, device: Any, granularity: str | None, inputs: list[Inputs]):
+RANDOMISED = ("body_mass", "body_com", "body_inertia")
+HEADLINE = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "solve_mass_matrix")
+
+
+def plain(
+    dtype: str, scene: spo.Scene, worlds: int, device: Any, granularity: str | None, inputs: list[Inputs],
+    variable: tuple[str, ...] = (),
+) -> Subject:  # fmt: skip
     """A subject in one scalar type throughout."""
-    return Subject(spo.Dynamics(scene, worlds, device, dtype, granularity=granularity), inputs)
+    return Subject(spo.Dynamics(scene, worlds, device, dtype, granularity=granularity, variable=variable), inputs)
 
 
 PRECISIONS = {
     "float32": Precision(functools.partial(plain, "float32"), OPERATIONS, TOLERANCE["float32"], "float32"),
     # a step takes the error of float32 once more; without it nothing is under 1e-8
     "refined": Precision(Refined, REFINED, 1e-8, None),
+    # inertias are inputs, as domain randomisation has them, each world's its own
+    "randomised": Precision(
+        functools.partial(plain, "float32", variable=RANDOMISED),
+        {name: OPERATIONS[name] for name in HEADLINE},
+        TOLERANCE["float32"],
+        "float32",
+    ),
     "float64": Precision(functools.partial(plain, "float64"), OPERATIONS, TOLERANCE["float64"], "float64"),
 }

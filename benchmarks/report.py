@@ -24,8 +24,9 @@ COLUMNS = {
     "registers": ("registers", ""), "local B": ("local_bytes", ""),
 }  # fmt: skip
 STRESS = {
-    "case": ("case", ""), "precision": ("precision", ""), "largest error": ("max_error", ".1e"),
-    "median": ("median_error", ".1e"), "law": ("law", ".1e"), "error / law": ("ratio", ".2g"),
+    "case": ("case", ""), "precision": ("precision", ""), "by": ("granularity", ""),
+    "largest error": ("max_error", ".1e"), "median": ("median_error", ".1e"), "law": ("law", ".1e"),
+    "error / law": ("ratio", ".2g"),
     "backward": ("backward_error", ".1e"), "µs a world": ("us", ".3g"), "verdict": ("verdict", ""),
     "law is": ("formula", ""), "from": ("source", ""), "against": ("reference", ""),
 }  # fmt: skip

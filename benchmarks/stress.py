@@ -59,7 +59,9 @@ def check_rows(
                        verdict=verdict, why=why)
 
 
-def side_by_side(cases: list[Case], checks: list[str], jobs: int, device: str, granularity: str | None) -> Iterator[dict]:
+def side_by_side(
+    cases: list[Case], checks: list[str], jobs: int, device: str, granularity: str | None
+) -> Iterator[dict]:
     """The rows of cases and checks, untimed, from processes that compile at the same time; in order."""
     work = [("case", case.id) for case in cases] + [("check", name) for name in checks]
     context = multiprocessing.get_context("spawn")  # a device does not survive a fork

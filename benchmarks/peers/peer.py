@@ -24,7 +24,7 @@ GRAPH_SECONDS = 0.02  # a graph goes through all sets of inputs up to ROUNDS tim
 ROUNDS = 8
 REPEATS = 20
 BUDGET = 0.4  # [s]: fewer repeats, 3 at least, where they would take longer
-SLOW = 0.2  # [s]: an operation that takes longer is not measured at more worlds
+SLOW = 0.5  # [s]: an operation that takes longer is not measured at more worlds
 
 
 class Absent(Exception):
@@ -83,6 +83,10 @@ class Peer(abc.ABC):
 class Stepped(Peer):
     """A peer that launches evaluations one by one, which are timed here."""
 
+    def states(self, inputs: list[Inputs]) -> Any:
+        """Sets of states as ``prepare`` gets them, with ``error`` of results."""
+        return States(self.coordinates, inputs, self.dtype)
+
     @abc.abstractmethod
     def prepare(self, op: str, variant: str, states: States, worlds: int) -> None:
         """Take the first ``worlds`` of all sets of states to the device, and compile."""
@@ -118,7 +122,7 @@ class Stepped(Peer):
         return seconds
 
     def rows(self, inputs: list[Inputs], worlds: list[int], wanted: Callable[[str, str], bool]) -> Iterator[dict]:
-        states = States(self.coordinates, inputs, self.dtype)
+        states = self.states(inputs)
         works = [work for work in self.works if wanted(*work)]
         for count in worlds:
             for op, variant in list(works):
