@@ -13,7 +13,7 @@ from warp_spo.kernels import status as status_kernels
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
 from granularities import GRANULARITIES, SLOW, skip_unless_served
 
-from benchmarks import stress, stress_checks, stress_measure
+from benchmarks import stress, stress_checks, stress_measure, stress_scenes
 from benchmarks.exact import Sweep
 from benchmarks.stress_cases import ALLOWED, CASES, choose
 from benchmarks.stress_scenes import Setting
@@ -71,6 +71,17 @@ def test_long_check(name, dtype, granularity, device):
     if name == "stiff_arm_million_steps" and not device.is_cuda:
         pytest.skip("a million steps need a graph: run with --device cuda:0; the check stiff_arm does 10 000")
     stress_checks.LONG[name][0](Setting(device, dtype, granularity))
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("bodies, fits", [(7, True), (31, False)])
+def test_limbs_that_tell_each_other_more_than_shared_memory_holds_run_as_a_tree(bodies, fits, dtype, device):
+    p = stress_scenes.binary_tree(bodies)
+    dyn = spo.Dynamics(p.scene, p.worlds, device, dtype, granularity="segment")
+    qdd = dyn.forward_dynamics(p.q, p.qd, p.tau)
+    wanted = spo.Dynamics(p.scene, p.worlds, "cpu", "float64", granularity="node").forward_dynamics(p.q, p.qd, p.tau)
+    np.testing.assert_allclose(qdd, wanted, rtol=1e-3, atol=1e-5)
+    assert (next(iter(dyn.programs._programs.values())).warps > 1) == fits
 
 
 # -- words -------------------------------------------------------------------------------------------------------------
