@@ -163,7 +163,8 @@ def run(parts: Sequence[Part], device: Any, budget: float, jobs: int | None, out
     folder = FOLDER / f"{short(found)}-{runner.commit()[:12]}"
     os.environ.setdefault(PEERS_FOLDER, str(FOLDER / "peers"))
     Path(os.environ[PEERS_FOLDER]).mkdir(parents=True, exist_ok=True)
-    lanes = Lanes(folder, budget, jobs or os.cpu_count() or 1, alone=not cuda)
+    cores = os.cpu_count() or 1
+    lanes = Lanes(folder, budget, jobs or (max(1, cores - 2) if cuda else cores), alone=not cuda)
     most = sum(part.seconds for part in parts)
     lanes.say(f"{found['device']}: {len(parts)} parts, at most {most:.0f} s of measuring")
     left_out = lanes.run(parts)

@@ -38,7 +38,7 @@ def newton(robot: str) -> list[Part]:
     """Newton's are cut by what they compile, which takes minutes."""
     few = WORLDS[:-1] if robot == "g1" else WORLDS  # 2.5 s a step at 65536 worlds
     return [
-        peer("newton", [robot], 40.0, WORLDS, "eval_mass_matrix", "mass"),
+        peer("newton", [robot], 30.0, WORLDS, "eval_mass_matrix", "mass"),
         peer("newton", [robot], 90.0, WORLDS, "SolverSteel", "steel"),
         peer("newton", [robot], 60.0, few, r"SolverFeatherstone\.", "featherstone"),
         peer("newton", [robot], 60.0, WORLDS, "tiles", "tiles"),
@@ -46,33 +46,34 @@ def newton(robot: str) -> list[Part]:
 
 
 def on_gpu() -> list[Part]:
-    """The headline; peers that take longest to compile; the others; then what the report shows beside."""
+    """What the README shows; the other rows of ours; peers; the stress suite."""
     both, jobs = ("--dtype", "float32", "float64"), str(max(1, (os.cpu_count() or 2) - 2))
     parts = [
         ours(f"headline.{robot}", rf"^{robot}\.{BASIC}\.", 90.0, *both, worlds=("1", "4096", "65536", "1048576"))
         for robot in ROBOTS
     ]
-    parts += [part for robot in ROBOTS for part in newton(robot)]
+    parts += [ours(f"operations.{robot}", rf"^{robot}\.(?!{BASIC})", 90.0, *both) for robot in ROBOTS]
+    parts += [ours(f"throughput.{robot}", rf"^{robot}\.(phi|phi\.T|psi|mass@v)\.", 60.0, "--dtype", "float32",
+                   worlds=("1048576",)) for robot in ROBOTS]  # fmt: skip
+    parts += [ours(f"randomised.{robot}", rf"^{robot}\.", 90.0, "--dtype", "randomised", worlds=("4096", "1048576"))
+              for robot in ROBOTS]  # fmt: skip
+    parts += [ours(f"sweep.{name}", rf"^({scenes})", 90.0, "--sweeps")
+              for name, scenes in (("worlds", "arm7|humanoid"), ("shapes", "chain|tree|deep|branching"))]  # fmt: skip
+    parts += [ours("others", rf"^(arm7|humanoid)\.{BASIC}\.", 60.0, *both)]
     for robot in ROBOTS:
-        parts += [peer(name, [robot], 40.0, WORLDS) for name in ("mujoco_warp", "grid", "torch")]
-        parts += [peer("resolvent", [robot], 40.0, ("1", "128", "4096"))]
-    parts += [peer("frax", ["panda"], 30.0, WORLDS), peer("pinocchio", list(ROBOTS), 120.0, WORLDS)]
-    for robot in ROBOTS:
-        others = rf"^{robot}\.(?!{BASIC})"
         parts += [
-            ours(f"operations.{robot}", others, 90.0, *both),
-            ours(f"throughput.{robot}", rf"^{robot}\.(phi|phi\.T|psi|mass@v)\.", 60.0, "--dtype", "float32",
-                 worlds=("1048576",)),
             ours(f"refined.{robot}", rf"^{robot}\.", 30.0, "--dtype", "refined"),
-            ours(f"randomised.{robot}", rf"^{robot}\.", 60.0, "--dtype", "randomised", worlds=("4096", "1048576")),
-            ours(f"granularities.{robot}", rf"^{robot}\.{BASIC}", 60.0, *both, "--granularity", "node", "segment",
+            ours(f"granularities.{robot}", rf"^{robot}\.{BASIC}", 90.0, *both, "--granularity", "node", "segment",
                  "tree"),
         ]  # fmt: skip
     parts += [Part("stress.node", ["benchmarks.stress", "--granularity", "node"], None, 150.0)]
-    parts += [Part("stress.long", ["benchmarks.stress", LONG, "--slow"], None, 120.0)]
-    parts += [ours(f"sweep.{name}", rf"^({scenes})", 60.0, "--sweeps")
-              for name, scenes in (("worlds", "arm7|humanoid"), ("shapes", "chain|tree|deep|branching"))]  # fmt: skip
-    parts += [ours("others", rf"^(arm7|humanoid)\.{BASIC}\.", 60.0, *both)]
+    for robot in ROBOTS:
+        parts += [peer("mujoco_warp", [robot], 40.0, WORLDS), peer("grid", [robot], 40.0, WORLDS)]
+        parts += newton(robot)[:3]
+        parts += [peer("resolvent", [robot], 40.0, ("1", "128", "4096")), peer("torch", [robot], 40.0, WORLDS)]
+    parts += [peer("frax", ["panda"], 30.0, WORLDS), peer("pinocchio", list(ROBOTS), 120.0, WORLDS)]
+    parts += [Part("stress.long", ["benchmarks.stress", LONG, "--slow"], None, 150.0)]
+    parts += [newton(robot)[3] for robot in ROBOTS]
     parts += [Part("stress.plan", ["benchmarks.stress", "--check", "--jobs", jobs], None, 180.0)]
     return parts
 

@@ -38,7 +38,13 @@ def rows(
             continue
         subject = Subject(case.problem, device, "node" if case.reads_pivots else granularity)
         for precision in case.shown:
-            yield row(case, subject, precision, timed)
+            try:
+                yield row(case, subject, precision, timed)
+            except ValueError:
+                raise
+            except Exception as error:
+                yield dict(case=case.name, parameters=case.parameters, precision=precision, granularity=granularity,
+                           source=f"theory.md {case.source}", verdict="FAILS", why=f"{type(error).__name__}: {error}")
         yield from contrasts(case)
 
 
@@ -55,6 +61,10 @@ def check_rows(
                 verdict, why = "ok", ""
             except AssertionError as error:
                 verdict, why = "FAILS", str(error).strip()
+            except ValueError:  # of the granularity
+                raise
+            except Exception as error:  # such as a kernel that does not compile: the other checks go on
+                verdict, why = "FAILS", f"{type(error).__name__}: {error}"
             yield dict(case=name, parameters={}, precision=dtype, granularity=granularity, source=source,
                        verdict=verdict, why=why)
 
