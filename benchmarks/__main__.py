@@ -44,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
         "FILTER is of parts' names; goes on where an earlier run of this commit stopped"
     )  # fmt: skip
     p.add_argument("--budget", type=float, default=3600.0, metavar="S", help="[s] of --everything; default: 3600")
-    p.add_argument("--jobs", type=int, metavar="N", help="processes that compile for --everything; default: nearly all cores")
+    p.add_argument("--jobs", type=int, metavar="N", help="processes that compile at a time; default: nearly all cores")
     p.add_argument("--check", action="store_true", help="compare with the reference, time nothing")
     p.add_argument("--compile", action="store_true", help="evaluate once: kernels come into Warp's cache")
     p.add_argument("--json", type=Path, metavar="OUT", help="write the run to this file, or by date into this folder")
