@@ -18,10 +18,12 @@ LONG_COPY = 64  # entries of a row from which it is copied to shared memory with
 ON_ITS_WAY = """\
 #define ON_ITS_WAY(to, from) asm volatile("cp.async.ca.shared.global [%0], [%1], %2;" \
     :: "r"((unsigned)__cvta_generic_to_shared(to)), "l"(from), "n"(sizeof(*(to))) : "memory")"""
+ARRIVED = 'asm volatile("cp.async.wait_all;" ::: "memory");'
 SHARED_BYTES = 46 * 1024  # that a block may declare: 48 KiB less what Warp takes
 C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
 MASKS = ("prescribed",)  # arrays of booleans
-IN_PLACE, STAGED, MAPPED, DIRECT = "in place", "staged", "mapped", "direct"
+IN_PLACE, STAGED, MAPPED, COLUMNS, DIRECT = "in place", "staged", "mapped", "columns", "direct"
+SPREAD_BLOCK = 256
 
 
 class Row(NamedTuple):
@@ -38,7 +40,8 @@ class Result(NamedTuple):
     Attributes:
         way: IN_PLACE: entry by entry over ``row``, which is read first; STAGED: through shared memory, as it is;
             MAPPED: through shared memory, ``slots`` values that a table ``place`` [entry] spreads, -1 being zero;
-            DIRECT: each entry to memory by itself, where shared memory is too small.
+            COLUMNS: the same values as [slot, world] to memory, whence the kernel :func:`spread` takes them; DIRECT:
+            each entry to memory by itself, where shared memory is too small.
     """
 
     way: str
@@ -58,13 +61,15 @@ class Frame(NamedTuple):
     Attributes:
         rows: arrays to read, by entry: ``name_row[i]``. staged: they are copied to shared memory first, all worlds
             together; otherwise each thread reads its world's row, which is faster while few worlds or few entries wait.
-        fields: arrays [item, component, world] to read: ``name_at[entry * name_part]``.
+        fields: arrays [entry, world] to read: ``FIELD(name, entry)``.
         result: how ``result_row[i]`` leaves.
         again: the statements run once more, with ``again`` set, if they left ``farthest`` beyond reach.
         sent: values that warps send each other, ``SENT(i)``.
         warps: how many work on 32 worlds.
         block: threads of a block.
         more: further results, ``name_row[i]``, each entry to memory by itself.
+        held: entries of each field, from the first on, that wait for their use in shared memory: a compiler that loads
+            them from memory does so long before, and has no registers left.
     """
 
     rows: list[Row]
@@ -76,6 +81,7 @@ class Frame(NamedTuple):
     block: int
     more: tuple[Row, ...] = ()
     again: bool = False
+    held: tuple[int, ...] = ()
 
     @property
     def groups(self) -> int:
@@ -87,7 +93,7 @@ class Frame(NamedTuple):
         """Scalars of shared memory that a group takes."""
         rows = sum(pitch(row.entries) for row in self.rows) if self.staged else 0
         extra = {STAGED: self.result.array.entries, MAPPED: self.result.slots | 1}.get(self.result.way)
-        return WARP * (rows + (0 if extra is None else pitch(extra)) + self.sent)
+        return WARP * (rows + (0 if extra is None else pitch(extra)) + self.sent + sum(self.held))
 
     def fits(self, T) -> bool:
         """Shared memory holds what is staged."""
@@ -114,36 +120,46 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
         else:
             text += [_own_row(row, c)]
     text += [f"{c}* {row.name}_row = {row.name}.data + world * {row.entries};" for row in frame.more]
+    if frame.held:
+        text += [ON_ITS_WAY, *_held(frame, c), "#undef ON_ITS_WAY"]
+        lines = cuda.split("\n")
+        lines.insert(next(i for i, line in enumerate(lines) if "FIELD(" in line), ARRIVED)
+        cuda = "\n".join(lines)
     if frame.staged:
         if any(row.entries >= LONG_COPY for row in frame.rows):
             text += [ON_ITS_WAY]
         text += [_stage_in(row, offset[row.name], c, team) for row in frame.rows]
         if any(row.entries >= LONG_COPY for row in frame.rows):
-            text += ['asm volatile("cp.async.wait_all;" ::: "memory");', "#undef ON_ITS_WAY"]
+            text += [ARRIVED, "#undef ON_ITS_WAY"]
         text += [sync]
     if result.way == IN_PLACE:
         start, width = offset[result.row], pitch(next(row.entries for row in frame.rows if row.name == result.row))
     else:
         width = pitch(result.slots | 1 if result.way == MAPPED else out.entries)
-        start, at = at, at + (0 if result.way == DIRECT else WARP * width)
+        start, at = at, at + (0 if result.way in (DIRECT, COLUMNS) else WARP * width)
     if result.way == DIRECT:
         text += [f"{c}* result_row = out.data + world * {out.entries};"]
+    elif result.way == COLUMNS:
+        text += _columns(c)
     else:
         text += [f"{c}* result_row = stage + {start} + lane * {width};"]
     if frame.sent:
         text += [f"{c}* sent = stage + {at} + lane;", "#define SENT(i) sent[(i) * 32]"]
     if frame.again:
         cuda = f"for (int again = 0;; ++again) {{\n{cuda}\nif (again || !(farthest > on::reach())) break;\n}}"
-    text += [*_fields(frame.fields, c), cuda]
+    text += [*([] if frame.held else _fields(frame.fields, c)), cuda]
     if result.way in (IN_PLACE, STAGED):
         text += [sync, _stage_out(out, start, width, c, team)]
     if result.way == MAPPED:
         text += [sync, _spread_out(result, start, c, team)]
+    text += ["#undef FIELD"] if frame.held else []
     text += ["#else", "const long long world = thread;", "const bool mine = true;"]
     text += [_own_row(row, c) for row in frame.rows]
     text += [f"{c}* {row.name}_row = {row.name}.data + world * {row.entries};" for row in frame.more]
     if result.way == MAPPED:
         text += [f"{c} result_row[{result.slots}];"]
+    elif result.way == COLUMNS:
+        text += _columns(c)
     else:
         text += [f"{c}* result_row = out.data + world * {out.entries};"]
     if frame.sent:
@@ -152,7 +168,14 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     if result.way == MAPPED:
         text += [f"for (int i = 0; i < {out.entries}; ++i) {{", "    const int slot = place.data[i];",
                  f"    out.data[world * {out.entries} + i] = slot < 0 ? 0 : result_row[slot];", "}"]
-    text += ["#endif", "#undef SENT", ""]
+    text += ["#endif", "#undef SENT", "#undef RESULT", *(["#undef FIELD"] if frame.fields else []), ""]
+    return "\n".join(text)
+
+
+def per_world(fields: list[str], statements: str) -> str:
+    """The native code of one thread, a world, around statements in float64."""
+    c = C_TYPE[wp.float64]
+    text = [NATIVE[c], "const long long world = thread;", *_fields(fields, c), statements, "#undef FIELD", ""]
     return "\n".join(text)
 
 
@@ -167,13 +190,43 @@ def _own_row(row: Row, c: str) -> str:
 
 
 def _fields(names: list[str], c: str) -> list[str]:
+    """FIELD for fields that are read where they are."""
+    if not names:
+        return []
     return [
-        line
-        for name in names
-        for line in (
-            f"const {c}* {name}_at = (const {c}*)((const char*){name}.data + world * {name}.strides[2]);",
-            f"const int {name}_part = (int)({name}.strides[1] / (int)sizeof({c}));",
-        )
+        "#if defined(__CUDA_ARCH__)",
+        "#define FIELD(name, entry) __ldg(name##_at + (entry) * name##_part)",
+        "#else",
+        "#define FIELD(name, entry) name##_at[(entry) * name##_part]",
+        "#endif",
+        *(
+            f"const {c}* {name}_at = (const {c}*)((const char*){name}.data + world * {name}.strides[1]);\n"
+            f"const long long {name}_part = {name}.strides[0] / (int)sizeof({c});"
+            for name in names
+        ),
+    ]
+
+
+def _held(frame: Frame, c: str) -> list[str]:
+    """FIELD for fields in the last part of the shared memory; each thread fetches those of its world."""
+    text, at = ["#define FIELD(name, entry) name##_at[(entry) * 32]"], frame.scalars - WARP * sum(frame.held)
+    for name, entries in zip(frame.fields, frame.held, strict=True):
+        text += [
+            f"{c}* {name}_at = stage + {at} + lane;",
+            f"const char* {name}_from = (const char*){name}.data + world * {name}.strides[1];",
+            "#pragma unroll 8",
+            f"for (int k = 0; k < {entries}; ++k)",
+            f"    ON_ITS_WAY({name}_at + 32 * k, {name}_from + k * (long long){name}.strides[0]);",
+        ]
+        at += WARP * entries
+    return text
+
+
+def _columns(c: str) -> list[str]:
+    return [
+        f"{c}* result_row = out.data + world;",
+        f"const long long result_part = out.strides[0] / (long long)sizeof({c});",
+        "#define RESULT(i) result_row[(i) * result_part]",
     ]
 
 
@@ -224,18 +277,61 @@ def _spread_out(result: Result, offset: int, c: str, team: int) -> str:
 }}"""
 
 
+def spread(result: Result, T) -> wp.Kernel:
+    """A kernel (worlds, columns [slot, world], place [entry]) -> out, all worlds of a tile side by side.
+
+    On CUDA it takes SPREAD_BLOCK threads for each :func:`tile` worlds, on the CPU a thread a world.
+    """
+    c, n, width, worlds = C_TYPE[T], result.array.entries, result.slots | 1, tile(result, T)
+    native = f"""#if defined(__CUDA_ARCH__)
+__shared__ {c} shared[{worlds * width}];
+const int member = threadIdx.x;
+const long long first = (long long)(thread / {SPREAD_BLOCK}) * {worlds};
+const int present = worlds - first < {worlds} ? (int)(worlds - first) : {worlds};
+const long long part = columns.strides[0] / (long long)sizeof({c});
+#pragma unroll 4
+for (int k = member; k < {result.slots * worlds}; k += {SPREAD_BLOCK}) {{
+    const int slot = k / {worlds}, world = k % {worlds};
+    if (world < present) shared[world * {width} + slot] = __ldg(columns.data + slot * part + first + world);
+}}
+__syncthreads();
+{c}* to = out.data + first * {n};
+#pragma unroll 4
+for (int i = member; i < present * {n}; i += {SPREAD_BLOCK}) {{
+    const int slot = __ldg(place.data + i % {n});
+    to[i] = slot < 0 ? ({c})0 : shared[(i / {n}) * {width} + slot];
+}}
+#else
+const long long part = columns.strides[0] / (long long)sizeof({c});
+for (int i = 0; i < {n}; ++i) {{
+    const int slot = place.data[i];
+    out.data[(long long)thread * {n} + i] = slot < 0 ? 0 : columns.data[slot * part + thread];
+}}
+#endif
+"""
+    return kernel("spread", native, [("columns", 2), ("place", 1), ("out", result.array.ndim)], T)
+
+
+def tile(result: Result, T) -> int:
+    """Worlds that :func:`spread` holds in shared memory at once: a power of two."""
+    worlds = SHARED_BYTES // ((result.slots | 1) * wp.types.type_size_in_bytes(T))
+    return min(WARP, 1 << (worlds.bit_length() - 1)) if worlds else 0
+
+
 def _slot(i: str, entries: int, distance: int) -> str:
     return i if entries == distance else f"({i} / {entries}) * {distance} + {i} % {entries}"
 
 
-def kernel(name: str, native: str, arrays: list[tuple[str, int]], T, registers: int | None = None) -> wp.Kernel:
+def kernel(
+    name: str, native: str, arrays: list[tuple[str, int]], T, registers: int | None = None, wide: tuple = ()
+) -> wp.Kernel:
     """A kernel of ``worlds``, then ``arrays`` (name, axes) of scalars ``T``, that runs ``native`` in each thread.
 
-    The arrays ``place`` and ``shifts`` hold integers, those of MASKS booleans.
+    The arrays ``place`` and ``shifts`` hold integers, those of MASKS booleans, the ``wide`` [entry, world] float64.
     """
     key = f"{name}_{hashlib.sha256(native.encode()).hexdigest()[:16]}"
     types = {array: "table" if array in ("place", "shifts") else f"array{axes}" for array, axes in arrays}
-    types |= {array: "mask" for array in types if array in MASKS}
+    types |= {array: "mask" for array in types if array in MASKS} | {array: "wide" for array in wide}
     declared = ", ".join(f"{array}: {kind}" for array, kind in types.items())
     source = f"""def native(thread: int, worlds: int, {declared}): ...
 
@@ -247,7 +343,8 @@ def {key}(worlds: int, {declared}):
     file = f"<{key}>"
     linecache.cache[file] = len(source), None, source.splitlines(True), file  # where Warp looks for the source
     space = {f"array{axes}": wp.array(dtype=T, ndim=axes) for axes in range(1, 5)} | {
-        "table": wp.array(dtype=int, ndim=1), "mask": wp.array(dtype=wp.bool, ndim=2), "wp": wp, "__name__": key
+        "table": wp.array(dtype=int, ndim=1), "mask": wp.array(dtype=wp.bool, ndim=2),
+        "wide": wp.array(dtype=wp.float64, ndim=2), "wp": wp, "__name__": key
     }
     exec(compile(source, file, "exec"), space)
     space["native"] = wp.func_native(native)(space["native"])

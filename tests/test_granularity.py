@@ -11,11 +11,12 @@ import zoo
 from robots import ROBOTS
 
 import warp_spo as spo
+from warp_spo.kernels import straight
 
 GRANULARITIES = ("tree", "segment")
 DTYPES = ("float32", "float64")
-SEGMENTED = ("forward_dynamics", "inverse_dynamics", "solve_mass_matrix", "mass_matrix")
-OPERATIONS = (*SEGMENTED, "bias_force", "gravity_force", "mass_matrix_inverse", "log_det_mass_matrix", "body_poses",
+SEGMENTED = ("forward_dynamics", "inverse_dynamics", "solve_mass_matrix", "mass_matrix", "mass_matrix_inverse")
+OPERATIONS = (*SEGMENTED, "bias_force", "gravity_force", "log_det_mass_matrix", "body_poses",
               "body_velocities", "jacobian", "operational_inertia_inverse")  # fmt: skip
 MANY = 33  # one more than a warp has threads
 
@@ -113,6 +114,7 @@ SCENES = {
     "three roots": lambda: zoo.from_parents([-1, 0, -1, 2, -1, 2],
                                             ["revolute", "ball", "free", "d6", "planar", "fixed"], 7),
     "two arms": zoo.fork,
+    "dancer": zoo.dancer,
     "several robots": zoo.forest,
     "oblique chain": lambda: zoo.chain(4),
 }
@@ -124,12 +126,13 @@ FEW = {  # operations that a quick run takes of a scene; the others have all
     "anisotropic armature": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
     "several robots": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
     "two arms": ("forward_dynamics", "mass_matrix"),
+    "dancer": ("mass_matrix_inverse",),
     "hand": (*SEGMENTED, "bias_force"),
     "arm": (*SEGMENTED, "log_det_mass_matrix", "body_poses"),
-    "three roots": (*SEGMENTED, "bias_force", "mass_matrix_inverse", "jacobian"),
+    "three roots": (*SEGMENTED, "bias_force", "jacobian"),
 }
 PRECISION = {"float32": ("every kind", "arm", "hand", "massless", "deep"),
-             "float64": ("fixed", "anisotropic armature", "three roots")}  # fmt: skip
+             "float64": ("fixed", "anisotropic armature", "three roots", "dancer")}  # fmt: skip
 """Scenes of which a quick run takes all of those in this precision; in the other one the first two."""
 
 
@@ -195,6 +198,17 @@ def test_equals_reference(name, granularity, dtype, operation, device):
     assert dyn.plan.of(operation) == granularity
     arrays = states(dyn)
     equals_reference(dyn, operation, arrays, laws.TOLERANCE[dtype], worlds=(0, 1, MANY // 2, MANY - 1))
+
+
+@pytest.mark.parametrize("granularity", GRANULARITIES)
+def test_a_long_result_by_columns(granularity, device, monkeypatch):
+    """Values that go through memory, [slot, world], some worlds at a time, and rows of parameters with them."""
+    dyn = dynamics("two arms", granularity, MANY, "float64", device, varied=True)
+    monkeypatch.setattr(straight, "SHARED_BYTES", 10_000)
+    dyn.programs.columns, dyn.programs.column_worlds = True, 14
+    for operation in ("mass_matrix", "mass_matrix_inverse"):
+        equals_reference(dyn, operation, states(dyn), laws.TOLERANCE["float64"])
+    assert all(program.spread is not None for program in dyn.programs._programs.values())
 
 
 @pytest.mark.parametrize("worlds", [1, 3])

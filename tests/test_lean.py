@@ -11,6 +11,7 @@ import zoo
 
 import warp_spo as spo
 from warp_spo.parameters import VARIABLE
+from warp_spo.recursions.links import LINK_VALUES
 
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
 from benchmarks import cases
@@ -134,15 +135,10 @@ def test_bodies_that_do_not_move_cost_nothing():
 
 
 # -- arrays and arguments ----------------------------------------------------------------------------------------------
-FIELDS = {"body_mass": {"rigid"}, "body_inertia": {"rigid"}, "body_com": {"rigid"}, "gravity": {"gravity"},
-          "joint_armature": {"joint_armature"}, "joint_X_p": {"rigid", "tree"},
-          "joint_X_c": {"rigid", "tree"}}  # fmt: skip
-
-
 @pytest.mark.parametrize("name", VARIABLE)
 def test_what_varies_is_an_argument_and_nothing_else(name):
     found = program(arm(), "forward_dynamics", variable=(name,))
-    assert set(found.fields) == FIELDS.get(name, set())
+    assert found.fields == (("value",) if name in LINK_VALUES else ())
     arguments = [argument.label for argument in found.kernel.adj.args]
     assert set(arguments) == {"worlds", "q", "qd", "tau", "out", *found.fields}
     assert program(arm(), "forward_dynamics").fields == ()
@@ -151,10 +147,10 @@ def test_what_varies_is_an_argument_and_nothing_else(name):
 def test_what_differs_between_worlds_is_an_argument_and_nothing_else():
     scene = arm()
     masses = scene.with_values(body_mass=np.linspace(1, 2, 21).reshape(3, 7))
-    assert program(masses, "forward_dynamics", worlds=3).fields == ("rigid",)
+    assert program(masses, "forward_dynamics", worlds=3).fields == ("value",)
     assert program(masses, "inverse_dynamics", (), worlds=3).rows == ("q",)
     gravity = scene.with_values(gravity=np.linspace(-9, -8, 9).reshape(3, 3))
-    assert program(gravity, "forward_dynamics", worlds=3).fields == ("gravity",)
+    assert program(gravity, "forward_dynamics", worlds=3).fields == ("value",)
     assert program(gravity, "mass_matrix", worlds=3).fields == ()
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warp_spo.kernels.straight import IN_PLACE, MAPPED, Frame
+from warp_spo.kernels.straight import COLUMNS, IN_PLACE, MAPPED, Frame
 from warp_spo.programs import Programs
 from warp_spo.teams import BARRIER
 
@@ -77,7 +77,7 @@ def run(text, arrays, backwards=False):
 
     Args:
         text: of the kernel.
-        arrays: by name: the callers' [world, ...], the parameters' [item, component, world].
+        arrays: by name: the callers' [world, ...], the tables of what the links are made of [entry, world].
         backwards: between barriers the last warp goes first.
     """
     frame = text.frame
@@ -85,8 +85,7 @@ def run(text, arrays, backwards=False):
     rows = {f"{row.name}_row": Shared(row.name, arrays[row.name].reshape(worlds, -1).T) for row in frame.rows}
     result = rows[f"{frame.result.row}_row"] if frame.result.way == IN_PLACE else Shared("result")
     sent = Shared("sent")
-    fields = {f"{name}_at": arrays[name].reshape(-1, worlds) for name in frame.fields}
-    fields |= {f"{name}_part": 1 for name in frame.fields}
+    fields = {name: arrays[name] for name in frame.fields}
     space = FUNCTIONS | rows | fields | {"result_row": result, "sent": sent}
     space |= {name: text.tables.get(name) for name in ("table", "shifts")}
     exec(translated(text.cuda), space)
@@ -105,7 +104,7 @@ def run(text, arrays, backwards=False):
         going = {} if stopped else going
         stretch += 1
     whole = np.zeros((frame.result.array.entries, worlds))
-    places = text.tables["place"] if frame.result.way == MAPPED else range(len(whole))
+    places = text.tables["place"] if frame.result.way in (MAPPED, COLUMNS) else range(len(whole))
     for entry, slot in enumerate(places):
         whole[entry] = 0.0 if slot < 0 else result.values[slot]
     return whole.T
@@ -149,7 +148,7 @@ def translated(cuda):
         branch = re.match(r"^(else )?(?:if \((.*)\) )?\{$", line)
         if branch:
             condition = "False" if "reach" in (branch[2] or "") else (branch[2] or "").replace("||", "or")
-            word = f"{'el' if branch[1] else ''}if {condition}" if branch[2] else "else"
+            word = f"{'el' if branch[1] else ''}if {condition}" if branch[2] else "else" if branch[1] else "if True"
             lines += ["    " * depth + f"{word}:", "    " * (depth + 1) + "pass"]
             depth += 1
             continue
@@ -170,10 +169,11 @@ def _statement(line):
             break
     line = re.sub(r"\((?:float|double)\)", "", line).replace("on::", "")
     line = re.sub(r"(?<![\w.])(\d+\.?\d*(?:e[-+]?\d+)?)f\b", r"\1", line)
+    line = re.sub(r"FIELD\((\w+), ([^()]*)\)", r"\1[\2]", line)
     line = re.sub(r"__ldg\(shifts\.data \+ (.*?)\)", r"int(shifts[\1])", line)
     line = re.sub(r"__ldg\((\w+ \+ \d+)\)", r"table[\1]", line)
     return _sent(line)
 
 
 def _sent(line):
-    return re.sub(r"SENT\(([^()]*)\)", r"sent[\1]", line)
+    return re.sub(r"RESULT\(([^()]*)\)", r"result_row[\1]", re.sub(r"SENT\(([^()]*)\)", r"sent[\1]", line))

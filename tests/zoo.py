@@ -94,6 +94,12 @@ def fork(seed=2):
     return from_parents([2, 0, -1, 2, 3], kinds, seed, [4, 2, 0, 3, 1])
 
 
+def dancer():
+    """A floating pelvis with two legs and a waist, on it two arms of two fingers each: limbs that part again."""
+    kinds = ["free", "revolute", "revolute", "prismatic"] + ["revolute", "universal", "revolute"] * 2
+    return from_parents([-1, 0, 0, 0, 3, 4, 4, 3, 7, 7], kinds, 58)
+
+
 def forest(seed=3):
     """Two robots in one scene, interleaved: a floating one and one on a fixed base with a fixed and a ball hinge."""
     parents = [-1, -1, 0, 1, 2, 3, 2]
@@ -266,6 +272,7 @@ SCENES |= {
     "chain_free": functools.partial(chain, 3, "free"),
     "every_d6": every_d6,
     "fork": fork,
+    "dancer": dancer,
     "forest": forest,
     "star": functools.partial(star, 6),
     "plain": plain,

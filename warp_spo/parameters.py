@@ -7,9 +7,9 @@ What every world shares is stored once and read through an axis of stride zero, 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
-import numpy as np
 import warp as wp
 
 from .kernels import parameters as kernels
@@ -46,63 +46,101 @@ def spread(array: wp.array, axis: int, worlds: int) -> wp.array:
     return view
 
 
-class Parameters:
-    """The values of ``scene`` for ``worlds`` worlds, as the kernels read them.
+class Derived(NamedTuple):
+    """Arrays that ``fill()``, launches alone, makes of the values ``of`` these names.
 
     Attributes:
-        tree, anchor, com, rigid: see :mod:`warp_spo.kernels.parameters`, [node, component, world].
+        each_time: at every request, as graphs that set values were captured before it was made.
     """
+
+    arrays: list[wp.array]
+    of: Sequence[str]
+    fill: Callable[[], None]
+    each_time: bool = False
+
+
+class Parameters:
+    """The values of ``scene`` for ``worlds`` worlds, and what is made of them at the first request."""
 
     def __init__(self, scene: Scene, topology: Topology, worlds: int, device: wp.Device, dtype: type, variable: tuple):
         self.scene, self.worlds, self.device, self.dtype = scene, worlds, device, dtype
         self.variable = variable
         self._topology = topology
         self._hinge_of: Any = wp.array(scene.hinge_of, dtype=int, device=device)
-        self._fields: dict[str, tuple[wp.array, wp.array]] = {}  # by dof, coordinate or component: (own, spread)
+        self._derived: dict[str, Derived] = {}
+        self._captured = False
+        self._sharers: list[Parameters] = []
         self._values: dict[str, wp.array] = {}
         for name, value in scene.values.items():
+            own: Any = wp.array(value, dtype=wp.float64, device=device)
             if name in variable:
-                value = np.broadcast_to(value, (worlds, *value.shape[1:]))
-            self._values[name] = wp.array(np.ascontiguousarray(value), dtype=wp.float64, device=device)
-        rigid_worlds = max(self._values[name].shape[0] for name in RIGID_VALUES)
-        self._rigid_values = [spread(self._values[name], 0, rigid_worlds) for name in RIGID_VALUES]
-        self._rigid_out = [
-            wp.empty((scene.body_count, components, rigid_worlds), dtype=dtype, device=device)
-            for components in (POSE, POSE, 3, RIGID)
-        ]
-        self.tree, self.anchor, self.com, self.rigid = (spread(array, 2, worlds) for array in self._rigid_out)
-        self._derive()
+                shared, own = own, wp.empty((worlds, *value.shape[1:]), dtype=wp.float64, device=device)
+                wp.copy(own, spread(shared, 0, worlds))
+            self._values[name] = own
 
-    def _derive(self) -> None:
-        wp.launch(
-            kernels.derive(self.dtype),
-            dim=(self.scene.body_count, self._rigid_out[0].shape[2]),
-            inputs=[self._topology, self._hinge_of, *self._rigid_values],
-            outputs=self._rigid_out,
-            device=self.device,
-        )
+    def derived(self, key: str, build: Callable[[], Derived]) -> list[wp.array]:
+        """The arrays of that name; ``build()`` allocates them at the first request."""
+        found = self._derived.get(key)
+        if found is None:
+            found = self._derived[key] = build()._replace(each_time=self._captured)
+            found.fill()
+        elif found.each_time:
+            found.fill()
+        return found.arrays
 
-    def array(self, name: str) -> wp.array:
-        """tree, anchor, com, rigid or a field, as [item, component, world]."""
-        if name in ("tree", "anchor", "com", "rigid"):
-            return getattr(self, name)
-        field = self.field(name)
-        return field.reshape((field.shape[0], 1, field.shape[1]))
+    def rows(self, names: Iterable[str]) -> int:
+        """1 if all worlds share these values, else the number of worlds."""
+        return max((self._values[name].shape[0] for name in names), default=1)
+
+    def entries(self, name: str, worlds: int) -> wp.array:
+        """Newton's numbers as [entry, world], float64; no copy."""
+        value = self._values[name]
+        flat = value.reshape((value.shape[0], math.prod(value.shape[1:])))
+        return spread(flat.transpose(), 1, worlds)
+
+    def _bodies(self) -> list:
+        """tree, anchor, com, rigid: see :mod:`warp_spo.kernels.parameters`, [node, component, world]."""
+
+        def build() -> Derived:
+            scene, worlds = self.scene, self.rows(RIGID_VALUES)
+            values = [spread(self._values[name], 0, worlds) for name in RIGID_VALUES]
+            own: list = [
+                wp.empty((scene.body_count, components, worlds), dtype=self.dtype, device=self.device)
+                for components in (POSE, POSE, 3, RIGID)
+            ]
+            inputs, dim = [self._topology, self._hinge_of, *values], (scene.body_count, worlds)
+            fill = lambda: wp.launch(kernels.derive(self.dtype), dim, inputs, own, device=self.device)  # noqa: E731
+            return Derived([spread(array, 2, self.worlds) for array in own], RIGID_VALUES, fill)
+
+        return self.derived("bodies", build)
+
+    @property
+    def tree(self) -> wp.array:
+        return self._bodies()[0]
+
+    @property
+    def anchor(self) -> wp.array:
+        return self._bodies()[1]
+
+    @property
+    def com(self) -> wp.array:
+        return self._bodies()[2]
+
+    @property
+    def rigid(self) -> wp.array:
+        return self._bodies()[3]
 
     def field(self, name: str) -> wp.array:
-        """``values[name]`` as [dof, coordinate or component, world], rounded; made at the first request."""
-        if name not in self._fields:
-            value = self._values[name]
-            own = wp.empty(value.shape[::-1], dtype=self.dtype, device=self.device)
-            self._fields[name] = (own, spread(own, 1, self.worlds))
-            self._refresh_field(name)
-        return self._fields[name][1]
+        """``values[name]`` as [dof, coordinate or component, world], rounded."""
 
-    def _refresh_field(self, name: str) -> None:
-        own = self._fields[name][0]
-        wp.launch(
-            kernels.transpose(self.dtype), dim=own.shape, inputs=[self._values[name]], outputs=[own], device=self.device
-        )
+        def build() -> Derived:
+            value = self._values[name]
+            own: Any = wp.empty(value.shape[::-1], dtype=self.dtype, device=self.device)
+            kernel = kernels.transpose(self.dtype)
+            fill = lambda: wp.launch(kernel, own.shape, [value], [own], device=self.device)  # noqa: E731
+            return Derived([spread(own, 1, self.worlds)], (name,), fill)
+
+        return self.derived(name, build)[0]
 
     @property
     def gravity(self) -> wp.array | None:
@@ -133,10 +171,17 @@ class Parameters:
             wp.copy(self._values[name], other._values[name])
         self.refresh(self.variable)
 
-    def refresh(self, names: Any) -> None:
+    def share(self, other: Parameters) -> None:
+        """Have the values of ``other``, from here on the same memory, and follow its :meth:`refresh`."""
+        self._values = other._values
+        self._derived.clear()
+        other._sharers.append(self)
+
+    def refresh(self, names: Iterable[str]) -> None:
         """Derive anew what depends on the named values."""
-        if any(name in RIGID_VALUES for name in names):
-            self._derive()
-        for name in names:
-            if name in self._fields:
-                self._refresh_field(name)
+        for sharer in self._sharers:
+            sharer.refresh(names)
+        self._captured |= self.device.is_capturing
+        for found in self._derived.values():
+            if any(name in found.of for name in names):
+                found.fill()

@@ -16,13 +16,14 @@ COLUMN_BYTES = 1 << 28  # workspace of a solve with many right-hand sides; more 
 FEW_WORLDS = 32768  # so many leave a GPU waiting: a warp for each limb, and rows read where they are
 MOST_DOFS = 128  # straight-line code of more takes too long to compile
 SPILLS = {"float32": 32, "float64": 15}  # dofs at which one thread no longer holds a whole tree in registers
+HELD = 24  # dofs whose variable values have room in shared memory until a thread needs them
 SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as through shared memory,
 LONG_ROWS = 24  # in segments; longer rows come in together already at fewer worlds
 MOST_WARPS = 16
 SHORT = ("inverse_dynamics", "bias_force", "gravity_force")  # little code: a thread for the whole tree does not spill
-LONG_RESULTS = ("mass_matrix",)  # writing them is most of the work, and goes faster by many warps
+LONG_RESULTS = ("mass_matrix", "mass_matrix_inverse")  # writing them is most of the work, and goes faster by many warps
 
-SEGMENTED = ("forward_dynamics", "solve_mass_matrix", "mass_matrix", *SHORT)
+SEGMENTED = ("forward_dynamics", "solve_mass_matrix", *LONG_RESULTS, *SHORT)
 """Operations that a warp a limb can share; the others run with a thread a world where the plan says segment."""
 NODE_ONLY = ("passive_force", "integrate")
 """Operations in which no body waits for another: one launch, a thread for each (node, world)."""
@@ -98,7 +99,7 @@ def choose(
 ) -> Plan:
     """Return the plan for a scene and a world count; ``granularity`` forces one.
 
-    ``varies``: inertias or hinge frames are inputs, which a thread has to keep too.
+    ``varies``: inertias or hinge frames are inputs, which a thread has to hold too.
 
     Raises:
         ValueError: no such granularity.
@@ -132,7 +133,7 @@ def _chosen(dofs: int, limbs: int, worlds: int, cuda: bool, dtype: str, varies: 
         return "tree", f"more than {MOST_WARPS} limbs"
     if worlds <= FEW_WORLDS:
         return "segment", f"up to {FEW_WORLDS} worlds, {limbs} limbs side by side take less time"
-    if dofs > SPILLS[dtype] / (2 if varies else 1):
+    if dofs > (min(HELD, SPILLS[dtype]) if varies else SPILLS[dtype]):
         return "segment", f"{dofs} dof in {dtype} do not fit into one thread's registers"
     return "tree", f"more than {FEW_WORLDS} worlds keep the GPU busy with a thread each"
 

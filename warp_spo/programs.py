@@ -12,26 +12,24 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from . import link_values
 from .kernels import straight
-from .kernels.straight import DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
+from .kernels.straight import COLUMNS, DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
 from .levels import Recursions
 from .plan import MOST_WARPS, TREE_ONLY, Plan
+from .recursions import messages
 from .recursions.applications import Applications
-from .recursions.links import Links
+from .recursions.links import TABLES, Links
+from .recursions.messages import INWARD, OUTWARD, SENDS
 from .recursions.operators import meet, written
-from .recursions.pieces import Piece, Pieces
-from .recursions.traced import SENT, Trace
-from .teams import Team
+from .recursions.pieces import Pieces
+from .recursions.traced import Trace
+from .teams import Team, Work
 from .trace.emit import Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
-FIELDS = {"rigid": 10, "tree": 12, "anchor": 12, "com": 3, "joint_armature": 1, "gravity": 1}
-"""The parameters' arrays, and how many components an item has."""
-SENDS = {"forward_dynamics": "Pza", "solve_mass_matrix": "Pza", "inverse_dynamics": "z", "mass_matrix": "R"}
-"""What the pieces of a robot send each other, by operation."""
 TRACED = (
     *SENDS,
-    "mass_matrix_inverse",
     "log_det_mass_matrix",
     "body_poses",
     "body_velocities",
@@ -41,6 +39,7 @@ TRACED = (
     *TREE_ONLY,
 )
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
+COLUMN_WORLDS = 1 << 18  # of so many at a time the values of a long result go through memory
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
@@ -50,9 +49,10 @@ class Program(NamedTuple):
     """One kernel.
 
     Attributes:
-        rows: names of the callers' arrays that it reads. fields: of the parameters' arrays.
+        rows: names of the callers' arrays that it reads. fields: of the tables of what the links are made of.
         tables: arrays of its own.
         operations: floating-point operations of one world.
+        spread: a second kernel that brings the values of the first, [slot, world], to their ``places``; or None.
     """
 
     kernel: wp.Kernel
@@ -62,6 +62,16 @@ class Program(NamedTuple):
     warps: int
     block: int
     operations: int
+    spread: Spread | None = None
+
+
+class Spread(NamedTuple):
+    """The second half of a program with a long result: ``columns`` [slot, world] of some worlds at a time."""
+
+    kernel: wp.Kernel
+    columns: wp.array
+    places: wp.array
+    tile: int
 
 
 class Programs:
@@ -72,15 +82,21 @@ class Programs:
         plan: which granularity each operation has.
         block: threads of a block at tree granularity, on CUDA.
         registers: a cap on the registers of a thread.
+
+    Attributes:
+        columns: a result that has no room in shared memory goes through memory. column_worlds: of so many at a time.
     """
 
     def __init__(self, run: Recursions, plan: Plan, block: int = WARP, registers: int | None = None):
         self.run, self.plan, self.block, self.registers = run, plan, block, registers
+        self.columns, self.column_worlds = run.device.is_cuda, COLUMN_WORLDS
         self._programs: dict[Any, Program | None] = {}
+        self._links: Links | None = None
 
     def forget(self) -> None:
         """Drop all programs: values that they folded have changed."""
         self._programs.clear()
+        self._links = None
 
     def find(
         self,
@@ -111,14 +127,34 @@ class Programs:
         return self._programs[key]
 
     def launch(self, program: Program, arrays: dict[str, wp.array], out: wp.array, *more: wp.array) -> None:
-        run = self.run
-        threads, block = run.worlds, program.block
-        if run.device.is_cuda:
-            worlds = block // program.warps  # of one block
-            threads = -(-run.worlds // worlds) * block
-        inputs = [run.worlds, *(arrays[name] for name in program.rows)]
-        inputs += [run.parameters.array(name) for name in program.fields]
-        wp.launch(program.kernel, threads, [*inputs, *program.tables], [out, *more], device=run.device, block_dim=block)
+        rows = [arrays[name] for name in program.rows]
+        fields = [self.table(name) for name in program.fields]
+        if program.spread is None:
+            self._launch(program, self.run.worlds, [*rows, *fields], [out, *more])
+            return
+        some = program.spread.columns.shape[1]
+        for first in range(0, self.run.worlds, some):
+            part = slice(first, min(first + some, self.run.worlds))
+            inputs = [*(row[part] for row in rows), *(field[:, part] for field in fields)]
+            self._launch(program, part.stop - first, inputs, [program.spread.columns, *(array[part] for array in more)])
+            self._spread(program.spread, part.stop - first, out[part])
+
+    def _launch(self, program: Program, worlds: int, inputs: list, outputs: list) -> None:
+        device, block = self.run.device, program.block
+        of_block = block // program.warps
+        threads = -(-worlds // of_block) * block if device.is_cuda else worlds
+        inputs = [worlds, *inputs, *program.tables]
+        wp.launch(program.kernel, threads, inputs, outputs, device=device, block_dim=block)
+
+    def _spread(self, spread: Spread, worlds: int, out: wp.array) -> None:
+        device, block = self.run.device, straight.SPREAD_BLOCK
+        threads = -(-worlds // spread.tile) * block if device.is_cuda else worlds
+        inputs = [worlds, spread.columns, spread.places]
+        wp.launch(spread.kernel, threads, inputs, [out], device=device, block_dim=block)
+
+    def table(self, name: str) -> wp.array:
+        """What the links are made of [entry, world]."""
+        return link_values.table(self.run.parameters, self.links, name)
 
     @property
     def operation_counts(self) -> dict[str, int]:
@@ -140,19 +176,23 @@ class Programs:
         return lines
 
     # -- building --------------------------------------------------------------------------------------------------
-    def _links(self) -> Links:
-        return Links(self.run.scene, self.run.parameters.variable)
+    @property
+    def links(self) -> Links:
+        if self._links is None:
+            self._links = Links(self.run.scene, self.run.parameters.variable)
+        return self._links
 
     def _build(self, operation: str, shapes: dict, out_shape: tuple, more: dict, options: dict) -> Program | None:
-        links = self._links()
-        if (operation == "body_poses" and links.varies_tree) or not links.links:
+        links = self.links.opened()
+        if (operation == "body_poses" and links.turns_vary) or not links.links:
             return None
         if operation == "expression" and not meet(options["expression"]):
             return None
         shapes = {**shapes, "out": out_shape}
         if self.plan.of(operation) == "segment":
             pieces = Pieces(links)
-            program = self._segment_program(operation, shapes, pieces) if 1 < pieces.warps <= MOST_WARPS else None
+            several = 1 < pieces.warps <= MOST_WARPS
+            program = self._segment_program(operation, shapes, pieces, options) if several else None
             if program is not None:
                 return program
         return self._tree_program(operation, links, {**shapes, **more}, tuple(more), options)
@@ -173,17 +213,19 @@ class Programs:
         tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
         return self._finished(operation, frame, body, body, tables, emitter.operations)
 
-    def _segment_program(self, operation: str, shapes: dict, pieces: Pieces) -> Program | None:
-        dtype, slots = self.run.dtype.__name__, _slots(pieces, SENDS[operation])
+    def _segment_program(self, operation: str, shapes: dict, pieces: Pieces, options: dict) -> Program | None:
+        dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(operation, pieces)
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
-        sent = sum(SENT[letter] for letter, _ in slots)
         everything: list[Store] = []
         traced: list[list[Store]] = []
+        apart: list[tuple[list[Store], dict[int, list[Store]]]] = []
         for index in range(len(pieces.pieces)):
-            links = self._links()  # its own: pieces of equal structure then give equal text
+            links = self.links.opened()  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
-            traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)()])
-            everything += traced[-1]
+            traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)(**options)])
+            flat = {at: [self._flattened(item, shapes) for item in items] for at, items in trace.across.items()}
+            apart.append((trace.news, flat))
+            everything += traced[-1] + trace.news + [item for items in flat.values() for item in items]
         frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
                             WARP * pieces.warps, everything)
         if frame.result.way == DIRECT and frame.result.array.entries > LONG_ROW:
@@ -192,15 +234,19 @@ class Programs:
             return None  # nor for what limbs tell each other
         team = Team(pieces, dtype)
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
-        everything, table = _placed([item for items in outs for item in items], frame.result)
-        outs[0] += everything[sum(map(len, outs)) :] if table is None else []  # zeros
-        for piece, stores, items in zip(pieces.pieces, traced, outs, strict=True):
+        whole = [item for item in everything if item.array == "out"]
+        placed, table = _placed(whole, frame.result)
+        outs[0] += placed[len(whole) :] if table is None else []  # zeros
+        for piece, stores, items, (news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
             emitter = self._emitter(shapes, frame)
-            placed = [item for item in stores if item.array == "sent"]
-            placed += items if table is None else _by_slot(items, table)
-            last = "a" in SENDS[operation]  # results come on the way out
-            inward = [item for item in placed if (_goes_inward(item, slots, piece) if last else True)]
-            team.add(piece, emitter, emitter.region(inward), emitter.region(placed if last else []))
+            inward = [item for item in stores if item.array == INWARD]
+            outward = [item for item in stores if item.array == OUTWARD]
+            last = outward if set(SENDS[operation]) & set(messages.OUTWARD_LETTERS) else inward
+            last += items if table is None else _by_slot(items, table)
+            meetings = {at: found if table is None else _by_slot(found, table) for at, found in others.items()}
+            regions = emitter.region(inward), emitter.region(outward)
+            branches = emitter.branch(news), {at: emitter.branch(found) for at, found in meetings.items()}
+            team.add(Work(piece, *regions, *branches), emitter.operations)
         cuda = team.cuda()  # fills the tables
         lists = ("place", table, int), ("table", team.table, self.run.dtype), ("shifts", team.shifts, int)
         tables: dict[str, Any] = {
@@ -210,16 +256,24 @@ class Programs:
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
-        return item if item.array == "sent" else item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
+        if item.array in (INWARD, OUTWARD):
+            return item
+        return item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
 
     def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int) -> Program:
         native = straight.assemble(frame, cuda, cpu, self.run.dtype)
         rows, fields = tuple(row.name for row in frame.rows), tuple(frame.fields)
-        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 3) for name in fields]
-        arrays += [(name, 1) for name in tables] + [("out", frame.result.array.ndim)]
+        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 2) for name in fields]
+        result, spread = frame.result, None
+        if result.way == COLUMNS:
+            some = min(self.run.worlds, self.column_worlds)
+            columns = wp.empty((result.slots, some), dtype=self.run.dtype, device=self.run.device)
+            tile = straight.tile(result, self.run.dtype)
+            spread = Spread(straight.spread(result, self.run.dtype), columns, tables.pop("place"), tile)
+        arrays += [(name, 1) for name in tables] + [("out", 2 if spread else result.array.ndim)]
         arrays += [(row.name, row.ndim) for row in frame.more]
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers)
-        return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations)
+        return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations, spread)
 
     def _emitter(self, shapes: dict, frame: Frame) -> Emitter:
         result = frame.result
@@ -227,25 +281,25 @@ class Programs:
         guard = "if (mine) " if result.way == DIRECT else ""
 
         def load(array: str, entry: str) -> str:
-            if array == "sent":
+            if array in (INWARD, OUTWARD):
                 return f"SENT({entry})"
-            if array in FIELDS:
-                return f"{array}_at[({entry}) * {array}_part]"
+            if array in TABLES:
+                return f"FIELD({array}, {entry})"
             return f"{array}_row[{entry}]"
 
         def store(array: str, entry: str, value: str) -> str:
-            if array == "sent":
+            if array in (INWARD, OUTWARD):
                 return f"SENT({entry}) = {value};"
+            if array == "out" and result.way == COLUMNS:
+                return f"if (mine) RESULT({entry}) = {value};"
             if array == "out":
                 return f"{guard}result_row[{entry}] = {value};"
             return f"if (mine) {array}_row[{entry}] = {value};"
 
         def flat(array: str, index: tuple) -> int:
-            if array in FIELDS:
-                return FIELDS[array] * index[0] + (index[1] if len(index) > 1 else 0)
             return index[0] if len(index) == 1 else _flat(index, shapes[array][1:])
 
-        return Emitter(self.run.dtype.__name__, load, store, flat, angles)
+        return Emitter(self.run.dtype.__name__, load, store, flat, angles, TABLES)
 
     def _frame(self, stores: list[Store], shapes: dict, sent: int, warps: int, block: int,
                everything: list[Store] | None = None) -> Frame:
@@ -257,7 +311,8 @@ class Programs:
         over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
         over = [name for name in over if _read_before(stores, name)]
         slots = len({_name(item.value) for item in stores})
-        fields = [name for name in FIELDS if name in used]
+        fields = {name: used[name] for name in TABLES if name in used}
+        held = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
         staged, ways = self.plan.staged, [(False, Result(DIRECT, out))]
         staged = staged or any(row.name == "x" and row.entries > SHORT_ROW for row in rows)
         if dense and (staged or out.entries > SHORT_ROW):
@@ -265,8 +320,15 @@ class Programs:
         if dense and staged:
             ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), *ways]
         if out.entries > LONG_ROW and not (dense and staged and over == ["x"]):
-            ways = [(staged, Result(MAPPED, out, slots=slots)), (False, Result(MAPPED, out, slots=slots)), *ways]
-        frames = [Frame(rows, staged, fields, result, sent, warps, block) for staged, result in ways]
+            mapped, columns = Result(MAPPED, out, slots=slots), Result(COLUMNS, out, slots=slots)
+            ways = [(staged, mapped), (False, mapped), *ways]
+            if self.columns and straight.tile(columns, self.run.dtype):
+                ways.insert(-1, (False, columns))
+        frames = [
+            Frame(rows, staged, list(fields), result, sent, warps, block, held=entries)
+            for staged, result in ways
+            for entries in held[::-1]
+        ]
         return next((frame for frame in frames if frame.fits(self.run.dtype)), frames[-1])
 
 
@@ -288,27 +350,10 @@ def _called(key: tuple) -> str:
     return without_qdd.get(key[1], key[0]) if key[0] == "inverse_dynamics" else key[0]
 
 
-def _slots(pieces: Pieces, letters: str) -> dict[tuple[str, int], int]:
-    """Where what each piece sends begins."""
-    slots, at = {}, 0
-    for piece in pieces.pieces:
-        for letter in letters:
-            if piece.children if letter == "a" else piece.parent is not None:
-                slots[letter, piece.index] = at
-                at += SENT[letter]
-    return slots
-
-
-def _goes_inward(item: Store, slots: dict, piece: Piece) -> bool:
-    return item.array == "sent" and not (
-        ("a", piece.index) in slots and 0 <= item.index[0] - slots["a", piece.index] < SENT["a"]
-    )
-
-
 def _placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int] | None]:
-    """Flat stores as the result wants them, and the table of a MAPPED one."""
+    """Flat stores as the result wants them, and the table of a MAPPED one or of COLUMNS."""
     out = result.array
-    if result.way == MAPPED:
+    if result.way in (MAPPED, COLUMNS):
         slots: dict[Any, int] = {}
         table = [-1] * out.entries
         for item in stores:
@@ -334,10 +379,16 @@ def _flat(index: tuple, shape: tuple) -> int:
     return at
 
 
-def _reads(stores: list[Store]) -> set[str]:
-    """Names of the arrays that are read."""
+def _reads(stores: list[Store]) -> dict[str, int]:
+    """Names of the arrays that are read, and one more than the last index."""
     graphs: dict[int, list[Value]] = {}
     for item in stores:
         if not is_constant(item.value):
             graphs.setdefault(id(item.value.graph), []).append(item.value)
-    return {scalar.args[0] for values in graphs.values() for scalar in ordered(values) if scalar.op == "input"}
+    read: dict[str, int] = {}
+    for values in graphs.values():
+        for scalar in ordered(values):
+            if scalar.op == "input":
+                array, index = scalar.args[:2]
+                read[array] = max(index + 1, read.get(array, 0))
+    return read

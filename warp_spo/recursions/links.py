@@ -4,12 +4,16 @@ A hinge that is a chain of screws becomes a chain of links without inertia, the 
 screw along its own z axis. A ball or a free hinge is one link that turns by a quaternion, about the anchor or about the
 body's centre of mass. What a fixed hinge carries belongs to the link under it. So H is a unit vector, or several, in
 every link, and a body that does not move costs nothing.
+
+Values that vary are symbols here, Newton's own. An operation works on an opened copy, in which what came out of them is
+read from tables: what depends on the scene alone is computed once, not in every call.
 """
 
 from __future__ import annotations
 
+import copy
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,14 +21,16 @@ import numpy as np
 from ..parts import BALL as BALL
 from ..parts import FREE, SCREWS
 from ..scene import Scene
-from ..trace.graph import Graph, Value, cos, is_constant, reciprocal, reduced, sin
+from ..trace.graph import Graph, Scalar, Value, cos, is_constant, reciprocal, reduced, sin
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
 
 TURN, SLIDE, HELIX = "turn", "slide", "helix"
+LINK_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c", "joint_armature", "gravity")
+TABLES = ("value", "node_value")  # what links are made of; what bodies by themselves are, for the operators
 ROUNDING = 1e-14  # a rotation's entry that is this close to 0 or 1 is meant to be
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(eq=False)
 class Link:
     """One moving frame.
 
@@ -62,8 +68,7 @@ class Link:
         self.inertia = inertia if self.inertia is None else self.inertia + inertia
 
 
-@dataclasses.dataclass
-class Seat:
+class Seat(NamedTuple):
     """Where a body's node frame sits: fixed in a link, or in the inertial frame (link None)."""
 
     link: Link | None
@@ -71,39 +76,85 @@ class Seat:
     offset: Vector
 
 
+class Node(NamedTuple):
+    """A body by itself, in the axes of its node frame.
+
+    Attributes:
+        tree: axes and origin of the hinge's parent anchor in the parent's node frame.
+        anchor: of the node frame in the body frame.
+        com: centre of mass in the node frame. rigid: inertia about its origin.
+    """
+
+    tree: tuple[Matrix, Vector]
+    anchor: tuple[Matrix, Vector]
+    com: Vector
+    rigid: Rigid
+
+
 class Links:
     """The links of a scene, parents before children, depth first.
 
     Args:
-        scene: values of one world fold, those of several worlds and the ``variable`` ones are inputs.
-        variable: names that are inputs: ``rigid`` [node, 10], ``tree`` [node, 12], ``com`` [node, 3],
-            ``armature`` [dof] and ``gravity`` [3], as :class:`warp_spo.parameters.Parameters` holds them.
+        scene: entries of its values that are the same in all worlds fold; the others are inputs in Newton's names and
+            order, ``graph.input("body_mass", body)``.
+        variable: names whose entries are inputs, all of them.
 
     Attributes:
         graph: the trace's graph.
-        links: the links. seats: by body.
-        gravity: Vector, of constants if it does not vary.
+        links: the links. seats, nodes: by body.
+        gravity: Vector.
+        turns_vary: some joint's anchor is turned by what is no constant.
+        tables: the scalars that an :meth:`opened` copy reads, by name, in order.
     """
 
     def __init__(self, scene: Scene, variable: tuple[str, ...] = ()):
         self.scene, self.graph = scene, Graph()
-        self.variable = variable
         self.links: list[Link] = []
         self.seats: dict[int, Seat] = {}
-        varies = lambda name: name in variable or scene.values[name].shape[0] > 1  # noqa: E731
-        frames = varies("joint_X_p") or varies("joint_X_c")
-        self.varies_tree = frames
-        self._varies_rigid = frames or varies("body_mass") or varies("body_com") or varies("body_inertia")
-        self._varies_com = frames or varies("body_com")
-        self._varies_armature = varies("joint_armature")
-        values = scene.values
-        if varies("gravity"):
-            self.gravity = Vector(self.graph.input("gravity", i) for i in range(3))
-        else:
-            self.gravity = Vector(float(g) for g in values["gravity"][0])
-        self._poses = {name: [_pose(p) for p in values[name][0]] for name in ("joint_X_p", "joint_X_c")}
+        self.nodes: dict[int, Node] = {}
+        self.tables: dict[str, dict[Scalar, int]] = {table: {} for table in TABLES}
+        self._values = {name: self._symbols(name, name in variable) for name in LINK_VALUES}
+        self.gravity = Vector(self._values["gravity"].tolist())
+        self._poses = {name: [_pose(p) for p in self._values[name]] for name in ("joint_X_p", "joint_X_c")}
+        self.turns_vary = any(R.dtype == object for poses in self._poses.values() for R, _ in poses)
         for root in scene.tree.roots:
             self._visit(root)
+
+    def opened(self) -> Links:
+        """A copy with a graph of its own; what is no constant is an entry of a table: its key there says which."""
+        other = copy.copy(self)
+        other.graph = Graph()
+        if self.graph.empty:
+            return other
+
+        def table(name: str) -> Callable[[Any], Any]:
+            slots = self.tables[name]
+            read = lambda x: other.graph.input(name, slots.setdefault(x, len(slots)))  # noqa: E731
+            return lambda values: _changed(values, lambda x: x if is_constant(x) else read(x))
+
+        value, apart = table("value"), table("node_value")
+        twin: dict[Link | None, Any] = {None: None}
+        for link in self.links:
+            twin[link] = dataclasses.replace(
+                link,
+                parent=twin[link.parent],
+                inertia=value(link.inertia),
+                matrix=value(link.matrix),
+                offset=value(link.offset),
+                com=value(link.com),
+                armature=value(link.armature),
+                children=[],
+            )
+            if link.parent is not None:
+                twin[link.parent].children.append(twin[link])
+        other.links = [twin[link] for link in self.links]
+        other.seats = {node: Seat(twin[s.link], *value(s[1:])) for node, s in self.seats.items()}
+        other.gravity = value(self.gravity)
+        other.nodes = {
+            node: Node(apart(own.tree), value(own.anchor), value(own.com), apart(own.rigid))
+            for node, own in self.nodes.items()
+        }
+        return other
 
     def traversal(self) -> Iterator[tuple[Link, bool]]:
         """(link, True) going out to it, (link, False) coming back with all that it carries: few values live at once."""
@@ -116,58 +167,42 @@ class Links:
                 stack.extend((child, True) for child in reversed(link.children))
 
     # -- values ----------------------------------------------------------------------------------------------------
-    def tree(self, node: int) -> tuple[Matrix, Vector]:
-        """Pose of the hinge's parent anchor in the parent's node frame."""
-        if self.varies_tree:
-            entries = [self.graph.input("tree", node, c) for c in range(12)]
-            return Matrix.of([entries[0:3], entries[3:6], entries[6:9]]), Vector(entries[9:])
-        scene = self.scene
-        R, p = self._poses["joint_X_p"][scene.hinge_of[node]]
+    def _symbols(self, name: str, all_vary: bool) -> np.ndarray:
+        """One world's value: numbers, or objects where some are inputs."""
+        values = self.scene.values[name]
+        vary = np.flatnonzero((values != values[:1]).any(axis=0) | all_vary)
+        if not vary.size:
+            return values[0]
+        symbols = values[0].astype(object)
+        symbols.flat[vary] = [self.graph.input(name, int(entry)) for entry in vary]
+        return symbols
+
+    def _node(self, node: int) -> Node:
+        scene, poses = self.scene, self._poses
+        R, p = poses["joint_X_p"][scene.hinge_of[node]]
         parent = scene.tree.parent[node]
         if parent >= 0:
-            R_c, p_c = self._poses["joint_X_c"][scene.hinge_of[parent]]
-            R, p = R_c.T @ R, R_c.T @ (p - p_c)
-        return _folded(R), Vector(p.tolist())
+            R_a, p_a = poses["joint_X_c"][scene.hinge_of[parent]]
+            R, p = R_a.T @ R, R_a.T @ (p - p_a)
+        R_c, p_c = poses["joint_X_c"][scene.hinge_of[node]]
+        com = _numbers(R_c.T @ (self._values["body_com"][node] - p_c))
+        return Node((_folded(R), Vector(p.tolist())), (_folded(R_c), Vector(p_c.tolist())), Vector(com.tolist()),
+                    self._rigid(node, R_c, com))
 
-    def anchor(self, node: int) -> tuple[Matrix, Vector]:
-        """Pose of the node frame in the body frame."""
-        if self.varies_tree:
-            entries = [self.graph.input("anchor", node, c) for c in range(12)]
-            return Matrix.of([entries[0:3], entries[3:6], entries[6:9]]), Vector(entries[9:])
-        R, p = self._poses["joint_X_c"][self.scene.hinge_of[node]]
-        return _folded(R), Vector(p.tolist())
-
-    def com(self, node: int) -> Vector:
-        """Centre of mass in the node frame."""
-        if self._varies_com:
-            return Vector(self.graph.input("com", node, i) for i in range(3))
-        R, p = self._poses["joint_X_c"][self.scene.hinge_of[node]]
-        return Vector((R.T @ (self.scene.values["body_com"][0, node] - p)).tolist())
-
-    def rigid(self, node: int) -> Rigid:
-        """Inertia of the body about the origin of its node frame."""
-        if self._varies_rigid:
-            e = [self.graph.input("rigid", node, c) for c in range(10)]
-            return Rigid(e[0], Vector(e[1:4]), symmetric(*e[4:]))
-        values = self.scene.values
-        R, _ = self._poses["joint_X_c"][self.scene.hinge_of[node]]
-        mass, c = float(values["body_mass"][0, node]), np.array(self.com(node), dtype=float)
-        inertia = R.T @ values["body_inertia"][0, node] @ R + mass * ((c @ c) * np.eye(3) - np.outer(c, c))
+    def _rigid(self, node: int, R: np.ndarray, c: np.ndarray) -> Rigid:
+        """Inertia of the body about the origin of its node frame, for its CoM ``c`` in it."""
+        mass = self._values["body_mass"][node : node + 1]
+        inertia = R.T @ self._values["body_inertia"][node] @ R + (np.eye(3) * (c @ c) - np.outer(c, c)) * mass
         J = (0.5 * (inertia + inertia.T)).tolist()
-        return Rigid(mass, Vector((mass * c).tolist()),
+        return Rigid(mass.tolist()[0], Vector((c * mass).tolist()),
                      symmetric(J[0][0], J[1][1], J[2][2], J[0][1], J[0][2], J[1][2]))
 
     def on_parent_node(self, link: Link) -> Link:
         """The first link of a hinge as it sits in the parent's node frame, instead of in the parent's link."""
-        matrix, offset = self.tree(link.node)
+        matrix, offset = self.nodes[link.node].tree
         if link.motion not in (BALL, FREE):
             matrix = matrix @ _aligned(self.scene.dof_axis[link.dofs[0]])
         return dataclasses.replace(link, matrix=_still(matrix), offset=offset)
-
-    def _armature(self, dof: int) -> Value:
-        if self._varies_armature:
-            return self.graph.input("joint_armature", dof, 0)
-        return float(self.scene.values["joint_armature"][0, dof])
 
     # -- building --------------------------------------------------------------------------------------------------
     def _visit(self, root: int) -> None:
@@ -181,18 +216,19 @@ class Links:
         scene = self.scene
         parent = scene.tree.parent[node]
         seat = self.seats[parent] if parent >= 0 else Seat(None, IDENTITY, ZERO)
-        R, l = self.tree(node)
+        self.nodes[node] = own = self._node(node)
+        R, l = own.tree
         matrix, offset, link = seat.matrix @ R, seat.offset + seat.matrix @ l, seat.link
         index = scene.hinge_of[node]
         hinge, dof, coordinate = scene.hinges[index], int(scene.qd_start[index]), int(scene.q_start[index])
-        label = scene.body_labels[node]
+        label, armatures = scene.body_labels[node], self._values["joint_armature"].tolist()
         if hinge.motion == SCREWS:
             for i in range(hinge.dof_count):
                 align = _aligned(scene.dof_axis[dof + i])
                 angular, linear = float(scene.dof_angular[dof + i]), float(scene.dof_linear[dof + i])
                 motion = SLIDE if angular == 0.0 else TURN if linear == 0.0 else HELIX
                 pitch = linear / angular if motion is HELIX else 0.0
-                armature = (self._armature(dof + i),)
+                armature = (armatures[dof + i],)
                 link = self._append(link, motion, matrix @ align, offset, pitch, (dof + i,), coordinate + i, armature,
                                     node, label)
                 matrix, offset = align.T, ZERO
@@ -200,14 +236,14 @@ class Links:
         else:
             count = hinge.dof_count
             dofs = tuple(range(dof, dof + count))
-            armature = tuple(self._armature(i) for i in dofs)
+            armature = tuple(armatures[dof : dof + count])
             link = self._append(link, hinge.motion, matrix, offset, 0.0, dofs, coordinate, armature, node, label)
             if hinge.motion == FREE:  # its frame sits at the centre of mass: its six rates are then six unit vectors
-                link.com = self.com(node)
+                link.com = own.com
             rest = Seat(link, IDENTITY, -link.com)
         self.seats[node] = rest
         if rest.link is not None:
-            rest.link.add(Pose(None, rest.matrix, rest.offset).rigid_to_parent(self.rigid(node)))
+            rest.link.add(Pose(None, rest.matrix, rest.offset).rigid_to_parent(own.rigid))
 
     def _append(self, parent: Link | None, motion: Any, matrix: Matrix, offset: Vector, pitch: float,
                 dofs: tuple, coordinate: int, armature: tuple, node: int, label: str) -> Link:
@@ -262,21 +298,38 @@ def quaternion_rotation(x: Value, y: Value, z: Value, w: Value) -> Matrix:
     )
 
 
+def _numbers(array: np.ndarray) -> np.ndarray:
+    """``array`` in float64, if no entry is a symbol."""
+    return array.astype(float) if all(map(is_constant, array.flat)) else array
+
+
 def _pose(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    rotation = np.array(quaternion_rotation(*value[3:].tolist()), dtype=float)
-    return rotation, np.array(value[:3])
+    rotation = np.array(quaternion_rotation(*value[3:].tolist()), dtype=object)
+    return _numbers(rotation), _numbers(value[:3])
+
+
+def _changed(values: Any, change: Callable[[Value], Value]) -> Any:
+    """A nest of tuples and dicts with ``change`` made to each scalar; None stays."""
+    if isinstance(values, dict):
+        return {key: _changed(value, change) for key, value in values.items()}
+    if isinstance(values, tuple):
+        items = [_changed(value, change) for value in values]
+        return type(values)(*items) if hasattr(values, "_fields") else type(values)(items)
+    return values if values is None else change(values)
 
 
 def _folded(rotation: np.ndarray) -> Matrix:
-    """A constant rotation; entries that are 0 or 1 but for rounding become so, and fold."""
+    """A rotation; if it is constant, entries that are 0 or 1 but for rounding become so, and fold."""
+    rotation = _numbers(rotation)
+    if rotation.dtype == object:
+        return Matrix.of(rotation.tolist())
     near = np.round(rotation)
     return Matrix.of(np.where(np.abs(rotation - near) < ROUNDING, near, rotation).tolist())
 
 
 def _still(matrix: Matrix) -> Matrix | None:
     """A link's matrix, folded where it is constant; None if it turns nothing."""
-    if all(is_constant(entry) for row in matrix for entry in row):
-        matrix = _folded(np.array(matrix, dtype=float))
+    matrix = _folded(np.array(matrix, dtype=object))
     return None if matrix == IDENTITY else matrix
 
 

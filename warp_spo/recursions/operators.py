@@ -404,7 +404,7 @@ class Operators:
     # -- bodies ----------------------------------------------------------------------------------------------------
     def _momentum(self, node: int, v: Vector) -> Vector:
         self._at(node, "m")
-        return _joined(self.links.rigid(node).apply(*_parts(v)))
+        return _joined(self.links.nodes[node].rigid.apply(*_parts(v)))
 
     def _carried(self, node: int, v: Vector) -> Vector:
         P = self.inertia(node)
@@ -418,7 +418,7 @@ class Operators:
             below.append(stack.pop())
             stack += [child for child in self.scene.tree.children[below[-1]] if child not in self._inertias]
         for node in reversed(below):
-            P = self.links.rigid(node).articulated
+            P = self.links.nodes[node].rigid.articulated
             for child in self.scene.tree.children[node]:
                 link, pose = self.hops(child)[0]
                 done = None if link is None else self.factor(link)
@@ -448,7 +448,7 @@ class Operators:
                 if seat.matrix != IDENTITY or not seat.offset.vanishes:
                     found.append((None, Pose(None, None if seat.matrix == IDENTITY else seat.matrix, seat.offset)))
             else:
-                matrix, offset = self.links.tree(node)
+                matrix, offset = self.links.nodes[node].tree
                 found.append((None, Pose(None, None if matrix == IDENTITY else matrix, offset)))
             self._hops[node] = found
         return self._hops[node]

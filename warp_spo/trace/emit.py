@@ -68,6 +68,7 @@ class Emitter:
         load, store: C++ for reading and writing an entry of an array, given the array's name and the entry's text.
         flat: entry of an array for the index of an input.
         angles: what is done about angles that are too far for the branch-free sine, on CUDA.
+        late: arrays whose entries are loaded where they are first needed, whenever the trace met them.
     """
 
     def __init__(
@@ -77,31 +78,41 @@ class Emitter:
         store: Callable[[str, str, str], str],
         flat: Callable[[str, tuple], int],
         angles: Angles = Angles.FIRST,
+        late: Iterable[str] = (),
     ):
         self.dtype, self._load, self._store, self._flat = dtype, load, store, flat
-        self._angles = angles
+        self._angles, self._late = angles, tuple(late)
         self.counts: Counter = Counter()
         self._names: dict[tuple, str] = {}
         self._count = 0
         self._constants: list[float] = []
         self._indices: list[tuple[str, int]] = []
         self._labels: list[str] = []
+        self._lines: list[str] = []
         self._place: str | None = None
+
+    def branch(self, stores: Iterable[Store]) -> Listing:
+        """A region inside braces: no later one uses what it computes."""
+        known = dict(self._names)
+        listing = self.region(stores)
+        self._names = known
+        return listing
 
     def region(self, stores: Iterable[Store]) -> Listing:
         """Statements that compute and store what is asked for, in the order in which the steps made it."""
         self._constants, self._indices, self._labels, self._place = [], [], [], None
-        lines: list[str] = []
+        lines = self._lines = []
         due: dict[tuple, list[Store]] = {}
-        values = []
+        values, known = [], []
         for item in stores:
             if is_constant(item.value) or item.value.key in self._names:
-                lines.append(self._stored(item))
+                known.append(item)  # at the end: what it overwrites may be read before
             else:
                 values.append(item.value)
                 due.setdefault(item.value.key, []).append(item)
         needed = [scalar for scalar in ordered(values) if scalar.key not in self._names]
         lines += self._near(needed)
+        needed = [scalar for scalar in needed if not self._is_late(scalar) or scalar.key in due]
         for scalar in sorted(needed, key=lambda scalar: scalar.number):
             where, _, step = scalar.step.rpartition("|")
             if where != self._place:
@@ -111,7 +122,10 @@ class Emitter:
             if scalar.key not in self._names:
                 lines += self._statement(scalar, step)
                 self.counts[scalar.op] += 1
-            lines += [self._stored(item) for item in due.get(scalar.key, ())]
+            for item in due.get(scalar.key, ()):
+                self._stored(item)
+        for item in known:
+            self._stored(item)
         return Listing("\n".join(lines), self._constants, self._indices, self._labels)
 
     def _near(self, needed: list[Scalar]) -> list[str]:
@@ -151,6 +165,8 @@ class Emitter:
 
     def _text(self, value: Value) -> str:
         if not is_constant(value):
+            if self._is_late(value) and value.key not in self._names:
+                self._lines += self._statement(value, value.args[0])
             return self._names[value.key]
         self._constants.append(float(value))
         return f"{CONSTANT}{len(self._constants) - 1}\x04"
@@ -159,8 +175,12 @@ class Emitter:
         self._indices.append((array, self._flat(array, index)))
         return f"{INDEX}{len(self._indices) - 1}\x04"
 
-    def _stored(self, item: Store) -> str:
-        return self._store(item.array, self._entry(item.array, item.index), self._text(item.value))
+    def _is_late(self, scalar: Scalar) -> bool:
+        return scalar.op == "input" and scalar.args[0] in self._late
+
+    def _stored(self, item: Store) -> None:
+        entry = self._entry(item.array, item.index)
+        self._lines.append(self._store(item.array, entry, self._text(item.value)))
 
     def _name(self, scalar: Scalar, step: str) -> str:
         self._count += 1

@@ -28,6 +28,10 @@ class Graph:
         self._known: dict[tuple, Scalar] = {}
         self.step = "v"
 
+    @property
+    def empty(self) -> bool:
+        return not self._known
+
     def input(self, array: str, *index: int) -> Scalar:
         """An element of an array that is given at run time."""
         return self.make("input", array, *index)
