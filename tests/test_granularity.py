@@ -404,31 +404,12 @@ def test_angles_that_are_not_numbers(granularity, dtype, bad, device):
 
 
 # -- random trees ------------------------------------------------------------------------------------------------------
-TREES = [(10, 1, 10), (60, 1, 30), (14, 2, 5), (18, 3, 4), (22, 1, 6), (27, 2, 12), (33, 1, 30), (40, 3, 8),
-         (48, 2, 20), (54, 1, 15)]  # fmt: skip
-"""dofs at least, roots, levels at most"""
 QUICK = (0, 2)
 MISSED = {
     1: "60 dof, 26 levels of oblique, turned and offset hinges: medians of qdd and tau 3.3e-7 and 3.8e-7",
     8: "48 dof, 19 levels: median of tau 3.3e-7",
 }
 """Tree -> by how much it misses the line."""
-SERIAL = ("revolute", "revolute", "revolute", "prismatic", "universal", "ball", "cylindrical", "fixed", "planar")
-
-
-def random_tree(seed, dofs, roots, levels):
-    """Of at least so many dofs; branches where chance has it; one root in two floats."""
-    rng = np.random.default_rng(1000 + seed)
-    parents, kinds, level, count = [], [], [], 0
-    while count < dofs or len(parents) < roots:
-        k = len(parents)
-        below = [p for p in range(k) if level[p] < levels]
-        straight = k > 0 and level[-1] < levels and rng.uniform() < (0.9 if levels > 10 else 0.6)
-        parents.append(-1 if k < roots else k - 1 if straight else int(rng.choice(below)))
-        kinds.append(str(rng.choice(SERIAL)) if parents[-1] >= 0 or k % 2 else "free")
-        level.append(1 if parents[-1] < 0 else level[parents[-1]] + 1)
-        count += zoo.random_hinge(rng, kinds[-1], -1, 0).dof_count
-    return zoo.from_parents(parents, kinds, 2000 + seed)
 
 
 def relative(got, wanted):
@@ -445,11 +426,11 @@ def marked(which):
 
 
 @pytest.mark.parametrize("granularity", GRANULARITIES)
-@pytest.mark.parametrize("which", [marked(which) for which in range(len(TREES))])
+@pytest.mark.parametrize("which", [marked(which) for which in range(len(zoo.BRANCHED))])
 def test_random_trees_meet_the_error_line(which, granularity, device):
     """Issue 4: float32 against float64 on the same inputs; float64 against the dense reference in two worlds."""
-    scene, worlds = random_tree(which, *TREES[which]), 200
-    assert scene.tree.depth <= 30 and len(scene.tree.roots) == TREES[which][1]
+    scene, worlds = zoo.branched(which), 200
+    assert scene.tree.depth <= 30 and len(scene.tree.roots) == zoo.BRANCHED[which][1]
     low = spo.Dynamics(scene, worlds, device=device, dtype="float32", granularity=granularity)
     high = spo.Dynamics(scene, worlds, device=device, dtype="float64", granularity="node")
     arrays = states(low)
