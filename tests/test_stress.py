@@ -15,23 +15,12 @@ from granularities import GRANULARITIES, SLOW, skip_unless_served
 
 from benchmarks import stress, stress_checks, stress_measure, stress_scenes
 from benchmarks.exact import Sweep
-from benchmarks.stress_cases import ALLOWED, CASES, choose
+from benchmarks.stress_cases import ALLOWED, CASES, CAUSES, choose
 from benchmarks.stress_scenes import Setting
 from warp_spo import reference
 
-COMPONENT = ("{} times the law: an entry of qdd that nearly cancels carries the rounding of its neighbours; median "
-             "entry 4e-7, worst entry of D 5e-7")
-KNOWN = {
-    ("S18.scale_sep_qdd.r1", "float32"): COMPONENT.format(130),
-    ("S18.scale_sep_qdd.r1", "float64"): COMPONENT.format(91),
-    ("S18.scale_sep_qdd.r0.5", "float32"): COMPONENT.format(42),
-    ("S18.scale_sep_qdd.r0.5", "float64"): COMPONENT.format(64),
-    ("S18.scale_sep_qdd.r0.3", "float32"): COMPONENT.format(210),
-    ("S18.scale_sep_qdd.r0.3", "float64"): COMPONENT.format(220),
-    ("S18.scale_sep_qdd.r0.1", "float32"): COMPONENT.format(19),
-    ("S18.scale_sep_qdd.r0.1", "float64"): COMPONENT.format(12),
-}
-"""(case or check, precision) -> why it fails. One case; three are allowed."""
+KNOWN = {(case.id, dtype): CAUSES[case.name] for case in CASES if case.name in CAUSES for dtype in case.precisions}
+"""(case, precision) -> why it fails. One case; three are allowed."""
 
 
 def marked(value, name, precision, granularity, slow=False):
