@@ -242,6 +242,8 @@ class Programs:
                             WARP * pieces.warps, everything)
         if frame.result.way == DIRECT and frame.result.array.entries > LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
+        if not frame.fits(self.run.dtype):
+            return None  # nor for what limbs tell each other
         team = Team(pieces, dtype)
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
         whole = [item for item in everything if item.array == "out"]
