@@ -17,11 +17,11 @@ import warp as wp
 from . import nodes
 from . import plan as plans
 from . import status as words
-from .applications import Applications
 from .arrays import Call, parse_device, parse_dtype, shape_of
 from .errors import UnsupportedError
 from .frames import Frame, checked
 from .levels import Recursions
+from .loops import EMBEDDED, Loops
 from .parameters import RIGID_VALUES, VARIABLE
 from .programs import Programs
 from .scene import Scene
@@ -56,7 +56,7 @@ OPERATIONS = (
 LOOPS = ("raise", "cut", "embed", "multipliers")
 
 
-class Dynamics(Applications):
+class Dynamics(Loops):
     """Dynamics of one scene in many worlds.
 
     Arrays are torch tensors, Warp arrays or NumPy arrays, [world, ...] and C-contiguous; the kind of the first one is
@@ -71,7 +71,10 @@ class Dynamics(Applications):
         dtype: "float32" or "float64".
         variable: names of values that :meth:`set` changes without rebuilding, one row a world.
         granularity: None (the plan chooses), "node", "segment" or "tree", see :class:`warp_spo.plan.Plan`.
-        loops: what to do with the scene's loop joints: "raise" or "cut", which leaves them open.
+        loops: what to do with the scene's loop joints and couplings. "raise": loop joints are refused. "cut": they stay
+            open. "embed": they hold, what they tie being one node of the tree; mass_matrix and its relatives are then
+            of :attr:`independent_dofs`. "multipliers": they hold by multipliers of the open tree in forward_dynamics;
+            mass_matrix, inverse_dynamics and the others remain the open tree's. "raise" and "cut" ignore couplings.
 
     Raises:
         ValueError, UnsupportedError: see each argument.
@@ -102,6 +105,7 @@ class Dynamics(Applications):
         self.granularity = self.plan.granularity
         self.recursions = Recursions(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)
+        self._close(loops)
 
     # -- values ----------------------------------------------------------------------------------------------------
     def set(self, **values: Any) -> None:
@@ -225,6 +229,8 @@ class Dynamics(Applications):
                 * 3 = digits lost: an estimate from above says that D keeps fewer than half of the dtype's digits,
                   perhaps none. The result stands: use float64 for such worlds, give light links armature, and lay
                   hinge axes along the axes of the anchors.
+                * 6 = the loops' closures lose rank here, or half of the dtype's digits: a change point. The result is
+                  NaN where rank is lost, and stands otherwise. Use float64, or stay away from there.
                 * 0 = none of these. A pair of tau and gravity that nearly cancel can still lose digits, as in any
                   subtraction: let gravity and wrenches enter by the scene and body_f, not by tau.
 
@@ -240,18 +246,24 @@ class Dynamics(Applications):
             body_f = self._read_body_f(call, body_f)
             status = call.update("status", status, (self.worlds,), "[world]", dtype=wp.int32)
             out = call.write(out, (self.worlds, self.scene.dof_count), "[world, dof]")
-            swept = self._run("forward_dynamics", out, q=q, qd=qd, tau=tau, body_f=body_f)
-            if status is not None:
-                words.write(self.recursions, q, qd, tau, body_f, out, status, factored=swept)
+            if self.closed:
+                self._closed_forward_dynamics(out, status, q, qd, tau, body_f)
+            else:
+                swept = self._run("forward_dynamics", out, q=q, qd=qd, tau=tau, body_f=body_f)
+                if status is not None:
+                    words.write(self.recursions, q, qd, tau, body_f, out, status, factored=swept)
         return call.result
 
     def inverse_dynamics(self, q: Any, qd: Any = None, qdd: Any = None, body_f: Any = None, out: Any = None) -> Any:
         """Forces that give the accelerations ``qdd``: tau = Mass qdd + bias_force, by the Newton-Euler recursion.
 
+        With loops embedded, forces on the independent dofs that do what forces on all dofs would, X* tau; of qdd only
+        the independent entries are read, the others follow. So do bias_force and gravity_force.
+
         Args: as :meth:`forward_dynamics`; qdd [world, dof], None is zero.
 
         Returns:
-            tau [world, dof].
+            tau [world, dof]; with loops embedded [world, independent dof].
         """
         return self._newton_euler("inverse_dynamics", q, qd, qdd, body_f, out)
 
@@ -268,15 +280,18 @@ class Dynamics(Applications):
             q, qd = self._read_state(call, q, qd)
             qdd = self._read_rate(call, "qdd", qdd)
             body_f = self._read_body_f(call, body_f)
-            out = call.write(out, (self.worlds, self.scene.dof_count), "[world, dof]")
+            out = call.write(out, (self.worlds, self._minimal), "[world, dof]")
             self._run("inverse_dynamics", out, q=q, qd=qd, qdd=qdd, body_f=body_f)
         return call.result
 
     def mass_matrix(self, q: Any, out: Any = None) -> Any:
-        """Mass = H phi M phi* H* + Delta, armature included, both triangles [world, dof, dof]; composite bodies."""
+        """Mass = H phi M phi* H* + Delta, armature included, both triangles [world, dof, dof]; composite bodies.
+
+        With loops embedded X* Mass X [world, independent dof, independent dof], of the kinetic energy that is left.
+        """
         with self._call("mass_matrix") as call:
             q, _ = self._read_state(call, q, None)
-            dofs = self.scene.dof_count
+            dofs = self._minimal
             out = call.write(out, (self.worlds, dofs, dofs), "[world, dof, dof]")
             self._run("mass_matrix", out, q=q)
         return call.result
@@ -285,19 +300,24 @@ class Dynamics(Applications):
         """Mass^-1 = [I - H psi K]* D^-1 [I - H psi K] (eq. 1), both triangles [world, dof, dof]."""
         with self._call("mass_matrix_inverse") as call:
             q, _ = self._read_state(call, q, None)
-            dofs = self.scene.dof_count
+            dofs = self._minimal
             out = call.write(out, (self.worlds, dofs, dofs), "[world, dof, dof]")
             self._run("mass_matrix_inverse", out, q=q)
         return call.result
 
     def solve_mass_matrix(self, q: Any, b: Any, out: Any = None) -> Any:
-        """Mass^-1 b in O(dof) a column; b and the result [world, dof] or [world, dof, columns]."""
+        """Mass^-1 b in O(dof) a column; b and the result [world, dof] or [world, dof, columns].
+
+        With loops embedded Mass is that of the independent dofs, and b [world, independent dof].
+        """
         with self._call("solve_mass_matrix") as call:
             q, _ = self._read_state(call, q, None)
-            shape: tuple = (self.worlds, self.scene.dof_count)
+            shape: tuple = (self.worlds, self._minimal)
             if hasattr(b, "shape") and len(b.shape) == 3:
                 shape = (*shape, b.shape[2])
             b = call.read("b", b, shape, "[world, dof] or [world, dof, columns]")
+            if self.embedding is not None and len(shape) == 3:
+                raise UnsupportedError(call.name, "several columns with loops='embed'", "call it for one at a time")
             out = call.write(out, shape, "like b")
             self._run("solve_mass_matrix", out, q=q, b=b)
         return call.result
@@ -380,6 +400,7 @@ class Dynamics(Applications):
     # -- operators -------------------------------------------------------------------------------------------------
     def operators(self, q: Any) -> SpatialOperators:
         """The paper's operators at ``q``: phi, psi, H, K, D, G, M, P, Delta ...; their ``update(q)`` refills them."""
+        self._check_operation("operators")
         operators = SpatialOperators(self.recursions, self.programs)
         operators.update(q)
         return operators
@@ -397,7 +418,7 @@ class Dynamics(Applications):
             f"levels       {len(widths)} of {min(widths)} to {max(widths)} nodes, {len(tree.segments)} segments",
             f"variable     {', '.join(self.variable) or 'nothing'}",
             f"gravity      {'none' if gravity is None else 'acceleration of the inertial frame'}",
-            f"loops        {len(scene.loops)} left open" if scene.loops else "loops        none",
+            f"loops        {self._loops_explained()}",
             f"workspace    {memory:.1f} MiB so far",
         ]
         return "\n".join(lines + self.programs.described())
@@ -408,12 +429,25 @@ class Dynamics(Applications):
         return self.programs.operation_counts
 
     # -- steps -----------------------------------------------------------------------------------------------------
+    def _loops_explained(self) -> str:
+        scene = self.scene
+        if not scene.loops and not scene.couplings:
+            return "none"
+        tied = f"{len(scene.loops)} loop joint(s), {len(scene.couplings)} coupling(s)"
+        if self.embedding is not None:
+            rows = len(self.embedding.rows)
+            return f"{tied} embedded: {rows} of {self.closure_rows} rows count, {self._minimal} dofs are independent"
+        return f"{tied} by {self.closure_rows} multipliers" if self.closed else f"{tied} left open"
+
     def _run(self, operation: str, out: wp.array, **given: Any) -> bool:
         """Launch an operation on what is given; None is not. Arrays [world, ...]; the rest are options.
 
         Returns:
             Whether it ran as sweeps, which leave what they found in the workspace.
         """
+        if self.embedding is not None and operation in EMBEDDED:
+            self._launch(f"embedded_{operation}", out, how=self.embedding, **given)
+            return False
         arrays = {name: value for name, value in given.items() if isinstance(value, wp.array)}
         options = {name: value for name, value in given.items() if value is not None and name not in arrays}
         shapes = {name: array.shape for name, array in arrays.items()}
@@ -425,6 +459,7 @@ class Dynamics(Applications):
         return program is None
 
     def _call(self, name: str) -> Call:
+        self._check_operation(name)
         return Call(f"Dynamics.{name}", self.device, self.dtype)
 
     def _read_state(self, call: Call, q: Any, qd: Any, optional: bool = True) -> tuple[wp.array, Any]:
@@ -474,11 +509,9 @@ def _variable_names(variable: Any) -> tuple[str, ...]:
 def _check_loops(scene: Scene, loops: str) -> None:
     if loops not in LOOPS:
         raise ValueError(f"Dynamics: loops is {loops!r}; expected one of {', '.join(LOOPS)}")
-    if loops in ("embed", "multipliers"):
-        raise UnsupportedError("Dynamics", f"loops={loops!r}", "loops='cut' leaves loop joints open")
     if scene.loops and loops == "raise":
         names = ", ".join(loop.label or f"body {loop.parent} to body {loop.child}" for loop in scene.loops)
         raise ValueError(
             f"Dynamics: the scene has {len(scene.loops)} loop joint(s): {names}; expected a tree; loops='cut' leaves "
-            f"them open"
+            f"them open, loops='embed' and loops='multipliers' close them"
         )

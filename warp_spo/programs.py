@@ -16,8 +16,8 @@ from .kernels import straight
 from .kernels.straight import DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
 from .levels import Recursions
 from .plan import MOST_WARPS, TREE_ONLY, Plan
-from .recursions.applications import Applications
 from .recursions.links import Links
+from .recursions.multipliers import Multipliers
 from .recursions.operators import meet, written
 from .recursions.pieces import Piece, Pieces
 from .recursions.traced import SENT, Trace
@@ -158,7 +158,7 @@ class Programs:
         return self._tree_program(operation, links, {**shapes, **more}, tuple(more), options)
 
     def _tree_program(self, operation: str, links: Links, shapes: dict, more: tuple, options: dict) -> Program:
-        trace = Applications(links, self.run.dtype.__name__, tuple(shapes))
+        trace = Multipliers(links, self.run.dtype.__name__, tuple(shapes))
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         frame = self._frame([item for item in stores if item.array == "out"], shapes, 0, 1, self.block, stores)

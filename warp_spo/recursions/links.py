@@ -137,6 +137,15 @@ class Links:
         R, p = self._poses["joint_X_c"][self.scene.hinge_of[node]]
         return _folded(R), Vector(p.tolist())
 
+    def seat(self, body: int, pose: np.ndarray) -> Seat:
+        """Where a frame of a body, or with -1 of the inertial frame, sits."""
+        R, p = _pose(pose)
+        if body < 0:
+            return Seat(None, _folded(R), Vector(p.tolist()))
+        seat, (R_body, p_body) = self.seats[body], self.anchor(body)
+        axes = seat.matrix @ R_body.T
+        return Seat(seat.link, axes @ _folded(R), seat.offset + axes @ (Vector(p.tolist()) - p_body))
+
     def com(self, node: int) -> Vector:
         """Centre of mass in the node frame."""
         if self._varies_com:

@@ -194,9 +194,9 @@ class Trace:
                 stores += self.send("a", (*alpha[key][0], *alpha[key][1]))
         return stores
 
-    def inverse_dynamics(self) -> list[Store]:
-        """out = Mass qdd + bias_force"""
-        qdd, moves = self.vector("qdd"), "qd" in self.given
+    def inverse_dynamics(self, qdd: Callable[[int], Value] | None = None) -> list[Store]:
+        """out = Mass qdd + bias_force, for ``qdd`` or the array of that name"""
+        qdd, moves = qdd or self.vector("qdd"), "qd" in self.given
         alpha: dict[int, tuple[Vector, Vector]] = {}
         forces: dict[int, Vector] = {}
         stores = []
