@@ -1,4 +1,4 @@
-"""Multipliers of loops: symmetric positive semidefinite systems of any rank, a thread a world; and their status word."""
+"""Multipliers of loops: symmetric positive semidefinite systems of any rank, a thread a world; the status of loops."""
 
 import functools
 

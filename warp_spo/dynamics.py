@@ -75,6 +75,8 @@ class Dynamics(Loops):
             open. "embed": they hold, what they tie being one node of the tree; mass_matrix and its relatives are then
             of :attr:`independent_dofs`. "multipliers": they hold by multipliers of the open tree in forward_dynamics;
             mass_matrix, inverse_dynamics and the others remain the open tree's. "raise" and "cut" ignore couplings.
+        independent: with loops embedded, the dofs (indices or labels) that are to be :attr:`independent_dofs`, such as
+            those that have motors: as many as move, those that no loop ties among them. None: they are chosen.
 
     Raises:
         ValueError, UnsupportedError: see each argument.
@@ -89,6 +91,7 @@ class Dynamics(Loops):
         variable: Sequence[str] = (),
         granularity: str | None = None,
         loops: str = "raise",
+        independent: Sequence[int | str] | None = None,
     ):
         if not isinstance(scene, Scene):
             raise TypeError(
@@ -105,7 +108,7 @@ class Dynamics(Loops):
         self.granularity = self.plan.granularity
         self.recursions = Recursions(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)
-        self._close(loops)
+        self._close(loops, independent)
 
     # -- values ----------------------------------------------------------------------------------------------------
     def set(self, **values: Any) -> None:

@@ -6,6 +6,7 @@ Jacobians of the closures say there. The draw is the same every time.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ SAMPLES = 64
 STEPS = 60
 CLOSED = 1e-9  # largest g of a configuration that counts as closed [m, rad]
 RANK = 1e-7  # singular values below this share of the largest are zero
+WORST = 0.1  # share of the draws that a choice may serve worse than it is said to
+NEARLY = 0.3  # share of the best choice's hold that an earlier dof must have
 MOST_DOFS = 32  # of a cluster: its D costs their cube, in straight-line code
 
 
@@ -100,13 +103,14 @@ def drawn(scene: Scene, count: int, seed: int = 0) -> np.ndarray:
     return q
 
 
-def embedding(scene: Scene, call: str = "Dynamics") -> Embedding:
-    """The rows that count, and the independent dofs of the scene: those that move the others best in the worst draw.
+def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str = "Dynamics") -> Embedding:
+    """The rows that count, and the independent dofs: those ``asked`` for, or the first ones that move all others well.
 
     Raises:
-        ValueError: no configuration was found that closes all loops.
+        ValueError: no configuration was found that closes all loops, or the dofs asked for do not move all others.
         UnsupportedError: more dofs in a cluster than straight-line code is good for.
     """
+    wanted = None if asked is None else _numbers(scene, asked, call)
     closing = Closing(scene)
     clusters = closing.trace.clusters
     for cluster in clusters:
@@ -124,27 +128,71 @@ def embedding(scene: Scene, call: str = "Dynamics") -> Embedding:
     free = set(range(scene.dof_count))
     for cluster in clusters:
         numbers, dofs = np.array(cluster.rows, dtype=int), np.array(cluster.dofs, dtype=int)
-        kept, independent = _chosen(Y[:, numbers][:, :, dofs])
+        kept, X = _spanning(Y[:, numbers][:, :, dofs])
         rows += numbers[kept].tolist()
+        if wanted is None:
+            independent = _independent(X)
+        else:
+            independent = [i for i, dof in enumerate(dofs.tolist()) if dof in wanted]
+            if len(independent) != X.shape[2] or not (_hold(X, independent) > RANK).any():
+                labels = [scene.dof_labels[dof] for dof in dofs]
+                raise ValueError(f"{call}: independent names {[labels[i] for i in independent]} of the dofs that move "
+                                 f"together, {labels}; expected {X.shape[2]} that move all of them")
         free -= set(dofs.tolist()) - set(dofs[independent].tolist())
+    if wanted is not None and free != wanted:
+        missing = [scene.dof_labels[dof] for dof in sorted(free - wanted)]
+        raise ValueError(f"{call}: independent leaves out {missing}, which no loop ties; expected them too")
     return Embedding(tuple(sorted(rows)), tuple(sorted(free)))
 
 
-def _chosen(Y: np.ndarray) -> tuple[list[int], list[int]]:
-    """Rows that span all of them, and columns that are free, of Y [draw, row, column]."""
+def _numbers(scene: Scene, asked: Sequence[int | str], call: str) -> set[int]:
+    labels, found = scene.dof_labels, set()
+    for dof in asked:
+        number = labels.index(dof) if isinstance(dof, str) and dof in labels else dof
+        if isinstance(number, str) or not 0 <= number < scene.dof_count:
+            raise ValueError(f"{call}: independent names {dof!r}; expected dofs, 0 to {scene.dof_count - 1}, or labels "
+                             f"among {', '.join(labels)}")
+        found.add(int(number))
+    return found
+
+
+def _spanning(Y: np.ndarray) -> tuple[list[int], np.ndarray]:
+    """Rows that span all of them, of Y [draw, row, column], and orthonormal X [draw, column, free] with Y X = 0."""
     singular = np.linalg.svd(Y, compute_uv=False)
     ranks = (singular > RANK * singular[:, :1]).sum(axis=1)
     rank = int(ranks.max(initial=0))
     if rank == 0:
-        return [], list(range(Y.shape[2]))
+        return [], np.tile(np.eye(Y.shape[2]), (len(Y), 1, 1))
     Y = Y[ranks == rank]
-    subsets = [_pivots(y, rank) for y in Y]
-    rows = _best(subsets, lambda subset: np.linalg.svd(Y[:, subset], compute_uv=False)[:, -1])
-    if rank == Y.shape[2]:
-        return rows, []
-    X = np.linalg.svd(Y[:, rows])[2][:, rank:].transpose(0, 2, 1)  # [draw, column, free]
-    subsets = [_pivots(x, x.shape[1]) for x in X]
-    return rows, _best(subsets, lambda subset: np.linalg.svd(X[:, subset], compute_uv=False)[:, -1])
+    measure = lambda rows: np.quantile(np.linalg.svd(Y[:, rows], compute_uv=False)[:, -1], WORST)  # noqa: E731
+    rows = list(max(sorted({tuple(_pivots(y, rank)) for y in Y}), key=lambda rows: float(measure(list(rows)))))
+    return rows, np.linalg.svd(Y[:, rows])[2][:, rank:].transpose(0, 2, 1)
+
+
+def _hold(X: np.ndarray, dofs: list[int]) -> np.ndarray:
+    """How well some dofs hold the others, by draw: nothing where they do not; whatever the units of a dof are."""
+    scale = np.sqrt((X**2).sum(axis=2).mean(axis=0))
+    if not dofs:
+        return np.ones(len(X))
+    if not scale[dofs].all():
+        return np.zeros(len(X))
+    return np.linalg.svd(X[:, dofs] / scale[dofs][:, None], compute_uv=False)[:, -1]
+
+
+def _independent(X: np.ndarray) -> list[int]:
+    """The first dofs that hold the others nearly as well as any: in the worst tenth of the draws."""
+    count = X.shape[2]
+    measure = lambda dofs: float(np.quantile(_hold(X, list(dofs)), WORST))  # noqa: E731
+    subsets = {tuple(_pivots(x, count)) for x in X}
+    for least in (0.3, 0.1, 0.03):
+        greedy: list[int] = []
+        for dof in range(X.shape[1]):
+            if len(greedy) < count and measure([*greedy, dof]) > least:
+                greedy.append(dof)
+        if len(greedy) == count:
+            subsets.add(tuple(greedy))
+    best = max(map(measure, subsets))
+    return list(min(subset for subset in subsets if measure(subset) >= NEARLY * best))
 
 
 def _pivots(A: np.ndarray, count: int) -> list[int]:
@@ -157,9 +205,3 @@ def _pivots(A: np.ndarray, count: int) -> list[int]:
         unit = left[row] / lengths[row]
         left = left - np.outer(left @ unit, unit)
     return sorted(found)
-
-
-def _best(subsets: list[list[int]], measure: Any) -> list[int]:
-    """The subset whose smallest singular value is largest where it is smallest: in the lower tenth of the draws."""
-    unique = sorted({tuple(subset) for subset in subsets})
-    return list(max(unique, key=lambda subset: float(np.quantile(measure(list(subset)), 0.1))))

@@ -49,10 +49,12 @@ class Loops(Applications):
     dtype: Any
     embedding: Embedding | None
 
-    def _close(self, loops: str) -> None:
+    def _close(self, loops: str, independent: Any) -> None:
         self.loops = loops
         self.closed = loops in ("embed", "multipliers") and bool(self.scene.loops or self.scene.couplings)
-        self.embedding = embedding(self.scene) if self.closed and loops == "embed" else None
+        if independent is not None and not (self.closed and loops == "embed"):
+            raise ValueError("Dynamics: independent= belongs to loops='embed' of a scene with loops or couplings")
+        self.embedding = embedding(self.scene, independent) if self.closed and loops == "embed" else None
         if self.closed:
             declare(kernels, self.dtype)
 
@@ -60,8 +62,8 @@ class Loops(Applications):
     def independent_dofs(self) -> np.ndarray:
         """Dofs that move all others where loops are embedded: the minimal coordinates, ascending [independent dof].
 
-        They are chosen when the object is made, by random configurations that close the loops: the dofs on which the
-        others depend least in the worst of them. Only mass_matrix, mass_matrix_inverse, solve_mass_matrix and
+        Those that ``Dynamics(independent=...)`` names. Otherwise they are chosen when the object is made, by random
+        configurations that close the loops: the first dofs that hold the others nearly as well as any do. Only mass_matrix, mass_matrix_inverse, solve_mass_matrix and
         inverse_dynamics speak of them, and are NaN where they lose their hold on the others (the dead point of a
         rocker); forward_dynamics passes such points.
         """
