@@ -5,13 +5,18 @@ the cut tree, their Jacobian and their second derivative along the motion are fi
 redundant rows are solved by least squares.
 """
 
+import functools
+import importlib
+from typing import NamedTuple
+
 import numpy as np
 import zoo
 
 import warp_spo as spo
+from warp_spo.embedding import Closing, drawn
+from warp_spo.examples.parts import at, bar
 from warp_spo.reference import Dense, homogeneous, pose7, rotation_vector
 
-IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 FIRST = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}  # weights of a first derivative, odd
 SECOND = {0: -205 / 72, 1: 8 / 5, 2: -1 / 5, 3: 8 / 315, 4: -1 / 560}  # of a second one, even
 STEP = 0.02
@@ -104,31 +109,114 @@ class Closed:
 
 
 # -- mechanisms --------------------------------------------------------------------------------------------------------
-def bar(length, mass=1.0, axis=0, label=""):
-    """A bar from its body's origin along one of its axes, a little thick, with its CoM a little off."""
-    com = np.full(3, 0.02 * length)
-    com[axis] = 0.5 * length
-    inertia = np.full(3, mass * length**2 / 12.0)
-    inertia[axis] *= 0.05
-    return spo.Body(mass, com, np.diag(inertia), label=label)
+def tilted(kind="revolute", seed=3, **more):
+    """A planar four-bar whose plane, anchors and bodies lie askew: nothing folds, and the rows stay redundant.
 
-
-def at(*position):
-    return (*position, 0.0, 0.0, 0.0, 1.0)
-
-
-def fourbar(ground=1.0, crank=0.4, coupler=0.9, rocker=0.7, kind="revolute", turn=IDENTITY, **more):
-    """Crank, coupler and rocker in the xz plane, hinges about y; the rocker's tip closes on the ground."""
+    kind "fixed": the rocker's tip carries one hinge more and is welded to the ground, six rows for three dofs.
+    """
+    rng = np.random.default_rng(seed)
+    world = zoo.random_pose(rng)
+    frames = [zoo.random_pose(rng) for _ in range(4)]  # of the joints in the bodies
+    lengths, turn = (0.4, 0.9, 0.7, 0.01), dict(axis=(0, 1, 0))
+    count = 4 if kind == "fixed" else 3
+    place = lambda *poses: pose7(np.linalg.multi_dot([np.eye(4), *map(homogeneous, poses)]))  # noqa: E731
     hinges = [
-        spo.Hinge("revolute", -1, 0, axis=(0, 1, 0), parent_pose=turn, **more),
-        spo.Hinge("revolute", 0, 1, axis=(0, 1, 0), parent_pose=at(crank, 0, 0), **more),
-        spo.Hinge("revolute", 1, 2, axis=(0, 1, 0), parent_pose=at(coupler, 0, 0), **more),
+        spo.Hinge("revolute", k - 1, k, parent_pose=place(frames[k - 1], at(lengths[k - 1])) if k else world,
+                  child_pose=frames[k], **turn, **more)
+        for k in range(count)
     ]
-    axis = {"axis": (0, 1, 0)} if kind == "revolute" else {}
-    rotated = homogeneous(np.array(turn)) @ homogeneous(np.array(at(ground, 0, 0)))
-    end = (*rotated[:3, 3], *turn[3:])
-    loop = spo.Loop(kind, -1, 2, parent_pose=end, child_pose=at(rocker, 0, 0), label="closing", **axis)
-    return spo.Scene([bar(crank), bar(coupler), bar(rocker)], hinges, loops=[loop])
+    axis = turn if kind == "revolute" else {}
+    loop = spo.Loop(kind, -1, count - 1, parent_pose=place(world, at(1.0)),
+                    child_pose=place(frames[count - 1], at(lengths[count - 1] if count == 3 else 0.0)), **axis)
+    return spo.Scene([zoo.random_body(rng) for _ in range(count)], hinges, loops=[loop])
+
+
+def parallelogram():
+    """S24: opposite bars of 0.4 and of 1 m; flat at q = 0, where it may fold the other way."""
+    hinges = [spo.Hinge("revolute", k - 1, k, axis=(0, 1, 0), parent_pose=at((0.4, 1.0)[k - 1] if k else 0.0))
+              for k in range(3)]
+    loop = spo.Loop("revolute", -1, 2, axis=(0, 1, 0), parent_pose=at(1.0), child_pose=at(0.4))
+    return spo.Scene([bar(0.4), bar(1.0), bar(0.4)], hinges, loops=[loop])
+
+
+def cassie_leg():
+    """A floating pelvis, a leg with a sprung shin and heel, a rod from thigh to heel, and a foot driven by a rod."""
+    y, z, universal = dict(axis=(0, 1, 0)), dict(axis=(0, 0, 1)), dict(axis=((0, 1, 0), (0, 0, 1)))
+    names = ["pelvis", "roll", "yaw", "thigh", "knee", "shin", "tarsus", "heel", "achilles", "crank", "plantar", "foot"]
+    masses = [10.0, 1.8, 1.2, 5.5, 0.8, 0.6, 0.8, 0.1, 0.2, 0.1, 0.1, 0.2]
+    bodies = [bar(0.3, mass, label=name) for mass, name in zip(masses, names, strict=True)]
+    hinges = [
+        spo.Hinge("free", -1, 0),
+        spo.Hinge("revolute", 0, 1, axis=(1, 0, 0), parent_pose=at(0.02, 0.13, 0.0)),
+        spo.Hinge("revolute", 1, 2, **z, parent_pose=at(-0.07)),
+        spo.Hinge("revolute", 2, 3, **y, parent_pose=at(0.0, 0.0, -0.09)),
+        spo.Hinge("revolute", 3, 4, **y, parent_pose=at(0.12, 0.0, 0.004), armature=0.01),
+        spo.Hinge("revolute", 4, 5, **y, parent_pose=at(0.06, 0.05, 0.0), stiffness=1500.0),
+        spo.Hinge("revolute", 5, 6, **y, parent_pose=at(0.43, 0.02, 0.0)),
+        spo.Hinge("revolute", 6, 7, **y, parent_pose=at(-0.01, -0.03, 0.0), stiffness=1250.0),
+        spo.Hinge("universal", 3, 8, **universal, parent_pose=at(0.0, 0.0, 0.05)),
+        spo.Hinge("revolute", 6, 9, **y, parent_pose=at(0.06, -0.03, 0.0), armature=0.01),
+        spo.Hinge("universal", 9, 10, **universal, parent_pose=at(0.055)),
+        spo.Hinge("revolute", 6, 11, **y, parent_pose=at(0.41, -0.04, 0.0)),
+    ]
+    loops = [
+        spo.Loop("ball", 7, 8, parent_pose=at(0.11, -0.03, 0.05), child_pose=at(0.65)),
+        spo.Loop("ball", 10, 11, parent_pose=at(0.36), child_pose=at(0.055)),
+    ]
+    return spo.Scene(bodies, hinges, loops=loops)
+
+
+def far_loop():
+    """A floating chain whose tip stands on the ground by a ball, and a coupling along the chain."""
+    open_scene = zoo.from_parents([-1, 0, 1, 2], ["free", "revolute", "revolute", "universal"], 31)
+    loop = spo.Loop("ball", -1, 3, parent_pose=at(0.4, 0.2, 0.1), child_pose=at(0.1, 0.2))
+    coupling = spo.Coupling(2, 1, -1.5, 0.2)
+    return spo.Scene(open_scene.bodies, open_scene.hinges, loops=[loop], couplings=[coupling])
+
+
+def ancestors():
+    """Mimics along one chain, a mimic of a mimic, and a leader that comes after its follower."""
+    kinds = ["universal", "revolute", "prismatic", "revolute", "revolute", "ball"]
+    open_scene = zoo.from_parents([-1, 0, 1, 2, 0, 4], kinds, 37)
+    couplings = [spo.Coupling(3, 1, 0.7, 0.1), spo.Coupling(1, 4, -2.0), spo.Coupling(2, 3, 0.3)]
+    return spo.Scene(open_scene.bodies, open_scene.hinges, couplings=couplings)
+
+
+MECHANISMS = {name: getattr(importlib.import_module(f"warp_spo.examples.{name}"), "scene")
+              for name in ("fourbar", "fivebar", "slider_crank", "stewart", "biped", "gripper")}
+MECHANISMS |= {
+    "tilted": tilted,
+    "tilted, a ball": functools.partial(tilted, "ball"),
+    "tilted, a weld": functools.partial(tilted, "fixed"),
+    "parallelogram": parallelogram,
+    "cassie_leg": cassie_leg,
+    "far_loop": far_loop,
+    "ancestors": ancestors,
+}
+
+
+class States(NamedTuple):
+    """Consistent states of a scene [world, ...], and what acts on it."""
+
+    q: np.ndarray
+    qd: np.ndarray
+    tau: np.ndarray
+    qdd: np.ndarray
+    body_f: np.ndarray
+
+
+def states(scene, worlds=3, seed=1, q=None):
+    """States near the middle of the range, each closed: positions by the package, whose closure the reference checks."""
+    rng = np.random.default_rng(seed)
+    if q is None:
+        q = Closing(scene).closed(drawn(scene, 64, seed))
+        q = q[rng.permutation(len(q))][:worlds]
+    assert len(q) == worlds, "too few configurations could be closed"
+    closed = [Closed(scene, x) for x in q]
+    assert max(np.abs(c.error).max(initial=0.0) for c in closed) < 1e-8
+    qd = np.array([c.consistent(rng.normal(size=scene.dof_count)) for c in closed])
+    tau, qdd = rng.normal(size=(2, worlds, scene.dof_count))
+    return States(q, qd, tau, qdd, rng.normal(size=(worlds, scene.body_count, 6)))
 
 
 def random_closed(n, seed, kinds, hinge_kinds=("revolute", "prismatic", "universal", "ball"), couplings=0, roots=1,
