@@ -16,9 +16,10 @@ NOISE = 32.0  # times rows and eps: eigenvalues below this share of the largest 
 def least_norm(T) -> wp.Kernel:
     """out = -A^+ right, rank = how many eigenvalues of A are not zero; A [world, n, n] is destroyed.
 
-    A is scaled to a unit diagonal, d^-1/2 A d^-1/2 = V E V*, by cyclic Jacobi rotations in a fixed order. Of all that
-    solve A x = -right, or come nearest, out is the one with the least sum of d x^2: no choice of units changes it.
-    resolved = the smallest eigenvalue that counts, over the largest.
+    Rows are measured by their ``size``, s: s^-1/2 A s^-1/2 = V E V*, by cyclic Jacobi rotations in a fixed order. Of all
+    that solve A x = -right, or come nearest, out is the one with the least sum of s x^2: no choice of units changes it.
+    resolved = the smallest eigenvalue that counts, over the largest. A rank below ``expected`` makes out NaN and
+    resolved 0.
     """
     eps = T(EPSILON[T])
 
@@ -33,6 +34,8 @@ def least_norm(T) -> wp.Kernel:
     def kernel(
         A: wp.array3d[T],
         right: wp.array2d[T],
+        size: wp.array2d[T],
+        expected: int,
         V_out: wp.array3d[T],
         scale_out: wp.array2d[T],
         out: wp.array2d[T],
@@ -43,9 +46,9 @@ def least_norm(T) -> wp.Kernel:
         n = A.shape[1]
         healthy = bool(True)
         for i in range(n):
-            d = A[world, i, i]
-            healthy = healthy and wp.isfinite(d) and wp.isfinite(right[world, i])
-            scale_out[world, i] = wp.where(d > T(0.0), T(1.0) / wp.sqrt(d), T(0.0))
+            s = size[world, i]
+            healthy = healthy and wp.isfinite(A[world, i, i]) and wp.isfinite(right[world, i])
+            scale_out[world, i] = wp.where(s > T(0.0), T(1.0) / wp.sqrt(s), T(0.0))
         for i in range(n):
             for j in range(n):
                 A[world, i, j] = A[world, i, j] * scale_out[world, i] * scale_out[world, j]
@@ -60,12 +63,12 @@ def least_norm(T) -> wp.Kernel:
                             wp.abs(theta) + wp.sqrt(theta * theta + T(1.0))
                         )
                         c = T(1.0) / wp.sqrt(t * t + T(1.0))
-                        s = t * c
+                        sine = t * c
                         for k in range(n):
-                            turn(A, world, k, p, k, q, c, s)
+                            turn(A, world, k, p, k, q, c, sine)
                         for k in range(n):
-                            turn(A, world, p, k, q, k, c, s)
-                            turn(V_out, world, k, p, k, q, c, s)
+                            turn(A, world, p, k, q, k, c, sine)
+                            turn(V_out, world, k, p, k, q, c, sine)
                         A[world, p, q] = T(0.0)
                         A[world, q, p] = T(0.0)
         largest = T(0.0)
@@ -87,6 +90,10 @@ def least_norm(T) -> wp.Kernel:
                     out[world, k] = out[world, k] - V_out[world, k, i] * scale_out[world, k] * (along / value)
         rank_out[world] = rank
         resolved_out[world] = wp.where(largest > T(0.0), smallest / largest, T(1.0))
+        if rank < expected:
+            resolved_out[world] = T(0.0)
+            for i in range(n):
+                out[world, i] = T(wp.nan)
 
     return kernel
 

@@ -103,6 +103,19 @@ def drawn(scene: Scene, count: int, seed: int = 0) -> np.ndarray:
     return q
 
 
+def usual_rank(scene: Scene) -> int:
+    """Independent rows where the loops close, but for change points; 0 if no configuration was found that closes them."""
+    closing = Closing(scene)
+    q = closing.closed(drawn(scene, SAMPLES))
+    if len(q) == 0 or closing.size == 0:
+        return 0
+    Y, rank = closing.at(q)[1], 0
+    for cluster in closing.trace.clusters:
+        singular = np.linalg.svd(Y[:, cluster.rows][:, :, cluster.dofs], compute_uv=False)
+        rank += int((singular > RANK * singular[:, :1]).sum(axis=1).max())
+    return rank
+
+
 def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str = "Dynamics") -> Embedding:
     """The rows that count, and the independent dofs: those ``asked`` for, or the first ones that move all others well.
 

@@ -16,7 +16,7 @@ import warp as wp
 
 from .applications import Applications
 from .arrays import Call
-from .embedding import Closing, embedding
+from .embedding import Closing, embedding, usual_rank
 from .errors import UnsupportedError
 from .kernels import declare
 from .kernels import loops as kernels
@@ -54,6 +54,7 @@ class Loops(Applications):
         self.closed = loops in ("embed", "multipliers") and bool(self.scene.loops or self.scene.couplings)
         if independent is not None and not (self.closed and loops == "embed"):
             raise ValueError("Dynamics: independent= belongs to loops='embed' of a scene with loops or couplings")
+        self._usual_rank = usual_rank(self.scene) if self.closed and loops == "multipliers" else 0
         self.embedding = embedding(self.scene, independent) if self.closed and loops == "embed" else None
         if self.closed:
             declare(kernels, self.dtype)
@@ -141,8 +142,8 @@ class Loops(Applications):
             name = "project_velocity" if rates else "project_position"
             self._launch(name, out, how=self.embedding, held=held, **state)
             return
-        system, right = self._system()
-        self._launch("closure_system", system, {"right": right}, rates=rates, **state)
+        system, more = self._system()
+        self._launch("closure_system", system, more, rates=rates, **state)
         multipliers, _, _ = self._least_norm()
         self._launch("closure_step", out, rates=rates, multipliers=multipliers, **state)
 
@@ -153,15 +154,16 @@ class Loops(Applications):
         """Multipliers of the rows of :meth:`closure_error`, as forward_dynamics finds them (loops="multipliers").
 
         tau + Y* multipliers moves the open tree as the closed loops do: [N] for rows in m, [N m] for rows in rad. Where
-        rows are redundant it is the answer with the least sum of (Y Mass^-1 Y*)(i, i) multipliers(i)^2, whatever the
-        units.
+        rows are redundant it is the answer with the least sum of squares, each weighed by the sum of squares of what
+        the dofs do to its joint, velocities for [m] and angular velocities for [rad]: their units do not matter.
 
         Args:
             q, qd, tau, body_f: as forward_dynamics. out: (multipliers, rank), each an array or None.
 
         Returns:
             multipliers [world, row]; rank [world], int32: how many of the rows are independent, that is eigenvalues of
-            Y Mass^-1 Y*, scaled to a unit diagonal, above 32 rows eps of the largest.
+            Y Mass^-1 Y*, so weighed, above 32 rows eps of the largest. Where they are fewer than where the loops
+            usually close, at a change point, the multipliers are NaN.
         """
         with self._call("loop_multipliers") as call:
             if not self.closed or self.loops != "multipliers":
@@ -177,9 +179,11 @@ class Loops(Applications):
             wp.copy(rank, known)
         return call.result
 
-    def _system(self) -> tuple[wp.array, wp.array]:
+    def _system(self) -> tuple[wp.array, dict[str, wp.array]]:
+        """The matrix [world, row, row]; the right-hand side and the sizes [world, row]."""
         n, run = self.closure_rows, self.recursions
-        return run.array("loop system", self.worlds, n, n), run.array("loop right", self.worlds, n)
+        more = {name: run.array(f"loop {name}", self.worlds, n) for name in ("right", "size")}
+        return run.array("loop system", self.worlds, n, n), more
 
     def _solution(self) -> tuple[wp.array, wp.array, wp.array]:
         """multipliers [world, row], rank [world], resolved [world, 1]."""
@@ -193,16 +197,16 @@ class Loops(Applications):
 
     def _least_norm(self) -> tuple[wp.array, wp.array, wp.array]:
         run, n = self.recursions, self.closure_rows
-        system, right = self._system()
+        system, more = self._system()
         found, rank, resolved = self._solution()
         vectors, scale = run.array("loop vectors", self.worlds, n, n), run.array("loop scale", self.worlds, n)
         outputs = [vectors, scale, found, rank, resolved.reshape((self.worlds,))]
-        run.launch(kernels.least_norm, self.worlds, [system, right], outputs)
+        run.launch(kernels.least_norm, self.worlds, [system, more["right"], more["size"], self._usual_rank], outputs)
         return found, rank, resolved
 
     def _find_multipliers(self, q: Any, qd: Any, tau: Any, body_f: Any) -> None:
-        system, right = self._system()
-        self._launch("loop_system", system, {"right": right}, q=q, qd=qd, tau=tau, body_f=body_f)
+        system, more = self._system()
+        self._launch("loop_system", system, more, q=q, qd=qd, tau=tau, body_f=body_f)
         self._least_norm()
 
     # -- what Dynamics asks for ------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ class Multipliers(Embedded):
         return [{dof: x for dof, x in row.items() if not (x.__class__ is float and x == 0.0)} for row in found]
 
     def loop_system(self) -> list[Store]:
-        """out [row, row] = Y Mass^-1 Y*; right [row] = Y qdd(0) + Y' qd"""
+        """out [row, row] = Y Mass^-1 Y*; right [row] = Y qdd(0) + Y' qd; size [row]"""
         moves = "qd" in self.given
         done, rates, _ = self.reduce(self.vector("tau"), moves, loads=True)
         open_ = {item.index[0]: item.value for item in self.expand(done, rates, self.base)}
@@ -39,7 +39,12 @@ class Multipliers(Embedded):
             self.graph.step = f"loop row {i}|m"
             halves[i] = self._loaded(done, row)
         stores = self._both(self._sandwich(done, halves))
-        return stores + [Store("right", (i,), value) for i, value in enumerate(right)]
+        return stores + [Store("right", (i,), value) for i, value in enumerate(right)] + self._sizes()
+
+    def _sizes(self) -> list[Store]:
+        """size [row]: the square of what each row is a projection of"""
+        sizes = [size for c in self.constraints for size in c.sizes(self.places)]
+        return [Store("size", (i,), value) for i, value in enumerate(sizes)]
 
     def _loaded(self, done: dict[int, articulated.Factor], tau: Columns) -> dict[int, list[Value]]:
         """D^-1 [I - H psi K] tau, by link."""
@@ -73,7 +78,7 @@ class Multipliers(Embedded):
 
     # -- projection ------------------------------------------------------------------------------------------------
     def closure_system(self, rates: bool = False) -> list[Store]:
-        """out [row, row] = Y Y*; right [row] = g, or Y qd."""
+        """out [row, row] = Y Y*; right [row] = g, or Y qd; size [row]"""
         self.place_links()
         rows = self.rows()
         if rates:
@@ -81,7 +86,7 @@ class Multipliers(Embedded):
             right = [total(x * qd(dof) for dof, x in row.items()) for row in rows]
         else:
             right = [g for c in self.constraints for g in c.error(self.places, self.vector("q"))]
-        stores = [Store("right", (i,), value) for i, value in enumerate(right)]
+        stores = [Store("right", (i,), value) for i, value in enumerate(right)] + self._sizes()
         for i, row in enumerate(rows):
             for j, other in enumerate(rows[: i + 1]):
                 value = total(x * other[dof] for dof, x in row.items() if dof in other)
