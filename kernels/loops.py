@@ -16,9 +16,9 @@ NOISE = 32.0  # times rows and eps: eigenvalues below this share of the largest 
 def least_norm(T) -> wp.Kernel:
     """out = -A^+ right, rank = how many eigenvalues of A are not zero; A [world, n, n] is destroyed.
 
-    Rows are measured by their ``size``, s: s^-1/2 A s^-1/2 = V E V*, by cyclic Jacobi rotations in a fixed order. Of all
-    that solve A x = -right, or come nearest, out is the one with the least sum of s x^2: no choice of units changes it.
-    resolved = the smallest eigenvalue that counts, over the largest. A rank below ``expected`` makes out NaN and
+    Rows are measured by their ``size``, s: s^-1/2 A s^-1/2 = V E V*, by cyclic Jacobi rotations in a fixed order. Of
+    all that solve A x = -right, or come nearest, out is the one with the least sum of s x^2: no choice of units changes
+    it. resolved = the smallest eigenvalue that counts, over the largest. A rank below ``expected`` makes out NaN and
     resolved 0.
     """
     eps = T(EPSILON[T])

@@ -13,8 +13,9 @@ import numpy as np
 import zoo
 
 import warp_spo as spo
-from warp_spo.embedding import Closing, drawn
+from warp_spo.embedding import Closing, drawn, embedding
 from warp_spo.examples.parts import at, bar
+from warp_spo.recursions.embedded import Embedding
 from warp_spo.reference import Dense, homogeneous, pose7, rotation_vector
 
 FIRST = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}  # weights of a first derivative, odd
@@ -60,7 +61,7 @@ class Closed:
     def _at(self, qd, t):
         return closure(self.scene, Dense(self.scene, self.dense.integrate(qd, t), world=self.world))
 
-    @property
+    @functools.cached_property
     def jacobian(self):
         columns = [
             sum(w * (self._at(unit, i * STEP) - self._at(unit, -i * STEP)) for i, w in FIRST.items()) / STEP
@@ -182,7 +183,7 @@ def ancestors():
     return spo.Scene(open_scene.bodies, open_scene.hinges, couplings=couplings)
 
 
-MECHANISMS = {name: getattr(importlib.import_module(f"warp_spo.examples.{name}"), "scene")
+MECHANISMS = {name: importlib.import_module(f"warp_spo.examples.{name}").scene
               for name in ("fourbar", "fivebar", "slider_crank", "stewart", "biped", "gripper")}
 MECHANISMS |= {
     "tilted": tilted,
@@ -193,6 +194,22 @@ MECHANISMS |= {
     "far_loop": far_loop,
     "ancestors": ancestors,
 }
+
+
+class Case(NamedTuple):
+    """A mechanism, how it is embedded, three states of it, and the reference at each."""
+
+    scene: spo.Scene
+    how: Embedding
+    states: "States"
+    closed: list
+
+
+@functools.cache
+def case(name):
+    scene = MECHANISMS[name]()
+    s = states(scene)
+    return Case(scene, embedding(scene), s, [Closed(scene, q) for q in s.q])
 
 
 class States(NamedTuple):
@@ -206,7 +223,7 @@ class States(NamedTuple):
 
 
 def states(scene, worlds=3, seed=1, q=None):
-    """States near the middle of the range, each closed: positions by the package, whose closure the reference checks."""
+    """States that differ from world to world, each closed: by the package, whose closure the reference checks."""
     rng = np.random.default_rng(seed)
     if q is None:
         q = Closing(scene).closed(drawn(scene, 64, seed))

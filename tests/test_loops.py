@@ -18,8 +18,8 @@ from mechanisms import MECHANISMS, Closed
 
 import warp_spo as spo
 from warp_spo.embedding import Closing, drawn, embedding
-from warp_spo.examples.parts import at, bar, energy, step
-from warp_spo.recursions import closures, clusters, embedded, motion, nullspace
+from warp_spo.examples.parts import at, bar, energy
+from warp_spo.recursions import closures, clusters, embedded, nullspace
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.multipliers import Multipliers
 from warp_spo.trace.evaluate import evaluate
@@ -58,27 +58,29 @@ def by_multipliers(scene, s, given=LOADED):
     return traced(scene, "loop_forward_dynamics", arrays, (*given, "multipliers"), {"out": (scene.dof_count,)})["out"]
 
 
-def lagrange(scene, s):
-    return np.array([Closed(scene, *row[:1]).forward_dynamics(row[1], row[2], row[4]) for row in zip(*s, strict=True)])
+def lagrange(scene, s, closed=None):
+    closed = closed or [Closed(scene, q) for q in s.q]
+    return np.array([c.forward_dynamics(*row) for c, *row in zip(closed, s.qd, s.tau, s.body_f, strict=True)])
+
+
+LARGE = ("stewart", "biped")
+ALL_BUT_LARGE = [pytest.param(name, marks=pytest.mark.slow) if name in LARGE else name for name in MECHANISMS]
 
 
 # -- against Lagrange --------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name", MECHANISMS)
 def test_forward_dynamics_equals_lagrange(name):
-    scene = MECHANISMS[name]()
-    s = mechanisms.states(scene)
-    one, two, wanted = by_embedding(scene, embedding(scene), s), by_multipliers(scene, s), lagrange(scene, s)
+    scene, how, s, closed = mechanisms.case(name)
+    one, two, wanted = by_embedding(scene, how, s), by_multipliers(scene, s), lagrange(scene, s, closed)
     for got, right, other in zip(one, wanted, two, strict=True):
         assert laws.error(got, right) <= DIFFERENCES
         assert laws.error(other, got) <= AGREE
 
 
-@pytest.mark.parametrize("name", MECHANISMS)
+@pytest.mark.parametrize("name", ALL_BUT_LARGE)
 def test_minimal_coordinates_equal_lagrange(name):
-    scene = MECHANISMS[name]()
-    s, how = mechanisms.states(scene), embedding(scene)
+    scene, how, s, closed = mechanisms.case(name)
     size = len(how.dofs)
-    closed = [Closed(scene, q) for q in s.q]
     b = np.random.default_rng(2).normal(size=(3, size))
     arrays = {**s._asdict(), "b": b}
 
@@ -97,11 +99,10 @@ def test_minimal_coordinates_equal_lagrange(name):
         assert laws.error(tau[w], c.inverse_dynamics(s.qd[w], s.qdd[w], how.dofs, s.body_f[w])) <= DIFFERENCES
 
 
-@pytest.mark.parametrize("name", MECHANISMS)
+@pytest.mark.parametrize("name", ALL_BUT_LARGE)
 def test_float32_loses_what_its_rounding_says(name):
-    """Against float64 at the same float32 states. A loop's forces cancel accelerations of the open tree: those scale."""
-    scene = MECHANISMS[name]()
-    s, how = mechanisms.states(scene), embedding(scene)
+    """Against float64 at the same float32 states. Loops cancel accelerations of the open tree: those are the scale."""
+    scene, how, s, _ = mechanisms.case(name)
     rounded = mechanisms.States(*(array.astype(np.float32).astype(np.float64) for array in s))
     exact, got = by_embedding(scene, how, rounded), by_embedding(scene, how, rounded, dtype="float32")
     open_ = symbolic.run(scene, "forward_dynamics", rounded._asdict(), LOADED, {"out": (scene.dof_count,)})["out"]
@@ -110,7 +111,7 @@ def test_float32_loses_what_its_rounding_says(name):
 
 
 LOOPS = ["revolute", "ball", "fixed", "universal", "cylindrical", "planar", "d6", "prismatic", "free"]
-RANDOM = [(6 + i % 4, i, [LOOPS[i % 9]] + [LOOPS[i * 5 % 9]] * (i % 3 > 0), i % 3) for i in range(18)]
+RANDOM = [(5 + i % 4, i, [LOOPS[i % 9]] + [LOOPS[i * 5 % 9]] * (i % 3 > 0), i % 3) for i in range(18)]
 
 
 @pytest.mark.parametrize(("n", "seed", "kinds", "couplings"), RANDOM)
@@ -126,14 +127,13 @@ def test_random_trees_of_random_numbering(n, seed, kinds, couplings):
     assert laws.error(by_multipliers(scene, s), by_embedding(scene, how, s)) <= AGREE * max(1.0, condition / 1e3)
 
 
-@pytest.mark.parametrize("name", ["tilted", "cassie_leg", "stewart"])
+@pytest.mark.parametrize("name", ["tilted", "cassie_leg", "far_loop"])
 def test_jacobian_and_bias_are_derivatives_of_the_error(name):
     """Rows of ours and of the reference forbid the same velocities, and ask for the same accelerations."""
-    scene = MECHANISMS[name]()
-    s, closing = mechanisms.states(scene), Closing(scene)
+    scene, _, s, references = mechanisms.case(name)
+    closing = Closing(scene)
     error, Y = closing.at(s.q)
-    for w, q in enumerate(s.q):
-        closed = Closed(scene, q)
+    for w, closed in enumerate(references):
         N = closed.null_space(closed.jacobian)
         assert np.abs(Y[w] @ N).max() <= 1e-11 and np.linalg.matrix_rank(Y[w], 1e-7) == scene.dof_count - N.shape[1]
         assert np.abs(error[w]).max() < 1e-8
@@ -143,7 +143,7 @@ def test_jacobian_and_bias_are_derivatives_of_the_error(name):
         trace.place_links(moves=True)
         values = [v for c in trace.constraints for v in c.acceleration(trace.places, trace.vector("qd"), lambda i: 0.0)]
         bias = evaluate(values, lambda name, index: getattr(s, name)[w : w + 1, index[0]])  # noqa: B023
-        np.testing.assert_allclose(np.ravel(bias), (ahead + behind - 2 * error[w]) / 1e-8, atol=1e-5)
+        np.testing.assert_allclose([np.ravel(b)[0] for b in bias], (ahead + behind - 2 * error[w]) / 1e-8, atol=1e-5)
 
 
 def test_equals_pinocchio():
@@ -151,8 +151,8 @@ def test_equals_pinocchio():
     pin = pytest.importorskip("pinocchio")
     import oracles
 
-    scene = MECHANISMS["biped"]()
-    s, oracle = mechanisms.states(scene), oracles.PinocchioModel(scene)
+    scene, how, s, _ = mechanisms.case("biped")
+    oracle = oracles.PinocchioModel(scene)
     constraints = pin.StdVec_RigidConstraintModel()
     for loop in scene.loops:
         frames = [oracle.in_joint[body] * oracles.se3(pose) for body, pose in (
@@ -166,7 +166,7 @@ def test_equals_pinocchio():
         datas.append(constraint.createData())
     pin.initConstraintDynamics(oracle.model, oracle.data, constraints, datas)
     settings = pin.ProximalSettings(1e-14, 1e-14, 0.0, 1)
-    got = by_embedding(scene, embedding(scene), s, ("q", "qd", "tau"))
+    got = by_embedding(scene, how, s, ("q", "qd", "tau"))
     for w in range(3):
         T, rate = oracle._maps(s.q[w], s.qd[w])
         q, tau = oracle.q_of(s.q[w]), np.linalg.solve(T.T, s.tau[w])
@@ -275,8 +275,7 @@ def test_kernels_do_what_traces_do(dtype, device):
     """Four-bar and Cassie's leg: forward dynamics both ways, minimal coordinates, ranks, status."""
     tolerance = {"float64": AGREE, "float32": 1e-4}[dtype]
     for name in ("tilted, a ball", "cassie_leg"):
-        scene = MECHANISMS[name]()
-        s = mechanisms.states(scene)
+        scene, _, s, _ = mechanisms.case(name)
         embed, lag = both(scene, 3, device, dtype)
         how = embed.embedding
         wanted = by_embedding(scene, how, s)
@@ -286,7 +285,7 @@ def test_kernels_do_what_traces_do(dtype, device):
             out = np.full(wanted.shape, np.nan, dtype=dtype)
             assert dyn.forward_dynamics(s.q, s.qd, s.tau, s.body_f, status=status, out=out) is out
             assert np.abs(out - wanted).max() <= tolerance * max(open_.max(), np.abs(wanted).max())
-            assert (status == 0).all() or dtype == "float32" and set(status) <= {0, 6}
+            assert set(status) <= ({0} if dtype == "float64" else {0, 6})
         if dtype == "float32":
             continue
         _, rank = lag.loop_multipliers(s.q, s.qd, s.tau, s.body_f)
@@ -324,15 +323,13 @@ def test_multipliers_are_forces_of_the_loops(device):
 
 
 def test_worlds_that_differ(device):
-    """Masses, anchors and gravity of their own in every world; a NaN stays in its world; nothing is allocated."""
+    """Masses and gravity of their own in every world; a NaN stays in its world; nothing is allocated."""
     from allocations import no_warp_allocation
 
-    scene = zoo.varied(MECHANISMS["tilted"](), 3, seed=1)
-    scene = scene.with_values(joint_X_p=scene.values["joint_X_p"][0], joint_X_c=scene.values["joint_X_c"][0])
-    moved = scene.with_values(joint_X_p=scene.values["joint_X_p"] + np.linspace(0, 0.02, 3)[:, None, None] * (
-        np.arange(7) < 3))  # bars of other lengths; the plane is askew, so a revolute closure would jam: a ball does not
-    scene = spo.Scene(scene.bodies, scene.hinges, gravity=(1.0, 2.0, -9.0), loops=[MECHANISMS["tilted, a ball"]().loops[0]])
-    scene = scene.with_values(**{name: moved.values[name] for name in ("body_mass", "gravity", "joint_armature")})
+    scene = MECHANISMS["tilted, a ball"]()
+    varied = zoo.varied(scene, 3, seed=1).values
+    names = ("body_mass", "body_com", "body_inertia", "gravity", "joint_armature")
+    scene = scene.with_values(**{name: varied[name] for name in names})
     s = mechanisms.states(scene)
     wanted = np.array([
         Closed(scene, s.q[w], world=w).forward_dynamics(s.qd[w], s.tau[w], s.body_f[w]) for w in range(3)])
@@ -405,7 +402,7 @@ def rolled(dyn, q, qd, seconds, dt):
 
 
 CLOSED = {"float64": 1e-9, "float32": 1e-6}  # after one projection a step of 1 ms, times the size [m]
-ROLLED = [("fourbar", 0.5), ("stewart", 0.1)]
+ROLLED = [("fourbar", 0.5), ("cassie_leg", 0.1)]
 ROLLED_LONG = ["fourbar", "fivebar", "slider_crank", "stewart", "biped", "gripper", "cassie_leg"]
 
 
@@ -484,7 +481,7 @@ def test_mistakes_are_explained(device):
     scene = MECHANISMS["fourbar"]()
     make = lambda loops="embed", of=scene, **more: spo.Dynamics(of, 2, device=device, loops=loops, **more)  # noqa: E731
     q = np.zeros((2, 3))
-    with pytest.raises(spo.UnsupportedError, match="hybrid_dynamics.*loops='embed'"):
+    with pytest.raises(spo.UnsupportedError, match=r"hybrid_dynamics.*loops='embed'"):
         make().hybrid_dynamics(q, prescribed=[True, False, False])
     with pytest.raises(spo.UnsupportedError, match="operators"):
         make().operators(q)
@@ -541,5 +538,6 @@ def test_an_example_runs(name, capsys):
 
 
 def test_examples_are_modules():
-    done = subprocess.run([sys.executable, "-m", "warp_spo.examples.gripper"], capture_output=True, text=True, check=True)
+    command = [sys.executable, "-m", "warp_spo.examples.gripper"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "5 dofs, 2 independent: wrist, left finger" in done.stdout

@@ -104,7 +104,7 @@ def drawn(scene: Scene, count: int, seed: int = 0) -> np.ndarray:
 
 
 def usual_rank(scene: Scene) -> int:
-    """Independent rows where the loops close, but for change points; 0 if no configuration was found that closes them."""
+    """Independent rows where the loops close, but for change points; 0 if no configuration that closes was found."""
     closing = Closing(scene)
     q = closing.closed(drawn(scene, SAMPLES))
     if len(q) == 0 or closing.size == 0:

@@ -64,9 +64,9 @@ class Loops(Applications):
         """Dofs that move all others where loops are embedded: the minimal coordinates, ascending [independent dof].
 
         Those that ``Dynamics(independent=...)`` names. Otherwise they are chosen when the object is made, by random
-        configurations that close the loops: the first dofs that hold the others nearly as well as any do. Only mass_matrix, mass_matrix_inverse, solve_mass_matrix and
-        inverse_dynamics speak of them, and are NaN where they lose their hold on the others (the dead point of a
-        rocker); forward_dynamics passes such points.
+        configurations that close the loops: the first dofs that hold the others nearly as well as any do. Only
+        mass_matrix, mass_matrix_inverse, solve_mass_matrix and inverse_dynamics speak of them, and are NaN where they
+        lose their hold on the others (the dead point of a rocker); forward_dynamics passes such points.
         """
         return np.arange(self.scene.dof_count) if self.embedding is None else np.array(self.embedding.dofs, dtype=int)
 

@@ -1,4 +1,4 @@
-"""A four-bar linkage, embedded: one degree of freedom, its energy, its closure, and the inertia that the crank feels."""
+"""A four-bar linkage, embedded: the inertia that the crank feels, and what a rollout does to closure and energy."""
 
 import numpy as np
 
