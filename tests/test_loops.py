@@ -476,6 +476,74 @@ def test_a_four_bar_from_newton(device):
     assert laws.error(one, wanted) <= DIFFERENCES and laws.error(two, one) <= AGREE
 
 
+def biped_file():
+    """The example's biped as MJCF: nested bodies, hinges one by one, a connect for each rod."""
+    scene = MECHANISMS["biped"]()
+    children = {k: [] for k in range(-1, scene.body_count)}
+    for hinge in scene.hinges:
+        children[hinge.parent].append(hinge)
+
+    def written(hinge):
+        k = hinge.child
+        body = scene.bodies[k]
+        pose, quat = hinge.parent_pose[:3], np.roll(hinge.parent_pose[3:], 1)
+        numbers = lambda values: " ".join(f"{x:.17g}" for x in values)  # noqa: E731
+        text = f'<body name="b{k}" pos="{numbers(pose)}" quat="{numbers(quat)}">'
+        text += f'<inertial pos="{numbers(body.com)}" mass="{body.mass}" diaginertia="{numbers(np.diag(body.inertia))}"/>'
+        text += f'<freejoint name="j{k}"/>' if hinge.kind == "free" else ""
+        for i, (axis, _, _) in enumerate(hinge.screws):
+            text += f'<joint name="j{k}_{i}" axis="{numbers(axis)}" armature="{hinge.armature[i]}"/>'
+        return text + "".join(map(written, children[k])) + "</body>"
+
+    connects = "".join(
+        f'<connect body1="b{loop.parent}" body2="b{loop.child}" anchor="{" ".join(map(str, loop.parent_pose[:3]))}"/>'
+        for loop in scene.loops
+    )
+    bodies = "".join(map(written, children[-1]))
+    return f'<mujoco><compiler balanceinertia="false"/><worldbody>{bodies}</worldbody><equality>{connects}</equality></mujoco>'
+
+
+@pytest.mark.slow
+def test_a_biped_from_a_robot_file(tmp_path, device):
+    """The example's biped, through a file: the same loops, and both ways of closing them agree."""
+    (tmp_path / "biped.xml").write_text(biped_file())
+    scene = spo.load(tmp_path / "biped.xml")
+    assert scene.dof_count == 30 and [loop.kind for loop in scene.loops] == ["ball"] * 4
+    s = mechanisms.states(scene, 2)
+    embed, lag = both(scene, 2, device)
+    assert len(embed.independent_dofs) == 18
+    one, two = (dyn.forward_dynamics(s.q, s.qd, s.tau, s.body_f) for dyn in (embed, lag))
+    assert laws.error(one, lagrange(scene, s)) <= DIFFERENCES and laws.error(two, one) <= AGREE
+
+
+def test_variable_values_are_read(device):
+    """Hinge frames and masses that dyn.set changes: as folded ones."""
+    scene = MECHANISMS["tilted, a ball"]()
+    s = mechanisms.states(scene)
+    names = ("body_mass", "joint_X_p")
+    for loops in ("embed", "multipliers"):
+        folded, free = (spo.Dynamics(scene, 3, device=device, dtype="float64", loops=loops, variable=variable)
+                        for variable in ((), names))
+        free.set(body_mass=2.0 * scene.values["body_mass"][0])
+        free.set(**{name: scene.values[name][0] for name in names})
+        for dyn in (folded, free):
+            dyn.prepare("forward_dynamics", status=True)
+        results = [dyn.forward_dynamics(s.q, s.qd, s.tau) for dyn in (folded, free)]
+        assert laws.error(results[1], results[0]) <= AGREE
+
+
+@pytest.mark.parametrize("granularity", ["node", "segment", "tree"])
+def test_every_granularity_closes_loops(granularity, device):
+    """With the same kernel, so to the same bits."""
+    scene = MECHANISMS["gripper"]()
+    q = np.array([[0.3, 0.02, -0.02, 0.3, -0.3]])
+    dyn = spo.Dynamics(scene, 1, device=device, dtype="float64", loops="embed", granularity=granularity)
+    other = spo.Dynamics(scene, 1, device=device, dtype="float64", loops="embed")
+    np.testing.assert_array_equal(dyn.forward_dynamics(q, q, q), other.forward_dynamics(q, q, q))
+    for name in ("mass_matrix_inverse", "solve_mass_matrix", "project", "closure_error"):
+        dyn.prepare(name)
+
+
 # -- errors and examples -----------------------------------------------------------------------------------------------
 def test_mistakes_are_explained(device):
     scene = MECHANISMS["fourbar"]()

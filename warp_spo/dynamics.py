@@ -52,6 +52,9 @@ OPERATIONS = (
     "log_det_mass_matrix_gradient",
     "fixman_torque",
     "mass_matrix_packed",
+    "closure_error",
+    "project",
+    "loop_multipliers",
 )
 LOOPS = ("raise", "cut", "embed", "multipliers")
 
@@ -169,14 +172,16 @@ class Dynamics(Loops):
         Args:
             operation: name of a method, such as "forward_dynamics".
             options: ``frames=`` for operations that take frames, ``columns=`` for solve_mass_matrix, ``prescribed=``
-                for hybrid_dynamics, ``body_f=True`` and ``status=True`` if they will be given.
+                for hybrid_dynamics, ``hold=`` for project, ``body_f=True`` and ``status=True`` if they will be given.
         """
         if operation not in OPERATIONS:
             raise ValueError(f"Dynamics.prepare: no operation {operation!r}; expected one of {', '.join(OPERATIONS)}")
         q: Any = wp.array(np.tile(self.scene.neutral_q, (self.worlds, 1)), dtype=self.dtype, device=self.device)
         rate = wp.zeros((self.worlds, self.scene.dof_count), dtype=self.dtype, device=self.device)
         extra: dict[str, Any] = {}
-        loaded = ("forward_dynamics", "inverse_dynamics", "bias_force", "hybrid_dynamics")
+        loaded = ("forward_dynamics", "inverse_dynamics", "bias_force", "hybrid_dynamics", "loop_multipliers")
+        if operation == "project":
+            extra["hold"] = options.pop("hold", False)
         if operation in loaded and options.pop("body_f", False):
             shape = (self.worlds, self.scene.body_count, 6)
             extra["body_f"] = wp.zeros(shape, dtype=self.dtype, device=self.device)
@@ -193,6 +198,8 @@ class Dynamics(Loops):
             "jacobian_bias": (q, rate),
             "centroidal_momentum_bias": (q, rate),
             "quasi_velocities": (q, rate),
+            "project": (q, rate),
+            "loop_multipliers": (q, rate, rate),
         }
         given = arguments.get(operation, (q,))
         if operation == "solve_mass_matrix":
@@ -200,7 +207,8 @@ class Dynamics(Loops):
             if columns is not None and (not isinstance(columns, int) or columns < 0):
                 raise ValueError(f"Dynamics.prepare: columns is {columns!r}; expected how many right-hand sides")
             sides = () if columns is None else (columns,)
-            given = (q, wp.zeros((*rate.shape, *sides), dtype=self.dtype, device=self.device))
+            shape = (self.worlds, self._minimal, *sides)
+            given = (q, wp.zeros(shape, dtype=self.dtype, device=self.device))
         if operation == "hybrid_dynamics":
             extra["prescribed"] = options.pop("prescribed", [False] * self.scene.dof_count)
         if operation in ("jacobian", "operational_inertia_inverse", "operational_inertia", "jacobian_bias"):
