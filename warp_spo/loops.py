@@ -96,11 +96,11 @@ class Loops(Applications):
             self._launch("closure_error", out, q=q)
         return call.result
 
-    def project(self, q: Any, qd: Any = None, hold: bool = False, iterations: int = 3, out: Any = None) -> Any:
+    def project(self, q: Any, qd: Any = None, hold: bool = False, iterations: int = 2, out: Any = None) -> Any:
         """The nearest state that closes the loops: Newton steps q - Y^+ g, then qd - Y^+ Y qd, Y the Jacobian of g.
 
         g is :meth:`closure_error`. Nearest in the sum of squares of the dofs, rad and m alike. Call it once a
-        time step with ``iterations=1``, or with more to close a state by hand.
+        time step; to close a state by hand, with more ``iterations``.
 
         Args:
             q, qd: [world, coordinate], [world, dof]; qd None is left out.

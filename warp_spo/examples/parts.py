@@ -8,7 +8,7 @@ import warp_spo as spo
 def bar(length, mass=1.0, axis=0, label=""):
     """A bar from its body's origin along one of its axes, 0 to 2."""
     com, inertia = np.zeros(3), np.full(3, mass * length**2 / 12.0)
-    com[axis], inertia[axis] = 0.5 * length, 0.002 * mass
+    com[axis], inertia[axis] = 0.5 * length, 0.05 * inertia[axis]
     return spo.Body(mass, com, np.diag(inertia), label=label)
 
 
@@ -38,6 +38,6 @@ def turned(quaternion, vector):
 
 
 def step(dyn, q, qd, tau, dt):
-    """Semi-implicit Euler, and one projection."""
+    """Semi-implicit Euler, and a projection."""
     qd = qd + dt * dyn.forward_dynamics(q, qd, tau)
-    return dyn.project(dyn.integrate(q, qd, dt), qd, iterations=1)
+    return dyn.project(dyn.integrate(q, qd, dt), qd)
