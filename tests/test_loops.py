@@ -17,11 +17,13 @@ import zoo
 from mechanisms import MECHANISMS, Closed
 
 import warp_spo as spo
-from warp_spo.embedding import Closing, drawn, embedding
+from warp_spo.embedding import Closing, _spanning, drawn, embedding
 from warp_spo.examples.parts import at, bar, energy
 from warp_spo.recursions import closures, clusters, embedded, nullspace
+from warp_spo.recursions.embedded import Embedding
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.multipliers import Multipliers
+from warp_spo.reference import homogeneous, pose7
 from warp_spo.trace.evaluate import evaluate
 
 DIFFERENCES = 1e-9  # what differences of order 8 leave of second derivatives; conditioning of the draws
@@ -178,7 +180,7 @@ def test_equals_pinocchio():
 BUGS = [
     (clusters, "factor", "force + (armature if row == dof else 0.0)", "force"),
     (clusters, "hinge_forces", "force = loads[key] + ", "force = "),
-    (clusters, "expanded", "k.get(dof, 0.0) + total", "total"),
+    (clusters, "expanded", "k.get(dof, 0.0) + ", ""),
     (closures.Closure, "acceleration", "+ dot(row.w_rate, w)", ""),
     (closures.Closure, "acceleration", "+ 2.0 * v)", ")"),
     (closures, "_moved", "2.0 * cross(spin, v)", "cross(spin, v)"),
@@ -223,7 +225,7 @@ def test_change_point_s24(dtype):
     assert np.isnan(got["out"][5]).all() or got["margin"][5].min() <= 4.0 * eps
 
 
-def test_pivots_switch_where_the_chosen_dof_loses_its_hold():
+def test_dead_points_pass():
     """A rocker as the independent dof: forward dynamics passes its dead point, minimal coordinates are lost there."""
     scene = MECHANISMS["fourbar"]()
     how = embedding(scene, asked=[2])  # relative angle between coupler and rocker
@@ -237,6 +239,33 @@ def test_pivots_switch_where_the_chosen_dof_loses_its_hold():
     assert np.abs(X[worst, 2]) < 1e-2
     s = mechanisms.states(scene, 1, q=q[[worst]])
     assert laws.error(by_embedding(scene, how, s), lagrange(scene, s)) <= DIFFERENCES
+
+
+@pytest.mark.parametrize("apart", [1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6])
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_near_parallel_loops(apart, dtype):
+    """Two balls side by side are a hinge, the worse the nearer they are: the law is eps / margin, or all is lost."""
+    scene = zoo.from_parents([-1, 0, 1, -1], ["ball", "universal", "ball", "ball"], 5)
+    q = zoo.random_state(scene, 1, 4).q
+    dense = Closed(scene, q[0]).dense
+    inner = np.linalg.inv(dense.body_matrix[2]) @ dense.body_matrix[3]
+    loops = [spo.Loop("ball", 2, 3, parent_pose=pose7(inner @ homogeneous(np.array(at(x)))), child_pose=at(x))
+             for x in (0.3, 0.3 + apart)]
+    scene = spo.Scene(scene.bodies, scene.hinges, loops=loops)
+    how = Embedding(tuple(_spanning(Closing(scene).at(q)[1])[0]), ())  # five: the balls' distance is the same anyway
+    s = mechanisms.States(q, *np.random.default_rng(0).normal(size=(3, 1, scene.dof_count)), np.zeros((1, 4, 6)))
+    shapes = {"out": (scene.dof_count,), "margin": (len(how.rows),)}
+    right = traced(scene, "embedded_forward_dynamics", s._asdict(), ("q", "tau"), shapes, how=how, status=True)
+    got = traced(scene, "embedded_forward_dynamics", s._asdict(), ("q", "tau"), shapes, dtype, how=how, status=True)
+    eps, sine = np.finfo(dtype).eps, right["margin"].min() ** 0.5
+    assert len(how.rows) == 5 and sine <= 10.0 * apart
+    if np.isfinite(got["out"]).all():
+        assert laws.error(got["out"], right["out"]) <= 100.0 * eps / sine
+        if dtype == "float64":
+            closed = Closed(scene, q[0])
+            assert laws.error(got["out"][0], closed.forward_dynamics(np.zeros(scene.dof_count), s.tau[0])) <= 1e-9 / sine
+    else:
+        assert sine <= 200.0 * eps
 
 
 def test_redundant_loop_s25():

@@ -245,7 +245,8 @@ class Dynamics(Loops):
                 * 0 = none of these. A pair of tau and gravity that nearly cancel can still lose digits, as in any
                   subtraction: let gravity and wrenches enter by the scene and body_f, not by tau.
 
-                Worlds do not touch each other's result, whatever the word.
+                Where loops are closed the words are 2, 6 and 1 alone: an estimate of digits is not made. Worlds do not
+                touch each other's result, whatever the word.
             out: the result.
 
         Returns:

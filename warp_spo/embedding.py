@@ -21,7 +21,7 @@ from .trace.evaluate import evaluate
 SAMPLES = 64
 STEPS = 60
 CLOSED = 1e-9  # largest g of a configuration that counts as closed [m, rad]
-RANK = 1e-7  # singular values below this share of the largest are zero
+RANK = 1e-7  # singular values below this share of the largest are zero: the rows are redundant
 WORST = 0.1  # share of the draws that a choice may serve worse than it is said to
 NEARLY = 0.3  # share of the best choice's hold that an earlier dof must have
 MOST_DOFS = 32  # of a cluster: its D costs their cube, in straight-line code

@@ -18,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from ..trace.graph import Value, guarded, reciprocal
+from ..trace.graph import Value, absolute, guarded, reciprocal, sqrt
 from ..trace.spatial import ZERO, Articulated, Vector, dot, total
 from . import articulated, newton_euler
 from .articulated import NO_INERTIA
@@ -124,6 +124,7 @@ class Factor:
         X: columns by dof. L: unit lower triangular rows of D = L diag(d) L*; inverse: 1 / d.
         U: columns, (n; f) in the parent's axes.
         P: P+ in the parent's frame.
+        nothing: zero, or NaN where the closures lose a row.
     """
 
     X: list[Columns]
@@ -132,6 +133,7 @@ class Factor:
     inverse: list[Value]
     U: list[Vector]
     P: Articulated
+    nothing: Value
 
     def forward(self, b: list[Value]) -> list[Value]:
         """L^-1 b"""
@@ -149,10 +151,10 @@ class Factor:
 
 
 def factor(
-    cluster: Cluster, X: list[Columns], places: dict[int, Placed], own: dict[int, Articulated], epsilon: float
+    cluster: Cluster, space: NullSpace, places: dict[int, Placed], own: dict[int, Articulated], epsilon: float
 ) -> Factor:
     """Eliminate the rates of a cluster from the articulated inertias that its links carry, ``own``."""
-    inside = set(map(id, cluster.links))
+    X, inside = space.basis, set(map(id, cluster.links))
     carried: dict[int, Articulated] = {}
     handed, M, F = NO_INERTIA, {}, {}
     for link in reversed(cluster.links):
@@ -178,8 +180,10 @@ def factor(
     ]
     U = [Vector(total(F[dof][c] * x for dof, x in column.items()) for c in range(6)) for column in X]
     D = [[total(x * MX[j][dof] for dof, x in X[i].items()) for j in range(i + 1)] for i in range(len(X))]
-    L, d, inverse = _pivots(D, epsilon)
-    done = Factor(X, L, d, inverse, U, handed)
+    root = {dof: sqrt(M[dof, dof]) for dof in cluster.dofs}
+    sizes = [total(absolute(x) * root[dof] for dof, x in column.items()) for column in X]
+    L, d, inverse = _pivots(D, [articulated.LEAST * epsilon * size * size for size in sizes])
+    done = Factor(X, L, d, inverse, U, handed, space.nothing)
     if cluster.parent is not None and X:
         across = [done.forward([column[c] for column in U]) for c in range(6)]
         for k in range(len(X)):
@@ -188,8 +192,11 @@ def factor(
     return done
 
 
-def _pivots(D: list[list[Value]], epsilon: float) -> tuple[list[list[Value]], list[Value], list[Value]]:
-    """L, d and 1 / d of D = L diag(d) L*, the lower triangle given; what is not positive becomes NaN."""
+def _pivots(D: list[list[Value]], least: list[Value]) -> tuple[list[list[Value]], list[Value], list[Value]]:
+    """L, d and 1 / d of D = L diag(d) L*, the lower triangle given; what is not above ``least`` becomes NaN.
+
+    Least is some roundings of (|x| sqrt(diag M))^2, which bounds all that cancels in x* M x.
+    """
     L: list[list[Value]] = []
     d: list[Value] = []
     inverse: list[Value] = []
@@ -199,7 +206,7 @@ def _pivots(D: list[list[Value]], epsilon: float) -> tuple[list[list[Value]], li
             weighted.append(row[j] - total(weighted[k] * L[j][k] for k in range(j)))
         L.append([w * r for w, r in zip(weighted, inverse, strict=True)])
         pivot = row[i] - total(w * entry for w, entry in zip(weighted, L[i], strict=True))
-        d.append(guarded(guarded(pivot, articulated.LEAST * epsilon * row[i]), 0.0))
+        d.append(guarded(guarded(pivot, least[i]), 0.0))
         inverse.append(reciprocal(d[i]))
     return L, d, inverse
 
@@ -245,4 +252,4 @@ def expanded(
     alpha = (*above[0], *above[1])
     y = [a - b for a, b in zip(rates, done.solve([dot(column, alpha) for column in done.U]), strict=True)]
     columns = list(zip(done.X, y, strict=True))
-    return {dof: k.get(dof, 0.0) + total(X.get(dof, 0.0) * x for X, x in columns) for dof in cluster.dofs}
+    return {dof: k.get(dof, 0.0) + done.nothing + total(X.get(dof, 0.0) * x for X, x in columns) for dof in cluster.dofs}

@@ -169,12 +169,12 @@ class Embedded(Applications):
             k = tied.space.particular([-a for a in tied.accelerations(self.places, self.vector("qd"))])
         swept.demanded[key] = k
         self.at_cluster(cluster, "D")
-        swept.clusters[key] = done = aggregates.factor(cluster, tied.space.basis, self.places, own, self.epsilon)
+        swept.clusters[key] = done = aggregates.factor(cluster, tied.space, self.places, own, self.epsilon)
         self.at_cluster(cluster, "z")
         t, force = aggregates.hinge_forces(
             cluster, self.places, self.motions, own, z, lambda dof: k.get(dof, 0.0)
         )
-        eps = [total(x * (tau(dof) - t[dof]) for dof, x in column.items()) for column in done.X]
+        eps = [done.nothing + total(x * (tau(dof) - t[dof]) for dof, x in column.items()) for column in done.X]
         swept.cluster_rates[key] = rates = done.solve(eps)
         for column, rate in zip(done.U, rates, strict=True):
             force = force + column * rate
@@ -226,7 +226,7 @@ class Embedded(Applications):
         D = {key: [pivot.D for pivot in done.pivots] for key, done in swept.links.items()}
         D |= {key: done.d for key, done in swept.clusters.items()}
         halves = [self._half(swept, dof) for dof in how.dofs]
-        nothing = total(done.nothing for done in swept.links.values())
+        nothing = total(done.nothing for done in (*swept.links.values(), *swept.clusters.values()))
         stores = []
         for i, half in enumerate(halves):
             self.graph.step = f"column {how.dofs[i]}|m"

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from ..trace.graph import Value, absolute, guarded, is_constant, reciprocal, select, sqrt
 from ..trace.spatial import total
+from .articulated import lost
 
 LEAST = 64.0  # roundings: what is less than so many of a row may be rounding alone
 
@@ -41,12 +42,14 @@ class NullSpace:
     Attributes:
         basis: orthonormal vectors that Y makes zero, by column.
         margins: of each row, the square of what is left of it beyond the rows before it, over its size.
+        nothing: zero, or NaN where a row is lost, which the basis alone need not show.
     """
 
     def __init__(self, rows: list[dict[int, Value]], sizes: list[Value], columns: list[int], epsilon: float):
         self._steps: list[tuple[int, int, Value, Reflection | None]] = []  # row, column, 1 / L, reflection
         self._rows = [{c: x for c, x in row.items() if not _vanishes(x)} for row in rows]
         self.margins: list[Value] = []
+        self.nothing: Value = 0.0
         waiting, live = list(range(len(rows))), list(columns)
         while waiting:
             row = min(waiting, key=lambda r: sum(c in self._rows[r] for c in live))
@@ -58,6 +61,7 @@ class NullSpace:
     def _reflect(self, row: int, left: dict, size: Value, waiting: list, live: list, epsilon: float) -> tuple:
         square = guarded(total(x * x for x in left.values()), (LEAST * epsilon) ** 2 * size)
         self.margins.append(square * reciprocal(size))
+        self.nothing = self.nothing + lost(square)
         if not left:
             pivot = live.pop(0)
             return row, pivot, square, None  # NaN: nothing is left of the row
