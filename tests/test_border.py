@@ -413,13 +413,6 @@ def test_bad_arguments_are_refused_in_words(name, value, error, device):
         spo.Dynamics(scene(), **arguments)
 
 
-@pytest.mark.parametrize("name", ["embed", "multipliers"])
-def test_what_is_not_offered_says_what(name, device):
-    with pytest.raises(spo.UnsupportedError) as caught:
-        spo.Dynamics(scene(), device=device, loops=name)
-    assert name in caught.value.what and "cut" in str(caught.value) and isinstance(caught.value, ValueError)
-
-
 def test_an_unoffered_granularity_is_a_value_error_that_names_it(device):
     for name in ("segment", "tree"):
         try:

@@ -22,6 +22,7 @@ from .recursions import messages
 from .recursions.adjoints import Adjoints
 from .recursions.links import TABLES, Links
 from .recursions.messages import INWARD, OUTWARD, SENDS
+from .recursions.multipliers import Multipliers
 from .recursions.operators import meet, written
 from .recursions.pieces import Pieces
 from .recursions.step import LOOPED
@@ -50,6 +51,10 @@ TILED_WORLDS = 1 << 20  # of so many worlds at a time
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
+
+
+class Traces(Adjoints, Multipliers):
+    """Every operation that is traced."""
 
 
 class Program(NamedTuple):
@@ -200,7 +205,7 @@ class Programs:
         return self._tree_program(operation, links, {**shapes, **more}, tuple(more), options)
 
     def _tree_program(self, operation: str, links: Links, shapes: dict, more: tuple, options: dict) -> Program:
-        trace = Adjoints(links, self.run.dtype.__name__, tuple(shapes))
+        trace = Traces(links, self.run.dtype.__name__, tuple(shapes))
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         frame = self._frame([item for item in stores if item.array == "out"], shapes, 0, 1, self.block, stores)
