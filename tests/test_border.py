@@ -455,7 +455,7 @@ def test_loop_joints_are_refused_or_cut(device):
     dyn, open_ = (spo.Dynamics(s, 1, device=device, loops="cut", dtype="float64") for s in (closed, one))
     q = zoo.random_state(one).q
     np.testing.assert_array_equal(dyn.forward_dynamics(q), open_.forward_dynamics(q))
-    assert "1 left open" in dyn.explain()
+    assert "1 loop joint(s), 0 coupling(s) left open" in dyn.explain()
 
 
 BAD_PREPARE = {

@@ -218,8 +218,8 @@ class Loops(Applications):
             self._launch("loop_forward_dynamics", out, multipliers=multipliers, **given)
             least = kernels.EPSILON[self.dtype] ** 0.5
         else:
-            margin = self.recursions.array("loop margin", self.worlds, max(1, len(self.embedding.rows)))
-            more = {} if status is None or not self.embedding.rows else {"margin": margin}
+            margin = self.recursions.array("loop margin", self.worlds, len(self.embedding.rows))
+            more = {} if status is None or margin.size == 0 else {"margin": margin}
             self._launch("embedded_forward_dynamics", out, more, how=self.embedding, status=bool(more), **given)
             least = 4.0 * kernels.EPSILON[self.dtype]
         if status is not None:

@@ -252,4 +252,6 @@ def expanded(
     alpha = (*above[0], *above[1])
     y = [a - b for a, b in zip(rates, done.solve([dot(column, alpha) for column in done.U]), strict=True)]
     columns = list(zip(done.X, y, strict=True))
-    return {dof: k.get(dof, 0.0) + done.nothing + total(X.get(dof, 0.0) * x for X, x in columns) for dof in cluster.dofs}
+    return {
+        dof: k.get(dof, 0.0) + done.nothing + total(X.get(dof, 0.0) * x for X, x in columns) for dof in cluster.dofs
+    }

@@ -226,7 +226,8 @@ class Embedded(Applications):
         D = {key: [pivot.D for pivot in done.pivots] for key, done in swept.links.items()}
         D |= {key: done.d for key, done in swept.clusters.items()}
         halves = [self._half(swept, dof) for dof in how.dofs]
-        nothing = total(done.nothing for done in (*swept.links.values(), *swept.clusters.values()))
+        nothing = total(done.nothing for done in swept.links.values())
+        nothing = nothing + total(done.nothing for done in swept.clusters.values())
         stores = []
         for i, half in enumerate(halves):
             self.graph.step = f"column {how.dofs[i]}|m"
