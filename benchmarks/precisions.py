@@ -9,7 +9,9 @@ import warp_spo as spo
 from warp_spo.operations import OPERATIONS, TOLERANCE, Inputs, Operation
 from warp_spo.trial import Subject
 
+HEADLINE = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "solve_mass_matrix")
 REFINED = ("forward_dynamics", "solve_mass_matrix")
+RANDOMISED = ("body_mass", "body_com", "body_inertia")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +49,13 @@ PRECISIONS = {
     # a step takes the error of float32 once more; without it nothing is under 1e-8
     "refined": Precision(
         functools.partial(of, "float64", refine=1), {name: OPERATIONS[name] for name in REFINED}, 1e-8, None
+    ),
+    # inertias are inputs, as domain randomisation has them, each world's its own
+    "randomised": Precision(
+        functools.partial(of, "float32", variable=RANDOMISED),
+        {name: OPERATIONS[name] for name in HEADLINE},
+        TOLERANCE["float32"],
+        "float32",
     ),
     "float64": Precision(functools.partial(of, "float64"), OPERATIONS, TOLERANCE["float64"], "float64"),
 }

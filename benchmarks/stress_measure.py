@@ -14,7 +14,7 @@ import warp_spo as spo
 
 from . import contrast
 from .exact import Sweep
-from .stress_cases import ALLOWED, EPS32, EPS64, Case
+from .stress_cases import ALLOWED, CAUSES, EPS32, EPS64, Case
 from .stress_scenes import Problem
 
 PRECISIONS = ("float32", "refined", "float64")  # refined: float32 and one step with a float64 residual
@@ -167,6 +167,8 @@ def row(case: Case, subject: Subject, precision: str, timed: bool = False) -> di
                  status=sorted({int(word) for word in status}), flagged=int((status != 0).sum()),
                  misjudged=int((~case.expects(status, dtype, law)).sum()))
     found["verdict"] = "" if not judged else "ok" if ratio <= ALLOWED and not found["misjudged"] else "FAILS"
+    if found["verdict"] == "FAILS" and case.name in CAUSES:
+        found["why"] = CAUSES[case.name]
     qdd = value if case.quantity in ("qdd", "dense") else subject.forward(dtype, steps).numpy()
     found["backward_error"] = float(subject.backward_error(qdd).max())
     if timed:

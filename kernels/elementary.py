@@ -67,6 +67,7 @@ struct on
     }
 
     static CUDA_CALLABLE inline float sqrt(float x) { return sqrtf(x); }
+    static CUDA_CALLABLE inline float arctangent(float y, float x) { return atan2f(y, x); }
     static CUDA_CALLABLE inline float absolute(float x) { return x < 0.0f ? -x : x; }
     static CUDA_CALLABLE inline double log(double x) { return ::log(x); }
 
@@ -151,6 +152,7 @@ struct on
     }
 
     static CUDA_CALLABLE inline double sqrt(double x) { return ::sqrt(x); }
+    static CUDA_CALLABLE inline double arctangent(double y, double x) { return ::atan2(y, x); }
     static CUDA_CALLABLE inline double absolute(double x) { return x < 0.0 ? -x : x; }
     static CUDA_CALLABLE inline double log(double x) { return ::log(x); }
 

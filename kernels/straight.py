@@ -22,8 +22,10 @@ ARRIVED = 'asm volatile("cp.async.wait_all;" ::: "memory");'
 SHARED_BYTES = 46 * 1024  # that a block may declare: 48 KiB less what Warp takes
 C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
 MASKS = ("prescribed",)  # arrays of booleans
-IN_PLACE, STAGED, MAPPED, COLUMNS, DIRECT = "in place", "staged", "mapped", "columns", "direct"
-SPREAD_BLOCK = 256
+INTEGERS = ("place", "shifts", "status")  # arrays of whole numbers, one axis
+MOST_PASSES = 16  # of a loop; see CONTRIBUTING
+IN_PLACE, STAGED, MAPPED, TILED, DIRECT = "in place", "staged", "mapped", "tiled", "direct"
+TILE = 8  # worlds of a tile: an entry of theirs fills a sector of 32 bytes
 
 
 class Row(NamedTuple):
@@ -40,8 +42,8 @@ class Result(NamedTuple):
     Attributes:
         way: IN_PLACE: entry by entry over ``row``, which is read first; STAGED: through shared memory, as it is;
             MAPPED: through shared memory, ``slots`` values that a table ``place`` [entry] spreads, -1 being zero;
-            COLUMNS: the same values to memory, [group, slot, world of 32], whence the kernel :func:`spread` takes them;
-            DIRECT: each entry to memory by itself, where shared memory is too small.
+            TILED: the same values to memory as [tile, slot, world of the tile], for the kernels of .tiles; DIRECT: each
+            entry to memory by itself.
     """
 
     way: str
@@ -70,6 +72,7 @@ class Frame(NamedTuple):
         more: further results, ``name_row[i]``, each entry to memory by itself.
         held: entries of each field, from the first on, that wait for their use in shared memory: a compiler that loads
             them from memory does so long before, and has no registers left.
+        numbers: numbers that all worlds share, ``name_row[0]``.
     """
 
     rows: list[Row]
@@ -82,6 +85,7 @@ class Frame(NamedTuple):
     more: tuple[Row, ...] = ()
     again: bool = False
     held: tuple[int, ...] = ()
+    numbers: tuple[str, ...] = ()
 
     @property
     def groups(self) -> int:
@@ -105,7 +109,8 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     c, result, out = C_TYPE[T], frame.result, frame.result.array
     team, at, offset = WARP * frame.warps, 0, {}
     sync = "__syncwarp();" if frame.warps == 1 else "__syncthreads();"
-    text = [NATIVE[c], "#if defined(__CUDA_ARCH__)"]
+    text = [NATIVE[c], *(f"const {c} {name}_row[1] = {{{name}}};" for name in frame.numbers)]
+    text += ["#if defined(__CUDA_ARCH__)"]
     text += [f"const int lane = threadIdx.x & 31, member = threadIdx.x % {team}, warp = member >> 5;"]
     text += [f"const long long first = (long long)(thread - member) / {frame.warps};"]
     text += ["const int present = worlds - first < 32 ? (int)(worlds - first) : 32;"]
@@ -119,7 +124,7 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
             text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
         else:
             text += [_own_row(row, c)]
-    text += [f"{c}* {row.name}_row = {row.name}.data + world * {row.entries};" for row in frame.more]
+    text += [_own_result(row, c) for row in frame.more]
     if frame.held:
         text += [ON_ITS_WAY, *_held(frame, c), "#undef ON_ITS_WAY"]
         lines = cuda.split("\n")
@@ -136,11 +141,12 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
         start, width = offset[result.row], pitch(next(row.entries for row in frame.rows if row.name == result.row))
     else:
         width = pitch(result.slots | 1 if result.way == MAPPED else out.entries)
-        start, at = at, at + (0 if result.way in (DIRECT, COLUMNS) else WARP * width)
-    if result.way == DIRECT:
-        text += [f"{c}* result_row = out.data + world * {out.entries};"]
-    elif result.way == COLUMNS:
-        text += _columns(result, c)
+        start, at = at, at + (0 if result.way in (DIRECT, TILED) else WARP * width)
+    own_row = f"{c}* result_row = out.data + world * {out.entries};"
+    if result.way == TILED:
+        own_row = f"{c}* result_row = out.data + world / {TILE} * {result.slots * TILE} + world % {TILE};"
+    if result.way in (DIRECT, TILED):
+        text += [own_row]
     else:
         text += [f"{c}* result_row = stage + {start} + lane * {width};"]
     if frame.sent:
@@ -155,20 +161,18 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     text += ["#undef FIELD"] if frame.held else []
     text += ["#else", "const long long world = thread;", "const bool mine = true;"]
     text += [_own_row(row, c) for row in frame.rows]
-    text += [f"{c}* {row.name}_row = {row.name}.data + world * {row.entries};" for row in frame.more]
+    text += [_own_result(row, c) for row in frame.more]
     if result.way == MAPPED:
         text += [f"{c} result_row[{result.slots}];"]
-    elif result.way == COLUMNS:
-        text += _columns(result, c)
     else:
-        text += [f"{c}* result_row = out.data + world * {out.entries};"]
+        text += [own_row]
     if frame.sent:
         text += [f"{c} sent[{frame.sent}];", "#define SENT(i) sent[i]"]
     text += [*_fields(frame.fields, c), cpu]
     if result.way == MAPPED:
         text += [f"for (int i = 0; i < {out.entries}; ++i) {{", "    const int slot = place.data[i];",
                  f"    out.data[world * {out.entries} + i] = slot < 0 ? 0 : result_row[slot];", "}"]
-    text += ["#endif", "#undef SENT", "#undef RESULT", *(["#undef FIELD"] if frame.fields else []), ""]
+    text += ["#endif", "#undef SENT", *(["#undef FIELD"] if frame.fields else []), ""]
     return "\n".join(text)
 
 
@@ -187,6 +191,11 @@ def _source(row: Row, c: str) -> tuple[str, str]:
 def _own_row(row: Row, c: str) -> str:
     kind, first = _source(row, c)
     return f"const {kind}* {row.name}_row = {first} + world * {row.entries};"
+
+
+def _own_result(row: Row, c: str) -> str:
+    kind = "int" if row.name in INTEGERS else c
+    return f"{kind}* {row.name}_row = {row.name}.data + world * {row.entries};"
 
 
 def _fields(names: list[str], c: str) -> list[str]:
@@ -220,13 +229,6 @@ def _held(frame: Frame, c: str) -> list[str]:
         ]
         at += WARP * entries
     return text
-
-
-def _columns(result: Result, c: str) -> list[str]:
-    return [
-        f"{c}* result_row = out.data + (world / {WARP} * {result.slots}) * {WARP} + world % {WARP};",
-        f"#define RESULT(i) result_row[(i) * {WARP}]",
-    ]
 
 
 def _each(n: int, team: int, statement: str) -> str:
@@ -276,52 +278,20 @@ def _spread_out(result: Result, offset: int, c: str, team: int) -> str:
 }}"""
 
 
-def spread(result: Result, T) -> wp.Kernel:
-    """A kernel (worlds, columns [group, slot, world of 32], place [entry]) -> out, the worlds of a tile side by side.
-
-    On CUDA it takes SPREAD_BLOCK threads for each :func:`tile` worlds, on the CPU a thread a world.
-    """
-    c, n, width, worlds = C_TYPE[T], result.array.entries, result.slots | 1, tile(result, T)
-    native = f"""#if defined(__CUDA_ARCH__)
-__shared__ {c} shared[{worlds * width}];
-const int member = threadIdx.x;
-const long long first = (long long)(thread / {SPREAD_BLOCK}) * {worlds};
-const int present = worlds - first < {worlds} ? (int)(worlds - first) : {worlds};
-const {c}* from = columns.data + (first / {WARP} * {result.slots}) * {WARP} + first % {WARP};
-if (present == {worlds}) {{
-    #pragma unroll 8
-    for (int k = member; k < {result.slots * worlds}; k += {SPREAD_BLOCK})
-        shared[(k % {worlds}) * {width} + k / {worlds}] = __ldg(from + k / {worlds} * {WARP} + k % {worlds});
-}} else {{
-    for (int k = member; k < {result.slots} * present; k += {SPREAD_BLOCK})
-        shared[(k % present) * {width} + k / present] = __ldg(from + k / present * {WARP} + k % present);
-}}
-__syncthreads();
-{c}* to = out.data + first * {n};
-#pragma unroll 4
-for (int i = member; i < present * {n}; i += {SPREAD_BLOCK}) {{
-    const int slot = __ldg(place.data + i % {n});
-    to[i] = slot < 0 ? ({c})0 : shared[(i / {n}) * {width} + slot];
-}}
-#else
-const {c}* from = columns.data + ((long long)thread / {WARP} * {result.slots}) * {WARP} + thread % {WARP};
-for (int i = 0; i < {n}; ++i) {{
-    const int slot = place.data[i];
-    out.data[(long long)thread * {n} + i] = slot < 0 ? 0 : from[slot * {WARP}];
-}}
-#endif
-"""
-    return kernel("spread", native, [("columns", 3), ("place", 1), ("out", result.array.ndim)], T)
-
-
-def tile(result: Result, T) -> int:
-    """Worlds that :func:`spread` holds in shared memory at once: a power of two."""
-    worlds = SHARED_BYTES // ((result.slots | 1) * wp.types.type_size_in_bytes(T))
-    return min(WARP, 1 << (worlds.bit_length() - 1)) if worlds else 0
-
-
 def _slot(i: str, entries: int, distance: int) -> str:
     return i if entries == distance else f"({i} / {entries}) * {distance} + {i} % {entries}"
+
+
+def looped(a_pass: str, last: str, names: tuple[str, str, str], entries: int, T) -> str:
+    """``a_pass`` until it leaves the last of the variables ``names`` at zero, then ``last``.
+
+    The variables are arrays of a thread, ``name_row[i]``, zero at first; their indices are constants, so that they
+    live in registers. In a warp, threads wait for the one that needs most passes.
+    """
+    c, missed = C_TYPE[T], names[-1]
+    declared = [f"{c} {name}_row[{entries}] = {{}};" for name in names[:-1]] + [f"{c} {missed}_row[1] = {{}};"]
+    loop = f"for (int pass = 0; pass < {MOST_PASSES}; ++pass) {{\n{a_pass}\nif (!({missed}_row[0] > 0)) break;\n}}"
+    return "\n".join([*declared, loop, last])
 
 
 def kernel(
@@ -329,10 +299,11 @@ def kernel(
 ) -> wp.Kernel:
     """A kernel of ``worlds``, then ``arrays`` (name, axes) of scalars ``T``, that runs ``native`` in each thread.
 
-    The arrays ``place`` and ``shifts`` hold integers, those of MASKS booleans, the ``wide`` [entry, world] float64.
+    The arrays of INTEGERS hold integers, those of MASKS booleans, the ``wide`` [entry, world] float64; what has no axes
+    is a number.
     """
     key = f"{name}_{hashlib.sha256(native.encode()).hexdigest()[:16]}"
-    types = {array: "table" if array in ("place", "shifts") else f"array{axes}" for array, axes in arrays}
+    types = {array: "table" if array in INTEGERS else f"array{axes}" for array, axes in arrays}
     types |= {array: "mask" for array in types if array in MASKS} | {array: "wide" for array in wide}
     declared = ", ".join(f"{array}: {kind}" for array, kind in types.items())
     source = f"""def native(thread: int, worlds: int, {declared}): ...
@@ -345,7 +316,7 @@ def {key}(worlds: int, {declared}):
     file = f"<{key}>"
     linecache.cache[file] = len(source), None, source.splitlines(True), file  # where Warp looks for the source
     space = {f"array{axes}": wp.array(dtype=T, ndim=axes) for axes in range(1, 5)} | {
-        "table": wp.array(dtype=int, ndim=1), "mask": wp.array(dtype=wp.bool, ndim=2),
+        "array0": T, "table": wp.array(dtype=int, ndim=1), "mask": wp.array(dtype=wp.bool, ndim=2),
         "wide": wp.array(dtype=wp.float64, ndim=2), "wp": wp, "__name__": key
     }
     exec(compile(source, file, "exec"), space)

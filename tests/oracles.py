@@ -105,7 +105,8 @@ class Oracle:
 
 class PinocchioModel(Oracle):
     """``crba``, ``rnea`` and ``aba`` of Pinocchio. Joint frames are node frames; joints are added depth first, without
-    which crba is silently wrong. Several screws make one composite joint."""
+    which crba is silently wrong. Several screws are as many joints: the derivatives of a composite one would take its
+    axes as fixed."""
 
     def __init__(self, scene, world=0):
         super().__init__(scene, world)
@@ -122,10 +123,14 @@ class PinocchioModel(Oracle):
             if len(dofs) == 0:
                 self.joint[k], self.in_joint[k] = self.joint[hinge.parent], placement * body_in_node
             else:
-                j = model.addJoint(self.joint[hinge.parent], self._joint(hinge), placement, f"body {k}")
-                self.joint[k], self.in_joint[k] = j, body_in_node
-                self.v_of[dofs] = np.arange(model.idx_vs[j], model.idx_vs[j] + model.nvs[j])
-                self.q_from[coords] = np.arange(model.idx_qs[j], model.idx_qs[j] + model.nqs[j])
+                self.joint[k], self.in_joint[k] = self.joint[hinge.parent], body_in_node
+                v, q = [], []
+                for i, joint in enumerate(self._joints(hinge)):
+                    at = placement if i == 0 else pin.SE3.Identity()
+                    self.joint[k] = j = model.addJoint(self.joint[k], joint, at, f"body {k}, {i}")
+                    v += range(model.idx_vs[j], model.idx_vs[j] + model.nvs[j])
+                    q += range(model.idx_qs[j], model.idx_qs[j] + model.nqs[j])
+                self.v_of[dofs], self.q_from[coords] = v, q
             model.appendBodyToJoint(self.joint[k], inertia, self.in_joint[k])
         armature = np.zeros(model.nv)
         armature[self.v_of] = self.inner_armature
@@ -134,23 +139,18 @@ class PinocchioModel(Oracle):
         assert model.check(self.data), "Pinocchio: joints not in depth-first order"
 
     @staticmethod
-    def _joint(hinge):
+    def _joints(hinge):
         if hinge.kind == "free":
-            return pin.JointModelFreeFlyer()
+            return [pin.JointModelFreeFlyer()]
         if hinge.kind == "ball":
-            return pin.JointModelSpherical()
+            return [pin.JointModelSpherical()]
         joints = []
         for axis, angular, linear in hinge.screws:
             if angular and linear:
                 joints.append(pin.JointModelHelicalUnaligned(axis, linear / angular))
             else:
                 joints.append((pin.JointModelRevoluteUnaligned if angular else pin.JointModelPrismaticUnaligned)(axis))
-        if len(joints) == 1:
-            return joints[0]
-        composite = pin.JointModelComposite()
-        for joint in joints:
-            composite.addJoint(joint)
-        return composite
+        return joints
 
     def q_of(self, q):
         own = np.empty(self.model.nq)
@@ -176,6 +176,47 @@ class PinocchioModel(Oracle):
 
     def _forward(self, q, v, tau):
         return pin.aba(self.model, self.data, q, v, tau)
+
+    def _derivatives(self, q, qd):
+        """T, Tdot qd, and how both change: (d T) x along each tangent coordinate for a given x, d(Tdot qd) by q, qd."""
+        (T, rate), dofs = self._maps(q, qd), self.scene.dof_count
+        turning, by_q, by_qd = np.zeros((dofs, dofs, dofs)), np.zeros((dofs, dofs)), np.zeros((dofs, dofs))
+        for h, hinge in enumerate(self.scene.hinges):
+            mine = self.entries(h)[1]
+            if hinge.kind not in TURNING:
+                continue
+            for i, e in zip(mine[-3:], np.eye(3), strict=True):  # T turns with the body: T (1 - e~)
+                for triple in (mine[:3], mine[-3:]):
+                    turning[np.ix_(triple, triple, [i])] = -pin.skew(e)[:, :, None]
+            if hinge.kind == "free":
+                Rt = T[np.ix_(self.v_of[mine[3:]], mine[3:])]
+                v, w = qd[mine[:3]], qd[mine[3:]]
+                at = self.v_of[mine[:3]]
+                by_q[np.ix_(at, mine[3:])] = -Rt @ pin.skew(np.cross(w, v))
+                by_qd[np.ix_(at, mine[:3])], by_qd[np.ix_(at, mine[3:])] = -Rt @ pin.skew(w), Rt @ pin.skew(v)
+        return T, rate, lambda x: T @ np.einsum("abi,b->ai", turning, x), by_q, by_qd
+
+    def inverse_dynamics_derivatives(self, q, qd, qdd):
+        """By tangent coordinates and by qd, from ``computeRNEADerivatives``, whose tangent is the body's."""
+        T, rate, turned, by_q, by_qd = self._derivatives(q, qd)
+        own = self.q_of(q), T @ qd, T @ qdd + rate
+        M, tau = self._mass(own[0]), self._inverse(*own)
+        dq, dv, _ = (np.array(x) for x in pin.computeRNEADerivatives(self.model, self.data, *own))
+        inner = T.T @ (dq @ T + dv @ turned(qd) + M @ (turned(qdd) + by_q))
+        # T* tau changes by (d T)* tau, which is -(d T of T* tau) where T turns from the right
+        return inner - np.linalg.solve(T, turned(T.T @ tau)), T.T @ (dv @ T + M @ by_qd)
+
+    def forward_dynamics_derivatives(self, q, qd, tau):
+        """Likewise from ``computeABADerivatives``: for ball and free hinges without armature."""
+        assert not self.outer_armature.any()
+        T, _, turned, by_q, by_qd = self._derivatives(q, qd)
+        own, qdd = np.linalg.solve(T.T, tau), self.forward_dynamics(q, qd, tau)
+        pin.computeABADerivatives(self.model, self.data, self.q_of(q), T @ qd, own)
+        dq, dv, inverse = (np.array(x) for x in (self.data.ddq_dq, self.data.ddq_dv, self.data.Minv))
+        inverse = np.triu(inverse) + np.triu(inverse, 1).T
+        force = np.linalg.solve(T.T, np.linalg.solve(T, turned(tau)))  # d(T^-*) tau
+        inner = dq @ T + dv @ turned(qd) + inverse @ force - by_q - turned(qdd)
+        return np.linalg.solve(T, inner), np.linalg.solve(T, dv @ T - by_qd)
 
     def body_poses(self, q):
         pin.forwardKinematics(self.model, self.data, self.q_of(q))

@@ -108,6 +108,8 @@ RULES = {
     "guarded": lambda x, y: g.guarded(x * x + 2.0, y * y) * y,
     "lost": lambda x, y: x.graph.make("lost", x) + x * y,
     "select": lambda x, y: g.select(x, x * y, y) + g.select(x.graph.make("lost", x), x, y * y),
+    "less": lambda x, y: g.less(x, y) + x * y,
+    "arctangent": lambda x, y: g.arctangent(x * x + 1.0, y),
     "sum_of_logarithms": lambda x, y: g.sum_of_logarithms([x * x, x * x + y * y]),
 }
 

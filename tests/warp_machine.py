@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warp_spo.kernels.straight import COLUMNS, IN_PLACE, MAPPED, Frame
+from warp_spo.kernels.straight import IN_PLACE, MAPPED, TILED, Frame
 from warp_spo.programs import Programs
 from warp_spo.teams import BARRIER
 
@@ -104,7 +104,7 @@ def run(text, arrays, backwards=False):
         going = {} if stopped else going
         stretch += 1
     whole = np.zeros((frame.result.array.entries, worlds))
-    places = text.tables["place"] if frame.result.way in (MAPPED, COLUMNS) else range(len(whole))
+    places = text.tables["place"] if frame.result.way in (MAPPED, TILED) else range(len(whole))
     for entry, slot in enumerate(places):
         whole[entry] = 0.0 if slot < 0 else result.values[slot]
     return whole.T
@@ -176,4 +176,5 @@ def _statement(line):
 
 
 def _sent(line):
-    return re.sub(r"RESULT\(([^()]*)\)", r"result_row[\1]", re.sub(r"SENT\(([^()]*)\)", r"sent[\1]", line))
+    line = re.sub(r"result_row\[\(([^()]*)\) \* \d+\]", r"result_row[\1]", line)
+    return re.sub(r"SENT\(([^()]*)\)", r"sent[\1]", line)

@@ -238,16 +238,16 @@ class Applications:
         return call.result
 
     def _launch(self, operation: str, out: wp.array, more: dict[str, wp.array] | None = None, **given: Any) -> None:
-        """Launch an operation that has no node form; None is not given, what is no array is an option."""
+        """Launch an operation that has no node form; None is not given, what is no array and no float is an option."""
         if out.size == 0:
             return
         if self.scene.dof_count == 0:
             out.zero_()
             return
         more = more or {}
-        arrays = {name: value for name, value in given.items() if isinstance(value, wp.array)}
+        arrays = {name: value for name, value in given.items() if isinstance(value, wp.array | float)}
         options = {name: value for name, value in given.items() if value is not None and name not in arrays}
-        shapes = {name: array.shape for name, array in arrays.items()}
+        shapes = {name: getattr(array, "shape", ()) for name, array in arrays.items()}
         further = {name: array.shape for name, array in more.items()}
         program = self.programs.find(operation, shapes, out.shape, further, **options)
         self.programs.launch(program, arrays, out, *more.values())

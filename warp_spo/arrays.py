@@ -68,6 +68,44 @@ def shape_of(array) -> tuple:
     return tuple(array.shape) + tuple(getattr(array.dtype, "_shape_", ()) if isinstance(array, wp.array) else ())
 
 
+class Values:
+    """The tensors, on record by torch, that values of a scene were set to, by name.
+
+    A value keeps its stamp as long as it is set to the same tensor, unchanged.
+    """
+
+    def __init__(self) -> None:
+        self.tensors: dict[str, Any] = {}
+        self.stamps: dict[str, int] = {}
+        self._versions: dict[str, int] = {}
+        self._count = 0
+
+    def set(self, name: str, value: Any) -> None:
+        """Take note of a value."""
+        tracked = recorded((value,))
+        if tracked and name in self.tensors and self.tensors[name] is value:
+            if self._versions[name] == value._version:
+                return
+        self._count += 1
+        self.stamps[name] = self._count
+        self.tensors.pop(name, None)
+        if tracked:
+            self.tensors[name], self._versions[name] = value, value._version
+
+
+def recorded(arguments: tuple, values: Values | None = None) -> bool:
+    """Whether torch is to go back through a call with these arguments, of an object with these values."""
+    if "torch" not in sys.modules:
+        return False
+    torch = _torch()
+    return torch.is_grad_enabled() and (bool(values and values.tensors) or any(map(torch.requires_grad, arguments)))
+
+
+def differentiated(*call: Any) -> Any:
+    """See :func:`warp_spo.torch.differentiated`."""
+    return _torch().differentiated(*call)
+
+
 class Call:
     """One call: takes the caller's arrays in, gives the result back in the caller's kind.
 
@@ -161,9 +199,10 @@ class Call:
             self._staged.append((array, taken))
         return taken
 
-    def write(self, out, shape: tuple, meaning: str = "", *, name: str = "out", dtype=None):
+    def write(self, out, shape: tuple, meaning: str = "", *, name: str = "out", dtype=None, over: str = ""):
         """Return the array for a result: ``out`` itself, or a new one of the kind of the first array read.
 
+        It may be the very array that was read as ``over``.
         Its content is undefined. Raises as :meth:`read`, and TypeError if ``out`` is of another kind.
         """
         dtype = dtype or self.dtype
@@ -183,7 +222,7 @@ class Call:
                 self._staged.append((out, taken))
             else:
                 taken = self._take(name, out, shape, meaning, dtype, change=True)
-            self._add_output(name, out, taken)
+            self._add_output(name, out, taken, over)
         self._results.append((out, taken))
         return taken
 
@@ -275,8 +314,9 @@ class Call:
         if not array.flags.writeable:
             raise ValueError(f"{self.name}: {name} is a read-only NumPy array; expected one to write into; pass a copy")
 
-    def _add_output(self, name, array, taken):
-        self._check_apart(name, array, taken, self._inputs)
+    def _add_output(self, name, array, taken, over=""):
+        same = [other for other in self._inputs if other[0] == over and _same_memory(taken, other[2])]
+        self._check_apart(name, array, taken, [other for other in self._inputs if other not in same])
         self._check_apart(name, array, taken, self._outputs)
         self._outputs.append((name, array, taken))
 
@@ -329,6 +369,10 @@ def new(kind: str | None, shape: tuple, dtype: type, device: wp.Device) -> tuple
 def view(pointer: int, shape: tuple, dtype: type, device: str) -> wp.array:
     """Return a Warp array over memory that someone else owns. Cached, because making one takes 4 us."""
     return wp.array(ptr=pointer, shape=shape, dtype=dtype, device=device)
+
+
+def _same_memory(a, b) -> bool:
+    return a.ptr == b.ptr and a.shape == b.shape
 
 
 def _bytes_meet(a, b) -> bool:

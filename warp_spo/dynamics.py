@@ -17,8 +17,10 @@ import warp as wp
 from . import nodes
 from . import plan as plans
 from . import status as words
+from .adjoints import Adjoints, differentiable
 from .applications import Applications
-from .arrays import Call, parse_device, parse_dtype, shape_of
+from .arrays import Call, Values, parse_device, parse_dtype, recorded, shape_of
+from .derivatives import Derivatives
 from .errors import UnsupportedError
 from .frames import Frame, checked
 from .levels import Recursions
@@ -27,6 +29,7 @@ from .programs import Programs
 from .refinement import Refinement
 from .scene import Scene
 from .spatial_operators import SpatialOperators
+from .steps import Steps
 
 OPERATIONS = (
     "forward_dynamics",
@@ -53,11 +56,17 @@ OPERATIONS = (
     "log_det_mass_matrix_gradient",
     "fixman_torque",
     "mass_matrix_packed",
+    "inverse_dynamics_derivatives",
+    "forward_dynamics_derivatives",
+    "mass_matrix_derivative",
+    "step",
+    "body_accelerations",
+    "body_reactions",
 )
 LOOPS = ("raise", "cut", "embed", "multipliers")
 
 
-class Dynamics(Applications):
+class Dynamics(Applications, Steps, Derivatives, Adjoints):
     """Dynamics of one scene in many worlds.
 
     Arrays are torch tensors, Warp arrays or NumPy arrays, [world, ...] and C-contiguous; the kind of the first one is
@@ -107,6 +116,7 @@ class Dynamics(Applications):
         self.granularity = self.plan.granularity
         self.recursions = Recursions(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)
+        self.values = Values()
         if not isinstance(refine, int) or refine < 0:
             raise ValueError(f"Dynamics: refine is {refine!r}; expected how many steps, 0 or more")
         self.refine = refine
@@ -136,7 +146,9 @@ class Dynamics(Applications):
                 shape = self.scene.values[name].shape[1:]
                 if len(shape_of(value)) > len(shape):
                     shape = (self.worlds, *shape)
-                array = call.read(name, value, shape, "[world, ...] or [...] as Newton has it")
+                followed = name in self.variable and name in self.differentiable_values and recorded((value,))
+                plain = value.detach() if followed else value
+                array = call.read(name, plain, shape, "[world, ...] or [...] as Newton has it")
                 if name in self.variable:
                     taken[name] = array
                 else:
@@ -151,8 +163,11 @@ class Dynamics(Applications):
             parameters = self.recursions.parameters
             for name, array in taken.items():
                 parameters.copy_in(name, array)
+                self.values.set(name, values[name])
             parameters.refresh(taken)
             if folded:
+                for name in folded:
+                    self.values.set(name, None)
                 self._rebuild(checked)
 
     def _rebuild(self, folded: dict[str, np.ndarray]) -> None:
@@ -172,18 +187,25 @@ class Dynamics(Applications):
         Args:
             operation: name of a method, such as "forward_dynamics".
             options: ``frames=`` for operations that take frames, ``columns=`` for solve_mass_matrix, ``prescribed=``
-                for hybrid_dynamics, ``body_f=True`` and ``status=True`` if they will be given.
+                for hybrid_dynamics, ``integrator=`` for step, and ``body_f=True``, ``status=True``, ``qdd=True``,
+                ``target_q=True``, ``target_qd=True`` if they will be given.
         """
         if operation not in OPERATIONS:
             raise ValueError(f"Dynamics.prepare: no operation {operation!r}; expected one of {', '.join(OPERATIONS)}")
         q: Any = wp.array(np.tile(self.scene.neutral_q, (self.worlds, 1)), dtype=self.dtype, device=self.device)
         rate = wp.zeros((self.worlds, self.scene.dof_count), dtype=self.dtype, device=self.device)
         extra: dict[str, Any] = {}
-        loaded = ("forward_dynamics", "inverse_dynamics", "bias_force", "hybrid_dynamics")
+        loaded = ("forward_dynamics", "inverse_dynamics", "bias_force", "hybrid_dynamics", "step", "body_reactions",
+                  "inverse_dynamics_derivatives", "forward_dynamics_derivatives")  # fmt: skip
         if operation in loaded and options.pop("body_f", False):
             shape = (self.worlds, self.scene.body_count, 6)
             extra["body_f"] = wp.zeros(shape, dtype=self.dtype, device=self.device)
-        if operation == "forward_dynamics" and options.pop("status", False):
+        if operation == "step":
+            extra |= {name: array for name, array in (("target_q", q), ("target_qd", rate)) if options.pop(name, False)}
+            extra["integrator"] = options.pop("integrator", "semi_implicit")
+        if operation == "step" and options.pop("qdd", False):
+            extra["qdd"] = wp.zeros_like(rate)
+        if operation in ("forward_dynamics", "step") and options.pop("status", False):
             extra["status"] = wp.zeros(self.worlds, dtype=wp.int32, device=self.device)
         arguments: dict[str, tuple] = {
             "forward_dynamics": (q, rate, rate),
@@ -193,9 +215,14 @@ class Dynamics(Applications):
             "body_velocities": (q, rate),
             "integrate": (q, rate, 0.0),
             "hybrid_dynamics": (q, rate, rate, rate),
+            "step": (q, rate, rate, 1e-3),
+            "body_accelerations": (q, rate, rate),
+            "body_reactions": (q, rate, rate),
             "jacobian_bias": (q, rate),
             "centroidal_momentum_bias": (q, rate),
             "quasi_velocities": (q, rate),
+            "inverse_dynamics_derivatives": (q, rate, rate),
+            "forward_dynamics_derivatives": (q, rate, rate),
         }
         given = arguments.get(operation, (q,))
         if operation == "solve_mass_matrix":
@@ -213,6 +240,7 @@ class Dynamics(Applications):
         getattr(self, operation)(*given, **extra)
 
     # -- dynamics --------------------------------------------------------------------------------------------------
+    @differentiable
     def forward_dynamics(
         self, q: Any, qd: Any = None, tau: Any = None, body_f: Any = None, status: Any = None, out: Any = None
     ) -> Any:
@@ -258,6 +286,7 @@ class Dynamics(Applications):
                     words.write(self.recursions, q, qd, tau, body_f, out, status, factored=swept)
         return call.result
 
+    @differentiable
     def inverse_dynamics(self, q: Any, qd: Any = None, qdd: Any = None, body_f: Any = None, out: Any = None) -> Any:
         """Forces that give the accelerations ``qdd``: tau = Mass qdd + bias_force, by the Newton-Euler recursion.
 
@@ -268,10 +297,12 @@ class Dynamics(Applications):
         """
         return self._newton_euler("inverse_dynamics", q, qd, qdd, body_f, out)
 
+    @differentiable
     def bias_force(self, q: Any, qd: Any = None, body_f: Any = None, out: Any = None) -> Any:
         """inverse_dynamics with qdd = 0: velocity terms, gravity and external wrenches [world, dof]."""
         return self._newton_euler("bias_force", q, qd, None, body_f, out)
 
+    @differentiable
     def gravity_force(self, q: Any, out: Any = None) -> Any:
         """bias_force with qd = 0: the force that holds the robot still, +dU/dq [world, dof]."""
         return self._newton_euler("gravity_force", q, None, None, None, out)
@@ -303,6 +334,7 @@ class Dynamics(Applications):
             self._run("mass_matrix_inverse", out, q=q)
         return call.result
 
+    @differentiable
     def solve_mass_matrix(self, q: Any, b: Any, out: Any = None) -> Any:
         """Mass^-1 b in O(dof) a column; b and the result [world, dof] or [world, dof, columns]."""
         with self._call("solve_mass_matrix") as call:
@@ -326,19 +358,8 @@ class Dynamics(Applications):
             self._run("log_det_mass_matrix", out, q=q)
         return call.result
 
-    def passive_force(self, q: Any, qd: Any = None, out: Any = None) -> Any:
-        """-damping qd - stiffness (q - rest) [world, dof].
-
-        For ball and free hinges, q - rest of the rotation is the rotation vector of R(q) R(rest)^T in the parent
-        anchor's axes.
-        """
-        with self._call("passive_force") as call:
-            q, qd = self._read_state(call, q, qd)
-            out = call.write(out, (self.worlds, self.scene.dof_count), "[world, dof]")
-            self._run("passive_force", out, q=q, qd=qd)
-        return call.result
-
     # -- kinematics ------------------------------------------------------------------------------------------------
+    @differentiable
     def body_poses(self, q: Any, out: Any = None) -> Any:
         """Pose of every body in the inertial frame: x, y, z [m], quaternion xyzw [world, body, 7], Newton's body_q."""
         with self._call("body_poses") as call:
@@ -347,6 +368,7 @@ class Dynamics(Applications):
             self._run("body_poses", out, q=q)
         return call.result
 
+    @differentiable
     def body_velocities(self, q: Any, qd: Any, out: Any = None) -> Any:
         """CoM velocity [m/s], angular velocity [rad/s], inertial axes [world, body, 6], Newton's body_qd."""
         with self._call("body_velocities") as call:
@@ -380,17 +402,6 @@ class Dynamics(Applications):
             rows = 6 * len(where)
             out = call.write(out, (self.worlds, rows, rows), "[world, 6 frames, 6 frames]")
             self._run("operational_inertia_inverse", out, q=q, frames=where)
-        return call.result
-
-    def integrate(self, q: Any, qd: Any, dt: float, out: Any = None) -> Any:
-        """q moved along a constant qd for dt [s] on the manifold, quaternions renormalised [world, coordinate].
-
-        A free hinge's CoM moves straight while the body turns about it.
-        """
-        with self._call("integrate") as call:
-            q, qd = self._read_state(call, q, qd, optional=False)
-            out = call.write(out, (self.worlds, self.scene.coord_count), "[world, coordinate]")
-            self._run("integrate", out, q=q, qd=qd, dt=_seconds(call.name, dt))
         return call.result
 
     # -- operators -------------------------------------------------------------------------------------------------
@@ -441,6 +452,12 @@ class Dynamics(Applications):
         return program is None
 
     def _call(self, name: str) -> Call:
+        if self.values.tensors and recorded((), self.values):
+            names = ", ".join(self.values.tensors)
+            raise ValueError(
+                f"Dynamics.{name}: {names} was set to a tensor that requires grad; derivatives are not available "
+                f"through this call; call inside torch.no_grad(), or set {names} to detached tensors"
+            )
         return Call(f"Dynamics.{name}", self.device, self.dtype)
 
     def _read_state(self, call: Call, q: Any, qd: Any, optional: bool = True) -> tuple[wp.array, Any]:
@@ -452,15 +469,6 @@ class Dynamics(Applications):
 
     def _read_body_f(self, call: Call, body_f: Any) -> Any:
         return call.read("body_f", body_f, (self.worlds, self.scene.body_count, 6), "[world, body, 6]", optional=True)
-
-
-def _seconds(call: str, dt: Any) -> float:
-    if getattr(dt, "requires_grad", False):
-        raise ValueError(f"{call}: dt requires grad; derivatives are not available through this call; pass float(dt)")
-    try:
-        return float(dt)
-    except (TypeError, ValueError):
-        raise TypeError(f"{call}: dt is {dt!r}; expected a number of seconds, the same in all worlds") from None
 
 
 def _world_count(scene: Scene, worlds: Any) -> int:

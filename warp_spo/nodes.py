@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from .kernels import articulated, kinematics, passive
+from .kernels import articulated, kinematics
 from .levels import Recursions
 
 
@@ -56,11 +56,6 @@ def log_det_mass_matrix(run: Recursions, out: wp.array, q: wp.array) -> None:
     run.launch(articulated.log_determinant, run.worlds, [run.factor()], [out])
 
 
-def passive_force(run: Recursions, out: wp.array, q: wp.array, qd: Any = None) -> None:
-    fields = [run.parameters.field(name) for name in ("joint_damping", "joint_stiffness", "joint_rest_q")]
-    run.launch(passive.passive_force, run.nodes, [run.topology, *fields, q, qd], [out])
-
-
 def body_poses(run: Recursions, out: wp.array, q: wp.array) -> None:
     run.hinges(q)
     run.launch(kinematics.body_poses, run.nodes, [run.world_poses(), run.parameters.anchor], [out])
@@ -84,7 +79,3 @@ def operational_inertia_inverse(run: Recursions, out: wp.array, q: wp.array, fra
     run.jacobian(*run.frames(frames), J)
     run.factor()
     run.sandwich(J.reshape((run.worlds, rows, dofs)).transpose((0, 2, 1)), rows, out)
-
-
-def integrate(run: Recursions, out: wp.array, q: wp.array, qd: wp.array, dt: float) -> None:
-    run.launch(kinematics.integrate, run.nodes, [run.topology, run.parameters.com, q, qd, dt], [out])

@@ -149,6 +149,10 @@ class Parameters:
             return None
         return self.field("gravity")
 
+    def value(self, name: str) -> wp.array:
+        """Newton's numbers as they are kept [1 or worlds, ...], float64."""
+        return self._values[name]
+
     def copy_in(self, name: str, value: wp.array) -> None:
         """Copy a variable value [world, ...] or [...] into place; launches only."""
         own = self._values[name]

@@ -25,8 +25,6 @@ LONG_RESULTS = ("mass_matrix", "mass_matrix_inverse")  # writing them is most of
 
 SEGMENTED = ("forward_dynamics", "solve_mass_matrix", *LONG_RESULTS, *SHORT)
 """Operations that a warp a limb can share; the others run with a thread a world where the plan says segment."""
-NODE_ONLY = ("passive_force", "integrate")
-"""Operations in which no body waits for another: one launch, a thread for each (node, world)."""
 TREE_ONLY = (
     "hybrid_dynamics",
     "jacobian_bias",
@@ -37,6 +35,25 @@ TREE_ONLY = (
     "log_det_mass_matrix_gradient",
     "fixman_torque",
     "mass_matrix_packed",
+    "inverse_dynamics_derivatives",
+    "mass_matrix_derivative",
+    "tiled_mass_matrix_inverse",
+    "forward_dynamics_vjp",
+    "inverse_dynamics_vjp",
+    "solve_mass_matrix_vjp",
+    "integrate_vjp",
+    "step_vjp",
+    "body_poses_vjp",
+    "body_velocities_vjp",
+    "forward_dynamics_jvp",
+    "inverse_dynamics_jvp",
+    "step",
+    "integrate",
+    "passive_force",
+    "hinge_force",
+    "coordinate_rates",
+    "body_accelerations",
+    "body_reactions",
 )
 """Operations that exist as traces alone: each is a kernel of its scene, a thread a world, whatever the plan."""
 
@@ -73,8 +90,6 @@ class Plan:
 
     def of(self, operation: str) -> str:
         """Granularity of one operation: the plan's own where the operation has that form."""
-        if operation in NODE_ONLY:
-            return "node"
         if operation in TREE_ONLY:
             return "tree"
         chosen = self.granularity if self.forced else self._rule(operation)

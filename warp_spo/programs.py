@@ -13,21 +13,25 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from . import link_values
-from .kernels import straight
-from .kernels.straight import COLUMNS, DIRECT, IN_PLACE, MAPPED, STAGED, WARP, Frame, Result, Row
+from .kernels import straight, tiles
+from .kernels.straight import DIRECT, IN_PLACE, MAPPED, STAGED, TILE, TILED, WARP, Frame, Result, Row
 from .levels import Recursions
+from .parts import DOF_VALUES
 from .plan import MOST_WARPS, TREE_ONLY, Plan
 from .recursions import messages
-from .recursions.applications import Applications
+from .recursions.adjoints import Adjoints
 from .recursions.links import TABLES, Links
 from .recursions.messages import INWARD, OUTWARD, SENDS
 from .recursions.operators import meet, written
 from .recursions.pieces import Pieces
+from .recursions.step import LOOPED
 from .recursions.traced import Trace
 from .teams import Team, Work
 from .trace.emit import Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
+FIELDS = (*TABLES, *DOF_VALUES, "joint_rest_q")
+"""Values of the scene as kernels read them, [entry, world]: what links are made of, and Newton's own."""
 TRACED = (
     *SENDS,
     "log_det_mass_matrix",
@@ -38,9 +42,11 @@ TRACED = (
     "expression",
     *TREE_ONLY,
 )
+TILES = ("tiled_mass_matrix_inverse", "inverse_dynamics_derivatives", "mass_matrix_derivative")
+"""Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
-COLUMN_SLOTS = 256  # different values of a result from which they go through memory, not through shared memory,
-COLUMN_WORLDS = 1 << 20  # of so many worlds at a time
+TILED_SLOTS = 256  # different values of a result from which they go through memory, not through shared memory,
+TILED_WORLDS = 1 << 20  # of so many worlds at a time
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
@@ -50,10 +56,12 @@ class Program(NamedTuple):
     """One kernel.
 
     Attributes:
-        rows: names of the callers' arrays that it reads. fields: of the tables of what the links are made of.
+        rows: names of the callers' arrays, and then numbers, that it reads. fields: of FIELDS.
         tables: arrays of its own.
         operations: floating-point operations of one world.
-        spread: a second kernel that brings the values of the first, [slot, world], to their ``places``; or None.
+        slots: values of one world in the tiles that it writes; entry: where each entry of the result is among them, -1
+            being zero. See :mod:`.kernels.tiles`.
+        tiles: those of some worlds at a time, if they are to be spread at once.
     """
 
     kernel: wp.Kernel
@@ -63,16 +71,9 @@ class Program(NamedTuple):
     warps: int
     block: int
     operations: int
-    spread: Spread | None = None
-
-
-class Spread(NamedTuple):
-    """The second half of a program with a long result: ``columns`` [group, slot, world of 32] of some worlds."""
-
-    kernel: wp.Kernel
-    columns: wp.array
-    places: wp.array
-    tile: int
+    slots: int = 0
+    entry: Any = None
+    tiles: Any = None
 
 
 class Programs:
@@ -85,13 +86,13 @@ class Programs:
         registers: a cap on the registers of a thread.
 
     Attributes:
-        columns: a result that is too long for shared memory goes through memory. column_worlds: of so many at a time,
-            a multiple of 32.
+        tiled: a result that is too long for shared memory goes through memory. tiled_worlds: of so many at a time,
+            a multiple of 8.
     """
 
     def __init__(self, run: Recursions, plan: Plan, block: int = WARP, registers: int | None = None):
         self.run, self.plan, self.block, self.registers = run, plan, block, registers
-        self.columns, self.column_worlds = run.device.is_cuda, COLUMN_WORLDS
+        self.tiled, self.tiled_worlds = run.device.is_cuda, TILED_WORLDS
         self._programs: dict[Any, Program | None] = {}
         self._links: Links | None = None
 
@@ -128,18 +129,21 @@ class Programs:
             self._programs[key] = self._build(operation, shapes, out, more or {}, options)
         return self._programs[key]
 
-    def launch(self, program: Program, arrays: dict[str, wp.array], out: wp.array, *more: wp.array) -> None:
+    def launch(self, program: Program, arrays: dict[str, Any], out: wp.array, *more: wp.array) -> None:
         rows = [arrays[name] for name in program.rows]
-        fields = [self.table(name) for name in program.fields]
-        if program.spread is None:
+        fields = [self.field(name) for name in program.fields]
+        if program.tiles is None:
             self._launch(program, self.run.worlds, [*rows, *fields], [out, *more])
             return
-        some = WARP * program.spread.columns.shape[0]
+        some, size = program.tiles.shape[0] * TILE, out.size // self.run.worlds
         for first in range(0, self.run.worlds, some):
             part = slice(first, min(first + some, self.run.worlds))
-            inputs = [*(row[part] for row in rows), *(field[:, part] for field in fields)]
-            self._launch(program, part.stop - first, inputs, [program.spread.columns, *(array[part] for array in more)])
-            self._spread(program.spread, part.stop - first, out[part])
+            inputs = [row[part] if isinstance(row, wp.array) else row for row in rows]
+            inputs += [field[:, part] for field in fields]
+            worlds = part.stop - first
+            self._launch(program, worlds, inputs, [program.tiles, *(array[part] for array in more)])
+            dim, result = (-(-worlds // TILE), size), out[part].reshape((worlds, size))
+            self.run.launch(tiles.spread, dim, [program.tiles, program.entry, 0], [result])
 
     def _launch(self, program: Program, worlds: int, inputs: list, outputs: list) -> None:
         device, block = self.run.device, program.block
@@ -148,14 +152,10 @@ class Programs:
         inputs = [worlds, *inputs, *program.tables]
         wp.launch(program.kernel, threads, inputs, outputs, device=device, block_dim=block)
 
-    def _spread(self, spread: Spread, worlds: int, out: wp.array) -> None:
-        device, block = self.run.device, straight.SPREAD_BLOCK
-        threads = -(-worlds // spread.tile) * block if device.is_cuda else worlds
-        inputs = [worlds, spread.columns, spread.places]
-        wp.launch(spread.kernel, threads, inputs, [out], device=device, block_dim=block)
-
-    def table(self, name: str) -> wp.array:
-        """What the links are made of [entry, world]."""
+    def field(self, name: str) -> wp.array:
+        """One of FIELDS."""
+        if name not in TABLES:
+            return self.run.parameters.field(name)
         return link_values.table(self.run.parameters, self.links, name)
 
     @property
@@ -200,20 +200,30 @@ class Programs:
         return self._tree_program(operation, links, {**shapes, **more}, tuple(more), options)
 
     def _tree_program(self, operation: str, links: Links, shapes: dict, more: tuple, options: dict) -> Program:
-        trace = Applications(links, self.run.dtype.__name__, tuple(shapes))
+        trace = Adjoints(links, self.run.dtype.__name__, tuple(shapes))
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         frame = self._frame([item for item in stores if item.array == "out"], shapes, 0, 1, self.block, stores)
-        frame = frame._replace(again=not frame.staged and frame.result.way == DIRECT)
+        alone = not any(item.array in LOOPED for item in stores)
+        if operation in TILES:
+            result = Result(TILED, frame.result.array, slots=_solid(stores))
+            frame = frame._replace(staged=self.plan.staged, result=result)
+        frame = frame._replace(again=alone and not frame.staged and frame.result.way in (DIRECT, TILED))
         frame = frame._replace(more=tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more))
         placed, table = _placed([item for item in stores if item.array == "out"], frame.result)
         placed += apart
         emitter = self._emitter(shapes, frame)
         listing = emitter.region(placed)
         body = literals(listing, self.run.dtype.__name__)
+        operations, looped = emitter.operations, [item for item in stores if item.array in LOOPED]
+        if looped:
+            emitter = self._emitter(shapes, frame)
+            a_pass = literals(emitter.region(looped), self.run.dtype.__name__)
+            body = straight.looped(a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
+            operations += emitter.operations
         frame = frame._replace(again=frame.again and "farthest" in listing.text)
         tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
-        return self._finished(operation, frame, body, body, tables, emitter.operations)
+        return self._finished(operation, frame, body, body, tables, operations)
 
     def _segment_program(self, operation: str, shapes: dict, pieces: Pieces, options: dict) -> Program | None:
         dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(operation, pieces)
@@ -232,6 +242,8 @@ class Programs:
                             WARP * pieces.warps, everything)
         if frame.result.way == DIRECT and frame.result.array.entries > LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
+        if not frame.fits(self.run.dtype):
+            return None  # nor for what limbs tell each other
         team = Team(pieces, dtype)
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
         whole = [item for item in everything if item.array == "out"]
@@ -256,24 +268,26 @@ class Programs:
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
-        if item.array in (INWARD, OUTWARD):
+        if item.array in (INWARD, OUTWARD, *LOOPED):
             return item
         return item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
 
     def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int) -> Program:
         native = straight.assemble(frame, cuda, cpu, self.run.dtype)
-        rows, fields = tuple(row.name for row in frame.rows), tuple(frame.fields)
-        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 2) for name in fields]
-        result, spread = frame.result, None
-        if result.way == COLUMNS:
-            some = min(self.run.worlds, self.column_worlds)
-            columns = wp.empty((-(-some // WARP), result.slots, WARP), dtype=self.run.dtype, device=self.run.device)
-            tile = straight.tile(result, self.run.dtype)
-            spread = Spread(straight.spread(result, self.run.dtype), columns, tables.pop("place"), tile)
-        arrays += [(name, 1) for name in tables] + [("out", 3 if spread else result.array.ndim)]
+        rows, fields = (*(row.name for row in frame.rows), *frame.numbers), tuple(frame.fields)
+        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 0) for name in frame.numbers]
+        arrays += [(name, 2) for name in fields]
+        result, entry, tiles = frame.result, None, None
+        if result.way == TILED:
+            entry = tables.pop("place")
+            if operation not in TILES:
+                shape = -(-min(self.run.worlds, self.tiled_worlds) // TILE), max(result.slots, 1), TILE
+                tiles = wp.empty(shape, dtype=self.run.dtype, device=self.run.device)
+        arrays += [(name, 1) for name in tables] + [("out", result.array.ndim if entry is None else 3)]
         arrays += [(row.name, row.ndim) for row in frame.more]
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers)
-        return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations, spread)
+        return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations, result.slots,
+                       entry, tiles)
 
     def _emitter(self, shapes: dict, frame: Frame) -> Emitter:
         result = frame.result
@@ -283,15 +297,15 @@ class Programs:
         def load(array: str, entry: str) -> str:
             if array in (INWARD, OUTWARD):
                 return f"SENT({entry})"
-            if array in TABLES:
+            if array in FIELDS:
                 return f"FIELD({array}, {entry})"
             return f"{array}_row[{entry}]"
 
         def store(array: str, entry: str, value: str) -> str:
             if array in (INWARD, OUTWARD):
                 return f"SENT({entry}) = {value};"
-            if array == "out" and result.way == COLUMNS:
-                return f"if (mine) RESULT({entry}) = {value};"
+            if array == "out" and result.way == TILED:
+                return f"if (mine) result_row[({entry}) * {TILE}] = {value};"
             if array == "out":
                 return f"{guard}result_row[{entry}] = {value};"
             return f"if (mine) {array}_row[{entry}] = {value};"
@@ -299,20 +313,21 @@ class Programs:
         def flat(array: str, index: tuple) -> int:
             return index[0] if len(index) == 1 else _flat(index, shapes[array][1:])
 
-        return Emitter(self.run.dtype.__name__, load, store, flat, angles, TABLES)
+        return Emitter(self.run.dtype.__name__, load, store, flat, angles, FIELDS)
 
     def _frame(self, stores: list[Store], shapes: dict, sent: int, warps: int, block: int,
                everything: list[Store] | None = None) -> Frame:
         """How rows come in and the result, of flat ``stores``, goes out: through shared memory where it has room."""
         used = _reads(everything or stores)
-        rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used]
+        rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used and shape]
+        numbers = tuple(name for name, shape in shapes.items() if name in used and not shape)
         out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
         dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
         over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
         over = [name for name in over if _read_before(stores, name)]
         slots = len({_name(item.value) for item in stores})
-        fields = {name: used[name] for name in TABLES if name in used}
-        held = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
+        fields = {name: used[name] for name in FIELDS if name in used}
+        held = ((), tuple(fields.values())) if fields and warps == 1 and set(fields) <= set(TABLES) else ((),)
         staged, ways = self.plan.staged, [(False, Result(DIRECT, out))]
         staged = staged or any(row.name == "x" and row.entries > SHORT_ROW for row in rows)
         if dense and (staged or out.entries > SHORT_ROW):
@@ -320,12 +335,12 @@ class Programs:
         if dense and staged:
             ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), *ways]
         if out.entries > LONG_ROW and not (dense and staged and over == ["x"]):
-            mapped, columns = Result(MAPPED, out, slots=slots), Result(COLUMNS, out, slots=slots)
+            mapped = Result(MAPPED, out, slots=slots)
             ways = [(staged, mapped), (False, mapped), *ways]
-            if self.columns and straight.tile(columns, self.run.dtype):
-                ways.insert(0 if slots >= COLUMN_SLOTS else -1, (False, columns))
+            if self.tiled:
+                ways.insert(0 if slots >= TILED_SLOTS else -1, (False, Result(TILED, out, slots=_solid(stores))))
         frames = [
-            Frame(rows, staged, list(fields), result, sent, warps, block, held=entries)
+            Frame(rows, staged, list(fields), result, sent, warps, block, held=entries, numbers=numbers)
             for staged, result in ways
             for entries in held[::-1]
         ]
@@ -351,21 +366,31 @@ def _called(key: tuple) -> str:
 
 
 def _placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int] | None]:
-    """Flat stores as the result wants them, and the table of a MAPPED one or of COLUMNS."""
+    """Flat stores as the result wants them, and the table of a MAPPED or TILED one."""
     out = result.array
-    if result.way in (MAPPED, COLUMNS):
+    if result.way in (MAPPED, TILED):
         slots: dict[Any, int] = {}
         table = [-1] * out.entries
         for item in stores:
-            table[item.index[0]] = slots.setdefault(_name(item.value), len(slots))
+            if result.way != TILED or not _is_zero(item.value):
+                table[item.index[0]] = slots.setdefault(_name(item.value), len(slots))
         return _by_slot(stores, table), table
     done = {item.index for item in stores}
     return stores + [Store("out", (i,), 0.0) for i in range(out.entries) if (i,) not in done], None
 
 
 def _by_slot(stores: list[Store], table: list[int]) -> list[Store]:
-    values = {table[item.index[0]]: item.value for item in stores}
+    values = {table[item.index[0]]: item.value for item in stores if table[item.index[0]] >= 0}
     return [Store("out", (slot,), value) for slot, value in sorted(values.items())]
+
+
+def _solid(stores: list[Store]) -> int:
+    """Different values that are not the constant zero."""
+    return len({_name(item.value) for item in stores if not _is_zero(item.value)})
+
+
+def _is_zero(value: Value) -> bool:
+    return is_constant(value) and value == 0.0
 
 
 def _name(value: Value) -> Any:

@@ -1,6 +1,7 @@
 """torch at the border: what :mod:`warp_spo.arrays` asks of tensors. The only file besides env.py that imports torch."""
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -56,3 +57,169 @@ def stream(device: wp.Device) -> wp.Stream:
 @functools.cache
 def _device(device: str) -> torch.device:
     return torch.device(wp.device_to_torch(device))
+
+
+# -- derivatives -------------------------------------------------------------------------------------------------------
+def requires_grad(array: Any) -> bool:
+    return isinstance(array, torch.Tensor) and array.requires_grad
+
+
+def differentiated(dyn: Any, operation: str, method: Any, arguments: dict[str, Any], by: tuple, values: tuple) -> Any:
+    """``method(dyn, **arguments)`` as an operation that torch can go back through.
+
+    Args:
+        operation: the public name. by: arguments with a derivative. values: of the scene, that enter.
+    """
+    sources = {name: tensor for name, tensor in dyn.values.tensors.items() if name in values}
+    given = {name: arguments.pop(name) for name in by if arguments.get(name) is not None}
+    tensors = {**given, **sources}
+    if not any(map(requires_grad, tensors.values())):
+        with torch.set_grad_enabled(any(map(requires_grad, arguments.values()))):  # which the call then refuses
+            return method(dyn, **given, **arguments)
+    call = f"Dynamics.{operation}"
+    for name, x in tensors.items():
+        if not is_tensor(x):
+            other = next(n for n, y in tensors.items() if requires_grad(y))
+            raise TypeError(
+                f"{call}: {other} requires grad and {name} is of type {type(x).__name__}; expected torch tensors only; "
+                f"pass torch.as_tensor({name}), or call inside torch.no_grad()"
+            )
+    if arguments.get("integrator", "semi_implicit") != "semi_implicit" or arguments.get("qdd") is not None:
+        raise ValueError(
+            f"{call}: an input requires grad; expected integrator='semi_implicit' and no qdd=, of which gradients are "
+            f"known; call inside torch.no_grad()"
+        )
+    out = arguments.pop("out", None)
+    if any(x is not None for x in (out if isinstance(out, tuple | list) else (out,))):
+        raise ValueError(
+            f"{call}: out is given and an input requires grad; a result that gradients flow through is a new tensor; "
+            f"leave out=, or call inside torch.no_grad()"
+        )
+    plain = _Plain(dyn, operation, method, arguments, tuple(given), tuple(sources))
+    return _Operation.apply(plain, *tensors.values())
+
+
+class _Plain:
+    """What an operation takes besides tensors: names of its arguments, and of values of the scene that enter."""
+
+    def __init__(self, dyn: Any, operation: str, method: Any, options: dict, arguments: tuple, values: tuple):
+        self.dyn, self.operation, self.method, self.options = dyn, operation, method, options
+        self.arguments, self.values = arguments, values
+        self.stamps = dict(dyn.values.stamps)
+
+    def run(self, tensors: Sequence[torch.Tensor]) -> tuple[Any, tuple]:
+        """The result; all that the way back needs of it."""
+        more = {}
+        if self.operation == "step":
+            more["qdd"] = torch.empty_like(tensors[self.arguments.index("qd")])
+        result = self.method(self.dyn, **dict(zip(self.arguments, tensors, strict=False)), **self.options, **more)
+        return result, (*(result if isinstance(result, tuple) else (result,)), *more.values())
+
+    def gradients(self, wanted: list[str], tensors: Sequence[torch.Tensor], results: tuple, cotangents: tuple) -> dict:
+        """By name; where a value has been set anew since the call, at the value of the call."""
+        given = dict(zip((*self.arguments, *self.values), tensors, strict=True))
+        stamps = self.dyn.values.stamps
+        anew = [name for name, stamp in stamps.items() if self.stamps.get(name) != stamp]
+        lost = [name for name in anew if name not in self.values and name in self.dyn.entering(self.operation)]
+        if lost:
+            raise RuntimeError(
+                f"Dynamics.{self.operation}: {', '.join(lost)} was set between this call and its backward pass; "
+                f"expected the values of the call; go back before Dynamics.set, or set tensors that require grad"
+            )
+        arrays = {name: given[name] for name in self.arguments}
+        with self.dyn.held({name: given[name] for name in anew if name in self.values}):
+            return self.dyn.pulled_back(self.operation, arrays, self.options, results, cotangents, wanted)
+
+
+class _Operation(torch.autograd.Function):
+    """An operation of Dynamics."""
+
+    @staticmethod
+    def forward(ctx: Any, plain: _Plain, *tensors: torch.Tensor) -> Any:
+        ctx.plain = plain
+        result, kept = plain.run([x.detach() for x in tensors])
+        ctx.save_for_backward(*tensors, *kept)
+        return result
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple:
+        plain, names = ctx.plain, (*ctx.plain.arguments, *ctx.plain.values)
+        tensors, results = ctx.saved_tensors[: len(names)], ctx.saved_tensors[len(names) :]
+        wanted = [name for name, needed in zip(names, ctx.needs_input_grad[1:], strict=True) if needed]
+        with torch.no_grad():
+            plainly = [x.detach() for x in tensors], tuple(y.detach() for y in results)
+            found = plain.gradients(wanted, *plainly, tuple(c.contiguous() for c in cotangents))
+            for name, tensor in zip(names, tensors, strict=True):
+                if name in found and found[name].dim() > tensor.dim():  # a value that all worlds share
+                    found[name] = found[name].sum(0)
+        if torch.is_grad_enabled():
+            sources = [x for x in (*tensors, *cotangents) if x.requires_grad]
+            found = {name: _Once.apply(plain.operation, value, *sources) for name, value in found.items()}
+        return None, *(found.get(name) for name in names)
+
+
+class _Once(torch.autograd.Function):
+    """A gradient that was asked for with ``create_graph=True``: itself, with an error behind it."""
+
+    @staticmethod
+    def forward(ctx: Any, operation: str, gradient: torch.Tensor, *sources: torch.Tensor) -> torch.Tensor:
+        ctx.operation = operation
+        return gradient.view_as(gradient)
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple:
+        raise RuntimeError(
+            f"Dynamics.{ctx.operation}: its gradient is differentiated once more; expected first derivatives only, "
+            f"which are analytic and not recorded; take finite differences of gradients for second ones"
+        )
+
+
+class Module(torch.nn.Module):
+    """A :class:`warp_spo.Dynamics` whose values are parameters, shared by all worlds and put in place before each call.
+
+    ::
+
+        robot = Module(spo.Dynamics(scene, worlds, variable=("body_mass", "joint_armature")))
+        optimizer = torch.optim.Adam(robot.parameters())
+        loss = (robot.forward_dynamics(q, qd, tau) - measured).square().mean()
+
+    Its methods are the operations of Dynamics that have gradients; calling it is ``forward_dynamics``.
+
+    Args:
+        dyn: what it wraps.
+        names: values, ``variable`` there; default: all of those that gradients reach. They start as the scene has them.
+
+    Raises:
+        ValueError: a name that is not variable, or has no gradient.
+    """
+
+    def __init__(self, dyn: Any, names: Sequence[str] | None = None):
+        super().__init__()
+        self.dyn = dyn
+        names = dyn.differentiable_values if names is None else tuple(names)
+        for name in names:
+            if name not in dyn.differentiable_values:
+                raise ValueError(
+                    f"Module: {name!r} has no gradient here; expected some of {', '.join(dyn.differentiable_values)}; "
+                    f"build Dynamics with variable=({name!r},)"
+                )
+            value = torch.as_tensor(dyn.scene.values[name].mean(0))
+            value = value.to(device=_device(dyn.device.alias), dtype=_DTYPES[dyn.dtype])
+            self.register_parameter(name, torch.nn.Parameter(value))
+
+    def _called(self, operation: str, *args: Any, **more: Any) -> Any:
+        self.dyn.set(**dict(self.named_parameters()))
+        return getattr(self.dyn, operation)(*args, **more)
+
+    def forward(self, *args: Any, **more: Any) -> Any:
+        return self._called("forward_dynamics", *args, **more)
+
+    forward_dynamics = functools.partialmethod(_called, "forward_dynamics")
+    inverse_dynamics = functools.partialmethod(_called, "inverse_dynamics")
+    bias_force = functools.partialmethod(_called, "bias_force")
+    gravity_force = functools.partialmethod(_called, "gravity_force")
+    step = functools.partialmethod(_called, "step")
+    solve_mass_matrix = functools.partialmethod(_called, "solve_mass_matrix")
+    body_poses = functools.partialmethod(_called, "body_poses")
+    body_velocities = functools.partialmethod(_called, "body_velocities")
+    integrate = functools.partialmethod(_called, "integrate")

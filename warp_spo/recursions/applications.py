@@ -7,7 +7,7 @@ from typing import Any
 from ..trace.emit import Store
 from ..trace.graph import Value, reciprocal, sqrt
 from ..trace.spatial import ZERO, Articulated, Rigid, Vector, cross, dot
-from . import articulated, composite, determinant, hybrid, motion, newton_euler
+from . import articulated, composite, determinant, hybrid, motion, newton_euler, reactions, step
 from .hybrid import Given
 from .links import Link
 from .operators import Operators
@@ -20,6 +20,29 @@ class Applications(Trace):
     def expression(self, expression: Any) -> list[Store]:
         """out = an operator, or what is composed of several, times the array x; see :mod:`.operators`."""
         return Operators(self).stores(expression)
+
+    # -- time steps ------------------------------------------------------------------------------------------------
+    def step(self, qdd: bool = False, status: bool = False) -> list[Store]:
+        """out = qd', q_out = q', qdd_out, status"""
+        return step.Step(self).stores(qdd, status)
+
+    def integrate(self) -> list[Store]:
+        return step.integrate(self)
+
+    def coordinate_rates(self) -> list[Store]:
+        return step.rates(self)
+
+    def passive_force(self) -> list[Store]:
+        return step.passive_force(self)
+
+    def hinge_force(self) -> list[Store]:
+        return step.hinge_force(self)
+
+    def body_accelerations(self) -> list[Store]:
+        return reactions.body_accelerations(self)
+
+    def body_reactions(self) -> list[Store]:
+        return reactions.body_reactions(self)
 
     # -- hybrid dynamics -------------------------------------------------------------------------------------------
     def hybrid_dynamics(self, held: tuple[bool, ...] | None = None) -> list[Store]:

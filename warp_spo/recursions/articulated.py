@@ -71,9 +71,9 @@ def factor(
     for other in carried_on:
         P = P + other
     triples = [link.armature[i : i + 3] for i in range(0, len(link.armature), 3)]
-    alike = all(map(is_constant, link.armature)) and all(len(set(triple)) == 1 for triple in triples)
+    alike = all(len(set(triple)) == 1 for triple in triples)
     turned = link.motion in (BALL, FREE) and alike
-    whole = link.motion == FREE and alike and not any(link.armature)
+    whole = link.motion == FREE and all(is_constant(a) and a == 0.0 for a in link.armature)
     pivots = []
     if turned or link.motion in (TURN, SLIDE):
         units = UNIT[link.motion][::-1]

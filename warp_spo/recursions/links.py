@@ -25,6 +25,7 @@ from ..trace.graph import Graph, Scalar, Value, cos, is_constant, reciprocal, re
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
 
 TURN, SLIDE, HELIX = "turn", "slide", "helix"
+SCREW_MOTIONS = (TURN, SLIDE, HELIX)
 LINK_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c", "joint_armature", "gravity")
 TABLES = ("value", "node_value")  # what links are made of; what bodies by themselves are, for the operators
 NOTHING = Rigid(0.0, ZERO, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
@@ -105,19 +106,21 @@ class Links:
         variable: names whose entries are inputs, all of them.
 
     Attributes:
-        graph: the trace's graph.
+        scene, variable: as given. graph: the trace's graph.
         links: the links. seats, nodes: by body.
         gravity: Vector.
         turns_vary: some joint's anchor is turned by what is no constant.
         tables: the scalars that an :meth:`opened` copy reads, by name, in order.
+        reverses: what takes gradients by the tables back to the values, see :mod:`warp_spo.link_values`.
     """
 
     def __init__(self, scene: Scene, variable: tuple[str, ...] = ()):
-        self.scene, self.graph = scene, Graph()
+        self.scene, self.variable, self.graph = scene, variable, Graph()
         self.links: list[Link] = []
         self.seats: dict[int, Seat] = {}
         self.nodes: dict[int, Node] = {}
         self.tables: dict[str, dict[Scalar, int]] = {table: {} for table in TABLES}
+        self.reverses: dict[Any, Any] = {}
         self._values = {name: self._symbols(name, name in variable) for name in LINK_VALUES}
         self.gravity = Vector(self._values["gravity"].tolist())
         self._poses = {name: [_pose(p) for p in self._values[name]] for name in ("joint_X_p", "joint_X_c")}
@@ -302,7 +305,7 @@ class Placed(NamedTuple):
 def placed(link: Link, q: Any) -> Placed:
     """``link`` where the coordinates put it; ``q(i)`` is entry i."""
     matrix, l = link.matrix, link.offset
-    if link.motion in (TURN, SLIDE, HELIX):
+    if link.motion in SCREW_MOTIONS:
         x, turn = q(link.coordinate), None
         if link.motion != SLIDE:
             angle = x if link.motion == TURN else reduced(x)

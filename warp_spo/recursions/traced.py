@@ -59,6 +59,7 @@ class Trace:
         self.places: dict[int, Placed] = {}
         self.motions: dict[int, Motion] = {}
         self.axes: dict[int, Matrix] = {}  # of every link, in the inertial frame
+        self.stiffened: Callable[[Link], Link] = lambda link: link  # with all that its pivots feel beside its inertia
         self.bodies: dict[int, list[int]] = {}  # by link: the bodies that sit on it
         for body, seat in links.seats.items():
             if seat.link is not None:
@@ -173,7 +174,8 @@ class Trace:
         self.at(link, "P")
         carried = self.carried_on(link, "P", inner, Articulated.unpacked)
         through = [(self.places[id(child)].pose, done[id(child)].P) for child in link.children if id(child) in done]
-        done[id(link)] = factor = articulated.factor(link, self.places[id(link)], carried, through, self.epsilon)
+        place = self.places[id(link)]
+        done[id(link)] = factor = articulated.factor(self.stiffened(link), place, carried, through, self.epsilon)
         inner[id(link)] = factor.in_parent
 
     def reduce(self, tau: Callable[[int], Value], moves: bool, loads: bool) -> tuple[dict, dict, list[Store]]:

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from .graph import Scalar, Value, cos, is_constant, ordered, reciprocal, select, sin
 
 UNIT = ("add", "reduced", "guarded")  # of each argument, a guard's limit excepted
-FLAT = ("input", "lost")  # a lost pivot is 0 or NaN, wherever it is
+FLAT = ("input", "lost", "less")  # a lost pivot is 0 or NaN, wherever it is
 
 
 def forward(outputs: Iterable[Value], inputs: Iterable[Scalar], seeds: Iterable[Value]) -> list[Value]:
@@ -86,6 +86,10 @@ def partial(scalar: Scalar, at: int) -> Value:
         return args[0] * reciprocal(scalar)
     if op == "select":
         return select(args[0], 1.0, 0.0) if at == 1 else select(args[0], 0.0, 1.0) if at == 2 else 0.0
+    if op == "arctangent":
+        y, x = args
+        scale = reciprocal(x * x + y * y)
+        return x * scale if at == 0 else -(y * scale)
     if op == "sum_of_logarithms":
         return reciprocal(args[at])
     raise AssertionError(f"no derivative of {op!r}: add its rule here")

@@ -14,7 +14,8 @@ from .graph import Scalar, Value, is_constant, ordered
 
 C_TYPE = {"float32": "float", "float64": "double"}
 BINARY = {"add": "+", "sub": "-", "mul": "*"}
-COST = {"add": 1, "sub": 1, "mul": 1, "neg": 0, "absolute": 0, "guarded": 1, "select": 1, "lost": 1, "input": 0}
+COST = {"add": 1, "sub": 1, "mul": 1, "neg": 0, "absolute": 0, "guarded": 1, "select": 1, "less": 1, "lost": 1,
+        "input": 0}
 COST_ELSE = 8  # about what a sine, a root or a reciprocal takes in additions
 
 
@@ -206,6 +207,8 @@ class Emitter:
             return [f"const {T} {name} = {texts[0]} > {texts[1]} ? {texts[0]} : nan;"]
         if op == "select":
             return [f"const {T} {name} = {texts[0]} != 0 ? {texts[1]} : {texts[2]};"]
+        if op == "less":
+            return [f"const {T} {name} = {texts[0]} < {texts[1]} ? 1 : 0;"]
         if op == "lost":
             return [f"const {T} {name} = {texts[0]} - {texts[0]};"]
         if op == "sum_of_logarithms":

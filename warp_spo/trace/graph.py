@@ -195,6 +195,22 @@ def select(mask: Value, x: Value, y: Value) -> Value:
     return mask.graph.make("select", mask, x, y)
 
 
+def less(x: Value, y: Value) -> Value:
+    """1 where ``x`` is less than ``y``, else 0; of a NaN, 0."""
+    if is_constant(x) and is_constant(y):
+        return 1.0 if x < y else 0.0
+    graph = x.graph if not is_constant(x) else y.graph
+    return graph.make("less", x, y)
+
+
+def arctangent(y: Value, x: Value) -> Value:
+    """The angle of the point (x, y) [rad]."""
+    if is_constant(x) and is_constant(y):
+        return math.atan2(y, x)
+    graph = x.graph if not is_constant(x) else y.graph
+    return graph.make("arctangent", y, x)
+
+
 def absolute(x: Value) -> Value:
     if is_constant(x):
         return abs(x)

@@ -227,7 +227,7 @@ class Pose(NamedTuple):
             S = upper(lambda i, j: dot(half[i], self.matrix[j]))  # type: ignore[index]
         return S
 
-    def _turned(self, C: Matrix) -> Matrix:
+    def turned(self, C: Matrix) -> Matrix:
         """R C R*"""
         rows = Matrix(self.to_parent(row) for row in C)  # C R*
         return Matrix(self.to_parent(column) for column in rows.T).T
@@ -243,7 +243,7 @@ class Pose(NamedTuple):
 
     def articulated_to_parent(self, P: Articulated) -> Articulated:
         """phi P phi*, block by block."""
-        m, C_r, J = self._turned_symmetric(P.m), self._turned(P.C), self._turned_symmetric(P.J)
+        m, C_r, J = self._turned_symmetric(P.m), self.turned(P.C), self._turned_symmetric(P.J)
         L = skew(self.l)
         C = C_r + L @ m
         first, second = L @ C_r.T, C @ L

@@ -17,9 +17,9 @@ import newton
 import numpy as np
 from newton import JointType
 
-from .errors import DirectedLoopError, UnsupportedError
-from .parts import DOF_VALUES, UNLIMITED, Body, Coupling, Hinge, Loop
-from .robot_files import (
+from ..errors import DirectedLoopError, UnsupportedError
+from ..parts import DOF_VALUES, UNLIMITED, Body, Coupling, Hinge, Loop
+from ..robot_files import (
     MISREAD,
     mjcf_gravity,
     mjcf_misread,
@@ -29,7 +29,7 @@ from .robot_files import (
     robot_format,
     urdf_source,
 )
-from .scene import Scene
+from ..scene import Scene
 
 KINDS = {
     JointType.FIXED: "fixed",

@@ -1,0 +1,20 @@
+"""Sums of states: what integrators do between evaluations."""
+
+import functools
+
+import warp as wp
+
+
+@functools.cache
+def combine(T) -> wp.Kernel:
+    """``out = a x + b y``, entry by entry; ``out`` may be either."""
+
+    @wp.kernel(module=f"warp_spo_combination_{T.__name__}", enable_backward=False)
+    def kernel(a: T, x: wp.array2d[T], b: T, y: wp.array2d[T], out: wp.array2d[T]):
+        world, i = wp.tid()
+        out[world, i] = a * x[world, i] + b * y[world, i]
+
+    return kernel
+
+
+KERNELS = (combine,)

@@ -1,0 +1,76 @@
+"""Between flat arrays of all worlds, as Newton keeps them, and arrays [world, entry]."""
+
+import functools
+
+import warp as wp
+
+
+@functools.cache
+def gather(T) -> wp.Kernel:
+    """``out[world, i] = flat[index[world, i]]``"""
+
+    @wp.kernel(module=f"warp_spo_exchange_{T.__name__}", enable_backward=False)
+    def kernel(index: wp.array2d[int], flat: wp.array[T], out: wp.array2d[T]):
+        world, i = wp.tid()
+        out[world, i] = flat[index[world, i]]
+
+    return kernel
+
+
+@functools.cache
+def scatter(T) -> wp.Kernel:
+    """``flat[index[world, i]] = array[world, i]``, in the worlds of ``mask``, all without one."""
+
+    @wp.kernel(module=f"warp_spo_exchange_{T.__name__}", enable_backward=False)
+    def kernel(index: wp.array2d[int], mask: wp.array[wp.bool], array: wp.array2d[T], flat_out: wp.array[T]):
+        world, i = wp.tid()
+        if mask:
+            if not mask[world]:
+                return
+        flat_out[index[world, i]] = array[world, i]
+
+    return kernel
+
+
+@functools.cache
+def scale(T) -> wp.Kernel:
+    """``out[world, i] = factor[i] array[world, i]``; nothing comes of a factor of zero."""
+
+    @wp.kernel(module=f"warp_spo_exchange_{T.__name__}", enable_backward=False)
+    def kernel(factor: wp.array[T], array: wp.array2d[T], out: wp.array2d[T]):
+        world, i = wp.tid()
+        out[world, i] = wp.where(factor[i] == T(0.0), T(0.0), factor[i] * array[world, i])
+
+    return kernel
+
+
+@functools.cache
+def turn_wrenches(T) -> wp.Kernel:
+    """World wrenches on free hinges into the axes of their parent anchors, in place.
+
+    ``hinge`` [n, 3]: first dof, hinge, parent body or -1. ``poses`` [world, body, 7].
+    """
+    quat = wp.types.quaternion(T)
+    vec3 = wp.types.vector(3, T)
+
+    @wp.func
+    def rotation(pose: wp.array3d[T], world: int, i: int):
+        return quat(pose[world, i, 3], pose[world, i, 4], pose[world, i, 5], pose[world, i, 6])
+
+    @wp.kernel(module=f"warp_spo_exchange_{T.__name__}", enable_backward=False)
+    def kernel(hinge: wp.array2d[int], anchor: wp.array3d[T], poses: wp.array3d[T], tau: wp.array2d[T]):
+        world, i = wp.tid()
+        dof, parent = hinge[i, 0], hinge[i, 2]
+        q = wp.normalize(rotation(anchor, world, hinge[i, 1]))
+        if parent >= 0:
+            q = rotation(poses, world, parent) * q
+        for half in range(2):
+            at = dof + 3 * half
+            v = wp.quat_rotate_inv(q, vec3(tau[world, at], tau[world, at + 1], tau[world, at + 2]))
+            for c in range(3):
+                tau[world, at + c] = v[c]
+
+    return kernel
+
+
+KERNELS = (gather, scatter, scale, turn_wrenches)

@@ -1,0 +1,81 @@
+"""The nonlinear equation of a time step, dense and in float64, solved one dof at a time by bisection.
+
+Mass (qd' - qd) / dt = tau - bias_force + f(q', qd') is the gradient of a convex function of qd', because no force grows
+with its own rate: sweeps over the dofs that solve each one's equation for its own rate converge to the one solution.
+"""
+
+import numpy as np
+
+from warp_spo.reference import Dense
+
+CREEP, HOLD = 1e-4, 1e3  # what Dynamics.step documents
+NONE = 1e6
+
+
+def hinge_force(d, h, qd, target_q, target_qd):
+    """f(dof, rate after the step): the laws as Dynamics.step states them, with min and max."""
+    value, turn = d.value, {"spring": d.passive_force(np.zeros(d.dof_count)), "drive": np.zeros(d.dof_count)}
+    ke, kd = value("joint_target_ke"), value("joint_target_kd")
+    scene = d.scene
+    one = scene.with_values(
+        **{name: array[min(d.world, len(array) - 1)] for name, array in scene.values.items()}
+    ).with_values(joint_stiffness=ke, joint_rest_q=target_q)
+    turn["drive"] = Dense(one, d.q).passive_force(np.zeros(d.dof_count))
+    position = np.full(d.dof_count, np.nan)
+    for hinge, q, v in zip(scene.hinges, scene.q_start, scene.qd_start, strict=False):
+        if hinge.kind not in ("ball", "free"):
+            position[v : v + hinge.dof_count] = d.q[q : q + hinge.dof_count]
+    heavy = HOLD * Dense(one, scene.neutral_q).mass_matrix.diagonal() / h
+
+    def force(i, v):
+        f = turn["spring"][i] - value("joint_stiffness")[i] * h * v - value("joint_damping")[i] * v
+        drive = turn["drive"][i] - ke[i] * h * v + kd[i] * (target_qd[i] - v)
+        effort = value("joint_effort_limit")[i]
+        f += np.clip(drive, -effort, effort) if effort < NONE else drive
+        stiff, damp = value("joint_limit_ke")[i], value("joint_limit_kd")[i]
+        lower, upper = value("joint_limit_lower")[i], value("joint_limit_upper")[i]
+        if np.isfinite(position[i]):
+            q, after = position[i], position[i] + h * v
+            f += max(0.0, stiff * (lower - after) - (damp * v if q < lower else 0.0)) if lower > -1e10 else 0.0
+            f += min(0.0, stiff * (upper - after) - (damp * v if q > upper else 0.0)) if upper < 1e10 else 0.0
+        f -= value("joint_friction")[i] * np.clip(v / CREEP, -1.0, 1.0)
+        most = value("joint_velocity_limit")[i]
+        if most < NONE:
+            f += heavy[i] * (max(-most - v, 0.0) - max(v - most, 0.0))
+        return f
+
+    return force
+
+
+def step(scene, world, h, q, qd, tau, body_f=None, target_q=None, target_qd=None, sweeps=20000):
+    """q', qd' of one world."""
+    d = Dense(scene, q, world=world)
+    target_q = scene.neutral_q if target_q is None else target_q
+    target_qd = np.zeros(scene.dof_count) if target_qd is None else target_qd
+    force = hinge_force(d, h, qd, target_q, target_qd)
+    M, load = d.mass_matrix, tau - d.bias_force(qd, body_f)
+    v = qd.copy()
+    for _ in range(sweeps):
+        before = v.copy()
+        for i in range(len(v)):
+            others = load[i] - M[i] @ (v - qd) / h + M[i, i] * v[i] / h
+            v[i] = _root(lambda x, i=i, others=others: M[i, i] * x / h - others - force(i, x), v[i])
+        if np.abs(v - before).max() <= 1e-15 * np.abs(v).max():
+            break
+    return d.integrate(v, h), v
+
+
+def _root(f, start):
+    """Of a growing function."""
+    width = 1.0
+    while f(start - width) > 0.0:
+        width *= 4.0
+    low, width = start - width, 1.0
+    while f(start + width) < 0.0:
+        width *= 4.0
+    high = start + width
+    while True:
+        middle = 0.5 * (low + high)
+        if middle in (low, high):
+            return middle
+        low, high = (low, middle) if f(middle) > 0.0 else (middle, high)

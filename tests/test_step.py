@@ -1,0 +1,362 @@
+"""Time steps: each law by its closed form, all together by the dense nonlinear equation, integrators by their order."""
+
+import dataclasses
+
+import implicit
+import laws
+import numpy as np
+import pytest
+import symbolic
+import warp as wp
+import zoo
+from allocations import no_warp_allocation
+
+import warp_spo as spo
+from warp_spo.errors import UnsupportedError
+from warp_spo.kernels import straight
+from warp_spo.parts import SCREWS
+from warp_spo.recursions import impedance, integration, step
+
+H = 2e-3
+TOLERANCE = {
+    "float64": 1e-12,  # of velocities of the order of 1, up to 30
+    "float32": 2e-5,
+}
+FORCES = ("tau", "body_f", "target_q", "target_qd")
+
+
+def furnished(scene, seed=0):
+    """Every law somewhere, at random."""
+    rng, n = np.random.default_rng(seed), scene.dof_count
+    screw = np.repeat([hinge.motion == SCREWS for hinge in scene.hinges], [hinge.dof_count for hinge in scene.hinges])
+    some = lambda low, high, none: np.where(rng.random(n) < 0.5, rng.uniform(low, high, n), none)  # noqa: E731
+    return scene.with_values(
+        joint_friction=some(0.0, 1.0, 0.0),
+        joint_target_ke=some(1.0, 100.0, 0.0),
+        joint_target_kd=some(0.0, 5.0, 0.0),
+        joint_effort_limit=some(1.0, 20.0, 1e6),
+        joint_velocity_limit=some(0.5, 1.5, 1e6),
+        joint_limit_lower=np.where(screw, rng.uniform(-1.0, -0.2, n), -1e10),
+        joint_limit_upper=np.where(screw, rng.uniform(0.2, 1.0, n), 1e10),
+    )
+
+
+def states(scene, worlds, dtype="float64"):
+    a = laws.states(scene, worlds, dtype=dtype)
+    a |= {"target_q": a["q"][::-1].copy(), "target_qd": a["qdd"]}
+    a["qd"][1] = 0.0
+    return {name: a[name] for name in ("q", "qd", *FORCES)}
+
+
+def slider(**values):
+    """A mass of 2 kg on rails, without gravity."""
+    hinge = spo.Hinge("prismatic", -1, 0, axis=(1, 0, 0), **values)
+    return spo.Scene([spo.Body(2.0, inertia=np.eye(3))], [hinge], gravity=(0, 0, 0))
+
+
+def slide(scene, q, qd, tau=0.0, h=H, dtype="float64", **more):
+    """q', qd' of sliders, one a world."""
+    given = {"q": q, "qd": qd, "tau": tau, **more}
+    arrays = {name: np.atleast_1d(x).astype(float)[:, None] for name, x in given.items()}
+    worlds = max(map(len, arrays.values()))
+    arrays = {name: np.broadcast_to(x, (worlds, 1)) for name, x in arrays.items()}
+    q_after, qd_after, passes = symbolic.advance(scene, arrays, h, dtype)
+    assert (passes <= 3).all()  # of one dof
+    return q_after[:, 0], qd_after[:, 0]
+
+
+# -- law by law --------------------------------------------------------------------------------------------------------
+def test_dampers_and_springs():
+    q, qd = slide(slider(damping=3.0, stiffness=50.0, rest=0.2), 0.7, 1.5, 4.0)
+    expected = (2.0 * 1.5 + H * (4.0 - 50.0 * (0.7 - 0.2))) / (2.0 + H * 3.0 + H * H * 50.0)
+    np.testing.assert_allclose([q[0], qd[0]], [0.7 + H * expected, expected], rtol=1e-14)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_stiffness_of_1e8(dtype):
+    """1e5 times what an explicit step could bear: the load hangs at tau / k and stays there."""
+    q, qd = 1.0, 0.0
+    for _ in range(50):
+        q, qd = slide(slider(stiffness=1e8, damping=1e3), q, qd, 9.0, dtype=dtype)
+    assert abs(q[0] - 9e-8) <= 1e-13 and abs(qd[0]) <= 1e-10
+
+
+def test_limits_push_and_never_pull():
+    """Inside nothing; outside a spring; a damper that resists going out, and lets go on the way back."""
+    scene = slider(limit_lower=-1.0, limit_upper=1.0, limit_ke=100.0, limit_kd=1e4)
+    q = np.array([0.0, 0.9, -1.1, 1.1, -1.1, 1.1])
+    qd = np.array([5.0, 2.0, -3.0, 3.0, 3.0, -3.0])
+    _, after = slide(scene, q, qd)
+    damped = (2.0 * 3.0 - H * 100.0 * 0.1) / (2.0 + H * 1e4 + H * H * 100.0)
+    np.testing.assert_allclose(after, [5.0, 2.0, -damped, damped, 3.0, -3.0], rtol=1e-13)
+    _, after = slide(scene, [0.999, -0.999], [2.0, -2.0])  # the step leads out: its spring is there already
+    outside = (2.0 * 2.0 + H * 100.0 * 0.001) / (2.0 + H * H * 100.0)
+    np.testing.assert_allclose(after, [outside, -outside], rtol=1e-13)
+
+
+def test_a_damper_that_pulls_or_comes_early_is_seen(monkeypatch):
+    bugs = ("d = select(less(0.0, depth), d, 0.0)", "pass"), ("(0.0, None) if inward > 0.0", "(None, None) if 1")
+    for old, new in bugs:
+        with monkeypatch.context() as patch:
+            symbolic.plant(patch, impedance.Impedance, "_limits", old, new)
+            with pytest.raises(AssertionError):
+                test_limits_push_and_never_pull()
+
+
+def test_a_drive_saturates():
+    scene = slider(target_ke=1e3, target_kd=10.0, effort_limit=30.0)
+    target = np.array([0.001, 10.0, -10.0])
+    _, qd = slide(scene, 0.0, [0.0, 1.0, 1.0], target_q=target, target_qd=0.5)
+    free = H * (1e3 * 0.001 + 10.0 * 0.5) / (2.0 + H * 10.0 + H * H * 1e3)
+    np.testing.assert_allclose(qd, [free, 1.0 + H * 15.0, 1.0 - H * 15.0], rtol=1e-13)
+
+
+def test_friction_sticks_and_slides():
+    scene = slider(friction=4.0)
+    _, qd = slide(scene, 0.0, [0.0, 0.0, 1.0, -1.0, 1e-3, 0.0], [3.9, -3.9, 0.0, 0.0, 0.0, 5.0])
+    assert (np.abs(qd[[0, 1, 4]]) <= impedance.CREEP).all()  # held, held, stopped without turning round
+    np.testing.assert_allclose(qd[[2, 3, 5]], [1.0 - H * 2.0, -1.0 + H * 2.0, H * 0.5], rtol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_velocity_limits(dtype):
+    _, qd = slide(slider(velocity_limit=2.0), 0.0, [1.0, 1.99, 5.0, -5.0, 2.0], [0.0, 1e3, 0.0, 0.0, -1e3], dtype=dtype)
+    np.testing.assert_allclose(qd, [1.0, 2.0, 2.0, -2.0, 1.0], atol=3.1 / impedance.HOLD)
+    assert abs(qd[4] - 1.0) < 1e-5  # braking is nothing that it resists
+
+
+def test_what_a_scene_does_not_have_costs_nothing():
+    """Unlimited values, zeros and Newton's defaults leave the trace as it is; a law costs its own dof alone."""
+    counts = lambda scene: len(symbolic.Applications(symbolic.Links(scene), "float64", ("q", "qd")).step())  # noqa: E731
+
+    def operations(scene):
+        trace = symbolic.Applications(symbolic.Links(scene), "float64", ("q", "qd", "tau"))
+        stores = trace.step()
+        return len(symbolic.ordered(item.value for item in stores)), {item.array for item in stores}
+
+    bare = zoo.plain()
+    dofs = bare.dof_count
+    assert counts(bare) == 2 * dofs
+    none, arrays = operations(bare)
+    assert arrays == {"out", "q_out"}
+    unlimited = bare.with_values(
+        joint_limit_lower=np.full(dofs, -1e10),
+        joint_effort_limit=np.full(dofs, 1e6),
+        joint_velocity_limit=np.full(dofs, 1e6),
+        joint_limit_ke=np.full(dofs, 7.0),
+    )
+    assert operations(unlimited) == (none, arrays)
+    damped = bare.with_values(joint_damping=np.eye(dofs)[2])
+    assert none < operations(damped)[0] < none + 100 and operations(damped)[1] == arrays
+    rough = bare.with_values(joint_friction=np.eye(dofs)[2])
+    assert operations(rough)[1] == {"out", "q_out", *step.LOOPED}
+
+
+def test_a_free_hinge_without_laws_keeps_its_short_way():
+    scene = zoo.single_body("free").with_values(
+        joint_armature=np.zeros(6), joint_damping=np.zeros(6), joint_stiffness=np.zeros(6)
+    )
+    count = lambda scene: len(symbolic.ordered(  # noqa: E731
+        item.value for item in symbolic.Applications(symbolic.Links(scene), "float64", ("q", "qd")).step()))
+    assert count(scene) * 2 < count(scene.with_values(joint_damping=np.arange(6.0)))
+
+
+# -- all together ------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("name", "dtype"), [("chain7", "float64"), ("fork", "float64"), ("fork", "float32"), ("forest", "float64")]
+)
+def test_equals_the_dense_nonlinear_equation(name, dtype, device):
+    scene, worlds = furnished(zoo.SCENES[name]()), 4
+    dyn = spo.Dynamics(scene, worlds, device=device, dtype=dtype)
+    a = states(scene, worlds, dtype)
+    on = laws.to_device(dyn, a)
+    status = wp.full(worlds, -1, dtype=wp.int32, device=device)
+    out = tuple(wp.full(x.shape, float("nan"), dtype=dyn.dtype, device=device) for x in (on["q"], on["qd"]))
+    assert dyn.step(on["q"], on["qd"], on["tau"], H, *(on[n] for n in FORCES[1:]), status=status, out=out) == out
+    assert not status.numpy().any()
+    q, qd = (array.numpy().astype(np.float64) for array in out)
+    for w in range(worlds):
+        wanted = implicit.step(scene, w, H, *(a[n][w] for n in ("q", "qd", *FORCES)))
+        np.testing.assert_allclose(qd[w], wanted[1], atol=TOLERANCE[dtype])
+        np.testing.assert_allclose(q[w], wanted[0], atol=TOLERANCE[dtype])
+
+
+BUGS = [
+    (impedance.Impedance, "_spring", "+ self.ahead(link.dofs[i])", ""),
+    (impedance.Impedance, "_limits", "(0.0, None) if inward > 0.0 else (None, 0.0)", "None, None"),
+    (impedance.Law, "piece", "select(over, 0.0, resistance)", "resistance"),
+    (impedance.Law, "missed", "self.at(u) - piece.line(u)", "0.0 * u"),
+    (step.Step, "_stiffened", "self.h * piece.resistance", "piece.resistance"),
+    (integration, "moved", "+ shift[i]", ""),
+    (integration, "turned", "half = turn * 0.5", "half = turn"),
+]
+
+
+@pytest.mark.parametrize(("owner", "name", "old", "new"), BUGS)
+def test_a_planted_bug_is_seen(monkeypatch, owner, name, old, new):
+    scene = furnished(zoo.fork())
+    a = states(scene, 3)
+    wanted = [implicit.step(scene, w, H, *(a[n][w] for n in ("q", "qd", *FORCES))) for w in range(3)]
+
+    def error():
+        q, qd, _ = symbolic.advance(scene, a, H)
+        return max(max(np.abs(q[w] - wanted[w][0]).max(), np.abs(qd[w] - wanted[w][1]).max()) for w in range(3))
+
+    assert error() < TOLERANCE["float64"]
+    symbolic.plant(monkeypatch, owner, name, old, new)
+    if owner is integration:
+        monkeypatch.setattr(step, "moved", integration.moved)
+    assert error() > 1e-6
+
+
+def test_passes_that_states_need():
+    """Thrown at random into everything: the number of passes that the kernel allows is enough for every world."""
+    for h in (2e-3, 2e-2):
+        scene = furnished(zoo.SCENES["chain7"]())
+        *_, passes = symbolic.advance(scene, states(scene, 1000), h)
+        assert passes.max() <= straight.MOST_PASSES and passes.mean() < 7.0
+
+
+# -- integrators -------------------------------------------------------------------------------------------------------
+def swinging():
+    """A floating body, two arms and a ball, springs and dampers everywhere."""
+    scene = zoo.fork()
+    return scene.with_values(joint_damping=0.3 * scene.values["joint_damping"])
+
+
+@pytest.mark.parametrize(("integrator", "order"), [("semi_implicit", 1), ("midpoint", 2), ("rk4", 4)])
+def test_integrators_converge_at_their_order_to_one_solution(integrator, order, device):
+    scene = swinging()
+    dyn = spo.Dynamics(scene, 1, device=device, dtype="float64")
+    a = laws.states(scene, 1)
+
+    def after(count, integrator):
+        q, qd = (wp.array(a[name], dtype=wp.float64, device=device) for name in ("q", "qd"))
+        tau = wp.array(0.1 * a["tau"], dtype=wp.float64, device=device)
+        for _ in range(count):
+            dyn.step(q, qd, tau, 0.1 / count, integrator=integrator, out=(q, qd))
+        q = laws.same_quaternion_sign("integrate", scene, q.numpy()[0], exact[0] if exact else q.numpy()[0])
+        return q, qd.numpy()[0]
+
+    exact = None
+    exact = after(160, "rk4")
+    errors = [max(np.abs(x - y).max() for x, y in zip(after(n, integrator), exact, strict=True)) for n in (10, 20)]
+    assert errors[1] < 0.2 / 10**order
+    assert abs(np.log2(errors[0] / errors[1]) - order) < 0.25
+
+
+def test_midpoint_bears_stiff_springs(device):
+    scene = slider(stiffness=1e8, damping=1e4)
+    dyn = spo.Dynamics(scene, 1, device=device, dtype="float64")
+    q, qd = np.array([[1.0]]), np.array([[0.0]])
+    for _ in range(2000):
+        q, qd = dyn.step(q, qd, None, H, integrator="midpoint")
+    assert abs(q[0, 0]) < 1.0
+    with pytest.raises(UnsupportedError, match="friction or velocity limits"):
+        spo.Dynamics(slider(friction=1.0), 1, device=device).step(q, qd, None, H, integrator="rk4")
+
+
+def test_many_stiff_steps_without_drift(device):
+    """1e5 steps of a pendulum that hangs on a stiff drive: the last state is that after 1e3."""
+    hinge = spo.Hinge("revolute", -1, 0, axis=(0, 1, 0), target_ke=1e6, target_kd=1e3, friction=0.1)
+    scene = spo.Scene([spo.Body(1.0, (0.3, 0.0, 0.0), 0.01 * np.eye(3))], [hinge])
+    dyn = spo.Dynamics(scene, 1, device=device)
+    q, qd = (wp.zeros((1, 1), dtype=wp.float32, device=device) for _ in range(2))
+    seen = []
+    for n in range(100_000):
+        dyn.step(q, qd, None, H, out=(q, qd))
+        if n in (1000, 99_999):
+            seen.append((q.numpy()[0, 0], qd.numpy()[0, 0]))
+    assert abs(seen[1][0] - 9.81 * 0.3 / 1e6) <= 1.1 * 0.1 / 1e6 and seen[0] == pytest.approx(seen[1], abs=1e-8)
+
+
+# -- as users call it --------------------------------------------------------------------------------------------------
+def test_in_place_and_without_allocation(device):
+    scene, worlds = furnished(zoo.fork()), 3
+    dyn = spo.Dynamics(scene, worlds, device=device)
+    on = laws.to_device(dyn, states(scene, worlds, "float32"))
+    dyn.prepare("step", target_q=True, target_qd=True, body_f=True)
+    out = [wp.empty_like(on[name]) for name in ("q", "qd")]
+    with no_warp_allocation():
+        dyn.step(on["q"], on["qd"], on["tau"], H, *(on[n] for n in FORCES[1:]), out=out)
+        dyn.step(on["q"], on["qd"], on["tau"], H, *(on[n] for n in FORCES[1:]), out=(on["q"], on["qd"]))
+    for array, name in zip(out, ("q", "qd"), strict=True):
+        np.testing.assert_array_equal(array.numpy(), on[name].numpy())
+    with pytest.raises(ValueError, match="overlaps"):
+        dyn.step(on["q"], on["qd"], on["tau"], H, out=(out[0], on["tau"]))
+
+
+def test_values_that_are_variable_or_differ_between_worlds(device):
+    """As inputs they do what they do folded."""
+    names = ("damping", "stiffness", "friction", "target_ke", "target_kd", "armature")
+    names = tuple(f"joint_{name}" for name in names)
+    scene, worlds = furnished(zoo.fork()), 2
+    scene = scene.with_values(joint_velocity_limit=np.full(scene.dof_count, 1e6))  # as heavy as the scene's armature
+    rng = np.random.default_rng(1)
+    values = {name: rng.uniform(0.1, 2.0, (worlds, scene.dof_count)) for name in names}
+    lower = rng.uniform(-1.0, -0.2, (worlds, scene.dof_count))
+    lower[:, scene.values["joint_limit_lower"][0] < -1e9] = -1e10
+    various = scene.with_values(joint_limit_lower=lower)
+    dyn = spo.Dynamics(various, worlds, device=device, dtype="float64", variable=names)
+    dyn.set(**values)
+    a = states(scene, worlds)
+    got = dyn.step(a["q"], a["qd"], a["tau"], H, *(a[n] for n in FORCES[1:]))
+    for w in range(worlds):
+        one = scene.with_values(joint_limit_lower=lower[w], **{name: array[w] for name, array in values.items()})
+        folded = symbolic.advance(one, {name: array[w : w + 1] for name, array in a.items()}, H)
+        for x, y in zip(got, folded, strict=False):
+            np.testing.assert_allclose(x[w], y[0], atol=1e-12)
+
+
+def test_status_words(device, monkeypatch):
+    monkeypatch.setattr(straight, "MOST_PASSES", 1)
+    dyn = spo.Dynamics(slider(friction=1.0), 4, device=device)
+    q, qd, tau = np.zeros((4, 1)), np.array([[1.0], [3e38], [np.nan], [1e-3]]), np.zeros((4, 1))
+    tau[1], h = 3e38, 10.0
+    status = np.full(4, -1, dtype=np.int32)
+    after = dyn.step(q, qd, tau, h, status=status)[1]
+    assert status.tolist() == [5, 1, 2, 5]
+    assert np.isfinite(after[[0, 3]]).all()
+    monkeypatch.undo()
+    dyn = spo.Dynamics(slider(friction=1.0), 4, device=device)
+    dyn.step(q, qd, tau, h, status=status)
+    assert status.tolist() == [0, 1, 2, 0]
+
+
+def test_mistakes_are_explained(device):
+    dyn = spo.Dynamics(zoo.fork(), 2, device=device)
+    a = states(dyn.scene, 2)
+    call = lambda **more: dyn.step(**{"q": a["q"], "qd": a["qd"], "tau": None, "dt": H, **more})  # noqa: E731
+    with pytest.raises(TypeError, match=r"Dynamics.step: dt is 'soon'; expected a number of seconds"):
+        call(dt="soon")
+    with pytest.raises(ValueError, match="integrator is 'euler'; expected one of semi_implicit"):
+        call(integrator="euler")
+    with pytest.raises(ValueError, match=r"Dynamics.step: qd is a NumPy array float64 \(2, 3\)"):
+        call(qd=np.zeros((2, 3)))
+    with pytest.raises(ValueError, match=r"target_q is a NumPy array float64 \(2, 11\)"):
+        call(target_q=a["qd"])
+    with pytest.raises(TypeError, match="expected a pair of arrays or None"):
+        call(out=np.zeros((2, 12)))
+    with pytest.raises(ValueError, match="status with integrator='rk4'"):
+        call(integrator="rk4", status=np.zeros(2, dtype=np.int32))
+    limited = zoo.single_body("ball").with_values(joint_limit_upper=np.ones(3))
+    with pytest.raises(UnsupportedError, match="a limit on 'joint_0:0', a dof of a ball or free hinge"):
+        spo.Dynamics(limited, 1, device=device).step(limited.neutral_q[None], np.zeros((1, 3)), None, H)
+
+
+def test_a_scene_that_cannot_move(device):
+    scene = spo.Scene([spo.Body(1.0)], [spo.Hinge("fixed", -1, 0)])
+    status = np.full(2, -1, dtype=np.int32)
+    q, qd = spo.Dynamics(scene, 2, device=device).step(np.zeros((2, 0)), np.zeros((2, 0)), None, H, status=status)
+    assert q.shape == qd.shape == (2, 0) and not status.any()
+
+
+def test_a_kernel_reads_rows_through_shared_memory_too(device):
+    """The staged form of the same text; on a CPU it is not compiled, but its rows are laid out."""
+    scene = furnished(zoo.fork())
+    dyn = spo.Dynamics(scene, 3, device=device)
+    dyn.programs.plan = dataclasses.replace(dyn.plan, staged=True)
+    plain = spo.Dynamics(scene, 3, device=device)
+    a = states(scene, 3, "float32")
+    for x, y in zip(dyn.step(a["q"], a["qd"], a["tau"], H), plain.step(a["q"], a["qd"], a["tau"], H), strict=True):
+        np.testing.assert_array_equal(x, y)

@@ -1,0 +1,304 @@
+"""torch goes back through Dynamics: gradients against finite differences, and what is refused, in words."""
+
+import functools
+
+import laws
+import numpy as np
+import pytest
+import symbolic
+import torch
+import warp as wp
+import zoo
+from torch.autograd import gradcheck
+
+import warp_spo as spo
+from warp_spo import torch as spo_torch
+from warp_spo.recursions.adjoints import Adjoints
+
+WORLDS = 2
+DT = 0.01
+INERTIAL = ("body_mass", "body_com", "body_inertia", "joint_armature", "gravity", "joint_X_p", "joint_X_c")
+GAINS = ("joint_damping", "joint_stiffness", "joint_friction", "joint_target_ke", "joint_target_kd")
+VARIABLE = INERTIAL + GAINS
+check = functools.partial(gradcheck, atol=1e-5, rtol=1e-4)  # of torch: central differences with a step of 1e-6
+
+
+def furnished(scene):
+    """Drives, and friction that is nowhere zero, where its force has a kink."""
+    n = scene.dof_count
+    return scene.with_values(joint_friction=np.linspace(0.2, 1.0, n), joint_target_ke=np.linspace(2.0, 30.0, n),
+                             joint_target_kd=np.linspace(2.0, 3.0, n))  # fmt: skip
+
+
+def on(dyn, arrays, *names, grad=True):
+    kind = torch.float64 if dyn.dtype is wp.float64 else torch.float32
+    place = wp.device_to_torch(dyn.device)
+    return [torch.tensor(arrays[n], dtype=kind, device=place, requires_grad=grad) for n in names]
+
+
+@pytest.fixture(scope="module")
+def tree(device):
+    """A floating tree with every value variable, and its state."""
+    scene = furnished(zoo.fork())
+    a = laws.states(scene, WORLDS)
+    a |= {"target_q": a["q"][::-1].copy(), "target_qd": a["qdd"]}
+    dyn = spo.Dynamics(scene, WORLDS, device=device, dtype="float64", variable=VARIABLE, granularity="tree")
+    return dyn, a
+
+
+@pytest.fixture(autouse=True)
+def forgotten(tree):
+    yield
+    dyn = tree[0]
+    dyn.set(**{name: dyn.scene.values[name][0] for name in VARIABLE})
+
+
+OPERATIONS = {
+    "forward_dynamics": ("q", "qd", "tau", "body_f"),
+    "inverse_dynamics": ("q", "qd", "qdd", "body_f"),
+    "bias_force": ("q", "qd"),
+    "gravity_force": ("q",),
+    "solve_mass_matrix": ("q", "b"),
+    "body_velocities": ("q", "qd"),
+    "integrate": ("q", "qd"),
+    "step": ("q", "qd", "tau", "body_f", "target_q", "target_qd"),
+}
+
+
+def called(dyn, operation, *args):
+    if operation == "step":
+        q, qd, tau, *more = args
+        return dyn.step(q, qd, tau, DT, *more)
+    return getattr(dyn, operation)(*args, *((DT,) if operation == "integrate" else ()))
+
+
+# -- gradients ---------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("operation", OPERATIONS)
+def test_gradients_by_arguments(tree, operation):
+    dyn, a = tree
+    assert check(functools.partial(called, dyn, operation), on(dyn, a, *OPERATIONS[operation]))
+
+
+@pytest.mark.parametrize("operation", ["forward_dynamics", "inverse_dynamics", "step", "body_velocities"])
+def test_gradients_by_values(tree, operation):
+    """Of tensors that all worlds share, and of one that differs from world to world."""
+    dyn, a = tree
+    names = VARIABLE if operation == "step" else INERTIAL
+    start = {name: dyn.scene.values[name][0] for name in names}
+    start["body_mass"] = np.linspace(0.8, 1.2, WORLDS)[:, None] * start["body_mass"]
+    arguments = on(dyn, a, *OPERATIONS[operation], grad=False)
+
+    def run(*values):
+        dyn.set(**dict(zip(names, values, strict=True)))
+        return called(dyn, operation, *arguments)
+
+    assert check(run, on(dyn, start, *names))
+
+
+def test_gradient_of_poses(device):
+    scene = zoo.fork()
+    dyn = spo.Dynamics(scene, WORLDS, device=device, dtype="float64", granularity="tree", variable=("body_com",))
+    a = laws.states(scene, WORLDS)
+    assert check(dyn.body_poses, on(dyn, a, "q"))
+
+
+@pytest.mark.parametrize("name", ["forest", "chain_free", "chain_helical", "every_d6"])
+def test_products_are_those_of_the_dense_derivatives(name):
+    """J* y and J x of the traces against the dense J of another trace, along tangent coordinates."""
+    scene = zoo.SCENES[name]()
+    n, a = scene.dof_count, laws.states(scene, 1)
+    a["cotangent"] = np.random.default_rng(1).normal(size=(1, n))
+    rates = {"q_dot": a["b"][..., 0], "qd_dot": a["b"][..., 1], "tau_dot": a["b"][..., 2]}
+    state = ("q", "qd", "qdd", "body_f")
+    run = functools.partial(symbolic.run, scene, trace=Adjoints)
+    J = np.nan_to_num(run("inverse_dynamics_derivatives", a, state, {"out": (3, n, n)})["out"])[0]
+    shapes = {"out": (n,), "qd_bar": (n,), "tau_bar": (n,)}
+    got = run("forward_dynamics_vjp", a, (*state, "cotangent"), shapes, wrt=("tangent", "qd", "tau"))
+    weights = np.linalg.solve(J[2], a["cotangent"][0])
+    for result, wanted in zip(got.values(), (-J[0].T @ weights, -J[1].T @ weights, weights), strict=True):
+        assert laws.error(result[0], wanted) <= 1e-11
+    moved = run("forward_dynamics_jvp", {**a, **rates}, (*state, *rates), {"out": (n,)})["out"][0]
+    q_dot, qd_dot, tau_dot = (rate[0] for rate in rates.values())
+    assert laws.error(moved, np.linalg.solve(J[2], tau_dot - J[0] @ q_dot - J[1] @ qd_dot)) <= 1e-11
+
+
+# -- rollouts ----------------------------------------------------------------------------------------------------------
+TOLERANCE = {("float64", 50): 1e-6, ("float64", 500): 1e-6, ("float32", 50): 1e-3, ("float32", 500): 1e-2}
+"""Of each gradient, 2-norm, against float64: differences of the loss along it where that is float64 itself."""
+ROLLED = ("body_mass", "joint_armature", "joint_damping", "joint_target_ke")
+H = 2e-3
+
+
+@functools.cache
+def damped_arm(device, dtype):
+    scene = zoo.from_parents([-1, 0, 1], ["revolute"] * 3, 8).with_values(
+        joint_damping=np.array([0.5, 0.3, 0.2]), joint_target_ke=np.array([3.0, 2.0, 1.0])
+    )
+    return spo.Dynamics(scene, 1, device=device, dtype=dtype, variable=ROLLED, granularity="tree")
+
+
+def loss(dyn, steps, q, qd, control, *values):
+    dyn.set(**dict(zip(ROLLED, values, strict=True)))
+    total = 0.0
+    for k in range(steps):
+        q, qd = dyn.step(q, qd, control[k * len(control) // steps], H)
+        total = total + (q * q).sum() * (1.0 / steps)
+    return total + (qd * qd).sum()
+
+
+def start(dyn):
+    rng = np.random.default_rng(5)
+    values = {name: dyn.scene.values[name][0] for name in ROLLED}
+    values |= {"q": rng.normal(size=(1, 3)), "qd": rng.normal(size=(1, 3)), "control": rng.normal(size=(10, 1, 3))}
+    return {name: values[name] for name in ("q", "qd", "control", *ROLLED)}
+
+
+@functools.cache
+def gradients(device, dtype, steps):
+    dyn = damped_arm(device, dtype)
+    tensors = on(dyn, start(dyn), *start(dyn))
+    return [g.cpu().double() for g in torch.autograd.grad(loss(dyn, steps, *tensors), tensors)]
+
+
+@pytest.mark.parametrize("steps", [50, 500])
+def test_gradient_of_a_rollout_is_the_difference(device, steps):
+    dyn = damped_arm(device.alias, "float64")
+    points = on(dyn, start(dyn), *start(dyn), grad=False)
+    found = gradients(device.alias, "float64", steps)
+    h = 1e-5
+    for i, gradient in enumerate(found):
+        along = gradient.to(points[i]) / gradient.norm()
+        ends = [loss(dyn, steps, *points[:i], points[i] + s * h * along, *points[i + 1 :]).item() for s in (1, -1)]
+        slope = (ends[0] - ends[1]) / (2 * h)
+        assert abs(slope - gradient.norm().item()) <= TOLERANCE["float64", steps] * abs(slope), i
+
+
+@pytest.mark.parametrize("steps", [50, 500])
+def test_gradient_of_a_rollout_in_float32(device, steps):
+    single, double = (gradients(device.alias, dtype, steps) for dtype in ("float32", "float64"))
+    for got, wanted in zip(single, double, strict=True):
+        assert (got - wanted).norm() <= TOLERANCE["float32", steps] * wanted.norm()
+
+
+def test_masses_are_found_again(device):
+    """System identification with the module."""
+    dyn = damped_arm(device.alias, "float64")
+    q, qd, tau = (torch.tensor(np.random.default_rng(6).normal(size=(1, 3)), device=wp.device_to_torch(device))
+                  for _ in range(3))  # fmt: skip
+    robot = spo_torch.Module(dyn, ["body_mass"])
+    assert [name for name, _ in robot.named_parameters()] == ["body_mass"]
+    with torch.no_grad():
+        wanted = robot(q, qd, tau)
+        robot.body_mass *= 1.2
+    optimizer = torch.optim.Adam(robot.parameters(), lr=0.02)
+    errors = []
+    for _ in range(60):
+        optimizer.zero_grad()
+        error = (robot.forward_dynamics(q, qd, tau) - wanted).square().mean()
+        error.backward()
+        optimizer.step()
+        errors.append(error.item())
+    assert errors[-1] < 1e-2 * errors[0]
+
+
+# -- what is refused ---------------------------------------------------------------------------------------------------
+def test_a_second_backward_pass_is_explained(tree):
+    dyn, a = tree
+    q, qd = on(dyn, a, "q", "qd")
+    (first,) = torch.autograd.grad(dyn.forward_dynamics(q, qd).sum(), q, create_graph=True)
+    with pytest.raises(RuntimeError, match=r"Dynamics.forward_dynamics: its gradient is differentiated once more"):
+        first.sum().backward()
+
+
+def test_out_is_refused(tree):
+    dyn, a = tree
+    (q,) = on(dyn, a, "q")
+    out = torch.zeros(WORLDS, dyn.scene.dof_count, dtype=q.dtype, device=q.device)
+    with pytest.raises(ValueError, match=r"Dynamics.gravity_force: out is given and an input requires grad"):
+        dyn.gravity_force(q, out=out)
+    with pytest.raises(ValueError, match="out requires grad"):
+        dyn.gravity_force(q.detach(), out=out.clone().requires_grad_())
+    with torch.no_grad():
+        assert dyn.gravity_force(q, out=out) is out
+
+
+def test_kinds_do_not_mix(tree):
+    dyn, a = tree
+    (q,) = on(dyn, a, "q")
+    with pytest.raises(TypeError, match=r"q requires grad and qd is of type ndarray; expected torch tensors only"):
+        dyn.forward_dynamics(q, a["qd"])
+
+
+def test_a_change_in_place_is_seen(tree):
+    dyn, a = tree
+    (q,) = on(dyn, a, "q", grad=False)
+    qd = on(dyn, a, "qd")[0]
+    y = dyn.forward_dynamics(q, qd).sum()
+    q += 1.0
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        y.backward()
+
+
+def test_values_set_since(tree):
+    """What was on record is put back for the backward pass, and back again; anything else is an error."""
+    dyn, a = tree
+    q, qd, tau = on(dyn, a, "q", "qd", "tau", grad=False)
+    (mass,) = on(dyn, {"m": dyn.scene.values["body_mass"][0]}, "m")
+    dyn.set(body_mass=mass)
+    y = dyn.forward_dynamics(q, qd, tau).square().sum()
+    (wanted,) = torch.autograd.grad(y, mass, retain_graph=True)
+    dyn.set(body_mass=2.0 * mass.detach())
+    with torch.no_grad():
+        heavy = dyn.forward_dynamics(q, qd, tau)
+    (got,) = torch.autograd.grad(y, mass, retain_graph=True)
+    assert torch.equal(got, wanted)
+    assert torch.equal(dyn.forward_dynamics(q, qd, tau), heavy)
+    dyn.set(gravity=(0.0, 0.0, -1.0))
+    with pytest.raises(RuntimeError, match=r"gravity was set between this call and its backward pass"):
+        y.backward()
+
+
+def test_what_has_no_gradient_says_so(tree):
+    dyn, a = tree
+    q, qd = on(dyn, a, "q", "qd", grad=False)
+    dyn.set(body_mass=on(dyn, {"m": dyn.scene.values["body_mass"][0]}, "m")[0])
+    with pytest.raises(ValueError, match=r"Dynamics.mass_matrix: body_mass was set to a tensor that requires grad"):
+        dyn.mass_matrix(q)
+    with pytest.raises(ValueError, match=r"expected integrator='semi_implicit'"):
+        dyn.step(q, qd, None, DT, integrator="rk4")
+    assert not dyn.integrate(q, qd, DT).requires_grad or "body_mass" in dyn.entering("integrate")
+    with pytest.raises(ValueError, match=r"'joint_limit_lower' has no gradient"):
+        spo_torch.Module(dyn, ["joint_limit_lower"])
+    folded = spo.Dynamics(dyn.scene, WORLDS, device=dyn.device, dtype="float64", granularity="tree")
+    with pytest.raises(ValueError, match=r"wrt names 'body_mass', which is folded"):
+        folded.forward_dynamics_vjp(q, qd, cotangent=qd, wrt=("body_mass",))
+    with pytest.raises(ValueError, match=r"wrt names 'qd', which is None; pass zeros"):
+        folded.forward_dynamics_vjp(q, cotangent=qd)
+    with pytest.raises(ValueError, match=r"wrt names 'colour'; expected some of q, tangent, qd, tau, body_f"):
+        folded.forward_dynamics_vjp(q, qd, cotangent=qd, wrt="colour")
+
+
+# -- planted bugs ------------------------------------------------------------------------------------------------------
+BUGS = {
+    "the slope of the forces": ("step_vjp", "inertia + h * total", "inertia + 0.0 * total"),
+    "what the new velocity moves": ("step_vjp", "pushed[1](dof) + value", "pushed[1](dof)"),
+    "the sign of lambda": ("forward_dynamics_vjp", "lambda dof: -solved[dof]", "lambda dof: solved[dof]"),
+    "the turn of a quaternion": ("tangent", "cross(u, g_u)", "cross(g_u, u)"),
+    "the arm of a free hinge": ("tangent", "turn - cross(", "turn + cross("),
+}
+
+
+@pytest.mark.parametrize("bug", BUGS)
+def test_a_planted_bug_is_seen(bug, monkeypatch):
+    """By the derivative along one direction."""
+    name, old, new = BUGS[bug]
+    symbolic.plant(monkeypatch, Adjoints, name, old, new)
+    if name == "step_vjp":
+        scene = furnished(zoo.from_parents([-1, 0], ["revolute", "ball"], 8))
+        dyn = spo.Dynamics(scene, 1, device="cpu", dtype="float64", granularity="tree")
+        q, qd = on(dyn, laws.states(scene, 1), "q", "qd")
+        with pytest.raises(Exception, match="Jacobian mismatch"):
+            check(lambda qd: dyn.step(q.detach(), qd, None, DT), [qd])
+    else:
+        with pytest.raises(AssertionError):
+            test_products_are_those_of_the_dense_derivatives("chain_free")

@@ -1,0 +1,66 @@
+"""Newton's flat arrays of all worlds, seen as [world, ...] without a copy where they are laid out so."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..arrays import view
+from ..kernels import exchange
+
+
+class Layout:
+    """Which entries of a flat array are ours.
+
+    Args:
+        rows: [world, n], rows of the model's array. shape: of one world, n rows of components.
+    """
+
+    def __init__(self, rows: np.ndarray, shape: tuple[int, ...], device: wp.Device):
+        components = int(np.prod(shape)) // max(1, rows.shape[1])
+        flat = (rows[..., None] * components + np.arange(components)).reshape(len(rows), -1)
+        self.device, self.shape, self._flat_shape = device, (len(rows), *shape), flat.shape
+        self.plain = bool(np.array_equal(flat.ravel(), np.arange(flat.size)))
+        self._index: Any = wp.array(flat, dtype=wp.int32, device=device)
+        self._buffers: dict[str, wp.array] = {}
+
+    def buffer(self, name: str) -> wp.array:
+        """An array of our own, made at the first request."""
+        if name not in self._buffers:
+            self._buffers[name] = wp.zeros(self.shape, dtype=wp.float32, device=self.device)
+        return self._buffers[name]
+
+    def read(self, flat: Any, name: str) -> wp.array:
+        """The entries as [world, ...]: a view, or gathered into the buffer of that name."""
+        if self.plain:
+            return view(flat.ptr, self.shape, wp.float32, self.device.alias)
+        out = self.buffer(name)
+        self._launch(exchange.gather, [self._index, _scalars(flat)], out.reshape(self._flat_shape))
+        return out
+
+    def target(self, flat: Any, name: str) -> wp.array:
+        """Where to write what :meth:`write` brings into ``flat``."""
+        return view(flat.ptr, self.shape, wp.float32, self.device.alias) if self.plain else self.buffer(name)
+
+    def write(self, array: wp.array, flat: Any, mask: Any = None) -> None:
+        """Bring an array into a flat one, in the worlds of a ``mask``; nothing if it is there already."""
+        if array.ptr != flat.ptr:
+            self._launch(exchange.scatter, [self._index, mask, array.reshape(self._flat_shape)], _scalars(flat))
+
+    def scaled(self, array: wp.array, factor: wp.array, name: str) -> wp.array:
+        """``array`` with each entry of a world times its factor, in the buffer of that name."""
+        out = self.buffer(name)
+        self._launch(exchange.scale, [factor, array], out)
+        return out
+
+    def _launch(self, factory: Any, inputs: list, out: wp.array) -> None:
+        if self._index.size:
+            wp.launch(factory(wp.float32), self._flat_shape, inputs, [out], device=self.device)
+
+
+def _scalars(flat: Any) -> wp.array:
+    """An array of vectors, matrices or transforms as one of its numbers."""
+    components = int(np.prod(getattr(flat.dtype, "_shape_", ()) or (1,)))
+    return view(flat.ptr, (flat.size * components,), wp.float32, flat.device.alias)

@@ -1,0 +1,255 @@
+"""Impedance of the hinges: springs, dampers, drives, limits and friction, implicit in the step that they act in.
+
+A step of h seconds takes qd to qd' = qd + u and, along the way, q by h qd'. Every law of a dof is then one line, cut
+off at both ends,
+
+    f(u) = force - resistance u, held between ``least`` and ``most``,
+
+and never grows with u. A piece of it is linear, so that one more piece of armature, h resistance, and one more force
+make it implicit: (Mass + h R) qdd = tau - bias_force + F, u = h qdd. Which piece holds is guessed and seen afterwards:
+a semismooth Newton iteration, exact as soon as the guess was right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import UnsupportedError
+from ..parts import UNLIMITED
+from ..scene import Scene
+from ..trace.graph import Value, absolute, is_constant, less, reciprocal, select
+from ..trace.spatial import Vector, total
+from .integration import rotation_vector
+from .links import BALL, FREE, Link, Links
+
+CREEP = 1e-4  # rate [rad/s, m/s] below which dry friction sticks: there it is a damper, which this rate saturates
+TURNING = (BALL, FREE)  # motions with a quaternion
+DEFAULT_BOUND = 1e6  # effort and velocity limits from here on bound nothing: Newton's value where nothing is said
+HOLD = 1e3  # resistance of a velocity limit, in M / h: what exceeds the limit shrinks by this in a step
+NOISE = 64.0  # roundings of a law's terms by which two of its pieces may differ where they meet
+
+
+class Law(NamedTuple):
+    """f(u) = force - resistance u, not below ``least`` and not above ``most`` (None: unbounded)."""
+
+    force: Value
+    resistance: Value
+    least: Value | None = None
+    most: Value | None = None
+
+    @property
+    def bends(self) -> bool:
+        return self.least is not None or self.most is not None
+
+    def line(self, u: Value) -> Value:
+        return self.force - self.resistance * u
+
+    def bounded(self, line: Value) -> Value:
+        if self.most is not None:
+            line = select(less(self.most, line), self.most, line)
+        if self.least is not None:
+            line = select(less(line, self.least), self.least, line)
+        return line
+
+    def at(self, u: Value) -> Value:
+        """The force itself."""
+        return self.bounded(self.line(u))
+
+    def piece(self, u: Value) -> Law:
+        """The piece that holds at ``u``, as a law that does not bend."""
+        if not self.bends:
+            return self
+        line = self.line(u)
+        force, resistance = self.force, self.resistance
+        if self.most is not None:
+            over = less(self.most, line)
+            force, resistance = select(over, self.most, force), select(over, 0.0, resistance)
+        if self.least is not None:
+            under = less(line, self.least)
+            force, resistance = select(under, self.least, force), select(under, 0.0, resistance)
+        return Law(force, resistance)
+
+    def missed(self, guess: Value, u: Value, epsilon: float) -> Value:
+        """Not 0 where the piece that was taken at ``guess`` is not the law at ``u``, by more than rounding."""
+        if not self.bends:
+            return 0.0
+        piece = self.piece(guess)
+        size = absolute(piece.force) + absolute(piece.resistance * u)
+        return less(NOISE * epsilon * size, absolute(self.at(u) - piece.line(u)))
+
+    def skipped(self, guess: Value, u: Value) -> Value:
+        """Not 0 where the way from ``guess`` to ``u`` leads from one bound to the other."""
+        if self.least is None or self.most is None:
+            return 0.0
+        before, after = self.line(guess), self.line(u)
+        down = less(self.most, before) * less(after, self.least)
+        up = less(before, self.least) * less(self.most, after)
+        return down + up
+
+    @property
+    def middle(self) -> Value:
+        """u at which the law crosses zero."""
+        return self.force * reciprocal(self.resistance)
+
+
+def added(laws: list[Law]) -> Law:
+    """One law for several that do not bend."""
+    return Law(total(law.force for law in laws), total(law.resistance for law in laws))
+
+
+class Impedance:
+    """The laws of every dof of a scene for one step.
+
+    Args:
+        links: of the scene. Values that are ``variable``, or that differ between worlds, are inputs by their name.
+        h: length of the step [s]; 0.0 gives the forces as they are, without what the step changes.
+        q, qd: entries of the state that the laws start from; ``qd`` None is zero.
+        ahead: entries of what a step adds to q if u = 0; None is h qd.
+        target_q, target_qd: entries of the drives' targets, laid out as q and qd; None: the neutral ones, zero.
+    """
+
+    def __init__(
+        self,
+        links: Links,
+        h: Value,
+        q: Callable[[int], Value],
+        qd: Callable[[int], Value],
+        ahead: Callable[[int], Value] | None = None,
+        target_q: Callable[[int], Value] | None = None,
+        target_qd: Callable[[int], Value] = lambda dof: 0.0,
+    ):
+        self.links, self.scene, self.h, self.q, self.qd = links, links.scene, h, q, qd
+        self.ahead = ahead or (lambda dof: h * qd(dof))
+        self.target_q, self.target_qd = target_q or self._neutral, target_qd
+        self._inertias: np.ndarray | None = None
+
+    def laws(self, link: Link) -> list[list[Law]]:
+        """All laws of each dof of a link; those that nothing bends come first, as one."""
+        every = []
+        for i, dof in enumerate(link.dofs):
+            straight = [*self._damper(dof), *self._spring(link, i, "joint_stiffness", self._rest)]
+            found = [*self._drive(link, i), *self._limits(link, i), *self._friction(dof), *self._rate_limit(dof)]
+            straight += [law for law in found if not law.bends]
+            every.append([added(straight)] * bool(straight) + [law for law in found if law.bends])
+        return every
+
+    def passive(self, link: Link) -> list[Law]:
+        """Damper and spring of each dof of a link."""
+        return [
+            added([*self._damper(dof), *self._spring(link, i, "joint_stiffness", self._rest)])
+            for i, dof in enumerate(link.dofs)
+        ]
+
+    # -- values ----------------------------------------------------------------------------------------------------
+    def value(self, name: str, index: int) -> Value:
+        """A value of the scene by dof, or by coordinate for joint_rest_q."""
+        column = self.scene.values[name][:, index]
+        if name in self.links.variable or (column != column[0]).any():
+            return self.links.graph.input(name, index)
+        return float(column[0])
+
+    def _bound(self, name: str, dof: int, none: float) -> Value | None:
+        """A bound, or None where it is ``none`` or beyond in all worlds."""
+        if (np.abs(self.scene.values[name][:, dof]) >= none).all():
+            return None
+        return self.value(name, dof)
+
+    def _rest(self, coordinate: int) -> Value:
+        return self.value("joint_rest_q", coordinate)
+
+    def _neutral(self, coordinate: int) -> Value:
+        return float(self.scene.neutral_q[coordinate])
+
+    def _inertia(self, dof: int) -> float:
+        """Diagonal entry of the mass matrix at the neutral configuration, of world 0."""
+        if self._inertias is None:
+            self._inertias = neutral_inertias(self.scene)
+        return float(self._inertias[dof])
+
+    # -- laws ------------------------------------------------------------------------------------------------------
+    def _damper(self, dof: int) -> list[Law]:
+        d = self.value("joint_damping", dof)
+        return [] if _is(d, 0.0) else [Law(-(d * self.qd(dof)), d)]
+
+    def _spring(self, link: Link, i: int, name: str, rest: Callable[[int], Value]) -> list[Law]:
+        """-k (q' - rest), q' = q + h (qd + u)"""
+        k = self.value(name, link.dofs[i])
+        if _is(k, 0.0):
+            return []
+        stretch = self._stretch(link, i, rest)
+        return [Law(-k * (stretch + self.ahead(link.dofs[i])), self.h * k)]
+
+    def _stretch(self, link: Link, i: int, rest: Callable[[int], Value]) -> Value:
+        """q - rest of one dof of a link; of a rotation, an entry of its rotation vector."""
+        first = link.coordinate
+        if link.motion in TURNING and (link.motion != FREE or i >= 3):
+            start = first + 3 * (link.motion == FREE)
+            q, r = (Vector(entry(start + c) for c in range(4)) for entry in (self.q, rest))
+            return rotation_vector(q, r)[i % 3]
+        return self.q(first + i) - rest(first + i)
+
+    def _drive(self, link: Link, i: int) -> list[Law]:
+        """ke (target_q - q') + kd (target_qd - qd'), within the effort limit."""
+        dof = link.dofs[i]
+        kd = self.value("joint_target_kd", dof)
+        laws = self._spring(link, i, "joint_target_ke", self.target_q)
+        laws += [] if _is(kd, 0.0) else [Law(kd * (self.target_qd(dof) - self.qd(dof)), kd)]
+        if not laws:
+            return []
+        effort, law = self._bound("joint_effort_limit", dof, DEFAULT_BOUND), added(laws)
+        if effort is not None and _is(effort, 0.0):
+            return []
+        return [law] if effort is None else [law._replace(least=-effort, most=effort)]
+
+    def _limits(self, link: Link, i: int) -> list[Law]:
+        """Springs that push back into the range, never pull; where q is outside, with dampers."""
+        dof, laws = link.dofs[i], []
+        for name, inward in (("joint_limit_lower", 1.0), ("joint_limit_upper", -1.0)):
+            bound = self._bound(name, dof, UNLIMITED)
+            if bound is None:
+                continue
+            if link.motion in TURNING:
+                label = self.scene.dof_labels[dof]
+                raise UnsupportedError("Dynamics.step", f"a limit on {label!r}, a dof of a ball or free hinge,",
+                                       f"leave {name} at {-inward * UNLIMITED:.0e} there")
+            depth = inward * (bound - self.q(link.coordinate + i))  # how far outside; positive there
+            k, d = self.value("joint_limit_ke", dof), self.value("joint_limit_kd", dof)
+            d = select(less(0.0, depth), d, 0.0)
+            force = k * (depth - inward * self.ahead(dof)) - d * (inward * self.qd(dof))
+            least, most = (0.0, None) if inward > 0.0 else (None, 0.0)
+            laws.append(Law(inward * force, self.h * k + d, least, most))
+        return laws
+
+    def _friction(self, dof: int) -> list[Law]:
+        """A force of at most ``joint_friction`` against the motion; below CREEP, as a damper."""
+        f = self.value("joint_friction", dof)
+        return [] if _is(f, 0.0) else [Law(-(f * (1.0 / CREEP)) * self.qd(dof), f * (1.0 / CREEP), -f, f)]
+
+    def _rate_limit(self, dof: int) -> list[Law]:
+        """Dampers on what exceeds the velocity limit, HOLD times as heavy as the inertia is in a step."""
+        bound = self._bound("joint_velocity_limit", dof, DEFAULT_BOUND)
+        if bound is None or _is(self.h, 0.0):
+            return []
+        qd, r = self.qd(dof), HOLD * self._inertia(dof) * reciprocal(self.h)
+        return [Law(r * (bound - qd), r, None, 0.0), Law(-(r * (bound + qd)), r, 0.0, None)]
+
+
+def _is(x: Value, number: float) -> bool:
+    return is_constant(x) and x == number
+
+
+def neutral_inertias(scene: Scene) -> np.ndarray:
+    """Diagonal of the mass matrix at the neutral configuration, of world 0 [dof]."""
+    from ..trace.evaluate import evaluate
+    from .traced import Trace
+
+    one = scene.with_values(**{name: array[:1] for name, array in scene.values.items()})
+    entries = [item for item in Trace(Links(one), "float64", ("q",)).mass_matrix() if item.index[0] == item.index[1]]
+    values = evaluate([item.value for item in entries], lambda array, index: scene.neutral_q[index[0]])
+    found = np.zeros(scene.dof_count)
+    for item, value in zip(entries, values, strict=True):
+        found[item.index[0]] = value
+    return found

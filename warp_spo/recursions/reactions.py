@@ -1,0 +1,74 @@
+"""What bodies feel: their accelerations, and the wrenches that reach them through their hinges; inertial axes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..trace.emit import Store
+from ..trace.spatial import IDENTITY, Pose, Vector, cross
+from . import newton_euler
+from .motion import STILL
+
+
+def body_accelerations(trace: Any) -> list[Store]:
+    """out [body, 6] = acceleration of the CoM, angular acceleration"""
+    _, alpha = _moving(trace)
+    stores = []
+    for body, seat in trace.links.seats.items():
+        if seat.link is None:
+            continue
+        key = id(seat.link)
+        trace.at(seat.link, "a")
+        (w, v), move, R = alpha[key], trace.motions[key], trace.axes[key]
+        com = seat.offset + seat.matrix @ trace.links.nodes[body].com
+        linear = R @ (v + cross(w, com) + move.whirl @ com) + trace.links.gravity
+        stores += [Store("out", (body, c), value) for c, value in enumerate((*linear, *(R @ w)))]
+    return stores
+
+
+def body_reactions(trace: Any) -> list[Store]:
+    """out [body, 6] = force, moment about the CoM, that a body's hinge puts on it
+
+    A body takes for itself what moves it, and hands on what its children need; forces meet at CoMs.
+    """
+    origins, alpha = _moving(trace)
+    tree, seats, stores = trace.links.scene.tree, trace.links.seats, []
+    still = -trace.places[id(trace.links.links[0])].pose.l  # the inertial frame's origin, seen from the first link's
+    forces: dict[int, tuple[Vector, Vector]] = {}
+    places: dict[int, Vector] = {}
+    for body in reversed(list(seats)):  # parents come first there
+        seat = seats[body]
+        move, R, origin = STILL, IDENTITY, still
+        w, v = trace.base
+        if seat.link is not None:
+            key = id(seat.link)
+            trace.at(seat.link, "f")
+            (w, v), move, R, origin = alpha[key], trace.motions[key], trace.axes[key], origins[key]
+        com = seat.offset + seat.matrix @ trace.links.nodes[body].com
+        place = Pose(None, seat.matrix, seat.offset)
+        moment = newton_euler.body_force(place.rigid_to_parent(trace.links.nodes[body].rigid), move, w, v)
+        n, f = Vector(moment[:3]), Vector(moment[3:])
+        n, f = R @ (n - cross(com, f)), R @ f
+        places[body] = at = origin + R @ com
+        if "body_f" in trace.given:
+            f = f - Vector(trace.graph.input("body_f", body, c) for c in range(3))
+            n = n - Vector(trace.graph.input("body_f", body, c) for c in range(3, 6))
+        for child in tree.children[body]:
+            n_c, f_c = forces[child]
+            n, f = n + n_c + cross(places[child] - at, f_c), f + f_c
+        forces[body] = n, f
+        stores += [Store("out", (body, c), value) for c, value in enumerate((*f, *n))]
+    return stores
+
+
+def _moving(trace: Any) -> tuple[dict[int, Vector], dict[int, tuple[Vector, Vector]]]:
+    """Origins and accelerations of all links, gravity in them as the other way round."""
+    origins = trace.place_all(moves=True)
+    qdd = trace.vector("qdd")
+    alpha: dict[int, tuple[Vector, Vector]] = {}
+    for link in trace.links.links:
+        trace.at(link, "a")
+        above = trace.base if link.parent is None else alpha[id(link.parent)]
+        place, move = trace.places[id(link)], trace.motions[id(link)]
+        alpha[id(link)] = newton_euler.accelerated(link, place, move, above, qdd)
+    return origins, alpha
