@@ -453,7 +453,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
         gravity = self.recursions.parameters.gravity
         lines = [
             f"{scene!r}",
-            f"worlds       {self.worlds} on {self.device}, {self.dtype.__name__}",
+            f"worlds       {self.worlds} on {self.device}, {self.dtype.__name__}{', refined' if self.refine else ''}",
             f"granularity  {plans.describe(self.plan)}",
             f"levels       {len(widths)} of {min(widths)} to {max(widths)} nodes, {len(tree.segments)} segments",
             f"variable     {', '.join(self.variable) or 'nothing'}",
