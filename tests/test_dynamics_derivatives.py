@@ -1,6 +1,8 @@
 """Analytic derivatives of the dynamics against Pinocchio's, and against central differences of the dense reference."""
 
 import functools
+import sys
+from pathlib import Path
 
 import laws
 import numpy as np
@@ -17,6 +19,9 @@ from warp_spo.plan import MOST_DOFS
 from warp_spo.recursions import sensitivity
 from warp_spo.recursions.derivatives import Derivatives
 from warp_spo.reference import Dense
+
+sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
+from benchmarks import cases
 
 STEP = 1e-5
 DIFFERENCES = 1e-6  # relative: eps / h + h^2; the issue's bound, measured 4e-9
@@ -255,6 +260,31 @@ def test_no_world_too_many_dofs_and_none(device):
     assert still.mass_matrix_derivative(nothing).shape == (2, 0, 0, 0)
     with pytest.raises(TypeError, match=r"expected three arrays or None, \(q, qd, tau\)"):
         still.forward_dynamics_derivatives(nothing, out=nothing)
+
+
+# -- operations --------------------------------------------------------------------------------------------------------
+PINNED = {"arm7": (2522, 1456, 2190), "quadruped": (10155, 7857, 6984), "humanoid": (22824, 26883, 12975)}
+"""Scene of the benchmarks -> operations of one world: derivatives of inverse dynamics, of Mass, J* y of forward dynamics.
+
+The last is 1.5 to 1.7 times forward dynamics.
+"""
+
+
+@pytest.mark.parametrize("name", PINNED)
+def test_operations_are_no_more_than_they_were(name):
+    scene = cases.SCENES[name]()
+    find = spo.Dynamics(scene, 1, device="cpu", granularity="tree").programs.find
+    q, rate, n = (1, scene.coord_count), (1, scene.dof_count), scene.dof_count
+    state = {"q": q, "qd": rate, "qdd": rate}
+    bars = {"qd_bar": rate, "tau_bar": rate}
+    found = (
+        find("inverse_dynamics_derivatives", state, (1, 3, n, n)),
+        find("mass_matrix_derivative", {"q": q}, (1, n, n, n)),
+        find("forward_dynamics_vjp", {**state, "cotangent": rate}, q, bars, wrt=("q", "qd", "tau")),
+    )
+    counts = tuple(program.operations for program in found)
+    assert all(a <= b for a, b in zip(counts, PINNED[name], strict=True)), counts
+    assert sum(counts) >= 0.97 * sum(PINNED[name]), f"fewer than pinned: write down {counts}"
 
 
 # -- planted bugs ------------------------------------------------------------------------------------------------------
