@@ -1,11 +1,10 @@
 """Run ``python -m benchmarks [FILTER]``: check against the dense reference, time, print ``case.metric value``.
 
-``--all --json benchmarks/results/`` measures everything that the README shows, ``--readme`` puts it there, ``--report``
-writes one HTML page.
+``--everything --json benchmarks/results/ --readme`` measures all that the README shows, peers too, and puts it there;
+``--report`` writes one HTML page.
 """
 
 import argparse
-import itertools
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from warp_spo import report as pages
 from warp_spo.__main__ import find_device
 
 from . import cases as data
-from . import evidence, pictures, report, roofline, runner, table
+from . import everything, evidence, parts, pictures, report, roofline, runner, table
 from .cases import case_name
 from .precisions import PRECISIONS
 
@@ -39,10 +38,15 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--dtype", nargs="+", choices=PRECISIONS, metavar="P", help=f"precisions: {', '.join(PRECISIONS)}")
     names = [name or PLAN for name in data.GRANULARITIES]
     p.add_argument("--granularity", nargs="+", choices=names, metavar="G", help=f"{', '.join(names)}; default: {PLAN}")
+    p.add_argument("--sweeps", action="store_true", help="growing world counts, chains and trees instead of robots")
     p.add_argument(
-        "--all", action="store_true", help="every precision and granularity, growing sizes, and the stress suite"
-    )
+        "--everything", action="store_true", help="ours, the peers that are there, and the stress suite, part by part; "
+        "FILTER is of parts' names; goes on where an earlier run of this commit stopped"
+    )  # fmt: skip
+    p.add_argument("--budget", type=float, default=3600.0, metavar="S", help="[s] of --everything; default: 3600")
+    p.add_argument("--jobs", type=int, metavar="N", help="processes that compile at a time; default: nearly all cores")
     p.add_argument("--check", action="store_true", help="compare with the reference, time nothing")
+    p.add_argument("--compile", action="store_true", help="evaluate once: kernels come into Warp's cache")
     p.add_argument("--json", type=Path, metavar="OUT", help="write the run to this file, or by date into this folder")
     p.add_argument("--report", type=Path, metavar="DIR", help="write the run as one page, DIR/report.html")
     p.add_argument(
@@ -56,13 +60,14 @@ def parser() -> argparse.ArgumentParser:
         type=Path,
         const=evidence.RESULTS,
         metavar="JSON",
-        help="put tables and pictures of a file or folder (default: benchmarks/results) into README.md; run nothing",
+        help="put tables and pictures of a file or folder (default: benchmarks/results) into README.md; run nothing "
+        "unless there is --everything before it",
     )
     return p
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Returns 0; 1 if an error is beyond its tolerance or two runs differ, 2 for a mistake of the caller."""
+    """Returns 0; 1 if an error is beyond its tolerance, two runs differ or time ran out, 2 for a caller's mistake."""
     options = parser().parse_args(argv)
     wp.config.log_level = wp.LOG_WARNING
     try:
@@ -73,8 +78,16 @@ def main(argv: list[str] | None = None) -> int:
         if options.compare:
             return compare(*options.compare)
         pyplot = pages.load_pyplot() if options.report or options.readme else None
+        if options.everything:
+            device = find_device(options.device)
+            chosen = parts.choose(options.filter, device.is_cuda, str(device))
+            out = options.json or evidence.RESULTS
+            _, left_out = everything.run(chosen, device, options.budget, options.jobs, out)
+            if left_out:
+                return 1
         if options.readme:
             write_readme(pyplot, options.readme)
+        if options.readme or options.everything:
             return 0
         if options.source:
             if not options.report:
@@ -97,45 +110,31 @@ def choose(options: Any, cuda: bool) -> list[dict]:
         ValueError: there are none.
     """
     worlds = options.worlds or (data.WORLDS if cuda else data.CPU_WORLDS)
-    dtypes = options.dtype or (tuple(PRECISIONS) if options.all else data.DTYPES)
-    asked = options.granularity and [None if name == PLAN else name for name in options.granularity]
-    granularities = asked or (data.GRANULARITIES if options.all else (None,))
-    return data.cases(options.filter, worlds, dtypes, granularities, options.all, cuda)
+    granularities = [None if name == PLAN else name for name in options.granularity or [PLAN]]
+    return data.cases(options.filter, worlds, options.dtype or data.DTYPES, granularities, options.sweeps, cuda)
 
 
 def measure(chosen: list[dict], options: Any, device: wp.Device, pyplot: Any) -> int:
     """Run, print, write; returns the exit code."""
+    if options.compile:
+        runner.compile_only(chosen, device)
+        return 0
     roof = None if options.check else roofline.measure(device)
     rows: list[dict] = []
-    stressed: list[dict] = []
-    try:
-        for row in runner.run(chosen, device, options.check, roof):
-            rows.append(row)
-            print("\n".join(runner.lines(row)), flush=True)
-        if options.all:
-            stressed += stress_rows(options.filter, device, not options.check)
-    finally:  # what was measured before an interrupt or an error is kept
-        run = runner.record(rows, device, roof) | (dict(stress=stressed) if stressed else {})
-        if options.json and rows:
-            print(f"wrote {runner.save(run, options.json)}", file=sys.stderr)
-        if options.report and rows:
-            print(f"wrote {report.write(pyplot, evidence.gather([run]), options.report)}", file=sys.stderr)
+    whole, file = runner.record(rows, device, roof), None
+    for row in runner.run(chosen, device, options.check, roof):
+        rows.append(row)
+        print("\n".join(runner.lines(row)), flush=True)
+        if options.json:  # after each row: what was measured before an interrupt is kept
+            file = runner.save(whole, options.json)
+    if file:
+        print(f"wrote {file}", file=sys.stderr)
+    if options.report:
+        print(f"wrote {report.write(pyplot, evidence.gather([whole]), options.report)}", file=sys.stderr)
     failed = [case_name(row) for row in rows if not row["error"] <= runner.tolerance(row)]
     if failed:
         print(f"benchmarks: the error is NaN or beyond its tolerance in {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0
-
-
-def stress_rows(pattern: str, device: wp.Device, timed: bool) -> list[dict]:
-    """Rows of the stress suite; its verdicts are shown, ``python -m benchmarks.stress`` is who fails for them."""
-    try:
-        from . import stress
-        from .stress_cases import choose
-    except ImportError as error:
-        print(f"skipped the stress suite: {error}; pip install warp_spo[test]", file=sys.stderr)
-        return []
-    found = itertools.chain(stress.rows(choose(pattern, slow=False), device, timed), stress.check_rows(pattern, device))
-    return list(found)
 
 
 def write_readme(pyplot: Any, source: Path) -> None:

@@ -78,9 +78,8 @@ SWEEPS = (
     *(Sweep(name, _family(name), (1024,), (4,), "node") for name in ("chain", "tree", "deep", "branching")),
 )
 SWEPT = ("forward_dynamics", "inverse_dynamics")
-PEERS_WORLDS = (1, 65536, 1048576), (1, 128)  # on a GPU, on a CPU: further counts for released robots
-SAMPLE, FEWER = 16, 4  # worlds of each set of inputs that are compared with the reference: usually, and beside it
-PEERS_OPERATIONS = ("forward_dynamics", "inverse_dynamics", "mass_matrix")
+SAMPLE, FEWER = 16, 4  # worlds of each set of inputs that are compared with the reference: usually, and
+MANY = 4096  # of more than so many, and in sweeps
 
 
 def cases(
@@ -93,27 +92,25 @@ def cases(
 ) -> list[dict]:
     """Cases of all scenes and operations whose ``case_name`` holds a match of the regular expression ``pattern``.
 
-    A released robot that is not at hand is left out unless ``pattern`` names it. With ``sweeps`` there follow the world
-    counts at which peers are measured, and the cases of :data:`SWEEPS`, at the sizes for a GPU or a CPU.
+    A released robot that is not at hand is left out unless ``pattern`` names it. ``sweeps``: the cases of
+    :data:`SWEEPS` instead, at the sizes for a GPU or a CPU.
 
     Raises:
         ValueError: no case does, naming what there is; or a world count below one.
     """
     if min(worlds) < 1:
         raise ValueError(f"benchmarks: --worlds has {min(worlds)}; expected one or more")
-    further = [count for count in PEERS_WORLDS[not cuda] if sweeps and count not in worlds]
     every = [
-        _case(scene, count, op, dtype, granularity, FEWER if count in further else SAMPLE)
+        _case(scene, count, op, dtype, granularity, FEWER if count > MANY else SAMPLE)
         for scene in SCENES
         if scene not in robots.ROBOTS or scene in pattern or robots.at_hand(scene)
-        for count in [*worlds, *(further if scene in robots.ROBOTS else [])]
+        for count in worlds
         for dtype in dtypes
         for granularity in granularities
         for op in PRECISIONS[dtype].operations
-        if count not in further or op in PEERS_OPERATIONS
     ]
     if sweeps:
-        every += [
+        every = [
             _case(scene, count, op, "float32", sweep.granularity, FEWER) | dict(sweep=sweep.name)
             for sweep in SWEEPS
             for scene in sweep.scenes

@@ -88,7 +88,8 @@ def _of_machine(runs: list[dict]) -> Evidence:
         for row in [*data["rows"], *data.get("stress", [])]:
             kind = "stress" if "verdict" in row else "peers" if row.get("peer") else "ours"
             of_newest = newest.setdefault((kind, row.get("peer")), data["commit"]) == data["commit"]
-            key = identity(row) if kind != "stress" else (row["case"], str(row["parameters"]), row.get("precision"))
+            stressed = (row.get("case"), str(row.get("parameters")), row.get("precision"), row.get("granularity"))
+            key = stressed if kind == "stress" else identity(row)
             if of_newest and key not in seen:
                 seen.add(key)
                 rows[kind].append(row)

@@ -13,8 +13,9 @@ PEERS = (
     *("tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive", "tab:cyan", "black", "gold", "navy", "salmon"),
     *("mediumpurple", "sandybrown", "darkred", "teal", "magenta", "lightskyblue"),
 )
-MARKERS = {"float32": "o", "refined": "D", "float64": "s"}
-NAMES = {"refined": "float32, refined"}
+MARKERS = {"float32": "o", "refined": "D", "randomised": "^", "float64": "s"}
+NAMES = {"refined": "float32, refined", "randomised": "float32, variable inertias"}
+SHOWN = (*HEADLINE[:3], "psi")  # in the headline: what all peers have, and an operator
 ROBOTS = ("panda", "go2", "g1"), ("arm7", "quadruped", "humanoid")  # of the headline: those that peers have, or ours
 PANELS = {
     "worlds": ("worlds", "worlds"),
@@ -65,11 +66,11 @@ def error_time(pyplot: Any, evidence: Evidence, operation: str, worlds: int) -> 
 
 
 def headline(pyplot: Any, evidence: Evidence) -> Any:
-    """Error against run time of the operations that all peers have, on three robots."""
+    """Error against run time of the operations that all peers have, and of psi, on three robots."""
     rows = _curves(evidence)
     scenes = {row["scene"] for row in rows}
     robots = next((names for names in ROBOTS if scenes >= set(names)), sorted(scenes)[:3])
-    operations = [op for op in HEADLINE[:3] if any(row["op"] == op for row in rows)]
+    operations = [op for op in SHOWN if any(row["op"] == op for row in rows)]
     worlds = usual_worlds(rows)
     rows = [r for r in rows if r["scene"] in robots and r["op"] in operations and r["worlds"] == worlds]
     if not rows:

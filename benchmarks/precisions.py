@@ -9,7 +9,9 @@ import warp_spo as spo
 from warp_spo.operations import OPERATIONS, TOLERANCE, Inputs, Operation
 from warp_spo.trial import Subject
 
-from .refinement import REFINED, Refined
+HEADLINE = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "solve_mass_matrix")
+REFINED = ("forward_dynamics", "solve_mass_matrix")
+RANDOMISED = ("body_mass", "body_com", "body_inertia")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,14 +31,31 @@ class Precision:
     scalar: str | None
 
 
-def plain(dtype: str, scene: spo.Scene, worlds: int, device: Any, granularity: str | None, inputs: list[Inputs]):
-    """A subject in one scalar type throughout."""
-    return Subject(spo.Dynamics(scene, worlds, device, dtype, granularity=granularity), inputs)
+def of(
+    dtype: str,
+    scene: spo.Scene,
+    worlds: int,
+    device: Any,
+    granularity: str | None,
+    inputs: list[Inputs],
+    **options: Any,
+) -> Subject:
+    """A subject whose arrays are of one scalar type."""
+    return Subject(spo.Dynamics(scene, worlds, device, dtype, granularity=granularity, **options), inputs)
 
 
 PRECISIONS = {
-    "float32": Precision(functools.partial(plain, "float32"), OPERATIONS, TOLERANCE["float32"], "float32"),
+    "float32": Precision(functools.partial(of, "float32"), OPERATIONS, TOLERANCE["float32"], "float32"),
     # a step takes the error of float32 once more; without it nothing is under 1e-8
-    "refined": Precision(Refined, REFINED, 1e-8, None),
-    "float64": Precision(functools.partial(plain, "float64"), OPERATIONS, TOLERANCE["float64"], "float64"),
+    "refined": Precision(
+        functools.partial(of, "float64", refine=1), {name: OPERATIONS[name] for name in REFINED}, 1e-8, None
+    ),
+    # inertias are inputs, as domain randomisation has them, each world's its own
+    "randomised": Precision(
+        functools.partial(of, "float32", variable=RANDOMISED),
+        {name: OPERATIONS[name] for name in HEADLINE},
+        TOLERANCE["float32"],
+        "float32",
+    ),
+    "float64": Precision(functools.partial(of, "float64"), OPERATIONS, TOLERANCE["float64"], "float64"),
 }

@@ -24,8 +24,9 @@ COLUMNS = {
     "registers": ("registers", ""), "local B": ("local_bytes", ""),
 }  # fmt: skip
 STRESS = {
-    "case": ("case", ""), "precision": ("precision", ""), "largest error": ("max_error", ".1e"),
-    "median": ("median_error", ".1e"), "law": ("law", ".1e"), "error / law": ("ratio", ".2g"),
+    "case": ("case", ""), "precision": ("precision", ""), "by": ("granularity", ""),
+    "largest error": ("max_error", ".1e"), "median": ("median_error", ".1e"), "law": ("law", ".1e"),
+    "error / law": ("ratio", ".2g"),
     "backward": ("backward_error", ".1e"), "µs a world": ("us", ".3g"), "verdict": ("verdict", ""),
     "law is": ("formula", ""), "from": ("source", ""), "against": ("reference", ""),
 }  # fmt: skip
@@ -70,6 +71,8 @@ def _machine(pyplot: Any, evidence: Evidence) -> list[str]:
         failed = [row for row in evidence.stress if row["verdict"] == "FAILS"]
         judged = sum(row["verdict"] in ("ok", "FAILS") for row in evidence.stress)
         parts.append(pages.paragraph(f"{judged - len(failed)} of {judged} within 10 times their law."))
+        causes = {row["case"]: row.get("why") or "not known why" for row in failed}
+        parts += [pages.paragraph(f"{case} misses its law: {cause}.") for case, cause in causes.items()]
         lines = [[_stress_cell(row, *column) for column in STRESS.values()] for row in evidence.stress]
         parts.append(pages.table(list(STRESS), lines))
     return parts

@@ -55,6 +55,20 @@ def run(
       rates ``GFLOPs`` and ``GBps``, and with ``roof`` the share of it that was reached;
     * on CUDA ``memory_MiB`` in use: operations keep their workspace, so it is the most that this subject's have taken.
     """
+    for case, subject, name in _subjects(cases, device, 1 if check else SETS):
+        granularity = subject.dyn.plan.of(case["op"])
+        row = case | dict(granularity=granularity, chosen=case["granularity"] is None)
+        yield row | dict(reference=name) | _measured(case, subject, name, check, roof)
+
+
+def compile_only(cases: Iterable[dict], device: Any = None) -> None:
+    """Evaluate each case once: its kernels are compiled into Warp's cache."""
+    for case, subject, _ in _subjects(cases, device, 1):
+        Trial(subject, PRECISIONS[case["dtype"]].operations[case["op"]], 1)
+
+
+def _subjects(cases: Iterable[dict], device: Any, sets: int) -> Iterator[tuple[dict, Any, str]]:
+    """Each case that is not another one again, its subject, and the name of its reference."""
     key = subject = subject_key = None
     skipped: set[str] = set()
     done: set[tuple] = set()
@@ -64,7 +78,7 @@ def run(
             scene = FACTORIES[case["scene"]]()
             name = "float64" if case.get("sweep") else "dense"
             reference = Recursive(scene) if name == "float64" else Dense
-            inputs = [Inputs(scene, case["worlds"], seed, reference) for seed in range(1 if check else SETS)]
+            inputs = [Inputs(scene, case["worlds"], seed, reference) for seed in range(sets)]
         try:
             precision = PRECISIONS[case["dtype"]]
             if (*key, case["dtype"], case["granularity"]) != subject_key:
@@ -72,12 +86,10 @@ def run(
                 subject = precision.subject(scene, case["worlds"], device, case["granularity"], inputs)
             if subject is None:  # refused before
                 continue
-            granularity = subject.dyn.plan.of(case["op"])
-            identity = (*key, case["op"], case["dtype"], granularity, case.get("sweep"))
+            identity = (*key, case["op"], case["dtype"], subject.dyn.plan.of(case["op"]), case.get("sweep"))
             if identity not in done:
                 done.add(identity)
-                row = case | dict(granularity=granularity, chosen=case["granularity"] is None)
-                yield row | dict(reference=name) | _measured(case, subject, name, check, roof)
+                yield case, subject, name
         except spo.UnsupportedError as error:
             if str(error) not in skipped:
                 skipped.add(str(error))

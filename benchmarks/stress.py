@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import concurrent.futures
+import functools
 import itertools
+import multiprocessing
 import re
 import sys
 from collections.abc import Iterable, Iterator
@@ -14,7 +17,7 @@ import warp as wp
 
 from . import runner
 from .stress_cases import Case, choose
-from .stress_checks import CHECKS, READS_PIVOTS
+from .stress_checks import CHECKS, LONG, READS_PIVOTS
 from .stress_measure import Subject, contrasts, row
 from .stress_scenes import Setting
 
@@ -35,13 +38,21 @@ def rows(
             continue
         subject = Subject(case.problem, device, "node" if case.reads_pivots else granularity)
         for precision in case.shown:
-            yield row(case, subject, precision, timed)
+            try:
+                yield row(case, subject, precision, timed)
+            except ValueError:
+                raise
+            except Exception as error:
+                yield dict(case=case.name, parameters=case.parameters, precision=precision, granularity=granularity,
+                           source=f"theory.md {case.source}", verdict="FAILS", why=f"{type(error).__name__}: {error}")
         yield from contrasts(case)
 
 
-def check_rows(pattern: str, device: Any = None, granularity: str | None = None) -> Iterator[dict]:
-    """Yield a row for each check whose name holds a match, and precision."""
-    for name, (check, source) in CHECKS.items():
+def check_rows(
+    pattern: str, device: Any = None, granularity: str | None = None, slow: bool = False
+) -> Iterator[dict]:
+    """Yield a row for each check whose name holds a match, and precision; the long ones too with ``slow``."""
+    for name, (check, source) in (CHECKS | (LONG if slow else {})).items():
         if not re.search(pattern, name) or (name in READS_PIVOTS and granularity not in (None, "node")):
             continue
         for dtype in ("float32", "float64"):
@@ -50,8 +61,32 @@ def check_rows(pattern: str, device: Any = None, granularity: str | None = None)
                 verdict, why = "ok", ""
             except AssertionError as error:
                 verdict, why = "FAILS", str(error).strip()
+            except ValueError:  # of the granularity
+                raise
+            except Exception as error:  # such as a kernel that does not compile: the other checks go on
+                verdict, why = "FAILS", f"{type(error).__name__}: {error}"
             yield dict(case=name, parameters={}, precision=dtype, granularity=granularity, source=source,
                        verdict=verdict, why=why)
+
+
+def side_by_side(
+    cases: list[Case], checks: list[str], jobs: int, device: str, granularity: str | None
+) -> Iterator[dict]:
+    """The rows of cases and checks, untimed, from processes that compile at the same time; in order."""
+    work = [("case", case.id) for case in cases] + [("check", name) for name in checks]
+    context = multiprocessing.get_context("spawn")  # a device does not survive a fork
+    with concurrent.futures.ProcessPoolExecutor(jobs, context) as pool:
+        for found in pool.map(functools.partial(_one, device, granularity), work):
+            yield from found
+
+
+def _one(device: str, granularity: str | None, work: tuple[str, str]) -> list[dict]:
+    kind, name = work
+    wp.config.log_level = wp.LOG_WARNING
+    pattern = f"^{re.escape(name)}$"
+    if kind == "check":
+        return list(check_rows(pattern, device, granularity, slow=True))
+    return list(rows(choose(pattern), device, False, granularity))
 
 
 def line(found: dict) -> str:
@@ -77,6 +112,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--granularity", help="of the library's recursions; default: what the plan chooses")
     p.add_argument("--slow", action="store_true", help="the long sizes too")
     p.add_argument("--check", action="store_true", help="time nothing")
+    p.add_argument("--jobs", type=int, default=1, metavar="N", help="with --check: processes side by side")
     p.add_argument("--json", type=Path, metavar="OUT", help="write the run to this file, or by date into this folder")
     options = p.parse_args(argv)
     wp.config.log_level = wp.LOG_WARNING
@@ -88,20 +124,28 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     found: list[dict] = []
     print("  ".join(f"{head:<{width}}" for head, width in zip(HEADS, WIDTHS, strict=True)))
-    where = options.device, options.granularity
+    where = str(wp.get_device(options.device)), options.granularity
+    run, file = runner.record(found, where[0]), None
+    if options.check and options.jobs > 1:
+        checks = [name for name in CHECKS | (LONG if options.slow else {}) if re.search(options.filter, name)]
+        measured = side_by_side(cases, checks, options.jobs, *where)
+    else:
+        timed = rows(cases, where[0], not options.check, where[1])
+        measured = itertools.chain(timed, check_rows(options.filter, *where, options.slow))
     try:
-        measured = rows(cases, where[0], not options.check, where[1])
-        for one in itertools.chain(measured, check_rows(options.filter, *where)):
+        for one in measured:
             found.append(one)
             print(line(one), flush=True)
+            if options.json:
+                file = runner.save(run, options.json)
     except ValueError as error:  # of --granularity
         print(error, file=sys.stderr)
         return 2
     if not found:
         print(f"stress: no case matches {options.filter!r}", file=sys.stderr)
         return 2
-    if options.json:
-        print(f"wrote {runner.save(runner.record(found, options.device), options.json)}", file=sys.stderr)
+    if file:
+        print(f"wrote {file}", file=sys.stderr)
     failed = [one for one in found if one["verdict"] == "FAILS"]
     for one in failed:
         print(f"fails: {line(one)} {one.get('why', '')}", file=sys.stderr)

@@ -10,6 +10,7 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 import warp_spo as spo
 
@@ -356,6 +357,20 @@ def worlds_against_closed_form(where: Setting, worlds: int = 1) -> None:
     assert not status.any() and error.max() <= 10 * 5e-7 * where.eps / 2.0**-23, f"error {error.max():.1e}"
 
 
+def many_worlds(where: Setting) -> None:
+    worlds_against_closed_form(where, 2**20)
+
+
+def many_steps(where: Setting) -> None:
+    """On a GPU, where a graph of steps is replayed; elsewhere the check stiff_arm does 10 000."""
+    device = wp.get_device(where.device)
+    stiff_arm(where, 1_000_000 if device.is_cuda else 20_000)
+
+
+def same_bits_of_many(where: Setting) -> None:
+    same_bits(where, 4096)
+
+
 CHECKS = {
     "S5.closed_form": (closed_form, "theory.md 4.3 S5"),
     "S6.cond_law": (condition_slope, "theory.md 4.3 S6"),
@@ -377,6 +392,13 @@ CHECKS = {
     "one_world": (worlds_against_closed_form, "theory.md 5.2 O1"),
 }
 """Name -> (check, where it stands)."""
+
+LONG = {
+    "S32.determinism_4096_worlds": (same_bits_of_many, "theory.md 4.3 S32"),
+    "stiff_arm_million_steps": (many_steps, "issue 3, item 4"),
+    "million_worlds": (many_worlds, "issue 3, item 4"),
+}
+"""Those that take long, as the slow cases do."""
 
 READS_PIVOTS = ("S5.closed_form",)
 """Checks of D as the recursions leave it in memory, which only granularity "node" does."""

@@ -14,29 +14,13 @@ import warp_spo as spo
 
 from . import contrast
 from .exact import Sweep
-from .stress_cases import ALLOWED, EPS32, EPS64, Case
+from .stress_cases import ALLOWED, CAUSES, EPS32, EPS64, Case
 from .stress_scenes import Problem
 
 PRECISIONS = ("float32", "refined", "float64")  # refined: float32 and one step with a float64 residual
 EPS = {"float32": EPS32, "float64": EPS64}
 MP_BODIES = 32  # larger scenes are compared with extended precision, whose eps is 1/2048 of float64's
 POWER_STEPS = 8  # of the power iteration for the norm of the mass matrix
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def residual(tau: wp.array2d[wp.float64], force: wp.array2d[wp.float64], out: wp.array2d[wp.float32]):
-    """tau - force, rounded once; tau absent is zero."""
-    world, dof = wp.tid()
-    wanted = wp.float64(0.0)
-    if tau:
-        wanted = tau[world, dof]
-    out[world, dof] = wp.float32(wanted - force[world, dof])
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def correct(step: wp.array2d[wp.float32], out: wp.array2d[wp.float64]):
-    world, dof = wp.tid()
-    out[world, dof] += wp.float64(step[world, dof])
 
 
 class Subject:
@@ -50,8 +34,9 @@ class Subject:
 
     def __init__(self, problem: Problem, device: Any = None, granularity: str | None = None):
         self.problem = problem
-        make = functools.partial(spo.Dynamics, problem.scene, problem.worlds, device, granularity=granularity)
-        self.dyn = {name: make(dtype=name) for name in EPS}
+        self._make = functools.partial(spo.Dynamics, problem.scene, problem.worlds, device, granularity=granularity)
+        self.dyn = {name: self._make(dtype=name) for name in EPS}
+        self._refined: dict[int, spo.Dynamics] = {}
         self.device, self.granularity = self.dyn["float32"].device, self.dyn["float32"].granularity
         self._inputs: dict[str, tuple] = {}
 
@@ -68,20 +53,11 @@ class Subject:
         return wp.zeros(self.problem.worlds, dtype=wp.int32, device=self.device)
 
     def forward(self, dtype: str, steps: int = 0) -> wp.array:
-        """qdd; in float32 with ``steps`` times qdd += Mass32^-1 (tau - inverse_dynamics64(q, qd, qdd))."""
-        q, qd, tau = self.inputs(dtype)
-        qdd = self.dyn[dtype].forward_dynamics(q, qd, tau, status=self.status)
-        if not steps:
-            return qdd
-        q64, qd64, tau64 = self.inputs("float64")
-        total = wp.zeros(qdd.shape, dtype=wp.float64, device=self.device)
-        wp.launch(correct, qdd.shape, [qdd], [total], device=self.device)
-        for _ in range(steps):
-            force = self.dyn["float64"].inverse_dynamics(q64, qd64, total)
-            wp.launch(residual, qdd.shape, [tau64, force], [qdd], device=self.device)
-            step = self.dyn["float32"].solve_mass_matrix(q, qdd)
-            wp.launch(correct, qdd.shape, [step], [total], device=self.device)
-        return total
+        """qdd; from float32 with ``steps`` of refinement, in float64 arrays."""
+        if steps and steps not in self._refined:
+            self._refined[steps] = self._make(dtype="float64", refine=steps)
+        dyn = self._refined[steps] if steps else self.dyn[dtype]
+        return dyn.forward_dynamics(*self.inputs(dyn.dtype.__name__), status=self.status)
 
     def pivots(self, dtype: str) -> np.ndarray:
         """D [world, dof] of the last forward dynamics in that precision."""
@@ -191,6 +167,8 @@ def row(case: Case, subject: Subject, precision: str, timed: bool = False) -> di
                  status=sorted({int(word) for word in status}), flagged=int((status != 0).sum()),
                  misjudged=int((~case.expects(status, dtype, law)).sum()))
     found["verdict"] = "" if not judged else "ok" if ratio <= ALLOWED and not found["misjudged"] else "FAILS"
+    if found["verdict"] == "FAILS" and case.name in CAUSES:
+        found["why"] = CAUSES[case.name]
     qdd = value if case.quantity in ("qdd", "dense") else subject.forward(dtype, steps).numpy()
     found["backward_error"] = float(subject.backward_error(qdd).max())
     if timed:

@@ -9,11 +9,11 @@ from warp_spo.operations import OPERATIONS
 
 from .cases import SCENES
 from .evidence import RESULTS, ROOT, Evidence, usual_worlds
+from .precisions import HEADLINE
 from .robots import ROBOTS
 
 BEGIN, END = "<!-- benchmarks:begin -->", "<!-- benchmarks:end -->"
 PICTURES = {"error-time.svg": "error against run time", "scaling.svg": "run time against size"}
-HEADLINE = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "solve_mass_matrix")
 
 
 def plain(evidence: Evidence) -> list[dict]:

@@ -24,8 +24,7 @@ C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
 MASKS = ("prescribed",)  # arrays of booleans
 INTEGERS = ("place", "shifts", "status")  # arrays of whole numbers, one axis
 MOST_PASSES = 16  # of a loop; see CONTRIBUTING
-IN_PLACE, STAGED, MAPPED, COLUMNS, TILED, DIRECT = "in place", "staged", "mapped", "columns", "tiled", "direct"
-SPREAD_BLOCK = 256
+IN_PLACE, STAGED, MAPPED, TILED, DIRECT = "in place", "staged", "mapped", "tiled", "direct"
 TILE = 8  # worlds of a tile: an entry of theirs fills a sector of 32 bytes
 
 
@@ -43,9 +42,8 @@ class Result(NamedTuple):
     Attributes:
         way: IN_PLACE: entry by entry over ``row``, which is read first; STAGED: through shared memory, as it is;
             MAPPED: through shared memory, ``slots`` values that a table ``place`` [entry] spreads, -1 being zero;
-            COLUMNS: the same values as [slot, world] to memory, whence the kernel :func:`spread` takes them; TILED: as
-            [tile, slot, world of the tile], for kernels that read them so (see .tiles); DIRECT: each entry to memory by
-            itself, where shared memory is too small.
+            TILED: the same values to memory as [tile, slot, world of the tile], for the kernels of .tiles; DIRECT: each
+            entry to memory by itself.
     """
 
     way: str
@@ -143,14 +141,12 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
         start, width = offset[result.row], pitch(next(row.entries for row in frame.rows if row.name == result.row))
     else:
         width = pitch(result.slots | 1 if result.way == MAPPED else out.entries)
-        start, at = at, at + (0 if result.way in (DIRECT, COLUMNS, TILED) else WARP * width)
+        start, at = at, at + (0 if result.way in (DIRECT, TILED) else WARP * width)
     own_row = f"{c}* result_row = out.data + world * {out.entries};"
     if result.way == TILED:
         own_row = f"{c}* result_row = out.data + world / {TILE} * {result.slots * TILE} + world % {TILE};"
     if result.way in (DIRECT, TILED):
         text += [own_row]
-    elif result.way == COLUMNS:
-        text += _columns(c)
     else:
         text += [f"{c}* result_row = stage + {start} + lane * {width};"]
     if frame.sent:
@@ -168,8 +164,6 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     text += [_own_result(row, c) for row in frame.more]
     if result.way == MAPPED:
         text += [f"{c} result_row[{result.slots}];"]
-    elif result.way == COLUMNS:
-        text += _columns(c)
     else:
         text += [own_row]
     if frame.sent:
@@ -178,7 +172,7 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     if result.way == MAPPED:
         text += [f"for (int i = 0; i < {out.entries}; ++i) {{", "    const int slot = place.data[i];",
                  f"    out.data[world * {out.entries} + i] = slot < 0 ? 0 : result_row[slot];", "}"]
-    text += ["#endif", "#undef SENT", "#undef RESULT", *(["#undef FIELD"] if frame.fields else []), ""]
+    text += ["#endif", "#undef SENT", *(["#undef FIELD"] if frame.fields else []), ""]
     return "\n".join(text)
 
 
@@ -237,14 +231,6 @@ def _held(frame: Frame, c: str) -> list[str]:
     return text
 
 
-def _columns(c: str) -> list[str]:
-    return [
-        f"{c}* result_row = out.data + world;",
-        f"const long long result_part = out.strides[0] / (long long)sizeof({c});",
-        "#define RESULT(i) result_row[(i) * result_part]",
-    ]
-
-
 def _each(n: int, team: int, statement: str) -> str:
     """``statement`` for every entry i of the rows of the worlds that are present, the whole team side by side."""
     turns = -(-WARP * n // team)
@@ -290,47 +276,6 @@ def _spread_out(result: Result, offset: int, c: str, team: int) -> str:
         for (int k = 0; k < present; ++k) to[k * {n}] = slot[u] < 0 ? ({c})0 : from[k * {width}];
     }}
 }}"""
-
-
-def spread(result: Result, T) -> wp.Kernel:
-    """A kernel (worlds, columns [slot, world], place [entry]) -> out, all worlds of a tile side by side.
-
-    On CUDA it takes SPREAD_BLOCK threads for each :func:`tile` worlds, on the CPU a thread a world.
-    """
-    c, n, width, worlds = C_TYPE[T], result.array.entries, result.slots | 1, tile(result, T)
-    native = f"""#if defined(__CUDA_ARCH__)
-__shared__ {c} shared[{worlds * width}];
-const int member = threadIdx.x;
-const long long first = (long long)(thread / {SPREAD_BLOCK}) * {worlds};
-const int present = worlds - first < {worlds} ? (int)(worlds - first) : {worlds};
-const long long part = columns.strides[0] / (long long)sizeof({c});
-#pragma unroll 4
-for (int k = member; k < {result.slots * worlds}; k += {SPREAD_BLOCK}) {{
-    const int slot = k / {worlds}, world = k % {worlds};
-    if (world < present) shared[world * {width} + slot] = __ldg(columns.data + slot * part + first + world);
-}}
-__syncthreads();
-{c}* to = out.data + first * {n};
-#pragma unroll 4
-for (int i = member; i < present * {n}; i += {SPREAD_BLOCK}) {{
-    const int slot = __ldg(place.data + i % {n});
-    to[i] = slot < 0 ? ({c})0 : shared[(i / {n}) * {width} + slot];
-}}
-#else
-const long long part = columns.strides[0] / (long long)sizeof({c});
-for (int i = 0; i < {n}; ++i) {{
-    const int slot = place.data[i];
-    out.data[(long long)thread * {n} + i] = slot < 0 ? 0 : columns.data[slot * part + thread];
-}}
-#endif
-"""
-    return kernel("spread", native, [("columns", 2), ("place", 1), ("out", result.array.ndim)], T)
-
-
-def tile(result: Result, T) -> int:
-    """Worlds that :func:`spread` holds in shared memory at once: a power of two."""
-    worlds = SHARED_BYTES // ((result.slots | 1) * wp.types.type_size_in_bytes(T))
-    return min(WARP, 1 << (worlds.bit_length() - 1)) if worlds else 0
 
 
 def _slot(i: str, entries: int, distance: int) -> str:

@@ -10,9 +10,18 @@ import warp as wp
 
 from .straight import C_TYPE, TILE
 
-MULTIPLY = """\
+TYPES = """\
 struct alignas(16) Part { %(c)s x[16 / sizeof(%(c)s)]; };  // read at once
 struct Tile { Part part[%(tile)d * sizeof(%(c)s) / 16]; };
+"""
+SPREAD = """\
+Tile v = {};
+if (slot >= 0) v = ((const Tile*)a.data)[(long long)tile * a.shape[1] + slot];
+const int first = tile * %(tile)d, count = out.shape[0] - first < %(tile)d ? out.shape[0] - first : %(tile)d;
+%(c)s* to = out.data + (long long)first * out.shape[1] + e;
+for (int u = 0; u < %(tile)d; ++u) if (u < count) to[(long long)u * out.shape[1]] = v.part[u / WIDE].x[u %% WIDE];
+"""
+MULTIPLY = """\
 const int n = a.shape[1], first = tile * %(tile)d;
 const int count = a.shape[0] - first < %(tile)d ? a.shape[0] - first : %(tile)d;
 const %(c)s* rows = a.data + ((long long)first * n + row) * n;
@@ -40,21 +49,22 @@ for (int u = 0; u < count; ++u) {
 """
 
 
+def _code(text: str, T) -> str:
+    wide = f"#define WIDE (16 / (int)sizeof({C_TYPE[T]}))\n"
+    return wide + (TYPES + text) % {"c": C_TYPE[T], "tile": TILE} + "#undef WIDE\n"
+
+
 @functools.cache
 def spread(T) -> wp.Kernel:
     """out[world, e] = the value at ``place[first + e]``; one thread for each (tile, e)."""
 
+    @wp.func_native(_code(SPREAD, T))
+    def write(tile: int, e: int, slot: int, a: wp.array3d[T], out: wp.array2d[T]): ...
+
     @wp.kernel(module=f"warp_spo_tiles_{T.__name__}", enable_backward=False)
-    def kernel(tiles: wp.array3d[T], place: wp.array[int], first: int, out: wp.array2d[T]):
+    def kernel(a: wp.array3d[T], place: wp.array[int], first: int, out: wp.array2d[T]):
         tile, e = wp.tid()
-        slot = place[first + e]
-        for u in range(wp.static(TILE)):
-            world = wp.static(TILE) * tile + u
-            if world < out.shape[0]:
-                value = T(0.0)
-                if slot >= 0:
-                    value = tiles[tile, slot, u]
-                out[world, e] = value
+        write(tile, e, place[first + e], a, out)
 
     return kernel
 
@@ -62,10 +72,8 @@ def spread(T) -> wp.Kernel:
 @functools.cache
 def product(T) -> wp.Kernel:
     """q_out, qd_out = -A B for two blocks of B in tiles, [dof, dof] each; one thread for each (tile, row, column)."""
-    wide = f"#define WIDE (16 / (int)sizeof({C_TYPE[T]}))\n"
-    code = wide + MULTIPLY % {"c": C_TYPE[T], "tile": TILE} + "#undef WIDE\n"
 
-    @wp.func_native(code)
+    @wp.func_native(_code(MULTIPLY, T))
     def multiply(
         tile: int,
         row: int,

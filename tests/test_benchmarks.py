@@ -2,10 +2,12 @@
 
 import base64
 import dataclasses
+import importlib
 import json
 import math
 import re
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +18,26 @@ from warp_spo.operations import INPUTS, OPERATIONS, TOLERANCE, Inputs, rotations
 from warp_spo.reference import Dense
 
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
-from benchmarks import cases, evidence, operation_counts, pictures, robots, roofline, runner, shapes, table
+from benchmarks import (
+    cases,
+    everything,
+    evidence,
+    operation_counts,
+    parts,
+    peers,
+    pictures,
+    robots,
+    roofline,
+    runner,
+    shapes,
+    table,
+)
 from benchmarks import report as reports
-from benchmarks.__main__ import main
+from benchmarks.__main__ import choose, main, parser
 from benchmarks.precisions import PRECISIONS
 
 NODE = ("node",)  # compiles nothing for a scene; other granularities have tests of their own
+REFINED = ("float32", "refined", "float64")
 ROOF = 1.2  # share that no measurement passes: the roof itself is measured to some per cent
 
 
@@ -109,7 +125,7 @@ def test_scalar_types_are_compared_and_timed_from_torch_too(device):
 
 
 def test_refinement_takes_the_error_of_float32_once_more(device):
-    found = cases.cases("arm7.(forward|solve)", worlds=[4], dtypes=tuple(PRECISIONS), granularities=NODE)
+    found = cases.cases("arm7.(forward|solve)", worlds=[4], dtypes=REFINED, granularities=NODE)
     rows = {(row["op"], row["dtype"]): row for row in runner.run(found, device, check=True)}
     assert len(rows) == 6
     for op in ("forward_dynamics", "solve_mass_matrix"):
@@ -310,18 +326,64 @@ def test_two_runs_are_compared(tmp_path, capsys):
     assert "2 cases of 20 us or more; 0 differ" in capsys.readouterr().out
 
 
-def test_everything_at_once(tmp_path, capsys, device, monkeypatch):
-    """``--all`` in small: robots, sweeps and the stress suite, one file, one page."""
-    pattern = r"arm7\.forward.*w3|chain_2\.|S1\.chain_rand.*n4$"
-    call = [pattern, "--all", "--worlds", "3", "--granularity", "node", "--device", str(device)]
-    assert main([*call, "--json", str(tmp_path / "run.json"), "--report", str(tmp_path)]) == 0
+def test_everything_goes_on_where_it_stopped(tmp_path, capsys, device, monkeypatch):
+    """``--everything`` in small: ours, a sweep, a peer and the stress suite, part by part, and one page of it."""
+    def few(pattern, cuda, where):
+        own = ["--device", where]
+        dtypes = ["--dtype", *PRECISIONS]
+        ours = parts.ours("ours", r"^arm7\.forward", 100.0, *dtypes, *own, "--granularity", "node", worlds=("3",))
+        sweep = parts.ours("sweep", r"^chain_2\.forward", 100.0, "--sweeps", *own)
+        stress = everything.Part("stress", ["benchmarks.stress", "S1.chain_rand.*n4$", "--granularity", "node", *own])
+        return [ours, sweep, stress, everything.Part("late", ["benchmarks", "nothing", *own])]
+
+    monkeypatch.setattr(parts, "choose", few)
+    monkeypatch.setattr(everything, "FOLDER", tmp_path / "parts")
+    monkeypatch.delenv(everything.PEERS_FOLDER, raising=False)
+    call = ["--everything", "--device", str(device), "--json", str(tmp_path / "run.json"), "--budget", "300"]
+    assert main(call) == 1
+    printed = capsys.readouterr().out
+    assert "late: 0 rows" in printed and "left out: late" in printed
     run = evidence.read(tmp_path / "run.json")
     keys = {(row["scene"], row["dtype"], row.get("sweep")) for row in run["rows"]}
     assert keys == {("arm7", dtype, None) for dtype in PRECISIONS} | {("chain_2", "float32", "chain")}
     assert {row["verdict"] for row in run["stress"] if row["case"] == "S1.chain_rand"} == {"ok", ""}
     assert all(row["roof"] <= ROOF for row in run["rows"] if "roof" in row)
     assert run["machine"]["copy_GBps"] > 0.0
+    assert main(call) == 1 and "3 parts are there already" in capsys.readouterr().out
+    assert evidence.read(tmp_path / "run.json")["rows"] == run["rows"]
+    assert main(["--from", str(tmp_path / "run.json"), "--report", str(tmp_path)]) == 0
     assert "S1.chain_rand n=4" in (tmp_path / reports.FILE).read_text()
+
+
+def test_a_part_that_takes_too_long_is_stopped(tmp_path, capsys, monkeypatch):
+    text = "import signal, time; signal.signal(signal.SIGINT, signal.SIG_IGN); time.sleep(60)"
+    (tmp_path / "endless_part.py").write_text(text)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(everything, "GRACE", 1.0)
+    part = everything.Part("endless", ["endless_part"], seconds=2.0)
+    begin = time.monotonic()
+    assert everything.Lanes(tmp_path, 60.0, 1, alone=True).run([part]) == [part]
+    assert "endless: 0 rows" in capsys.readouterr().out and 2.0 < time.monotonic() - begin < 20.0
+
+
+def test_parts_are_cases_that_there_are():
+    """Every command of every part names cases, peers and options that exist."""
+    for found in (parts.choose("", True, "cuda:0"), parts.choose("", False, "cpu")):
+        assert len({part.name for part in found}) == len(found)
+        for part in found:
+            module, *arguments = part.measure
+            if module == "benchmarks":
+                options = parser().parse_args(arguments)
+                assert choose(options, True), part.name
+            elif module == "benchmarks.peers":
+                options = importlib.import_module("benchmarks.peers.__main__").parser().parse_args(arguments)
+                names = [f"{options.peers[0]}.{scene}" for scene in options.scenes]
+                kind = importlib.import_module(f"benchmarks.peers.{peers.PEERS[options.peers[0]]}").PEER
+                works = [f"{name}.{op}.{variant}.{dtype}" for name in names for op, variant in kind.works
+                         for dtype in kind.dtypes]  # fmt: skip
+                assert any(re.search(options.filter, work) for work in works), part.name
+    with pytest.raises(ValueError, match="no part matches"):
+        parts.choose("nothing", True, "cuda:0")
 
 
 def test_inputs_are_reproducible_and_exact_in_both_precisions():

@@ -263,10 +263,10 @@ def test_no_world_too_many_dofs_and_none(device):
 
 
 # -- operations --------------------------------------------------------------------------------------------------------
-PINNED = {"arm7": (2522, 1456, 2190), "quadruped": (10155, 7857, 6984), "humanoid": (22824, 26883, 12975)}
-"""Scene of the benchmarks -> operations of one world: derivatives of inverse dynamics, of Mass, J* y of forward dynamics.
+PINNED = {"arm7": (2522, 1456, 1814), "quadruped": (10155, 7857, 6864), "humanoid": (22824, 26883, 12968)}
+"""Scene of the benchmarks -> operations of one world: derivatives of inverse dynamics, of Mass; J* y of forward dynamics.
 
-The last is 1.5 to 1.7 times forward dynamics.
+The last is 1.2 to 1.7 times forward dynamics.
 """
 
 

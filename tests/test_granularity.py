@@ -11,11 +11,12 @@ import zoo
 from robots import ROBOTS
 
 import warp_spo as spo
+from warp_spo.kernels import straight
 
 GRANULARITIES = ("tree", "segment")
 DTYPES = ("float32", "float64")
-SEGMENTED = ("forward_dynamics", "inverse_dynamics", "solve_mass_matrix", "mass_matrix")
-OPERATIONS = (*SEGMENTED, "bias_force", "gravity_force", "mass_matrix_inverse", "log_det_mass_matrix", "body_poses",
+SEGMENTED = ("forward_dynamics", "inverse_dynamics", "solve_mass_matrix", "mass_matrix", "mass_matrix_inverse")
+OPERATIONS = (*SEGMENTED, "bias_force", "gravity_force", "log_det_mass_matrix", "body_poses",
               "body_velocities", "jacobian", "operational_inertia_inverse")  # fmt: skip
 MANY = 33  # one more than a warp has threads
 
@@ -113,6 +114,7 @@ SCENES = {
     "three roots": lambda: zoo.from_parents([-1, 0, -1, 2, -1, 2],
                                             ["revolute", "ball", "free", "d6", "planar", "fixed"], 7),
     "two arms": zoo.fork,
+    "dancer": zoo.dancer,
     "several robots": zoo.forest,
     "oblique chain": lambda: zoo.chain(4),
 }
@@ -124,12 +126,13 @@ FEW = {  # operations that a quick run takes of a scene; the others have all
     "anisotropic armature": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
     "several robots": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
     "two arms": ("forward_dynamics", "mass_matrix"),
+    "dancer": ("mass_matrix_inverse",),
     "hand": (*SEGMENTED, "bias_force"),
     "arm": (*SEGMENTED, "log_det_mass_matrix", "body_poses"),
-    "three roots": (*SEGMENTED, "bias_force", "mass_matrix_inverse", "jacobian"),
+    "three roots": (*SEGMENTED, "bias_force", "jacobian"),
 }
 PRECISION = {"float32": ("every kind", "arm", "hand", "massless", "deep"),
-             "float64": ("fixed", "anisotropic armature", "three roots")}  # fmt: skip
+             "float64": ("fixed", "anisotropic armature", "three roots", "dancer")}  # fmt: skip
 """Scenes of which a quick run takes all of those in this precision; in the other one the first two."""
 
 
@@ -195,6 +198,17 @@ def test_equals_reference(name, granularity, dtype, operation, device):
     assert dyn.plan.of(operation) == granularity
     arrays = states(dyn)
     equals_reference(dyn, operation, arrays, laws.TOLERANCE[dtype], worlds=(0, 1, MANY // 2, MANY - 1))
+
+
+@pytest.mark.parametrize("granularity", GRANULARITIES)
+def test_a_long_result_by_tiles(granularity, device, monkeypatch):
+    """Values that go through memory, some worlds at a time, and parameters with them."""
+    dyn = dynamics("two arms", granularity, MANY, "float64", device, varied=True)
+    monkeypatch.setattr(straight, "SHARED_BYTES", 10_000)
+    dyn.programs.tiled, dyn.programs.tiled_worlds = True, 16
+    for operation in ("mass_matrix", "mass_matrix_inverse"):
+        equals_reference(dyn, operation, states(dyn), laws.TOLERANCE["float64"])
+    assert all(program.tiles is not None for program in dyn.programs._programs.values())
 
 
 @pytest.mark.parametrize("worlds", [1, 3])
@@ -390,31 +404,12 @@ def test_angles_that_are_not_numbers(granularity, dtype, bad, device):
 
 
 # -- random trees ------------------------------------------------------------------------------------------------------
-TREES = [(10, 1, 10), (60, 1, 30), (14, 2, 5), (18, 3, 4), (22, 1, 6), (27, 2, 12), (33, 1, 30), (40, 3, 8),
-         (48, 2, 20), (54, 1, 15)]  # fmt: skip
-"""dofs at least, roots, levels at most"""
 QUICK = (0, 2)
 MISSED = {
     1: "60 dof, 26 levels of oblique, turned and offset hinges: medians of qdd and tau 3.3e-7 and 3.8e-7",
     8: "48 dof, 19 levels: median of tau 3.3e-7",
 }
 """Tree -> by how much it misses the line."""
-SERIAL = ("revolute", "revolute", "revolute", "prismatic", "universal", "ball", "cylindrical", "fixed", "planar")
-
-
-def random_tree(seed, dofs, roots, levels):
-    """Of at least so many dofs; branches where chance has it; one root in two floats."""
-    rng = np.random.default_rng(1000 + seed)
-    parents, kinds, level, count = [], [], [], 0
-    while count < dofs or len(parents) < roots:
-        k = len(parents)
-        below = [p for p in range(k) if level[p] < levels]
-        straight = k > 0 and level[-1] < levels and rng.uniform() < (0.9 if levels > 10 else 0.6)
-        parents.append(-1 if k < roots else k - 1 if straight else int(rng.choice(below)))
-        kinds.append(str(rng.choice(SERIAL)) if parents[-1] >= 0 or k % 2 else "free")
-        level.append(1 if parents[-1] < 0 else level[parents[-1]] + 1)
-        count += zoo.random_hinge(rng, kinds[-1], -1, 0).dof_count
-    return zoo.from_parents(parents, kinds, 2000 + seed)
 
 
 def relative(got, wanted):
@@ -431,11 +426,11 @@ def marked(which):
 
 
 @pytest.mark.parametrize("granularity", GRANULARITIES)
-@pytest.mark.parametrize("which", [marked(which) for which in range(len(TREES))])
+@pytest.mark.parametrize("which", [marked(which) for which in range(len(zoo.BRANCHED))])
 def test_random_trees_meet_the_error_line(which, granularity, device):
     """Issue 4: float32 against float64 on the same inputs; float64 against the dense reference in two worlds."""
-    scene, worlds = random_tree(which, *TREES[which]), 200
-    assert scene.tree.depth <= 30 and len(scene.tree.roots) == TREES[which][1]
+    scene, worlds = zoo.branched(which), 200
+    assert scene.tree.depth <= 30 and len(scene.tree.roots) == zoo.BRANCHED[which][1]
     low = spo.Dynamics(scene, worlds, device=device, dtype="float32", granularity=granularity)
     high = spo.Dynamics(scene, worlds, device=device, dtype="float64", granularity="node")
     arrays = states(low)

@@ -102,3 +102,11 @@ def test_what_no_graph_knew_of_is_derived_at_each_request(device):
         after = laws.numpy_call(dyn, "forward_dynamics", arrays)
         wanted = laws.numpy_call(fresh, "forward_dynamics", arrays)
         assert laws.error(after, wanted) <= laws.TOLERANCE["float64"] < laws.error(before, wanted)
+
+
+def test_a_turning_link_keeps_seven_numbers():
+    """What lies on the axis of a hinge counts as its parent's; the base carries it for nothing."""
+    for link in Links(zoo.chain(5)).links:
+        mass, h_x, h_y, h_z, _, J_yy, *_ = link.grouped.packed
+        assert mass == h_z == J_yy == 0.0 and h_x != 0.0 != h_y
+        assert link.inertia.mass > 0.0

@@ -10,8 +10,9 @@ from laws import TOLERANCE
 from mutants import mutant
 
 import warp_spo as spo
-from warp_spo import blocks, levels, programs, teams
-from warp_spo.recursions import articulated, links, newton_euler, pieces, traced
+from warp_spo import blocks, levels, teams
+from warp_spo.kernels import straight
+from warp_spo.recursions import articulated, inverse, links, messages, newton_euler, pieces, traced
 from warp_spo.trace import graph, spatial
 
 WORLDS = 3
@@ -162,25 +163,26 @@ def test_a_wrong_step(bug, monkeypatch):
 def team_error(monkeypatch, operation="forward_dynamics", name="star"):
     """Of the CUDA text of a scene's warps, against the dense reference; raises Race."""
     texts = warp_machine.recorded(monkeypatch)
+    monkeypatch.setattr(straight, "SHARED_BYTES", 1 << 20)
     scene = zoo.SCENES[name]()
     dyn = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="segment")
     arrays = laws.states(scene, WORLDS)
-    given = ("q", "qd", "tau") if operation == "forward_dynamics" else ("q", "qd", "qdd")
-    rate = (WORLDS, scene.dof_count)
-    dyn.programs.find(operation, {name: arrays[name].shape for name in given}, rate)
+    given = {"forward_dynamics": ("q", "qd", "tau"), "mass_matrix_inverse": ("q",)}.get(operation, ("q", "qd", "qdd"))
     arrays["body_f"][:] = 0.0
     wanted = np.array([laws.expected(dyn, operation, arrays, w) for w in range(WORLDS)])
-    return laws.error(warp_machine.run(texts[-1], arrays), wanted)
+    dyn.programs.find(operation, {name: arrays[name].shape for name in given}, wanted.shape)
+    assert texts[-1].frame.warps > 1
+    return laws.error(warp_machine.run(texts[-1], arrays).reshape(wanted.shape), wanted)
 
 
 TEAM_MUTANTS = {
-    "a slot too near": (programs, "_slots", "at += SENT[letter]", "at += SENT[letter] - 1"),
+    "a slot too near": (messages, "slots", "at += size(letter, piece)", "at += size(letter, piece) - 1"),
     "no barrier before the trunk": (pieces.Pieces, "__init__", "child.inward + (child is not heir)", "child.inward"),
     "no barrier after the trunk": (pieces.Pieces, "__init__",
                                    "piece.parent.outward + (piece.warp != piece.parent.warp)", "piece.parent.outward"),
-    "another limb's entries": (teams.Team, "_shared", "zip(*shifts.columns, strict=True)",
+    "another limb's entries": (teams.Team, "_filled", "zip(*shifts.columns, strict=True)",
                                "[*zip(*shifts.columns, strict=True)][::-1]"),
-    "another limb's constants": (teams.Team, "_shared", "zip(*constants.columns, strict=True)",
+    "another limb's constants": (teams.Team, "_filled", "zip(*constants.columns, strict=True)",
                                  "[*zip(*constants.columns, strict=True)][::-1]"),
 }  # fmt: skip
 
@@ -198,3 +200,22 @@ def test_a_wrong_team(bug, monkeypatch):
         except warp_machine.Race:
             seen.append(True)
     assert any(seen)
+
+
+INVERSE_MUTANTS = {
+    "another column": (inverse.Inverse, "_meet", "sent[heads * at : heads * at + common]", "sent[:common]"),
+    "what lies further in": (inverse.Inverse, "_come_back", "[dot(row, force) for row in N]", "[0.0 for row in N]"),
+    "parted too early": (pieces.Piece, "fork", "(other, *other.ancestors)", "reversed((other, *other.ancestors))"),
+    "no barrier before they meet": (teams.Team, "cuda", "BARRIER, self._across(alike)", "self._across(alike)"),
+}
+
+
+@pytest.mark.parametrize("bug", INVERSE_MUTANTS)
+def test_a_wrong_inverse(bug, monkeypatch):
+    """Branches that meet where limbs part, and part again."""
+    assert team_error(monkeypatch, "mass_matrix_inverse", "dancer") <= TOLERANCE["float64"]
+    symbolic.plant(monkeypatch, *INVERSE_MUTANTS[bug])
+    try:
+        assert not team_error(monkeypatch, "mass_matrix_inverse", "dancer") <= TOLERANCE["float64"]
+    except warp_machine.Race:
+        pass

@@ -13,25 +13,14 @@ from warp_spo.kernels import status as status_kernels
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
 from granularities import GRANULARITIES, SLOW, skip_unless_served
 
-from benchmarks import stress, stress_checks, stress_measure, stress_steps
+from benchmarks import stress, stress_checks, stress_measure, stress_scenes
 from benchmarks.exact import Sweep
-from benchmarks.stress_cases import ALLOWED, CASES, choose
+from benchmarks.stress_cases import ALLOWED, CASES, CAUSES, choose
 from benchmarks.stress_scenes import Setting
 from warp_spo import reference
 
-COMPONENT = ("{} times the law: an entry of qdd that nearly cancels carries the rounding of its neighbours; median "
-             "entry 4e-7, worst entry of D 5e-7")
-KNOWN = {
-    ("S18.scale_sep_qdd.r1", "float32"): COMPONENT.format(130),
-    ("S18.scale_sep_qdd.r1", "float64"): COMPONENT.format(91),
-    ("S18.scale_sep_qdd.r0.5", "float32"): COMPONENT.format(42),
-    ("S18.scale_sep_qdd.r0.5", "float64"): COMPONENT.format(64),
-    ("S18.scale_sep_qdd.r0.3", "float32"): COMPONENT.format(210),
-    ("S18.scale_sep_qdd.r0.3", "float64"): COMPONENT.format(220),
-    ("S18.scale_sep_qdd.r0.1", "float32"): COMPONENT.format(19),
-    ("S18.scale_sep_qdd.r0.1", "float64"): COMPONENT.format(12),
-}
-"""(case or check, precision) -> why it fails. One case; three are allowed."""
+KNOWN = {(case.id, dtype): CAUSES[case.name] for case in CASES if case.name in CAUSES for dtype in case.precisions}
+"""(case, precision) -> why it fails. One case; three are allowed."""
 
 
 def marked(value, name, precision, granularity, slow=False):
@@ -66,17 +55,22 @@ def test_check(name, dtype, granularity, device):
 @pytest.mark.slow
 @pytest.mark.parametrize("granularity", GRANULARITIES)
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-class TestLong:
-    def test_bits_do_not_depend_on_the_number_of_worlds(self, dtype, granularity, device):
-        stress_checks.same_bits(Setting(device, dtype, granularity), worlds=4096)
+@pytest.mark.parametrize("name", stress_checks.LONG)
+def test_long_check(name, dtype, granularity, device):
+    if name == "stiff_arm_million_steps" and not device.is_cuda:
+        pytest.skip("a million steps need a graph: run with --device cuda:0; the check stiff_arm does 10 000")
+    stress_checks.LONG[name][0](Setting(device, dtype, granularity))
 
-    def test_a_million_worlds(self, dtype, granularity, device):
-        stress_checks.worlds_against_closed_form(Setting(device, dtype, granularity), worlds=2**20)
 
-    def test_a_million_steps(self, dtype, granularity, device):
-        if not device.is_cuda:
-            pytest.skip("a million steps need a graph: run with --device cuda:0; the check stiff_arm does 10 000")
-        stress_steps.stiff_arm(Setting(device, dtype, granularity), steps=1_000_000)
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("bodies, fits", [(7, True), (31, False)])
+def test_limbs_that_tell_each_other_more_than_shared_memory_holds_run_as_a_tree(bodies, fits, dtype, device):
+    p = stress_scenes.binary_tree(bodies)
+    dyn = spo.Dynamics(p.scene, p.worlds, device, dtype, granularity="segment")
+    qdd = dyn.forward_dynamics(p.q, p.qd, p.tau)
+    wanted = spo.Dynamics(p.scene, p.worlds, "cpu", "float64", granularity="node").forward_dynamics(p.q, p.qd, p.tau)
+    np.testing.assert_allclose(qdd, wanted, rtol=1e-3, atol=1e-5)
+    assert (next(iter(dyn.programs._programs.values())).warps > 1) == fits
 
 
 # -- words -------------------------------------------------------------------------------------------------------------

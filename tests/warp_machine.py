@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warp_spo.kernels.straight import IN_PLACE, MAPPED, Frame
+from warp_spo.kernels.straight import IN_PLACE, MAPPED, TILED, Frame
 from warp_spo.programs import Programs
 from warp_spo.teams import BARRIER
 
@@ -104,7 +104,7 @@ def run(text, arrays, backwards=False):
         going = {} if stopped else going
         stretch += 1
     whole = np.zeros((frame.result.array.entries, worlds))
-    places = text.tables["place"] if frame.result.way == MAPPED else range(len(whole))
+    places = text.tables["place"] if frame.result.way in (MAPPED, TILED) else range(len(whole))
     for entry, slot in enumerate(places):
         whole[entry] = 0.0 if slot < 0 else result.values[slot]
     return whole.T
@@ -148,7 +148,7 @@ def translated(cuda):
         branch = re.match(r"^(else )?(?:if \((.*)\) )?\{$", line)
         if branch:
             condition = "False" if "reach" in (branch[2] or "") else (branch[2] or "").replace("||", "or")
-            word = f"{'el' if branch[1] else ''}if {condition}" if branch[2] else "else"
+            word = f"{'el' if branch[1] else ''}if {condition}" if branch[2] else "else" if branch[1] else "if True"
             lines += ["    " * depth + f"{word}:", "    " * (depth + 1) + "pass"]
             depth += 1
             continue
@@ -176,4 +176,5 @@ def _statement(line):
 
 
 def _sent(line):
+    line = re.sub(r"result_row\[\(([^()]*)\) \* \d+\]", r"result_row[\1]", line)
     return re.sub(r"SENT\(([^()]*)\)", r"sent[\1]", line)

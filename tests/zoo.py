@@ -94,6 +94,12 @@ def fork(seed=2):
     return from_parents([2, 0, -1, 2, 3], kinds, seed, [4, 2, 0, 3, 1])
 
 
+def dancer():
+    """A floating pelvis with two legs and a waist, on it two arms of two fingers each: limbs that part again."""
+    kinds = ["free", "revolute", "revolute", "prismatic"] + ["revolute", "universal", "revolute"] * 2
+    return from_parents([-1, 0, 0, 0, 3, 4, 4, 3, 7, 7], kinds, 58)
+
+
 def forest(seed=3):
     """Two robots in one scene, interleaved: a floating one and one on a fixed base with a fixed and a ball hinge."""
     parents = [-1, -1, 0, 1, 2, 3, 2]
@@ -217,6 +223,28 @@ def permuted(scene, seed=0):
     return Permuted(new.with_values(**values), body, hinge, q, qd)
 
 
+BRANCHED = [(10, 1, 10), (60, 1, 30), (14, 2, 5), (18, 3, 4), (22, 1, 6), (27, 2, 12), (33, 1, 30), (40, 3, 8),
+            (48, 2, 20), (54, 1, 15)]  # fmt: skip
+"""Ten random trees: dofs at least, roots, levels at most."""
+SERIAL = ("revolute", "revolute", "revolute", "prismatic", "universal", "ball", "cylindrical", "fixed", "planar")
+
+
+def branched(which):
+    """One of BRANCHED; branches where chance has it; one root in two floats."""
+    dofs, roots, levels = BRANCHED[which]
+    rng = np.random.default_rng(1000 + which)
+    parents, kinds, level, count = [], [], [], 0
+    while count < dofs or len(parents) < roots:
+        k = len(parents)
+        below = [p for p in range(k) if level[p] < levels]
+        straight = k > 0 and level[-1] < levels and rng.uniform() < (0.9 if levels > 10 else 0.6)
+        parents.append(-1 if k < roots else k - 1 if straight else int(rng.choice(below)))
+        kinds.append(str(rng.choice(SERIAL)) if parents[-1] >= 0 or k % 2 else "free")
+        level.append(1 if parents[-1] < 0 else level[parents[-1]] + 1)
+        count += random_hinge(rng, kinds[-1], -1, 0).dof_count
+    return from_parents(parents, kinds, 2000 + which)
+
+
 def varied(scene, worlds, seed=0):
     """``scene`` with masses, CoMs, inertias, anchors, armature and gravity that differ from world to world."""
     rng = np.random.default_rng(seed)
@@ -266,6 +294,7 @@ SCENES |= {
     "chain_free": functools.partial(chain, 3, "free"),
     "every_d6": every_d6,
     "fork": fork,
+    "dancer": dancer,
     "forest": forest,
     "star": functools.partial(star, 6),
     "plain": plain,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from .arrays import Call
-from .kernels import declare, tiles
+from .kernels import tiles
 from .kernels.straight import TILE
 from .levels import Recursions
 from .programs import Program, Programs
@@ -144,7 +144,6 @@ class Derivatives:
         arrays = {name: array for name, array in given.items() if array is not None}
         shapes = {name: array.shape for name, array in arrays.items()}
         program: Program = self.programs.find(operation, shapes, (self.worlds, *shape))
-        declare(tiles, self.dtype)
         count = -(-self.worlds // TILE)
         found = self.recursions.array(("tiles", operation, *shapes), count, max(program.slots, 1), TILE)
         self.programs.launch(program, arrays, found)

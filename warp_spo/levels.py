@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .kernels import articulated, composite, declare, kinematics, newton_euler, parameters, rigid_blocks
+from .kernels import articulated, composite, declare, kinematics, newton_euler, parameters, rigid_blocks, tiles
 from .kernels.spatial import ARTICULATED, MOTION, POSE, RIGID
 from .kernels.topology import Topology
 from .parameters import Parameters
@@ -31,7 +31,7 @@ class Recursions:
 
     def __init__(self, scene: Scene, plan: Plan, device: wp.Device, dtype: type, variable: tuple[str, ...]):
         self.scene, self.plan, self.device, self.dtype = scene, plan, device, dtype
-        for file in (parameters, kinematics, newton_euler, articulated, composite, rigid_blocks):
+        for file in (parameters, kinematics, newton_euler, articulated, composite, rigid_blocks, tiles):
             declare(file, dtype)
         self.worlds = plan.worlds
         self.topology = _topology(scene, device)

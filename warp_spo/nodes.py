@@ -27,10 +27,10 @@ def forward_dynamics(
 
 
 def inverse_dynamics(
-    run: Recursions, out: wp.array, q: Any, qd: Any = None, qdd: Any = None, body_f: Any = None
+    run: Recursions, out: wp.array, q: Any, qd: Any = None, qdd: Any = None, body_f: Any = None, gravity: bool = True
 ) -> None:
     run.hinges(q, qd)
-    force = run.body_forces(*run.accelerations(qdd, qd is not None, gravity=True), body_f)
+    force = run.body_forces(*run.accelerations(qdd, qd is not None, gravity), body_f)
     run.hinge_forces(qdd, force, out)
 
 

@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
 import warp as wp
 
 from .kernels import parameters as kernels
@@ -70,11 +69,14 @@ class Parameters:
         self._hinge_of: Any = wp.array(scene.hinge_of, dtype=int, device=device)
         self._derived: dict[str, Derived] = {}
         self._captured = False
+        self._sharers: list[Parameters] = []
         self._values: dict[str, wp.array] = {}
         for name, value in scene.values.items():
+            own: Any = wp.array(value, dtype=wp.float64, device=device)
             if name in variable:
-                value = np.broadcast_to(value, (worlds, *value.shape[1:]))
-            self._values[name] = wp.array(np.ascontiguousarray(value), dtype=wp.float64, device=device)
+                shared, own = own, wp.empty((worlds, *value.shape[1:]), dtype=wp.float64, device=device)
+                wp.copy(own, spread(shared, 0, worlds))
+            self._values[name] = own
 
     def derived(self, key: str, build: Callable[[], Derived]) -> list[wp.array]:
         """The arrays of that name; ``build()`` allocates them at the first request."""
@@ -173,8 +175,16 @@ class Parameters:
             wp.copy(self._values[name], other._values[name])
         self.refresh(self.variable)
 
+    def share(self, other: Parameters) -> None:
+        """Have the values of ``other``, from here on the same memory, and follow its :meth:`refresh`."""
+        self._values = other._values
+        self._derived.clear()
+        other._sharers.append(self)
+
     def refresh(self, names: Iterable[str]) -> None:
         """Derive anew what depends on the named values."""
+        for sharer in self._sharers:
+            sharer.refresh(names)
         self._captured |= self.device.is_capturing
         for found in self._derived.values():
             if any(name in found.of for name in names):

@@ -16,14 +16,14 @@ COLUMN_BYTES = 1 << 28  # workspace of a solve with many right-hand sides; more 
 FEW_WORLDS = 32768  # so many leave a GPU waiting: a warp for each limb, and rows read where they are
 MOST_DOFS = 128  # straight-line code of more takes too long to compile
 SPILLS = {"float32": 32, "float64": 15}  # dofs at which one thread no longer holds a whole tree in registers
-HELD = 24  # dofs whose variable values have room in shared memory until a thread needs them
+HELD = 16  # dofs of which a thread holds the variable values, too
 SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as through shared memory,
 LONG_ROWS = 24  # in segments; longer rows come in together already at fewer worlds
 MOST_WARPS = 16
 SHORT = ("inverse_dynamics", "bias_force", "gravity_force")  # little code: a thread for the whole tree does not spill
-LONG_RESULTS = ("mass_matrix",)  # writing them is most of the work, and goes faster by many warps
+LONG_RESULTS = ("mass_matrix", "mass_matrix_inverse")  # writing them is most of the work, and goes faster by many warps
 
-SEGMENTED = ("forward_dynamics", "solve_mass_matrix", "mass_matrix", *SHORT)
+SEGMENTED = ("forward_dynamics", "solve_mass_matrix", *LONG_RESULTS, *SHORT)
 """Operations that a warp a limb can share; the others run with a thread a world where the plan says segment."""
 TREE_ONLY = (
     "hybrid_dynamics",

@@ -13,28 +13,27 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from . import link_values
-from .kernels import straight
-from .kernels.straight import COLUMNS, DIRECT, IN_PLACE, MAPPED, STAGED, TILE, TILED, WARP, Frame, Result, Row
+from .kernels import straight, tiles
+from .kernels.straight import DIRECT, IN_PLACE, MAPPED, STAGED, TILE, TILED, WARP, Frame, Result, Row
 from .levels import Recursions
 from .parts import DOF_VALUES
 from .plan import MOST_WARPS, TREE_ONLY, Plan
+from .recursions import messages
 from .recursions.adjoints import Adjoints
 from .recursions.links import TABLES, Links
+from .recursions.messages import INWARD, OUTWARD, SENDS
 from .recursions.operators import meet, written
 from .recursions.pieces import Pieces
 from .recursions.step import LOOPED
-from .recursions.traced import INWARD, OUTWARD, SENT, Trace
-from .teams import Team
+from .recursions.traced import Trace
+from .teams import Team, Work
 from .trace.emit import Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
 FIELDS = (*TABLES, *DOF_VALUES, "joint_rest_q")
 """Values of the scene as kernels read them, [entry, world]: what links are made of, and Newton's own."""
-SENDS = {"forward_dynamics": "Pza", "solve_mass_matrix": "Pza", "inverse_dynamics": "z", "mass_matrix": "R"}
-"""What the pieces of a robot send each other, by operation."""
 TRACED = (
     *SENDS,
-    "mass_matrix_inverse",
     "log_det_mass_matrix",
     "body_poses",
     "body_velocities",
@@ -46,9 +45,8 @@ TRACED = (
 TILES = ("inverse_dynamics_derivatives", "mass_matrix_derivative")
 """Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
-COLUMN_SLOTS = 256  # values of a result that shared memory has no good place for; they go through memory,
-COLUMN_WORLDS = 1 << 16  # of so many worlds at a time
-NEVER = 1 << 30
+TILED_SLOTS = 256  # different values of a result from which they go through memory, not through shared memory,
+TILED_WORLDS = 1 << 20  # of so many worlds at a time
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
@@ -61,9 +59,9 @@ class Program(NamedTuple):
         rows: names of the callers' arrays, and then numbers, that it reads. fields: of FIELDS.
         tables: arrays of its own.
         operations: floating-point operations of one world.
-        spread: a second kernel that brings the values of the first, [slot, world], to their ``places``; or None.
         slots: values of one world in the tiles that it writes; entry: where each entry of the result is among them, -1
-            being zero. Programs whose results are tiles for other kernels, see :mod:`.kernels.tiles`.
+            being zero. See :mod:`.kernels.tiles`.
+        tiles: those of some worlds at a time, if they are to be spread at once.
     """
 
     kernel: wp.Kernel
@@ -73,18 +71,9 @@ class Program(NamedTuple):
     warps: int
     block: int
     operations: int
-    spread: Spread | None = None
     slots: int = 0
     entry: Any = None
-
-
-class Spread(NamedTuple):
-    """The second half of a program with a long result: ``columns`` [slot, world] of some worlds at a time."""
-
-    kernel: wp.Kernel
-    columns: wp.array
-    places: wp.array
-    tile: int
+    tiles: Any = None
 
 
 class Programs:
@@ -97,13 +86,13 @@ class Programs:
         registers: a cap on the registers of a thread.
 
     Attributes:
-        column_slots: values of a result from which they go through memory, [slot, world]. column_worlds: at a time.
+        tiled: a result that is too long for shared memory goes through memory. tiled_worlds: of so many at a time,
+            a multiple of 8.
     """
 
     def __init__(self, run: Recursions, plan: Plan, block: int = WARP, registers: int | None = None):
         self.run, self.plan, self.block, self.registers = run, plan, block, registers
-        self.column_slots = COLUMN_SLOTS if run.device.is_cuda else NEVER
-        self.column_worlds = COLUMN_WORLDS
+        self.tiled, self.tiled_worlds = run.device.is_cuda, TILED_WORLDS
         self._programs: dict[Any, Program | None] = {}
         self._links: Links | None = None
 
@@ -143,16 +132,18 @@ class Programs:
     def launch(self, program: Program, arrays: dict[str, Any], out: wp.array, *more: wp.array) -> None:
         rows = [arrays[name] for name in program.rows]
         fields = [self.field(name) for name in program.fields]
-        if program.spread is None:
+        if program.tiles is None:
             self._launch(program, self.run.worlds, [*rows, *fields], [out, *more])
             return
-        some = program.spread.columns.shape[1]
+        some, size = program.tiles.shape[0] * TILE, out.size // self.run.worlds
         for first in range(0, self.run.worlds, some):
             part = slice(first, min(first + some, self.run.worlds))
             inputs = [row[part] if isinstance(row, wp.array) else row for row in rows]
             inputs += [field[:, part] for field in fields]
-            self._launch(program, part.stop - first, inputs, [program.spread.columns, *(array[part] for array in more)])
-            self._spread(program.spread, part.stop - first, out[part])
+            worlds = part.stop - first
+            self._launch(program, worlds, inputs, [program.tiles, *(array[part] for array in more)])
+            dim, result = (-(-worlds // TILE), size), out[part].reshape((worlds, size))
+            self.run.launch(tiles.spread, dim, [program.tiles, program.entry, 0], [result])
 
     def _launch(self, program: Program, worlds: int, inputs: list, outputs: list) -> None:
         device, block = self.run.device, program.block
@@ -160,12 +151,6 @@ class Programs:
         threads = -(-worlds // of_block) * block if device.is_cuda else worlds
         inputs = [worlds, *inputs, *program.tables]
         wp.launch(program.kernel, threads, inputs, outputs, device=device, block_dim=block)
-
-    def _spread(self, spread: Spread, worlds: int, out: wp.array) -> None:
-        device, block = self.run.device, straight.SPREAD_BLOCK
-        threads = -(-worlds // spread.tile) * block if device.is_cuda else worlds
-        inputs = [worlds, spread.columns, spread.places]
-        wp.launch(spread.kernel, threads, inputs, [out], device=device, block_dim=block)
 
     def field(self, name: str) -> wp.array:
         """One of FIELDS."""
@@ -208,7 +193,8 @@ class Programs:
         shapes = {**shapes, "out": out_shape}
         if self.plan.of(operation) == "segment":
             pieces = Pieces(links)
-            program = self._segment_program(operation, shapes, pieces) if 1 < pieces.warps <= MOST_WARPS else None
+            several = 1 < pieces.warps <= MOST_WARPS
+            program = self._segment_program(operation, shapes, pieces, options) if several else None
             if program is not None:
                 return program
         return self._tree_program(operation, links, {**shapes, **more}, tuple(more), options)
@@ -220,8 +206,7 @@ class Programs:
         frame = self._frame([item for item in stores if item.array == "out"], shapes, 0, 1, self.block, stores)
         alone = not any(item.array in LOOPED for item in stores)
         if operation in TILES:
-            slots = len({_name(item.value) for item in stores if not _is_zero(item.value)})
-            result = Result(TILED, Row("out", 3, frame.result.array.entries), slots=slots)
+            result = Result(TILED, frame.result.array, slots=_solid(stores))
             frame = frame._replace(staged=self.plan.staged, result=result)
         frame = frame._replace(again=alone and not frame.staged and frame.result.way in (DIRECT, TILED))
         frame = frame._replace(more=tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more))
@@ -237,36 +222,43 @@ class Programs:
             body = straight.looped(a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
             operations += emitter.operations
         frame = frame._replace(again=frame.again and "farthest" in listing.text)
-        place: Any = None if table is None else wp.array(table, dtype=int, device=self.run.device)
-        tables = {} if place is None or frame.result.way == TILED else {"place": place}
-        program = self._finished(operation, frame, body, body, tables, operations)
-        return program._replace(slots=frame.result.slots, entry=place) if frame.result.way == TILED else program
+        tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
+        return self._finished(operation, frame, body, body, tables, operations)
 
-    def _segment_program(self, operation: str, shapes: dict, pieces: Pieces) -> Program | None:
-        dtype, slots = self.run.dtype.__name__, _slots(pieces, SENDS[operation])
+    def _segment_program(self, operation: str, shapes: dict, pieces: Pieces, options: dict) -> Program | None:
+        dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(operation, pieces)
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
-        sent = sum(SENT[letter] for letter, _ in slots)
         everything: list[Store] = []
         traced: list[list[Store]] = []
+        apart: list[tuple[list[Store], dict[int, list[Store]]]] = []
         for index in range(len(pieces.pieces)):
             links = self.links.opened()  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
-            traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)()])
-            everything += traced[-1]
+            traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)(**options)])
+            flat = {at: [self._flattened(item, shapes) for item in items] for at, items in trace.across.items()}
+            apart.append((trace.news, flat))
+            everything += traced[-1] + trace.news + [item for items in flat.values() for item in items]
         frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
                             WARP * pieces.warps, everything)
         if frame.result.way == DIRECT and frame.result.array.entries > LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
+        if not frame.fits(self.run.dtype):
+            return None  # nor for what limbs tell each other
         team = Team(pieces, dtype)
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
-        everything, table = _placed([item for items in outs for item in items], frame.result)
-        outs[0] += everything[sum(map(len, outs)) :] if table is None else []  # zeros
-        for piece, stores, items in zip(pieces.pieces, traced, outs, strict=True):
+        whole = [item for item in everything if item.array == "out"]
+        placed, table = _placed(whole, frame.result)
+        outs[0] += placed[len(whole) :] if table is None else []  # zeros
+        for piece, stores, items, (news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
             emitter = self._emitter(shapes, frame)
             inward = [item for item in stores if item.array == INWARD]
             outward = [item for item in stores if item.array == OUTWARD]
-            (outward if "a" in SENDS[operation] else inward).extend(items if table is None else _by_slot(items, table))
-            team.add(piece, emitter, emitter.region(inward), emitter.region(outward))
+            last = outward if set(SENDS[operation]) & set(messages.OUTWARD_LETTERS) else inward
+            last += items if table is None else _by_slot(items, table)
+            meetings = {at: found if table is None else _by_slot(found, table) for at, found in others.items()}
+            regions = emitter.region(inward), emitter.region(outward)
+            branches = emitter.branch(news), {at: emitter.branch(found) for at, found in meetings.items()}
+            team.add(Work(piece, *regions, *branches), emitter.operations)
         cuda = team.cuda()  # fills the tables
         lists = ("place", table, int), ("table", team.table, self.run.dtype), ("shifts", team.shifts, int)
         tables: dict[str, Any] = {
@@ -285,22 +277,22 @@ class Programs:
         rows, fields = (*(row.name for row in frame.rows), *frame.numbers), tuple(frame.fields)
         arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 0) for name in frame.numbers]
         arrays += [(name, 2) for name in fields]
-        result, spread = frame.result, None
-        if result.way == COLUMNS:
-            some = min(self.run.worlds, self.column_worlds)
-            columns = wp.empty((result.slots, some), dtype=self.run.dtype, device=self.run.device)
-            tile = straight.tile(result, self.run.dtype)
-            spread = Spread(straight.spread(result, self.run.dtype), columns, tables.pop("place"), tile)
-        arrays += [(name, 1) for name in tables] + [("out", 2 if spread else result.array.ndim)]
+        result, entry, tiles = frame.result, None, None
+        if result.way == TILED:
+            entry = tables.pop("place")
+            if operation not in TILES:
+                shape = -(-min(self.run.worlds, self.tiled_worlds) // TILE), max(result.slots, 1), TILE
+                tiles = wp.empty(shape, dtype=self.run.dtype, device=self.run.device)
+        arrays += [(name, 1) for name in tables] + [("out", result.array.ndim if entry is None else 3)]
         arrays += [(row.name, row.ndim) for row in frame.more]
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers)
-        return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations, spread)
+        return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations, result.slots,
+                       entry, tiles)
 
     def _emitter(self, shapes: dict, frame: Frame) -> Emitter:
         result = frame.result
         angles = Angles.IN_PLACE if frame.staged else Angles.AGAIN if frame.again else Angles.FIRST
-        tile = f" * {TILE}" if result.way == TILED else ""
-        guard = "if (mine) " if result.way in (DIRECT, TILED) else ""
+        guard = "if (mine) " if result.way == DIRECT else ""
 
         def load(array: str, entry: str) -> str:
             if array in (INWARD, OUTWARD):
@@ -312,10 +304,10 @@ class Programs:
         def store(array: str, entry: str, value: str) -> str:
             if array in (INWARD, OUTWARD):
                 return f"SENT({entry}) = {value};"
-            if array == "out" and result.way == COLUMNS:
-                return f"if (mine) RESULT({entry}) = {value};"
+            if array == "out" and result.way == TILED:
+                return f"if (mine) result_row[({entry}) * {TILE}] = {value};"
             if array == "out":
-                return f"{guard}result_row[{entry}{tile}] = {value};"
+                return f"{guard}result_row[{entry}] = {value};"
             return f"if (mine) {array}_row[{entry}] = {value};"
 
         def flat(array: str, index: tuple) -> int:
@@ -343,9 +335,10 @@ class Programs:
         if dense and staged:
             ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), *ways]
         if out.entries > LONG_ROW and not (dense and staged and over == ["x"]):
-            ways = [(staged, Result(MAPPED, out, slots=slots)), (False, Result(MAPPED, out, slots=slots)), *ways]
-        if slots >= self.column_slots and straight.tile(Result(COLUMNS, out, slots=slots), self.run.dtype):
-            ways = [(False, Result(COLUMNS, out, slots=slots))]
+            mapped = Result(MAPPED, out, slots=slots)
+            ways = [(staged, mapped), (False, mapped), *ways]
+            if self.tiled:
+                ways.insert(0 if slots >= TILED_SLOTS else -1, (False, Result(TILED, out, slots=_solid(stores))))
         frames = [
             Frame(rows, staged, list(fields), result, sent, warps, block, held=entries, numbers=numbers)
             for staged, result in ways
@@ -372,21 +365,10 @@ def _called(key: tuple) -> str:
     return without_qdd.get(key[1], key[0]) if key[0] == "inverse_dynamics" else key[0]
 
 
-def _slots(pieces: Pieces, letters: str) -> dict[tuple[str, int], int]:
-    """Where what each piece sends begins."""
-    slots, at = {}, 0
-    for piece in pieces.pieces:
-        for letter in letters:
-            if piece.children if letter == "a" else piece.parent is not None:
-                slots[letter, piece.index] = at
-                at += SENT[letter]
-    return slots
-
-
 def _placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int] | None]:
-    """Flat stores as the result wants them, and the table of a MAPPED one or of COLUMNS."""
+    """Flat stores as the result wants them, and the table of a MAPPED or TILED one."""
     out = result.array
-    if result.way in (MAPPED, COLUMNS, TILED):
+    if result.way in (MAPPED, TILED):
         slots: dict[Any, int] = {}
         table = [-1] * out.entries
         for item in stores:
@@ -400,6 +382,11 @@ def _placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int]
 def _by_slot(stores: list[Store], table: list[int]) -> list[Store]:
     values = {table[item.index[0]]: item.value for item in stores if table[item.index[0]] >= 0}
     return [Store("out", (slot,), value) for slot, value in sorted(values.items())]
+
+
+def _solid(stores: list[Store]) -> int:
+    """Different values that are not the constant zero."""
+    return len({_name(item.value) for item in stores if not _is_zero(item.value)})
 
 
 def _is_zero(value: Value) -> bool:

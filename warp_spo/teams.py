@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from .recursions.pieces import Piece, Pieces
-from .trace.emit import Emitter, Listing, filled, literal, literals
+from .trace.emit import Listing, filled, literal, literals
 
 BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
 
 
 class Work(NamedTuple):
-    """What one piece has to do: going in, and coming out."""
+    """What one piece has to do: going in, coming out, telling the others, and with each of those that it meets."""
 
     piece: Piece
     inward: Listing
     outward: Listing
+    news: Listing
+    across: dict[int, Listing]
 
     @property
     def text(self) -> tuple[str, str]:
@@ -41,17 +44,19 @@ class Team:
         self.operations = 0
         self._work: dict[int, Work] = {}
 
-    def add(self, piece: Piece, emitter: Emitter, inward: Listing, outward: Listing) -> None:
-        self._work[piece.index] = Work(piece, inward, outward)
-        self.operations += emitter.operations
+    def add(self, work: Work, operations: int) -> None:
+        """Take on the work of a piece; what is ``across``, by the other piece's index, may use all that others sent."""
+        self._work[work.piece.index] = work
+        self.operations += operations
 
     @property
     def _last(self) -> int:
         """The last stage in which there is something to do."""
         stages = [0]
-        for piece, inward, outward in self._work.values():
+        for piece, inward, outward, _, across in self._work.values():
             stages += [piece.inward] if inward.text else []
             stages += [piece.outward] if outward.text else []
+            stages += [self.pieces.stages - 1] if across else []  # pieces further in meet in the last one
         return max(stages)
 
     def cpu(self) -> str:
@@ -64,6 +69,9 @@ class Team:
             for piece in self.pieces.pieces:
                 if piece.outward == stage:
                     text.append(literals(self._work[piece.index].outward, self.dtype, f"p{piece.index}_"))
+                    text.append(literals(self._work[piece.index].news, self.dtype, f"p{piece.index}_"))
+        for work in self._work.values():
+            text += [literals(listing, self.dtype, f"p{work.piece.index}_") for listing in work.across.values()]
         return "\n".join(text)
 
     def cuda(self) -> str:
@@ -76,7 +84,10 @@ class Team:
         for alike in kinds.values():
             text.append(f"{'else ' if text else ''}if ({_any_of([work.piece.warp for work in alike])}) {{")
             inward, outward = self._shared(alike)
-            text += [inward, self._inner([work.piece.warp for work in alike]), outward, "}"]
+            text += [inward, self._inner([work.piece.warp for work in alike]), outward]
+            if any(work.across for works in kinds.values() for work in works):
+                text += [self._apart(alike, [work.news for work in alike], "n_"), BARRIER, self._across(alike)]
+            text.append("}")
         return "\n".join(text)
 
     def _inner(self, warps: list[int]) -> str:
@@ -94,52 +105,86 @@ class Team:
                 text.append(BARRIER)
                 order = list(zip(chains[0], shared, strict=True))
                 text += [inward for work, (inward, _) in reversed(order) if work.piece.inward == stage]
-                text += [outward for work, (_, outward) in order if work.piece.outward == stage]
+                for at, (alike, (_, outward)) in enumerate(zip(zip(*chains, strict=True), shared, strict=True)):
+                    if alike[0].piece.outward == stage:
+                        text += [outward, self._apart(alike, [work.news for work in alike], f"i{at}_n_", f"i{at}_")]
+            text += [self._across(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
             text.append("}")
         idle = [BARRIER] * self._last
         if text and len(warps) > sum(map(len, owners.values())):
             text += ["else {", *idle, "}"]
         return "\n".join(text or idle)
 
-    def _shared(self, alike: list[Work] | tuple[Work, ...], prefix: str = "") -> tuple[str, str]:
-        """One text, in and out, for pieces of equal structure; what differs comes from the tables."""
-        names = [", ".join(dict.fromkeys(label)) for label in zip(*(w.inward.labels for w in alike), strict=True)]
-        out_names = [", ".join(dict.fromkeys(label)) for label in zip(*(w.outward.labels for w in alike), strict=True)]
+    def _across(self, alike: Sequence[Work], prefix: str = "") -> str:
+        """What pieces of equal structure have to do with each other piece."""
+        others = sorted({index for work in alike for index in work.across})
+        met = [(other, [work.across.get(other) for work in alike]) for other in others]
+        return "\n".join(self._apart(alike, listings, f"{prefix}x{other}_", prefix) for other, listings in met)
+
+    def _apart(self, alike: Sequence[Work], listings: list[Listing | None], tables: str, prefix: str = "") -> str:
+        """What some pieces of equal structure do, a branch for those that do the same."""
+        kinds: dict[str, list[tuple[Work, Listing]]] = {}
+        for work, listing in zip(alike, listings, strict=True):
+            if listing is not None and listing.text:
+                kinds.setdefault(listing.text, []).append((work, listing))
+        text: list[str] = []
+        for some in kinds.values():
+            head, (body,) = self._filled([work for work, _ in some], [[listing for _, listing in some]], prefix, tables)
+            condition = "" if len(some) == len(alike) else f"if ({_any_of([work.piece.warp for work, _ in some])}) "
+            text.append("\n".join([f"{condition}{{", head, body, "}"]))
+        return "\n".join(text)
+
+    def _shared(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str]:
+        """One text, in and out, for pieces of equal structure."""
+        both = [[work.inward for work in alike], [work.outward for work in alike]]
+        head, (inward, outward) = self._filled(alike, both, prefix, prefix)
+        return f"{head}\n{inward}" if head else inward, outward
+
+    def _filled(
+        self, alike: Sequence[Work], regions: list[list[Listing]], prefix: str, tables: str
+    ) -> tuple[str, list[str]]:
+        """The text of each region, one listing for each of ``alike``; what differs comes from the tables.
+
+        Args:
+            prefix: of the names of values. tables: of the names of what is read from the tables.
+
+        Returns:
+            What comes first, and the regions.
+        """
         constants, shifts = _Columns(), _Columns()
 
         def constant(values: tuple[float, ...]) -> str:
             texts = {literal(value, self.dtype) for value in values}
-            return texts.pop() if len(texts) == 1 else f"__ldg({prefix}numbers + {constants.of(values)})"
+            return texts.pop() if len(texts) == 1 else f"__ldg({tables}numbers + {constants.of(values)})"
 
         def entry(found: tuple[tuple[str, int], ...]) -> str:
             first = found[0][1]
             distances = tuple(at - first for _, at in found)
-            return f"{first} + {prefix}shift[{shifts.of(distances)}]" if any(distances) else str(first)
+            return f"{first} + {tables}shift[{shifts.of(distances)}]" if any(distances) else str(first)
 
         texts = []
-        for which, labels in (("inward", names), ("outward", out_names)):
-            listings = [getattr(work, which) for work in alike]
+        for listings in regions:
+            names = [", ".join(dict.fromkeys(label)) for label in zip(*(x.labels for x in listings), strict=True)]
             numbers = [constant(values) for values in zip(*(x.constants for x in listings), strict=True)]
             entries = [entry(found) for found in zip(*(x.indices for x in listings), strict=True)]
-            texts.append(filled(listings[0], numbers, entries, labels, prefix))
+            texts.append(filled(listings[0], numbers, entries, names, prefix))
         head = []
         if constants.columns or shifts.columns:
             warps = [work.piece.warp for work in alike]
             member = " : ".join(f"warp == {warp} ? {at}" for at, warp in enumerate(warps[:-1])) + f" : {len(warps) - 1}"
-            head.append(f"const int {prefix}who = {member};")
+            head.append(f"const int {tables}who = {member};")
         if constants.columns:
             c = {"float32": "float", "float64": "double"}[self.dtype]
             first, count = len(self.table), len(constants.columns)
-            head.append(f"const {c}* {prefix}numbers = table.data + {first} + {prefix}who * {count};")
+            head.append(f"const {c}* {tables}numbers = table.data + {first} + {tables}who * {count};")
             self.table += [value for row in zip(*constants.columns, strict=True) for value in row]
         if shifts.columns:
             first, count = len(self.shifts), len(shifts.columns)
-            head.append(f"int {prefix}shift[{count}];")
+            head.append(f"int {tables}shift[{count}];")
             read = "__ldg(shifts.data + {} + {}who * {})"
-            head += [f"{prefix}shift[{k}] = {read.format(first + k, prefix, count)};" for k in range(count)]
+            head += [f"{tables}shift[{k}] = {read.format(first + k, tables, count)};" for k in range(count)]
             self.shifts += [value for row in zip(*shifts.columns, strict=True) for value in row]
-        return "\n".join([*head, texts[0]]), texts[1]
-
+        return "\n".join(head), texts
 
 class _Columns:
     """Distinct tuples, one value for each member, in the order in which they were met."""

@@ -9,6 +9,7 @@ PEERS = {
     "grid": "grid",
     "frax": "frax_jax",
     "torch": "torch_dense",
+    "resolvent": "torch_resolvent",
     "pinocchio": "pinocchio_cpu",
     "mujoco": "mujoco_c",
 }

@@ -32,6 +32,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--worlds", type=int, nargs="+", default=WORLDS, metavar="N", help="world counts")
     p.add_argument("--scenes", nargs="+", default=ROBOTS, choices=SCENES, metavar="NAME", help="robots; armature-free")
     p.add_argument("--peers", nargs="+", default=list(PEERS), choices=PEERS, metavar="PEER", help=", ".join(PEERS))
+    p.add_argument("--compile", action="store_true", help="evaluate once, time nothing: kernels come into the caches")
     p.add_argument("--json", type=Path, metavar="OUT", help="write the run to this file, or by date into this folder")
     return p
 
@@ -69,7 +70,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict]:
                     continue
                 try:
                     peer = kind(robot, options.device, dtype)
-                    peer.scene = scene
+                    peer.scene, peer.timed = scene, not options.compile
                     for row in peer.rows(inputs, worlds, wanted):
                         yield finished(row, scene, robot, f"{kind.name} {version}", kind, dtype)
                 except (Absent, Unsupported) as reason:
@@ -107,17 +108,18 @@ def main(argv: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     options.device = str(wp.get_device(options.device))
-    found = []
-    try:
-        for row in rows(options):
-            found.append(row)
-            if "skipped" in row:
-                skip(case_name(row), row["skipped"])
-            else:
-                print("\n".join(f"{case_name(row)}.{m} {row[m]:.4g}" for m in METRICS if m in row), flush=True)
-    finally:  # what was measured before an interrupt or an error is kept
-        if options.json and found:
-            print(f"wrote {runner.save(runner.record(found, options.device), options.json)}", file=sys.stderr)
+    found: list[dict] = []
+    run, file = runner.record(found, options.device), None
+    for row in rows(options):
+        found.append(row)
+        if "skipped" in row:
+            skip(case_name(row), row["skipped"])
+        else:
+            print("\n".join(f"{case_name(row)}.{m} {row[m]:.4g}" for m in METRICS if m in row), flush=True)
+        if options.json:  # after each row: a peer may end the process, and one that compiles listens to no interrupt
+            file = runner.save(run, options.json)
+    if file:
+        print(f"wrote {file}", file=sys.stderr)
     return 0
 
 

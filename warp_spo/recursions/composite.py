@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from ..trace.graph import Value
-from ..trace.spatial import ZERO, Rigid, Vector
+from ..trace.spatial import Rigid, Vector
 from .articulated import columns
+from .links import NOTHING as NOTHING
 from .links import Link, Placed
-from .motion import NONE, in_hinge
-
-NOTHING = Rigid(0.0, ZERO, NONE)
+from .motion import in_hinge
 
 
 def entries(link: Link, places: dict[int, Placed], body: Rigid) -> dict[tuple[int, int], Value]:

@@ -28,6 +28,8 @@ TURN, SLIDE, HELIX = "turn", "slide", "helix"
 SCREW_MOTIONS = (TURN, SLIDE, HELIX)
 LINK_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c", "joint_armature", "gravity")
 TABLES = ("value", "node_value")  # what links are made of; what bodies by themselves are, for the operators
+NOTHING = Rigid(0.0, ZERO, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+PRICES = (6, 10, 10, 10, 4, 4, 4, 8, 8, 8)  # of mass, first moment, moments and products of inertia
 ROUNDING = 1e-14  # a rotation's entry that is this close to 0 or 1 is meant to be
 
 
@@ -44,6 +46,8 @@ class Link:
         coordinate: its first entry of q.
         armature: of each dof.
         inertia: of the bodies it carries, in its frame; None where it carries none.
+        grouped: the same for sums of forces and composite inertias, where it may be counted elsewhere: what turns about
+            its own axis, or does not turn, belongs to the parent as well as to the link. It need not be positive.
         node: the body whose hinge it belongs to; label: its name.
         com: of a FREE hinge's body, from the anchor, in the link's axes.
         children: the links that move on it.
@@ -61,6 +65,7 @@ class Link:
     label: str
     com: Vector = ZERO
     inertia: Rigid | None = None
+    grouped: Rigid | None = None
     children: list = dataclasses.field(default_factory=list)
 
     def add(self, inertia: Rigid) -> None:
@@ -122,6 +127,7 @@ class Links:
         self.turns_vary = any(R.dtype == object for poses in self._poses.values() for R, _ in poses)
         for root in scene.tree.roots:
             self._visit(root)
+        self._group()
 
     def opened(self) -> Links:
         """A copy with a graph of its own; what is no constant is an entry of a table: its key there says which."""
@@ -142,6 +148,7 @@ class Links:
                 link,
                 parent=twin[link.parent],
                 inertia=value(link.inertia),
+                grouped=value(link.grouped),
                 matrix=value(link.matrix),
                 offset=value(link.offset),
                 com=value(link.com),
@@ -248,6 +255,37 @@ class Links:
         if rest.link is not None:
             rest.link.add(Pose(None, rest.matrix, rest.offset).rigid_to_parent(own.rigid))
 
+    def _group(self) -> None:
+        """Hand inward what a hinge does not move: a rod on the axis of a turn, the moments of inertia of a slide.
+
+        Khalil, Kleinfinger 1987: the base parameters of an arm; mass, first moment along the axis and one moment of
+        inertia of every turning link become zero. Only constants, which fold.
+        """
+        for link in self.links:
+            link.grouped = link.inertia
+        for link in reversed(self.links):
+            own = link.grouped
+            if own is None or link.motion not in (TURN, SLIDE):
+                continue
+            if not all(map(is_constant, (*own.packed, *link.offset, *(x for row in link.matrix or () for x in row)))):
+                continue
+            (xx, xy, xz), (_, yy, yz), (_, _, zz) = own.inertia
+            if link.motion == TURN:
+                handed = Rigid(own.mass, Vector((0.0, 0.0, own.moment[2])), symmetric(yy, yy, 0.0, 0.0, 0.0, 0.0))
+                xx = 0.0 if abs(xx - yy) <= ROUNDING * abs(yy) else xx - yy
+                kept = Rigid(0.0, Vector((*own.moment[:2], 0.0)), symmetric(xx, 0.0, zz, xy, xz, yz))
+            else:
+                handed = Rigid(0.0, ZERO, own.inertia)
+                kept = Rigid(own.mass, own.moment, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+            parent = link.parent
+            if parent is None:
+                link.grouped = kept
+                continue
+            before = NOTHING if parent.grouped is None else parent.grouped
+            after = before + Pose(None, link.matrix, link.offset).rigid_to_parent(handed)
+            if _price(kept) + _price(after) < _price(own) + _price(before):
+                link.grouped, parent.grouped = kept, after
+
     def _append(self, parent: Link | None, motion: Any, matrix: Matrix, offset: Vector, pitch: float,
                 dofs: tuple, coordinate: int, armature: tuple, node: int, label: str) -> Link:
         link = Link(parent, motion, _still(matrix), offset, pitch, dofs, coordinate, armature, node, label)
@@ -304,6 +342,11 @@ def quaternion_rotation(x: Value, y: Value, z: Value, w: Value) -> Matrix:
 def _numbers(array: np.ndarray) -> np.ndarray:
     """``array`` in float64, if no entry is a symbol."""
     return array.astype(float) if all(map(is_constant, array.flat)) else array
+
+
+def _price(inertia: Rigid) -> int:
+    """Operations, roughly, in which the numbers of an inertia that are not zero take part."""
+    return sum(price for x, price in zip(inertia.packed, PRICES, strict=True) if not is_constant(x) or x != 0.0)
 
 
 def _pose(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

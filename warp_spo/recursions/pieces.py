@@ -12,7 +12,7 @@ import dataclasses
 from .links import Link, Links
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(eq=False)
 class Piece:
     """A chain of links.
 
@@ -32,8 +32,48 @@ class Piece:
     outward: int = 0
 
     @property
+    def dofs(self) -> list[int]:
+        """Its dofs, from the innermost out."""
+        return [dof for link in self.links for dof in link.dofs]
+
+    @property
     def weight(self) -> int:
-        return sum(len(link.dofs) for link in self.links)
+        return len(self.dofs)
+
+    @property
+    def ancestors(self) -> list[Piece]:
+        """The pieces that it moves on, its parent first."""
+        return [] if self.parent is None else [self.parent, *self.parent.ancestors]
+
+    @property
+    def depth(self) -> int:
+        return len(self.ancestors)
+
+    @property
+    def all_dofs(self) -> list[int]:
+        """The dofs that move its last link, from the root out."""
+        return [dof for piece in reversed([self, *self.ancestors]) for dof in piece.dofs]
+
+    def reach(self, dof: int) -> int:
+        """How many dofs, from the root out, the link of one of its dofs needs to move."""
+        further = sum(piece.weight for piece in self.ancestors)
+        at = next(at for at, link in enumerate(self.links) if dof in link.dofs)
+        return further + sum(len(link.dofs) for link in self.links[: at + 1])
+
+    def fork(self, other: Piece) -> Piece | None:
+        """The last piece that carries both, or None."""
+        mine = [self, *self.ancestors]
+        return next((piece for piece in (other, *other.ancestors) if piece in mine), None)
+
+    def looks_at(self, other: Piece) -> bool:
+        """Whether this piece, not ``other``, works out what two branches have in common.
+
+        One of the two does: a leaf; then the later one.
+        """
+        fork = self.fork(other)
+        if fork is None or fork in (self, other):
+            return False
+        return (bool(self.children), -self.index) < (bool(other.children), -other.index)
 
 
 class Pieces:

@@ -11,18 +11,14 @@ from typing import Any
 from ..trace.emit import Store
 from ..trace.graph import Value, is_constant, sum_of_logarithms
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Rigid, Vector, cross, total
-from . import articulated, composite, kinematics, motion, newton_euler
+from . import articulated, composite, kinematics, messages, motion, newton_euler
+from .inverse import Inverse
 from .links import Link, Links, Placed, placed
 from .motion import STILL, Motion
 from .pieces import Piece
 
 EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}
 
-
-SENT = {"P": 21, "z": 6, "R": 10, "a": 6}
-"""Values that pieces send each other: inward phi P+ phi*, z or f, the composite inertia; outward alpha."""
-INWARD, OUTWARD = "sent", "returned"
-"""The array that they go through, by either name."""
 
 
 class Trace:
@@ -35,6 +31,10 @@ class Trace:
         piece: trace the work on this piece alone. How its ancestors move is worked out anew; what it takes from other
             pieces and gives to them goes through the array "sent" or "returned", ``slot(letter, piece)`` on.
         slot: see there.
+
+    Attributes:
+        news: what a piece sends to those that meet it, apart: pieces of equal structure do not all send it.
+        across: what a piece has to store after that, by the other piece that it is about.
     """
 
     def __init__(
@@ -47,6 +47,9 @@ class Trace:
     ):
         self.links, self.graph, self.epsilon, self.given = links, links.graph, EPSILON[dtype], given
         self.piece, self.slot = piece, slot
+        self.news: list[Store] = []
+        self.across: dict[int, list[Store]] = {}
+        self._mail: dict[tuple[str, int], list[Value]] = {}  # messages between pieces of this trace
         self.own = set(map(id, links.links if piece is None else piece.links))
         self.active = set(self.own)
         above = None if piece is None else piece.links[0].parent
@@ -109,15 +112,22 @@ class Trace:
         """The links of this piece, parents first."""
         return [link for link in self.links.links if id(link) in self.own]
 
-    def send(self, letter: str, values: Iterable[Value]) -> list[Store]:
-        assert self.piece is not None and self.slot is not None
-        first = self.slot(letter, self.piece)
-        return [Store(_way(letter), (first + i,), value) for i, value in enumerate(values)]
-
-    def receive(self, letter: str, piece: Piece) -> list[Value]:
+    def post(self, letter: str, piece: Piece, values: Iterable[Value]) -> list[Store]:
+        """Send a message of ``piece``; a trace of the whole tree keeps it."""
+        if self.piece is None:
+            self._mail[letter, piece.index] = list(values)
+            return []
         assert self.slot is not None
         first = self.slot(letter, piece)
-        return [self.graph.input(_way(letter), first + i) for i in range(SENT[letter])]
+        return [Store(messages.way(letter), (first + i,), value) for i, value in enumerate(values)]
+
+    def receive(self, letter: str, piece: Piece) -> list[Value]:
+        """The message that ``piece`` sends."""
+        if self.piece is None:
+            return self._mail[letter, piece.index]
+        assert self.slot is not None
+        first = self.slot(letter, piece)
+        return [self.graph.input(messages.way(letter), first + i) for i in range(messages.size(letter, piece))]
 
     def carried_on(self, link: Link, letter: str, found: dict[int, Any], build: Callable[[list], Any]) -> list[Any]:
         """What the children of a link hand to it, of this piece or sent by others."""
@@ -129,7 +139,7 @@ class Trace:
         """Send what a link's parent needs of it, if another piece works on the parent."""
         if self.piece is None or link is not self.piece.links[0] or link.parent is None:
             return []
-        return self.send(letter, values)
+        return self.post(letter, self.piece, values)
 
     @property
     def base(self) -> tuple[Vector, Vector]:
@@ -144,7 +154,29 @@ class Trace:
         return stores + self.expand(done, rates, self.base if bias else (ZERO, ZERO))
 
     def factor(self) -> dict[int, articulated.Factor]:
-        return self.reduce(lambda dof: 0.0, moves=False, loads=False)[0]
+        return self.factors()[0]
+
+    def factors(self) -> tuple[dict[int, articulated.Factor], list[Store]]:
+        """Factors of every link, and what other pieces need of them."""
+        done: dict[int, articulated.Factor] = {}
+        inner: dict[int, Articulated] = {}
+        stores: list[Store] = []
+        for link, outward in self.traversal():
+            if outward:
+                self.place(link)
+                continue
+            self.eliminate(link, done, inner)
+            stores += self.handed_on("P", link, inner[id(link)].packed)
+        return done, stores
+
+    def eliminate(self, link: Link, done: dict[int, articulated.Factor], inner: dict[int, Articulated]) -> None:
+        """Add the factor of a link to ``done``, and P+ in its parent's frame to ``inner``, after its children's."""
+        self.at(link, "P")
+        carried = self.carried_on(link, "P", inner, Articulated.unpacked)
+        through = [(self.places[id(child)].pose, done[id(child)].P) for child in link.children if id(child) in done]
+        place = self.places[id(link)]
+        done[id(link)] = factor = articulated.factor(self.stiffened(link), place, carried, through, self.epsilon)
+        inner[id(link)] = factor.in_parent
 
     def reduce(self, tau: Callable[[int], Value], moves: bool, loads: bool) -> tuple[dict, dict, list[Store]]:
         """Factors of every link, D^-1 [I - H psi K] (tau - ...), and what other pieces need of them."""
@@ -158,12 +190,8 @@ class Trace:
             if outward:
                 self.place(link, moves)
                 continue
-            self.at(link, "P")
-            place, move = self.places[key], self.motions[key]
-            carried = self.carried_on(link, "P", inner, Articulated.unpacked)
-            through = [(self.places[id(child)].pose, done[id(child)].P) for child in link.children if id(child) in done]
-            done[key] = factor = articulated.factor(self.stiffened(link), place, carried, through, self.epsilon)
-            inner[key] = factor.in_parent
+            self.eliminate(link, done, inner)
+            place, move, factor = self.places[key], self.motions[key], done[key]
             self.at(link, "z")
             z = articulated.gyroscopic(link.inertia, move)
             if loads:
@@ -194,11 +222,12 @@ class Trace:
             )
             stores += [Store("out", (dof,), value) for dof, value in zip(link.dofs, qdd, strict=True)]
             if self.piece is not None and self.piece.children and link is self.piece.links[-1]:
-                stores += self.send("a", (*alpha[key][0], *alpha[key][1]))
+                stores += self.post("a", self.piece, (*alpha[key][0], *alpha[key][1]))
         return stores
 
-    def inverse_dynamics(self) -> list[Store]:
+    def inverse_dynamics(self, gravity: bool = True) -> list[Store]:
         """out = Mass qdd + bias_force"""
+        base = self.base if gravity else (ZERO, ZERO)
         qdd, moves = self.vector("qdd"), "qd" in self.given
         alpha: dict[int, tuple[Vector, Vector]] = {}
         forces: dict[int, Vector] = {}
@@ -208,13 +237,13 @@ class Trace:
             if outward:
                 self.place(link, moves)
                 self.at(link, "a")
-                above = self.base if link.parent is None else alpha[id(link.parent)]
+                above = base if link.parent is None else alpha[id(link.parent)]
                 alpha[key] = newton_euler.accelerated(link, self.places[key], self.motions[key], above, qdd)
                 continue
             self.at(link, "f")
             f = -self.external(link)
-            if link.inertia is not None:
-                f = f + newton_euler.body_force(link.inertia, self.motions[key], *alpha[key])
+            if link.grouped is not None:
+                f = f + newton_euler.body_force(link.grouped, self.motions[key], *alpha[key])
             for other in self.carried_on(link, "z", forces, Vector):
                 f = f + other
             n, f = Vector(f[:3]), Vector(f[3:])
@@ -237,7 +266,7 @@ class Trace:
                 continue
             key = id(link)
             self.at(link, "R")
-            body = link.inertia or composite.NOTHING
+            body = link.grouped or composite.NOTHING
             for other in self.carried_on(link, "R", carried, Rigid.unpacked):
                 body = body + other
             if link.parent is not None:
@@ -259,15 +288,12 @@ class Trace:
         return [Store("out", (), sum_of_logarithms(p.D for f in done.values() for p in f.pivots))]
 
     def mass_matrix_inverse(self) -> list[Store]:
-        """out = Y* D Y, Y = D^-1 [I - H psi K]: column j of Y ends at the root, so only common ancestors meet."""
-        done = self.factor()
-        halves = {}
-        for link in self.links.links:
-            for i, dof in enumerate(link.dofs):
-                self.at(link, f"y{dof}_")
-                unit = [1.0 if j == i else 0.0 for j in range(len(link.dofs))]
-                halves[dof] = self.inward(done, link, Vector((*ZERO, *ZERO)), unit)
-        return self._both(self._sandwich(done, halves))
+        """out = Mass^-1, both triangles"""
+        inverse = Inverse(self)
+        across = {other: self._both(entries) for other, entries in inverse.across.items()}
+        if self.piece is not None:
+            self.across, self.news, across = across, inverse.news, {}
+        return inverse.stores + self._both(inverse.entries) + [item for stores in across.values() for item in stores]
 
     def inward(self, done: dict, link: Link, force: Vector, right: list[Value]) -> dict[int, list[Value]]:
         """D^-1 [I - H psi K] of ``right`` at a link's dofs and a ``force`` on it: by link, on the way to the root."""
@@ -388,10 +414,6 @@ class Trace:
             values = (*(R @ (v + cross(w, com))), *(R @ w))
             stores += [Store("out", (body, c), value) for c, value in enumerate(values)]
         return stores
-
-
-def _way(letter: str) -> str:
-    return OUTWARD if letter == "a" else INWARD
 
 
 def _mirrored(i: int, j: int, value: Value) -> list[tuple[tuple[int, int], Value]]:

@@ -92,15 +92,22 @@ class Emitter:
         self._lines: list[str] = []
         self._place: str | None = None
 
+    def branch(self, stores: Iterable[Store]) -> Listing:
+        """A region inside braces: no later one uses what it computes."""
+        known = dict(self._names)
+        listing = self.region(stores)
+        self._names = known
+        return listing
+
     def region(self, stores: Iterable[Store]) -> Listing:
         """Statements that compute and store what is asked for, in the order in which the steps made it."""
         self._constants, self._indices, self._labels, self._place = [], [], [], None
         lines = self._lines = []
         due: dict[tuple, list[Store]] = {}
-        values = []
+        values, known = [], []
         for item in stores:
             if is_constant(item.value) or item.value.key in self._names:
-                self._stored(item)
+                known.append(item)  # at the end: what it overwrites may be read before
             else:
                 values.append(item.value)
                 due.setdefault(item.value.key, []).append(item)
@@ -118,6 +125,8 @@ class Emitter:
                 self.counts[scalar.op] += 1
             for item in due.get(scalar.key, ()):
                 self._stored(item)
+        for item in known:
+            self._stored(item)
         return Listing("\n".join(lines), self._constants, self._indices, self._labels)
 
     def _near(self, needed: list[Scalar]) -> list[str]:

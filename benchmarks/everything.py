@@ -1,0 +1,181 @@
+"""``python -m benchmarks --everything``: every number and picture of the README, ours and the peers', in one go.
+
+The work is cut into parts, each a process with a file of rows. Kernels of all parts are compiled side by side, on all
+cores; what is compiled is measured, one part at a time and nothing else beside it. Parts come in order of importance:
+what the time budget leaves out is named, and the same command goes on from there.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from . import runner
+from .evidence import ROOT
+
+FOLDER = ROOT / "build" / "evidence"
+PEERS_FOLDER = "WARP_SPO_PEERS"  # where peers' own programs are, or are built
+GRACE = 15.0  # [s] between an interrupt and the end of a process
+LAST = 8.0  # [s]: with less left, no part is begun
+
+
+class Part(NamedTuple):
+    """Some cases that are compiled and measured by one process each.
+
+    Attributes:
+        name: of its files.
+        measure: arguments of ``python -m``, to which ``--json FILE`` is added.
+        compile: the same for what compiles its kernels and measures nothing; None: nothing is worth it.
+        seconds: most that measuring may take.
+    """
+
+    name: str
+    measure: Sequence[str]
+    compile: Sequence[str] | None = None
+    seconds: float = 60.0
+
+
+class Lanes:
+    """Processes of parts: many that compile, one that measures.
+
+    Args:
+        folder: for rows and logs; a part that has its ``.done`` there is not run again.
+        budget: [s] from now.
+        jobs: how many compile at a time.
+        alone: measure nothing until everything is compiled, as where both need the same cores.
+    """
+
+    def __init__(self, folder: Path, budget: float, jobs: int, alone: bool):
+        self.folder, self.end, self.jobs, self.alone = folder, time.monotonic() + budget, jobs, alone
+        self.begin, self.used = time.monotonic(), {}
+        self.compiling: dict[str, subprocess.Popen] = {}
+        folder.mkdir(parents=True, exist_ok=True)
+
+    @property
+    def left(self) -> float:
+        return self.end - time.monotonic()
+
+    def say(self, text: str) -> None:
+        print(f"[{time.monotonic() - self.begin:4.0f} s, {max(0.0, self.left):4.0f} s left] {text}", flush=True)
+
+    def start(self, arguments: Sequence[str], log: Path) -> subprocess.Popen:
+        """``python -m arguments``, in a process group of its own."""
+        with log.open("w") as out:
+            return subprocess.Popen([sys.executable, "-m", *arguments], cwd=ROOT, stdout=out, stderr=subprocess.STDOUT,
+                                    start_new_session=True)  # fmt: skip
+
+    def run(self, parts: Sequence[Part]) -> list[Part]:
+        """Compile and measure; returns the parts that the budget left out or cut short."""
+        waiting = [part for part in parts if not (self.folder / f"{part.name}.done").exists()]
+        if len(waiting) < len(parts):
+            self.say(f"{len(parts) - len(waiting)} parts are there already, in {self.folder}")
+        queue, unfinished = [part for part in waiting if part.compile], []
+        try:
+            while waiting and self.left > LAST:
+                while queue and sum(job.poll() is None for job in self.compiling.values()) < self.jobs:
+                    part = queue.pop(0)
+                    self.compiling[part.name] = self.start(part.compile or (), self.folder / f"{part.name}.compile.log")
+                part = self._ready(waiting, bool(queue))
+                if part is None:
+                    time.sleep(0.1)
+                    continue
+                waiting.remove(part)
+                if not self.measure(part):
+                    unfinished.append(part)
+        finally:
+            for job in self.compiling.values():
+                stop(job, 1.0)
+        return unfinished + waiting
+
+    def _ready(self, waiting: list[Part], queued: bool) -> Part | None:
+        """The first part whose kernels are compiled."""
+        busy = {name for name, job in self.compiling.items() if job.poll() is None}
+        if self.alone and (busy or queued):
+            return None
+        compiled = self.compiling.keys() - busy
+        return next((part for part in waiting if part.name in compiled or not part.compile), None)
+
+    def measure(self, part: Part) -> bool:
+        """Whether the part came to its end in time."""
+        file, log, begin = self.folder / f"{part.name}.json", self.folder / f"{part.name}.log", time.monotonic()
+        job = self.start([*part.measure, "--json", str(file)], log)
+        try:
+            code = job.wait(max(1.0, min(part.seconds, self.left)))
+        except subprocess.TimeoutExpired:
+            code = None
+        finally:
+            stop(job, GRACE)
+        self.used[part.name] = time.monotonic() - begin
+        rows = len(json.loads(file.read_text())["rows"]) if file.exists() else 0
+        how = "stopped, out of time" if code is None else "" if code == 0 else f"returned {code}"
+        reasons = [line for line in log.read_text().splitlines() if line.startswith(("skipped", "benchmarks:"))]
+        self.say("; ".join([f"{part.name}: {rows} rows in {self.used[part.name]:.0f} s", *filter(None, [how])]))
+        print("".join(f"    {line[:200]}\n" for line in dict.fromkeys(reasons)), end="", flush=True)
+        if code in (0, 1):  # 1: measured, and something is beyond its tolerance, as the log says
+            (self.folder / f"{part.name}.done").touch()
+        return code in (0, 1)
+
+
+def stop(job: subprocess.Popen, grace: float) -> None:
+    """Interrupt a process and its children; end them where they do not listen."""
+    for number, wait in ((signal.SIGINT, grace), (signal.SIGKILL, None)):
+        if job.poll() is not None:
+            return
+        os.killpg(job.pid, number)
+        try:
+            job.wait(wait)
+        except subprocess.TimeoutExpired:
+            continue
+
+
+def merged(files: Sequence[Path]) -> dict:
+    """The runs in files of one commit and machine as one run."""
+    runs = sorted((json.loads(file.read_text()) for file in files), key=lambda run: run["date"])
+    whole: dict[str, Any] = dict(runs[-1], rows=[])
+    for key in ("machine", "versions"):
+        whole[key] = {name: value for run in runs for name, value in run[key].items()}
+    for run in runs:
+        whole["rows"] += [row for row in run["rows"] if "verdict" not in row]
+    stress = [row for run in runs for row in [*run["rows"], *run.get("stress", [])] if "verdict" in row]
+    return whole | (dict(stress=stress) if stress else {})
+
+
+def short(machine: dict) -> str:
+    """Such as h200 or cpu."""
+    return machine["device"].split()[-1].lower() if "device_memory_GiB" in machine else "cpu"
+
+
+def run(parts: Sequence[Part], device: Any, budget: float, jobs: int | None, out: Path) -> tuple[Path, list[Part]]:
+    """Run parts, write their rows as one run into the file or folder ``out``; returns the file, and parts left out.
+
+    Raises:
+        ValueError: there was no time for a single row.
+    """
+    found = runner.machine(device)
+    cuda = "device_memory_GiB" in found
+    folder = FOLDER / f"{short(found)}-{runner.commit()[:12]}"
+    os.environ.setdefault(PEERS_FOLDER, str(FOLDER / "peers"))
+    Path(os.environ[PEERS_FOLDER]).mkdir(parents=True, exist_ok=True)
+    cores = os.cpu_count() or 1
+    lanes = Lanes(folder, budget, jobs or (max(1, cores - 2) if cuda else cores), alone=not cuda)
+    most = sum(part.seconds for part in parts)
+    lanes.say(f"{found['device']}: {len(parts)} parts, at most {most:.0f} s of measuring")
+    left_out = lanes.run(parts)
+    files = [folder / f"{part.name}.json" for part in parts if (folder / f"{part.name}.json").exists()]
+    if not files:
+        raise ValueError(f"benchmarks: nothing was measured in {budget:g} s; logs are in {folder}")
+    whole = merged(files)
+    if out.is_dir() or not out.suffix:
+        out = out / f"{whole['date'][:10]}-{short(found)}.json"
+    lanes.say(f"wrote {runner.save(whole, out)}")
+    if left_out:
+        names = ", ".join(part.name for part in left_out)
+        lanes.say(f"left out: {names}; the same command goes on with them")
+    return out, left_out

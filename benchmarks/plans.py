@@ -1,0 +1,94 @@
+"""Does the plan choose well? Forward dynamics of ten random trees at each granularity, beside what the plan takes.
+
+    python -m benchmarks.plans [--device cuda:0] [--trees 0 1 ...] [--worlds 1 256 4096 65536]
+
+A line is one tree and world count: the time at each granularity in us, the choice, and its time over the best one's.
+All kernels are compiled first, side by side. The exit code is 1 if a choice takes more than ``ALLOWED`` of the best.
+"""
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+import warp as wp
+
+import warp_spo as spo
+from warp_spo.kernels.straight import WARP
+from warp_spo.operations import OPERATIONS, Inputs
+from warp_spo.trial import Subject, Trial
+
+sys.path.append(str(Path(__file__).parent.parent / "tests"))  # the trees are those of the tests
+import zoo
+
+OPERATION = "forward_dynamics"
+WORLDS = (1, 256, 4096, 65536)
+NODE_WORLDS = 256  # up to which node granularity is worth a look: it needs no compilation, but a launch a level
+ALLOWED = 1.1
+SAMPLE, REPEATS, WARM_UP, BUDGET = 1, 10, 0.01, 0.1
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="benchmarks.plans", description="The plan's choice beside the best.")
+    parser.add_argument("--device", help="Warp device, default: the current one")
+    parser.add_argument("--trees", nargs="+", type=int, default=list(range(len(zoo.BRANCHED))))
+    parser.add_argument("--worlds", nargs="+", type=int, default=WORLDS)
+    options = parser.parse_args(arguments)
+    start = time.perf_counter()
+    scenes = {which: zoo.branched(which) for which in options.trees}
+    made = {which: prepared(scene, options.worlds, options.device) for which, scene in scenes.items()}
+    load(made)
+    print(f"traced and compiled in {time.perf_counter() - start:.0f} s", flush=True)
+    beyond = []
+    for which, scene in scenes.items():
+        for worlds in options.worlds:
+            chosen = spo.Dynamics(scene, worlds, options.device).plan.of(OPERATION)
+            inputs = [Inputs(scene, worlds)]
+            times = {}
+            for name in ("tree", "segment", *(["node"] if worlds <= NODE_WORLDS else [])):
+                dyn = made[which].get((name, worlds)) or spo.Dynamics(scene, worlds, options.device, granularity=name)
+                trial = Trial(Subject(dyn, inputs), OPERATIONS[OPERATION], SAMPLE)
+                times[name] = 1e6 * trial.measure(REPEATS, WARM_UP, BUDGET)[0].median
+            ratio = times[chosen] / min(times.values())
+            beyond += [ratio] * (ratio > ALLOWED)
+            shown = ", ".join(f"{name} {us:.4g}" for name, us in times.items())
+            limbs = sum(not children for children in scene.tree.children)
+            print(f"tree {which}: {scene.dof_count} dof, depth {scene.tree.depth}, {limbs} leaves, w{worlds}: {shown}; "
+                  f"plan {chosen}, {ratio:.3f} of the best", flush=True)
+    print(f"{len(beyond)} of {len(scenes) * len(options.worlds)} choices take more than {ALLOWED} times the best")
+    return 1 if beyond else 0
+
+
+def prepared(scene: spo.Scene, counts: list[int], device: str | None) -> dict[tuple[str, int], spo.Dynamics]:
+    """Traced, not compiled, by granularity and worlds. Programs depend on how rows are read, not on the worlds."""
+    made, programs = {}, {}
+    for name in ("tree", "segment"):
+        for worlds in counts:
+            made[name, worlds] = dyn = spo.Dynamics(scene, worlds, device, granularity=name)
+            key = name, dyn.plan.staged
+            if key in programs:
+                dyn.programs._programs = programs[key]
+                continue
+            rate = (worlds, scene.dof_count)
+            dyn.programs.find(OPERATION, {"q": (worlds, scene.coord_count), "qd": rate, "tau": rate}, rate)
+            programs[key] = dyn.programs._programs
+    return made
+
+
+def load(made: dict) -> None:
+    """Compile the kernels side by side."""
+    blocks: dict[int, dict] = {}
+    device = None
+    for dyns in made.values():
+        for dyn in dyns.values():
+            device = dyn.device
+            for program in dyn.programs._programs.values():
+                kernel = program.kernel
+                blocks.setdefault(program.block if device.is_cuda else WARP, {})[kernel.key] = kernel.module
+    for block, modules in blocks.items():
+        wp.force_load(device, list(modules.values()), block_dim=block, max_workers=os.cpu_count())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

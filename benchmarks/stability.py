@@ -1,0 +1,269 @@
+"""Released robots left to gravity inside their limits: who stays finite, and what becomes of the energy.
+
+    python -m benchmarks.stability so100 z1 --seconds 10 --peers
+
+Each robot starts at random between its limits, a fixed one at rest, a floating one with its joints moving, and has the
+limits, damping and friction of its file and Newton's default for what the file does not say. The energy is kinetic, of
+gravity and of the springs of limits that are passed, in float64; what it ever exceeds its start by is shown as a share
+of what has been turned over between motion and height. Without friction and limits of position and velocity the first
+half second is compared with MuJoCo at 0.1 ms, which then has the same terms.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+import warnings
+import xml.etree.ElementTree as ET
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+import warp_spo as spo
+
+from .robots import INSTALLED, PACKAGE
+
+STEPS = (2e-3, 5e-3)  # [s]
+FINE, COMPARED = 1e-4, 0.5  # MuJoCo's step, and how long it is compared [s]
+SPAN = 0.5  # share of its range, in the middle, in which a joint starts
+FREE_RANGE = 0.5  # [rad, m] either side of zero where there are no limits
+GIVE_UP = 20.0  # seconds of clock time after which a slow solver is stopped
+
+
+class Robot(NamedTuple):
+    path: str
+    floating: bool = False
+
+
+ROBOTS = {
+    "so100": Robot("so_arm_description/urdf/so100.urdf"),
+    "so101": Robot("so_arm_description/urdf/so101.urdf"),
+    "z1": Robot("z1_description/urdf/z1.urdf"),
+    "panda": Robot("panda_description/urdf/panda.urdf"),
+    "ur5": Robot("ur_description/urdf/ur5_robot.urdf"),
+    "g1": Robot("g1_description/urdf/g1_29dof_rev_1_0.urdf", True),
+    "talos": Robot("talos_data/robots/talos_full_v2.urdf", True),
+    "go2": Robot("go2_description/urdf/go2.urdf", True),
+    "anymal": Robot("anymal_c_simple_description/urdf/anymal.urdf", True),
+}
+
+
+def stripped(text: str) -> str:
+    """A URDF without shapes and without mimic joints, which are held at zero; damping and friction stay."""
+    root = ET.fromstring(text)
+    for child in list(root):
+        if child.tag not in ("link", "joint"):
+            root.remove(child)
+    for link in root.findall("link"):
+        for shape in [*link.findall("visual"), *link.findall("collision")]:
+            link.remove(shape)
+    for joint in root.findall("joint"):
+        for mimic in joint.findall("mimic"):
+            joint.remove(mimic)
+            joint.set("type", "fixed")
+    return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def model(name: str) -> Any:
+    """A robot as Newton imports it, one world on the CPU."""
+    import newton
+
+    robot = ROBOTS[name]
+    source = Path(str(metadata.distribution(PACKAGE).locate_file(f"{INSTALLED}/{robot.path}")))
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        file = Path(folder) / f"{name}.urdf"
+        file.write_text(stripped(source.read_text()))
+        builder = newton.ModelBuilder()
+        builder.add_urdf(str(file), floating=robot.floating)
+        return builder.finalize(device="cpu")
+
+
+def start(scene: spo.Scene, seed: int = 0) -> np.ndarray:
+    """Coordinates inside the limits, a floating base at the origin, [coordinate]."""
+    rng, q = np.random.default_rng(seed), scene.neutral_q
+    lower, upper = scene.values["joint_limit_lower"][0], scene.values["joint_limit_upper"][0]
+    for hinge, first, dof in zip(scene.hinges, scene.q_start, scene.qd_start, strict=False):
+        for i in range(hinge.dof_count if hinge.coord_count == hinge.dof_count else 0):
+            low, high = lower[dof + i], upper[dof + i]
+            if high - low > 2.0 * np.pi:
+                low, high = -FREE_RANGE, FREE_RANGE
+            q[first + i] = 0.5 * (low + high) + SPAN * (high - low) * (rng.random() - 0.5)
+    return q
+
+
+def start_rates(scene: spo.Scene, seed: int = 0) -> np.ndarray:
+    """Velocities [dof]: nothing on a fixed base, and N(0, 1) of the joints of a floating robot, its base at rest."""
+    qd = np.random.default_rng(seed).normal(size=scene.dof_count)
+    qd[:6] = 0.0
+    return qd if scene.hinges[0].kind == "free" else 0.0 * qd
+
+
+def energies(scene: spo.Scene, q: np.ndarray, qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Kinetic energy, armature included, and that of gravity, springs and passed limits, at states [n, ...] [J]."""
+    dyn = spo.Dynamics(scene, len(q), "cpu", "float64")
+    poses, rates = dyn.body_poses(q), dyn.body_velocities(q, qd)
+    values = {name: array[0] for name, array in scene.values.items()}
+    x, y, z, w = np.moveaxis(poses[..., 3:], -1, 0)
+    rows = [[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]  # fmt: skip
+    R = np.stack([np.stack(row, -1) for row in rows], -2)
+    spin = np.einsum("nbij,nbi->nbj", R, rates[..., 3:])
+    kinetic = 0.5 * np.einsum("b,nbi,nbi->n", values["body_mass"], rates[..., :3], rates[..., :3])
+    kinetic += 0.5 * np.einsum("nbi,bij,nbj->n", spin, values["body_inertia"], spin)
+    kinetic += 0.5 * (qd**2) @ values["joint_armature"]
+    com = poses[..., :3] + np.einsum("nbij,bj->nbi", R, values["body_com"])
+    potential = -np.einsum("b,nbi,i->n", values["body_mass"], com, values["gravity"])
+    screws = [(c + i, d + i) for h, c, d in zip(scene.hinges, scene.q_start, scene.qd_start, strict=False)
+              if h.coord_count == h.dof_count for i in range(h.dof_count)]  # fmt: skip
+    for coordinate, dof in screws:
+        at = q[:, coordinate]
+        outside = np.maximum(values["joint_limit_lower"][dof] - at, 0.0)
+        outside = outside + np.maximum(at - values["joint_limit_upper"][dof], 0.0)
+        stretch = at - values["joint_rest_q"][coordinate]
+        potential += 0.5 * values["joint_limit_ke"][dof] * outside**2
+        potential += 0.5 * values["joint_stiffness"][dof] * stretch**2
+    return kinetic, potential
+
+
+def excess(kinetic: np.ndarray, potential: np.ndarray) -> float:
+    """Largest rise of the energy above its start, as a share of what had been turned over until then."""
+    turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(kinetic)))])
+    rise = kinetic + potential - (kinetic + potential)[0]
+    return max(0.0, float((rise[1:] / np.maximum(turned[1:], 1e-12)).max()))
+
+
+class Run(NamedTuple):
+    """A trajectory [step, ...], and when it stopped being finite [s]; None if it never did."""
+
+    q: np.ndarray
+    qd: np.ndarray
+    diverged: float | None
+    finished: bool
+
+
+def run(solver: Any, q: np.ndarray, qd: np.ndarray, dt: float, seconds: float) -> Run:
+    """Swing freely."""
+    import newton
+
+    state = solver.model.state()
+    state.joint_q.assign(q.astype(np.float32))
+    state.joint_qd.assign(qd.astype(np.float32))
+    newton.eval_fk(solver.model, state.joint_q, state.joint_qd, state)
+    other, control, began = solver.model.state(), solver.model.control(), time.perf_counter()
+    qs, qds = [state.joint_q.numpy().copy()], [state.joint_qd.numpy().copy()]
+    for step in range(round(seconds / dt)):
+        solver.step(state, other, control, None, dt)
+        state, other = other, state
+        qs.append(state.joint_q.numpy().copy())
+        qds.append(state.joint_qd.numpy().copy())
+        if not np.isfinite(qds[-1]).all() or np.abs(qds[-1]).max() > 1e6:
+            return Run(np.array(qs), np.array(qds), (step + 1) * dt, True)
+        if time.perf_counter() - began > GIVE_UP:
+            return Run(np.array(qs), np.array(qds), None, False)
+    return Run(np.array(qs), np.array(qds), None, True)
+
+
+def mujoco_errors(scene: spo.Scene, q: np.ndarray, qd: np.ndarray, ways: list[tuple[float, str]]) -> list[float]:
+    """Distances of q after COMPARED seconds from MuJoCo's at FINE, over the distance travelled.
+
+    First MuJoCo's own at FINE / 2, then ours at each (dt, integrator), in float64; both without limits and friction.
+    """
+    import mujoco
+
+    from .peers.lumped import lump
+    from .peers.mujoco_model import model as mujoco_model
+
+    dofs = scene.dof_count
+    free = scene.with_values(joint_limit_lower=np.full(dofs, -1e10), joint_limit_upper=np.full(dofs, 1e10),
+                             joint_velocity_limit=np.full(dofs, 1e6), joint_friction=np.zeros(dofs))  # fmt: skip
+    robot = lump(free)
+    theirs = mujoco_model(robot)
+    theirs.dof_damping[:] = free.values["joint_damping"][0][robot.dofs]
+    theirs.dof_armature[:] = free.values["joint_armature"][0][robot.dofs]
+    order = np.array(robot.coords)
+    if robot.floating:
+        order[3:7] = order[[6, 3, 4, 5]]  # wxyz
+
+    def mujoco_after(dt: float) -> np.ndarray:
+        theirs.opt.timestep, data = dt, mujoco.MjData(theirs)
+        data.qpos[:], data.qvel[:] = q[order], qd[robot.dofs]
+        for _ in range(round(COMPARED / dt)):
+            mujoco.mj_step(theirs, data)
+        return data.qpos.copy()
+
+    dyn = spo.Dynamics(free, 1, "cpu", "float64")
+
+    def after(dt: float, integrator: str) -> np.ndarray:
+        ours, rate = (wp.array(x[None], dtype=wp.float64, device="cpu") for x in (q, qd))
+        for _ in range(round(COMPARED / dt)):
+            dyn.step(ours, rate, None, dt, integrator=integrator, out=(ours, rate))
+        return ours.numpy()[0][order]
+
+    wanted = mujoco_after(FINE)
+    errors = []
+    for mine in (mujoco_after(FINE / 2), *(after(*way) for way in ways)):
+        if robot.floating and mine[3:7] @ wanted[3:7] < 0.0:
+            mine[3:7] *= -1.0
+        errors.append(float(np.linalg.norm(mine - wanted) / np.linalg.norm(wanted - q[order])))
+    return errors
+
+
+def row(name: str, seconds: float, peers: bool) -> dict[str, str]:
+    """One line of the table."""
+    from newton.solvers import SolverFeatherstone, SolverSteel
+
+    from warp_spo.newton import SolverSPO, from_newton
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        robot = model(name)
+        scene = from_newton(robot)
+        q, qd = start(scene), start_rates(scene)
+        cells = {"robot": f"{name} ({scene.dof_count})"}
+        solver = SolverSPO(robot)
+        for dt in STEPS:
+            done = run(solver, q, qd, dt, seconds)
+            if done.diverged is None:
+                cells[f"{dt * 1e3:g} ms"] = f"{100 * excess(*energies(scene, done.q, done.qd)):.2f} %"
+            else:
+                cells[f"{dt * 1e3:g} ms"] = f"NaN at {done.diverged:.3g} s"
+        ways = [(FINE, "semi_implicit"), *((dt, i) for dt in STEPS for i in ("semi_implicit", "midpoint"))]
+        own, fine, *errors = (f"{100 * e:.2g} %" for e in mujoco_errors(scene, q, qd, ways))
+        cells |= {"MuJoCo at half its step": own, "ours at its step": fine}
+        cells |= {f"from MuJoCo, {dt * 1e3:g} ms": " / ".join(errors[2 * i : 2 * i + 2]) for i, dt in enumerate(STEPS)}
+        for other in (SolverFeatherstone, SolverSteel) if peers else ():
+            for dt in STEPS:
+                peer = other(robot)
+                done = run(peer, q, qd, dt, seconds)
+                said = "finite" if done.finished else f"finite until stopped at {len(done.q) * dt:.2g} s"
+                if done.diverged is not None:
+                    said = f"diverges at {done.diverged:.3g} s"
+                elif done.finished:
+                    said = f"{100 * excess(*energies(scene, done.q, done.qd)):.3g} %"
+                cells[f"{other.__name__.removeprefix('Solver')}, {dt * 1e3:g} ms"] = said
+    return cells
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("robots", nargs="*", default=list(ROBOTS), help=f"some of {', '.join(ROBOTS)}")
+    parser.add_argument("--seconds", type=float, default=10.0, help="simulated time")
+    parser.add_argument("--peers", action="store_true", help="SolverFeatherstone and SolverSteel beside it")
+    options = parser.parse_args()
+    header: list[str] = []
+    for name in options.robots or ROBOTS:
+        cells = row(name, options.seconds, options.peers)
+        if not header:
+            header = list(cells)
+            print("| " + " | ".join(header) + " |\n|" + "---|" * len(header), flush=True)
+        print("| " + " | ".join(cells.values()) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

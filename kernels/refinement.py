@@ -1,0 +1,44 @@
+"""What iterative refinement does between a solution in float32 and a residual in float64."""
+
+import functools
+
+import warp as wp
+
+
+@functools.cache
+def cast(S, T) -> wp.Kernel:
+    """``out = T(x)``"""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def kernel(x: wp.array2d[S], x_out: wp.array2d[T]):
+        world, i = wp.tid()
+        x_out[world, i] = T(x[world, i])
+
+    return kernel
+
+
+@functools.cache
+def residual(S) -> wp.Kernel:
+    """``right - force`` in float64, rounded once; ``right`` absent is zero."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def kernel(right: wp.array2d[S], force: wp.array2d[wp.float64], residual_out: wp.array2d[wp.float32]):
+        world, dof = wp.tid()
+        wanted = wp.float64(0.0)
+        if right:
+            wanted = wp.float64(right[world, dof])
+        residual_out[world, dof] = wp.float32(wanted - force[world, dof])
+
+    return kernel
+
+
+@functools.cache
+def add() -> wp.Kernel:
+    """``x += step``"""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def kernel(step: wp.array2d[wp.float32], x_out: wp.array2d[wp.float64]):
+        world, dof = wp.tid()
+        x_out[world, dof] += wp.float64(step[world, dof])
+
+    return kernel

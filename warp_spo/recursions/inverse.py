@@ -1,0 +1,129 @@
+"""All of Mass^-1 = Y* D Y, Y = D^-1 [I - H psi K] (eq. 1), a few operations an entry, piece by piece.
+
+Going inward, a unit force at dof j makes the rates Y_j in its piece and leaves the force F_j on the link under it. What
+F_j then does further in is linear in its six numbers: coming back, a piece learns the rates of every pivot further in
+for each of them, N, and its columns of Y are complete. Two columns meet in the pivots that both branches have.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..trace.emit import Store
+from ..trace.graph import Value
+from ..trace.spatial import ZERO, Vector, dot, total
+from . import articulated
+from .links import Link
+from .motion import STILL
+from .pieces import Piece, Pieces
+
+if TYPE_CHECKING:
+    from .traced import Trace
+
+NO_FORCE = Vector((*ZERO, *ZERO))
+
+
+class Inverse:
+    """The entries of Mass^-1 that a trace's pieces work out.
+
+    Columns of Y are lists over the pivots from the root out to the end of a piece; it has one pivot for each dof.
+
+    Attributes:
+        entries: by (row, column), one of the two triangles' entries each.
+        across: by index of another piece: the entries that it has in common with the trace's own.
+        stores: what is sent. news: likewise, to the pieces that meet this one.
+    """
+
+    def __init__(self, trace: Trace):
+        self.trace, self.pieces = trace, Pieces(trace.links).pieces
+        self.entries: dict[tuple[int, int], Value] = {}
+        self.across: dict[int, dict[tuple[int, int], Value]] = {}
+        self.done, self.stores = trace.factors()
+        self.news: list[Store] = []
+        self._rates: dict[int, list[Value]] = {}  # the part of Y_j in j's own piece
+        self._forces: dict[int, Vector] = {}  # F_j
+        self._columns: dict[int, list[Value]] = {}  # Y_j
+        own = [piece for piece in self.pieces if trace.piece is None or piece.index == trace.piece.index]
+        for piece in own:
+            for at, link in enumerate(piece.links):
+                for i, dof in enumerate(link.dofs):
+                    trace.graph.step = f"column {dof}|y"
+                    unit = [1.0 if j == i else 0.0 for j in range(len(link.dofs))]
+                    self._rates[dof], self._forces[dof] = self._inward(piece.links[: at + 1], NO_FORCE, unit)
+        for piece in own:
+            self._come_back(piece)
+        for piece in own:
+            for other in self.pieces:
+                if piece.looks_at(other):
+                    self._meet(piece, other)
+
+    def _inward(self, links: list[Link], force: Vector, right: list[Value]) -> tuple[list[Value], Vector]:
+        """Rates that a ``force`` on the last link and ``right`` at its dofs make, and what they leave further in."""
+        rates: list[Value] = []
+        for link in reversed(links):
+            key = id(link)
+            found, force = articulated.reduced(link, self.trace.places[key], self.done[key], STILL, force, right)
+            rates = found + rates
+            inner = link.parent
+            right = [0.0] * (0 if inner is None else len(inner.dofs))
+        return rates, NO_FORCE if links[0].parent is None else force
+
+    def _come_back(self, piece: Piece) -> None:
+        """Complete the columns of a piece, multiply them with one another and with those further in."""
+        trace = self.trace
+        further = [one for one in reversed(piece.ancestors)]
+        N = [] if piece.parent is None else _sixes(trace.receive("N", piece.parent))
+        D = [d for one in further for d in trace.receive("D", one)]
+        D += [pivot.D for link in piece.links for pivot in self.done[id(link)].pivots]
+        for j in piece.dofs:
+            trace.graph.step = f"column {j}|y"
+            self._columns[j] = [dot(row, self._forces[j]) for row in N] + self._rates[j]
+        if any(other.looks_at(piece) for other in self.pieces):
+            heads = (self._columns[j][: len(N)] for j in piece.dofs)
+            self.news += trace.post("Y", piece, [x for head in heads for x in head])
+        weighted = {j: [d * y for d, y in zip(D, self._columns[j], strict=False)] for j in piece.dofs}
+        for at, j in enumerate(piece.dofs):
+            trace.graph.step = f"column {j}|m"
+            for i in piece.dofs[: at + 1]:
+                self.entries[i, j] = _meeting(weighted[i], self._columns[j])
+        for one in further:
+            known = trace.receive("V", one)
+            for i in one.dofs:
+                theirs, known = known[: one.reach(i)], known[one.reach(i) :]
+                for j in piece.dofs:
+                    trace.graph.step = f"column {j}|m"
+                    self.entries[i, j] = _meeting(theirs, self._columns[j])
+        if not piece.children:
+            return
+        trace.at(piece.links[-1], "n")
+        still = [0.0] * len(piece.links[-1].dofs)
+        columns = []
+        for c in range(6):
+            rates, force = self._inward(piece.links, Vector(float(i == c) for i in range(6)), still)
+            columns.append([dot(row, force) for row in N] + rates)
+        self.stores += trace.post("N", piece, [x for row in zip(*columns, strict=True) for x in row])
+        self.stores += trace.post("D", piece, D[len(N) :])
+        self.stores += trace.post("V", piece, [x for j in piece.dofs for x in weighted[j]])
+
+    def _meet(self, piece: Piece, other: Piece) -> None:
+        """The entries of two branches: their columns meet in the pivots up to where they part."""
+        fork = piece.fork(other)
+        assert fork is not None and other.parent is not None
+        common, heads = len(fork.all_dofs), len(other.parent.all_dofs)
+        D = [d for one in reversed([fork, *fork.ancestors]) for d in self.trace.receive("D", one)]
+        sent = self.trace.receive("Y", other)
+        found = self.across[other.index] = self.across.get(other.index, {})
+        for at, i in enumerate(other.dofs):
+            self.trace.graph.step = f"column {i}|m"
+            theirs = [d * y for d, y in zip(D, sent[heads * at : heads * at + common], strict=True)]
+            for j in piece.dofs:
+                found[i, j] = _meeting(theirs, self._columns[j])
+
+
+def _meeting(first: list[Value], second: list[Value]) -> Value:
+    """Sum over the pivots that both have."""
+    return total(a * b for a, b in zip(first, second, strict=False))
+
+
+def _sixes(values: list[Value]) -> list[list[Value]]:
+    return [values[i : i + 6] for i in range(0, len(values), 6)]

@@ -1,0 +1,64 @@
+"""What the pieces of a robot send each other, and where each message lies among those of an operation.
+
+Letters: inward P = phi P+ phi*, z = phi z+ or a force, R = the composite inertia; outward a = alpha, and for Mass^-1
+N = the rates of all pivots further in for each unit force on the last link, D = the piece's own pivots, V = D times its
+columns of Y, Y = the part of its columns that lies further in.
+"""
+
+from __future__ import annotations
+
+from .pieces import Piece, Pieces
+
+SENDS = {
+    "forward_dynamics": "Pza",
+    "solve_mass_matrix": "Pza",
+    "inverse_dynamics": "z",
+    "mass_matrix": "R",
+    "mass_matrix_inverse": "PNDVY",
+}
+"""Letters by operation."""
+INWARD, OUTWARD = "sent", "returned"
+"""The array that messages go through, by either name."""
+OUTWARD_LETTERS = "aNDVY"
+SIZES = {"P": 21, "z": 6, "R": 10, "a": 6}
+
+
+def way(letter: str) -> str:
+    return OUTWARD if letter in OUTWARD_LETTERS else INWARD
+
+
+def size(letter: str, piece: Piece) -> int:
+    """Values of a message."""
+    if letter in SIZES:
+        return SIZES[letter]
+    further = sum(one.weight for one in piece.ancestors)
+    if letter == "V":
+        return sum(piece.reach(dof) for dof in piece.dofs)
+    return {"N": 6 * (further + piece.weight), "D": piece.weight, "Y": further * piece.weight}[letter]
+
+
+def slots(operation: str, pieces: Pieces) -> tuple[dict[tuple[str, int], int], int]:
+    """Where each message begins, by letter and piece, and the values of all together.
+
+    Long messages outward take the place of what the same tree sent inward and has read by then.
+    """
+    letters, places, end = SENDS[operation], {}, 0
+    groups = ("P", letters[1:]) if "N" in letters else (letters,)
+    for root in (piece for piece in pieces.pieces if piece.parent is None):
+        tree = [piece for piece in pieces.pieces if root in (piece, *piece.ancestors)]
+        start = end
+        for group in groups:
+            at = start
+            for piece in tree:
+                for letter in group:
+                    if _sends(letter, piece, tree):
+                        places[letter, piece.index] = at
+                        at += size(letter, piece)
+            end = max(end, at)
+    return places, end
+
+
+def _sends(letter: str, piece: Piece, tree: list[Piece]) -> bool:
+    if letter == "Y":
+        return any(other.looks_at(piece) for other in tree)
+    return bool(piece.children) if letter in OUTWARD_LETTERS else piece.parent is not None
