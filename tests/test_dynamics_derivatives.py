@@ -230,6 +230,42 @@ def test_forward_dynamics_by_minus_the_inverse(name):
             assert laws.error(-np.linalg.solve(got[2, w], ours), theirs) <= SAME_NUMBERS
 
 
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_products(dtype, device):
+    """J* y and J x against the dense J; written entirely, no allocation, NaN stays at home."""
+    scene = zoo.varied(zoo.fork(), WORLDS)
+    dyn = spo.Dynamics(scene, WORLDS, device=device, dtype=dtype)
+    a = laws.states(scene, WORLDS, dtype=dtype)
+    x = [a["b"][..., i].copy() for i in range(3)]
+    y = a["qdd"] - a["tau"]
+    tolerance = 1e-11 if dtype == "float64" else FLOAT32
+    on = laws.to_device(dyn, a | {"y": y} | {f"x{i}": rate for i, rate in enumerate(x)})
+    for name, third in (("inverse_dynamics", "qdd"), ("forward_dynamics", "tau")):
+        J = numbers(call(dyn, f"{name}_derivatives", on))
+        state = on["q"], on["qd"], on[third], on["body_f"]
+        wrt = ("tangent", "qd", third)
+        vjp = getattr(dyn, f"{name}_vjp")
+        got = vjp(*state, cotangent=on["y"], wrt=wrt)
+        for block, key in zip(J, wrt, strict=True):
+            assert laws.error(got[key].numpy(), np.einsum("wij,wi->wj", block, y)) <= tolerance, (name, key)
+        out = {key: wp.full(got[key].shape, float("nan"), dtype=dyn.dtype, device=device) for key in wrt}
+        with no_warp_allocation():
+            assert vjp(*state, cotangent=on["y"], wrt=wrt, out=out)["qd"] is out["qd"]
+        for key in wrt:
+            np.testing.assert_array_equal(out[key].numpy(), got[key].numpy())
+        spoiled = a["q"].copy()
+        spoiled[3] = np.nan
+        bad = vjp(spoiled, *(v.numpy() for v in state[1:]), cotangent=y, wrt=wrt)
+        for key in wrt:
+            np.testing.assert_array_equal(np.delete(bad[key], 3, 0), np.delete(got[key].numpy(), 3, 0))
+            assert np.isnan(bad[key][3]).any()
+        rates = {"dq": on["x0"], "dqd": on["x1"], f"d{third}": on["x2"]}
+        moved = getattr(dyn, f"{name}_jvp")(*state, **rates).numpy()
+        assert laws.error(moved, sum(np.einsum("wij,wj->wi", J[i], x[i]) for i in range(3))) <= tolerance
+    with pytest.raises(ValueError, match=r"dbody_f is given and body_f is None; expected both"):
+        dyn.forward_dynamics_jvp(on["q"], dbody_f=on["body_f"])
+
+
 def test_far_from_the_origin_and_fast():
     """10 km away and at 1 km/s, float32 keeps its digits: neither enters, to the bit."""
     scene = scene_of("fork")
@@ -264,7 +300,7 @@ def test_no_world_too_many_dofs_and_none(device):
 
 # -- operations --------------------------------------------------------------------------------------------------------
 PINNED = {"arm7": (2522, 1456, 1814), "quadruped": (10155, 7857, 6864), "humanoid": (22824, 26883, 12968)}
-"""Scene of the benchmarks -> operations of one world: derivatives of inverse dynamics, of Mass; J* y of forward dynamics.
+"""Scene of the benchmarks -> operations of a world: derivatives of inverse dynamics, of Mass; J* y of forward dynamics.
 
 The last is 1.2 to 1.7 times forward dynamics.
 """
