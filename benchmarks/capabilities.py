@@ -1,0 +1,272 @@
+"""What the library does beyond one evaluation of the dynamics, beside those who do the same, on one device.
+
+    python -m benchmarks.capabilities [PATTERN] [--device cuda:0] [--worlds 4096 65536] [--json FILE]
+
+* steps: a whole step of Newton's SolverMuJoCo, SolverSteel and SolverFeatherstone and of SolverSPO, on Newton's model
+  of the Panda with drives and the limits of its file;
+* derivatives: dense derivatives of forward dynamics, and its vector-Jacobian product beside forward dynamics;
+* operational: the inverse operational-space inertia of G1's two feet, beside the Jacobians and twelve columns of M^-1
+  that it takes in mujoco_warp;
+* inverse: all of M^-1;
+* loops: forward dynamics of a biped with closed ankles, embedded, beside the same robot with its loops cut.
+
+Calls are captured into a CUDA graph, several in a row, and replayed; on a CPU they are timed one by one. A line is the
+time of one call; what cannot run is skipped with its reason. Results are checked to be finite.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import warp_spo as spo
+from warp_spo.operations import Inputs
+
+from . import robots, runner
+
+DT = 2e-3  # [s]
+SETS = 4
+CALLS = 12  # in one graph
+REPEATS = 15
+KE, KD = 200.0, 20.0  # drives [N m/rad, N m s/rad]
+
+
+def timed(run: Callable[[int], Any], device: wp.Device) -> float:
+    """Median time of ``run(index)`` [us], index going round the sets of inputs."""
+    for index in range(SETS):
+        run(index)
+    wp.synchronize_device(device)
+    if not device.is_cuda:
+        return 1e6 * float(np.median([_wall(run, index % SETS) for index in range(2 * SETS)]))
+    with wp.ScopedCapture(device) as capture:
+        for index in range(CALLS):
+            run(index % SETS)
+    for _ in range(3):
+        wp.capture_launch(capture.graph)
+    events = [[wp.Event(device, enable_timing=True) for _ in range(2)] for _ in range(REPEATS)]
+    for start, end in events:
+        device.stream.record_event(start)
+        wp.capture_launch(capture.graph)
+        device.stream.record_event(end)
+    wp.synchronize_device(device)
+    return 1e3 * float(np.median([wp.get_event_elapsed_time(start, end) for start, end in events])) / CALLS
+
+
+def _wall(run: Callable[[int], Any], index: int) -> float:
+    start = time.perf_counter()
+    run(index)
+    return time.perf_counter() - start
+
+
+# -- steps -------------------------------------------------------------------------------------------------------------
+def steps(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], float]]]:
+    import newton
+
+    from warp_spo.newton import SolverSPO
+
+    def model() -> Any:
+        one = newton.ModelBuilder()
+        one.add_urdf(robots.urdf("panda"), floating=False)
+        one.joint_target_ke[:] = [KE] * len(one.joint_target_ke)
+        one.joint_target_kd[:] = [KD] * len(one.joint_target_kd)
+        one.joint_target_mode[:] = [int(newton.JointTargetMode.POSITION)] * len(one.joint_target_mode)
+        many = newton.ModelBuilder()
+        many.replicate(one, worlds)
+        return many.finalize(device=device)
+
+    shared: list[Any] = []
+
+    def step(name: str, **options: Any) -> float:
+        if not shared:
+            shared.append(model())
+        its = shared[0]
+        solver = SolverSPO(its) if name == "SolverSPO" else getattr(newton.solvers, name)(its, **options)
+        now, after, control = its.state(), its.state(), its.control()
+        middle = 0.5 * (its.joint_limit_lower.numpy() + its.joint_limit_upper.numpy())
+        noise = np.random.default_rng(0).uniform(-0.3, 0.3, (SETS, len(middle)))
+        starts = [wp.array(middle + each, dtype=wp.float32, device=device) for each in noise]
+        control.joint_target_q = wp.array(middle, dtype=wp.float32, device=device)
+
+        def run(index: int) -> None:
+            wp.copy(now.joint_q, starts[index])
+            solver.step(now, after, control, None, DT)
+
+        us = timed(run, device)
+        assert np.isfinite(after.joint_qd.numpy()).all(), f"{name}: not finite"
+        return us
+
+    yield "SolverSPO.step", lambda: step("SolverSPO")
+    yield "SolverSteel.step", lambda: step("SolverSteel", enable_joint_limits=True)
+    yield "SolverMuJoCo.step", lambda: step("SolverMuJoCo", disable_contacts=True)
+    if worlds <= 4096:
+        yield "SolverFeatherstone.step", lambda: step("SolverFeatherstone")
+
+
+# -- ours --------------------------------------------------------------------------------------------------------------
+class Ours:
+    """Dynamics of one scene with inputs on the device."""
+
+    def __init__(self, scene: spo.Scene, worlds: int, device: wp.Device, **options: Any):
+        self.dyn, self.scene, self.device = spo.Dynamics(scene, worlds, device, **options), scene, device
+        sets = [Inputs(scene, worlds, seed) for seed in range(SETS)]
+        self.sets = [
+            {name: wp.array(each.array(name), dtype=wp.float32, device=device) for name in ("q", "qd", "tau", "b")}
+            for each in sets
+        ]
+
+    def out(self, *shape: int) -> wp.array:
+        return wp.empty((self.dyn.worlds, *shape), dtype=wp.float32, device=self.device)
+
+    def time(self, call: Callable[..., Any], out: Any) -> float:
+        """Of ``call(dyn, set, out)`` [us]."""
+        us = timed(lambda index: call(self.dyn, self.sets[index], out), self.device)
+        for array in out.values() if isinstance(out, dict) else out if isinstance(out, tuple) else (out,):
+            assert np.isfinite(array.numpy()).all(), "not finite"
+        return us
+
+
+def forward(dyn: spo.Dynamics, x: dict, out: wp.array) -> None:
+    dyn.forward_dynamics(x["q"], x["qd"], x["tau"], out=out)
+
+
+def derivatives(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], float]]]:
+    for name in ("panda", "go2", "g1"):
+        scene = robots.scene(name)
+        n, kept = scene.dof_count, []
+
+        def ours(scene: spo.Scene = scene, kept: list = kept) -> Ours:
+            kept[:] = kept or [Ours(scene, worlds, device)]
+            return kept[0]
+
+        def dense(ours: Any = ours, n: int = n) -> float:
+            out = tuple(ours().out(n, n) for _ in range(3))
+            return ours().time(
+                lambda dyn, x, out: dyn.forward_dynamics_derivatives(x["q"], x["qd"], x["tau"], out=out), out
+            )
+
+        def product(ours: Any = ours, n: int = n, scene: spo.Scene = scene) -> float:
+            out = dict(q=ours().out(scene.coord_count), qd=ours().out(n), tau=ours().out(n))
+
+            def pull(dyn: spo.Dynamics, x: dict, out: dict) -> None:
+                dyn.forward_dynamics_vjp(x["q"], x["qd"], x["tau"], cotangent=x["b"], out=out)
+
+            return ours().time(pull, out)
+
+        yield f"{name} forward_dynamics", lambda ours=ours, n=n: ours().time(forward, ours().out(n))
+        yield f"{name} forward_dynamics_derivatives", dense
+        yield f"{name} forward_dynamics_vjp", product
+
+
+def inverse(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], float]]]:
+    for name in ("panda", "go2", "g1"):
+        scene = robots.scene(name)
+
+        def whole(scene: spo.Scene = scene) -> float:
+            ours = Ours(scene, worlds, device)
+            return ours.time(
+                lambda dyn, x, out: dyn.mass_matrix_inverse(x["q"], out=out), ours.out(*[scene.dof_count] * 2)
+            )
+
+        yield f"{name} mass_matrix_inverse", whole
+
+
+def operational(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], float]]]:
+    scene = robots.scene("g1")
+    feet = [label for label in scene.body_labels if label.endswith("ankle_roll_link")]
+
+    def ours() -> float:
+        one = Ours(scene, worlds, device)
+        return one.time(
+            lambda dyn, x, out: dyn.operational_inertia_inverse(x["q"], feet, out=out), one.out(12, 12)
+        )
+
+    def mujoco() -> float:
+        from .peers.coordinates import States
+        from .peers.lumped import lump
+        from .peers.mujoco_gpu import MujocoWarp
+
+        peer = MujocoWarp(lump(scene), device, "float32")
+        states = States(peer.coordinates, [Inputs(scene, worlds, seed) for seed in range(SETS)], "float32")
+        peer.prepare("forward_dynamics", "", states, worlds)
+        mjw, m, d, nv = peer.mjw, peer.model, peer.data, peer.host.nv
+        bodies = [body for body in range(peer.host.nbody) if "ankle_roll" in peer.host.body(body).name]
+        assert len(bodies) == 2, "two feet"
+        J = [[wp.zeros((worlds, 3, nv), dtype=wp.float32, device=device) for _ in range(2)] for _ in bodies]
+        x = wp.empty((worlds, nv), dtype=wp.float32, device=device)
+        columns = [part[:, row].contiguous() for pair in J for part in pair for row in range(3)]
+        points = [wp.zeros(worlds, dtype=wp.vec3, device=device) for _ in bodies]
+        which = [wp.full(worlds, body, dtype=int, device=device) for body in bodies]
+
+        def run(index: int) -> None:
+            d.qpos = peer.sets[index]["q"]
+            mjw.kinematics(m, d)
+            mjw.com_pos(m, d)
+            mjw.crb(m, d)
+            mjw.factor_m(m, d)
+            for (jacp, jacr), point, body in zip(J, points, which, strict=True):
+                mjw.jac(m, d, jacp, jacr, point, body)
+            for column in columns:
+                mjw.solve_m(m, d, x, column)
+
+        with wp.ScopedDevice(device):
+            return timed(run, device)
+
+    yield "g1 operational_inertia_inverse of two feet", ours
+    yield "g1 mujoco_warp kinematics, com_pos, crb, factor_m, 2 jac, 12 solve_m", mujoco
+
+
+def loops(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], float]]]:
+    from warp_spo.examples.biped import scene as biped
+
+    def ours(how: str) -> float:
+        one = Ours(biped(), worlds, device, loops=how, granularity="tree")
+        q = one.dyn.project(np.tile(one.scene.neutral_q, (worlds, 1))) if how == "embed" else one.sets[0]["q"]
+        q = wp.array(q, dtype=wp.float32, device=device) if isinstance(q, np.ndarray) else q
+        for each in one.sets:
+            each["q"] = q
+        return one.time(forward, one.out(one.scene.dof_count))
+
+    yield "biped forward_dynamics, loops cut", lambda: ours("cut")
+    yield "biped forward_dynamics, loops embedded", lambda: ours("embed")
+
+
+GROUPS = dict(steps=steps, derivatives=derivatives, inverse=inverse, operational=operational, loops=loops)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="benchmarks.capabilities", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("pattern", nargs="?", default="", help="regular expression on 'group name'")
+    parser.add_argument("--device", help="Warp device, default: the current one")
+    parser.add_argument("--worlds", nargs="+", type=int, default=[4096, 65536])
+    parser.add_argument("--json", type=Path, help="write the rows there")
+    options = parser.parse_args(arguments)
+    device, rows, failed = wp.get_device(options.device), [], 0
+    for group, cases in GROUPS.items():
+        for worlds in options.worlds:
+            for name, measure in cases(worlds, device):
+                if not re.search(options.pattern, f"{group} {name}"):
+                    continue
+                row: dict[str, Any] = dict(group=group, name=name, worlds=worlds)
+                try:
+                    row["us"] = measure()
+                    text = f"{row['us']:.4g} us, {worlds / row['us']:.4g} 10^6/s"
+                except Exception as error:  # the others go on
+                    row["skipped"] = f"{type(error).__name__}: {error}"
+                    text, failed = f"skipped: {row['skipped'][:300]}", failed + 1
+                print(f"{group} {name}, {worlds} worlds: {text}", flush=True)
+                rows.append(row)
+                if options.json:
+                    runner.save(runner.record(rows, options.device), options.json)
+    return 0 if failed < len(rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
