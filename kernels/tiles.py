@@ -10,37 +10,37 @@ import warp as wp
 
 from .straight import C_TYPE, TILE
 
-LOAD = """\
-struct alignas(16) Part { %(c)s x[16 / sizeof(%(c)s)]; };
+TYPES = """\
+struct alignas(16) Part { %(c)s x[16 / sizeof(%(c)s)]; };  // read at once
 struct Tile { Part part[%(tile)d * sizeof(%(c)s) / 16]; };
-const Tile* of_a = (const Tile*)a.data + (long long)tile * a.shape[1];
 """
 SPREAD = """\
 Tile v = {};
-if (slot >= 0) v = of_a[slot];
+if (slot >= 0) v = ((const Tile*)a.data)[(long long)tile * a.shape[1] + slot];
 const int first = tile * %(tile)d, count = out.shape[0] - first < %(tile)d ? out.shape[0] - first : %(tile)d;
 %(c)s* to = out.data + (long long)first * out.shape[1] + e;
 for (int u = 0; u < %(tile)d; ++u) if (u < count) to[(long long)u * out.shape[1]] = v.part[u / WIDE].x[u %% WIDE];
 """
 MULTIPLY = """\
+const int n = a.shape[1], first = tile * %(tile)d;
+const int count = a.shape[0] - first < %(tile)d ? a.shape[0] - first : %(tile)d;
+const %(c)s* rows = a.data + ((long long)first * n + row) * n;
 const Tile* of_b = (const Tile*)b.data + (long long)tile * b.shape[1];
-const int n = a_place.shape[0];
 %(c)s q_sum[%(tile)d] = {}, qd_sum[%(tile)d] = {};
 for (int k = 0; k < n; ++k) {
-    const int weight = a_place.data[row * n + k];
     const int q_slot = b_place.data[k * n + column], qd_slot = b_place.data[(n + k) * n + column];
-    if (weight < 0) continue;
-    const Tile w = of_a[weight];
+    if (q_slot < 0 && qd_slot < 0) continue;
+    %(c)s w[%(tile)d];
+    for (int u = 0; u < %(tile)d; ++u) w[u] = u < count ? rows[(long long)u * n * n + k] : 0;
     if (q_slot >= 0) {
         const Tile v = of_b[q_slot];
-        for (int u = 0; u < %(tile)d; ++u) q_sum[u] -= w.part[u / WIDE].x[u %% WIDE] * v.part[u / WIDE].x[u %% WIDE];
+        for (int u = 0; u < %(tile)d; ++u) q_sum[u] -= w[u] * v.part[u / WIDE].x[u %% WIDE];
     }
     if (qd_slot >= 0) {
         const Tile v = of_b[qd_slot];
-        for (int u = 0; u < %(tile)d; ++u) qd_sum[u] -= w.part[u / WIDE].x[u %% WIDE] * v.part[u / WIDE].x[u %% WIDE];
+        for (int u = 0; u < %(tile)d; ++u) qd_sum[u] -= w[u] * v.part[u / WIDE].x[u %% WIDE];
     }
 }
-const int first = tile * %(tile)d, count = worlds - first < %(tile)d ? worlds - first : %(tile)d;
 for (int u = 0; u < count; ++u) {
     const long long at = ((long long)(first + u) * n + row) * n + column;
     q_out.data[at] = q_sum[u];
@@ -51,7 +51,7 @@ for (int u = 0; u < count; ++u) {
 
 def _code(text: str, T) -> str:
     wide = f"#define WIDE (16 / (int)sizeof({C_TYPE[T]}))\n"
-    return wide + (LOAD + text) % {"c": C_TYPE[T], "tile": TILE} + "#undef WIDE\n"
+    return wide + (TYPES + text) % {"c": C_TYPE[T], "tile": TILE} + "#undef WIDE\n"
 
 
 @functools.cache
@@ -71,16 +71,14 @@ def spread(T) -> wp.Kernel:
 
 @functools.cache
 def product(T) -> wp.Kernel:
-    """q_out, qd_out = -A B for the two blocks of B, [dof, dof] each; one thread for each (tile, row, column)."""
+    """q_out, qd_out = -A B for two blocks of B in tiles, [dof, dof] each; one thread for each (tile, row, column)."""
 
     @wp.func_native(_code(MULTIPLY, T))
     def multiply(
         tile: int,
         row: int,
         column: int,
-        worlds: int,
         a: wp.array3d[T],
-        a_place: wp.array2d[int],
         b: wp.array3d[T],
         b_place: wp.array3d[int],
         q_out: wp.array3d[T],
@@ -90,14 +88,13 @@ def product(T) -> wp.Kernel:
     @wp.kernel(module=f"warp_spo_tiles_{T.__name__}", enable_backward=False)
     def kernel(
         a: wp.array3d[T],
-        a_place: wp.array2d[int],
         b: wp.array3d[T],
         b_place: wp.array3d[int],
         q_out: wp.array3d[T],
         qd_out: wp.array3d[T],
     ):
         tile, row, column = wp.tid()
-        multiply(tile, row, column, q_out.shape[0], a, a_place, b, b_place, q_out, qd_out)
+        multiply(tile, row, column, a, b, b_place, q_out, qd_out)
 
     return kernel
 

@@ -1,6 +1,8 @@
 """Analytic derivatives of the dynamics against Pinocchio's, and against central differences of the dense reference."""
 
 import functools
+import sys
+from pathlib import Path
 
 import laws
 import numpy as np
@@ -17,6 +19,9 @@ from warp_spo.plan import MOST_DOFS
 from warp_spo.recursions import sensitivity
 from warp_spo.recursions.derivatives import Derivatives
 from warp_spo.reference import Dense
+
+sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
+from benchmarks import cases
 
 STEP = 1e-5
 DIFFERENCES = 1e-6  # relative: eps / h + h^2; the issue's bound, measured 4e-9
@@ -225,6 +230,42 @@ def test_forward_dynamics_by_minus_the_inverse(name):
             assert laws.error(-np.linalg.solve(got[2, w], ours), theirs) <= SAME_NUMBERS
 
 
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_products(dtype, device):
+    """J* y and J x against the dense J; written entirely, no allocation, NaN stays at home."""
+    scene = zoo.varied(zoo.fork(), WORLDS)
+    dyn = spo.Dynamics(scene, WORLDS, device=device, dtype=dtype)
+    a = laws.states(scene, WORLDS, dtype=dtype)
+    x = [a["b"][..., i].copy() for i in range(3)]
+    y = a["qdd"] - a["tau"]
+    tolerance = 1e-11 if dtype == "float64" else FLOAT32
+    on = laws.to_device(dyn, a | {"y": y} | {f"x{i}": rate for i, rate in enumerate(x)})
+    for name, third in (("inverse_dynamics", "qdd"), ("forward_dynamics", "tau")):
+        J = numbers(call(dyn, f"{name}_derivatives", on))
+        state = on["q"], on["qd"], on[third], on["body_f"]
+        wrt = ("tangent", "qd", third)
+        vjp = getattr(dyn, f"{name}_vjp")
+        got = vjp(*state, cotangent=on["y"], wrt=wrt)
+        for block, key in zip(J, wrt, strict=True):
+            assert laws.error(got[key].numpy(), np.einsum("wij,wi->wj", block, y)) <= tolerance, (name, key)
+        out = {key: wp.full(got[key].shape, float("nan"), dtype=dyn.dtype, device=device) for key in wrt}
+        with no_warp_allocation():
+            assert vjp(*state, cotangent=on["y"], wrt=wrt, out=out)["qd"] is out["qd"]
+        for key in wrt:
+            np.testing.assert_array_equal(out[key].numpy(), got[key].numpy())
+        spoiled = a["q"].copy()
+        spoiled[3] = np.nan
+        bad = vjp(spoiled, *(v.numpy() for v in state[1:]), cotangent=y, wrt=wrt)
+        for key in wrt:
+            np.testing.assert_array_equal(np.delete(bad[key], 3, 0), np.delete(got[key].numpy(), 3, 0))
+            assert np.isnan(bad[key][3]).any()
+        rates = {"dq": on["x0"], "dqd": on["x1"], f"d{third}": on["x2"]}
+        moved = getattr(dyn, f"{name}_jvp")(*state, **rates).numpy()
+        assert laws.error(moved, sum(np.einsum("wij,wj->wi", J[i], x[i]) for i in range(3))) <= tolerance
+    with pytest.raises(ValueError, match=r"dbody_f is given and body_f is None; expected both"):
+        dyn.forward_dynamics_jvp(on["q"], dbody_f=on["body_f"])
+
+
 def test_far_from_the_origin_and_fast():
     """10 km away and at 1 km/s, float32 keeps its digits: neither enters, to the bit."""
     scene = scene_of("fork")
@@ -255,6 +296,31 @@ def test_no_world_too_many_dofs_and_none(device):
     assert still.mass_matrix_derivative(nothing).shape == (2, 0, 0, 0)
     with pytest.raises(TypeError, match=r"expected three arrays or None, \(q, qd, tau\)"):
         still.forward_dynamics_derivatives(nothing, out=nothing)
+
+
+# -- operations --------------------------------------------------------------------------------------------------------
+PINNED = {"arm7": (2522, 1456, 1814), "quadruped": (10155, 7857, 6864), "humanoid": (22824, 26883, 12968)}
+"""Scene of the benchmarks -> operations of a world: derivatives of inverse dynamics, of Mass; J* y of forward dynamics.
+
+The last is 1.2 to 1.7 times forward dynamics.
+"""
+
+
+@pytest.mark.parametrize("name", PINNED)
+def test_operations_are_no_more_than_they_were(name):
+    scene = cases.SCENES[name]()
+    find = spo.Dynamics(scene, 1, device="cpu", granularity="tree").programs.find
+    q, rate, n = (1, scene.coord_count), (1, scene.dof_count), scene.dof_count
+    state = {"q": q, "qd": rate, "qdd": rate}
+    bars = {"qd_bar": rate, "tau_bar": rate}
+    found = (
+        find("inverse_dynamics_derivatives", state, (1, 3, n, n)),
+        find("mass_matrix_derivative", {"q": q}, (1, n, n, n)),
+        find("forward_dynamics_vjp", {**state, "cotangent": rate}, q, bars, wrt=("q", "qd", "tau")),
+    )
+    counts = tuple(program.operations for program in found)
+    assert all(a <= b for a, b in zip(counts, PINNED[name], strict=True)), counts
+    assert sum(counts) >= 0.97 * sum(PINNED[name]), f"fewer than pinned: write down {counts}"
 
 
 # -- planted bugs ------------------------------------------------------------------------------------------------------

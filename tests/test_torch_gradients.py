@@ -201,6 +201,26 @@ def test_masses_are_found_again(device):
     assert errors[-1] < 1e-2 * errors[0]
 
 
+@pytest.mark.parametrize("operation", ["forward_dynamics", "step", "integrate", "solve_mass_matrix"])
+def test_under_compile(operation, device):
+    """As a custom op in one graph: the same gradients, to the bit."""
+    scene = zoo.fork()
+    dyn = spo.Dynamics(scene, WORLDS, device=device, dtype="float64", granularity="tree")
+    options = {"dt": DT} if operation in ("step", "integrate") else {}
+    op = spo_torch.custom_op(dyn, operation, **options)
+    tensors = on(dyn, laws.states(scene, WORLDS), *OPERATIONS[operation][:3])
+
+    def squares(function, *args):
+        results = function(*args)
+        return sum((y * y).sum() for y in (results if isinstance(results, tuple) else (results,)))
+
+    wanted = torch.autograd.grad(squares(functools.partial(called, dyn, operation), *tensors), tensors)
+    for backend in ("eager", "aot_eager"):
+        compiled = torch.compile(functools.partial(squares, op), backend=backend, fullgraph=True)
+        for got, right in zip(torch.autograd.grad(compiled(*tensors), tensors), wanted, strict=True):
+            assert torch.equal(got, right)
+
+
 # -- what is refused ---------------------------------------------------------------------------------------------------
 def test_a_second_backward_pass_is_explained(tree):
     dyn, a = tree

@@ -206,6 +206,15 @@ class Adjoints:
         """Names of the variable values by which results can be differentiated."""
         return tuple(name for name in ENTERING["step"] if name in self.variable)
 
+    def result_shapes(self, operation: str) -> tuple[tuple[int, ...], ...]:
+        """Shapes of what an operation gives, and of what its way back needs besides."""
+        scene, worlds = self.scene, self.worlds
+        q, rate = (worlds, scene.coord_count), (worlds, scene.dof_count)
+        shapes = {"body_poses": (worlds, scene.body_count, 7), "body_velocities": (worlds, scene.body_count, 6)}
+        if operation == "step":
+            return q, rate, rate
+        return (q if operation == "integrate" else shapes.get(operation, rate),)
+
     def entering(self, operation: str) -> tuple[str, ...]:
         """Names of the values that enter an operation."""
         return ENTERING.get(operation, LINK_VALUES)

@@ -92,13 +92,11 @@ class Derivatives:
             qdd = self._accelerations(None, arrays)
             arrays = {"q": arrays["q"], "qd": arrays["qd"], "qdd": qdd, "body_f": arrays["body_f"]}
             program, rates = self._tiled("inverse_dynamics_derivatives", (3, *self._square), **arrays)
-            inverse, weights = self._tiled("tiled_mass_matrix_inverse", self._square, q=arrays["q"])
-            if self.scene.dof_count:
-                n = self.scene.dof_count
-                places = inverse.entry.reshape((n, n)), program.entry.reshape((3, n, n))
-                inputs = [weights, places[0], rates, places[1]]
-                self.recursions.launch(tiles.product, (len(weights), n, n), inputs, list(outs[:2]))
-            self._spread(inverse, weights, 0, outs[2])
+            n, (by_q, by_qd, inverse) = self.scene.dof_count, outs
+            if n:
+                self._run("mass_matrix_inverse", inverse, q=arrays["q"])
+                inputs = [inverse, rates, program.entry.reshape((3, n, n))]
+                self.recursions.launch(tiles.product, (len(rates), n, n), inputs, [by_q, by_qd])
         return ForwardDynamicsDerivatives(*call.result)
 
     def mass_matrix_derivative(self, q: Any, out: Any = None) -> Any:
@@ -163,5 +161,6 @@ class Derivatives:
     _read_state: Any
     _read_rate: Any
     _read_body_f: Any
+    _run: Any
     _accelerations: Any
     _check_size: Any

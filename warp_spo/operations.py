@@ -12,8 +12,11 @@ from typing import Any
 import numpy as np
 
 from .parts import SCREWS
+from .recursions.adjoints import Adjoints
+from .recursions.links import Links
 from .reference import Dense
 from .scene import Scene
+from .trace.evaluate import evaluate
 
 DT = 0.01  # time step of integrate [s]
 FRAME_POSE = (0.1, -0.05, 0.2, 0.0, 0.0, 0.0, 1.0)  # of the second of the two frames, in its body [m]
@@ -286,6 +289,49 @@ def _hybrid(subject: Any, q: Any, qd: Any, tau: Any, qdd: Any, out: Any) -> None
     dyn.hybrid_dynamics(q, qd, tau, qdd, prescribed=every_other(dyn.scene), out=(out, forces))
 
 
+def _inverse_derivatives(dense: Dense, qd: np.ndarray, qdd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """d tau / d q along tangent coordinates and d tau / d qd: Newton-Euler's trace differentiated step by step.
+
+    Not the recursion that the operation runs, which takes the dense reference too long to difference.
+    """
+    scene, n = dense.scene, dense.scene.dof_count
+    one = scene.with_values(**{name: value[dense.world : dense.world + 1] for name, value in scene.values.items()
+                               if value.shape[0] > 1})  # fmt: skip
+    arrays = {"q": dense.q, "qd": qd, "qdd": qdd}
+    directions = {"q_dot": np.eye(2 * n, n), "qd_dot": np.eye(2 * n, n, -n)}  # [direction, dof]
+    stores = Adjoints(Links(one), "float64", (*arrays, *directions)).inverse_dynamics_jvp()
+    values = evaluate(
+        [item.value for item in stores],
+        lambda name, at: directions[name][:, at[0]] if name in directions else float(arrays[name][at[0]]),
+    )
+    J = np.zeros((n, 2 * n))
+    for item, value in zip(stores, values, strict=True):
+        J[item.index[0]] = value
+    return J[:, :n], J[:, n:]
+
+
+def _forward_derivative(dense: Dense, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
+    by_q, _ = _inverse_derivatives(dense, qd, dense.forward_dynamics(qd, tau))
+    return -np.linalg.solve(dense.mass_matrix, by_q)
+
+
+def _derivatives(name: str) -> Callable[..., None]:
+    """Call an operation with three results, of which the one by q is looked at."""
+
+    def call(subject: Any, *inputs: Any, out: Any) -> None:
+        dyn = subject.dyn
+        others = (dyn.recursions.array(f"trial of {name} {i}", *out.shape) for i in range(2))
+        getattr(dyn, name)(*inputs, out=(out, *others))
+
+    return call
+
+
+def _pulled_back(subject: Any, q: Any, qd: Any, tau: Any, b: Any, out: Any) -> None:
+    dyn = subject.dyn
+    others = {name: dyn.recursions.array(f"trial of vjp {name}", *tau.shape) for name in ("qd", "tau")}
+    dyn.forward_dynamics_vjp(q, qd, tau, cotangent=b, wrt=("tangent", *others), out={"tangent": out, **others})
+
+
 _APPLICATIONS = (
     Operation(
         "hybrid_dynamics",
@@ -310,6 +356,27 @@ _APPLICATIONS = (
     ),
     _method("centroidal_momentum_bias", "q qd", lambda scene: (6,), lambda d, q, qd: d.centroidal_momentum_bias(qd)),
     _method("quasi_velocities", "q qd", _dof, lambda d, q, qd: d.quasi_velocities(qd)),
+    Operation(
+        "inverse_dynamics_derivatives",
+        ("q", "qd", "qdd"),
+        _square,
+        _derivatives("inverse_dynamics_derivatives"),
+        lambda d, q, qd, qdd: _inverse_derivatives(d, qd, qdd)[0],
+    ),
+    Operation(
+        "forward_dynamics_derivatives",
+        ("q", "qd", "tau"),
+        _square,
+        _derivatives("forward_dynamics_derivatives"),
+        _forward_derivative,
+    ),
+    Operation(
+        "forward_dynamics_vjp",
+        ("q", "qd", "tau", "b"),
+        _dof,
+        _pulled_back,
+        lambda d, q, qd, tau, b: _forward_derivative(d, q, qd, tau).T @ b,
+    ),
     _method("fixman_torque", "q", _dof, lambda d, q: d.fixman_torque, scale=lambda d, e: max(1.0, np.linalg.norm(e))),
 )
 APPLICATIONS = {operation.name: operation for operation in _APPLICATIONS}

@@ -37,7 +37,6 @@ TREE_ONLY = (
     "mass_matrix_packed",
     "inverse_dynamics_derivatives",
     "mass_matrix_derivative",
-    "tiled_mass_matrix_inverse",
     "forward_dynamics_vjp",
     "inverse_dynamics_vjp",
     "solve_mass_matrix_vjp",

@@ -43,7 +43,7 @@ TRACED = (
     "expression",
     *TREE_ONLY,
 )
-TILES = ("tiled_mass_matrix_inverse", "inverse_dynamics_derivatives", "mass_matrix_derivative")
+TILES = ("inverse_dynamics_derivatives", "mass_matrix_derivative")
 """Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
 TILED_SLOTS = 256  # different values of a result from which they go through memory, not through shared memory,

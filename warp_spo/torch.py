@@ -1,11 +1,15 @@
 """torch at the border: what :mod:`warp_spo.arrays` asks of tensors. The only file besides env.py that imports torch."""
 
 import functools
+import inspect
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 import warp as wp
+
+from .adjoints import ARGUMENTS
 
 _DTYPES: dict[Any, torch.dtype] = {
     wp.float32: torch.float32,
@@ -223,3 +227,88 @@ class Module(torch.nn.Module):
     body_poses = functools.partialmethod(_called, "body_poses")
     body_velocities = functools.partialmethod(_called, "body_velocities")
     integrate = functools.partialmethod(_called, "integrate")
+
+
+_made = itertools.count()
+
+
+def custom_op(dyn: Any, operation: str, **options: Any) -> Any:
+    """An operation of ``dyn`` as a custom op of torch: ``torch.compile`` keeps it in its graph, gradients included.
+
+    ::
+
+        step = custom_op(dyn, "step", dt=2e-3)
+
+        @torch.compile(fullgraph=True)
+        def loss(q, qd, tau): ...  step(q, qd, tau) ...
+
+    Args:
+        operation: one that has gradients. options: its arguments that are no tensors.
+
+    Returns:
+        A function of the operation's tensors, by position or by name, [world, ...].
+
+    Raises:
+        ValueError: another operation.
+        RuntimeError: when called, if a value of ``dyn`` is set to a tensor that requires grad: it is no input here.
+    """
+    if operation not in ARGUMENTS:
+        raise ValueError(f"custom_op: operation is {operation!r}; expected one of {', '.join(ARGUMENTS)}")
+    by, method = ARGUMENTS[operation], inspect.unwrap(getattr(type(dyn), operation))
+    name = f"warp_spo::{operation}_{next(_made)}"
+
+    def plain(names: str) -> _Plain:
+        if dyn.values.tensors:
+            raise RuntimeError(
+                f"custom_op({operation!r}): {', '.join(dyn.values.tensors)} was set to a tensor that requires grad; "
+                f"expected detached values; call Dynamics.{operation} itself to go back to them"
+            )
+        return _Plain(dyn, operation, method, options, tuple(names.split()), ())
+
+    def forward(names: str, tensors: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+        return list(plain(names).run(tensors)[1])
+
+    def backward(names: str, wanted: str, tensors: Any, kept: Any, cotangents: Any) -> list[torch.Tensor]:
+        found = plain(names).gradients(wanted.split(), tensors, tuple(kept), tuple(c.contiguous() for c in cotangents))
+        return [found[name] for name in wanted.split()]
+
+    ahead = torch.library.custom_op(name, forward, mutates_args=(), schema="(str names, Tensor[] tensors) -> Tensor[]")
+    back = torch.library.custom_op(
+        f"{name}_backward", backward, mutates_args=(),
+        schema="(str names, str wanted, Tensor[] tensors, Tensor[] kept, Tensor[] cotangents) -> Tensor[]",
+    )  # fmt: skip
+    shapes = dyn.result_shapes(operation)
+    results = 2 if operation == "step" else 1  # what comes after them serves the way back
+
+    @ahead.register_fake
+    def _(names: str, tensors: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+        if operation == "solve_mass_matrix":
+            return [torch.empty_like(tensors[1])]
+        return [tensors[0].new_empty(shape) for shape in shapes]
+
+    @back.register_fake
+    def _(names: str, wanted: str, tensors: Any, kept: Any, cotangents: Any) -> list[torch.Tensor]:
+        given = dict(zip(names.split(), tensors, strict=True))
+        return [torch.empty_like(given[name]) for name in wanted.split()]
+
+    def setup(ctx: Any, inputs: tuple, output: list[torch.Tensor]) -> None:
+        ctx.names, tensors = inputs
+        ctx.count = len(tensors)
+        ctx.wanted = [x.requires_grad for x in tensors]
+        ctx.save_for_backward(*tensors, *output)
+
+    def pulled(ctx: Any, cotangents: Sequence[torch.Tensor]) -> tuple:
+        tensors, kept = ctx.saved_tensors[: ctx.count], ctx.saved_tensors[ctx.count :]
+        names = [name for name, wanted in zip(ctx.names.split(), ctx.wanted, strict=True) if wanted]
+        found = back(ctx.names, " ".join(names), list(tensors), list(kept), list(cotangents[:results]))
+        rest = iter(found)
+        return None, [next(rest) if wanted else None for wanted in ctx.wanted]
+
+    ahead.register_autograd(pulled, setup_context=setup)
+
+    def call(*args: Any, **more: Any) -> Any:
+        given = {n: x for n, x in (*zip(by, args, strict=False), *more.items()) if x is not None}
+        found = ahead(" ".join(given), list(given.values()))
+        return tuple(found[:results]) if results > 1 else found[0]
+
+    return call

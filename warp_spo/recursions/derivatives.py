@@ -114,10 +114,6 @@ class Derivatives(Applications):
                         stores.append(Store("out", (block, dof, j), row.at(other)))
         return stores
 
-    def tiled_mass_matrix_inverse(self) -> list[Store]:
-        """out = Mass^-1; by another name, because its kernel leaves the result otherwise"""
-        return self.mass_matrix_inverse()
-
     def mass_matrix_derivative(self) -> list[Store]:
         """out [dof, dof, dof] = d Mass / d q along the tangent coordinates, the last index the coordinate.
 
