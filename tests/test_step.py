@@ -324,6 +324,22 @@ def test_status_words(device, monkeypatch):
     assert status.tolist() == [0, 1, 2, 0]
 
 
+def test_further_results_are_asked_for_one_by_one(device):
+    """qdd alone, status alone, both, neither: each its own kernel, and the same step."""
+    scene = furnished(zoo.fork())
+    dyn, a = spo.Dynamics(scene, 2, device=device, dtype="float64"), states(scene, 2)
+    plain = dyn.step(a["q"], a["qd"], a["tau"], H)
+    for asked in (("status",), ("qdd",), ("qdd", "status")):
+        given = {"status": np.full(2, -1, np.int32), "qdd": np.full(a["qd"].shape, np.nan)}
+        given = {name: given[name] for name in asked}
+        for x, y in zip(dyn.step(a["q"], a["qd"], a["tau"], H, **given), plain, strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-14)
+        if "status" in asked:
+            assert not given["status"].any()
+        if "qdd" in asked:
+            np.testing.assert_allclose(a["qd"] + H * given["qdd"], plain[1], atol=1e-13)
+
+
 def test_mistakes_are_explained(device):
     dyn = spo.Dynamics(zoo.fork(), 2, device=device)
     a = states(dyn.scene, 2)

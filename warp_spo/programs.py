@@ -104,7 +104,7 @@ class Programs:
             return None
         if operation == "solve_mass_matrix" and len(out) > 2:
             return None
-        key = operation, tuple(shapes), out[1:], *options.values()
+        key = operation, (*shapes, *(more or ())), out[1:], *options.values()
         if key not in self._programs:
             lists = sum(1 for other in self._programs if other[0] == operation)
             most = EXPRESSIONS if operation == "expression" else FRAME_LISTS
