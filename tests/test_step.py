@@ -287,6 +287,22 @@ def test_in_place_and_without_allocation(device):
         dyn.step(on["q"], on["qd"], on["tau"], H, out=(out[0], on["tau"]))
 
 
+def test_a_step_in_place_reads_its_state_once(device, monkeypatch):
+    """No second try for far angles after the state has been written over: they are looked at first."""
+    texts, kernel = [], straight.kernel
+    monkeypatch.setattr(straight, "kernel", lambda name, text, *more: texts.append(text) or kernel(name, text, *more))
+    scene = zoo.chain(3)
+    scene = scene.with_values(joint_stiffness=np.zeros(3))
+    dyn = spo.Dynamics(scene, 2, device=device, dtype="float64")
+    a = laws.states(scene, 2)
+    q = a["q"] + 2.0 * np.pi * 2.0**40
+    on = [wp.array(x, dtype=wp.float64, device=device) for x in (q, a["qd"])]
+    dyn.step(*on, None, H, out=tuple(on))
+    near = dyn.step(np.remainder(q, 2.0 * np.pi), a["qd"], None, H)
+    np.testing.assert_allclose(on[1].numpy(), near[1], atol=1e-3)  # what 2^40 turns leave of an angle
+    assert len(texts) == 1 and "reach()" in texts[0] and "again" not in texts[0]
+
+
 def test_values_that_are_variable_or_differ_between_worlds(device):
     """As inputs they do what they do folded."""
     names = ("damping", "stiffness", "friction", "target_ke", "target_kd", "armature")

@@ -165,8 +165,8 @@ class Programs:
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         frame = self._frame([item for item in stores if item.array == "out"], shapes, 0, 1, self.block, stores)
-        alone = not any(item.array in LOOPED for item in stores)
-        frame = frame._replace(again=alone and not frame.staged and frame.result.way == DIRECT)
+        once = operation == "step"  # may write over what it reads
+        frame = frame._replace(again=not once and not frame.staged and frame.result.way == DIRECT)
         frame = frame._replace(more=tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more))
         placed, table = _placed([item for item in stores if item.array == "out"], frame.result)
         placed += apart
