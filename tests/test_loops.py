@@ -419,6 +419,24 @@ def test_change_points_have_a_word(device):
     assert np.isnan(dyn.forward_dynamics(q, None, np.full((3, 3), np.nan))).all()
 
 
+def test_loops_that_move_no_inertia_are_lost(device):
+    """Bars without mass in one world: NaN and word 1 there; armature of the crank alone mends it."""
+    scene = MECHANISMS["fourbar"]()
+    masses = np.stack([np.ones(3), np.zeros(3), np.zeros(3)])
+    armature = np.zeros((3, 3))
+    armature[2, 0] = 0.1
+    values = dict(body_mass=masses, body_inertia=masses[..., None, None] * 0.01 * np.eye(3), joint_armature=armature)
+    scene = scene.with_values(**values)
+    q = np.tile(mechanisms.states(MECHANISMS["fourbar"](), 1).q, (3, 1))
+    dyn = spo.Dynamics(scene, 3, device=device, dtype="float64", loops="embed")
+    status, tau = np.full(3, -1, dtype=np.int32), np.ones((3, 3))
+    qdd = dyn.forward_dynamics(q, None, tau, status=status)
+    np.testing.assert_array_equal(status, [0, 1, 0])
+    assert np.isnan(qdd[1]).all() and np.isfinite(qdd[[0, 2]]).all()
+    X = Closed(scene, q[2]).columns(dyn.independent_dofs)[:, 0]
+    np.testing.assert_allclose(qdd[2, 0], X.sum() / 0.1, rtol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["tilted", "far_loop"])
 def test_project_closes(name, device):
     """Quadratically, for both kinds; velocities keep what the closures allow; held dofs stay."""

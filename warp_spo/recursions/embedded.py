@@ -103,7 +103,7 @@ class Embedded(Applications):
 
     # -- forward dynamics ------------------------------------------------------------------------------------------
     def embedded_forward_dynamics(self, how: Embedding, status: bool = False) -> list[Store]:
-        """out = qdd [dof]; with ``status`` also margin [1], see :class:`.nullspace.NullSpace`."""
+        """out = qdd [dof]; with ``status`` also margin [row that counts], see :class:`.nullspace.NullSpace`."""
         swept = self.sweep(how, self.vector("tau"), "qd" in self.given, loads=True)
         qdd = self.outward_accelerations(swept, self.base)
         stores = [Store("out", (dof,), value) for dof, value in qdd.items()]
