@@ -35,8 +35,10 @@ OF_TREES = {
         "fixman_torque",
         "mass_matrix_packed",
         "operators",
+        "step",
+        "body_reactions",
     ),
-    "multipliers": ("hybrid_dynamics",),
+    "multipliers": ("hybrid_dynamics", "step", "body_reactions"),
 }
 """Operations that know nothing of closed loops."""
 

@@ -56,6 +56,7 @@ class Steps:
         * velocity limit: what exceeds it shrinks about a thousandfold in a step.
 
         Effort and velocity limits of 1e6 and more, Newton's default, bound nothing; position limits of 1e10 neither.
+        Loops that Dynamics closes raise UnsupportedError.
         What is zero or unbounded in the scene has no instruction in the kernel. The forces are implicit, at one
         addition to the mass matrix's diagonal: (Mass + dt R) qdd = tau - bias_force(q, qd) + F. Which parts of the
         laws hold is tried in passes, in one launch, until no force changes (16 at most).

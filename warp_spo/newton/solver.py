@@ -124,6 +124,9 @@ class SolverSPO(Plugs, SolverBase):
         variable = tuple(name for name in self._asked if name not in GAINS or (position | rate).any())
         W, device = scene.worlds, model.device
         self.dynamics = Dynamics(scene, W, device, "float32", variable, **self._options)
+        if self.dynamics.closed:
+            what = f"loops={self._options['loops']!r} of {len(scene.loops)} loop joint(s)"
+            raise UnsupportedError("SolverSPO", what, "loops='cut' leaves them open")
         declare(exchange, wp.float32)
         factor: Any = lambda mask: wp.array(mask, dtype=wp.float32, device=device)  # noqa: E731
         self._factors = {
