@@ -103,8 +103,13 @@ def start_rates(scene: spo.Scene, seed: int = 0) -> np.ndarray:
     return qd if scene.hinges[0].kind == "free" else 0.0 * qd
 
 
-def energies(scene: spo.Scene, q: np.ndarray, qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Kinetic energy, armature included, and that of gravity, springs and passed limits, at states [n, ...] [J]."""
+def energies(
+    scene: spo.Scene, q: np.ndarray, qd: np.ndarray, limits: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
+    """Kinetic energy, armature included, and that of gravity, springs and passed limits, at states [n, ...] [J].
+
+    ``limits``: they are springs; SolverSteel has none unless asked.
+    """
     dyn = spo.Dynamics(scene, len(q), "cpu", "float64")
     poses, rates = dyn.body_poses(q), dyn.body_velocities(q, qd)
     values = {name: array[0] for name, array in scene.values.items()}
@@ -126,7 +131,7 @@ def energies(scene: spo.Scene, q: np.ndarray, qd: np.ndarray) -> tuple[np.ndarra
         outside = np.maximum(values["joint_limit_lower"][dof] - at, 0.0)
         outside = outside + np.maximum(at - values["joint_limit_upper"][dof], 0.0)
         stretch = at - values["joint_rest_q"][coordinate]
-        potential += 0.5 * values["joint_limit_ke"][dof] * outside**2
+        potential += 0.5 * limits * values["joint_limit_ke"][dof] * outside**2
         potential += 0.5 * values["joint_stiffness"][dof] * stretch**2
     return kinetic, potential
 
@@ -245,7 +250,7 @@ def row(name: str, seconds: float, peers: bool) -> dict[str, str]:
                 if done.diverged is not None:
                     said = f"diverges at {done.diverged:.3g} s"
                 elif done.finished:
-                    said = f"{100 * excess(*energies(scene, done.q, done.qd)):.3g} %"
+                    said = f"{100 * excess(*energies(scene, done.q, done.qd, other is SolverFeatherstone)):.3g} %"
                 cells[f"{other.__name__.removeprefix('Solver')}, {dt * 1e3:g} ms"] = said
     return cells
 

@@ -23,7 +23,7 @@ SHARED_BYTES = 46 * 1024  # that a block may declare: 48 KiB less what Warp take
 C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
 MASKS = ("prescribed",)  # arrays of booleans
 INTEGERS = ("place", "shifts", "status")  # arrays of whole numbers, one axis
-MOST_PASSES = 16  # of a loop; see CONTRIBUTING
+MOST_PASSES = 16  # of a loop; 13 were needed at most, see CONTRIBUTING
 IN_PLACE, STAGED, MAPPED, TILED, DIRECT = "in place", "staged", "mapped", "tiled", "direct"
 TILE = 8  # worlds of a tile: an entry of theirs fills a sector of 32 bytes
 

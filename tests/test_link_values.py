@@ -82,7 +82,7 @@ def test_values_are_rounded_once(device):
     for dtype in ("float64", "float32"):
         dyn = spo.Dynamics(scene, device=device, dtype=dtype, granularity="tree")
         find(dyn)
-        tables.append([dyn.programs.table(name).numpy() for name in ("value", "node_value")])
+        tables.append([dyn.programs.field(name).numpy() for name in ("value", "node_value")])
     for wide, narrow in zip(*tables, strict=True):
         np.testing.assert_array_equal(narrow, wide.astype(np.float32))
 

@@ -328,6 +328,17 @@ def test_masked_reset(turned):
         solver.reset(state, wp.zeros(2, dtype=wp.bool, device="cpu"))
 
 
+def test_reset_of_a_model_without_worlds():
+    """Its bodies belong to no world, and go with the last entry of a mask."""
+    model = wheel(JointTargetMode.NONE)
+    solver = SolverSPO(model)
+    for mask, after in (([True, False], 1.0), ([False, True], 0.0)):
+        state = model.state()
+        state.joint_q.fill_(1.0)
+        solver.reset(state, wp.array(mask, dtype=wp.bool, device="cpu"))
+        assert state.joint_q.numpy()[0] == after
+
+
 def test_a_nan_stays_in_its_world(turned):
     model, solver = turned
     clean = advance(solver, moving(model), 2)

@@ -16,6 +16,7 @@ from warp_spo.errors import UnsupportedError
 from warp_spo.kernels import straight
 from warp_spo.parts import SCREWS
 from warp_spo.recursions import impedance, integration, step
+from warp_spo.reference import Dense, rotation
 
 H = 2e-3
 TOLERANCE = {
@@ -286,6 +287,22 @@ def test_in_place_and_without_allocation(device):
         dyn.step(on["q"], on["qd"], on["tau"], H, out=(out[0], on["tau"]))
 
 
+def test_a_step_in_place_reads_its_state_once(device, monkeypatch):
+    """No second try for far angles after the state has been written over: they are looked at first."""
+    texts, kernel = [], straight.kernel
+    monkeypatch.setattr(straight, "kernel", lambda name, text, *more: texts.append(text) or kernel(name, text, *more))
+    scene = zoo.chain(3)
+    scene = scene.with_values(joint_stiffness=np.zeros(3))
+    dyn = spo.Dynamics(scene, 2, device=device, dtype="float64")
+    a = laws.states(scene, 2)
+    q = a["q"] + 2.0 * np.pi * 2.0**40
+    on = [wp.array(x, dtype=wp.float64, device=device) for x in (q, a["qd"])]
+    dyn.step(*on, None, H, out=tuple(on))
+    near = dyn.step(np.remainder(q, 2.0 * np.pi), a["qd"], None, H)
+    np.testing.assert_allclose(on[1].numpy(), near[1], atol=1e-3)  # what 2^40 turns leave of an angle
+    assert len(texts) == 1 and "reach()" in texts[0] and "again" not in texts[0]
+
+
 def test_values_that_are_variable_or_differ_between_worlds(device):
     """As inputs they do what they do folded."""
     names = ("damping", "stiffness", "friction", "target_ke", "target_kd", "armature")
@@ -321,6 +338,22 @@ def test_status_words(device, monkeypatch):
     dyn = spo.Dynamics(slider(friction=1.0), 4, device=device)
     dyn.step(q, qd, tau, h, status=status)
     assert status.tolist() == [0, 1, 2, 0]
+
+
+def test_further_results_are_asked_for_one_by_one(device):
+    """qdd alone, status alone, both, neither: each its own kernel, and the same step."""
+    scene = furnished(zoo.fork())
+    dyn, a = spo.Dynamics(scene, 2, device=device, dtype="float64"), states(scene, 2)
+    plain = dyn.step(a["q"], a["qd"], a["tau"], H)
+    for asked in (("status",), ("qdd",), ("qdd", "status")):
+        given = {"status": np.full(2, -1, np.int32), "qdd": np.full(a["qd"].shape, np.nan)}
+        given = {name: given[name] for name in asked}
+        for x, y in zip(dyn.step(a["q"], a["qd"], a["tau"], H, **given), plain, strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-14)
+        if "status" in asked:
+            assert not given["status"].any()
+        if "qdd" in asked:
+            np.testing.assert_allclose(a["qd"] + H * given["qdd"], plain[1], atol=1e-13)
 
 
 def test_mistakes_are_explained(device):
@@ -360,3 +393,40 @@ def test_a_kernel_reads_rows_through_shared_memory_too(device):
     a = states(scene, 3, "float32")
     for x, y in zip(dyn.step(a["q"], a["qd"], a["tau"], H), plain.step(a["q"], a["qd"], a["tau"], H), strict=True):
         np.testing.assert_array_equal(x, y)
+
+
+# -- what bodies feel --------------------------------------------------------------------------------------------------
+def fixed_and_floating():
+    """A body fixed to the world, one on a hinge on it, one fixed to that, and a floating body beside them."""
+    kinds = ["fixed", "revolute", "fixed", "free", "ball"]
+    return zoo.from_parents([-1, 0, 1, -1, 3], kinds, 8)
+
+
+@pytest.mark.parametrize("scene", [fixed_and_floating, zoo.forest, zoo.SCENES["tree10"]])
+def test_accelerations_and_reactions_of_bodies(scene):
+    """Accelerations are the rates of velocities; reactions, children's and body_f move every body as Newton says."""
+    scene = scene()
+    a = laws.states(scene, 2)
+    given, shape = ("q", "qd", "qdd"), {"out": (scene.body_count, 6)}
+    acceleration = np.nan_to_num(symbolic.run(scene, "body_accelerations", a, given, shape)["out"])
+    reaction = symbolic.run(scene, "body_reactions", a, (*given, "body_f"), shape)["out"]
+    for w in range(2):
+        q, qd, qdd, h = a["q"][w], a["qd"][w], a["qdd"][w], 1e-6
+        dense = Dense(scene, q, world=w)
+        ahead, behind = (
+            Dense(scene, dense.integrate(qd + 0.5 * s * h * qdd, s * h), world=w).body_velocities(qd + s * h * qdd)
+            for s in (1.0, -1.0)
+        )
+        np.testing.assert_allclose(acceleration[w], (ahead - behind) / (2.0 * h), atol=1e-7)
+        mass, com, inertia = (scene.values[f"body_{name}"][0] for name in ("mass", "com", "inertia"))
+        turn = [rotation(pose[3:]) for pose in dense.body_poses]
+        centre = [pose[:3] + R @ c for pose, R, c in zip(dense.body_poses, turn, com, strict=True)]
+        for k in range(scene.body_count):
+            I, spin = turn[k] @ inertia[k] @ turn[k].T, dense.body_velocities(qd)[k, 3:]
+            linear, angular = acceleration[w, k, :3], acceleration[w, k, 3:]
+            got = reaction[w, k] + a["body_f"][w, k]
+            for child in scene.tree.children[k]:
+                f = reaction[w, child]
+                got = got - f - np.concatenate([np.zeros(3), np.cross(centre[child] - centre[k], f[:3])])
+            wanted = [*(mass[k] * (linear - scene.values["gravity"][0])), *(I @ angular + np.cross(spin, I @ spin))]
+            np.testing.assert_allclose(got, wanted, atol=1e-9)

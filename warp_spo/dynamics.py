@@ -18,12 +18,12 @@ from . import nodes
 from . import plan as plans
 from . import status as words
 from .adjoints import Adjoints, differentiable
-from .applications import Applications
 from .arrays import Call, Values, parse_device, parse_dtype, recorded, shape_of
 from .derivatives import Derivatives
 from .errors import UnsupportedError
 from .frames import Frame, checked
 from .levels import Recursions
+from .loops import EMBEDDED, Loops
 from .parameters import RIGID_VALUES, VARIABLE
 from .programs import Programs
 from .refinement import Refinement
@@ -62,11 +62,14 @@ OPERATIONS = (
     "step",
     "body_accelerations",
     "body_reactions",
+    "closure_error",
+    "project",
+    "loop_multipliers",
 )
 LOOPS = ("raise", "cut", "embed", "multipliers")
 
 
-class Dynamics(Applications, Steps, Derivatives, Adjoints):
+class Dynamics(Loops, Steps, Derivatives, Adjoints):
     """Dynamics of one scene in many worlds.
 
     Arrays are torch tensors, Warp arrays or NumPy arrays, [world, ...] and C-contiguous; the kind of the first one is
@@ -81,7 +84,12 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
         dtype: "float32" or "float64".
         variable: names of values that :meth:`set` changes without rebuilding, one row a world.
         granularity: None (the plan chooses), "node", "segment" or "tree", see :class:`warp_spo.plan.Plan`.
-        loops: what to do with the scene's loop joints: "raise" or "cut", which leaves them open.
+        loops: what to do with the scene's loop joints and couplings. "raise": loop joints are refused. "cut": they stay
+            open. "embed": they hold, what they tie being one node of the tree; mass_matrix and its relatives are then
+            of :attr:`independent_dofs`. "multipliers": they hold by multipliers of the open tree in forward_dynamics;
+            mass_matrix, inverse_dynamics and the others remain the open tree's. "raise" and "cut" ignore couplings.
+        independent: with loops embedded, the dofs (indices or labels) that are to be :attr:`independent_dofs`, such as
+            those that have motors: as many as move, those that no loop ties among them. None: they are chosen.
         refine: steps of iterative refinement in forward_dynamics and solve_mass_matrix, which then solve in float32 and
             take the residual in float64. With dtype "float32" the result is right up to its rounding, where the
             condition of Mass is below 1e9 or so; with "float64" its error is that of float32 to the power refine + 1.
@@ -99,6 +107,7 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
         variable: Sequence[str] = (),
         granularity: str | None = None,
         loops: str = "raise",
+        independent: Sequence[int | str] | None = None,
         refine: int = 0,
     ):
         if not isinstance(scene, Scene):
@@ -117,8 +126,11 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
         self.recursions = Recursions(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)
         self.values = Values()
+        self._close(loops, independent)
         if not isinstance(refine, int) or refine < 0:
             raise ValueError(f"Dynamics: refine is {refine!r}; expected how many steps, 0 or more")
+        if refine and self.closed:
+            raise UnsupportedError("Dynamics", f"refine={refine} with loops={loops!r}", "dtype='float64'")
         self.refine = refine
         self._refinement = Refinement(self, refine) if refine else None
 
@@ -187,8 +199,8 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
         Args:
             operation: name of a method, such as "forward_dynamics".
             options: ``frames=`` for operations that take frames, ``columns=`` for solve_mass_matrix, ``prescribed=``
-                for hybrid_dynamics, ``integrator=`` for step, and ``body_f=True``, ``status=True``, ``qdd=True``,
-                ``target_q=True``, ``target_qd=True`` if they will be given.
+                for hybrid_dynamics, ``integrator=`` for step, ``hold=`` for project, and ``body_f=True``,
+                ``status=True``, ``qdd=True``, ``target_q=True``, ``target_qd=True`` if they will be given.
         """
         if operation not in OPERATIONS:
             raise ValueError(f"Dynamics.prepare: no operation {operation!r}; expected one of {', '.join(OPERATIONS)}")
@@ -196,7 +208,9 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
         rate = wp.zeros((self.worlds, self.scene.dof_count), dtype=self.dtype, device=self.device)
         extra: dict[str, Any] = {}
         loaded = ("forward_dynamics", "inverse_dynamics", "bias_force", "hybrid_dynamics", "step", "body_reactions",
-                  "inverse_dynamics_derivatives", "forward_dynamics_derivatives")  # fmt: skip
+                  "inverse_dynamics_derivatives", "forward_dynamics_derivatives", "loop_multipliers")  # fmt: skip
+        if operation == "project":
+            extra["hold"] = options.pop("hold", False)
         if operation in loaded and options.pop("body_f", False):
             shape = (self.worlds, self.scene.body_count, 6)
             extra["body_f"] = wp.zeros(shape, dtype=self.dtype, device=self.device)
@@ -223,6 +237,8 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
             "quasi_velocities": (q, rate),
             "inverse_dynamics_derivatives": (q, rate, rate),
             "forward_dynamics_derivatives": (q, rate, rate),
+            "project": (q, rate),
+            "loop_multipliers": (q, rate, rate),
         }
         given = arguments.get(operation, (q,))
         if operation == "solve_mass_matrix":
@@ -230,7 +246,8 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
             if columns is not None and (not isinstance(columns, int) or columns < 0):
                 raise ValueError(f"Dynamics.prepare: columns is {columns!r}; expected how many right-hand sides")
             sides = () if columns is None else (columns,)
-            given = (q, wp.zeros((*rate.shape, *sides), dtype=self.dtype, device=self.device))
+            shape = (self.worlds, self._minimal, *sides)
+            given = (q, wp.zeros(shape, dtype=self.dtype, device=self.device))
         if operation == "hybrid_dynamics":
             extra["prescribed"] = options.pop("prescribed", [False] * self.scene.dof_count)
         if operation in ("jacobian", "operational_inertia_inverse", "operational_inertia", "jacobian_bias"):
@@ -263,10 +280,13 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
                 * 3 = digits lost: an estimate from above says that D keeps fewer than half of the dtype's digits,
                   perhaps none. The result stands: use float64 for such worlds, give light links armature, and lay
                   hinge axes along the axes of the anchors.
+                * 6 = the loops' closures lose rank here, or half of the dtype's digits: a change point. The result is
+                  NaN where rank is lost, and stands otherwise. Use float64, or stay away from there.
                 * 0 = none of these. A pair of tau and gravity that nearly cancel can still lose digits, as in any
                   subtraction: let gravity and wrenches enter by the scene and body_f, not by tau.
 
-                Worlds do not touch each other's result, whatever the word.
+                Where loops are closed the words are 2, 6 and 1 alone: an estimate of digits is not made. Worlds do not
+                touch each other's result, whatever the word.
             out: the result.
 
         Returns:
@@ -278,7 +298,9 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
             body_f = self._read_body_f(call, body_f)
             status = call.update("status", status, (self.worlds,), "[world]", dtype=wp.int32)
             out = call.write(out, (self.worlds, self.scene.dof_count), "[world, dof]")
-            if self._refinement:
+            if self.closed:
+                self._closed_forward_dynamics(out, status, q, qd, tau, body_f)
+            elif self._refinement:
                 self._refinement.forward_dynamics(q, qd, tau, body_f, status, out)
             else:
                 swept = self._run("forward_dynamics", out, q=q, qd=qd, tau=tau, body_f=body_f)
@@ -290,10 +312,13 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
     def inverse_dynamics(self, q: Any, qd: Any = None, qdd: Any = None, body_f: Any = None, out: Any = None) -> Any:
         """Forces that give the accelerations ``qdd``: tau = Mass qdd + bias_force, by the Newton-Euler recursion.
 
+        With loops embedded, forces on the independent dofs that do what forces on all dofs would, X* tau; of qdd only
+        the independent entries are read, the others follow. So do bias_force and gravity_force.
+
         Args: as :meth:`forward_dynamics`; qdd [world, dof], None is zero.
 
         Returns:
-            tau [world, dof].
+            tau [world, dof]; with loops embedded [world, independent dof].
         """
         return self._newton_euler("inverse_dynamics", q, qd, qdd, body_f, out)
 
@@ -312,15 +337,18 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
             q, qd = self._read_state(call, q, qd)
             qdd = self._read_rate(call, "qdd", qdd)
             body_f = self._read_body_f(call, body_f)
-            out = call.write(out, (self.worlds, self.scene.dof_count), "[world, dof]")
+            out = call.write(out, (self.worlds, self._minimal), "[world, dof]")
             self._run("inverse_dynamics", out, q=q, qd=qd, qdd=qdd, body_f=body_f)
         return call.result
 
     def mass_matrix(self, q: Any, out: Any = None) -> Any:
-        """Mass = H phi M phi* H* + Delta, armature included, both triangles [world, dof, dof]; composite bodies."""
+        """Mass = H phi M phi* H* + Delta, armature included, both triangles [world, dof, dof]; composite bodies.
+
+        With loops embedded X* Mass X [world, independent dof, independent dof], of the kinetic energy that is left.
+        """
         with self._call("mass_matrix") as call:
             q, _ = self._read_state(call, q, None)
-            dofs = self.scene.dof_count
+            dofs = self._minimal
             out = call.write(out, (self.worlds, dofs, dofs), "[world, dof, dof]")
             self._run("mass_matrix", out, q=q)
         return call.result
@@ -329,20 +357,25 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
         """Mass^-1 = [I - H psi K]* D^-1 [I - H psi K] (eq. 1), both triangles [world, dof, dof]."""
         with self._call("mass_matrix_inverse") as call:
             q, _ = self._read_state(call, q, None)
-            dofs = self.scene.dof_count
+            dofs = self._minimal
             out = call.write(out, (self.worlds, dofs, dofs), "[world, dof, dof]")
             self._run("mass_matrix_inverse", out, q=q)
         return call.result
 
     @differentiable
     def solve_mass_matrix(self, q: Any, b: Any, out: Any = None) -> Any:
-        """Mass^-1 b in O(dof) a column; b and the result [world, dof] or [world, dof, columns]."""
+        """Mass^-1 b in O(dof) a column; b and the result [world, dof] or [world, dof, columns].
+
+        With loops embedded Mass is that of the independent dofs, and b [world, independent dof].
+        """
         with self._call("solve_mass_matrix") as call:
             q, _ = self._read_state(call, q, None)
-            shape: tuple = (self.worlds, self.scene.dof_count)
+            shape: tuple = (self.worlds, self._minimal)
             if hasattr(b, "shape") and len(b.shape) == 3:
                 shape = (*shape, b.shape[2])
             b = call.read("b", b, shape, "[world, dof] or [world, dof, columns]")
+            if self.embedding is not None and len(shape) == 3:
+                raise UnsupportedError(call.name, "several columns with loops='embed'", "call it for one at a time")
             out = call.write(out, shape, "like b")
             if self._refinement:
                 self._refinement.solve_mass_matrix(q, b, out)
@@ -407,6 +440,7 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
     # -- operators -------------------------------------------------------------------------------------------------
     def operators(self, q: Any) -> SpatialOperators:
         """The paper's operators at ``q``: phi, psi, H, K, D, G, M, P, Delta ...; their ``update(q)`` refills them."""
+        self._check_operation("operators")
         operators = SpatialOperators(self.recursions, self.programs)
         operators.update(q)
         return operators
@@ -419,12 +453,12 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
         gravity = self.recursions.parameters.gravity
         lines = [
             f"{scene!r}",
-            f"worlds       {self.worlds} on {self.device}, {self.dtype.__name__}",
+            f"worlds       {self.worlds} on {self.device}, {self.dtype.__name__}{', refined' if self.refine else ''}",
             f"granularity  {plans.describe(self.plan)}",
             f"levels       {len(widths)} of {min(widths)} to {max(widths)} nodes, {len(tree.segments)} segments",
             f"variable     {', '.join(self.variable) or 'nothing'}",
             f"gravity      {'none' if gravity is None else 'acceleration of the inertial frame'}",
-            f"loops        {len(scene.loops)} left open" if scene.loops else "loops        none",
+            f"loops        {self._loops_explained()}",
             f"workspace    {memory:.1f} MiB so far",
         ]
         return "\n".join(lines + self.programs.described())
@@ -435,12 +469,25 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
         return self.programs.operation_counts
 
     # -- steps -----------------------------------------------------------------------------------------------------
+    def _loops_explained(self) -> str:
+        scene = self.scene
+        if not scene.loops and not scene.couplings:
+            return "none"
+        tied = f"{len(scene.loops)} loop joint(s), {len(scene.couplings)} coupling(s)"
+        if self.embedding is not None:
+            rows = len(self.embedding.rows)
+            return f"{tied} embedded: {rows} of {self.closure_rows} rows count, {self._minimal} dofs are independent"
+        return f"{tied} by {self.closure_rows} multipliers" if self.closed else f"{tied} left open"
+
     def _run(self, operation: str, out: wp.array, **given: Any) -> bool:
         """Launch an operation on what is given; None is not. Arrays [world, ...]; the rest are options.
 
         Returns:
             Whether it ran as sweeps, which leave what they found in the workspace.
         """
+        if self.embedding is not None and operation in EMBEDDED:
+            self._launch(f"embedded_{operation}", out, how=self.embedding, **given)
+            return False
         arrays = {name: value for name, value in given.items() if isinstance(value, wp.array)}
         options = {name: value for name, value in given.items() if value is not None and name not in arrays}
         shapes = {name: array.shape for name, array in arrays.items()}
@@ -452,6 +499,7 @@ class Dynamics(Applications, Steps, Derivatives, Adjoints):
         return program is None
 
     def _call(self, name: str) -> Call:
+        self._check_operation(name)
         if self.values.tensors and recorded((), self.values):
             names = ", ".join(self.values.tensors)
             raise ValueError(
@@ -498,11 +546,9 @@ def _variable_names(variable: Any) -> tuple[str, ...]:
 def _check_loops(scene: Scene, loops: str) -> None:
     if loops not in LOOPS:
         raise ValueError(f"Dynamics: loops is {loops!r}; expected one of {', '.join(LOOPS)}")
-    if loops in ("embed", "multipliers"):
-        raise UnsupportedError("Dynamics", f"loops={loops!r}", "loops='cut' leaves loop joints open")
     if scene.loops and loops == "raise":
         names = ", ".join(loop.label or f"body {loop.parent} to body {loop.child}" for loop in scene.loops)
         raise ValueError(
             f"Dynamics: the scene has {len(scene.loops)} loop joint(s): {names}; expected a tree; loops='cut' leaves "
-            f"them open"
+            f"them open, loops='embed' and loops='multipliers' close them"
         )

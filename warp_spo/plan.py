@@ -53,6 +53,18 @@ TREE_ONLY = (
     "coordinate_rates",
     "body_accelerations",
     "body_reactions",
+    "embedded_forward_dynamics",
+    "embedded_inverse_dynamics",
+    "embedded_mass_matrix",
+    "embedded_mass_matrix_inverse",
+    "embedded_solve_mass_matrix",
+    "closure_error",
+    "project_position",
+    "project_velocity",
+    "loop_system",
+    "loop_forward_dynamics",
+    "closure_system",
+    "closure_step",
 )
 """Operations that exist as traces alone: each is a kernel of its scene, a thread a world, whatever the plan."""
 

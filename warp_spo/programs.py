@@ -22,6 +22,7 @@ from .recursions import messages
 from .recursions.adjoints import Adjoints
 from .recursions.links import TABLES, Links
 from .recursions.messages import INWARD, OUTWARD, SENDS
+from .recursions.multipliers import Multipliers
 from .recursions.operators import meet, written
 from .recursions.pieces import Pieces
 from .recursions.step import LOOPED
@@ -50,6 +51,10 @@ TILED_WORLDS = 1 << 20  # of so many worlds at a time
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
+
+
+class Traces(Adjoints, Multipliers):
+    """Every operation that is traced."""
 
 
 class Program(NamedTuple):
@@ -120,7 +125,7 @@ class Programs:
             return None
         if operation == "solve_mass_matrix" and len(out) > 2:
             return None
-        key = operation, tuple(shapes), out[1:], *options.values()
+        key = operation, (*shapes, *(more or ())), out[1:], *options.values()
         if key not in self._programs:
             lists = sum(1 for other in self._programs if other[0] == operation)
             most = EXPRESSIONS if operation == "expression" else FRAME_LISTS
@@ -200,15 +205,15 @@ class Programs:
         return self._tree_program(operation, links, {**shapes, **more}, tuple(more), options)
 
     def _tree_program(self, operation: str, links: Links, shapes: dict, more: tuple, options: dict) -> Program:
-        trace = Adjoints(links, self.run.dtype.__name__, tuple(shapes))
+        trace = Traces(links, self.run.dtype.__name__, tuple(shapes))
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         frame = self._frame([item for item in stores if item.array == "out"], shapes, 0, 1, self.block, stores)
-        alone = not any(item.array in LOOPED for item in stores)
         if operation in TILES:
             result = Result(TILED, frame.result.array, slots=_solid(stores))
             frame = frame._replace(staged=self.plan.staged, result=result)
-        frame = frame._replace(again=alone and not frame.staged and frame.result.way in (DIRECT, TILED))
+        once = operation == "step" or any(item.array in LOOPED for item in stores)  # may write over what it reads
+        frame = frame._replace(again=not once and not frame.staged and frame.result.way in (DIRECT, TILED))
         frame = frame._replace(more=tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more))
         placed, table = _placed([item for item in stores if item.array == "out"], frame.result)
         placed += apart

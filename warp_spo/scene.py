@@ -132,6 +132,8 @@ class Scene:
             raise ValueError(f"Scene: body {lost} {self.bodies[lost].label!r} is the child of no hinge; expected one "
                              f"hinge a body: add Hinge('free', -1, {lost}) to let it float")
         for coupling in self.couplings:
+            if coupling.hinge == coupling.reference:
+                raise ValueError(f"Scene: a coupling ties hinge {coupling.hinge} to itself; expected two hinges")
             for index in (coupling.hinge, coupling.reference):
                 if not 0 <= index < len(self.hinges) or self.hinges[index].coord_count != 1:
                     raise ValueError(f"Scene: a coupling names hinge {index}; expected one of {len(self.hinges)} "

@@ -67,7 +67,8 @@ class Steps:
             body_f: as :meth:`forward_dynamics`.
             target_q, target_qd: targets of the drives, laid out as q and qd; None is the neutral q, and zero.
             integrator: "semi_implicit": order 1. "midpoint": implicit midpoint, order 2, the forces above implicit, the
-                velocity terms by six fixed-point iterations. "rk4": order 4, all explicit: stable only while
+                velocity terms by six fixed-point iterations, which diverge where a link turns by much of a radian in a
+                step. "rk4": order 4, all explicit: stable only while
                 (damping dt + stiffness dt^2) / inertia stays below 2, and only for scenes without friction and velocity
                 limits.
             qdd: [world, dof], written with (qd' - qd) / dt of the semi-implicit step, before rounding it into qd'.

@@ -21,6 +21,7 @@ from ..scene import Scene
 from ..steps import INTEGRATORS
 from .layout import Layout
 from .model import _host, _Worlds, from_newton
+from .plugs import Plugs
 
 DEFAULT_VARIABLE = (
     "body_mass",
@@ -57,7 +58,7 @@ class Observables(SolverBase.Observables):
     """(qd after - qd before) / dt [m/s^2, rad/s^2], shape (joint_dof_count,)."""
 
 
-class SolverSPO(SolverBase):
+class SolverSPO(Plugs, SolverBase):
     """Articulations in reduced coordinates, implicit in all that their joints do.
 
     Damping, springs, drives with their effort limits, position limits, dry friction and velocity limits, see
@@ -132,6 +133,7 @@ class SolverSPO(SolverBase):
         }
         self._driven, self._tracks_rates = bool((position | rate).any()), bool(rate.any())
         bodies, hinges = worlds.bodies, worlds.hinges
+        self._body_rows = bodies
         gravity = np.arange(W) if worlds.declared else np.full(W, len(_host(model, "gravity")) - 1)
         self._mask_from = 0 if worlds.declared else -1  # bodies outside worlds go with the last entry of a mask
         layout = lambda rows, *shape: Layout(rows, (*rows.shape[1:], *shape), device)  # noqa: E731

@@ -207,6 +207,15 @@ class Links:
         return Rigid(mass.tolist()[0], Vector((c * mass).tolist()),
                      symmetric(J[0][0], J[1][1], J[2][2], J[0][1], J[0][2], J[1][2]))
 
+    def seat(self, body: int, pose: np.ndarray) -> Seat:
+        """Where a frame of a body, or with -1 of the inertial frame, sits."""
+        R, p = _pose(pose)
+        if body < 0:
+            return Seat(None, _folded(R), Vector(p.tolist()))
+        seat, (R_body, p_body) = self.seats[body], self.nodes[body].anchor
+        axes = seat.matrix @ R_body.T
+        return Seat(seat.link, axes @ _folded(R), seat.offset + axes @ (Vector(p.tolist()) - p_body))
+
     def on_parent_node(self, link: Link) -> Link:
         """The first link of a hinge as it sits in the parent's node frame, instead of in the parent's link."""
         matrix, offset = self.nodes[link.node].tree

@@ -225,10 +225,12 @@ class Trace:
                 stores += self.post("a", self.piece, (*alpha[key][0], *alpha[key][1]))
         return stores
 
-    def inverse_dynamics(self, gravity: bool = True) -> list[Store]:
-        """out = Mass qdd + bias_force"""
+    def inverse_dynamics(
+        self, gravity: bool = True, qdd: Callable[[int], Value] | None = None
+    ) -> list[Store]:
+        """out = Mass qdd + bias_force, for ``qdd`` or the array of that name"""
         base = self.base if gravity else (ZERO, ZERO)
-        qdd, moves = self.vector("qdd"), "qd" in self.given
+        qdd, moves = qdd or self.vector("qdd"), "qd" in self.given
         alpha: dict[int, tuple[Vector, Vector]] = {}
         forces: dict[int, Vector] = {}
         stores = []

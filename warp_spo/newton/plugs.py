@@ -1,0 +1,129 @@
+"""Where Newton asks a solver for its inertia: actuators, operational-space control, coupling of solvers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+from newton import ModelFlags
+from newton.solvers.experimental.coupled import CouplingInterface
+
+from ..dynamics import Dynamics
+from ..frames import Frame
+from .layout import Layout
+from .model import _host
+
+
+class Plugs(CouplingInterface):
+    """What SolverSPO inherits."""
+
+    model: newton.Model
+    dynamics: Dynamics
+    _q: Layout
+
+    def solve_inverse(self, state: newton.State) -> Callable[[wp.array, wp.array], None]:
+        """``solve(x, y)``: x = Mass^-1 y at a state, armature included, both [world, dof] of the scene.
+
+        For ``newton.actuators.JointSpaceResponse``; ``dof_map`` is needed where loop joints own entries::
+
+            response.refresh_from_solve(solver.solve_inverse(state), dof_map=solver.dof_map)
+        """
+        q = self._q.read(state.joint_q, "q")
+        return lambda x, y: self.dynamics.solve_mass_matrix(q, y, out=x) and None
+
+    @property
+    def dof_map(self) -> wp.array:
+        """The model's entry of joint_qd for each dof of the scene, int32 [world, dof]."""
+        return wp.array(self.dynamics.scene.dof_index, dtype=wp.int32, device=self.model.device)
+
+    def operational_space(self, state: newton.State, frame: Frame, inputs: Any) -> None:
+        """Fill ``jacobian_tool_world``, ``mass_matrix`` and ``gravity_force`` of a controller's inputs; None is left.
+
+        For ``newton.controllers.ControllerOperationalSpaceModelFree`` that controls every dof of every world, one
+        robot a world. Launches only.
+
+        Args:
+            frame: of the tool: a body's index or label, or (body, pose in the body).
+        """
+        dyn, q = self.dynamics, self._q.read(state.joint_q, "q")
+        worlds, dofs = dyn.worlds, dyn.scene.dof_count
+        dyn.jacobian(q, [frame], out=inputs.jacobian_tool_world.reshape((worlds, 1, 6, dofs)))
+        if inputs.mass_matrix is not None:
+            dyn.mass_matrix(q, out=inputs.mass_matrix)
+        if inputs.gravity_force is not None:
+            dyn.gravity_force(q, out=inputs.gravity_force.reshape((worlds, dofs)))
+
+    # -- coupling --------------------------------------------------------------------------------------------------
+    def coupling_effective_mass_refresh_flags(self) -> int:
+        """Flags after which effective masses are different."""
+        flags = ModelFlags.BODY_INERTIAL_PROPERTIES | ModelFlags.JOINT_PROPERTIES | ModelFlags.JOINT_DOF_PROPERTIES
+        return int(flags | ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES)
+
+    def coupling_supports_inertial_property_refresh(self) -> bool:
+        return "body_mass" in self.dynamics.variable and "body_inertia" in self.dynamics.variable
+
+    def coupling_eval_effective_mass(
+        self, endpoint_kind: Any, endpoint_index: Any, endpoint_local_pos: Any, out: Any
+    ) -> None:
+        """As :meth:`coupling_eval_effective_mass_block`, masses alone."""
+        self.coupling_eval_effective_mass_block(endpoint_kind, endpoint_index, endpoint_local_pos, out)
+
+    def coupling_eval_effective_mass_block(
+        self,
+        endpoint_kind: Any,
+        endpoint_index: Any,
+        endpoint_local_pos: Any,
+        out_mass: Any,
+        out_inertia: Any = None,
+    ) -> None:
+        """What points of bodies weigh to a force on them at ``model.joint_q``; on the host, outside of captures.
+
+        The mass [kg] is 3 / trace(J Mass^-1 J*) of the point's linear Jacobian; infinite mobility is none: a point
+        that cannot move has mass 0, as Newton's particles and bodies that are fixed have. The inertia [kg m^2] is
+        (J Mass^-1 J*)^-1 of the body's rotation, in its own axes, where all three are free, and the body's own inertia,
+        its least, where they are not.
+
+        Args:
+            endpoint_kind: int [n]; only 0, bodies. endpoint_index: the model's bodies [n].
+            endpoint_local_pos: from the CoM, body axes [m] [n, 3].
+            out_mass: [n]. out_inertia: [n, 3, 3] or None.
+
+        Raises:
+            ValueError: an endpoint that is no body.
+        """
+        kinds, bodies = endpoint_kind.numpy(), endpoint_index.numpy()
+        if kinds.any():
+            raise ValueError("SolverSPO: a coupling endpoint that is no body; expected kinds of BODY alone")
+        dyn, scene = self.dynamics, self.dynamics.scene
+        q = self._q.read(self.model.joint_q, "coupled").numpy()
+        frames = list(range(scene.body_count))
+        J = dyn.jacobian(q, frames).astype(np.float64)
+        poses, minv = dyn.body_poses(q), dyn.mass_matrix_inverse(q).astype(np.float64)
+        at = {int(body): divmod(i, scene.body_count) for i, body in enumerate(self._body_rows.ravel())}
+        com, own = _host(self.model, "body_com"), _host(self.model, "body_inertia")
+        mass, inertia = np.zeros(len(bodies), np.float32), own[bodies].astype(np.float32)
+        for i, (body, place) in enumerate(zip(bodies, endpoint_local_pos.numpy(), strict=True)):
+            world, k = at[int(body)]
+            R = np.array(wp.quat_to_matrix(wp.quat(*poses[world, k, 3:].tolist()))).reshape(3, 3)
+            arm, spin = R @ (com[body] + place), J[world, k, 3:]
+            linear = J[world, k, :3] + np.cross(spin.T, arm).T
+            mobility = np.trace(linear @ minv[world] @ linear.T)
+            mass[i] = 3.0 / mobility if mobility > 0.0 else 0.0
+            turning = R.T @ (spin @ minv[world] @ spin.T) @ R
+            if np.linalg.matrix_rank(turning, tol=1e-6 * max(np.trace(turning), 1e-30)) == 3:
+                inertia[i] = np.linalg.inv(turning)
+        out_mass.assign(mass)
+        if out_inertia is not None and len(out_inertia):
+            out_inertia.assign(inertia)
+
+    def coupling_prepare_proxy_contacts(self, *_: Any, **__: Any) -> Any:
+        """Refused: contacts are not computed."""
+        raise NotImplementedError("SolverSPO cannot be a proxy coupling destination: it takes no contacts")
+
+    coupling_rewind_proxy_body = coupling_rewind_proxy_particle = coupling_prepare_proxy_contacts
+    coupling_harvest_proxy_wrenches = coupling_harvest_proxy_particle_forces = coupling_prepare_proxy_contacts
+
+    _body_rows: np.ndarray
