@@ -13,6 +13,8 @@ from torch.autograd import gradcheck
 
 import warp_spo as spo
 from warp_spo import torch as spo_torch
+from warp_spo.plan import MOST_DOFS
+from warp_spo.programs import _read_before
 from warp_spo.recursions.adjoints import Adjoints
 
 WORLDS = 2
@@ -276,6 +278,31 @@ def test_values_set_since(tree):
     dyn.set(gravity=(0.0, 0.0, -1.0))
     with pytest.raises(RuntimeError, match=r"gravity was set between this call and its backward pass"):
         y.backward()
+
+
+def test_scenes_without_gradients_say_so_at_once(device):
+    chain = spo.Dynamics(zoo.chain(MOST_DOFS + 1), 1, device=device)
+    q = torch.zeros(1, MOST_DOFS + 1, requires_grad=True, device=wp.device_to_torch(device))
+    with pytest.raises(spo.UnsupportedError, match="gravity_force, backwards: a scene of"):
+        chain.gravity_force(q)
+    scene = zoo.fork()
+    moving = spo.Dynamics(scene, WORLDS, device=device, dtype="float64", variable=("joint_X_p",))
+    with pytest.raises(spo.UnsupportedError, match="the gradient of poses where anchors vary"):
+        moving.body_poses(*on(moving, laws.states(scene, WORLDS), "q"))
+
+
+def test_a_result_is_not_written_over_what_is_read_later():
+    """In shared memory on CUDA: lambda is known before the other arguments are read."""
+    scene = zoo.fork()
+    rate = (1, scene.dof_count)
+    dyn = spo.Dynamics(scene, 1, device="cpu", granularity="tree")
+    shapes = {"q": (1, scene.coord_count), "qd": rate, "qdd": rate, "cotangent": rate, "out": rate}
+    trace = Adjoints(dyn.programs.links.opened(), "float32", tuple(shapes))
+    stores = trace.forward_dynamics_vjp(("tau", "q"))
+    first = [item for item in stores if item.array == "out"]
+    free = {name: _read_before(first, stores, name) for name in ("cotangent", "qd", "qdd")}
+    del first, stores  # which pytest would write out
+    assert free == {"cotangent": True, "qd": False, "qdd": False}
 
 
 def test_what_has_no_gradient_says_so(tree):

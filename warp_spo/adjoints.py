@@ -215,6 +215,14 @@ class Adjoints:
             return q, rate, rate
         return (q if operation == "integrate" else shapes.get(operation, rate),)
 
+    def check_gradient(self, operation: str) -> None:
+        """Raise UnsupportedError where an operation has no gradient on this scene."""
+        call = self._call(f"{operation}, backwards")
+        self._check_size(call)
+        if operation == "body_poses" and self.scene.dof_count and self.programs.links.turns_vary:
+            what = "the gradient of poses where anchors vary"
+            raise UnsupportedError(call.name, what, "keep joint_X_p and joint_X_c folded")
+
     def entering(self, operation: str) -> tuple[str, ...]:
         """Names of the values that enter an operation."""
         return ENTERING.get(operation, LINK_VALUES)
@@ -295,10 +303,12 @@ class Adjoints:
                 before[name] = wp.clone(parameters.value(name))
                 parameters.copy_in(name, array)
             parameters.refresh(values)
-            yield
-            for name, value in before.items():
-                wp.copy(parameters.value(name), value)
-            parameters.refresh(values)
+            try:
+                yield
+            finally:
+                for name, value in before.items():
+                    wp.copy(parameters.value(name), value)
+                parameters.refresh(values)
 
     # -- steps -----------------------------------------------------------------------------------------------------
     def _push(

@@ -329,7 +329,7 @@ class Programs:
         out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
         dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
         over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
-        over = [name for name in over if _read_before(stores, name)]
+        over = [name for name in over if _read_before(stores, everything or stores, name)]
         slots = len({_name(item.value) for item in stores})
         fields = {name: used[name] for name in FIELDS if name in used}
         held = ((), tuple(fields.values())) if fields and warps == 1 and set(fields) <= set(TABLES) else ((),)
@@ -352,9 +352,9 @@ class Programs:
         return next((frame for frame in frames if frame.fits(self.run.dtype)), frames[-1])
 
 
-def _read_before(stores: list[Store], row: str) -> bool:
+def _read_before(stores: list[Store], everything: list[Store], row: str) -> bool:
     """Every entry of ``row`` that is read at all is read before the same entry of the result is written over it."""
-    symbols = [item.value for item in stores if not is_constant(item.value)]
+    symbols = [item.value for item in everything if not is_constant(item.value)]
     if len({id(value.graph) for value in symbols}) > 1:
         return True  # pieces write when all have read
     read = {s.args[1]: s.number for s in ordered(symbols) if s.op == "input" and s.args[0] == row}

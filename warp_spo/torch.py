@@ -100,6 +100,8 @@ def differentiated(dyn: Any, operation: str, method: Any, arguments: dict[str, A
             f"leave out=, or call inside torch.no_grad()"
         )
     plain = _Plain(dyn, operation, method, arguments, tuple(given), tuple(sources))
+    with torch.no_grad():
+        dyn.check_gradient(operation)
     return _Operation.apply(plain, *tensors.values())
 
 
@@ -254,6 +256,7 @@ def custom_op(dyn: Any, operation: str, **options: Any) -> Any:
     """
     if operation not in ARGUMENTS:
         raise ValueError(f"custom_op: operation is {operation!r}; expected one of {', '.join(ARGUMENTS)}")
+    dyn.check_gradient(operation)
     by, method = ARGUMENTS[operation], inspect.unwrap(getattr(type(dyn), operation))
     name = f"warp_spo::{operation}_{next(_made)}"
 
