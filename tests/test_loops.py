@@ -394,8 +394,12 @@ def test_worlds_that_differ(device):
         out = wp.full(first.shape, float("nan"), dtype=wp.float64, device=device)
         status = wp.full(3, -1, dtype=wp.int32, device=device)
         dyn.forward_dynamics(on["q"], on["qd"], on["tau"], on["body_f"], status=status, out=out)
+        pair = wp.empty_like(on["q"]), wp.empty_like(on["qd"])
+        dyn.project(on["q"], on["qd"], out=pair)
         with no_warp_allocation():
             dyn.forward_dynamics(on["q"], on["qd"], on["tau"], on["body_f"], status=status, out=out)
+            dyn.project(on["q"], on["qd"], out=pair)
+        assert laws.error(pair[1].numpy(), s.qd) <= 1e-6
         np.testing.assert_array_equal(out.numpy(), first.numpy())
         spoiled = s.q.copy()
         spoiled[1] = np.nan

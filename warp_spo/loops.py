@@ -101,8 +101,8 @@ class Loops(Applications):
     def project(self, q: Any, qd: Any = None, hold: bool = False, iterations: int = 2, out: Any = None) -> Any:
         """The nearest state that closes the loops: Newton steps q - Y^+ g, then qd - Y^+ Y qd, Y the Jacobian of g.
 
-        g is :meth:`closure_error`. Nearest in the sum of squares of the dofs, rad and m alike. Call it once a
-        time step; to close a state by hand, with more ``iterations``.
+        g is :meth:`closure_error`. Nearest in the sum of squares of the dofs, rad and m alike. Call it once a time
+        step; to close a state by hand, with more ``iterations``.
 
         Args:
             q, qd: [world, coordinate], [world, dof]; qd None is left out.
@@ -111,8 +111,8 @@ class Loops(Applications):
             out: an array for q, or with qd a pair of arrays or None, (q, qd).
 
         Returns:
-            q [world, coordinate]; with ``qd`` the pair q, qd [world, dof]. A world whose closures are dependent there,
-            beyond what they are everywhere, is NaN with loops="embed".
+            q [world, coordinate]; with ``qd`` the pair q, qd [world, dof]. A world whose closures lose rank there, at a
+            change point, is NaN.
         """
         with self._call("project") as call:
             self._check_closed(call)
