@@ -90,9 +90,9 @@ def steps(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], fl
         its = shared[0]
         solver = SolverSPO(its) if name == "SolverSPO" else getattr(newton.solvers, name)(its, **options)
         now, after, control = its.state(), its.state(), its.control()
-        middle = 0.5 * (its.joint_limit_lower.numpy() + its.joint_limit_upper.numpy())
-        noise = np.random.default_rng(0).uniform(-0.3, 0.3, (SETS, len(middle)))
-        starts = [wp.array(middle + each, dtype=wp.float32, device=device) for each in noise]
+        low, high = its.joint_limit_lower.numpy(), its.joint_limit_upper.numpy()
+        middle, noise = 0.5 * (low + high), np.random.default_rng(0).uniform(-0.45, 0.45, (SETS, len(low)))
+        starts = [wp.array(middle + each * (high - low), dtype=wp.float32, device=device) for each in noise]
         control.joint_target_q = wp.array(middle, dtype=wp.float32, device=device)
 
         def run(index: int) -> None:
@@ -197,8 +197,13 @@ def operational(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[
         states = States(peer.coordinates, [Inputs(scene, worlds, seed) for seed in range(SETS)], "float32")
         peer.prepare("forward_dynamics", "", states, worlds)
         mjw, m, d, nv = peer.mjw, peer.model, peer.data, peer.host.nv
-        bodies = [body for body in range(peer.host.nbody) if "ankle_roll" in peer.host.body(body).name]
-        assert len(bodies) == 2, "two feet"
+        owners = [at for at, link in enumerate(peer.robot.links) for _ in range(6 if link.kind == "free" else 1)]
+        bodies = [
+            1 + owners[place]
+            for place, dof in enumerate(peer.robot.dofs)
+            if "ankle_roll" in scene.dof_labels[dof]
+        ]
+        assert len(bodies) == 2, f"{len(bodies)} feet"
         J = [[wp.zeros((worlds, 3, nv), dtype=wp.float32, device=device) for _ in range(2)] for _ in bodies]
         x = wp.empty((worlds, nv), dtype=wp.float32, device=device)
         columns = [part[:, row].contiguous() for pair in J for part in pair for row in range(3)]

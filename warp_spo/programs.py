@@ -332,9 +332,9 @@ class Programs:
         over = [name for name in over if _read_before(stores, everything or stores, name)]
         slots = len({_name(item.value) for item in stores})
         fields = {name: used[name] for name in FIELDS if name in used}
-        held = ((), tuple(fields.values())) if fields and warps == 1 and set(fields) <= set(TABLES) else ((),)
+        held = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
         staged, ways = self.plan.staged, [(False, Result(DIRECT, out))]
-        staged = staged or any(row.name == "x" and row.entries > SHORT_ROW for row in rows)
+        staged = staged or any(row.name in ("x", "body_f") and row.entries > SHORT_ROW for row in rows)
         if dense and (staged or out.entries > SHORT_ROW):
             ways = [(staged, Result(STAGED, out)), (False, Result(STAGED, out)), *ways]
         if dense and staged:
