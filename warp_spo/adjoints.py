@@ -70,6 +70,7 @@ class Adjoints:
     recursions: Recursions
     programs: Programs
     values: Values
+    closed: bool
 
     # -- backwards -------------------------------------------------------------------------------------------------
     def forward_dynamics_vjp(
@@ -385,6 +386,8 @@ class Adjoints:
             link_values.pull_back(self.recursions.parameters, self.programs.links, results["value"], flat)
 
     def _check_size(self, call: Call) -> None:
+        if self.closed:
+            raise UnsupportedError(call.name, "a derivative with closed loops", "loops='cut' leaves them open")
         if self.scene.dof_count > MOST_DOFS:
             what = f"a scene of {self.scene.dof_count} dof"
             raise UnsupportedError(call.name, what, f"derivatives are straight-line code, of up to {MOST_DOFS} dof")
