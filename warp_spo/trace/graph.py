@@ -59,7 +59,8 @@ class Scalar:
         return self.key[0]
 
     def __repr__(self) -> str:
-        return f"{self.op}({', '.join(map(repr, self.args))})"
+        names = (f"#{a.number}" if a.__class__ is Scalar else repr(a) for a in self.args)
+        return f"#{self.number} = {self.op}({', '.join(names)})"
 
     def __add__(self, other: Value) -> Value:
         return add(self, other)
