@@ -3,7 +3,7 @@
     python -m benchmarks.capabilities [PATTERN] [--device cuda:0] [--worlds 4096 65536] [--json FILE]
 
 * steps: a whole step of Newton's SolverMuJoCo, SolverSteel and SolverFeatherstone and of SolverSPO, on Newton's model
-  of the Panda with drives and the limits of its file;
+  of the Panda with drives and the limits of its file: steps in a row, that start anywhere and are driven elsewhere;
 * derivatives: dense derivatives of forward dynamics, and its vector-Jacobian product beside forward dynamics;
 * operational: the inverse operational-space inertia of G1's two feet, beside the Jacobians and twelve columns of M^-1
   that it takes in mujoco_warp;
@@ -91,16 +91,17 @@ def steps(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], fl
         solver = SolverSPO(its) if name == "SolverSPO" else getattr(newton.solvers, name)(its, **options)
         now, after, control = its.state(), its.state(), its.control()
         low, high = its.joint_limit_lower.numpy(), its.joint_limit_upper.numpy()
-        middle, noise = 0.5 * (low + high), np.random.default_rng(0).uniform(-0.45, 0.45, (SETS, len(low)))
-        starts = [wp.array(middle + each * (high - low), dtype=wp.float32, device=device) for each in noise]
-        control.joint_target_q = wp.array(middle, dtype=wp.float32, device=device)
+        anywhere = low + (high - low) * np.random.default_rng(0).uniform(0.05, 0.95, (2, len(low)))
+        start, target = (wp.array(q, dtype=wp.float32, device=device) for q in anywhere)
+        wp.copy(now.joint_q, start)
+        control.joint_target_q = target
 
         def run(index: int) -> None:
-            wp.copy(now.joint_q, starts[index])
-            solver.step(now, after, control, None, DT)
+            before, then = (now, after) if index % 2 == 0 else (after, now)
+            solver.step(before, then, control, None, DT)
 
         us = timed(run, device)
-        assert np.isfinite(after.joint_qd.numpy()).all(), f"{name}: not finite"
+        assert np.isfinite(now.joint_qd.numpy()).all(), f"{name}: not finite"
         return us
 
     yield "SolverSPO.step", lambda: step("SolverSPO")

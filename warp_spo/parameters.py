@@ -185,7 +185,7 @@ class Parameters:
         """Derive anew what depends on the named values."""
         for sharer in self._sharers:
             sharer.refresh(names)
-        self._captured |= self.device.is_capturing
+        self._captured |= bool(self.device.is_capturing)
         for found in self._derived.values():
             if any(name in found.of for name in names):
                 found.fill()
