@@ -23,9 +23,10 @@ def skew(vector):
 
 def rotation_exp(vector):
     """Rotation matrix (3, 3) of a rotation vector [rad]."""
-    angle = np.linalg.norm(vector)
-    k = skew(vector)
-    return np.eye(3) + np.sinc(angle / np.pi) * k + 0.5 * np.sinc(0.5 * angle / np.pi) ** 2 * k @ k
+    angle, k = np.linalg.norm(vector), skew(vector)
+    if angle == 0.0:
+        return np.eye(3)
+    return np.eye(3) + np.sin(angle) / angle * k + 0.5 * (np.sin(0.5 * angle) / (0.5 * angle)) ** 2 * k @ k
 
 
 def rotation(quaternion):
