@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +22,7 @@ class Evidence(NamedTuple):
         machine: what the newest file says of it, its peaks too.
         rows: ours; ``peers``: with "peer", its name; ``stress``: with "case" and "verdict".
         sources: a line for each file that rows come from: machine, what, commit, date, versions.
+        capabilities: with "group", see :mod:`.capabilities`.
     """
 
     machine: dict
@@ -29,6 +30,7 @@ class Evidence(NamedTuple):
     peers: list[dict]
     stress: list[dict]
     sources: list[str]
+    capabilities: Sequence[dict] = ()
 
     @property
     def is_gpu(self) -> bool:
@@ -81,22 +83,29 @@ def gather(runs: Iterable[dict]) -> list[Evidence]:
 def _of_machine(runs: list[dict]) -> Evidence:
     """Evidence of one machine; ``runs`` come newest first."""
     newest: dict[tuple, str] = {}  # kind of rows -> commit that they come from
-    rows: dict[str, list[dict]] = {"ours": [], "peers": [], "stress": []}
+    rows: dict[str, list[dict]] = {"ours": [], "peers": [], "stress": [], "capabilities": []}
     used: dict[int, dict[str, None]] = {}
     seen: set[tuple] = set()
     for index, data in enumerate(runs):
         for row in [*data["rows"], *data.get("stress", [])]:
-            kind = "stress" if "verdict" in row else "peers" if row.get("peer") else "ours"
+            kind = _kind(row)
             of_newest = newest.setdefault((kind, row.get("peer")), data["commit"]) == data["commit"]
             stressed = (row.get("case"), str(row.get("parameters")), row.get("precision"), row.get("granularity"))
-            key = stressed if kind == "stress" else identity(row)
+            key = stressed if kind == "stress" else (*identity(row), row.get("group"), row.get("name"))
             if of_newest and key not in seen:
                 seen.add(key)
                 rows[kind].append(row)
                 used.setdefault(index, {})[row.get("peer") or kind] = None
     machine = {key: value for data in runs[::-1] for key, value in data["machine"].items()}
     lines = [_source(data, list(used[index])) for index, data in enumerate(runs) if index in used]
-    return Evidence(machine, rows["ours"], rows["peers"], rows["stress"], list(dict.fromkeys(lines)))
+    sources = list(dict.fromkeys(lines))
+    return Evidence(machine, rows["ours"], rows["peers"], rows["stress"], sources, rows["capabilities"])
+
+
+def _kind(row: dict) -> str:
+    if "group" in row:
+        return "capabilities"
+    return "stress" if "verdict" in row else "peers" if row.get("peer") else "ours"
 
 
 def _source(data: dict, kinds: list[str]) -> str:

@@ -66,6 +66,7 @@ def on_gpu() -> list[Part]:
             ours(f"granularities.{robot}", rf"^{robot}\.{BASIC}", 90.0, *both, "--granularity", "node", "segment",
                  "tree"),
         ]  # fmt: skip
+    parts += [Part("capabilities", ["benchmarks.capabilities"], None, 240.0)]
     parts += [Part("stress.node", ["benchmarks.stress", "--granularity", "node"], None, 150.0)]
     for robot in ROBOTS:
         parts += [peer("mujoco_warp", [robot], 40.0, WORLDS), peer("grid", [robot], 40.0, WORLDS)]

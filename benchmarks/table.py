@@ -81,6 +81,20 @@ def rates(evidence: Evidence) -> str:
     return "\n".join(text) + "\n\n"
 
 
+def beyond(evidence: Evidence) -> str:
+    """What the library does beyond one evaluation of the dynamics, beside those who do the same."""
+    rows = sorted((row for row in evidence.capabilities if "us" in row), key=lambda row: row["group"])
+    counts = sorted({row["worlds"] for row in rows})
+    if not rows:
+        return ""
+    text = ["| | " + " | ".join(f"µs, {worlds:,} worlds" for worlds in counts) + " |"]
+    text.append("|---|" + "---:|" * len(counts))
+    for group, name in dict.fromkeys((row["group"], row["name"]) for row in rows):
+        mine = {row["worlds"]: row for row in rows if (row["group"], row["name"]) == (group, name)}
+        text.append(f"| {group}: {name} | " + " | ".join(time(mine.get(worlds)) for worlds in counts) + " |")
+    return "\n".join(text) + "\n"
+
+
 def worst(errors: Sequence[float]) -> float:
     """The largest, NaN if any is, or if there is none."""
     return max(errors) if errors and all(error == error for error in errors) else float("nan")
@@ -103,6 +117,7 @@ def readme(everything: Sequence[Evidence]) -> str:
         text += [*evidence.sources, "", rates(evidence) + markdown(shown, operations)]
         if evidence is everything[0]:
             folder = RESULTS.relative_to(ROOT).as_posix()
+            text += [beyond(evidence)] if evidence.capabilities else []
             text += [f"![{what}]({folder}/{name})" for name, what in PICTURES.items()] + [""]
     return "\n".join(text).rstrip("\n") + "\n"
 
