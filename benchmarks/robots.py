@@ -76,13 +76,18 @@ def urdf(name: str) -> str:
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
-def _strip(root: ET.Element, locked: tuple[str, ...]) -> None:
+def without_shapes(root: ET.Element) -> None:
+    """Leave links and joints, and no shapes on them."""
     for child in list(root):
         if child.tag not in ("link", "joint"):
             root.remove(child)
     for link in root.findall("link"):
         for shape in [*link.findall("visual"), *link.findall("collision")]:
             link.remove(shape)
+
+
+def _strip(root: ET.Element, locked: tuple[str, ...]) -> None:
+    without_shapes(root)
     for joint in root.findall("joint"):
         if joint.get("name") in locked:
             joint.set("type", "fixed")

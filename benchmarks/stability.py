@@ -25,7 +25,7 @@ import warp as wp
 
 import warp_spo as spo
 
-from .robots import INSTALLED, PACKAGE
+from .robots import INSTALLED, PACKAGE, without_shapes
 
 STEPS = (2e-3, 5e-3)  # [s]
 FINE, COMPARED = 1e-4, 0.5  # MuJoCo's step, and how long it is compared [s]
@@ -55,12 +55,7 @@ ROBOTS = {
 def stripped(text: str) -> str:
     """A URDF without shapes and without mimic joints, which are held at zero; damping and friction stay."""
     root = ET.fromstring(text)
-    for child in list(root):
-        if child.tag not in ("link", "joint"):
-            root.remove(child)
-    for link in root.findall("link"):
-        for shape in [*link.findall("visual"), *link.findall("collision")]:
-            link.remove(shape)
+    without_shapes(root)
     for joint in root.findall("joint"):
         for mimic in joint.findall("mimic"):
             joint.remove(mimic)

@@ -12,6 +12,7 @@ import zoo
 from allocations import no_warp_allocation
 
 import warp_spo as spo
+from warp_spo.examples import estimation
 from warp_spo.operations import APPLICATIONS, Inputs
 from warp_spo.recursions import determinant, newton_euler
 from warp_spo.recursions.applications import Applications
@@ -113,6 +114,12 @@ def test_quasi_velocities_are_the_kinetic_energy():
     for w in range(2):
         energy = a["qd"][w] @ Dense(scene, a["q"][w]).mass_matrix @ a["qd"][w]
         assert nu[w] @ nu[w] == pytest.approx(energy, rel=1e-13)
+
+
+def test_the_mass_matrix_is_a_covariance():
+    """Of what noise with the bodies' inertias does to the hinges; D is that of the filter's innovations (example)."""
+    samples = 4000
+    assert max(estimation.main(samples)) <= 5.0 / np.sqrt(samples)  # five standard deviations or so
 
 
 def test_a_root_hinge_does_not_change_the_determinant():

@@ -10,7 +10,7 @@ import functools
 import inspect
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import warp as wp
 
@@ -62,6 +62,7 @@ def differentiable(method: Callable) -> Callable:
 class Adjoints:
     """What Dynamics inherits. Arrays and coordinates are as there."""
 
+    differentiable_by: ClassVar[dict[str, tuple[str, ...]]] = ARGUMENTS
     scene: Scene
     worlds: int
     device: wp.Device

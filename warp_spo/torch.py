@@ -9,8 +9,6 @@ from typing import Any
 import torch
 import warp as wp
 
-from .adjoints import ARGUMENTS
-
 _DTYPES: dict[Any, torch.dtype] = {
     wp.float32: torch.float32,
     wp.float64: torch.float64,
@@ -254,10 +252,11 @@ def custom_op(dyn: Any, operation: str, **options: Any) -> Any:
         ValueError: another operation.
         RuntimeError: when called, if a value of ``dyn`` is set to a tensor that requires grad: it is no input here.
     """
-    if operation not in ARGUMENTS:
-        raise ValueError(f"custom_op: operation is {operation!r}; expected one of {', '.join(ARGUMENTS)}")
+    known = dyn.differentiable_by
+    if operation not in known:
+        raise ValueError(f"custom_op: operation is {operation!r}; expected one of {', '.join(known)}")
     dyn.check_gradient(operation)
-    by, method = ARGUMENTS[operation], inspect.unwrap(getattr(type(dyn), operation))
+    by, method = known[operation], inspect.unwrap(getattr(type(dyn), operation))
     name = f"warp_spo::{operation}_{next(_made)}"
 
     def plain(names: str) -> _Plain:

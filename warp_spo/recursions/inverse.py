@@ -7,7 +7,7 @@ for each of them, N, and its columns of Y are complete. Two columns meet in the 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from ..trace.emit import Store
 from ..trace.graph import Value
@@ -17,14 +17,11 @@ from .links import Link
 from .motion import STILL
 from .pieces import Piece, Pieces
 
-if TYPE_CHECKING:
-    from .traced import Trace
-
 NO_FORCE = Vector((*ZERO, *ZERO))
 
 
 class Inverse:
-    """The entries of Mass^-1 that a trace's pieces work out.
+    """The entries of Mass^-1 that the pieces of a :class:`.traced.Trace` work out.
 
     Columns of Y are lists over the pivots from the root out to the end of a piece; it has one pivot for each dof.
 
@@ -34,7 +31,7 @@ class Inverse:
         stores: what is sent. news: likewise, to the pieces that meet this one.
     """
 
-    def __init__(self, trace: Trace):
+    def __init__(self, trace: Any):
         self.trace, self.pieces = trace, Pieces(trace.links).pieces
         self.entries: dict[tuple[int, int], Value] = {}
         self.across: dict[int, dict[tuple[int, int], Value]] = {}
