@@ -1,0 +1,64 @@
+"""Operational-space control of a floating robot: an arm on a drifting base draws a circle that stands in space.
+
+Nothing holds the base, so what the hand does moves it: a = J Mass^-1 (S* tau - bias_force) + J' qd, S the rows of the
+arm's hinges. The torques that give the hand the acceleration a it needs are one small solve in each world.
+"""
+
+import numpy as np
+
+import warp_spo as spo
+from warp_spo.examples.parts import at, bar
+
+RADIUS, PERIOD = 0.1, 2.0  # of the circle [m, s]
+STIFF, DAMP = 400.0, 40.0  # of the hand's error [1/s^2, 1/s]
+WORLDS = 4
+
+
+def scene(gravity=(0.0, 0.0, 0.0)):
+    """A base of 40 kg and an arm of six hinges; the hand is the last bar's end."""
+    bodies, hinges = [spo.Body(40.0, (0, 0, 0), np.diag([2.0, 2.0, 2.0]))], [spo.Hinge("free", -1, 0)]
+    for k, axis in enumerate([(0, 0, 1), (0, 1, 0), (0, 1, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]):
+        bodies.append(bar(0.3, 2.0))
+        hinges.append(spo.Hinge("revolute", k, k + 1, axis=axis, parent_pose=at(0.3 * (k > 0)), armature=0.01))
+    return spo.Scene(bodies, hinges, gravity=gravity)
+
+
+def main(seconds=2.0, dt=2e-3, seed=0):
+    dyn = spo.Dynamics(scene(), worlds=WORLDS, dtype="float64")
+    hand, rng = [(6, (0.3, 0, 0, 0, 0, 0, 1))], np.random.default_rng(seed)
+    q, qd = np.tile(dyn.scene.neutral_q, (WORLDS, 1)), 0.02 * rng.standard_normal((WORLDS, 12))
+    q[:, 7:] = [0.2, 0.7, -1.3, 0.3, 0.5, 0.2] + 0.1 * rng.standard_normal((WORLDS, 6))
+    arm = np.repeat(np.eye(12)[None, :, 6:], WORLDS, axis=0)  # S*
+    center, drawn = place(dyn, q), []
+    for step in range(round(seconds / dt)):
+        angle, rate = 2.0 * np.pi * step * dt / PERIOD, 2.0 * np.pi / PERIOD
+        circle = RADIUS * np.array([[0.0, np.cos(angle) - 1.0, np.sin(angle)],
+                                    [0.0, -rate * np.sin(angle), rate * np.cos(angle)],
+                                    [0.0, -(rate**2) * np.cos(angle), -(rate**2) * np.sin(angle)]])  # fmt: skip
+        J = dyn.jacobian(q, hand)[:, 0, :3]
+        error, slip = center + circle[0] - place(dyn, q), circle[1] - np.einsum("wij,wj->wi", J, qd)
+        wanted = circle[2] + STIFF * error + DAMP * slip
+        moved = dyn.solve_mass_matrix(q, np.concatenate([arm, dyn.bias_force(q, qd)[:, :, None]], axis=2))
+        reach = J @ moved  # of each torque, and of the bias force
+        wanted += reach[:, :, 6] - dyn.jacobian_bias(q, qd, hand)[:, 0, :3]
+        calm = -0.2 * qd[:, 6:]  # for what the hand does not feel
+        need = wanted - np.einsum("wij,wj->wi", reach[:, :, :6], calm)
+        tau = np.zeros((WORLDS, 12))
+        tau[:, 6:] = calm + np.einsum("wij,wj->wi", np.linalg.pinv(reach[:, :, :6]), need)
+        q, qd = dyn.step(q, qd, tau, dt)
+        drawn.append(np.linalg.norm(error, axis=1))
+    late = np.max(drawn[len(drawn) // 2 :])
+    print(f"the hand is within {1e3 * late:.1f} mm of its circle; the base has moved by up to "
+          f"{1e3 * np.linalg.norm(q[:, :3], axis=1).max():.0f} mm")
+    return late
+
+
+def place(dyn, q):
+    """Where the hand is [world, 3]."""
+    pose = dyn.body_poses(q)[:, 6]
+    u, w, v = pose[:, 3:6], pose[:, 6:], np.array([0.3, 0.0, 0.0])
+    return pose[:, :3] + v + 2.0 * np.cross(u, np.cross(u, v) + w * v)
+
+
+if __name__ == "__main__":
+    main()
