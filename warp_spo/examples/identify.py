@@ -1,7 +1,7 @@
 """Masses and damping of an arm from its motion: the gradient of the joint forces by each mass is a regressor.
 
-The forces are linear in the masses: tau = tau(m0) + (d tau / d m)(m - m0) + damping qd'. Every state of the trajectory is
-a world; one vector-Jacobian product a hinge gives the rows of all of them, and least squares the masses.
+The forces are linear in the masses: tau = tau(m0) + (d tau / d m)(m - m0) + damping qd'. Every state of the trajectory
+is a world; one vector-Jacobian product a hinge gives the rows of all of them, and least squares the masses.
 """
 
 import numpy as np
@@ -15,9 +15,9 @@ DT = 2e-3  # [s]
 
 
 def scene(masses, damping):
-    axes = [(0, 0, 1), (0, 1, 0), (0, 1, 0)]
+    axes, places = [(0, 0, 1), (0, 1, 0), (0, 1, 0)], [at(), at(0.4), at(0.4)]
     hinges = [
-        spo.Hinge("revolute", k - 1, k, axis=axes[k], parent_pose=at(0.4 * (k > 0)), damping=damping[k]) for k in range(3)
+        spo.Hinge("revolute", k - 1, k, axis=axes[k], parent_pose=places[k], damping=damping[k]) for k in range(3)
     ]
     arm = spo.Scene([bar(0.4, 1.0) for _ in range(3)], hinges)
     return arm.with_values(body_mass=np.array([masses]))
