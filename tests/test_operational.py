@@ -116,6 +116,25 @@ def test_quasi_velocities_are_the_kinetic_energy():
         assert nu[w] @ nu[w] == pytest.approx(energy, rel=1e-13)
 
 
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_frames_accelerate(dtype, device):
+    """Under wrenches, and with the joints: against dense Jacobians, in every world."""
+    scene, worlds = zoo.SCENES["tree10"](), 3
+    dyn = spo.Dynamics(scene, worlds, dtype=dtype, device=device)
+    arrays, frames = laws.states(scene, worlds, dtype=dtype), laws.frames_of(scene)
+    x = np.random.default_rng(5).normal(size=(worlds, 6 * len(frames))).astype(dtype)
+    out = np.full((worlds, len(frames), 6), np.nan, dtype=dtype)
+    pushed = dyn.operational_inertia_inverse_product(arrays["q"], x, frames, out=out)
+    moved = dyn.frame_accelerations(arrays["q"], arrays["qd"], arrays["qdd"], frames)
+    for w in range(worlds):
+        dense = Dense(scene, arrays["q"][w])
+        J = dense.jacobian(frames).reshape(-1, scene.dof_count)
+        wanted = J @ np.linalg.solve(dense.mass_matrix, J.T @ x[w].astype(float))
+        assert laws.error(pushed[w].ravel(), wanted) <= TOLERANCE[dtype]
+        rate = J @ arrays["qdd"][w] + dense.jacobian_bias(arrays["qd"][w].astype(float), frames).ravel()
+        assert laws.error(moved[w].ravel(), rate) <= TOLERANCE[dtype]
+
+
 def test_the_mass_matrix_is_a_covariance():
     """Of what noise with the bodies' inertias does to the hinges; D is that of the filter's innovations (example)."""
     samples = 4000
@@ -181,7 +200,7 @@ def test_equals_pinocchio(name):
 
 # -- planted bugs ------------------------------------------------------------------------------------------------------
 BUGS = {
-    "jacobian_bias": (Applications, "jacobian_bias", "+ self.motions[id(link)].whirl @ arm", ""),
+    "jacobian_bias": (Applications, "_at_frames", "+ self.motions[id(link)].whirl @ arm", ""),
     "com_jacobian": (Applications, "center", "mass = mass + body.mass", "mass = body.mass"),
     "centroidal_momentum_matrix": (Applications, "center", " + origins[id(link)] * body.mass", ""),
     "centroidal_momentum_bias": (newton_euler, "body_force", "cross(motion.spin, in", "-cross(motion.spin, in"),

@@ -137,6 +137,44 @@ class Applications:
             self._launch("jacobian_bias", out, q=q, qd=qd, frames=where)
         return call.result
 
+    def frame_accelerations(
+        self, q: Any, qd: Any, qdd: Any, frames: Sequence[Frame], out: Any = None
+    ) -> Any:
+        """J qdd + J' qd: how the frames accelerate, in one outward sweep; with forward_dynamics, task-space dynamics.
+
+        Acceleration of each frame's origin [m/s^2], then angular acceleration [rad/s^2], inertial axes. Gravity is not
+        in it. qd and qdd None are zero.
+
+        Returns:
+            [world, frame, 6]
+        """
+        with self._call("frame_accelerations") as call:
+            q, qd = self._read_state(call, q, qd)
+            qdd = self._read_rate(call, "qdd", qdd)
+            where = checked(self.scene, call.name, frames)
+            out = call.write(out, (self.worlds, len(where), 6), "[world, frame, 6]")
+            self._launch("frame_accelerations", out, q=q, qd=qd, qdd=qdd, frames=where)
+        return call.result
+
+    def operational_inertia_inverse_product(self, q: Any, x: Any, frames: Sequence[Frame], out: Any = None) -> Any:
+        """J Mass^-1 J* x in O(dof), nothing formed: what wrenches x on the frames make these accelerate.
+
+        Args:
+            q: coordinates [world, coordinate].
+            x: force, then torque on each frame, at its origin, inertial axes [world, 6 frames].
+            frames: as :meth:`jacobian`.
+
+        Returns:
+            [world, frame, 6], laid out as :meth:`frame_accelerations`. NaN where Mass has no inverse.
+        """
+        with self._call("operational_inertia_inverse_product") as call:
+            q, _ = self._read_state(call, q, None)
+            where = checked(self.scene, call.name, frames)
+            x = call.read("x", x, (self.worlds, 6 * len(where)), "[world, 6 frames]")
+            out = call.write(out, (self.worlds, len(where), 6), "[world, frame, 6]")
+            self._launch("operational_inertia_inverse_product", out, q=q, x=x, frames=where)
+        return call.result
+
     # -- momentum --------------------------------------------------------------------------------------------------
     def com_jacobian(self, q: Any, out: Any = None) -> Any:
         """Velocity of the centre of mass per unit qd, inertial axes: sum of m(k) J(k) / sum of m(k).

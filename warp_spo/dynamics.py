@@ -49,6 +49,8 @@ OPERATIONS = (
     "hybrid_dynamics",
     "operational_inertia",
     "jacobian_bias",
+    "frame_accelerations",
+    "operational_inertia_inverse_product",
     "com_jacobian",
     "centroidal_momentum_matrix",
     "centroidal_momentum_bias",
@@ -233,6 +235,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
             "body_accelerations": (q, rate, rate),
             "body_reactions": (q, rate, rate),
             "jacobian_bias": (q, rate),
+            "frame_accelerations": (q, rate, rate),
             "centroidal_momentum_bias": (q, rate),
             "quasi_velocities": (q, rate),
             "inverse_dynamics_derivatives": (q, rate, rate),
@@ -250,8 +253,12 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
             given = (q, wp.zeros(shape, dtype=self.dtype, device=self.device))
         if operation == "hybrid_dynamics":
             extra["prescribed"] = options.pop("prescribed", [False] * self.scene.dof_count)
-        if operation in ("jacobian", "operational_inertia_inverse", "operational_inertia", "jacobian_bias"):
+        if operation in ("jacobian", "operational_inertia_inverse", "operational_inertia", "jacobian_bias",
+                         "frame_accelerations", "operational_inertia_inverse_product"):  # fmt: skip
             extra["frames"] = options.pop("frames", [0])
+        if operation == "operational_inertia_inverse_product":
+            wrenches = self.worlds, 6 * len(extra["frames"])
+            given = (q, wp.zeros(wrenches, dtype=self.dtype, device=self.device))
         if options:
             raise ValueError(f"Dynamics.prepare: {operation} has no option {', '.join(options)}")
         getattr(self, operation)(*given, **extra)

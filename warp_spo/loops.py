@@ -28,6 +28,7 @@ OF_TREES = {
     "embed": (
         "log_det_mass_matrix",
         "operational_inertia_inverse",
+        "operational_inertia_inverse_product",
         "operational_inertia",
         "hybrid_dynamics",
         "quasi_velocities",

@@ -28,6 +28,8 @@ SEGMENTED = ("forward_dynamics", "solve_mass_matrix", *LONG_RESULTS, *SHORT)
 TREE_ONLY = (
     "hybrid_dynamics",
     "jacobian_bias",
+    "frame_accelerations",
+    "operational_inertia_inverse_product",
     "com_jacobian",
     "centroidal_momentum_matrix",
     "centroidal_momentum_bias",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from ..trace.emit import Store
@@ -10,6 +11,7 @@ from ..trace.spatial import ZERO, Articulated, Rigid, Vector, cross, dot
 from . import articulated, composite, determinant, hybrid, motion, newton_euler, reactions, step
 from .hybrid import Given
 from .links import Link
+from .motion import STILL
 from .operators import Operators
 from .traced import Trace
 
@@ -118,20 +120,32 @@ class Applications(Trace):
                 origins[key] = origins[over] + self.axes[over] @ pose.l
         return origins
 
-    def bias_accelerations(self) -> dict[int, tuple[Vector, Vector]]:
-        """Accelerations of the links at qdd = 0 without gravity: phi* a."""
+    def link_accelerations(self, qdd: Callable[[int], Value]) -> dict[int, tuple[Vector, Vector]]:
+        """Accelerations of the links without gravity: phi* (H* qdd + a)."""
         alpha: dict[int, tuple[Vector, Vector]] = {}
         for link in self.links.links:
             self.at(link, "a")
             above = (ZERO, ZERO) if link.parent is None else alpha[id(link.parent)]
             place, move = self.places[id(link)], self.motions[id(link)]
-            alpha[id(link)] = newton_euler.accelerated(link, place, move, above, lambda dof: 0.0)
+            alpha[id(link)] = newton_euler.accelerated(link, place, move, above, qdd)
         return alpha
+
+    def bias_accelerations(self) -> dict[int, tuple[Vector, Vector]]:
+        """The same at qdd = 0."""
+        return self.link_accelerations(lambda dof: 0.0)
 
     def jacobian_bias(self, frames: tuple) -> list[Store]:
         """out [frame, 6] = J' qd: acceleration of each frame's origin, angular acceleration, inertial axes, qdd = 0."""
         self.place_all(moves=True)
-        alpha = self.bias_accelerations()
+        return self._at_frames(frames, self.bias_accelerations())
+
+    def frame_accelerations(self, frames: tuple) -> list[Store]:
+        """out [frame, 6] = J qdd + J' qd"""
+        self.place_all(moves="qd" in self.given)
+        return self._at_frames(frames, self.link_accelerations(self.vector("qdd")))
+
+    def _at_frames(self, frames: tuple, alpha: dict[int, tuple[Vector, Vector]]) -> list[Store]:
+        """out [frame, 6]: how frames accelerate whose links do as ``alpha`` says, inertial axes."""
         stores = []
         for index, (body, origin) in enumerate(frames):
             link, arm = self.frame(body, origin)
@@ -142,6 +156,34 @@ class Applications(Trace):
                 values = (*(R @ (v + cross(w, arm) + self.motions[id(link)].whirl @ arm)), *(R @ w))
             stores += [Store("out", (index, c), value) for c, value in enumerate(values)]
         return stores
+
+    def operational_inertia_inverse_product(self, frames: tuple) -> list[Store]:
+        """out [frame, 6] = J Mass^-1 J* x: wrenches x on the frames inward, the accelerations that they make outward"""
+        self.place_all()
+        x, done = self.vector("x"), self.factor()
+        forces: dict[int, Vector] = {id(link): Vector((*ZERO, *ZERO)) for link in self.links.links}
+        for index, (body, origin) in enumerate(frames):
+            link, arm = self.frame(body, origin)
+            if link is not None:
+                self.at(link, f"x{index}_")
+                back = self.axes[id(link)].T
+                f, n = (back @ Vector(x(6 * index + 3 * part + c) for c in range(3)) for part in range(2))
+                forces[id(link)] = forces[id(link)] - Vector((*(n + cross(arm, f)), *f))
+        rates: dict[int, list[Value]] = {}
+        for link in reversed(self.links.links):
+            self.at(link, "z")
+            key, still = id(link), [0.0] * len(link.dofs)
+            rates[key], force = articulated.reduced(link, self.places[key], done[key], STILL, forces[key], still)
+            if link.parent is not None:
+                forces[id(link.parent)] = forces[id(link.parent)] + force
+        alpha: dict[int, tuple[Vector, Vector]] = {}
+        for link in self.links.links:
+            self.at(link, "a")
+            above = (ZERO, ZERO) if link.parent is None else alpha[id(link.parent)]
+            _, alpha[id(link)] = articulated.expanded(
+                link, self.places[id(link)], done[id(link)], rates[id(link)], STILL, above
+            )
+        return self._at_frames(frames, alpha)
 
     # -- momentum --------------------------------------------------------------------------------------------------
     def composites(self) -> dict[int, Rigid]:
