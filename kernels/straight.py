@@ -282,8 +282,8 @@ def _slot(i: str, entries: int, distance: int) -> str:
     return i if entries == distance else f"({i} / {entries}) * {distance} + {i} % {entries}"
 
 
-def looped(a_pass: str, last: str, names: tuple[str, str, str], entries: int, T) -> str:
-    """``a_pass`` until it leaves the last of the variables ``names`` at zero, then ``last``.
+def looped(ahead: str, a_pass: str, last: str, names: tuple[str, str, str], entries: int, T) -> str:
+    """``ahead``, then ``a_pass`` until it leaves the last of the variables ``names`` at zero, then ``last``.
 
     The variables are arrays of a thread, ``name_row[i]``, zero at first; their indices are constants, so that they
     live in registers. In a warp, threads wait for the one that needs most passes.
@@ -291,7 +291,7 @@ def looped(a_pass: str, last: str, names: tuple[str, str, str], entries: int, T)
     c, missed = C_TYPE[T], names[-1]
     declared = [f"{c} {name}_row[{entries}] = {{}};" for name in names[:-1]] + [f"{c} {missed}_row[1] = {{}};"]
     loop = f"for (int pass = 0; pass < {MOST_PASSES}; ++pass) {{\n{a_pass}\nif (!({missed}_row[0] > 0)) break;\n}}"
-    return "\n".join([*declared, loop, last])
+    return "\n".join([ahead, *declared, loop, last])
 
 
 def kernel(

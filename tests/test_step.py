@@ -15,7 +15,7 @@ import warp_spo as spo
 from warp_spo.errors import UnsupportedError
 from warp_spo.kernels import straight
 from warp_spo.parts import SCREWS
-from warp_spo.recursions import impedance, integration, step
+from warp_spo.recursions import impedance, integration, joint_space, step
 from warp_spo.reference import Dense, rotation
 
 H = 2e-3
@@ -187,7 +187,8 @@ BUGS = [
     (impedance.Impedance, "_limits", "(0.0, None) if inward > 0.0 else (None, 0.0)", "None, None"),
     (impedance.Law, "piece", "select(over, 0.0, resistance)", "resistance"),
     (impedance.Law, "missed", "self.at(u) - piece.line(u)", "0.0 * u"),
-    (step.Step, "_stiffened", "self.h * piece.resistance", "piece.resistance"),
+    (step.Step, "_swept", "self.h * piece.resistance", "piece.resistance"),
+    (joint_space.JointSpace, "solve", "U[i, j] - column[i]", "U[i, j] + column[i]"),
     (integration, "moved", "+ shift[i]", ""),
     (integration, "turned", "half = turn * 0.5", "half = turn"),
 ]
@@ -196,6 +197,7 @@ BUGS = [
 @pytest.mark.parametrize(("owner", "name", "old", "new"), BUGS)
 def test_a_planted_bug_is_seen(monkeypatch, owner, name, old, new):
     scene = furnished(zoo.fork())
+    monkeypatch.setattr(step, "SHORT", 99 if owner is joint_space.JointSpace else 0)
     a = states(scene, 3)
     wanted = [implicit.step(scene, w, H, *(a[n][w] for n in ("q", "qd", *FORCES))) for w in range(3)]
 
@@ -208,6 +210,18 @@ def test_a_planted_bug_is_seen(monkeypatch, owner, name, old, new):
     if owner is integration:
         monkeypatch.setattr(step, "moved", integration.moved)
     assert error() > 1e-6
+
+
+@pytest.mark.parametrize(("name", "dtype"), [("forest", "float64"), ("dancer", "float64"), ("chain7", "float32")])
+def test_passes_in_joint_space_equal_sweeps(monkeypatch, name, dtype):
+    """Several roots, a floating base, balls; chain7 takes joint space by itself."""
+    scene, results = furnished(zoo.SCENES[name]()), []
+    a = states(scene, 8)
+    for short in (0, 99):
+        monkeypatch.setattr(step, "SHORT", short)
+        results.append(symbolic.advance(scene, a, H, dtype)[:2])
+    for swept, short in zip(*results, strict=True):
+        np.testing.assert_allclose(short, swept, rtol=0.0, atol=TOLERANCE[dtype])
 
 
 def test_passes_that_states_need():

@@ -217,18 +217,15 @@ class Programs:
         frame = frame._replace(more=tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more))
         placed, table = _placed([item for item in stores if item.array == "out"], frame.result)
         placed += apart
-        emitter = self._emitter(shapes, frame)
-        listing = emitter.region(placed)
-        body = literals(listing, self.run.dtype.__name__)
-        operations, looped = emitter.operations, [item for item in stores if item.array in LOOPED]
+        emitter, looped = self._emitter(shapes, frame), [item for item in stores if item.array in LOOPED]
+        regions = [emitter.region([], trace.ahead), emitter.branch(looped)] if looped else []
+        *before, body = (literals(each, self.run.dtype.__name__) for each in [*regions, emitter.region(placed)])
         if looped:
-            emitter = self._emitter(shapes, frame)
-            a_pass = literals(emitter.region(looped), self.run.dtype.__name__)
-            body = straight.looped(a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
-            operations += emitter.operations
-        frame = frame._replace(again=frame.again and "farthest" in listing.text)
+            ahead, a_pass = before
+            body = straight.looped(ahead, a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
+        frame = frame._replace(again=frame.again and "farthest" in body)
         tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
-        return self._finished(operation, frame, body, body, tables, operations)
+        return self._finished(operation, frame, body, body, tables, emitter.operations)
 
     def _segment_program(self, operation: str, shapes: dict, pieces: Pieces, options: dict) -> Program | None:
         dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(operation, pieces)

@@ -2,7 +2,7 @@
 
 R and F are what the hinges' laws leave of themselves, see :mod:`.impedance`; where laws bend, a pass solves for the
 pieces at its guess of u = qd' - qd and says whether they were the right ones. Passes share one text, run in a loop
-until they were.
+until they were: sweeps over the tree, or with few dofs the solution of a system that is formed before the loop.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ from ..trace.graph import Value, less, reciprocal, select
 from ..trace.spatial import total
 from .impedance import Impedance, Law, added
 from .integration import coordinate_rates, moved
+from .joint_space import JointSpace
 from .links import Link
 from .traced import Trace
 
 GUESS, GAIN, MISSED = "guess", "gain", "missed"
 """Variables of a loop over passes, zero at first: by dof, the guess of u, and u; whether a guess missed a piece."""
 LOOPED = (GUESS, GAIN, MISSED)
+SHORT = 10  # dofs up to which passes solve a system that is formed once
 NOT_POSITIVE, NOT_FINITE, NOT_SETTLED = 1, 2, 5  # status words; those of warp_spo.status but for the last
 
 
@@ -48,15 +50,11 @@ class Step:
             vector("target_qd"),
         )
         self.laws: dict[int, list[Law]] = {}  # by dof
-        self.forces: dict[int, Value] = {}
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
         """out = qd', q_out = q'; with ``qdd`` qdd_out = (qd' - qd) / h, with ``status`` the word of each world."""
         trace = self.trace
-        trace.stiffened = self._stiffened
-        tau = trace.vector("tau")
-        done, rates, _ = trace.reduce(lambda dof: tau(dof) + self.forces[dof], moves=True, loads=True)
-        gains = {item.index[0]: self.h * item.value for item in trace.expand(done, rates, trace.base)}
+        gains = self._in_joint_space() if self._short else self._swept()
         looped = self._looped(gains)
         if looped:
             gains = {dof: trace.graph.input(GAIN, dof) for dof in gains}
@@ -74,14 +72,41 @@ class Step:
             stores.append(Store("status", (), self._word([item.value for item in stores], bool(looped))))
         return looped + stores
 
-    def _stiffened(self, link: Link) -> Link:
-        armature = []
-        for dof, laws, inertia in zip(link.dofs, self.impedance.laws(link), link.armature, strict=True):
-            self.laws[dof] = laws
-            piece = added([law.piece(self._guess(dof)) for law in laws])
-            self.forces[dof] = piece.force
-            armature.append(inertia + self.h * piece.resistance)
-        return dataclasses.replace(link, armature=tuple(armature))
+    @property
+    def _short(self) -> bool:
+        """Several passes over few dofs."""
+        if self.trace.links.scene.dof_count > SHORT:
+            return False
+        return any(law.bends for link in self.links for laws in self.impedance.laws(link) for law in laws)
+
+    def _swept(self) -> dict[int, Value]:
+        """u by dof, by sweeps over the tree."""
+        trace, tau, forces = self.trace, self.trace.vector("tau"), {}
+
+        def stiffened(link: Link) -> Link:
+            pieces = self._pieces(link)
+            forces.update({dof: piece.force for dof, piece in zip(link.dofs, pieces, strict=True)})
+            armature = (a + self.h * piece.resistance for a, piece in zip(link.armature, pieces, strict=True))
+            return dataclasses.replace(link, armature=tuple(armature))
+
+        trace.stiffened = stiffened
+        done, rates, _ = trace.reduce(lambda dof: tau(dof) + forces[dof], moves=True, loads=True)
+        return {item.index[0]: self.h * item.value for item in trace.expand(done, rates, trace.base)}
+
+    def _in_joint_space(self) -> dict[int, Value]:
+        """u by dof, of a system that is formed once for all passes."""
+        tau, system, pieces = self.trace.vector("tau"), JointSpace(self.trace), {}
+        self.trace.ahead = [*system.mass.values(), *system.bias.values()]
+        for link in self.links:
+            self.trace.at(link, "r")
+            pieces.update(zip(link.dofs, self._pieces(link), strict=True))
+        qdd = system.solve(lambda dof: self.h * pieces[dof].resistance, lambda dof: tau(dof) + pieces[dof].force)
+        return {dof: self.h * value for dof, value in enumerate(qdd)}
+
+    def _pieces(self, link: Link) -> list[Law]:
+        """What holds at the guess, of each dof."""
+        self.laws |= dict(zip(link.dofs, self.impedance.laws(link), strict=True))
+        return [added([law.piece(self._guess(dof)) for law in self.laws[dof]]) for dof in link.dofs]
 
     def _guess(self, dof: int) -> Value:
         """Of u; what the pass before has found, unless a law asked for another."""

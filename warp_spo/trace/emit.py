@@ -99,12 +99,16 @@ class Emitter:
         self._names = known
         return listing
 
-    def region(self, stores: Iterable[Store]) -> Listing:
-        """Statements that compute and store what is asked for, in the order in which the steps made it."""
+    def region(self, stores: Iterable[Store], ahead: Iterable[Value] = ()) -> Listing:
+        """Statements that compute and store what is asked for, in the order in which the steps made it.
+
+        Args:
+            ahead: values to compute that a later region stores.
+        """
         self._constants, self._indices, self._labels, self._place = [], [], [], None
         lines = self._lines = []
         due: dict[tuple, list[Store]] = {}
-        values, known = [], []
+        values, known = [value for value in ahead if not is_constant(value)], []
         for item in stores:
             if is_constant(item.value) or item.value.key in self._names:
                 known.append(item)  # at the end: what it overwrites may be read before

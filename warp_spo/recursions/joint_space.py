@@ -1,0 +1,59 @@
+"""Mass and bias force of a short system, formed once, and solved for many diagonals: Mass + Delta = U D U*.
+
+The sweeps find the same factors, [I + H phi K] D [I + H phi K]*, in O(dof), and start from the links each time. Where
+only Delta changes from solve to solve and dofs are few, taking them from the entries of Mass is less work. What the tree
+leaves out of Mass stays out: eliminating from the leaves fills nothing in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from ..trace.graph import Value, guarded, reciprocal
+
+if TYPE_CHECKING:
+    from .traced import Trace
+
+Entries = dict[tuple[int, int], Value]  # (row, column), row <= column
+
+
+class JointSpace:
+    """Mass and bias force less the loads of a trace's state.
+
+    Attributes:
+        mass: entries of the upper triangle that the tree allows. bias: by dof.
+    """
+
+    def __init__(self, trace: Trace):
+        self.trace, self.dofs = trace, range(trace.links.scene.dof_count)
+        self.mass: Entries = {
+            (item.index[0], item.index[1]): item.value for item in trace.mass_matrix() if item.index[0] <= item.index[1]
+        }
+        self.bias = {item.index[0]: item.value for item in trace.inverse_dynamics(qdd=lambda dof: 0.0)}
+
+    def solve(self, delta: Callable[[int], Value], b: Callable[[int], Value]) -> list[Value]:
+        """(Mass + diag(delta))^-1 (b - bias), by dof; NaN where a pivot is not positive beyond rounding."""
+        U, x = dict(self.mass), [b(dof) - self.bias[dof] for dof in self.dofs]
+        inverse: dict[int, Value] = {}
+        for k in self.dofs:
+            U[k, k] = U[k, k] + delta(k)
+        sizes = {k: U[k, k] for k in self.dofs}
+        for k in reversed(self.dofs):
+            self.trace.graph.step = f"dof {k}|D"
+            inverse[k] = reciprocal(guarded(U[k, k], 4.0 * self.trace.epsilon * sizes[k]))
+            above = [i for i in self.dofs[:k] if (i, k) in U]
+            column = {i: U[i, k] * inverse[k] for i in above}
+            for i in above:
+                x[i] = x[i] - column[i] * x[k]
+                for j in above:
+                    if i <= j:
+                        U[i, j] = U[i, j] - column[i] * U[j, k]
+            U |= {(i, k): column[i] for i in above}
+        for k in self.dofs:
+            self.trace.graph.step = f"dof {k}|u"
+            x[k] = x[k] * inverse[k]
+            for i in self.dofs[:k]:
+                if (i, k) in U:
+                    x[k] = x[k] - U[i, k] * x[i]
+        return x
