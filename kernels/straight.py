@@ -70,8 +70,8 @@ class Frame(NamedTuple):
         warps: how many work on 32 worlds.
         block: threads of a block.
         more: further results, ``name_row[i]``, each entry to memory by itself.
-        held: entries of each field, from the first on, that wait for their use in shared memory: a compiler that loads
-            them from memory does so long before, and has no registers left.
+        held: entries of each field that wait for their use in shared memory, by place there: a compiler that loads them
+            from memory does so long before, and has no registers left.
         numbers: numbers that all worlds share, ``name_row[0]``.
     """
 
@@ -84,7 +84,7 @@ class Frame(NamedTuple):
     block: int
     more: tuple[Row, ...] = ()
     again: bool = False
-    held: tuple[int, ...] = ()
+    held: tuple[tuple[int, ...], ...] = ()
     numbers: tuple[str, ...] = ()
 
     @property
@@ -97,7 +97,7 @@ class Frame(NamedTuple):
         """Scalars of shared memory that a group takes."""
         rows = sum(pitch(row.entries) for row in self.rows) if self.staged else 0
         extra = {STAGED: self.result.array.entries, MAPPED: self.result.slots | 1}.get(self.result.way)
-        return WARP * (rows + (0 if extra is None else pitch(extra)) + self.sent + sum(self.held))
+        return WARP * (rows + (0 if extra is None else pitch(extra)) + self.sent + sum(map(len, self.held)))
 
     def fits(self, T) -> bool:
         """Shared memory holds what is staged."""
@@ -168,7 +168,7 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
         text += [own_row]
     if frame.sent:
         text += [f"{c} sent[{frame.sent}];", "#define SENT(i) sent[i]"]
-    text += [*_fields(frame.fields, c), cpu]
+    text += [*(_places(frame) if frame.held else []), *_fields(frame.fields, c, bool(frame.held)), cpu]
     if result.way == MAPPED:
         text += [f"for (int i = 0; i < {out.entries}; ++i) {{", "    const int slot = place.data[i];",
                  f"    out.data[world * {out.entries} + i] = slot < 0 ? 0 : result_row[slot];", "}"]
@@ -198,15 +198,23 @@ def _own_result(row: Row, c: str) -> str:
     return f"{kind}* {row.name}_row = {row.name}.data + world * {row.entries};"
 
 
-def _fields(names: list[str], c: str) -> list[str]:
-    """FIELD for fields that are read where they are."""
+def _places(frame: Frame) -> list[str]:
+    """The entry of each place of the fields that are held: on the CPU they are read where they are."""
+    return [
+        f"static const int {name}_entry[] = {{{', '.join(map(str, entries))}}};"
+        for name, entries in zip(frame.fields, frame.held, strict=True)
+    ]
+
+
+def _fields(names: list[str], c: str, by_place: bool = False) -> list[str]:
+    """FIELD for fields that are read where they are, by entry or ``by_place`` of one."""
     if not names:
         return []
     return [
         "#if defined(__CUDA_ARCH__)",
         "#define FIELD(name, entry) __ldg(name##_at + (entry) * name##_part)",
         "#else",
-        "#define FIELD(name, entry) name##_at[(entry) * name##_part]",
+        f"#define FIELD(name, entry) name##_at[{'name##_entry[entry]' if by_place else '(entry)'} * name##_part]",
         "#endif",
         *(
             f"const {c}* {name}_at = (const {c}*)((const char*){name}.data + world * {name}.strides[1]);\n"
@@ -218,16 +226,16 @@ def _fields(names: list[str], c: str) -> list[str]:
 
 def _held(frame: Frame, c: str) -> list[str]:
     """FIELD for fields in the last part of the shared memory; each thread fetches those of its world."""
-    text, at = ["#define FIELD(name, entry) name##_at[(entry) * 32]"], frame.scalars - WARP * sum(frame.held)
+    text = ["#define FIELD(name, place) name##_at[(place) * 32]"]
+    at = frame.scalars - WARP * sum(map(len, frame.held))
     for name, entries in zip(frame.fields, frame.held, strict=True):
         text += [
             f"{c}* {name}_at = stage + {at} + lane;",
             f"const char* {name}_from = (const char*){name}.data + world * {name}.strides[1];",
-            "#pragma unroll 8",
-            f"for (int k = 0; k < {entries}; ++k)",
-            f"    ON_ITS_WAY({name}_at + 32 * k, {name}_from + k * (long long){name}.strides[0]);",
         ]
-        at += WARP * entries
+        for place, entry in enumerate(entries):
+            text += [f"ON_ITS_WAY({name}_at + {32 * place}, {name}_from + {entry}ll * {name}.strides[0]);"]
+        at += WARP * len(entries)
     return text
 
 

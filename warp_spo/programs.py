@@ -312,7 +312,14 @@ class Programs:
                 return f"{guard}result_row[{entry}] = {value};"
             return f"if (mine) {array}_row[{entry}] = {value};"
 
+        places = {
+            name: {entry: place for place, entry in enumerate(entries)}
+            for name, entries in zip(frame.fields, frame.held, strict=False)
+        }
+
         def flat(array: str, index: tuple) -> int:
+            if array in places:
+                return places[array][index[0]]
             return index[0] if len(index) == 1 else _flat(index, shapes[array][1:])
 
         return Emitter(self.run.dtype.__name__, load, store, flat, angles, FIELDS)
@@ -328,7 +335,7 @@ class Programs:
         over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
         over = [name for name in over if _read_before(stores, everything or stores, name)]
         slots = len({_name(item.value) for item in stores})
-        fields = {name: used[name] for name in FIELDS if name in used}
+        fields = {name: tuple(sorted(used[name])) for name in FIELDS if name in used}
         held = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
         staged, ways = self.plan.staged, [(False, Result(DIRECT, out))]
         staged = staged or any(row.name in ("x", "body_f") and row.entries > SHORT_ROW for row in rows)
@@ -406,16 +413,16 @@ def _flat(index: tuple, shape: tuple) -> int:
     return at
 
 
-def _reads(stores: list[Store]) -> dict[str, int]:
-    """Names of the arrays that are read, and one more than the last index."""
+def _reads(stores: list[Store]) -> dict[str, set[int]]:
+    """Names of the arrays that are read, and which first indices."""
     graphs: dict[int, list[Value]] = {}
     for item in stores:
         if not is_constant(item.value):
             graphs.setdefault(id(item.value.graph), []).append(item.value)
-    read: dict[str, int] = {}
+    read: dict[str, set[int]] = {}
     for values in graphs.values():
         for scalar in ordered(values):
             if scalar.op == "input":
                 array, index = scalar.args[:2]
-                read[array] = max(index + 1, read.get(array, 0))
+                read.setdefault(array, set()).add(index)
     return read

@@ -1,7 +1,7 @@
 """Mass and bias force of a short system, formed once, and solved for many diagonals: Mass + Delta = U D U*.
 
 The sweeps find the same factors, [I + H phi K] D [I + H phi K]*, in O(dof), and start from the links each time. Where
-only Delta changes from solve to solve and dofs are few, taking them from the entries of Mass is less work. What the tree
+only Delta changes from solve to solve and dofs are few, the entries of Mass give them with less work. What the tree
 leaves out of Mass stays out: eliminating from the leaves fills nothing in.
 """
 
