@@ -69,7 +69,8 @@ class Frame(NamedTuple):
         sent: values that warps send each other, ``SENT(i)``.
         warps: how many work on 32 worlds.
         block: threads of a block.
-        more: further results, ``name_row[i]``, each entry to memory by itself.
+        more: further results, ``name_row[i]``, each entry to memory by itself, but for those named in ``beside``: their
+            rows, all of them filled, leave through shared memory.
         held: entries of each field that wait for their use in shared memory, by place there: a compiler that loads them
             from memory does so long before, and has no registers left.
         numbers: numbers that all worlds share, ``name_row[0]``.
@@ -83,6 +84,7 @@ class Frame(NamedTuple):
     warps: int
     block: int
     more: tuple[Row, ...] = ()
+    beside: tuple[str, ...] = ()
     again: bool = False
     held: tuple[tuple[int, ...], ...] = ()
     numbers: tuple[str, ...] = ()
@@ -97,6 +99,7 @@ class Frame(NamedTuple):
         """Scalars of shared memory that a group takes."""
         rows = sum(pitch(row.entries) for row in self.rows) if self.staged else 0
         extra = {STAGED: self.result.array.entries, MAPPED: self.result.slots | 1}.get(self.result.way)
+        rows += sum(pitch(row.entries) for row in self.more if row.name in self.beside)
         return WARP * (rows + (0 if extra is None else pitch(extra)) + self.sent + sum(map(len, self.held)))
 
     def fits(self, T) -> bool:
@@ -124,7 +127,8 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
             text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
         else:
             text += [_own_row(row, c)]
-    text += [_own_result(row, c) for row in frame.more]
+    beside = [row for row in frame.more if row.name in frame.beside]
+    text += [_own_result(row, c) for row in frame.more if row not in beside]
     if frame.held:
         text += [ON_ITS_WAY, *_held(frame, c), "#undef ON_ITS_WAY"]
         lines = cuda.split("\n")
@@ -151,11 +155,17 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
         text += [f"{c}* result_row = stage + {start} + lane * {width};"]
     if frame.sent:
         text += [f"{c}* sent = stage + {at} + lane;", "#define SENT(i) sent[(i) * 32]"]
+        at += WARP * frame.sent
+    for row in beside:
+        offset[row.name], at = at, at + WARP * pitch(row.entries)
+        text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
     if frame.again:
         cuda = f"for (int again = 0;; ++again) {{\n{cuda}\nif (again || !(farthest > on::reach())) break;\n}}"
     text += [*([] if frame.held else _fields(frame.fields, c)), cuda]
-    if result.way in (IN_PLACE, STAGED):
-        text += [sync, _stage_out(out, start, width, c, team)]
+    leaving = [(out, start, width)] if result.way in (IN_PLACE, STAGED) else []
+    leaving += [(row, offset[row.name], pitch(row.entries)) for row in beside]
+    if leaving:
+        text += [sync, *(_stage_out(row, first, apart, c, team) for row, first, apart in leaving)]
     if result.way == MAPPED:
         text += [sync, _spread_out(result, start, c, team)]
     text += ["#undef FIELD"] if frame.held else []
@@ -265,7 +275,7 @@ def _stage_in(row: Row, offset: int, c: str, team: int) -> str:
 def _stage_out(out: Row, offset: int, width: int, c: str, team: int) -> str:
     n = out.entries
     copy = _each(n, team, f"to[i] = from[{_slot('i', n, width)}];")
-    return f"{{\n{c}* to = out.data + first * {n};\nconst {c}* from = stage + {offset};\n{copy}\n}}"
+    return f"{{\n{c}* to = {out.name}.data + first * {n};\nconst {c}* from = stage + {offset};\n{copy}\n}}"
 
 
 def _spread_out(result: Result, offset: int, c: str, team: int) -> str:

@@ -444,3 +444,19 @@ def test_random_trees_meet_the_error_line(which, granularity, device):
         assert np.median(error) <= MEDIAN, f"{operation}: median {np.median(error):.1e}"
         if operation == "forward_dynamics":
             assert np.percentile(error, 99) <= WORST, f"99th percentile {np.percentile(error, 99):.1e}"
+
+
+@pytest.mark.parametrize("granularity", [None, "node"])
+@pytest.mark.parametrize("name", ["fixed", "hand"])
+def test_body_states_are_poses_and_velocities(name, granularity, device):
+    """Of variable CoMs, too; the rows of the hand's 11 bodies leave through shared memory."""
+    scene = SCENES[name]()
+    dyn = spo.Dynamics(scene, MANY, device=device, dtype="float64", granularity=granularity, variable=("body_com",))
+    a = laws.to_device(dyn, laws.states(scene, MANY))
+    shapes = (MANY, scene.body_count, 7), (MANY, scene.body_count, 6)
+    out = tuple(wp.full(shape, math.nan, dtype=dyn.dtype, device=device) for shape in shapes)
+    assert dyn.body_states(a["q"], a["qd"], out=out) == out
+    for got, wanted in zip(out, (dyn.body_poses(a["q"]), dyn.body_velocities(a["q"], a["qd"])), strict=True):
+        np.testing.assert_allclose(got.numpy(), wanted.numpy(), rtol=0.0, atol=1e-14)
+    with pytest.raises(TypeError, match="expected a pair"):
+        dyn.body_states(a["q"], a["qd"], out=out[0])

@@ -43,6 +43,7 @@ OPERATIONS = (
     "log_det_mass_matrix",
     "body_poses",
     "body_velocities",
+    "body_states",
     "jacobian",
     "operational_inertia_inverse",
     "integrate",
@@ -229,6 +230,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
             "bias_force": (q, rate),
             "passive_force": (q, rate),
             "body_velocities": (q, rate),
+            "body_states": (q, rate),
             "integrate": (q, rate, 0.0),
             "hybrid_dynamics": (q, rate, rate, rate),
             "step": (q, rate, rate, 1e-3),
@@ -415,6 +417,32 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
             q, qd = self._read_state(call, q, qd, optional=False)
             out = call.write(out, (self.worlds, self.scene.body_count, 6), "[world, body, 6]")
             self._run("body_velocities", out, q=q, qd=qd)
+        return call.result
+
+    def body_states(self, q: Any, qd: Any, out: Any = (None, None)) -> tuple[Any, Any]:
+        """:meth:`body_poses` and :meth:`body_velocities` in one kernel.
+
+        Args:
+            q, qd: the state [world, coordinate], [world, dof].
+            out: (poses, velocities), each an array or None.
+
+        Returns:
+            poses [world, body, 7], velocities [world, body, 6].
+        """
+        with self._call("body_states") as call:
+            if not isinstance(out, tuple | list) or len(out) != 2:
+                raise TypeError(f"{call.name}: out is {out!r}; expected a pair of arrays or None, (poses, velocities)")
+            q, qd = self._read_state(call, q, qd, optional=False)
+            bodies = self.scene.body_count
+            poses = call.write(out[0], (self.worlds, bodies, 7), "[world, body, 7]", name="out[0]")
+            velocities = call.write(out[1], (self.worlds, bodies, 6), "[world, body, 6]", name="out[1]")
+            shapes, further = {"q": q.shape, "qd": qd.shape}, {"velocities_out": velocities.shape}
+            program = self.programs.find("body_states", shapes, poses.shape, further)
+            if program is not None:
+                self.programs.launch(program, {"q": q, "qd": qd}, poses, velocities)
+            else:
+                self._run("body_poses", poses, q=q)
+                self._run("body_velocities", velocities, q=q, qd=qd)
         return call.result
 
     def jacobian(self, q: Any, frames: Sequence[Frame], out: Any = None) -> Any:

@@ -38,6 +38,7 @@ TRACED = (
     "log_det_mass_matrix",
     "body_poses",
     "body_velocities",
+    "body_states",
     "jacobian",
     "operational_inertia_inverse",
     "expression",
@@ -191,7 +192,7 @@ class Programs:
 
     def _build(self, operation: str, shapes: dict, out_shape: tuple, more: dict, options: dict) -> Program | None:
         links = self.links.opened()
-        if (operation == "body_poses" and links.turns_vary) or not links.links:
+        if (operation in ("body_poses", "body_states") and links.turns_vary) or not links.links:
             return None
         if operation == "expression" and not meet(options["expression"]):
             return None
@@ -214,7 +215,8 @@ class Programs:
             frame = frame._replace(staged=self.plan.staged, result=result)
         once = operation == "step" or any(item.array in LOOPED for item in stores)  # may write over what it reads
         frame = frame._replace(again=not once and not frame.staged and frame.result.way in (DIRECT, TILED))
-        frame = frame._replace(more=tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more))
+        rows = [Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more]
+        frame = self._with_more(frame, rows, apart)
         placed, table = _placed([item for item in stores if item.array == "out"], frame.result)
         placed += apart
         emitter, looped = self._emitter(shapes, frame), [item for item in stores if item.array in LOOPED]
@@ -226,6 +228,14 @@ class Programs:
         frame = frame._replace(again=frame.again and "farthest" in body)
         tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
         return self._finished(operation, frame, body, body, tables, emitter.operations)
+
+    def _with_more(self, frame: Frame, rows: list[Row], stores: list[Store]) -> Frame:
+        """A frame with further results; long rows that are filled go through shared memory if it has room."""
+        filled = {row.name: len({item.index for item in stores if item.array == row.name}) for row in rows}
+        beside = tuple(row.name for row in rows if SHORT_ROW < row.entries == filled[row.name])
+        frame = frame._replace(more=tuple(rows))
+        roomy = frame._replace(beside=beside)
+        return roomy if roomy.fits(self.run.dtype) else frame
 
     def _segment_program(self, operation: str, shapes: dict, pieces: Pieces, options: dict) -> Program | None:
         dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(operation, pieces)

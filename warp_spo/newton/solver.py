@@ -224,8 +224,7 @@ class SolverSPO(Plugs, SolverBase):
 
     def _write_bodies(self, q: wp.array, qd: wp.array, state: newton.State) -> None:
         poses, rates = self._poses.target(state.body_q, "poses"), self._wrenches.target(state.body_qd, "rates")
-        self.dynamics.body_poses(q, out=poses)
-        self.dynamics.body_velocities(q, qd, out=rates)
+        self.dynamics.body_states(q, qd, out=(poses, rates))
         self._poses.write(poses, state.body_q)
         self._wrenches.write(rates, state.body_qd)
 
@@ -302,8 +301,7 @@ class SolverSPO(Plugs, SolverBase):
         if flags & (StateFlags.BODY_Q | StateFlags.BODY_QD):
             q, qd = self._q.read(state.joint_q, "q"), self._qd.read(state.joint_qd, "qd")
             poses, rates = self._poses.buffer("poses"), self._wrenches.buffer("rates")
-            self.dynamics.body_poses(q, out=poses)
-            self.dynamics.body_velocities(q, qd, out=rates)
+            self.dynamics.body_states(q, qd, out=(poses, rates))
             self._poses.write(poses, state.body_q, mask)
             self._wrenches.write(rates, state.body_qd, mask)
 

@@ -95,7 +95,8 @@ class Step:
 
     def _in_joint_space(self) -> dict[int, Value]:
         """u by dof, of a system that is formed once for all passes."""
-        tau, system, pieces = self.trace.vector("tau"), JointSpace(self.trace), {}
+        tau, system = self.trace.vector("tau"), JointSpace(self.trace)
+        pieces: dict[int, Law] = {}
         self.trace.ahead = [*system.mass.values(), *system.bias.values()]
         for link in self.links:
             self.trace.at(link, "r")

@@ -419,6 +419,10 @@ class Trace:
             stores += [Store("out", (body, c), value) for c, value in enumerate(values)]
         return stores
 
+    def body_states(self) -> list[Store]:
+        """out = body_poses, velocities_out = body_velocities"""
+        return self.body_poses() + [item._replace(array="velocities_out") for item in self.body_velocities()]
+
 
 def _mirrored(i: int, j: int, value: Value) -> list[tuple[tuple[int, int], Value]]:
     return [((i, j), value)] if i == j else [((i, j), value), ((j, i), value)]
