@@ -1,5 +1,6 @@
 """Tree and segment granularity: every traced operation against the dense reference, on scenes with all there is."""
 
+import dataclasses
 import functools
 import math
 
@@ -460,3 +461,18 @@ def test_body_states_are_poses_and_velocities(name, granularity, device):
         np.testing.assert_allclose(got.numpy(), wanted.numpy(), rtol=0.0, atol=1e-14)
     with pytest.raises(TypeError, match="expected a pair"):
         dyn.body_states(a["q"], a["qd"], out=out[0])
+
+
+@pytest.mark.parametrize("granularity", GRANULARITIES)
+@pytest.mark.parametrize("name", ["every kind", "fixed", "hand", "massless"])
+def test_velocity_terms_first(name, granularity, device):
+    """Forward dynamics as the plan has it for many worlds on a GPU: bias forces, then the solution; with loads."""
+    scene = SCENES[name]()
+    dyn = spo.Dynamics(scene, MANY, device=device, dtype="float64", granularity=granularity)
+    dyn.programs.plan = dataclasses.replace(dyn.plan, apart=True)
+    arrays = laws.states(scene, MANY)
+    laws.equals_reference(dyn, "forward_dynamics", arrays, laws.TOLERANCE["float64"])
+    direct = spo.Dynamics(scene, MANY, device=device, dtype="float64", granularity=granularity)
+    laws.equals_reference(direct, "forward_dynamics", arrays, laws.TOLERANCE["float64"])
+    one, other = (next(iter(each.programs._programs.values())).kernel.key for each in (dyn, direct))
+    assert one != other

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from .parts import FREE
 from .recursions.links import Links
 from .recursions.pieces import Pieces
 from .scene import Scene
@@ -15,11 +16,14 @@ COLUMN_BYTES = 1 << 28  # workspace of a solve with many right-hand sides; more 
 # Measured on an H200, 2026-11-21; see CONTRIBUTING.
 FEW_WORLDS = 32768  # so many leave a GPU waiting: a warp for each limb, and rows read where they are
 MOST_DOFS = 128  # straight-line code of more takes too long to compile
-SPILLS = {"float32": 32, "float64": 15}  # dofs at which one thread no longer holds a whole tree in registers
+SPILLS = {"float32": 32, "float64": 15}  # dofs at which one thread no longer holds a whole tree in registers,
+SOLVES = {"float32": 32, "float64": 20}  # and at which it does not without velocities
 HELD = 16  # dofs of which a thread holds the variable values, too
 SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as through shared memory,
 LONG_ROWS = 24  # in segments; longer rows come in together already at fewer worlds
 MOST_WARPS = 16
+DEEPEST = 12  # dofs from a root to a leaf, a free hinge one, up to which velocity terms that come first are as accurate
+APART = {"chain": 2048, "tree": 4 * FEW_WORLDS, "segment": FEW_WORLDS}  # worlds beyond which they are faster
 SHORT = ("inverse_dynamics", "bias_force", "gravity_force")  # little code: a thread for the whole tree does not spill
 LONG_RESULTS = ("mass_matrix", "mass_matrix_inverse")  # writing them is most of the work, and goes faster by many warps
 
@@ -84,7 +88,9 @@ class Plan:
         outward: (first, count) into the nodes ordered by level, roots first.
         worlds: number of worlds.
         dtype: "float32" or "float64".
+        dofs: of the scene.
         limbs: serial chains that end in a leaf; counted where it matters.
+        apart: forward dynamics takes velocity terms and loads first, and keeps no link's velocity for the rest.
     """
 
     granularity: str
@@ -94,7 +100,9 @@ class Plan:
     outward: tuple[tuple[int, int], ...]
     worlds: int
     dtype: str
+    dofs: int
     limbs: int = 1
+    apart: bool = False
 
     @property
     def inward(self) -> tuple[tuple[int, int], ...]:
@@ -113,8 +121,9 @@ class Plan:
             return self.granularity
         if operation in LONG_RESULTS:
             return "segment"
-        if self.granularity == "segment" and operation in SHORT:
-            return "segment" if self.worlds <= FEW_WORLDS or self.dtype == "float64" else "tree"
+        if self.granularity == "segment" and self.worlds > FEW_WORLDS:
+            if operation in SHORT or (operation == "solve_mass_matrix" and self.dofs <= SOLVES[self.dtype]):
+                return "tree"
         return self.granularity
 
     def column_chunk(self, columns: int, bytes_per_column: int) -> int:
@@ -136,7 +145,7 @@ def choose(
         names = ", ".join(GRANULARITIES)
         raise ValueError(f"Dynamics: granularity is {granularity!r}; expected None or one of {names}")
     asked = granularity or DEFAULT
-    side_by_side = cuda and not asked and 0 < scene.dof_count <= MOST_DOFS
+    side_by_side = cuda and asked != "node" and 0 < scene.dof_count <= MOST_DOFS
     limbs = Pieces(Links(scene)).warps if side_by_side else 1
     chosen, reason = (asked, "asked for") if asked else _chosen(scene.dof_count, limbs, worlds, cuda, dtype, varies)
     rows = SHORT_ROWS if chosen == "tree" else LONG_ROWS
@@ -145,7 +154,20 @@ def choose(
     for level in scene.tree.levels:
         outward.append((first, len(level)))
         first += len(level)
-    return Plan(chosen, reason, asked is not None, staged, tuple(outward), worlds, dtype, limbs)
+    apart = side_by_side and not varies and worlds > APART["chain" if limbs == 1 else chosen]
+    apart = apart and _depth(scene) <= DEEPEST
+    return Plan(chosen, reason, asked is not None, staged, tuple(outward), worlds, dtype, scene.dof_count, limbs, apart)
+
+
+def _depth(scene: Scene) -> int:
+    """Most dofs from a root to a leaf; a free hinge counts as one: nothing it carries is far from it."""
+    depth: dict[int, int] = {-1: 0}
+    for level in scene.tree.levels:
+        for node in level:
+            hinge = scene.hinges[scene.hinge_of[node]]
+            own = 1 if hinge.motion == FREE else hinge.dof_count
+            depth[node] = depth[int(scene.tree.parent[node])] + own
+    return max(depth.values())
 
 
 def _chosen(dofs: int, limbs: int, worlds: int, cuda: bool, dtype: str, varies: bool) -> tuple[str, str]:
@@ -170,4 +192,5 @@ def describe(plan: Plan) -> str:
     """One line: the choice, why, and what else there is."""
     others = ", ".join(name for name in GRANULARITIES if name != plan.granularity)
     rows = "through shared memory" if plan.staged else "each by its thread"
-    return f"{plan.granularity}: {plan.reason}; rows are read {rows}; granularity= can force {others}"
+    first = "forward dynamics takes velocity terms first; " if plan.apart else ""
+    return f"{plan.granularity}: {plan.reason}; rows are read {rows}; {first}granularity= can force {others}"

@@ -46,6 +46,8 @@ TRACED = (
 )
 TILES = ("inverse_dynamics_derivatives", "mass_matrix_derivative")
 """Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
+REGISTERS = 65536  # of a multiprocessor
+THREE, ENOUGH = 3, 168  # blocks on it, and registers of a thread that the solution by limbs needs for that
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
 TILED_SLOTS = 256  # different values of a result from which they go through memory, not through shared memory,
 TILED_WORLDS = 1 << 20  # of so many worlds at a time
@@ -197,6 +199,8 @@ class Programs:
         if operation == "expression" and not meet(options["expression"]):
             return None
         shapes = {**shapes, "out": out_shape}
+        if operation == "forward_dynamics" and "qd" in shapes:
+            options = {**options, "apart": self.plan.apart}
         if self.plan.of(operation) == "segment":
             pieces = Pieces(links)
             several = 1 < pieces.warps <= MOST_WARPS
@@ -272,11 +276,15 @@ class Programs:
             branches = emitter.branch(news), {at: emitter.branch(found) for at, found in meetings.items()}
             team.add(Work(piece, *regions, *branches), emitter.operations)
         cuda = team.cuda()  # fills the tables
+        registers = REGISTERS // (THREE * frame.block) // 8 * 8
+        fits = options.get("apart") and dtype == "float32" and registers >= ENOUGH
         lists = ("place", table, int), ("table", team.table, self.run.dtype), ("shifts", team.shifts, int)
         tables: dict[str, Any] = {
             name: wp.array(values, dtype=kind, device=self.run.device) for name, values, kind in lists if values
         }
-        return self._finished(operation, frame, cuda, team.cpu(), tables, team.operations)
+        return self._finished(
+            operation, frame, cuda, team.cpu(), tables, team.operations, registers if fits else None
+        )
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
@@ -284,7 +292,8 @@ class Programs:
             return item
         return item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
 
-    def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int) -> Program:
+    def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int,
+                  registers: int | None = None) -> Program:
         native = straight.assemble(frame, cuda, cpu, self.run.dtype)
         rows, fields = (*(row.name for row in frame.rows), *frame.numbers), tuple(frame.fields)
         arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 0) for name in frame.numbers]
@@ -297,7 +306,7 @@ class Programs:
                 tiles = wp.empty(shape, dtype=self.run.dtype, device=self.run.device)
         arrays += [(name, 1) for name in tables] + [("out", result.array.ndim if entry is None else 3)]
         arrays += [(row.name, row.ndim) for row in frame.more]
-        kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers)
+        kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers or registers)
         return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations, result.slots,
                        entry, tiles)
 

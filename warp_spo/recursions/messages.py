@@ -10,7 +10,7 @@ from __future__ import annotations
 from .pieces import Piece, Pieces
 
 SENDS = {
-    "forward_dynamics": "Pza",
+    "forward_dynamics": "bPza",
     "solve_mass_matrix": "Pza",
     "inverse_dynamics": "z",
     "mass_matrix": "R",
@@ -20,7 +20,7 @@ SENDS = {
 INWARD, OUTWARD = "sent", "returned"
 """The array that messages go through, by either name."""
 OUTWARD_LETTERS = "aNDVY"
-SIZES = {"P": 21, "z": 6, "R": 10, "a": 6}
+SIZES = {"P": 21, "z": 6, "b": 6, "R": 10, "a": 6}
 
 
 def way(letter: str) -> str:

@@ -149,11 +149,22 @@ class Trace:
         return ZERO, -self.links.gravity
 
     # -- operations ------------------------------------------------------------------------------------------------
-    def forward_dynamics(self, right: str = "tau", bias: bool = True) -> list[Store]:
-        """out = Mass^-1 (tau - bias_force); without ``bias`` Mass^-1 times the array ``right``."""
-        moves = bias and "qd" in self.given
-        done, rates, stores = self.reduce(self.vector(right), moves, bias)
-        return stores + self.expand(done, rates, self.base if bias else (ZERO, ZERO))
+    def forward_dynamics(self, right: str = "tau", bias: bool = True, apart: bool = False) -> list[Store]:
+        """out = Mass^-1 (tau - bias_force); without ``bias`` Mass^-1 times the array ``right``.
+
+        ``apart``: velocity terms and loads become forces of the hinges first, so that no link has to keep its velocity
+        while the sweep with P goes in and out: less to hold, at one more pass through the tree.
+        """
+        tau, stores = self.vector(right), []
+        if apart:
+            known = self.inverse_dynamics(gravity=False, qdd=lambda dof: 0.0, letter="b")
+            forces = {item.index[0]: item.value for item in known if item.array == "out"}
+            stores = [item for item in known if item.array != "out"]
+            left = lambda dof: tau(dof) - forces[dof]  # noqa: E731
+            self.motions = dict.fromkeys(self.motions, STILL)
+        moves = bias and not apart and "qd" in self.given
+        done, rates, sent = self.reduce(left if apart else tau, moves, bias and not apart)
+        return stores + sent + self.expand(done, rates, self.base if bias else (ZERO, ZERO))
 
     def factor(self) -> dict[int, articulated.Factor]:
         return self.factors()[0]
@@ -228,7 +239,7 @@ class Trace:
         return stores
 
     def inverse_dynamics(
-        self, gravity: bool = True, qdd: Callable[[int], Value] | None = None
+        self, gravity: bool = True, qdd: Callable[[int], Value] | None = None, letter: str = "z"
     ) -> list[Store]:
         """out = Mass qdd + bias_force, for ``qdd`` or the array of that name"""
         base = self.base if gravity else (ZERO, ZERO)
@@ -248,7 +259,7 @@ class Trace:
             f = -self.external(link)
             if link.grouped is not None:
                 f = f + newton_euler.body_force(link.grouped, self.motions[key], *alpha[key])
-            for other in self.carried_on(link, "z", forces, Vector):
+            for other in self.carried_on(link, letter, forces, Vector):
                 f = f + other
             n, f = Vector(f[:3]), Vector(f[3:])
             tau = newton_euler.hinge_force(link, self.places[key], n, f, qdd)
@@ -256,7 +267,7 @@ class Trace:
             if link.parent is not None:
                 n, f = self.places[key].pose.force_to_parent(n, f)
                 forces[key] = Vector((*n, *f))
-                stores += self.handed_on("z", link, forces[key])
+                stores += self.handed_on(letter, link, forces[key])
         return stores
 
     def mass_matrix(self) -> list[Store]:
