@@ -19,6 +19,7 @@ from mechanisms import MECHANISMS, Closed
 import warp_spo as spo
 from warp_spo.embedding import Closing, _spanning, drawn, embedding
 from warp_spo.examples.parts import at, bar, energy
+from warp_spo.programs import Traces
 from warp_spo.recursions import closures, clusters, embedded, nullspace
 from warp_spo.recursions.embedded import Embedding
 from warp_spo.recursions.links import Links
@@ -34,7 +35,7 @@ LOADED = ("q", "qd", "tau", "body_f")
 
 def traced(scene, operation, arrays, given, shapes, dtype="float64", **options):
     """Results by name, as symbolic.run, of a scene with closed loops."""
-    trace = Multipliers(Links(scene), dtype, tuple(given))
+    trace = Traces(Links(scene), dtype, tuple(given))
     stores = [item for item in getattr(trace, operation)(**options) if item.array in shapes]
     values = evaluate([item.value for item in stores], lambda name, index: arrays[name][(slice(None), *index)], dtype)
     worlds = len(arrays["q"])
@@ -627,8 +628,8 @@ def test_mistakes_are_explained(device):
     scene = MECHANISMS["fourbar"]()
     make = lambda loops="embed", of=scene, **more: spo.Dynamics(of, 2, device=device, loops=loops, **more)  # noqa: E731
     q = np.zeros((2, 3))
-    with pytest.raises(spo.UnsupportedError, match=r"hybrid_dynamics.*loops='embed'"):
-        make().hybrid_dynamics(q, prescribed=[True, False, False])
+    with pytest.raises(spo.UnsupportedError, match=r"hybrid_dynamics.*loops='multipliers'.*use loops='embed'"):
+        make("multipliers").hybrid_dynamics(q, prescribed=[True, False, False])
     with pytest.raises(spo.UnsupportedError, match="operators"):
         make().operators(q)
     with pytest.raises(spo.UnsupportedError, match="several columns"):
