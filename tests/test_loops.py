@@ -632,8 +632,6 @@ def test_mistakes_are_explained(device):
         make("multipliers").hybrid_dynamics(q, prescribed=[True, False, False])
     with pytest.raises(spo.UnsupportedError, match="operators"):
         make().operators(q)
-    with pytest.raises(spo.UnsupportedError, match="several columns"):
-        make().solve_mass_matrix(q, np.zeros((2, 1, 2)))
     with pytest.raises(spo.UnsupportedError, match=r"loop_multipliers.*build Dynamics with loops='multipliers'"):
         make().loop_multipliers(q)
     with pytest.raises(spo.UnsupportedError, match="closure_error"):

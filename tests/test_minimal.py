@@ -158,6 +158,34 @@ def test_operational_inertia_of_feet_that_rods_drive(name, frames, dtype, device
         assert laws.error(free[w], wanted) > 0.01
 
 
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_solve_mass_matrix_with_several_columns(dtype, device):
+    """None, one, as many as a kernel takes, and more, in turns: each column as by itself."""
+    scene, how, s, closed = mechanisms.case("far_loop")
+    dyn, size = spo.Dynamics(scene, 3, device=device, dtype=dtype, loops="embed"), len(how.dofs)
+    q = wp.array(s.q, dtype=dyn.dtype, device=device)
+    for columns in (0, 1, loops.COLUMNS, 2 * loops.COLUMNS + 1):
+        b = np.random.default_rng(columns).normal(size=(3, size, columns)).astype(dtype)
+        on, out = (wp.array(x, dtype=dyn.dtype, device=device) for x in (b, np.full_like(b, np.nan)))
+        dyn.prepare("solve_mass_matrix", columns=columns)
+        with no_warp_allocation():
+            assert dyn.solve_mass_matrix(q, on, out=out) is out
+        for w, c in enumerate(closed):
+            assert laws.error(out.numpy()[w], np.linalg.solve(c.mass_matrix(how.dofs), b[w])) <= TOLERANCE[dtype]
+
+
+def test_a_planted_bug_in_the_columns_is_seen(monkeypatch):
+    first = "place[dof], *(0 for _ in column))"
+    symbolic.plant(monkeypatch, minimal.Minimal, "embedded_solve_mass_matrix", "place[dof], *column)", first)
+    scene, how, s, _ = mechanisms.case("fivebar")
+    b = np.random.default_rng(0).normal(size=(3, len(how.dofs), 2))
+    both = traced(scene, "embedded_solve_mass_matrix", {**s._asdict(), "b": b}, ("q", "b"), {"out": b.shape[1:]},
+                  how=how, columns=2)["out"]
+    second = traced(scene, "embedded_solve_mass_matrix", {**s._asdict(), "b": b[:, :, 1]}, ("q", "b"),
+                    {"out": b.shape[1:2]}, how=how)["out"]
+    assert laws.error(both[:, :, 1], second) > 0.1
+
+
 def test_hybrid_dynamics_as_users_call_it(device):
     """A motor follows a motion; what it takes, as a force, makes the same motion."""
     scene = MECHANISMS["fivebar"]()

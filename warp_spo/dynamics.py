@@ -375,7 +375,8 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
     def solve_mass_matrix(self, q: Any, b: Any, out: Any = None) -> Any:
         """Mass^-1 b in O(dof) a column; b and the result [world, dof] or [world, dof, columns].
 
-        With loops embedded Mass is that of the independent dofs, and b [world, independent dof].
+        With loops embedded Mass is that of the independent dofs, and b [world, independent dof] or with columns, of
+        which one kernel takes up to six.
         """
         with self._call("solve_mass_matrix") as call:
             q, _ = self._read_state(call, q, None)
@@ -383,11 +384,11 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
             if hasattr(b, "shape") and len(b.shape) == 3:
                 shape = (*shape, b.shape[2])
             b = call.read("b", b, shape, "[world, dof] or [world, dof, columns]")
-            if self.embedding is not None and len(shape) == 3:
-                raise UnsupportedError(call.name, "several columns with loops='embed'", "call it for one at a time")
             out = call.write(out, shape, "like b")
             if self._refinement:
                 self._refinement.solve_mass_matrix(q, b, out)
+            elif self.embedding is not None and len(shape) == 3:
+                self._solve_columns(q, b, out)
             else:
                 self._run("solve_mass_matrix", out, q=q, b=b)
         return call.result

@@ -65,6 +65,8 @@ WAYS_OUT = {
     "fixman_torque": "take differences of log_det_mass_matrix",
     "mass_matrix_packed": "use mass_matrix",
 }
+COLUMNS = 6
+"""Right-hand sides of solve_mass_matrix that one kernel solves for."""
 EMBED, OPEN = "use loops='embed'", "loops='cut' is the open tree"
 
 
@@ -254,6 +256,20 @@ class Loops(Applications):
         if self.embedding is not None and operation in EMBEDDED:
             operation, given = f"embedded_{operation}", {**given, "how": self.embedding}
         super()._launch(operation, out, more, **given)
+
+    def _solve_columns(self, q: wp.array, b: wp.array, out: wp.array) -> None:
+        """With loops embedded: up to COLUMNS right-hand sides in one kernel, which factors once; more in turns."""
+        columns = b.shape[2]
+        if columns <= COLUMNS:
+            self._launch("solve_mass_matrix", out, q=q, b=b, columns=columns)
+            return
+        for first in range(0, columns, COLUMNS):
+            turn = slice(first, min(first + COLUMNS, columns))
+            size = *b.shape[:2], turn.stop - turn.start
+            right, x = (self.recursions.array((name, size), *size) for name in ("columns of b", "columns of Mass^-1 b"))
+            wp.copy(right, b[:, :, turn])
+            self._launch("solve_mass_matrix", x, q=q, b=right, columns=size[2])
+            wp.copy(out[:, :, turn], x)
 
     def _check_prescribed(self, call: Call, held: tuple[bool, ...] | None) -> None:
         """Of closed loops, only independent dofs can be prescribed, and a kernel is made for each mask."""

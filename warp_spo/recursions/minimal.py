@@ -82,12 +82,17 @@ class Minimal(Embedded):
                 stores += [Store("out", place, value) for place in {(i, j), (j, i)}]
         return stores
 
-    def embedded_solve_mass_matrix(self, how: Embedding) -> list[Store]:
-        """out [independent dof] = (X* Mass X)^-1 b"""
-        b, place = self.vector("b"), {dof: i for i, dof in enumerate(how.dofs)}
-        swept = self.sweep(how, lambda dof: b(place[dof]) if dof in place else 0.0, moves=False, loads=False)
-        qdd = self.outward_accelerations(swept, (ZERO, ZERO))
-        return [Store("out", (i,), qdd[dof]) for i, dof in enumerate(how.dofs)]
+    def embedded_solve_mass_matrix(self, how: Embedding, columns: int | None = None) -> list[Store]:
+        """out [independent dof] or [independent dof, column] = (X* Mass X)^-1 b; all columns share the factors."""
+        place, stores = {dof: i for i, dof in enumerate(how.dofs)}, []
+        for column in [()] if columns is None else [(c,) for c in range(columns)]:
+
+            def b(dof: int, column: tuple = column) -> Value:
+                return self.graph.input("b", place[dof], *column) if dof in place else 0.0
+
+            qdd = self.outward_accelerations(self.sweep(how, b, moves=False, loads=False), (ZERO, ZERO))
+            stores += [Store("out", (i, *column), qdd[dof]) for i, dof in enumerate(how.dofs)]
+        return stores
 
     def embedded_inverse_dynamics(self, how: Embedding) -> list[Store]:
         """out [independent dof] = X* (Mass qdd + bias_force); of ``qdd`` the independent entries are read."""
