@@ -558,9 +558,8 @@ def _variable_names(variable: Any) -> tuple[str, ...]:
 def _check_loops(scene: Scene, loops: str) -> None:
     if loops not in LOOPS:
         raise ValueError(f"Dynamics: loops is {loops!r}; expected one of {', '.join(LOOPS)}")
-    if scene.loops and loops == "raise":
-        names = ", ".join(loop.label or f"body {loop.parent} to body {loop.child}" for loop in scene.loops)
+    if scene.ties and loops == "raise":
         raise ValueError(
-            f"Dynamics: the scene has {len(scene.loops)} loop joint(s): {names}; expected a tree; loops='cut' leaves "
-            f"them open, loops='embed' and loops='multipliers' close them"
+            f"Dynamics: the scene has {scene.ties}; expected a tree; loops='cut' leaves them open, loops='embed' and "
+            f"loops='multipliers' close them"
         )

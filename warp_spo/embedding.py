@@ -133,9 +133,8 @@ def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str 
                                          f"up to {MOST_DOFS} are)", "use loops='multipliers'")
     q = closing.closed(drawn(scene, SAMPLES))
     if len(q) == 0:
-        names = ", ".join(loop.label or f"body {loop.parent} to body {loop.child}" for loop in scene.loops)
-        raise ValueError(f"{call}: no configuration was found that closes the loops ({names or 'couplings'}); expected "
-                         f"anchors that can meet; loops='cut' leaves them open")
+        raise ValueError(f"{call}: no configuration was found that closes {scene.ties}; expected anchors that can "
+                         f"meet; loops='cut' leaves them open")
     Y = closing.at(q)[1]
     rows: list[int] = []
     free = set(range(scene.dof_count))
