@@ -208,8 +208,8 @@ OF_ALL_DOFS = {"forward_dynamics", "passive_force", "body_poses", "body_velociti
 """What speaks of all dofs, or of bodies, whatever ties them."""
 OF_MULTIPLIERS = {"inverse_dynamics", "mass_matrix", "mass_matrix_inverse", "solve_mass_matrix", "bias_force",
                   "gravity_force", "log_det_mass_matrix", "log_det_mass_matrix_gradient", "mass_matrix_packed",
-                  "jacobian", "jacobian_bias", "com_jacobian", "centroidal_momentum_matrix",
-                  "centroidal_momentum_bias", "quasi_velocities", "loop_multipliers"}
+                  "mass_matrix_inverse_packed", "jacobian", "jacobian_bias", "com_jacobian",
+                  "centroidal_momentum_matrix", "centroidal_momentum_bias", "quasi_velocities", "loop_multipliers"}
 """What multipliers are about is Mass qdd + bias_force = tau + Y* lambda of all dofs: these are its terms."""
 
 
@@ -225,8 +225,9 @@ def test_no_operation_forgets_the_loops(how, device):
             dyn.prepare(operation)
     q = np.zeros((1, dyn.scene.coord_count))
     if how == "embed":
-        with pytest.raises(spo.UnsupportedError, match="use mass_matrix"):
-            dyn.mass_matrix_pattern  # noqa: B018
+        for pattern in ("mass_matrix_pattern", "mass_matrix_inverse_pattern"):
+            with pytest.raises(spo.UnsupportedError, match="use mass_matrix"):
+                getattr(dyn, pattern)
         with pytest.raises(spo.UnsupportedError, match="operators"):
             dyn.operators(q)
     else:

@@ -275,6 +275,29 @@ class Applications:
         rows, columns = np.array(met, dtype=int).reshape(-1, 2).T
         return rows, columns
 
+    def mass_matrix_inverse_packed(self, q: Any, out: Any = None) -> Any:
+        """Entries of :meth:`mass_matrix_inverse` at :attr:`mass_matrix_inverse_pattern` [world, entry].
+
+        Worlds where Mass is not positive definite are NaN as there.
+        """
+        shape = self.mass_matrix_inverse_pattern[0].shape
+        return self._of_q("mass_matrix_inverse_packed", q, shape, "[world, entry]", out)
+
+    @functools.cached_property
+    def mass_matrix_inverse_pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of the entries of Mass^-1's lower triangle that are not zero, row after row.
+
+        Two dofs meet if one moving body carries both. Within one tree nothing is zero; trees of a forest do not meet.
+        """
+        self._check_operation("mass_matrix_inverse_packed")
+        scene, carrier = self.scene, np.full(self.scene.body_count, -1)
+        for node in (node for level in scene.tree.levels for node in level):
+            above = carrier[scene.tree.parent[node]] if scene.tree.parent[node] >= 0 else -1
+            carrier[node] = above if above >= 0 or scene.hinge_sizes[node] == 0 else node
+        root = np.repeat(carrier[np.argsort(scene.hinge_of)], np.diff(scene.qd_start))
+        rows, columns = np.nonzero(np.tril(root[:, None] == root[None]))
+        return rows, columns
+
     # -- steps -----------------------------------------------------------------------------------------------------
     def _of_q(self, name: str, q: Any, shape: tuple[int, ...], meaning: str, out: Any) -> Any:
         with self._call(name) as call:

@@ -58,6 +58,7 @@ OPERATIONS = (
     "log_det_mass_matrix_gradient",
     "fixman_torque",
     "mass_matrix_packed",
+    "mass_matrix_inverse_packed",
     "inverse_dynamics_derivatives",
     "forward_dynamics_derivatives",
     "mass_matrix_derivative",

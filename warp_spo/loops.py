@@ -44,6 +44,7 @@ OF_TREES = {
         "log_det_mass_matrix_gradient",
         "fixman_torque",
         "mass_matrix_packed",
+        "mass_matrix_inverse_packed",
         "operators",
         "step",
         "body_reactions",
@@ -64,6 +65,7 @@ WAYS_OUT = {
     "log_det_mass_matrix_gradient": "take differences of log_det_mass_matrix",
     "fixman_torque": "take differences of log_det_mass_matrix",
     "mass_matrix_packed": "use mass_matrix",
+    "mass_matrix_inverse_packed": "use mass_matrix_inverse",
 }
 COLUMNS = 6
 """Right-hand sides of solve_mass_matrix that one kernel solves for."""

@@ -37,6 +37,7 @@ TREE_ONLY = (
     "log_det_mass_matrix_gradient",
     "fixman_torque",
     "mass_matrix_packed",
+    "mass_matrix_inverse_packed",
     "inverse_dynamics_derivatives",
     "mass_matrix_derivative",
     "forward_dynamics_vjp",

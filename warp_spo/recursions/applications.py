@@ -338,5 +338,13 @@ class Applications(Trace):
 
     def mass_matrix_packed(self) -> list[Store]:
         """out = the entries of Mass that the tree allows, lower triangle, row after row"""
-        entries = {item.index: item.value for item in self.mass_matrix() if item.index[0] >= item.index[1]}
-        return [Store("out", (i,), entries[index]) for i, index in enumerate(sorted(entries))]
+        return _packed(self.mass_matrix())
+
+    def mass_matrix_inverse_packed(self) -> list[Store]:
+        """out = the entries of Mass^-1 within one tree, lower triangle, row after row"""
+        return _packed(self.mass_matrix_inverse())
+
+
+def _packed(stores: list[Store]) -> list[Store]:
+    entries = {item.index: item.value for item in stores if item.index[0] >= item.index[1]}
+    return [Store("out", (i,), entries[index]) for i, index in enumerate(sorted(entries))]
