@@ -266,6 +266,34 @@ def test_a_loop_that_spans_a_long_chain():
         embedding(scene)
 
 
+def test_a_ring_of_forty_bars(device):
+    """Too long to be embedded, which names the way out: multipliers close it, five rows of which two count."""
+    count, turn = 40, 2.0 * np.pi / 41
+    hinges = [spo.Hinge("revolute", k - 1, k, axis=(0, 1, 0), parent_pose=at(0.1 if k else 0.0)) for k in range(count)]
+    loop = spo.Loop("revolute", -1, count - 1, axis=(0, 1, 0), parent_pose=at(0.1), child_pose=at(0.1))
+    scene = spo.Scene([bar(0.1)] * count, hinges, loops=[loop])
+    with pytest.raises(spo.UnsupportedError, match=r"embedding 40 dof.*body_5 and 34 more.*use loops='multipliers'"):
+        spo.Dynamics(scene, 1, device=device, loops="embed")
+    rng = np.random.default_rng(0)
+    q = np.full((2, count), turn) + 0.05 * rng.normal(size=(2, count))  # a polygon, the ground its last side
+    q[:, 0] += np.pi
+    qd, tau = rng.normal(size=(2, 2, count))
+    for dtype, tolerance in (("float64", 1e-9), ("float32", 3e-5)):  # cond(Mass) is 2e6
+        dyn = spo.Dynamics(scene, 2, device=device, dtype=dtype, loops="multipliers")
+        q, qd = (x.astype(float) for x in dyn.project(q, qd, iterations=6))
+        assert np.abs(dyn.closure_error(q)).max() <= 10.0 * np.finfo(dtype).eps
+        status = np.full(2, -1, dtype=np.int32)
+        qdd = dyn.forward_dynamics(q, qd, tau, status=status)
+        np.testing.assert_array_equal(status, 0)
+        np.testing.assert_array_equal(dyn.loop_multipliers(q, qd, tau)[1], 2)
+        for w in range(2):
+            dense, tip = Closed(scene, q[w]).dense, [(count - 1, (*at(0.1)[:3], 0.0, 0.0, 0.0, 1.0))]
+            J, bias = dense.jacobian(tip)[0, [0, 2]], dense.jacobian_bias(qd[w], tip)[0, [0, 2]]
+            system = np.block([[dense.mass_matrix, -J.T], [J, np.zeros((2, 2))]])
+            wanted = np.linalg.solve(system, np.concatenate([tau[w] - dense.bias_force(qd[w]), -bias]))[:count]
+            assert laws.error(qdd[w], wanted) <= tolerance
+
+
 @pytest.mark.parametrize("apart", [1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6])
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_near_parallel_loops(apart, dtype):

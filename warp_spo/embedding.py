@@ -24,6 +24,7 @@ CLOSED = 1e-9  # largest g of a configuration that counts as closed [m, rad]
 RANK = 1e-7  # singular values below this share of the largest are zero: the rows are redundant
 WORST = 0.1  # share of the draws that a choice may serve worse than it is said to
 NEARLY = 0.3  # share of the best choice's hold that an earlier dof must have
+NAMED = 6  # bodies that an error lists
 MOST_DOFS = 32  # of a cluster: its D costs their cube, in straight-line code
 
 
@@ -128,7 +129,8 @@ def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str 
     clusters = closing.trace.clusters
     for cluster in clusters:
         if len(cluster.dofs) > MOST_DOFS:
-            tied = ", ".join(sorted({link.label for link in cluster.links}))
+            names = list(dict.fromkeys(link.label for link in cluster.links))
+            tied = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
             raise UnsupportedError(call, f"embedding {len(cluster.dofs)} dof that move together ({tied}; "
                                          f"up to {MOST_DOFS} are)", "use loops='multipliers'")
     q = closing.closed(drawn(scene, SAMPLES))
