@@ -100,13 +100,35 @@ class Closed:
         X = self.columns(independent)
         return X.T @ self.dense.mass_matrix @ X
 
+    def accelerations(self, qd, qdd, independent):
+        """All of them, that ``qdd[independent]`` leads to."""
+        dependent = [dof for dof in range(self.scene.dof_count) if dof not in independent]
+        whole = self.columns(independent) @ qdd[list(independent)]
+        whole[dependent] -= np.linalg.lstsq(self.jacobian[:, dependent], self.bias(qd), rcond=1e-8)[0]
+        return whole
+
     def inverse_dynamics(self, qd, qdd, independent, body_f=None):
         """X* of the tree's force, at the accelerations that ``qdd[independent]`` leads to."""
-        X, J = self.columns(independent), self.jacobian
-        dependent = [dof for dof in range(self.scene.dof_count) if dof not in independent]
-        whole = X @ qdd[list(independent)]
-        whole[dependent] -= np.linalg.lstsq(J[:, dependent], self.bias(qd), rcond=1e-8)[0]
-        return X.T @ self.dense.inverse_dynamics(qd, whole, body_f)
+        whole = self.accelerations(qd, qdd, independent)
+        return self.columns(independent).T @ self.dense.inverse_dynamics(qd, whole, body_f)
+
+    def hybrid_dynamics(self, qd, tau, qdd, held, independent, body_f=None):
+        """qdd, tau [dof]: of the equations of independent dofs, the rows of those that are ``held`` give forces."""
+        X, on = self.columns(independent), held[list(independent)]
+        M, bias = self.mass_matrix(independent), self.inverse_dynamics(qd, np.zeros_like(qdd), independent, body_f)
+        tau, found = np.where(held, 0.0, tau), qdd[list(independent)]
+        right = X.T @ tau - bias
+        found[~on] = np.linalg.solve(M[~on][:, ~on], right[~on] - M[~on][:, on] @ found[on])
+        tau[np.array(independent)[on]] = (M @ found - right)[on]
+        whole = np.zeros_like(qdd)
+        whole[list(independent)] = found
+        return self.accelerations(qd, whole, independent), tau
+
+    def operational_inertia_inverse(self, frames):
+        """J qdd per wrench, with multipliers: Mass qdd = J* + Y* lambda, Y qdd = 0."""
+        J = self.dense.jacobian(frames).reshape(-1, self.scene.dof_count)
+        N = self.null_space(self.jacobian)
+        return J @ N @ np.linalg.solve(N.T @ self.dense.mass_matrix @ N, N.T @ J.T)
 
 
 # -- mechanisms --------------------------------------------------------------------------------------------------------

@@ -458,6 +458,23 @@ def test_loop_joints_are_refused_or_cut(device):
     assert "1 loop joint(s), 0 coupling(s) left open" in dyn.explain()
 
 
+def test_couplings_are_refused_or_cut(device):
+    """A mimic that is dropped in silence would be a wrong answer: with a loop joint and without."""
+    one = zoo.from_parents([-1, 0, 1], ["revolute"] * 3, 3)
+    own = dict(gravity=one.values["gravity"][0], couplings=[spo.Coupling(2, 1, 0.5)])
+    make = lambda **more: spo.Scene(one.bodies, one.hinges, **own, **more)  # noqa: E731
+    follows = f"1 coupling(s): {one.joint_labels[2]} follows {one.joint_labels[1]}"
+    with explained(ValueError, f"Dynamics: the scene has {follows}; expected a tree", "loops='cut'", "'embed'"):
+        spo.Dynamics(make(), device=device)
+    both = make(loops=[spo.Loop("ball", -1, 2, label="pin")])
+    with explained(ValueError, f"the scene has 1 loop joint(s): pin and {follows}"):
+        spo.Dynamics(both, device=device)
+    dyn, open_ = (spo.Dynamics(s, 1, device=device, loops="cut", dtype="float64") for s in (make(), one))
+    q = zoo.random_state(one).q
+    np.testing.assert_array_equal(dyn.forward_dynamics(q), open_.forward_dynamics(q))
+    assert "0 loop joint(s), 1 coupling(s) left open" in dyn.explain()
+
+
 BAD_PREPARE = {
     "no operation": (dict(operation="acceleration"), "no operation 'acceleration'; expected one of forward_dynamics"),
     "not a name": (dict(operation=None), "no operation None; expected one of forward_dynamics"),

@@ -62,7 +62,7 @@ def test_loops_are_cut_and_named(tmp_path, capsys, monkeypatch, device):
     monkeypatch.setattr(job, "OPERATIONS", {"mass_matrix": OPERATIONS["mass_matrix"]})
     (tmp_path / "loop.xml").write_text(LOOP)
     assert job.main([str(tmp_path / "loop.xml"), "--worlds", "2", "--device", str(device)]) == 0
-    assert "loops are cut: 1 loop joint(s) are left open: pin" in capsys.readouterr().out
+    assert "left open: 1 loop joint(s): pin" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

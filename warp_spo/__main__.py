@@ -66,9 +66,8 @@ def main(argv: list[str] | None = None) -> int:
     title = f"{Path(options.robot).stem}: {scene.body_count} bodies, {scene.dof_count} dof, {worlds} worlds on "
     title += f"{device.alias} ({device.name})" if device.is_cuda else device.alias
     print(title)
-    if scene.loops:
-        labels = ", ".join(loop.label or f"body {loop.parent} to body {loop.child}" for loop in scene.loops)
-        print(f"loops are cut: {len(scene.loops)} loop joint(s) are left open: {labels}")
+    if scene.ties:
+        print(f"left open: {scene.ties}")
     try:
         rows = list(run(dyns))
     except (MemoryError, RuntimeError) as error:

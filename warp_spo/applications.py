@@ -31,6 +31,7 @@ class Applications:
     dtype: type
     recursions: Recursions
     programs: Programs
+    _minimal: int  # independent dofs
 
     # -- prescribed motion -----------------------------------------------------------------------------------------
     def hybrid_dynamics(
@@ -61,6 +62,9 @@ class Applications:
         Returns:
             qdd, tau [world, dof]: all of them, the given ones as they were given. A world whose free dofs have no
             positive definite mass matrix is NaN.
+
+        With loops embedded, dofs under the mask are among the independent ones, and the mask folds; their tau is what
+        is needed beside the tau of all other dofs.
         """
         shape = (self.worlds, self.scene.dof_count)
         with self._call("hybrid_dynamics") as call:
@@ -70,6 +74,7 @@ class Applications:
             tau, qdd = self._read_rate(call, "tau", tau), self._read_rate(call, "qdd", qdd)
             body_f = self._read_body_f(call, body_f)
             mask, held = self._read_mask(call, prescribed)
+            self._check_prescribed(call, held)
             qdd_out = call.write(out[0], shape, "[world, dof]", name="out[0]")
             tau_out = call.write(out[1], shape, "[world, dof]", name="out[1]")
             given = dict(q=q, qd=qd, tau=tau, qdd=qdd, body_f=body_f, prescribed=mask, held=held)
@@ -104,7 +109,7 @@ class Applications:
         """Inertia that the frames feel: (J Mass^-1 J*)^-1, J of :meth:`jacobian`, by Cholesky.
 
         Rows and columns: linear [kg], then angular [kg m^2], frame after frame, inertial axes. Khatib 1987; Jain 2011,
-        ch. 10.
+        ch. 10. With loops embedded they are part of what the frames feel.
 
         Returns:
             [world, 6 frames, 6 frames], both triangles. NaN in worlds where J Mass^-1 J* is singular to working
@@ -125,7 +130,8 @@ class Applications:
         """J' qd: what the frames accelerate at qdd = 0, so that J qdd + J' qd is their acceleration.
 
         Acceleration of each frame's origin [m/s^2], then angular acceleration [rad/s^2], inertial axes: the time
-        derivative of the rows of :meth:`jacobian` times qd. Gravity is not in it.
+        derivative of the rows of :meth:`jacobian` times qd. Gravity is not in it. With loops embedded at qdd = 0 of the
+        independent dofs, what the velocities demand of the others included.
 
         Returns:
             [world, frame, 6]
@@ -179,24 +185,25 @@ class Applications:
     def com_jacobian(self, q: Any, out: Any = None) -> Any:
         """Velocity of the centre of mass per unit qd, inertial axes: sum of m(k) J(k) / sum of m(k).
 
-        The centre of mass is that of all bodies that a hinge lets move, of every tree of the scene together.
+        The centre of mass is that of all bodies that a hinge lets move, of every tree of the scene together. With loops
+        embedded per unit qd of the independent dofs.
 
         Returns:
             [world, 3, dof], [m/s per unit qd]
         """
-        return self._of_q("com_jacobian", q, (3, self.scene.dof_count), "[world, 3, dof]", out)
+        return self._of_q("com_jacobian", q, (3, self._minimal), "[world, 3, dof]", out)
 
     def centroidal_momentum_matrix(self, q: Any, out: Any = None) -> Any:
         """Momentum per unit qd: linear [kg m/s], then angular about the centre of mass [kg m^2/s], inertial axes.
 
         The order is that of :meth:`jacobian`: linear first. The centre of mass is that of :meth:`com_jacobian`;
-        armature is not in it. A column is R(k) H*, R(k) the composite inertia, seen from the centre of mass. Orin,
-        Goswami, Lee 2013.
+        armature is not in it. A column is R(k) H*, R(k) the composite inertia, seen from the centre of mass. With loops
+        embedded A X, of the independent dofs. Orin, Goswami, Lee 2013.
 
         Returns:
             A [world, 6, dof]
         """
-        return self._of_q("centroidal_momentum_matrix", q, (6, self.scene.dof_count), "[world, 6, dof]", out)
+        return self._of_q("centroidal_momentum_matrix", q, (6, self._minimal), "[world, 6, dof]", out)
 
     def centroidal_momentum_bias(self, q: Any, qd: Any, out: Any = None) -> Any:
         """A' qd for A of :meth:`centroidal_momentum_matrix`: A qdd + A' qd is the rate of the momentum.
@@ -258,6 +265,7 @@ class Applications:
 
         Two dofs meet if one's body carries the other's, or if they are of one hinge.
         """
+        self._check_operation("mass_matrix_packed")
         scene, met = self.scene, []
         node_of = np.repeat(np.argsort(scene.hinge_of), np.diff(scene.qd_start))
         for row, a in enumerate(node_of):
@@ -265,6 +273,29 @@ class Applications:
                 if a == b or scene.tree.is_ancestor(int(a), int(b)) or scene.tree.is_ancestor(int(b), int(a)):
                     met.append((row, column))
         rows, columns = np.array(met, dtype=int).reshape(-1, 2).T
+        return rows, columns
+
+    def mass_matrix_inverse_packed(self, q: Any, out: Any = None) -> Any:
+        """Entries of :meth:`mass_matrix_inverse` at :attr:`mass_matrix_inverse_pattern` [world, entry].
+
+        Worlds where Mass is not positive definite are NaN as there.
+        """
+        shape = self.mass_matrix_inverse_pattern[0].shape
+        return self._of_q("mass_matrix_inverse_packed", q, shape, "[world, entry]", out)
+
+    @functools.cached_property
+    def mass_matrix_inverse_pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of the entries of Mass^-1's lower triangle that are not zero, row after row.
+
+        Two dofs meet if one moving body carries both. Within one tree nothing is zero; trees of a forest do not meet.
+        """
+        self._check_operation("mass_matrix_inverse_packed")
+        scene, carrier = self.scene, np.full(self.scene.body_count, -1)
+        for node in (node for level in scene.tree.levels for node in level):
+            above = carrier[scene.tree.parent[node]] if scene.tree.parent[node] >= 0 else -1
+            carrier[node] = above if above >= 0 or scene.hinge_sizes[node] == 0 else node
+        root = np.repeat(carrier[np.argsort(scene.hinge_of)], np.diff(scene.qd_start))
+        rows, columns = np.nonzero(np.tril(root[:, None] == root[None]))
         return rows, columns
 
     # -- steps -----------------------------------------------------------------------------------------------------
@@ -290,6 +321,8 @@ class Applications:
         program = self.programs.find(operation, shapes, out.shape, further, **options)
         self.programs.launch(program, arrays, out, *more.values())
 
+    _check_operation: Any
+    _check_prescribed: Any
     _call: Any
     _read_state: Any
     _read_rate: Any

@@ -59,6 +59,7 @@ OPERATIONS = (
     "log_det_mass_matrix_gradient",
     "fixman_torque",
     "mass_matrix_packed",
+    "mass_matrix_inverse_packed",
     "inverse_dynamics_derivatives",
     "forward_dynamics_derivatives",
     "mass_matrix_derivative",
@@ -87,10 +88,12 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
         dtype: "float32" or "float64".
         variable: names of values that :meth:`set` changes without rebuilding, one row a world.
         granularity: None (the plan chooses), "node", "segment" or "tree", see :class:`warp_spo.plan.Plan`.
-        loops: what to do with the scene's loop joints and couplings. "raise": loop joints are refused. "cut": they stay
-            open. "embed": they hold, what they tie being one node of the tree; mass_matrix and its relatives are then
-            of :attr:`independent_dofs`. "multipliers": they hold by multipliers of the open tree in forward_dynamics;
-            mass_matrix, inverse_dynamics and the others remain the open tree's. "raise" and "cut" ignore couplings.
+        loops: what to do with the scene's loop joints and couplings. "raise": they are refused. "cut": they stay open.
+            "embed": they hold, what they tie being one node of the tree. Mass matrices, Jacobians, momentum matrices
+            and forces of inverse_dynamics, bias_force and gravity_force are then of :attr:`independent_dofs`: X* Mass
+            X, J X, X* tau. "multipliers": they hold by multipliers of the open tree in forward_dynamics; mass_matrix,
+            inverse_dynamics, jacobian and so on remain the open tree's, the terms of Mass qdd + bias_force = tau + Y*
+            lambda. What would be wrong with the loops left out raises.
         independent: with loops embedded, the dofs (indices or labels) that are to be :attr:`independent_dofs`, such as
             those that have motors: as many as move, those that no loop ties among them. None: they are chosen.
         refine: steps of iterative refinement in forward_dynamics and solve_mass_matrix, which then solve in float32 and
@@ -375,7 +378,8 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
     def solve_mass_matrix(self, q: Any, b: Any, out: Any = None) -> Any:
         """Mass^-1 b in O(dof) a column; b and the result [world, dof] or [world, dof, columns].
 
-        With loops embedded Mass is that of the independent dofs, and b [world, independent dof].
+        With loops embedded Mass is that of the independent dofs, and b [world, independent dof] or with columns, of
+        which one kernel takes up to six.
         """
         with self._call("solve_mass_matrix") as call:
             q, _ = self._read_state(call, q, None)
@@ -383,17 +387,17 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
             if hasattr(b, "shape") and len(b.shape) == 3:
                 shape = (*shape, b.shape[2])
             b = call.read("b", b, shape, "[world, dof] or [world, dof, columns]")
-            if self.embedding is not None and len(shape) == 3:
-                raise UnsupportedError(call.name, "several columns with loops='embed'", "call it for one at a time")
             out = call.write(out, shape, "like b")
             if self._refinement:
                 self._refinement.solve_mass_matrix(q, b, out)
+            elif self.embedding is not None and len(shape) == 3:
+                self._solve_columns(q, b, out)
             else:
                 self._run("solve_mass_matrix", out, q=q, b=b)
         return call.result
 
     def log_det_mass_matrix(self, q: Any, out: Any = None) -> Any:
-        """log det Mass = sum of log D(k), added in float64 [world]."""
+        """log det Mass = sum of log D(k), added in float64 [world]; with loops embedded of X* Mass X."""
         with self._call("log_det_mass_matrix") as call:
             q, _ = self._read_state(call, q, None)
             out = call.write(out, (self.worlds,), "[world]")
@@ -448,6 +452,8 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
     def jacobian(self, q: Any, frames: Sequence[Frame], out: Any = None) -> Any:
         """Velocity of each frame's origin, then angular velocity, in inertial axes, per unit qd.
 
+        With loops embedded J X, per unit qd of the independent dofs, the others following.
+
         Args:
             q: coordinates [world, coordinate].
             frames: bodies (index or label), or pairs (body, pose of the frame in the body).
@@ -458,12 +464,12 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
         with self._call("jacobian") as call:
             q, _ = self._read_state(call, q, None)
             where = checked(self.scene, call.name, frames)
-            out = call.write(out, (self.worlds, len(where), 6, self.scene.dof_count), "[world, frame, 6, dof]")
+            out = call.write(out, (self.worlds, len(where), 6, self._minimal), "[world, frame, 6, dof]")
             self._run("jacobian", out, q=q, frames=where)
         return call.result
 
     def operational_inertia_inverse(self, q: Any, frames: Sequence[Frame], out: Any = None) -> Any:
-        """J Mass^-1 J* for the frames of :meth:`jacobian` [world, 6 frames, 6 frames]."""
+        """J Mass^-1 J* for the frames of :meth:`jacobian` [world, 6 frames, 6 frames]; loops that are embedded hold."""
         with self._call("operational_inertia_inverse") as call:
             q, _ = self._read_state(call, q, None)
             where = checked(self.scene, call.name, frames)
@@ -521,7 +527,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
             Whether it ran as sweeps, which leave what they found in the workspace.
         """
         if self.embedding is not None and operation in EMBEDDED:
-            self._launch(f"embedded_{operation}", out, how=self.embedding, **given)
+            self._launch(operation, out, **given)
             return False
         arrays = {name: value for name, value in given.items() if isinstance(value, wp.array)}
         options = {name: value for name, value in given.items() if value is not None and name not in arrays}
@@ -581,9 +587,8 @@ def _variable_names(variable: Any) -> tuple[str, ...]:
 def _check_loops(scene: Scene, loops: str) -> None:
     if loops not in LOOPS:
         raise ValueError(f"Dynamics: loops is {loops!r}; expected one of {', '.join(LOOPS)}")
-    if scene.loops and loops == "raise":
-        names = ", ".join(loop.label or f"body {loop.parent} to body {loop.child}" for loop in scene.loops)
+    if scene.ties and loops == "raise":
         raise ValueError(
-            f"Dynamics: the scene has {len(scene.loops)} loop joint(s): {names}; expected a tree; loops='cut' leaves "
-            f"them open, loops='embed' and loops='multipliers' close them"
+            f"Dynamics: the scene has {scene.ties}; expected a tree; loops='cut' leaves them open, loops='embed' and "
+            f"loops='multipliers' close them"
         )

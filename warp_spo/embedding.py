@@ -24,6 +24,7 @@ CLOSED = 1e-9  # largest g of a configuration that counts as closed [m, rad]
 RANK = 1e-7  # singular values below this share of the largest are zero: the rows are redundant
 WORST = 0.1  # share of the draws that a choice may serve worse than it is said to
 NEARLY = 0.3  # share of the best choice's hold that an earlier dof must have
+NAMED = 6  # bodies that an error lists
 MOST_DOFS = 32  # of a cluster: its D costs their cube, in straight-line code
 
 
@@ -128,14 +129,14 @@ def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str 
     clusters = closing.trace.clusters
     for cluster in clusters:
         if len(cluster.dofs) > MOST_DOFS:
-            tied = ", ".join(sorted({link.label for link in cluster.links}))
+            names = list(dict.fromkeys(link.label for link in cluster.links))
+            tied = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
             raise UnsupportedError(call, f"embedding {len(cluster.dofs)} dof that move together ({tied}; "
                                          f"up to {MOST_DOFS} are)", "use loops='multipliers'")
     q = closing.closed(drawn(scene, SAMPLES))
     if len(q) == 0:
-        names = ", ".join(loop.label or f"body {loop.parent} to body {loop.child}" for loop in scene.loops)
-        raise ValueError(f"{call}: no configuration was found that closes the loops ({names or 'couplings'}); expected "
-                         f"anchors that can meet; loops='cut' leaves them open")
+        raise ValueError(f"{call}: no configuration was found that closes {scene.ties}; expected anchors that can "
+                         f"meet; loops='cut' leaves them open")
     Y = closing.at(q)[1]
     rows: list[int] = []
     free = set(range(scene.dof_count))

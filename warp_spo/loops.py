@@ -22,26 +22,54 @@ from .kernels import declare
 from .kernels import loops as kernels
 from .recursions.embedded import Embedding
 
-EMBEDDED = ("mass_matrix", "mass_matrix_inverse", "solve_mass_matrix", "inverse_dynamics")
-"""Operations that, with loops embedded, are those of the minimal coordinates."""
+EMBEDDED = (
+    "mass_matrix",
+    "mass_matrix_inverse",
+    "solve_mass_matrix",
+    "inverse_dynamics",
+    "log_det_mass_matrix",
+    "operational_inertia_inverse",
+    "operational_inertia_inverse_product",
+    "hybrid_dynamics",
+    "jacobian",
+    "jacobian_bias",
+    "com_jacobian",
+    "centroidal_momentum_matrix",
+    "centroidal_momentum_bias",
+)
+"""Operations that have a form of their own where loops are embedded, most of them in the independent dofs."""
 OF_TREES = {
     "embed": (
-        "log_det_mass_matrix",
-        "operational_inertia_inverse",
-        "operational_inertia_inverse_product",
-        "operational_inertia",
-        "hybrid_dynamics",
         "quasi_velocities",
         "log_det_mass_matrix_gradient",
         "fixman_torque",
         "mass_matrix_packed",
+        "mass_matrix_inverse_packed",
         "operators",
         "step",
         "body_reactions",
     ),
-    "multipliers": ("hybrid_dynamics", "step", "body_reactions"),
+    "multipliers": (
+        "hybrid_dynamics",
+        "operational_inertia_inverse",
+        "operational_inertia_inverse_product",
+        "operational_inertia",
+        "fixman_torque",
+        "step",
+        "body_reactions",
+    ),
 }
-"""Operations that know nothing of closed loops."""
+"""Operations that know nothing of closed loops, and would be wrong."""
+WAYS_OUT = {
+    "quasi_velocities": "factor mass_matrix, which is that of the independent dofs",
+    "log_det_mass_matrix_gradient": "take differences of log_det_mass_matrix",
+    "fixman_torque": "take differences of log_det_mass_matrix",
+    "mass_matrix_packed": "use mass_matrix",
+    "mass_matrix_inverse_packed": "use mass_matrix_inverse",
+}
+COLUMNS = 6
+"""Right-hand sides of solve_mass_matrix that one kernel solves for."""
+EMBED, OPEN = "use loops='embed'", "loops='cut' is the open tree"
 
 
 class Loops(Applications):
@@ -59,6 +87,7 @@ class Loops(Applications):
             raise ValueError("Dynamics: independent= belongs to loops='embed' of a scene with loops or couplings")
         self._usual_rank = usual_rank(self.scene) if self.closed and loops == "multipliers" else 0
         self.embedding = embedding(self.scene, independent) if self.closed and loops == "embed" else None
+        self._minimal = len(self.independent_dofs)
         if self.closed:
             declare(kernels, self.dtype)
 
@@ -67,15 +96,11 @@ class Loops(Applications):
         """Dofs that move all others where loops are embedded: the minimal coordinates, ascending [independent dof].
 
         Those that ``Dynamics(independent=...)`` names. Otherwise they are chosen when the object is made, by random
-        configurations that close the loops: the first dofs that hold the others nearly as well as any do. Only
-        mass_matrix, mass_matrix_inverse, solve_mass_matrix and inverse_dynamics speak of them, and are NaN where they
-        lose their hold on the others (the dead point of a rocker); forward_dynamics passes such points.
+        configurations that close the loops: the first dofs that hold the others nearly as well as any do. What speaks
+        of them (mass matrices, Jacobians, forces) is NaN where they lose their hold on the others (the dead point of a
+        rocker); forward_dynamics and operational_inertia pass such points.
         """
         return np.arange(self.scene.dof_count) if self.embedding is None else np.array(self.embedding.dofs, dtype=int)
-
-    @property
-    def _minimal(self) -> int:
-        return len(self.independent_dofs)
 
     @functools.cached_property
     def closure_rows(self) -> int:
@@ -229,6 +254,38 @@ class Loops(Applications):
             inputs = [q, qd, tau, body_f, out, margin, self.dtype(least)]
             self.recursions.launch(kernels.word, self.worlds, inputs, [status])
 
+    def _launch(self, operation: str, out: wp.array, more: dict[str, wp.array] | None = None, **given: Any) -> None:
+        if self.embedding is not None and operation in EMBEDDED:
+            operation, given = f"embedded_{operation}", {**given, "how": self.embedding}
+        super()._launch(operation, out, more, **given)
+
+    def _solve_columns(self, q: wp.array, b: wp.array, out: wp.array) -> None:
+        """With loops embedded: up to COLUMNS right-hand sides in one kernel, which factors once; more in turns."""
+        columns = b.shape[2]
+        if columns <= COLUMNS:
+            self._launch("solve_mass_matrix", out, q=q, b=b, columns=columns)
+            return
+        for first in range(0, columns, COLUMNS):
+            turn = slice(first, min(first + COLUMNS, columns))
+            size = *b.shape[:2], turn.stop - turn.start
+            right, x = (self.recursions.array((name, size), *size) for name in ("columns of b", "columns of Mass^-1 b"))
+            wp.copy(right, b[:, :, turn])
+            self._launch("solve_mass_matrix", x, q=q, b=right, columns=size[2])
+            wp.copy(out[:, :, turn], x)
+
+    def _check_prescribed(self, call: Call, held: tuple[bool, ...] | None) -> None:
+        """Of closed loops, only independent dofs can be prescribed, and a kernel is made for each mask."""
+        if self.embedding is None:
+            return
+        if held is None:
+            raise UnsupportedError(call.name, "a mask on the device, or one for each world, with loops='embed'",
+                                   "pass a list or a NumPy array [dof]")
+        labels = self.scene.dof_labels
+        wrong = [labels[dof] for dof, on in enumerate(held) if on and dof not in self.embedding.dofs]
+        if wrong:
+            raise UnsupportedError(call.name, f"prescribing {', '.join(wrong)}, which the loops make follow other dofs",
+                                   "name them in Dynamics(independent=...)")
+
     def _check_closed(self, call: Call) -> None:
         if not self.closed:
             what = f"loops={self.loops!r}" if self.scene.loops or self.scene.couplings else "a scene without loops"
@@ -237,4 +294,6 @@ class Loops(Applications):
 
     def _check_operation(self, name: str) -> None:
         if self.closed and name in OF_TREES[self.loops]:
-            raise UnsupportedError(f"Dynamics.{name}", f"loops={self.loops!r}", "loops='cut' is the open tree")
+            ways = WAYS_OUT if self.loops == "embed" else dict.fromkeys((*EMBEDDED, "operational_inertia"), EMBED)
+            way = f"{ways[name]}; {OPEN}" if name in ways else OPEN
+            raise UnsupportedError(f"Dynamics.{name}", f"loops={self.loops!r}", way)

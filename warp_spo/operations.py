@@ -27,7 +27,7 @@ TOLERANCE = {
     "float32": 1e-4,
     "float64": 1e-10,
 }
-INPUTS = ("q", "qd", "qdd", "tau", "b", "x")
+INPUTS = ("q", "qd", "qdd", "tau", "b", "x", "wrenches")
 
 Shape = Callable[[Scene], tuple[int, ...]]
 
@@ -104,7 +104,7 @@ class Operation:
 class Inputs:
     """Random inputs in all worlds, and the reference at them. They are float32 numbers: exact in either precision.
 
-    q: angles and lengths U(-1, 1) [rad, m], rotations uniform; qd, qdd, b, x: N(0, 1); tau: 10 N(0, 1).
+    q: angles and lengths U(-1, 1) [rad, m], rotations uniform; qd, qdd, b, x, wrenches: N(0, 1); tau: 10 N(0, 1).
 
     Args:
         scene: whose inputs.
@@ -130,7 +130,7 @@ class Inputs:
                     turn = rng.standard_normal((self.worlds, 4))
                     array[:, first : first + 4] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
             else:
-                size = sum(scene.node_sizes) if name == "x" else scene.dof_count
+                size = {"x": sum(scene.node_sizes), "wrenches": 12}.get(name, scene.dof_count)
                 array = rng.standard_normal((self.worlds, size), dtype=np.float32)
                 array *= 10.0 if name == "tau" else 1.0
             self._arrays[name] = array.astype(np.float32)
@@ -345,6 +345,20 @@ _APPLICATIONS = (
         "q qd",
         lambda scene: (2, 6),
         lambda d, q, qd: d.jacobian_bias(qd, two_frames(d.scene)),
+        two_frames,
+    ),
+    _method(
+        "frame_accelerations",
+        "q qd qdd",
+        lambda scene: (2, 6),
+        lambda d, q, qd, qdd: d.jacobian(two_frames(d.scene)) @ qdd + d.jacobian_bias(qd, two_frames(d.scene)),
+        two_frames,
+    ),
+    _method(
+        "operational_inertia_inverse_product",
+        "q wrenches",
+        lambda scene: (2, 6),
+        lambda d, q, x: d.operational_inertia_inverse(two_frames(d.scene)) @ x,
         two_frames,
     ),
     _method("com_jacobian", "q", lambda scene: (3, scene.dof_count), lambda d, q: d.com_jacobian),

@@ -22,6 +22,7 @@ from .recursions import messages
 from .recursions.adjoints import Adjoints
 from .recursions.links import TABLES, Links
 from .recursions.messages import INWARD, OUTWARD, SENDS
+from .recursions.minimal import Minimal
 from .recursions.multipliers import Multipliers
 from .recursions.operators import meet, written
 from .recursions.pieces import Pieces
@@ -56,7 +57,7 @@ FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
 
 
-class Traces(Adjoints, Multipliers):
+class Traces(Adjoints, Minimal, Multipliers):
     """Every operation that is traced."""
 
 

@@ -183,6 +183,15 @@ class Scene:
                 for label, hinge in zip(self.joint_labels, self.hinges, strict=True) for i in range(hinge.dof_count)]
 
     @property
+    def ties(self) -> str:
+        """What holds beyond the tree, in words: loop joints and couplings; empty if there is nothing."""
+        loops = [loop.label or f"body {loop.parent} to body {loop.child}" for loop in self.loops]
+        labels = self.joint_labels
+        couplings = [f"{labels[c.hinge]} follows {labels[c.reference]}" for c in self.couplings]
+        kinds = ("loop joint(s)", loops), ("coupling(s)", couplings)
+        return " and ".join(f"{len(names)} {kind}: {', '.join(names)}" for kind, names in kinds if names)
+
+    @property
     def neutral_q(self) -> np.ndarray:
         """Coordinates at which every hinge's anchors coincide [coordinate]: zeros and identity quaternions."""
         q = np.zeros(self.coord_count)

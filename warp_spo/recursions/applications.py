@@ -16,6 +16,11 @@ from .operators import Operators
 from .traced import Trace
 
 
+def at_rest(dof: int) -> Value:
+    """qdd = 0"""
+    return 0.0
+
+
 class Applications(Trace):
     """The operations of :class:`Trace`, and those beyond them."""
 
@@ -130,14 +135,10 @@ class Applications(Trace):
             alpha[id(link)] = newton_euler.accelerated(link, place, move, above, qdd)
         return alpha
 
-    def bias_accelerations(self) -> dict[int, tuple[Vector, Vector]]:
-        """The same at qdd = 0."""
-        return self.link_accelerations(lambda dof: 0.0)
-
     def jacobian_bias(self, frames: tuple) -> list[Store]:
         """out [frame, 6] = J' qd: acceleration of each frame's origin, angular acceleration, inertial axes, qdd = 0."""
         self.place_all(moves=True)
-        return self._at_frames(frames, self.bias_accelerations())
+        return self._at_frames(frames, self.link_accelerations(at_rest))
 
     def frame_accelerations(self, frames: tuple) -> list[Store]:
         """out [frame, 6] = J qdd + J' qd"""
@@ -160,15 +161,10 @@ class Applications(Trace):
     def operational_inertia_inverse_product(self, frames: tuple) -> list[Store]:
         """out [frame, 6] = J Mass^-1 J* x: wrenches x on the frames inward, the accelerations that they make outward"""
         self.place_all()
-        x, done = self.vector("x"), self.factor()
+        done = self.factor()
         forces: dict[int, Vector] = {id(link): Vector((*ZERO, *ZERO)) for link in self.links.links}
-        for index, (body, origin) in enumerate(frames):
-            link, arm = self.frame(body, origin)
-            if link is not None:
-                self.at(link, f"x{index}_")
-                back = self.axes[id(link)].T
-                f, n = (back @ Vector(x(6 * index + 3 * part + c) for c in range(3)) for part in range(2))
-                forces[id(link)] = forces[id(link)] - Vector((*(n + cross(arm, f)), *f))
+        for key, wrench in self.pushed(frames).items():
+            forces[key] = forces[key] - wrench
         rates: dict[int, list[Value]] = {}
         for link in reversed(self.links.links):
             self.at(link, "z")
@@ -184,6 +180,19 @@ class Applications(Trace):
                 link, self.places[id(link)], done[id(link)], rates[id(link)], STILL, above
             )
         return self._at_frames(frames, alpha)
+
+    def pushed(self, frames: tuple) -> dict[int, Vector]:
+        """(n; f) by link, in its frame, of the wrenches x on the frames; after the links are placed."""
+        x, found = self.vector("x"), dict[int, Vector]()
+        for index, (body, origin) in enumerate(frames):
+            link, arm = self.frame(body, origin)
+            if link is not None:
+                self.at(link, f"x{index}_")
+                back = self.axes[id(link)].T
+                f, n = (back @ Vector(x(6 * index + 3 * part + c) for c in range(3)) for part in range(2))
+                wrench = Vector((*(n + cross(arm, f)), *f))
+                found[id(link)] = found[id(link)] + wrench if id(link) in found else wrench
+        return found
 
     # -- momentum --------------------------------------------------------------------------------------------------
     def composites(self) -> dict[int, Rigid]:
@@ -241,10 +250,10 @@ class Applications(Trace):
                 stores += [Store("out", (i, dof), value) for i, value in enumerate((*f, *(n + cross(arm, f))))]
         return stores
 
-    def centroidal_momentum_bias(self) -> list[Store]:
-        """out [6] = A' qd: the force and the moment about the CoM that the motion takes at qdd = 0, without gravity"""
+    def centroidal_momentum_bias(self, qdd: Callable[[int], Value] = at_rest) -> list[Store]:
+        """out [6] = A qdd + A' qd: the force and the moment about the CoM that the motion takes, without gravity"""
         origins = self.place_all(moves=True)
-        alpha, bodies = self.bias_accelerations(), self.composites()
+        alpha, bodies = self.link_accelerations(qdd), self.composites()
         _, c = self.center(bodies, origins)
         forces: dict[int, Vector] = {}
         n, f = ZERO, ZERO
@@ -329,5 +338,13 @@ class Applications(Trace):
 
     def mass_matrix_packed(self) -> list[Store]:
         """out = the entries of Mass that the tree allows, lower triangle, row after row"""
-        entries = {item.index: item.value for item in self.mass_matrix() if item.index[0] >= item.index[1]}
-        return [Store("out", (i,), entries[index]) for i, index in enumerate(sorted(entries))]
+        return _packed(self.mass_matrix())
+
+    def mass_matrix_inverse_packed(self) -> list[Store]:
+        """out = the entries of Mass^-1 within one tree, lower triangle, row after row"""
+        return _packed(self.mass_matrix_inverse())
+
+
+def _packed(stores: list[Store]) -> list[Store]:
+    entries = {item.index: item.value for item in stores if item.index[0] >= item.index[1]}
+    return [Store("out", (i,), entries[index]) for i, index in enumerate(sorted(entries))]

@@ -25,7 +25,7 @@ from .articulated import NO_INERTIA
 from .closures import Closure, Ratio
 from .links import Link, Links, Placed
 from .motion import Motion, in_hinge
-from .nullspace import NullSpace
+from .nullspace import Basis, NullSpace
 
 Columns = dict[int, Value]  # by dof
 
@@ -151,7 +151,7 @@ class Factor:
 
 
 def factor(
-    cluster: Cluster, space: NullSpace, places: dict[int, Placed], own: dict[int, Articulated], epsilon: float
+    cluster: Cluster, space: NullSpace | Basis, places: dict[int, Placed], own: dict[int, Articulated], epsilon: float
 ) -> Factor:
     """Eliminate the rates of a cluster from the articulated inertias that its links carry, ``own``."""
     X, inside = space.basis, set(map(id, cluster.links))

@@ -1,7 +1,7 @@
 """Loops embedded: the operations of a scene whose loops and couplings always hold, as traces.
 
-What has all dofs keeps all of them: states come in consistent, accelerations go out so. Minimal coordinates are the
-independent dofs: with qd = X qd[independent] and qdd = X qdd[independent] + k the minimal mass matrix is X* Mass X.
+What has all dofs keeps all of them: states come in consistent, accelerations go out so. What speaks of independent dofs
+is in :mod:`.minimal`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from .articulated import NO_INERTIA
 from .closures import Closure, Ratio, closures
 from .clusters import Cluster, Columns, Tied
 from .links import FREE, HELIX, SLIDE, TURN, Link, quaternion_rotation
-from .motion import STILL
+from .nullspace import Basis, NullSpace
 
 HERE = Pose(None, None, ZERO)
 
@@ -39,8 +39,12 @@ class Swept(NamedTuple):
     link_rates: dict[int, list[Value]]
     clusters: dict[int, aggregates.Factor]
     cluster_rates: dict[int, list[Value]]
-    demanded: dict[int, Columns]  # the shortest qdd that the velocities of a cluster demand
+    demanded: dict[int, Columns]  # the qdd of a cluster where its rates do not change
     margins: list[Value]
+
+
+Allowed = Callable[[Cluster], "tuple[NullSpace | Basis, Columns]"]
+"""What a cluster may do: columns of its rates, and its qdd where these do not change."""
 
 
 class Embedded(Applications):
@@ -91,16 +95,6 @@ class Embedded(Applications):
         rows = [row for c in self.constraints for row in c.jacobian(self.places)]
         return [Store("out", (i, dof), value) for i, row in enumerate(rows) for dof, value in row.items()]
 
-    def minimal_columns(self, how: Embedding) -> dict[int, Columns]:
-        """X of the independent dofs, by independent dof; after the links are placed."""
-        found: dict[int, Columns] = {dof: {dof: 1.0} for dof in how.dofs}
-        for cluster in self.clusters:
-            tied = self.tied(cluster, how, how.dofs)
-            for dof in cluster.dofs:
-                if dof in found:
-                    found[dof] = {**found[dof], **tied.space.particular([-row.get(dof, 0.0) for row in tied.rows])}
-        return found
-
     # -- forward dynamics ------------------------------------------------------------------------------------------
     def embedded_forward_dynamics(self, how: Embedding, status: bool = False) -> list[Store]:
         """out = qdd [dof]; with ``status`` also margin [row that counts], see :class:`.nullspace.NullSpace`."""
@@ -109,15 +103,21 @@ class Embedded(Applications):
         stores = [Store("out", (dof,), value) for dof, value in qdd.items()]
         return stores + [Store("margin", (i,), margin) for i, margin in enumerate(swept.margins) if status]
 
-    def embedded_solve_mass_matrix(self, how: Embedding) -> list[Store]:
-        """out [independent dof] = (X* Mass X)^-1 b"""
-        b, place = self.vector("b"), {dof: i for i, dof in enumerate(how.dofs)}
-        swept = self.sweep(how, lambda dof: b(place[dof]) if dof in place else 0.0, moves=False, loads=False)
-        qdd = self.outward_accelerations(swept, (ZERO, ZERO))
-        return [Store("out", (i,), qdd[dof]) for i, dof in enumerate(how.dofs)]
+    def sweep(
+        self,
+        how: Embedding,
+        tau: Callable[[int], Value],
+        moves: bool,
+        loads: bool,
+        pushed: dict[int, Vector] | None = None,
+        allowed: Allowed | None = None,
+    ) -> Swept:
+        """In, node by node, a cluster being one node.
 
-    def sweep(self, how: Embedding, tau: Callable[[int], Value], moves: bool, loads: bool) -> Swept:
-        """In, node by node, a cluster being one node."""
+        Args:
+            loads: with the wrenches body_f. pushed: wrenches (n; f) by link, in its frame.
+            allowed: what clusters may do; None: an orthonormal basis, and the shortest accelerations demanded.
+        """
         swept = Swept({}, {}, {}, {}, {}, [])
         own: dict[int, Articulated] = {}  # of the links in clusters
         z: dict[int, Vector] = {}
@@ -136,6 +136,8 @@ class Embedded(Applications):
             force = articulated.gyroscopic(link.inertia, self.motions[key])
             if loads:
                 force = force - self.external(link)
+            if pushed and key in pushed:
+                force = force - pushed[key]
             for other in apart + bundles:
                 force = force + forces[other]
             cluster = self.cluster_of.get(key)
@@ -156,20 +158,27 @@ class Embedded(Applications):
                 own[key] = own[key] + inertia
             waiting[id(cluster)] -= 1
             if waiting[id(cluster)] == 0:
-                inner[id(cluster)], forces[id(cluster)] = self._eliminate(cluster, how, swept, own, z, tau, moves)
+                space, k = self._shortest(cluster, how, swept, moves) if allowed is None else allowed(cluster)
+                found = self._eliminate(cluster, space, k, swept, own, z, tau)
+                inner[id(cluster)], forces[id(cluster)] = found
         return swept
 
-    def _eliminate(
-        self, cluster: Cluster, how: Embedding, swept: Swept, own: dict, z: dict, tau: Callable, moves: bool
-    ) -> tuple[Articulated, Vector]:
-        key, tied = id(cluster), self.tied(cluster, how)
+    def _shortest(self, cluster: Cluster, how: Embedding, swept: Swept, moves: bool) -> tuple[NullSpace, Columns]:
+        tied = self.tied(cluster, how)
         swept.margins.extend(tied.space.margins)
-        k = {}
-        if moves:
-            k = tied.space.particular([-a for a in tied.accelerations(self.places, self.vector("qd"))])
+        return tied.space, self.demanded(tied) if moves else {}
+
+    def demanded(self, tied: Tied) -> Columns:
+        """The shortest qdd of a cluster that its velocities demand; of the dofs that are not held."""
+        return tied.space.particular([-a for a in tied.accelerations(self.places, self.vector("qd"))])
+
+    def _eliminate(
+        self, cluster: Cluster, space: NullSpace | Basis, k: Columns, swept: Swept, own: dict, z: dict, tau: Callable
+    ) -> tuple[Articulated, Vector]:
+        key = id(cluster)
         swept.demanded[key] = k
         self.at_cluster(cluster, "D")
-        swept.clusters[key] = done = aggregates.factor(cluster, tied.space, self.places, own, self.epsilon)
+        swept.clusters[key] = done = aggregates.factor(cluster, space, self.places, own, self.epsilon)
         self.at_cluster(cluster, "z")
         t, force = aggregates.hinge_forces(
             cluster, self.places, self.motions, own, z, lambda dof: k.get(dof, 0.0)
@@ -182,6 +191,12 @@ class Embedded(Applications):
 
     def outward_accelerations(self, swept: Swept, base: tuple[Vector, Vector]) -> Columns:
         """qdd by dof."""
+        return self.outward_motion(swept, base)[0]
+
+    def outward_motion(
+        self, swept: Swept, base: tuple[Vector, Vector]
+    ) -> tuple[Columns, dict[int, tuple[Vector, Vector]]]:
+        """qdd by dof, and the accelerations of the links."""
         alpha: dict[int, tuple[Vector, Vector]] = {}
         qdd: Columns = {}
         for link in self.links.links:
@@ -202,83 +217,7 @@ class Embedded(Applications):
                     cluster, swept.clusters[at], swept.cluster_rates[at], swept.demanded[at], above
                 )
             alpha[key] = newton_euler.accelerated(link, place, move, above, qdd.__getitem__)
-        return qdd
-
-    # -- minimal coordinates ---------------------------------------------------------------------------------------
-    def embedded_mass_matrix(self, how: Embedding) -> list[Store]:
-        """out [independent dof, independent dof] = X* Mass X"""
-        Mass = {item.index: item.value for item in self.mass_matrix()}
-        X = self.minimal_columns(how)
-        stores = []
-        for i, row in enumerate(how.dofs):
-            MX = {
-                dof: total(x * Mass[other, dof] for other, x in X[row].items() if (other, dof) in Mass)
-                for dof in range(self.links.scene.dof_count)
-            }
-            for j, column in enumerate(how.dofs[: i + 1]):
-                value = total(MX[dof] * x for dof, x in X[column].items())
-                stores += [Store("out", place, value) for place in {(i, j), (j, i)}]
-        return stores
-
-    def embedded_mass_matrix_inverse(self, how: Embedding) -> list[Store]:
-        """out [independent dof, independent dof] = (X* Mass X)^-1 = Y* D Y, Y the unit forces on their way in."""
-        swept = self.sweep(how, lambda dof: 0.0, moves=False, loads=False)
-        D = {key: [pivot.D for pivot in done.pivots] for key, done in swept.links.items()}
-        D |= {key: done.d for key, done in swept.clusters.items()}
-        halves = [self._half(swept, dof) for dof in how.dofs]
-        nothing = total(done.nothing for done in swept.links.values())
-        nothing = nothing + total(done.nothing for done in swept.clusters.values())
-        stores = []
-        for i, half in enumerate(halves):
-            self.graph.step = f"column {how.dofs[i]}|m"
-            weighted = {key: [x * d for x, d in zip(y, D[key], strict=True)] for key, y in half.items()}
-            for j, other in enumerate(halves[: i + 1]):
-                both = [key for key in other if key in weighted]
-                value = total(a * b for key in both for a, b in zip(weighted[key], other[key], strict=True)) + nothing
-                stores += [Store("out", place, value) for place in {(i, j), (j, i)}]
-        return stores
-
-    def _half(self, swept: Swept, dof: int) -> dict[int, list[Value]]:
-        """D^-1 [I - H psi K] of a unit force on a dof, by node on the way to the root; in clusters (L D)^-1 eps."""
-        link: Link | None = next(link for link in self.links.links if dof in link.dofs)
-        tau, force, rates = {dof: 1.0}, Vector((*ZERO, *ZERO)), {}
-        while link is not None:
-            key, cluster = id(link), self.cluster_of.get(id(link))
-            if cluster is None:
-                right = [tau.get(other, 0.0) for other in link.dofs]
-                rates[key], force = articulated.reduced(
-                    link, self.places[key], swept.links[key], STILL, force, right
-                )
-                link, tau = link.parent, {}
-                continue
-            done = swept.clusters[id(cluster)]
-            loads = {id(other): Vector((*ZERO, *ZERO)) for other in cluster.links} | {key: force}
-            own = dict.fromkeys(loads, NO_INERTIA)
-            t, force = aggregates.hinge_forces(cluster, self.places, self.motions, own, loads, lambda other: 0.0)
-            eps = [total(x * (tau.get(i, 0.0) - t[i]) for i, x in column.items()) for column in done.X]
-            rates[id(cluster)] = [y * d for y, d in zip(done.forward(eps), done.inverse, strict=True)]
-            for column, rate in zip(done.U, done.solve(eps), strict=True):
-                force = force + column * rate
-            link, tau = cluster.parent, {}
-        return rates
-
-    def embedded_inverse_dynamics(self, how: Embedding) -> list[Store]:
-        """out [independent dof] = X* (Mass qdd + bias_force); of ``qdd`` the independent entries are read."""
-        moves, given = "qd" in self.given, self.vector("qdd")
-        self.place_links(moves)
-        X = self.minimal_columns(how)
-        qdd: dict[int, Value] = dict.fromkeys(range(self.links.scene.dof_count), 0.0)
-        for cluster in self.clusters:
-            if moves:
-                tied = self.tied(cluster, how, how.dofs)
-                qdd |= tied.space.particular([-a for a in tied.accelerations(self.places, self.vector("qd"))])
-        for free, column in X.items():
-            for dof, x in column.items():
-                qdd[dof] = qdd[dof] + x * given(free)
-        tau = {item.index[0]: item.value for item in self.inverse_dynamics(qdd=qdd.__getitem__)}
-        return [
-            Store("out", (i,), total(x * tau[dof] for dof, x in X[free].items())) for i, free in enumerate(how.dofs)
-        ]
+        return qdd, alpha
 
     # -- projection ------------------------------------------------------------------------------------------------
     def project_position(self, how: Embedding, held: tuple[int, ...] = ()) -> list[Store]:

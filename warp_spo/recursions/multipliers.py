@@ -15,6 +15,7 @@ from . import articulated
 from .clusters import Columns
 from .embedded import Embedded
 from .motion import STILL
+from .traced import pivots
 
 
 class Multipliers(Embedded):
@@ -38,7 +39,7 @@ class Multipliers(Embedded):
         for i, row in enumerate(self.rows()):
             self.graph.step = f"loop row {i}|m"
             halves[i] = self._loaded(done, row)
-        stores = self._both(self._sandwich(done, halves))
+        stores = self._both(self._sandwich(*pivots(done), halves))
         return stores + [Store("right", (i,), value) for i, value in enumerate(right)] + self._sizes()
 
     def _sizes(self) -> list[Store]:

@@ -30,6 +30,13 @@ class Reflection(NamedTuple):
         return {**x, **{column: x.get(column, 0.0) - along * value for column, value in self.v.items()}}
 
 
+class Basis(NamedTuple):
+    """Columns of one's own choice that rows leave free, by dof; NaN where the rows are lost, otherwise zero."""
+
+    basis: list[dict[int, Value]]
+    nothing: Value
+
+
 class NullSpace:
     """Factors of rows.
 

@@ -321,15 +321,14 @@ class Trace:
             over = over.parent
             right = [0.0] * len(over.dofs)
 
-    def _sandwich(self, done: dict, halves: dict) -> dict[tuple[int, int], Value]:
-        """Y* D Y; entries of columns without a common ancestor are absent, unless a pivot may be lost."""
+    def _sandwich(self, D: dict, nothing: Value, halves: dict) -> dict[tuple[int, int], Value]:
+        """Y* D Y + nothing; entries of columns that do not meet are absent, unless a pivot may be lost."""
         entries: dict[tuple[int, int], Value] = {}
-        names, nothing = list(halves), total(factor.nothing for factor in done.values())
+        names = list(halves)
         for at, i in enumerate(names):
             self.graph.step = f"column {i}|m"
             weighted = {
-                key: [rate * pivot.D for rate, pivot in zip(rates, done[key].pivots, strict=True)]
-                for key, rates in halves[i].items()
+                key: [rate * d for rate, d in zip(rates, D[key], strict=True)] for key, rates in halves[i].items()
             }
             for j in names[: at + 1]:
                 both = [key for key in halves[j] if key in weighted]
@@ -377,18 +376,21 @@ class Trace:
             self.place_axes(each)
         done = self.factor()
         halves: dict[int, dict] = {}
+        for row, (link, wrench) in enumerate(self.unit_wrenches(frames)):
+            halves[row] = {} if link is None else self.inward(done, link, wrench, [0.0] * len(link.dofs))
+        return self._both(self._sandwich(*pivots(done), halves))
+
+    def unit_wrenches(self, frames: tuple) -> Iterator[tuple[Link | None, Vector]]:
+        """The link of each frame, and (n; f) in its frame of three unit forces, then torques."""
         for index, (body, origin) in enumerate(frames):
             link, arm = self.frame(body, origin)
             for c in range(6):
                 if link is None:
-                    halves[6 * index + c] = {}
+                    yield None, ZERO
                     continue
                 self.at(link, f"y{index}{c}_")
                 axis = self.axes[id(link)][c % 3]
-                wrench = (*cross(arm, axis), *axis) if c < 3 else (*axis, *ZERO)
-                halves[6 * index + c] = self.inward(done, link, Vector(wrench), [0.0] * len(link.dofs))
-        entries = self._sandwich(done, halves)
-        return self._both(entries)
+                yield link, Vector((*cross(arm, axis), *axis) if c < 3 else (*axis, *ZERO))
 
     def body_poses(self) -> list[Store]:
         """out [body, 7] = position, quaternion xyzw"""
@@ -433,6 +435,12 @@ class Trace:
     def body_states(self) -> list[Store]:
         """out = body_poses, velocities_out = body_velocities"""
         return self.body_poses() + [item._replace(array="velocities_out") for item in self.body_velocities()]
+
+
+def pivots(done: dict[int, articulated.Factor]) -> tuple[dict[int, list[Value]], Value]:
+    """D by link, and NaN where a pivot is lost that nobody would notice."""
+    return {key: [pivot.D for pivot in factor.pivots] for key, factor in done.items()}, total(
+        factor.nothing for factor in done.values())
 
 
 def _mirrored(i: int, j: int, value: Value) -> list[tuple[tuple[int, int], Value]]:
