@@ -69,7 +69,8 @@ class Frame(NamedTuple):
         sent: values that warps send each other, ``SENT(i)``.
         warps: how many work on 32 worlds.
         block: threads of a block.
-        more: further results, ``name_row[i]``, each entry to memory by itself.
+        more: further results, ``name_row[i]``. gathered: they leave through shared memory, as rows; otherwise, and if
+            they are integers, each entry goes to memory by itself.
         held: entries of each field, from the first on, that wait for their use in shared memory: a compiler that loads
             them from memory does so long before, and has no registers left.
         numbers: numbers that all worlds share, ``name_row[0]``.
@@ -83,6 +84,7 @@ class Frame(NamedTuple):
     warps: int
     block: int
     more: tuple[Row, ...] = ()
+    gathered: bool = False
     again: bool = False
     held: tuple[int, ...] = ()
     numbers: tuple[str, ...] = ()
@@ -97,7 +99,13 @@ class Frame(NamedTuple):
         """Scalars of shared memory that a group takes."""
         rows = sum(pitch(row.entries) for row in self.rows) if self.staged else 0
         extra = {STAGED: self.result.array.entries, MAPPED: self.result.slots | 1}.get(self.result.way)
+        rows += sum(pitch(row.entries) for row in self.leaving)
         return WARP * (rows + (0 if extra is None else pitch(extra)) + self.sent + sum(self.held))
+
+    @property
+    def leaving(self) -> tuple[Row, ...]:
+        """Further results that leave through shared memory."""
+        return tuple(row for row in self.more if self.gathered and row.name not in INTEGERS)
 
     def fits(self, T) -> bool:
         """Shared memory holds what is staged."""
@@ -124,7 +132,12 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
             text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
         else:
             text += [_own_row(row, c)]
-    text += [_own_result(row, c) for row in frame.more]
+    for row in frame.more:
+        if row in frame.leaving:
+            offset[row.name], at = at, at + WARP * pitch(row.entries)
+            text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
+        else:
+            text += [_own_result(row, c)]
     if frame.held:
         text += [ON_ITS_WAY, *_held(frame, c), "#undef ON_ITS_WAY"]
         lines = cuda.split("\n")
@@ -156,6 +169,7 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     text += [*([] if frame.held else _fields(frame.fields, c)), cuda]
     if result.way in (IN_PLACE, STAGED):
         text += [sync, _stage_out(out, start, width, c, team)]
+        text += [_stage_out(row, offset[row.name], pitch(row.entries), c, team) for row in frame.leaving]
     if result.way == MAPPED:
         text += [sync, _spread_out(result, start, c, team)]
     text += ["#undef FIELD"] if frame.held else []
@@ -257,7 +271,7 @@ def _stage_in(row: Row, offset: int, c: str, team: int) -> str:
 def _stage_out(out: Row, offset: int, width: int, c: str, team: int) -> str:
     n = out.entries
     copy = _each(n, team, f"to[i] = from[{_slot('i', n, width)}];")
-    return f"{{\n{c}* to = out.data + first * {n};\nconst {c}* from = stage + {offset};\n{copy}\n}}"
+    return f"{{\n{c}* to = {out.name}.data + first * {n};\nconst {c}* from = stage + {offset};\n{copy}\n}}"
 
 
 def _spread_out(result: Result, offset: int, c: str, team: int) -> str:

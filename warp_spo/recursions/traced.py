@@ -153,6 +153,12 @@ class Trace:
         done, rates, stores = self.reduce(self.vector(right), moves, bias)
         return stores + self.expand(done, rates, self.base if bias else (ZERO, ZERO))
 
+    def forward_dynamics_and_solve(self) -> list[Store]:
+        """out = Mass^-1 (tau - bias_force), solved = Mass^-1 cotangent, by one factorisation"""
+        stores = self.forward_dynamics()
+        done, rates, sent = self.reduce(self.vector("cotangent"), moves=False, loads=False, letters="y")
+        return stores + sent + self.expand(done, rates, (ZERO, ZERO), "b", "solved")
+
     def factor(self) -> dict[int, articulated.Factor]:
         return self.factors()[0]
 
@@ -178,8 +184,10 @@ class Trace:
         done[id(link)] = factor = articulated.factor(self.stiffened(link), place, carried, through, self.epsilon)
         inner[id(link)] = factor.in_parent
 
-    def reduce(self, tau: Callable[[int], Value], moves: bool, loads: bool) -> tuple[dict, dict, list[Store]]:
-        """Factors of every link, D^-1 [I - H psi K] (tau - ...), and what other pieces need of them."""
+    def reduce(
+        self, tau: Callable[[int], Value], moves: bool, loads: bool, letters: str = "Pz"
+    ) -> tuple[dict, dict, list[Store]]:
+        """Factors of every link, D^-1 [I - H psi K] (tau - ...), and what other pieces need of them: ``letters``."""
         done: dict[int, articulated.Factor] = {}
         rates: dict[int, list[Value]] = {}
         inner: dict[int, Articulated] = {}
@@ -196,15 +204,17 @@ class Trace:
             z = articulated.gyroscopic(link.inertia, move)
             if loads:
                 z = z - self.external(link)
-            for force in self.carried_on(link, "z", forces, Vector):
+            for force in self.carried_on(link, letters[-1], forces, Vector):
                 z = z + force
             right = [tau(dof) for dof in link.dofs]
             rates[key], forces[key] = articulated.reduced(link, place, factor, move, z, right)
-            stores += self.handed_on("P", link, inner[key].packed)
-            stores += self.handed_on("z", link, forces[key])
+            stores += self.handed_on("P", link, inner[key].packed) if "P" in letters else []
+            stores += self.handed_on(letters[-1], link, forces[key])
         return done, rates, stores
 
-    def expand(self, done: dict, rates: dict, base: tuple[Vector, Vector]) -> list[Store]:
+    def expand(
+        self, done: dict, rates: dict, base: tuple[Vector, Vector], letter: str = "a", name: str = "out"
+    ) -> list[Store]:
         alpha: dict[int, tuple[Vector, Vector]] = {}
         stores = []
         for link in self.outward:
@@ -215,14 +225,14 @@ class Trace:
             elif id(link.parent) in self.own:
                 above = alpha[id(link.parent)]
             else:
-                received = self.receive("a", self.piece.parent)  # type: ignore[union-attr, arg-type]
+                received = self.receive(letter, self.piece.parent)  # type: ignore[union-attr, arg-type]
                 above = Vector(received[:3]), Vector(received[3:])
             qdd, alpha[key] = articulated.expanded(
                 link, self.places[key], done[key], rates[key], self.motions[key], above
             )
-            stores += [Store("out", (dof,), value) for dof, value in zip(link.dofs, qdd, strict=True)]
+            stores += [Store(name, (dof,), value) for dof, value in zip(link.dofs, qdd, strict=True)]
             if self.piece is not None and self.piece.children and link is self.piece.links[-1]:
-                stores += self.post("a", self.piece, (*alpha[key][0], *alpha[key][1]))
+                stores += self.post(letter, self.piece, (*alpha[key][0], *alpha[key][1]))
         return stores
 
     def inverse_dynamics(
