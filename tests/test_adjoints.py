@@ -7,12 +7,17 @@ import numpy as np
 import pytest
 import symbolic
 import warp as wp
+import warp_machine
 import zoo
+from test_granularity import hand
 
 import warp_spo as spo
+from warp_spo import plan
+from warp_spo.kernels import straight
 from warp_spo.recursions import power
 from warp_spo.recursions.adjoints import Adjoints
 from warp_spo.recursions.power import Carried, Power
+from warp_spo.reference import Dense
 
 WORLDS = 3
 TOLERANCE = {"float64": 1e-11, "float32": 2e-5}  # grows with the condition of Mass; measured 3e-14, 3e-6
@@ -20,6 +25,7 @@ SCENES = {
     "limbs": lambda: zoo.from_parents([-1, 0, 0, 2, 2], ["free", "ball", "helical", "prismatic", "revolute"], 61),
     "two roots": lambda: zoo.from_parents([-1, -1, 1], ["ball", "planar", "revolute"], 62),
 }
+WARPS = {"limbs": lambda: SCENES["limbs"](), "fork": zoo.fork, "hand": hand}
 NAMES = ("tangent", "qd", "tau")
 
 
@@ -100,6 +106,39 @@ def test_a_world_without_a_solution_stays_alone(device):
     for key, array in good.items():
         np.testing.assert_array_equal(np.delete(bad[key], 1, 0), np.delete(array, 1, 0))
         assert np.isnan(bad[key][1]).any()
+
+
+# -- warps -------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("staged", [False, True])
+@pytest.mark.parametrize("name", WARPS)
+def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
+    """The CUDA text of both kernels, warp by warp in either order, with rows and results in shared memory or not."""
+    for limit in ("FEW_WORLDS", "LONG_ROWS") if staged else ():
+        monkeypatch.setattr(plan, limit, 0)
+    monkeypatch.setattr(straight, "SHARED_BYTES", 1 << 20)
+    texts, scene = warp_machine.recorded(monkeypatch), WARPS[name]()
+    dyn = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="segment")
+    a, rate, wide = laws.states(scene, WORLDS), (WORLDS, scene.dof_count), (WORLDS, scene.coord_count)
+    a["cotangent"] = a["b"][:, :, 0].copy()
+    dense = [Dense(scene, a["q"][w]) for w in range(WORLDS)]
+    qdd = np.array([dense[w].forward_dynamics(a["qd"][w], a["tau"][w]) for w in range(WORLDS)])
+    solved = np.array([np.linalg.solve(dense[w].mass_matrix, a["cotangent"][w]) for w in range(WORLDS)])
+    state, find, further = {"q": wide, "qd": rate}, dyn.programs.find, {}
+    program = find("forward_dynamics_and_solve", state | {"tau": rate, "cotangent": rate}, rate, {"solved": rate})
+    assert program.warps > 1 and texts[-1].frame.staged == texts[-1].frame.gathered == staged
+    for backwards in (False, True):
+        assert laws.error(warp_machine.run(texts[-1], a, backwards, further), qdd) <= TOLERANCE["float64"]
+        assert laws.error(further.pop("solved"), solved) <= TOLERANCE["float64"]
+    a |= {"qdd": qdd, "solved": solved}
+    n = scene.dof_count
+    J = symbolic.run(scene, "inverse_dynamics_derivatives", a, ("q", "qd", "qdd"), {"out": (3, n, n)}, trace=Adjoints)
+    by_q, by_qd, _ = -np.einsum("wbij,wi->bwj", np.nan_to_num(J["out"]), solved)
+    state |= {"qdd": rate, "solved": rate}
+    program = find("forward_dynamics_vjp", state, rate, {"qd_bar": rate}, wrt=("tangent", "qd"))
+    assert program.warps > 1
+    for backwards in (False, True):
+        assert laws.error(warp_machine.run(texts[-1], a, backwards, further), by_q) <= TOLERANCE["float64"]
+        assert laws.error(further.pop("qd_bar"), by_qd) <= TOLERANCE["float64"]
 
 
 # -- planted bugs ------------------------------------------------------------------------------------------------------
