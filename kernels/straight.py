@@ -69,8 +69,8 @@ class Frame(NamedTuple):
         sent: values that warps send each other, ``SENT(i)``.
         warps: how many work on 32 worlds.
         block: threads of a block.
-        more: further results, ``name_row[i]``, each entry to memory by itself, but for those named in ``beside``: their
-            rows, all of them filled, leave through shared memory.
+        more: further results, ``name_row[i]``. gathered: they leave through shared memory, as rows; otherwise, and if
+            they are integers, each entry goes to memory by itself.
         held: entries of each field that wait for their use in shared memory, by place there: a compiler that loads them
             from memory does so long before, and has no registers left.
         numbers: numbers that all worlds share, ``name_row[0]``.
@@ -84,7 +84,7 @@ class Frame(NamedTuple):
     warps: int
     block: int
     more: tuple[Row, ...] = ()
-    beside: tuple[str, ...] = ()
+    gathered: bool = False
     again: bool = False
     held: tuple[tuple[int, ...], ...] = ()
     numbers: tuple[str, ...] = ()
@@ -99,8 +99,13 @@ class Frame(NamedTuple):
         """Scalars of shared memory that a group takes."""
         rows = sum(pitch(row.entries) for row in self.rows) if self.staged else 0
         extra = {STAGED: self.result.array.entries, MAPPED: self.result.slots | 1}.get(self.result.way)
-        rows += sum(pitch(row.entries) for row in self.more if row.name in self.beside)
+        rows += sum(pitch(row.entries) for row in self.leaving)
         return WARP * (rows + (0 if extra is None else pitch(extra)) + self.sent + sum(map(len, self.held)))
+
+    @property
+    def leaving(self) -> tuple[Row, ...]:
+        """Further results that leave through shared memory."""
+        return tuple(row for row in self.more if self.gathered and row.name not in INTEGERS)
 
     def fits(self, T) -> bool:
         """Shared memory holds what is staged."""
@@ -127,8 +132,12 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
             text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
         else:
             text += [_own_row(row, c)]
-    beside = [row for row in frame.more if row.name in frame.beside]
-    text += [_own_result(row, c) for row in frame.more if row not in beside]
+    for row in frame.more:
+        if row in frame.leaving:
+            offset[row.name], at = at, at + WARP * pitch(row.entries)
+            text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
+        else:
+            text += [_own_result(row, c)]
     if frame.held:
         text += [ON_ITS_WAY, *_held(frame, c), "#undef ON_ITS_WAY"]
         lines = cuda.split("\n")
@@ -155,17 +164,12 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
         text += [f"{c}* result_row = stage + {start} + lane * {width};"]
     if frame.sent:
         text += [f"{c}* sent = stage + {at} + lane;", "#define SENT(i) sent[(i) * 32]"]
-        at += WARP * frame.sent
-    for row in beside:
-        offset[row.name], at = at, at + WARP * pitch(row.entries)
-        text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
     if frame.again:
         cuda = f"for (int again = 0;; ++again) {{\n{cuda}\nif (again || !(farthest > on::reach())) break;\n}}"
     text += [*([] if frame.held else _fields(frame.fields, c)), cuda]
-    leaving = [(out, start, width)] if result.way in (IN_PLACE, STAGED) else []
-    leaving += [(row, offset[row.name], pitch(row.entries)) for row in beside]
-    if leaving:
-        text += [sync, *(_stage_out(row, first, apart, c, team) for row, first, apart in leaving)]
+    if result.way in (IN_PLACE, STAGED):
+        text += [sync, _stage_out(out, start, width, c, team)]
+        text += [_stage_out(row, offset[row.name], pitch(row.entries), c, team) for row in frame.leaving]
     if result.way == MAPPED:
         text += [sync, _spread_out(result, start, c, team)]
     text += ["#undef FIELD"] if frame.held else []

@@ -99,6 +99,7 @@ RULES = {
     "sub": lambda x, y: x - y,
     "mul": lambda x, y: x * y,
     "neg": lambda x, y: -x,
+    "cut": lambda x, y: g.cut(x * y) * x,
     "sin": lambda x, y: g.sin(x * y),
     "cos": lambda x, y: g.cos(x * y),
     "sqrt": lambda x, y: g.sqrt(x * x + y * y),

@@ -72,17 +72,19 @@ class Shared:
         self.values[entry], self.writer[entry] = value, self.now
 
 
-def run(text, arrays, backwards=False):
+def run(text, arrays, backwards=False, further=None):
     """The result of a kernel, [world, entry].
 
     Args:
         text: of the kernel.
         arrays: by name: the callers' [world, ...], the tables of what the links are made of [entry, world].
         backwards: between barriers the last warp goes first.
+        further: receives the other results, by name.
     """
     frame = text.frame
     worlds = len(next(array for name, array in arrays.items() if name not in frame.fields))
     rows = {f"{row.name}_row": Shared(row.name, arrays[row.name].reshape(worlds, -1).T) for row in frame.rows}
+    rows |= {f"{row.name}_row": Shared(row.name) for row in frame.more}
     result = rows[f"{frame.result.row}_row"] if frame.result.way == IN_PLACE else Shared("result")
     sent = Shared("sent")
     fields = {name: arrays[name] for name in frame.fields}
@@ -103,6 +105,10 @@ def run(text, arrays, backwards=False):
             raise Race(f"warps {sorted(stopped)} of {sorted(going)} end after {stretch} barriers, the others do not")
         going = {} if stopped else going
         stretch += 1
+    for row in frame.more:
+        further[row.name] = np.full((worlds, row.entries), np.nan)
+        for entry, value in rows[f"{row.name}_row"].values.items():
+            further[row.name][:, entry] = value
     whole = np.zeros((frame.result.array.entries, worlds))
     places = text.tables["place"] if frame.result.way in (MAPPED, TILED) else range(len(whole))
     for entry, slot in enumerate(places):

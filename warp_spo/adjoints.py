@@ -118,9 +118,8 @@ class Adjoints:
             cotangent = self._read_rate(call, "cotangent", cotangent, False)
             given = {"q": q, "qd": qd, "tau": tau, "body_f": body_f}
             names, outs = self._gradients(call, "forward_dynamics", given, wrt, out)
-            qdd = self._accelerations(self._read_rate(call, "qdd", qdd), given)
-            del given["tau"]
-            self._pull("forward_dynamics", names, outs, {**given, "qdd": qdd, "cotangent": cotangent})
+            given |= {"qdd": self._read_rate(call, "qdd", qdd), "cotangent": cotangent}
+            self._pull_forward_dynamics(names, outs, given)
         return _by_name(names, call.result)
 
     def inverse_dynamics_vjp(
@@ -385,6 +384,26 @@ class Adjoints:
         if values:
             flat = {name: array.reshape((self.worlds, math.prod(array.shape[1:]))) for name, array in values.items()}
             link_values.pull_back(self.recursions.parameters, self.programs.links, results["value"], flat)
+
+    def _pull_forward_dynamics(self, names: tuple[str, ...], outs: Sequence[wp.array], given: dict[str, Any]) -> None:
+        """In one kernel; where a warp works on a limb, in one for qdd and lambda and another one for what follows."""
+        qdd, cotangent = given["qdd"], given["cotangent"]
+        state = {name: given[name] for name in ("q", "qd", "body_f")}
+        forces = {"tau": given["tau"]} if qdd is None else {"qdd": qdd}
+        if self.scene.dof_count == 0 or self.programs.plan.of("forward_dynamics_vjp") != "segment":
+            self._pull("forward_dynamics", names, outs, {**state, **forces, "cotangent": cotangent})
+            return
+        results, shape = dict(zip(names, outs, strict=True)), (self.worlds, self.scene.dof_count)
+        solved = results.pop("tau", None)
+        if solved is None:
+            solved = self.recursions.array("lambda of derivatives", *shape)
+        if qdd is None and results:
+            qdd = self.recursions.array("qdd of derivatives", *shape)
+            self._launch("forward_dynamics_and_solve", qdd, {"solved": solved}, **state, **forces, cotangent=cotangent)
+        else:
+            self._run("solve_mass_matrix", solved, q=given["q"], b=cotangent)
+        if results:
+            self._pull("forward_dynamics", tuple(results), [*results.values()], {**state, "qdd": qdd, "solved": solved})
 
     def _check_size(self, call: Call) -> None:
         if self.closed:

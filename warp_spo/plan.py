@@ -44,8 +44,6 @@ TREE_ONLY = (
     "mass_matrix_inverse_packed",
     "inverse_dynamics_derivatives",
     "mass_matrix_derivative",
-    "forward_dynamics_vjp",
-    "inverse_dynamics_vjp",
     "solve_mass_matrix_vjp",
     "integrate_vjp",
     "step_vjp",
@@ -83,6 +81,8 @@ TREE_ONLY = (
     "closure_step",
 )
 """Operations that exist as traces alone: each is a kernel of its scene, a thread a world, whatever the plan."""
+SHARED = ("forward_dynamics_and_solve", "forward_dynamics_vjp", "inverse_dynamics_vjp")
+"""Traces alone, too, that a warp a limb can share."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,6 +124,8 @@ class Plan:
         if operation in TREE_ONLY:
             return "tree"
         chosen = self.granularity if self.forced else self._rule(operation)
+        if operation in SHARED:
+            return "segment" if chosen == "segment" else "tree"
         return "tree" if chosen == "segment" and operation not in SEGMENTED else chosen
 
     def _rule(self, operation: str) -> str:

@@ -17,7 +17,7 @@ from .kernels import straight, tiles
 from .kernels.straight import DIRECT, IN_PLACE, MAPPED, STAGED, TILE, TILED, WARP, Frame, Result, Row
 from .levels import Recursions
 from .parts import DOF_VALUES
-from .plan import MOST_WARPS, TREE_ONLY, Plan
+from .plan import MOST_WARPS, SHARED, TREE_ONLY, Plan
 from .recursions import messages
 from .recursions.adjoints import Adjoints
 from .recursions.links import TABLES, Links
@@ -27,7 +27,6 @@ from .recursions.multipliers import Multipliers
 from .recursions.operators import meet, written
 from .recursions.pieces import Pieces
 from .recursions.step import LOOPED
-from .recursions.traced import Trace
 from .teams import Team, Work
 from .trace.emit import Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
@@ -133,7 +132,7 @@ class Programs:
         if key not in self._programs:
             lists = sum(1 for other in self._programs if other[0] == operation)
             most = EXPRESSIONS if operation == "expression" else FRAME_LISTS
-            if options and lists >= most and operation not in TREE_ONLY:
+            if options and lists >= most and operation not in (*TREE_ONLY, *SHARED):
                 return None
             self._programs[key] = self._build(operation, shapes, out, more or {}, options)
         return self._programs[key]
@@ -200,12 +199,14 @@ class Programs:
         if operation == "expression" and not meet(options["expression"]):
             return None
         shapes = {**shapes, "out": out_shape}
-        if operation == "forward_dynamics" and "qd" in shapes:
-            options = {**options, "apart": self.plan.apart}
-        if self.plan.of(operation) == "segment":
+        shared = self.plan.of(operation) == "segment" and messages.shared(operation, shapes, options.get("wrt", ()))
+        if operation == "forward_dynamics" and self.plan.apart and "qd" in shapes:
+            operation = "forward_dynamics_apart"
+        if shared:
             pieces = Pieces(links)
             several = 1 < pieces.warps <= MOST_WARPS
-            program = self._segment_program(operation, shapes, pieces, options) if several else None
+            both = {**shapes, **more}
+            program = self._segment_program(operation, both, pieces, tuple(more), options) if several else None
             if program is not None:
                 return program
         return self._tree_program(operation, links, {**shapes, **more}, tuple(more), options)
@@ -214,15 +215,14 @@ class Programs:
         trace = Traces(links, self.run.dtype.__name__, tuple(shapes))
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
-        frame = self._frame([item for item in stores if item.array == "out"], shapes, 0, 1, self.block, stores)
+        outs = [item for item in stores if item.array == "out"]
+        frame = self._frame(outs, shapes, 0, 1, self.block, stores, more)
         if operation in TILES:
             result = Result(TILED, frame.result.array, slots=_solid(stores))
             frame = frame._replace(staged=self.plan.staged, result=result)
         once = operation == "step" or any(item.array in LOOPED for item in stores)  # may write over what it reads
         frame = frame._replace(again=not once and not frame.staged and frame.result.way in (DIRECT, TILED))
-        rows = [Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more]
-        frame = self._with_more(frame, rows, apart)
-        placed, table = _placed([item for item in stores if item.array == "out"], frame.result)
+        placed, table = _placed(outs, frame.result)
         placed += apart
         emitter, looped = self._emitter(shapes, frame), [item for item in stores if item.array in LOOPED]
         regions = [emitter.region([], trace.ahead), emitter.branch(looped)] if looped else []
@@ -234,15 +234,9 @@ class Programs:
         tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
         return self._finished(operation, frame, body, body, tables, emitter.operations)
 
-    def _with_more(self, frame: Frame, rows: list[Row], stores: list[Store]) -> Frame:
-        """A frame with further results; long rows that are filled go through shared memory if it has room."""
-        filled = {row.name: len({item.index for item in stores if item.array == row.name}) for row in rows}
-        beside = tuple(row.name for row in rows if SHORT_ROW < row.entries == filled[row.name])
-        frame = frame._replace(more=tuple(rows))
-        roomy = frame._replace(beside=beside)
-        return roomy if roomy.fits(self.run.dtype) else frame
-
-    def _segment_program(self, operation: str, shapes: dict, pieces: Pieces, options: dict) -> Program | None:
+    def _segment_program(
+        self, operation: str, shapes: dict, pieces: Pieces, more: tuple, options: dict
+    ) -> Program | None:
         dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(operation, pieces)
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         everything: list[Store] = []
@@ -250,13 +244,13 @@ class Programs:
         apart: list[tuple[list[Store], dict[int, list[Store]]]] = []
         for index in range(len(pieces.pieces)):
             links = self.links.opened()  # its own: pieces of equal structure then give equal text
-            trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
+            trace = Traces(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)(**options)])
             flat = {at: [self._flattened(item, shapes) for item in items] for at, items in trace.across.items()}
             apart.append((trace.news, flat))
             everything += traced[-1] + trace.news + [item for items in flat.values() for item in items]
         frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
-                            WARP * pieces.warps, everything)
+                            WARP * pieces.warps, everything, more)
         if frame.result.way == DIRECT and frame.result.array.entries > LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
         if not frame.fits(self.run.dtype):
@@ -272,13 +266,14 @@ class Programs:
             outward = [item for item in stores if item.array == OUTWARD]
             last = outward if set(SENDS[operation]) & set(messages.OUTWARD_LETTERS) else inward
             last += items if table is None else _by_slot(items, table)
+            last += [item for item in stores if item.array in more]
             meetings = {at: found if table is None else _by_slot(found, table) for at, found in others.items()}
             regions = emitter.region(inward), emitter.region(outward)
             branches = emitter.branch(news), {at: emitter.branch(found) for at, found in meetings.items()}
             team.add(Work(piece, *regions, *branches), emitter.operations)
         cuda = team.cuda()  # fills the tables
         registers = REGISTERS // (THREE * frame.block) // 8 * 8
-        fits = options.get("apart") and dtype == "float32" and registers >= ENOUGH
+        fits = operation == "forward_dynamics_apart" and dtype == "float32" and registers >= ENOUGH
         lists = ("place", table, int), ("table", team.table, self.run.dtype), ("shifts", team.shifts, int)
         tables: dict[str, Any] = {
             name: wp.array(values, dtype=kind, device=self.run.device) for name, values, kind in lists if values
@@ -345,7 +340,7 @@ class Programs:
         return Emitter(self.run.dtype.__name__, load, store, flat, angles, FIELDS)
 
     def _frame(self, stores: list[Store], shapes: dict, sent: int, warps: int, block: int,
-               everything: list[Store] | None = None) -> Frame:
+               everything: list[Store] | None = None, more: tuple = ()) -> Frame:
         """How rows come in and the result, of flat ``stores``, goes out: through shared memory where it has room."""
         used = _reads(everything or stores)
         rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used and shape]
@@ -368,9 +363,11 @@ class Programs:
             ways = [(staged, mapped), (False, mapped), *ways]
             if self.tiled:
                 ways.insert(0 if slots >= TILED_SLOTS else -1, (False, Result(TILED, out, slots=_solid(stores))))
+        further = tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more)
         frames = [
-            Frame(rows, staged, list(fields), result, sent, warps, block, held=entries, numbers=numbers)
+            Frame(rows, staged, list(fields), result, sent, warps, block, further, gathered, False, entries, numbers)
             for staged, result in ways
+            for gathered in ((True, False) if further and result.way in (IN_PLACE, STAGED) else (False,))
             for entries in held[::-1]
         ]
         return next((frame for frame in frames if frame.fits(self.run.dtype)), frames[-1])
@@ -378,12 +375,17 @@ class Programs:
 
 def _read_before(stores: list[Store], everything: list[Store], row: str) -> bool:
     """Every entry of ``row`` that is read at all is read before the same entry of the result is written over it."""
-    symbols = [item.value for item in everything if not is_constant(item.value)]
-    if len({id(value.graph) for value in symbols}) > 1:
-        return True  # pieces write when all have read
-    read = {s.args[1]: s.number for s in ordered(symbols) if s.op == "input" and s.args[0] == row}
-    done = {item.index[0]: -1 if is_constant(item.value) else item.value.number for item in stores}
-    return all(number <= done.get(entry, number) for entry, number in read.items())
+    graphs: dict[int, list[Value]] = {}  # of pieces, which write their own entries when all others have read
+    for item in everything:
+        if not is_constant(item.value):
+            graphs.setdefault(id(item.value.graph), []).append(item.value)
+    for symbols in graphs.values():
+        read = {s.args[1]: s.number for s in ordered(symbols) if s.op == "input" and s.args[0] == row}
+        done = {item.index[0]: item.value.number if not is_constant(item.value) else -1 for item in stores
+                if is_constant(item.value) or item.value.graph is symbols[0].graph}
+        if any(number > done.get(entry, number) for entry, number in read.items()):
+            return False
+    return True
 
 
 def _called(key: tuple) -> str:

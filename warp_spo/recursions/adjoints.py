@@ -7,7 +7,7 @@ lambda = Mass^-1 y, J* y is lambda for tau and -(d tau / d x)* lambda at the acc
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 from ..trace.derivative import forward, reverse
 from ..trace.emit import Store
@@ -16,9 +16,10 @@ from ..trace.spatial import ZERO, Vector, cross, total
 from .derivatives import Derivatives
 from .impedance import Impedance
 from .integration import moved
-from .links import FREE, SCREW_MOTIONS, Link
+from .links import BALL, FREE, SCREW_MOTIONS, Link
+from .power import Entry, Power
 
-Entry = Callable[[int], Value]
+COORDINATES = {BALL: 4, FREE: 7}  # of a hinge; of the others one each
 
 
 class Adjoints(Derivatives):
@@ -36,18 +37,30 @@ class Adjoints(Derivatives):
     # -- backwards -------------------------------------------------------------------------------------------------
     def inverse_dynamics_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
         """J* cotangent of inverse dynamics for the arguments ``wrt``"""
-        return self._pulled_back(wrt, self.vector("cotangent"))
+        power = Power(self, self.vector("cotangent"), self.vector("qdd"))
+        return power.stores + self._named_stores(power.ways, wrt, wrt)
 
     def forward_dynamics_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
-        """J* cotangent of forward dynamics for the arguments ``wrt``, at the accelerations "qdd\""""
-        solved = self.solved("cotangent")
-        stores = self._pulled_back(tuple(name for name in wrt if name != "tau"), lambda dof: -solved[dof], wrt)
-        return stores + [Store(_named("tau", wrt), (dof,), solved[dof]) for dof in solved if "tau" in wrt]
+        """J* cotangent of forward dynamics for the arguments ``wrt``
+
+        "qdd" is what it makes, and "solved" Mass^-1 cotangent, where they are given.
+        """
+        if "qdd" in self.given:
+            qdd = self.vector("qdd")
+        else:
+            qdd = {item.index[0]: item.value for item in self.forward_dynamics()}.__getitem__
+        solved = self.vector("solved") if "solved" in self.given else self.solved("cotangent").__getitem__
+        power = Power(self, lambda dof: -solved(dof), qdd)
+        others = tuple(name for name in wrt if name != "tau")
+        stores = power.stores + self._named_stores(power.ways, others, wrt)
+        dofs = [dof for link in self.outward for dof in link.dofs] if "tau" in wrt else []
+        return stores + [Store(_named("tau", wrt), (dof,), solved(dof)) for dof in dofs]
 
     def solve_mass_matrix_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
         """J* cotangent of Mass^-1 b, which is "qdd": lambda for b, -(d (Mass qdd) / d x)* lambda for the others"""
         solved, self.weightless = self.solved("cotangent"), True
-        stores = self._pulled_back(tuple(name for name in wrt if name != "b"), lambda dof: -solved[dof], wrt)
+        power = Power(self, lambda dof: -solved[dof], self.vector("qdd"))
+        stores = self._named_stores(power.ways, tuple(name for name in wrt if name != "b"), wrt)
         return stores + [Store(_named("b", wrt), (dof,), solved[dof]) for dof in solved if "b" in wrt]
 
     def body_poses_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
@@ -119,35 +132,36 @@ class Adjoints(Derivatives):
         done, rates, _ = self.reduce(entry, moves=False, loads=False)
         return {item.index[0]: item.value for item in self.expand(done, rates, (ZERO, ZERO))}
 
-    def _pulled_back(self, wrt: tuple[str, ...], seed: Entry, names: tuple[str, ...] | None = None) -> list[Store]:
-        tau = self.inverse_dynamics()
-        return self._reversed([item.value for item in tau], [seed(item.index[0]) for item in tau], wrt, names or wrt)
-
-    def _reversed(
-        self, outputs: list[Value], seeds: list[Value], wrt: tuple[str, ...], names: tuple[str, ...]
-    ) -> list[Store]:
-        inputs = [x for x in ordered(outputs) if x.op == "input"]
-        found = dict(zip((x.args for x in inputs), reverse(outputs, inputs, seeds), strict=True))
+    def _named_stores(self, found: dict[tuple, Value], wrt: tuple[str, ...], names: tuple[str, ...]) -> list[Store]:
         stores = []
         for name in wrt:
             entries = self.tangent(found) if name == "tangent" else self.entries(name, found)
             stores += [Store(_named(name, names), index, value) for index, value in entries]
         return stores
 
+    def _reversed(
+        self, outputs: list[Value], seeds: list[Value], wrt: tuple[str, ...], names: tuple[str, ...]
+    ) -> list[Store]:
+        inputs = [x for x in ordered(outputs) if x.op == "input"]
+        found = dict(zip((x.args for x in inputs), reverse(outputs, inputs, seeds), strict=True))
+        return self._named_stores(found, wrt, names)
+
     def entries(self, name: str, found: dict[tuple, Value]) -> Iterable[tuple[tuple[int, ...], Value]]:
         """(index, gradient) of every entry of an argument, or of "value"; zero where it does not enter."""
-        scene = self.links.scene
         if name == "body_f":
-            places: list[tuple] = [(body, c) for body in range(scene.body_count) for c in range(6)]
+            places: list[tuple] = [(body, c) for body in range(self.links.scene.body_count) for c in range(6)]
+        elif name == "value":
+            places = [(i,) for i in range(len(self.links.tables["value"]))]
+        elif name in ("q", "target_q"):
+            places = [(link.coordinate + c,) for link in self.outward for c in range(COORDINATES.get(link.motion, 1))]
         else:
-            sizes = {"q": scene.coord_count, "target_q": scene.coord_count, "value": len(self.links.tables["value"])}
-            places = [(i,) for i in range(sizes.get(name, scene.dof_count))]
+            places = [(dof,) for link in self.outward for dof in link.dofs]
         return [(place, found.get((name, *place), 0.0)) for place in places]
 
     def tangent(self, found: dict[tuple, Value]) -> list[tuple[tuple[int, ...], Value]]:
         """The gradient by q along the tangent coordinates."""
         entries: list[tuple[tuple[int, ...], Value]] = []
-        for link in self.links.links:
+        for link in self.outward:
             self.at(link, "g")
             first = link.coordinate
             g = [found.get(("q", first + i), 0.0) for i in range(7)]

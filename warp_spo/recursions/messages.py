@@ -1,26 +1,42 @@
 """What the pieces of a robot send each other, and where each message lies among those of an operation.
 
-Letters: inward P = phi P+ phi*, z = phi z+ or a force, R = the composite inertia; outward a = alpha, and for Mass^-1
-N = the rates of all pivots further in for each unit force on the last link, D = the piece's own pivots, V = D times its
-columns of Y, Y = the part of its columns that lies further in.
+Letters: inward P = phi P+ phi*, z and y = phi z+ or a force, f = a force, R = the composite inertia, B = how a sum
+changes with the parent's motion; outward a and b = alpha, and for Mass^-1 N = the rates of all pivots further in for each
+unit force on the last link, D = the piece's own pivots, V = D times its columns of Y, Y = the part of its columns that
+lies further in.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from .pieces import Piece, Pieces
 
 SENDS = {
-    "forward_dynamics": "bPza",
+    "forward_dynamics": "Pza",
+    "forward_dynamics_apart": "fPza",
     "solve_mass_matrix": "Pza",
     "inverse_dynamics": "z",
+    "forward_dynamics_and_solve": "Pzayb",
+    "forward_dynamics_vjp": "B",
+    "inverse_dynamics_vjp": "B",
     "mass_matrix": "R",
     "mass_matrix_inverse": "PNDVY",
 }
 """Letters by operation."""
 INWARD, OUTWARD = "sent", "returned"
 """The array that messages go through, by either name."""
-OUTWARD_LETTERS = "aNDVY"
-SIZES = {"P": 21, "z": 6, "b": 6, "R": 10, "a": 6}
+OUTWARD_LETTERS = "abNDVY"
+SIZES = {"P": 21, "z": 6, "f": 6, "y": 6, "R": 10, "B": 24, "a": 6, "b": 6}
+SHORT_WAYS = ("q", "tangent", "qd", "qdd", "tau")  # arguments whose gradient a piece knows by itself
+
+
+def shared(operation: str, given: Iterable[str], wrt: Iterable[str] = ()) -> bool:
+    """Whether pieces can share the work: backwards only if qdd and lambda are known, and by what belongs to a piece."""
+    if not operation.endswith("_vjp"):
+        return operation in SENDS
+    known = operation == "inverse_dynamics_vjp" or {"qdd", "solved"} <= set(given)
+    return known and "body_f" not in given and set(wrt) <= set(SHORT_WAYS)
 
 
 def way(letter: str) -> str:

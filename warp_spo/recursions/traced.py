@@ -149,22 +149,28 @@ class Trace:
         return ZERO, -self.links.gravity
 
     # -- operations ------------------------------------------------------------------------------------------------
-    def forward_dynamics(self, right: str = "tau", bias: bool = True, apart: bool = False) -> list[Store]:
-        """out = Mass^-1 (tau - bias_force); without ``bias`` Mass^-1 times the array ``right``.
+    def forward_dynamics(self, right: str = "tau", bias: bool = True) -> list[Store]:
+        """out = Mass^-1 (tau - bias_force); without ``bias`` Mass^-1 times the array ``right``."""
+        moves = bias and "qd" in self.given
+        done, rates, stores = self.reduce(self.vector(right), moves, bias)
+        return stores + self.expand(done, rates, self.base if bias else (ZERO, ZERO))
 
-        ``apart``: velocity terms and loads become forces of the hinges first, so that no link has to keep its velocity
-        while the sweep with P goes in and out: less to hold, at one more pass through the tree.
+    def forward_dynamics_apart(self) -> list[Store]:
+        """The same: velocity terms and loads become forces of the hinges first.
+
+        No link has to keep its velocity while the sweep with P goes in and out: less to hold, at one more pass through
+        the tree. Gravity stays the base's acceleration.
         """
-        tau, stores = self.vector(right), []
-        if apart:
-            known = self.inverse_dynamics(gravity=False, qdd=lambda dof: 0.0, letter="b")
-            forces = {item.index[0]: item.value for item in known if item.array == "out"}
-            stores = [item for item in known if item.array != "out"]
-            left = lambda dof: tau(dof) - forces[dof]  # noqa: E731
-            self.motions = dict.fromkeys(self.motions, STILL)
-        moves = bias and not apart and "qd" in self.given
-        done, rates, sent = self.reduce(left if apart else tau, moves, bias and not apart)
-        return stores + sent + self.expand(done, rates, self.base if bias else (ZERO, ZERO))
+        known = self.inverse_dynamics(gravity=False, qdd=lambda dof: 0.0, letter="f")
+        forces, tau = {item.index[0]: item.value for item in known if item.array == "out"}, self.vector("tau")
+        done, rates, sent = self.reduce(lambda dof: tau(dof) - forces[dof], moves=False, loads=False)
+        return [item for item in known if item.array != "out"] + sent + self.expand(done, rates, self.base)
+
+    def forward_dynamics_and_solve(self) -> list[Store]:
+        """out = Mass^-1 (tau - bias_force), solved = Mass^-1 cotangent, by one factorisation"""
+        stores = self.forward_dynamics()
+        done, rates, sent = self.reduce(self.vector("cotangent"), moves=False, loads=False, letters="y")
+        return stores + sent + self.expand(done, rates, (ZERO, ZERO), "b", "solved")
 
     def factor(self) -> dict[int, articulated.Factor]:
         return self.factors()[0]
@@ -191,8 +197,10 @@ class Trace:
         done[id(link)] = factor = articulated.factor(self.stiffened(link), place, carried, through, self.epsilon)
         inner[id(link)] = factor.in_parent
 
-    def reduce(self, tau: Callable[[int], Value], moves: bool, loads: bool) -> tuple[dict, dict, list[Store]]:
-        """Factors of every link, D^-1 [I - H psi K] (tau - ...), and what other pieces need of them."""
+    def reduce(
+        self, tau: Callable[[int], Value], moves: bool, loads: bool, letters: str = "Pz"
+    ) -> tuple[dict, dict, list[Store]]:
+        """Factors of every link, D^-1 [I - H psi K] (tau - ...), and what other pieces need of them: ``letters``."""
         done: dict[int, articulated.Factor] = {}
         rates: dict[int, list[Value]] = {}
         inner: dict[int, Articulated] = {}
@@ -209,15 +217,17 @@ class Trace:
             z = articulated.gyroscopic(link.inertia, move)
             if loads:
                 z = z - self.external(link)
-            for force in self.carried_on(link, "z", forces, Vector):
+            for force in self.carried_on(link, letters[-1], forces, Vector):
                 z = z + force
             right = [tau(dof) for dof in link.dofs]
             rates[key], forces[key] = articulated.reduced(link, place, factor, move, z, right)
-            stores += self.handed_on("P", link, inner[key].packed)
-            stores += self.handed_on("z", link, forces[key])
+            stores += self.handed_on("P", link, inner[key].packed) if "P" in letters else []
+            stores += self.handed_on(letters[-1], link, forces[key])
         return done, rates, stores
 
-    def expand(self, done: dict, rates: dict, base: tuple[Vector, Vector]) -> list[Store]:
+    def expand(
+        self, done: dict, rates: dict, base: tuple[Vector, Vector], letter: str = "a", name: str = "out"
+    ) -> list[Store]:
         alpha: dict[int, tuple[Vector, Vector]] = {}
         stores = []
         for link in self.outward:
@@ -228,14 +238,14 @@ class Trace:
             elif id(link.parent) in self.own:
                 above = alpha[id(link.parent)]
             else:
-                received = self.receive("a", self.piece.parent)  # type: ignore[union-attr, arg-type]
+                received = self.receive(letter, self.piece.parent)  # type: ignore[union-attr, arg-type]
                 above = Vector(received[:3]), Vector(received[3:])
             qdd, alpha[key] = articulated.expanded(
                 link, self.places[key], done[key], rates[key], self.motions[key], above
             )
-            stores += [Store("out", (dof,), value) for dof, value in zip(link.dofs, qdd, strict=True)]
+            stores += [Store(name, (dof,), value) for dof, value in zip(link.dofs, qdd, strict=True)]
             if self.piece is not None and self.piece.children and link is self.piece.links[-1]:
-                stores += self.post("a", self.piece, (*alpha[key][0], *alpha[key][1]))
+                stores += self.post(letter, self.piece, (*alpha[key][0], *alpha[key][1]))
         return stores
 
     def inverse_dynamics(

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 from .graph import Scalar, Value, cos, is_constant, ordered, reciprocal, select, sin
 
-UNIT = ("add", "reduced", "guarded")  # of each argument, a guard's limit excepted
+UNIT = ("add", "cut", "reduced", "guarded")  # of each argument, a guard's limit excepted
 FLAT = ("input", "lost", "less")  # a lost pivot is 0 or NaN, wherever it is
 
 
@@ -41,18 +41,17 @@ def reverse(outputs: Iterable[Value], inputs: Iterable[Scalar], seeds: Iterable[
 
     Args:
         outputs: values of one graph.
-        inputs: as in :func:`forward`.
+        inputs: as in :func:`forward`; what lies behind them is not looked at.
         seeds: one for each output.
     """
     outputs, inputs = list(outputs), list(inputs)
-    ends = {x.key for x in inputs}
     duals: dict[tuple, Value] = {}
     for y, seed in zip(outputs, seeds, strict=True):
         if not is_constant(y):
             duals[y.key] = duals.get(y.key, 0.0) + seed
-    for scalar in reversed(ordered(outputs)):
+    for scalar in reversed(ordered(outputs, inputs)):
         dual = duals.get(scalar.key, 0.0)
-        if scalar.key in ends or _vanishes(dual):
+        if _vanishes(dual):
             continue
         with _Step(scalar):
             for at, argument in enumerate(scalar.args):

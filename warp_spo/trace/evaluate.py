@@ -14,6 +14,7 @@ FUNCTIONS: dict[str, Callable] = {
     "sub": lambda a, b: a - b,
     "mul": lambda a, b: a * b,
     "neg": lambda a: -a,
+    "cut": lambda a: a,
     "sin": np.sin,
     "cos": np.cos,
     "sqrt": np.sqrt,

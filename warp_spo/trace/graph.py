@@ -212,6 +212,11 @@ def arctangent(y: Value, x: Value) -> Value:
     return graph.make("arctangent", y, x)
 
 
+def cut(x: Value) -> Value:
+    """``x`` by another name, behind which neither simplification nor a derivative that ends here looks."""
+    return x if is_constant(x) else x.graph.make("cut", x)
+
+
 def absolute(x: Value) -> Value:
     if is_constant(x):
         return abs(x)
@@ -228,9 +233,12 @@ def sum_of_logarithms(terms: Iterable[Value]) -> Value:
     return add(symbols[0].graph.make("sum_of_logarithms", *symbols), constant) if symbols else float(constant)
 
 
-def ordered(outputs: Iterable[Value]) -> list[Scalar]:
-    """Every scalar that the outputs need, depth first: each just before its first use, so that few live at once."""
-    seen: set[tuple] = set()
+def ordered(outputs: Iterable[Value], known: Iterable[Scalar] = ()) -> list[Scalar]:
+    """Every scalar that the outputs need, depth first: each just before its first use, so that few live at once.
+
+    Those that are ``known`` are left out, with all that only they need.
+    """
+    seen: set[tuple] = {x.key for x in known}
     order: list[Scalar] = []
     for output in outputs:
         if is_constant(output) or output.key in seen:

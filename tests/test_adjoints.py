@@ -1,0 +1,168 @@
+"""Products J* y by limbs side by side and by whole trees, against the dense derivatives of another recursion."""
+
+import functools
+
+import laws
+import numpy as np
+import pytest
+import symbolic
+import warp as wp
+import warp_machine
+import zoo
+from test_granularity import hand
+
+import warp_spo as spo
+from warp_spo import plan
+from warp_spo.kernels import straight
+from warp_spo.recursions import power
+from warp_spo.recursions.adjoints import Adjoints
+from warp_spo.recursions.power import Carried, Power
+from warp_spo.reference import Dense
+
+WORLDS = 3
+TOLERANCE = {"float64": 1e-11, "float32": 2e-5}  # grows with the condition of Mass; measured 3e-14, 3e-6
+SCENES = {
+    "limbs": lambda: zoo.from_parents([-1, 0, 0, 2, 2], ["free", "ball", "helical", "prismatic", "revolute"], 61),
+    "two roots": lambda: zoo.from_parents([-1, -1, 1], ["ball", "planar", "revolute"], 62),
+}
+WARPS = {"limbs": lambda: SCENES["limbs"](), "fork": zoo.fork, "hand": hand}
+NAMES = ("tangent", "qd", "tau")
+
+
+@functools.cache
+def scene_of(name):
+    return zoo.varied(SCENES[name](), WORLDS)
+
+
+def built(name, granularity, dtype="float64", device=None):
+    """Dynamics and the arrays of a state; ``y`` is the cotangent, qdd the accelerations of the state."""
+    scene = scene_of(name)
+    dyn = spo.Dynamics(scene, WORLDS, device=device, dtype=dtype, granularity=granularity)
+    arrays = laws.states(scene, WORLDS, dtype=dtype)
+    arrays["y"] = np.ascontiguousarray(arrays["b"][:, :, 0])
+    return dyn, arrays
+
+
+def poisoned(dyn, name):
+    width = dyn.scene.coord_count if name == "q" else dyn.scene.dof_count
+    return wp.full((WORLDS, width), float("nan"), dtype=dyn.dtype, device=dyn.device)
+
+
+def error(got, J, y):
+    return laws.error(got.numpy(), np.einsum("wij,wi->wj", np.asarray(J, dtype=np.float64), y))
+
+
+@pytest.mark.parametrize("granularity", ["tree", "segment"])
+@pytest.mark.parametrize("name, dtype", [("limbs", "float64"), ("limbs", "float32"), ("two roots", "float64")])
+def test_forward_dynamics(name, dtype, granularity, device):
+    """Accelerations made on the way, or given; external forces, or none."""
+    dyn, a = built(name, granularity, dtype, device)
+    on = laws.to_device(dyn, a)
+    for body_f in (None, on["body_f"]):
+        state = on["q"], on["qd"], on["tau"], body_f
+        J = [block.numpy() for block in dyn.forward_dynamics_derivatives(*state)]
+        for qdd in (None, dyn.forward_dynamics(*state)):
+            out = {key: poisoned(dyn, key) for key in NAMES}
+            dyn.forward_dynamics_vjp(*state, cotangent=on["y"], qdd=qdd, wrt=NAMES, out=out)
+            for key, block in zip(NAMES, J, strict=True):
+                assert error(out[key], block, a["y"]) <= TOLERANCE[dtype], (key, body_f is None, qdd is None)
+    lines = [line for line in dyn.programs.described() if "forward_dynamics_vjp" in line]
+    assert any("segment" in line for line in lines) == (granularity == "segment")
+
+
+@pytest.mark.parametrize("wrt", [("qd", "q"), ("tau",), ("tau", "tangent"), ("body_f", "q")])
+def test_what_is_asked_for_by_limbs(wrt, device):
+    """Any part of it, in any order, is what a thread for the whole tree gives."""
+    found = []
+    for granularity in ("segment", "tree"):
+        dyn, a = built("limbs", granularity, device=device)
+        body_f = a["body_f"] if "body_f" in wrt else None
+        given = {"cotangent": a["y"], "wrt": wrt}
+        found.append(dyn.forward_dynamics_vjp(a["q"], a["qd"], a["tau"], body_f, **given))
+        assert tuple(found[-1]) == wrt
+    for key in wrt:
+        assert laws.error(found[0][key], found[1][key]) <= TOLERANCE["float64"], key
+
+
+@pytest.mark.parametrize("granularity", ["tree", "segment"])
+def test_inverse_dynamics(granularity, device):
+    dyn, a = built("limbs", granularity, device=device)
+    on = laws.to_device(dyn, a)
+    state, wrt = (on["q"], on["qd"], on["qdd"]), ("tangent", "qd", "qdd")
+    J = [block.numpy() for block in dyn.inverse_dynamics_derivatives(*state)]
+    out = {key: poisoned(dyn, key) for key in wrt}
+    dyn.inverse_dynamics_vjp(*state, cotangent=on["y"], wrt=wrt, out=out)
+    for key, block in zip(wrt, J, strict=True):
+        assert error(out[key], block, a["y"]) <= TOLERANCE["float64"], key
+
+
+def test_a_world_without_a_solution_stays_alone(device):
+    """NaN in one world's state, and a body without inertia at the tip of another's limb."""
+    dyn, a = built("limbs", "segment", device=device)
+    given = {"cotangent": a["y"], "wrt": ("q", "qd", "tau")}
+    good = dyn.forward_dynamics_vjp(a["q"], a["qd"], a["tau"], **given)
+    a["q"][1, 0:9] = np.nan
+    bad = dyn.forward_dynamics_vjp(a["q"], a["qd"], a["tau"], **given)
+    for key, array in good.items():
+        np.testing.assert_array_equal(np.delete(bad[key], 1, 0), np.delete(array, 1, 0))
+        assert np.isnan(bad[key][1]).any()
+
+
+# -- warps -------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("staged", [False, True])
+@pytest.mark.parametrize("name", WARPS)
+def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
+    """The CUDA text of both kernels, warp by warp in either order, with rows and results in shared memory or not."""
+    for limit in ("FEW_WORLDS", "LONG_ROWS") if staged else ():
+        monkeypatch.setattr(plan, limit, 0)
+    monkeypatch.setattr(straight, "SHARED_BYTES", 1 << 20)
+    texts, scene = warp_machine.recorded(monkeypatch), WARPS[name]()
+    dyn = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="segment")
+    a, rate, wide = laws.states(scene, WORLDS), (WORLDS, scene.dof_count), (WORLDS, scene.coord_count)
+    a["cotangent"] = a["b"][:, :, 0].copy()
+    dense = [Dense(scene, a["q"][w]) for w in range(WORLDS)]
+    qdd = np.array([dense[w].forward_dynamics(a["qd"][w], a["tau"][w]) for w in range(WORLDS)])
+    solved = np.array([np.linalg.solve(dense[w].mass_matrix, a["cotangent"][w]) for w in range(WORLDS)])
+    state, find, further = {"q": wide, "qd": rate}, dyn.programs.find, {}
+    program = find("forward_dynamics_and_solve", state | {"tau": rate, "cotangent": rate}, rate, {"solved": rate})
+    assert program.warps > 1 and texts[-1].frame.staged == texts[-1].frame.gathered == staged
+    for backwards in (False, True):
+        assert laws.error(warp_machine.run(texts[-1], a, backwards, further), qdd) <= TOLERANCE["float64"]
+        assert laws.error(further.pop("solved"), solved) <= TOLERANCE["float64"]
+    a |= {"qdd": qdd, "solved": solved}
+    n = scene.dof_count
+    J = symbolic.run(scene, "inverse_dynamics_derivatives", a, ("q", "qd", "qdd"), {"out": (3, n, n)}, trace=Adjoints)
+    by_q, by_qd, _ = -np.einsum("wbij,wi->bwj", np.nan_to_num(J["out"]), solved)
+    state |= {"qdd": rate, "solved": rate}
+    program = find("forward_dynamics_vjp", state, rate, {"qd_bar": rate}, wrt=("tangent", "qd"))
+    assert program.warps > 1
+    for backwards in (False, True):
+        assert laws.error(warp_machine.run(texts[-1], a, backwards, further), by_q) <= TOLERANCE["float64"]
+        assert laws.error(further.pop("qd_bar"), by_qd) <= TOLERANCE["float64"]
+
+
+# -- planted bugs ------------------------------------------------------------------------------------------------------
+BUGS = {
+    "what the children say": (Power, "_handed", "a + b for a, b in zip(bars, other", "a for a, b in zip(bars, other"),
+    "how fast points turn": (Power, "_handed", "a + b for a, b in zip(bars[:own]", "a for a, b in zip(bars[:own]"),
+    "the sense of a turn": (Power, "_handed", "x[1] * bars[3 * at] - x[0]", "x[1] * bars[3 * at] + x[0]"),
+    "lambda and the armature": (Power, "_handed", "a * x for a, x", "0.0 * x for a, x"),
+    "the Coriolis acceleration": (Power, "_moved", "2.0 * cross(spin, v_d)", "cross(spin, v_d)"),
+    "what is met by the arm": (Carried, "of", "parent.turning @ pose.l", "parent.turning @ pose.l * 0.0"),
+    "omega'": (power, "turning_of", "skew(moving.w) + ", ""),
+}
+
+
+@pytest.mark.parametrize("bug", ["none", *BUGS])
+def test_a_planted_bug_is_seen(bug, monkeypatch):
+    if bug != "none":
+        symbolic.plant(monkeypatch, *BUGS[bug])
+    scene = SCENES["limbs"]()
+    n, a = scene.dof_count, laws.states(scene, 1)
+    a["cotangent"] = np.ascontiguousarray(a["b"][:, :, 0])
+    run, state = functools.partial(symbolic.run, scene, trace=Adjoints), ("q", "qd", "qdd")
+    J = np.nan_to_num(run("inverse_dynamics_derivatives", a, state, {"out": (3, n, n)})["out"])[0]
+    shapes, wrt = {"out": (n,), "qd_bar": (n,), "qdd_bar": (n,)}, ("tangent", "qd", "qdd")
+    got = run("inverse_dynamics_vjp", a, (*state, "cotangent"), shapes, wrt=wrt)
+    worst = max(laws.error(x[0], J[i].T @ a["cotangent"][0]) for i, x in enumerate(got.values()))
+    assert worst <= 1e-11 if bug == "none" else worst > 1e-3
