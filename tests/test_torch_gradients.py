@@ -65,6 +65,8 @@ OPERATIONS = {
     "bias_force": ("q", "qd"),
     "gravity_force": ("q",),
     "solve_mass_matrix": ("q", "b"),
+    "mass_matrix": ("q",),
+    "jacobian": ("q",),
     "body_velocities": ("q", "qd"),
     "integrate": ("q", "qd"),
     "step": ("q", "qd", "tau", "body_f", "target_q", "target_qd"),
@@ -75,7 +77,12 @@ def called(dyn, operation, *args):
     if operation == "step":
         q, qd, tau, *more = args
         return dyn.step(q, qd, tau, DT, *more)
-    return getattr(dyn, operation)(*args, *((DT,) if operation == "integrate" else ()))
+    return getattr(dyn, operation)(*args, **options(operation))
+
+
+def options(operation):
+    some = {"dt": DT} if operation in ("step", "integrate") else {}
+    return some | ({"frames": [0, (2, (0.3, -0.2, 0.1, 0, 0, 0, 1))]} if operation == "jacobian" else {})
 
 
 # -- gradients ---------------------------------------------------------------------------------------------------------
@@ -85,7 +92,9 @@ def test_gradients_by_arguments(tree, operation):
     assert check(functools.partial(called, dyn, operation), on(dyn, a, *OPERATIONS[operation]))
 
 
-@pytest.mark.parametrize("operation", ["forward_dynamics", "inverse_dynamics", "step", "body_velocities"])
+@pytest.mark.parametrize(
+    "operation", ["forward_dynamics", "inverse_dynamics", "step", "body_velocities", "mass_matrix", "jacobian"]
+)
 def test_gradients_by_values(tree, operation):
     """Of tensors that all worlds share, and of one that differs from world to world."""
     dyn, a = tree
@@ -242,13 +251,13 @@ def test_masses_are_found_again(device):
     assert errors[-1] < 1e-2 * errors[0]
 
 
-@pytest.mark.parametrize("operation", ["forward_dynamics", "step", "integrate", "solve_mass_matrix"])
+@pytest.mark.parametrize("operation", ["forward_dynamics", "step", "integrate", "solve_mass_matrix", "jacobian"])
 def test_under_compile(operation, device):
     """As a custom op in one graph: the same gradients, to the bit."""
+    torch._dynamo.reset()  # it counts the ops that this test has handed it
     scene = zoo.fork()
     dyn = spo.Dynamics(scene, WORLDS, device=device, dtype="float64", granularity="tree")
-    options = {"dt": DT} if operation in ("step", "integrate") else {}
-    op = spo_torch.custom_op(dyn, operation, **options)
+    op = spo_torch.custom_op(dyn, operation, **options(operation))
     tensors = on(dyn, laws.states(scene, WORLDS), *OPERATIONS[operation][:3])
 
     def squares(function, *args):
@@ -263,6 +272,38 @@ def test_under_compile(operation, device):
 
 
 # -- what is refused ---------------------------------------------------------------------------------------------------
+def test_prepared_ahead_nothing_is_compiled(device, monkeypatch):
+    """What prepare makes is what products, and torch on its way back, look for."""
+    scene = zoo.from_parents([-1, 0, 1], ["ball", "revolute", "revolute"], 3)
+    dyn = spo.Dynamics(scene, WORLDS, device=device, dtype="float64", granularity="tree", variable=("body_mass",))
+    for operation, arguments in OPERATIONS.items():
+        loaded = {"body_f": True} if operation in ("forward_dynamics", "inverse_dynamics", "step") else {}
+        driven = {"target_q": True, "target_qd": True} if operation == "step" else {}
+        frames = {"frames": options(operation)["frames"]} if operation == "jacobian" else {}
+        dyn.prepare(operation, **loaded, **driven, **frames, **({"qdd": True} if operation == "step" else {}))
+        mass = () if operation in ("integrate", "jacobian", "body_velocities") else ("body_mass",)
+        dyn.prepare(f"{operation}_vjp", wrt=(*arguments, *mass), **frames)
+    for product in ("forward_dynamics", "inverse_dynamics"):
+        dyn.prepare(f"{product}_jvp", along=("dq", "dqd"))
+    with pytest.raises(ValueError, match="step_vjp has no option colour"):
+        dyn.prepare("step_vjp", colour=True)
+    with pytest.raises(ValueError, match=r"Dynamics.step, backwards: wrt names 'joint_armature', which is folded"):
+        dyn.prepare("step_vjp", wrt=("q", "joint_armature"))
+    monkeypatch.setattr(dyn.programs, "_build", lambda *_: pytest.fail("compiled after all"))
+    a = laws.states(scene, WORLDS)
+    a |= {"target_q": a["q"][::-1].copy(), "target_qd": a["qdd"], "mass": scene.values["body_mass"][0]}
+    (mass,) = on(dyn, a, "mass")
+    dyn.set(body_mass=mass)
+    for operation, arguments in OPERATIONS.items():
+        found = called(dyn, operation, *on(dyn, a, *arguments))
+        sum(y.square().sum() for y in (found if isinstance(found, tuple) else (found,))).backward()
+    assert mass.grad.isfinite().all()
+    with torch.no_grad():
+        state = on(dyn, a, "q", "qd", "tau", grad=False)
+        for product in ("forward_dynamics", "inverse_dynamics"):
+            getattr(dyn, f"{product}_jvp")(*state, dq=state[2], dqd=state[2])
+
+
 def test_a_second_backward_pass_is_explained(tree):
     dyn, a = tree
     q, qd = on(dyn, a, "q", "qd")
@@ -359,8 +400,8 @@ def test_what_has_no_gradient_says_so(tree):
     dyn, a = tree
     q, qd = on(dyn, a, "q", "qd", grad=False)
     dyn.set(body_mass=on(dyn, {"m": dyn.scene.values["body_mass"][0]}, "m")[0])
-    with pytest.raises(ValueError, match=r"Dynamics.mass_matrix: body_mass was set to a tensor that requires grad"):
-        dyn.mass_matrix(q)
+    with pytest.raises(ValueError, match=r"Dynamics.mass_matrix_inverse: body_mass was set to a tensor that"):
+        dyn.mass_matrix_inverse(q)
     with pytest.raises(ValueError, match=r"expected integrator='semi_implicit'"):
         dyn.step(q, qd, None, DT, integrator="rk4")
     assert not dyn.integrate(q, qd, DT).requires_grad or "body_mass" in dyn.entering("integrate")

@@ -42,6 +42,8 @@ TREE_ONLY = (
     "forward_dynamics_vjp",
     "inverse_dynamics_vjp",
     "solve_mass_matrix_vjp",
+    "mass_matrix_vjp",
+    "jacobian_vjp",
     "integrate_vjp",
     "step_vjp",
     "body_poses_vjp",
