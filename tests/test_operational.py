@@ -12,7 +12,7 @@ import zoo
 from allocations import no_warp_allocation
 
 import warp_spo as spo
-from warp_spo.examples import estimation, floating_arm, identify
+from warp_spo.examples import estimation
 from warp_spo.operations import APPLICATIONS, Inputs
 from warp_spo.recursions import applications, determinant, newton_euler
 from warp_spo.recursions.applications import Applications
@@ -145,14 +145,6 @@ def test_the_mass_matrix_is_a_covariance():
     """Of what noise with the bodies' inertias does to the hinges; D is that of the filter's innovations (example)."""
     samples = 4000
     assert max(estimation.main(samples)) <= 5.0 / np.sqrt(samples)  # five standard deviations or so
-
-
-def test_a_floating_arm_draws_its_circle():
-    assert floating_arm.main(seconds=1.0) <= 1e-3  # [m]; 3e-4 here, of order dt
-
-
-def test_masses_and_damping_are_found_again():
-    assert identify.main(steps=50) <= 1e-9  # [kg, N m s], by linear least squares of 150 forces
 
 
 def test_packed_matrices_are_the_full_ones(device):

@@ -36,10 +36,10 @@ def recorded(monkeypatch):
     """A list that from here on receives the :class:`Text` of every kernel that is built."""
     texts, finished = [], Programs._finished
 
-    def record(self, operation, frame, cuda, cpu, tables, operations):
+    def record(self, operation, frame, cuda, cpu, tables, operations, *more):
         held = {name: array.numpy() for name, array in tables.items()}
         texts.append(Text(operation, frame, cuda, cpu, held, operations))
-        return finished(self, operation, frame, cuda, cpu, tables, operations)
+        return finished(self, operation, frame, cuda, cpu, tables, operations, *more)
 
     monkeypatch.setattr(Programs, "_finished", record)
     return texts

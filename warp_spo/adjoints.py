@@ -17,6 +17,7 @@ import warp as wp
 from . import link_values
 from .arrays import Call, Values, differentiated, recorded
 from .errors import UnsupportedError
+from .frames import checked
 from .levels import Recursions
 from .plan import MOST_DOFS
 from .programs import Programs
@@ -29,6 +30,8 @@ ARGUMENTS = {
     "bias_force": ("q", "qd", "body_f"),
     "gravity_force": ("q",),
     "solve_mass_matrix": ("q", "b"),
+    "mass_matrix": ("q",),
+    "jacobian": ("q",),
     "body_poses": ("q",),
     "body_velocities": ("q", "qd"),
     "integrate": ("q", "qd"),
@@ -38,10 +41,13 @@ ARGUMENTS = {
 ANCHORS = ("joint_X_p", "joint_X_c")
 GAINS = ("joint_damping", "joint_stiffness", "joint_friction", "joint_target_ke", "joint_target_kd")
 ENTERING: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(("body_poses", "body_velocities", "integrate"), (*ANCHORS, "body_com")),
+    **dict.fromkeys(("jacobian", "body_poses", "body_velocities", "integrate"), (*ANCHORS, "body_com")),
     "step": (*LINK_VALUES, *GAINS),
 }
 """Values that enter an operation, where they are not those that links are made of."""
+OPTIONAL = ("body_f", "target_q", "target_qd")
+PRODUCTS = (*(f"{operation}_vjp" for operation in ARGUMENTS), "forward_dynamics_jvp", "inverse_dynamics_jvp")
+"""What ``prepare`` takes besides operations."""
 
 
 def differentiable(method: Callable) -> Callable:
@@ -207,11 +213,16 @@ class Adjoints:
         """Names of the variable values by which results can be differentiated."""
         return tuple(name for name in ENTERING["step"] if name in self.variable)
 
-    def result_shapes(self, operation: str) -> tuple[tuple[int, ...], ...]:
-        """Shapes of what an operation gives, and of what its way back needs besides."""
+    def result_shapes(self, operation: str, frames: Sequence[Any] = (), **_: Any) -> tuple[tuple[int, ...], ...]:
+        """Shapes of what an operation gives, with its options, and of what its way back needs besides."""
         scene, worlds = self.scene, self.worlds
         q, rate = (worlds, scene.coord_count), (worlds, scene.dof_count)
-        shapes = {"body_poses": (worlds, scene.body_count, 7), "body_velocities": (worlds, scene.body_count, 6)}
+        shapes: dict[str, tuple[int, ...]] = {
+            "body_poses": (worlds, scene.body_count, 7),
+            "body_velocities": (worlds, scene.body_count, 6),
+            "mass_matrix": (*rate, scene.dof_count),
+            "jacobian": (worlds, len(frames), 6, scene.dof_count),
+        }
         if operation == "step":
             return q, rate, rate
         return (q if operation == "integrate" else shapes.get(operation, rate),)
@@ -255,6 +266,8 @@ class Adjoints:
                 arrays["dt"] = float(options["dt"])
             if operation == "solve_mass_matrix":
                 arrays["qdd"] = call.read("result", result, shape)
+            if operation == "jacobian":
+                arrays["frames"] = checked(self.scene, call.name, options["frames"])
             names, outs = self._gradients(call, operation, {}, wrt, None)
             self._pull(operation, names, outs, arrays)
         return _by_name(names, call.result)
@@ -287,6 +300,30 @@ class Adjoints:
                 else:
                     found.setdefault("b", result.clone())[..., c] = gradient
         return found
+
+    def _prepare_product(self, product: str, options: dict[str, Any]) -> None:
+        """See ``prepare``."""
+        operation, way = product[:-4], product[-3:]
+        wrt = tuple(options.pop("wrt", ()) if way == "vjp" else ())
+        along = tuple(options.pop("along", ("dq", "dqd", f"d{ARGUMENTS[operation][2]}")) if way == "jvp" else ())
+        asked = (name for name in ARGUMENTS[operation]
+                 if name not in OPTIONAL or options.pop(name, name in wrt or f"d{name}" in along))  # fmt: skip
+        zeros = lambda shape: wp.zeros(shape, dtype=self.dtype, device=self.device)  # noqa: E731
+        given: dict[str, Any] = {name: zeros(self._shape_of(name)) for name in asked}
+        given["q"].assign([self.scene.neutral_q] * self.worlds)
+        more: dict[str, Any] = {"frames": options.pop("frames", [0])} if operation == "jacobian" else {"dt": 1e-3}
+        if options:
+            raise ValueError(f"Dynamics.prepare: {product} has no option {', '.join(options)}")
+        if way == "jvp":
+            rates = {name: zeros(self._shape_of(name[1:] if name == "dbody_f" else "qd")) for name in along}
+            getattr(self, product)(**given, **rates)
+            return
+        results = [zeros(shape) for shape in self.result_shapes(operation, **more)]
+        if operation == "forward_dynamics":
+            self.forward_dynamics_vjp(**given, cotangent=results[0], wrt=wrt or tuple(given))
+        else:
+            cotangents = results[: 2 if operation == "step" else 1]
+            self.pulled_back(operation, given, more, results, cotangents, wrt or tuple(given))
 
     @contextlib.contextmanager
     def held(self, values: dict[str, Any]) -> Iterator[None]:

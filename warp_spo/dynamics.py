@@ -17,7 +17,7 @@ import warp as wp
 from . import nodes
 from . import plan as plans
 from . import status as words
-from .adjoints import Adjoints, differentiable
+from .adjoints import PRODUCTS, Adjoints, differentiable
 from .arrays import Call, Values, parse_device, parse_dtype, recorded, shape_of
 from .derivatives import Derivatives
 from .errors import UnsupportedError
@@ -207,7 +207,14 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
             options: ``frames=`` for operations that take frames, ``columns=`` for solve_mass_matrix, ``prescribed=``
                 for hybrid_dynamics, ``integrator=`` for step, ``hold=`` for project, and ``body_f=True``,
                 ``status=True``, ``qdd=True``, ``target_q=True``, ``target_qd=True`` if they will be given.
+
+        Of the way back from an operation, torch's too, the name is "<operation>_vjp", such as "step_vjp", with ``wrt=``
+        the names of arguments and then of values in their order; default: all arguments that are given. For
+        "forward_dynamics_jvp" and "inverse_dynamics_jvp" ``along=`` names directions; default: all but "dbody_f".
         """
+        if operation in PRODUCTS:
+            self._prepare_product(operation, options)
+            return
         if operation not in OPERATIONS:
             raise ValueError(f"Dynamics.prepare: no operation {operation!r}; expected one of {', '.join(OPERATIONS)}")
         q: Any = wp.array(np.tile(self.scene.neutral_q, (self.worlds, 1)), dtype=self.dtype, device=self.device)
@@ -353,6 +360,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
             self._run("inverse_dynamics", out, q=q, qd=qd, qdd=qdd, body_f=body_f)
         return call.result
 
+    @differentiable
     def mass_matrix(self, q: Any, out: Any = None) -> Any:
         """Mass = H phi M phi* H* + Delta, armature included, both triangles [world, dof, dof]; composite bodies.
 
@@ -449,6 +457,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
                 self._run("body_velocities", velocities, q=q, qd=qd)
         return call.result
 
+    @differentiable
     def jacobian(self, q: Any, frames: Sequence[Frame], out: Any = None) -> Any:
         """Velocity of each frame's origin, then angular velocity, in inertial axes, per unit qd.
 

@@ -45,6 +45,8 @@ TREE_ONLY = (
     "inverse_dynamics_derivatives",
     "mass_matrix_derivative",
     "solve_mass_matrix_vjp",
+    "mass_matrix_vjp",
+    "jacobian_vjp",
     "integrate_vjp",
     "step_vjp",
     "body_poses_vjp",

@@ -223,6 +223,8 @@ class Module(torch.nn.Module):
     bias_force = functools.partialmethod(_called, "bias_force")
     gravity_force = functools.partialmethod(_called, "gravity_force")
     step = functools.partialmethod(_called, "step")
+    mass_matrix = functools.partialmethod(_called, "mass_matrix")
+    jacobian = functools.partialmethod(_called, "jacobian")
     solve_mass_matrix = functools.partialmethod(_called, "solve_mass_matrix")
     body_poses = functools.partialmethod(_called, "body_poses")
     body_velocities = functools.partialmethod(_called, "body_velocities")
@@ -279,7 +281,7 @@ def custom_op(dyn: Any, operation: str, **options: Any) -> Any:
         f"{name}_backward", backward, mutates_args=(),
         schema="(str names, str wanted, Tensor[] tensors, Tensor[] kept, Tensor[] cotangents) -> Tensor[]",
     )  # fmt: skip
-    shapes = dyn.result_shapes(operation)
+    shapes = dyn.result_shapes(operation, **options)
     results = 2 if operation == "step" else 1  # what comes after them serves the way back
 
     @ahead.register_fake

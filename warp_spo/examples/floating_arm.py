@@ -7,7 +7,7 @@ arm's hinges. The torques that give the hand the acceleration a it needs are one
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, bar
+from warp_spo.examples.parts import at, bar, command, drawing
 
 RADIUS, PERIOD = 0.1, 2.0  # of the circle [m, s]
 STIFF, DAMP = 400.0, 40.0  # of the hand's error [1/s^2, 1/s]
@@ -23,13 +23,13 @@ def scene(gravity=(0.0, 0.0, 0.0)):
     return spo.Scene(bodies, hinges, gravity=gravity)
 
 
-def main(seconds=2.0, dt=2e-3, seed=0):
+def main(seconds=2.0, dt=2e-3, seed=0, picture=None):
     dyn = spo.Dynamics(scene(), worlds=WORLDS, dtype="float64")
     hand, rng = [(6, (0.3, 0, 0, 0, 0, 0, 1))], np.random.default_rng(seed)
     q, qd = np.tile(dyn.scene.neutral_q, (WORLDS, 1)), 0.02 * rng.standard_normal((WORLDS, 12))
     q[:, 7:] = [0.2, 0.7, -1.3, 0.3, 0.5, 0.2] + 0.1 * rng.standard_normal((WORLDS, 6))
     arm = np.repeat(np.eye(12)[None, :, 6:], WORLDS, axis=0)  # S*
-    center, drawn = place(dyn, q), []
+    center, drawn, path = place(dyn, q), [], []
     for step in range(round(seconds / dt)):
         angle, rate = 2.0 * np.pi * step * dt / PERIOD, 2.0 * np.pi / PERIOD
         circle = RADIUS * np.array([[0.0, np.cos(angle) - 1.0, np.sin(angle)],
@@ -47,9 +47,16 @@ def main(seconds=2.0, dt=2e-3, seed=0):
         tau[:, 6:] = calm + np.einsum("wij,wj->wi", np.linalg.pinv(reach[:, :, :6]), need)
         q, qd = dyn.step(q, qd, tau, dt)
         drawn.append(np.linalg.norm(error, axis=1))
+        path.append(np.stack([center + circle[0] - error, q[:, :3]]))
     late = np.max(drawn[len(drawn) // 2 :])
     print(f"the hand is within {1e3 * late:.1f} mm of its circle; the base has moved by up to "
           f"{1e3 * np.linalg.norm(q[:, :3], axis=1).max():.0f} mm")
+    if picture:
+        with drawing(picture, "paths of hand and base, y and z [m]", "the hand's distance from its circle [m]") as axes:
+            axes[0].plot(*np.moveaxis(np.array(path)[:, :, 0, 1:], -1, 0))
+            axes[0].set_aspect("equal")
+            axes[1].semilogy(dt * np.arange(len(drawn)), drawn)
+            axes[1].set_xlabel("time [s]")
     return late
 
 
@@ -61,4 +68,4 @@ def place(dyn, q):
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -1,56 +1,68 @@
-"""Masses and damping of an arm from its motion: the gradient of the joint forces by each mass is a regressor.
+"""Masses and damping of an arm from its motion, by gradients of rollouts: Gauss and Newton's iteration.
 
-The forces are linear in the masses: tau = tau(m0) + (d tau / d m)(m - m0) + damping qd'. Every state of the trajectory
-is a world; one vector-Jacobian product a hinge gives the rows of all of them, and least squares the masses.
+The record is cut into windows, each a world that starts where it was measured. Masses and damping are tensors with a
+row for each world, so one backward pass for a coordinate gives the rows of the regressor of all windows.
 """
 
 import numpy as np
+import torch
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, bar
+from warp_spo.examples.parts import at, bar, command, drawing
 
 MASSES, DAMPING = [2.0, 1.5, 0.7], [0.5, 0.3, 0.1]  # what is to be found [kg, N m s]
-GUESS = [1.0, 1.0, 1.0]
-DT = 2e-3  # [s]
+DT, WINDOW = 2e-3, 20  # [s, steps]
+UNITS = np.repeat([1e-4, 2e-3], 3)  # how well q and qd are measured [rad, rad/s]
 
 
-def scene(masses, damping):
+def scene(masses=(1.0, 1.0, 1.0), damping=(0.0, 0.0, 0.0)):
+    """Bars of 0.4 m; what they weigh by default is a guess."""
     axes, places = [(0, 0, 1), (0, 1, 0), (0, 1, 0)], [at(), at(0.4), at(0.4)]
-    hinges = [
-        spo.Hinge("revolute", k - 1, k, axis=axes[k], parent_pose=places[k], damping=damping[k]) for k in range(3)
-    ]
-    arm = spo.Scene([bar(0.4, 1.0) for _ in range(3)], hinges)
-    return arm.with_values(body_mass=np.array([masses]))
+    hinges = [spo.Hinge("revolute", k - 1, k, axis=axes[k], parent_pose=places[k]) for k in range(3)]
+    arm = spo.Scene([bar(0.4, 1.0) for _ in hinges], hinges)
+    return arm.with_values(body_mass=np.array([masses]), joint_damping=np.array([damping]))
 
 
-def trajectory(steps, seed):
-    """States and the forces that made them, [step, dof] each: q, qd, qdd, qd after the step, tau."""
-    dyn, rng, found = spo.Dynamics(scene(MASSES, DAMPING), dtype="float64"), np.random.default_rng(seed), []
-    q, qd = rng.uniform(-1.0, 1.0, (1, 3)), np.zeros((1, 3))
+def record(steps, noise, rng):
+    """States (q; qd) [step + 1, 6] as measured, and the torques between them [step, 3]."""
+    dyn = spo.Dynamics(scene(MASSES, DAMPING), device="cpu", dtype="float64")
+    q, qd, states, pushes = rng.uniform(-1.0, 1.0, (1, 3)), np.zeros((1, 3)), [], []
     for _ in range(steps):
-        tau, qdd = dyn.gravity_force(q) + rng.normal(0.0, 2.0, (1, 3)), np.zeros((1, 3))
-        q_after, qd_after = dyn.step(q, qd, tau, DT, qdd=qdd)
-        found.append((q, qd, qdd, qd_after, tau))
-        q, qd = q_after, qd_after
-    return [np.concatenate(column) for column in zip(*found, strict=True)]
+        pushes.append(dyn.gravity_force(q) + rng.normal(0.0, 5.0, (1, 3)))
+        states.append(np.hstack([q, qd]))
+        q, qd = dyn.step(q, qd, pushes[-1], DT)
+    states = np.concatenate([*states, np.hstack([q, qd])])
+    return states + noise * UNITS * rng.normal(size=states.shape), np.concatenate(pushes)
 
 
-def main(steps=400, seed=0, noise=0.0):
-    q, qd, qdd, qd_after, tau = trajectory(steps, seed)
-    tau = tau + noise * np.random.default_rng(seed).standard_normal(tau.shape)
-    dyn = spo.Dynamics(scene(GUESS, [0.0] * 3), worlds=steps, dtype="float64", variable=("body_mass",))
-    rows, left = [], tau - dyn.inverse_dynamics(q, qd, qdd)
-    for dof in range(3):
-        unit = np.tile(np.eye(3)[dof], (steps, 1))
-        by_mass = dyn.inverse_dynamics_vjp(q, qd, qdd, cotangent=unit, wrt=("body_mass",))["body_mass"]
-        rows.append(np.concatenate([by_mass, unit * qd_after], axis=1))
-    change, *_ = np.linalg.lstsq(np.concatenate(rows), left.T.ravel(), rcond=None)
-    masses, damping = GUESS + change[:3], change[3:]
-    error = max(np.abs(masses - MASSES).max(), np.abs(damping - DAMPING).max())
-    print(f"{steps} states: masses {np.round(masses, 3)} kg, damping {np.round(damping, 3)} N m s, off by {error:.1e}")
-    return error
+def main(steps=1000, noise=1.0, iterations=6, seed=0, picture=None):
+    states, pushes = (torch.as_tensor(x) for x in record(steps, noise, np.random.default_rng(seed)))
+    starts, ends, windows = states[:-1:WINDOW], states[WINDOW::WINDOW], steps // WINDOW
+    pushes, units = pushes.reshape(windows, WINDOW, 3), torch.as_tensor(UNITS)
+    dyn = spo.Dynamics(scene(), windows, "cpu", "float64", variable=("body_mass", "joint_damping"), granularity="tree")
+    guesses = [torch.tensor([*dyn.scene.values["body_mass"][0], *dyn.scene.values["joint_damping"][0]])]
+    for _ in range(iterations):
+        masses, damping = (x.repeat(windows, 1).requires_grad_() for x in guesses[-1].split(3))
+        dyn.set(body_mass=masses, joint_damping=damping)
+        q, qd = starts[:, :3].contiguous(), starts[:, 3:].contiguous()
+        for k in range(WINDOW):
+            q, qd = dyn.step(q, qd, pushes[:, k].contiguous(), DT)
+        missed = (torch.cat([q, qd], 1) - ends) / units
+        rows = [torch.cat(torch.autograd.grad(column.sum(), (masses, damping), retain_graph=True), 1)
+                for column in missed.unbind(1)]  # fmt: skip
+        change = torch.linalg.lstsq(torch.cat(rows), -missed.detach().T.reshape(-1, 1)).solution
+        guesses.append(guesses[-1] + change[:, 0])
+    found, right = guesses[-1].numpy(), np.array(MASSES + DAMPING)
+    print(f"{steps} steps: masses {found[:3].round(3)} kg, damping {found[3:].round(3)} N m s, off by "
+          f"{np.abs(found - right).max():.1e}")
+    if picture:
+        with drawing(picture, "masses [kg]", "damping [N m s]") as axes:
+            for each, lines, dashed in zip(axes, np.hsplit(np.array(guesses), 2), np.split(right, 2), strict=True):
+                each.plot(lines, ".-")
+                each.hlines(dashed, 0, iterations, "0.7", "dashed")
+                each.set_xlabel("iteration")
+    return np.abs(found - right).max()
 
 
 if __name__ == "__main__":
-    main()
-    main(noise=0.05)
+    command(main)

@@ -1,4 +1,7 @@
-"""What the examples share: bars, anchors, energy, and a time step."""
+"""What the examples share: bars, anchors, energy, a time step, and pictures."""
+
+import argparse
+import contextlib
 
 import numpy as np
 
@@ -41,3 +44,23 @@ def step(dyn, q, qd, tau, dt):
     """Semi-implicit Euler, and a projection."""
     qd = qd + dt * dyn.forward_dynamics(q, qd, tau)
     return dyn.project(dyn.integrate(q, qd, dt), qd)
+
+
+def command(main):
+    """Run an example from the command line; ``--picture FILE`` has it draw."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--picture", metavar="FILE", help="draw what happened, as .png, .svg or .pdf; needs matplotlib")
+    main(picture=parser.parse_args().picture)
+
+
+@contextlib.contextmanager
+def drawing(file, *titles):
+    """Axes side by side, one under each title, saved to a file at the end."""
+    from matplotlib.figure import Figure
+
+    figure = Figure((5.0 * len(titles), 4.0), layout="constrained")
+    axes = figure.subplots(1, len(titles), squeeze=False)[0]
+    for each, title in zip(axes, titles, strict=True):
+        each.set_title(title)
+    yield axes
+    figure.savefig(file)

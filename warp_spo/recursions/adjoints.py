@@ -65,19 +65,27 @@ class Adjoints(Derivatives):
 
     def body_poses_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
         """J* cotangent of body_poses"""
-        return self._of_bodies(self.body_poses(), wrt)
+        return self._of_stores(self.body_poses(), wrt)
 
     def body_velocities_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
         """J* cotangent of body_velocities"""
-        return self._of_bodies(self.body_velocities(), wrt)
+        return self._of_stores(self.body_velocities(), wrt)
 
-    def _of_bodies(self, results: list[Store], wrt: tuple[str, ...]) -> list[Store]:
+    def mass_matrix_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
+        """J* cotangent of mass_matrix, both triangles"""
+        return self._of_stores(self.mass_matrix(), wrt)
+
+    def jacobian_vjp(self, frames: tuple, wrt: tuple[str, ...]) -> list[Store]:
+        """J* cotangent of jacobian"""
+        return self._of_stores(self.jacobian(frames), wrt)
+
+    def _of_stores(self, results: list[Store], wrt: tuple[str, ...]) -> list[Store]:
         seeds = [self.graph.input("cotangent", *item.index) for item in results]
         return self._reversed([item.value for item in results], seeds, wrt, wrt)
 
     def integrate_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
         """J* cotangent of integrate"""
-        return self._of_bodies(self.integrate(), wrt)
+        return self._of_stores(self.integrate(), wrt)
 
     def step_vjp(self, wrt: tuple[str, ...]) -> list[Store]:
         """J* (q_cotangent; qd_cotangent) of a step whose accelerations are "qdd".

@@ -1,9 +1,9 @@
 """What the pieces of a robot send each other, and where each message lies among those of an operation.
 
 Letters: inward P = phi P+ phi*, z and y = phi z+ or a force, f = a force, R = the composite inertia, B = how a sum
-changes with the parent's motion; outward a and b = alpha, and for Mass^-1 N = the rates of all pivots further in for each
-unit force on the last link, D = the piece's own pivots, V = D times its columns of Y, Y = the part of its columns that
-lies further in.
+changes with the parent's motion; outward a and b = alpha, and for Mass^-1 N = the rates of all pivots further in for
+each unit force on the last link, D = the piece's own pivots, V = D times its columns of Y, Y = the part of its columns
+that lies further in.
 """
 
 from __future__ import annotations

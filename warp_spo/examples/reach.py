@@ -1,0 +1,66 @@
+"""Trajectory optimisation by gradient through 500 steps: arms of seven hinges learn to swing their hands to targets.
+
+Every world has a target of its own. What is optimised are torques at a few knots, linear in between, beside those that
+hold the arm at its start; the loss is how far the hand is off at the end, how fast it is there, and the effort.
+"""
+
+import numpy as np
+import torch
+import warp as wp
+
+import warp_spo as spo
+from warp_spo.examples.parts import at, bar, command, drawing
+
+DT, STEPS, KNOTS = 2e-3, 500, 11  # [s]
+START = [0.0, 0.5, 0.0, 1.2, 0.0, 0.6, 0.0]  # [rad]
+LINK = 0.25  # [m]
+
+
+def scene():
+    """Bars of 2 kg that turn about z and y in turn, each along z at zero."""
+    axes = [(0, 0, 1), (0, 1, 0)]
+    motor = dict(armature=0.05, damping=1.0, parent_pose=at(z=LINK))
+    hinges = [spo.Hinge("revolute", k - 1, k, axis=axes[k % 2], **motor) for k in range(7)]
+    return spo.Scene([bar(LINK, 2.0, axis=2) for _ in hinges], hinges)
+
+
+def hand(poses):
+    """Where the hand is [world, 3]: the end of the last bar."""
+    x, y, z, w = poses[:, 6, 3:].unbind(-1)
+    along = torch.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], dim=-1)
+    return poses[:, 6, :3] + LINK * along
+
+
+def main(worlds=8, iterations=30, seed=0, picture=None):
+    dyn = spo.Dynamics(scene(), worlds, dtype="float64", granularity="tree")
+    start = torch.tensor([START] * worlds, dtype=torch.float64, device=wp.device_to_torch(dyn.device))
+    rng, hold, there = np.random.default_rng(seed), dyn.gravity_force(start), hand(dyn.body_poses(start))
+    targets = there + torch.as_tensor(rng.uniform(-0.35, 0.35, (worlds, 3)), device=start.device)
+    knots = torch.zeros((KNOTS, worlds, 7), dtype=start.dtype, device=start.device, requires_grad=True)
+    optimizer, losses = torch.optim.Adam([knots], lr=0.4), []
+    for _ in range(iterations):
+        q, qd, path = start, torch.zeros_like(start), []
+        for step in range(STEPS):
+            knot, part = divmod(step * (KNOTS - 1) / STEPS, 1.0)
+            q, qd = dyn.step(q, qd, hold + torch.lerp(knots[int(knot)], knots[int(knot) + 1], part), DT)
+            path.append(q.detach())
+        off = (hand(dyn.body_poses(q)) - targets).square().sum(1)
+        loss = off.mean() + 1e-3 * qd.square().sum(1).mean() + 1e-5 * knots.square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    print(f"{iterations} gradients through {STEPS} steps of {worlds} arms: the loss falls from {losses[0]:.3g} to "
+          f"{losses[-1]:.3g}, hands are {1e2 * off.detach().sqrt().mean():.1f} cm off")
+    if picture:
+        paths = torch.stack([hand(dyn.body_poses(q)) for q in path]) - targets
+        with drawing(picture, "loss", "the hands' distance from their targets [m]") as (left, right):
+            left.semilogy(losses)
+            left.set_xlabel("iteration")
+            right.plot(DT * np.arange(STEPS), paths.norm(dim=-1).cpu())
+            right.set_xlabel("time [s]")
+    return losses
+
+
+if __name__ == "__main__":
+    command(main)
