@@ -36,7 +36,6 @@ OF_TREES = {
         "fixman_torque",
         "mass_matrix_packed",
         "operators",
-        "step",
         "body_reactions",
     ),
     "multipliers": ("hybrid_dynamics", "step", "body_reactions"),

@@ -11,6 +11,7 @@ from .arrays import Call
 from .errors import UnsupportedError
 from .kernels import combination
 from .levels import Recursions
+from .recursions.closed_step import NEWTON_STEPS
 from .recursions.impedance import DEFAULT_BOUND
 from .scene import Scene
 
@@ -175,7 +176,7 @@ class Steps:
         option = {name.removesuffix("_out"): True for name in asked}
         if self.scene.dof_count == 0 and status is not None:
             status.zero_()
-        self._launch("step", qd_out, more, q=q, qd=qd, dt=dt, **given, **option)
+        self._launch("step", qd_out, more, q=q, qd=qd, dt=dt, how=self.embedding, **given, **option)
 
     def _midpoint(self, call: Call, q: Any, qd: Any, q_out: Any, qd_out: Any, dt: float, **forces: Any) -> None:
         """The midpoint is a half step whose sweep and laws are taken at the midpoint itself."""
@@ -185,8 +186,8 @@ class Steps:
             self._step(q_at, qd_at, q_next, qd_next, 0.5 * dt, q_from=q, qd_from=qd, **forces)
             q_at, qd_at, q_next, qd_next = q_next, qd_next, q_at, qd_at
         self._launch("integrate", q_next, q=q, qd=qd_at, dt=dt)
-        self._combine(2.0, qd_at, -1.0, qd, qd_out)
-        wp.copy(q_out, q_next)
+        self._combine(2.0, qd_at, -1.0, qd, qd_next)
+        self._finish(q_next, qd_next, q_out, qd_out)
 
     def _rk4(self, call: Call, q: Any, qd: Any, q_out: Any, qd_out: Any, dt: float, tau: Any, body_f: Any,
              **targets: Any) -> None:
@@ -207,13 +208,24 @@ class Steps:
             self._launch("hinge_force", force, q=q_at, qd=qd_at, **targets)
             if tau is not None:
                 self._combine(1.0, force, 1.0, tau, force)
-            self._run("forward_dynamics", qdd, q=q_at, qd=qd_at, tau=force, body_f=body_f)
+            if self.closed:
+                self._closed_forward_dynamics(qdd, None, q_at, qd_at, force, body_f)
+            else:
+                self._run("forward_dynamics", qdd, q=q_at, qd=qd_at, tau=force, body_f=body_f)
             self._launch("coordinate_rates", q_rate, q=q_at, qd=qd_at)
             self._combine(1.0, q_sum, weight * dt, q_rate, q_sum)
             self._combine(1.0, qd_sum, weight * dt, qdd, qd_sum)
-        wp.copy(qd_out, qd_sum)
         qdd.zero_()
-        self._launch("integrate", q_out, q=q_sum, qd=qdd, dt=0.0)  # normalises
+        self._launch("integrate", q_at, q=q_sum, qd=qdd, dt=0.0)  # normalises
+        self._finish(q_at, qd_sum, q_out, qd_out)
+
+    def _finish(self, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array) -> None:
+        """The state after the step is q, qd, with its loops closed."""
+        if self.closed:
+            self._project(q, qd, False, NEWTON_STEPS, q_out, qd_out)
+        else:
+            wp.copy(q_out, q)
+            wp.copy(qd_out, qd)
 
     def _scratch(self, name: str, like: wp.array) -> wp.array:
         return self.recursions.array(name, *like.shape)
@@ -221,6 +233,10 @@ class Steps:
     def _combine(self, a: float, x: wp.array, b: float, y: wp.array, out: wp.array) -> None:
         self.recursions.launch(combination.combine, out.shape, [a, x, b, y], [out])
 
+    closed: bool
+    embedding: Any
+    _closed_forward_dynamics: Any
+    _project: Any
     _call: Any
     _read_state: Any
     _read_rate: Any

@@ -21,7 +21,7 @@ from .traced import Trace
 GUESS, GAIN, MISSED = "guess", "gain", "missed"
 """Variables of a loop over passes, zero at first: by dof, the guess of u, and u; whether a guess missed a piece."""
 LOOPED = (GUESS, GAIN, MISSED)
-NOT_POSITIVE, NOT_FINITE, NOT_SETTLED = 1, 2, 5  # status words; those of warp_spo.status but for the last
+NOT_POSITIVE, NOT_FINITE, NOT_SETTLED, CHANGE_POINT = 1, 2, 5, 6  # status words; the first two as warp_spo.status
 
 
 class Step:
@@ -55,8 +55,8 @@ class Step:
         trace = self.trace
         trace.stiffened = self._stiffened
         tau = trace.vector("tau")
-        done, rates, _ = trace.reduce(lambda dof: tau(dof) + self.forces[dof], moves=True, loads=True)
-        gains = {item.index[0]: self.h * item.value for item in trace.expand(done, rates, trace.base)}
+        found = self._accelerations(lambda dof: tau(dof) + self.forces[dof])
+        gains = {dof: self.h * value for dof, value in found.items()}
         looped = self._looped(gains)
         if looped:
             gains = {dof: trace.graph.input(GAIN, dof) for dof in gains}
@@ -69,10 +69,24 @@ class Step:
             stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
             if qdd:
                 stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
+        stores = self._put_back(stores)
         if status:
             trace.graph.step = "status|s"
             stores.append(Store("status", (), self._word([item.value for item in stores], bool(looped))))
         return looped + stores
+
+    def _accelerations(self, tau: Callable[[int], Value]) -> dict[int, Value]:
+        """qdd by dof, of what :meth:`_stiffened` leaves."""
+        done, rates, _ = self.trace.reduce(tau, moves=True, loads=True)
+        return {item.index[0]: item.value for item in self.trace.expand(done, rates, self.trace.base)}
+
+    def _put_back(self, stores: list[Store]) -> list[Store]:
+        """The stores with what constrains the state after the step seen to."""
+        return stores
+
+    def _unresolved(self) -> Value:
+        """Not 0 where constraints lose rank."""
+        return 0.0
 
     def _stiffened(self, link: Link) -> Link:
         armature = []
@@ -122,7 +136,7 @@ class Step:
                 inputs += [trace.graph.input(name, body, c) for body in range(scene.body_count) for c in range(6)]
         settled = less(trace.graph.input(MISSED, 0), 0.5) if looped else 1.0
         word = select(_finite(results), select(settled, 0.0, NOT_SETTLED), NOT_POSITIVE)
-        return select(_finite(inputs), word, NOT_FINITE)
+        return select(_finite(inputs), select(self._unresolved(), CHANGE_POINT, word), NOT_FINITE)
 
 
 def _finite(values: list[Value]) -> Value:
