@@ -38,7 +38,7 @@ OF_TREES = {
         "operators",
         "body_reactions",
     ),
-    "multipliers": ("hybrid_dynamics", "step", "body_reactions"),
+    "multipliers": ("hybrid_dynamics", "body_reactions"),
 }
 """Operations that know nothing of closed loops."""
 

@@ -176,7 +176,22 @@ class Steps:
         option = {name.removesuffix("_out"): True for name in asked}
         if self.scene.dof_count == 0 and status is not None:
             status.zero_()
+        if self.closed and self.embedding is None:
+            self._step_by_multipliers(q_out, qd_out, asked, option, q=q, qd=qd, dt=dt, **given)
+            return
         self._launch("step", qd_out, more, q=q, qd=qd, dt=dt, how=self.embedding, **given, **option)
+
+    def _step_by_multipliers(
+        self, q_out: wp.array, qd_out: wp.array, asked: dict[str, wp.array], option: dict[str, Any], **given: Any
+    ) -> None:
+        """The multipliers, the open tree's step under them, and back onto the closures."""
+        system, more = self._system()
+        self._launch("step_system", system, more, **given)
+        found, _, resolved = self._least_norm()
+        q, qd = self._scratch("open q", q_out), self._scratch("open qd", qd_out)
+        known = {"multipliers": found, **({"resolved": resolved} if "status" in option else {})}
+        self._launch("step", qd, {"q_out": q, **asked}, **known, **given, **option)
+        self._project(q, qd, False, NEWTON_STEPS, q_out, qd_out)
 
     def _midpoint(self, call: Call, q: Any, qd: Any, q_out: Any, qd_out: Any, dt: float, **forces: Any) -> None:
         """The midpoint is a half step whose sweep and laws are taken at the midpoint itself."""
@@ -236,6 +251,8 @@ class Steps:
     closed: bool
     embedding: Any
     _closed_forward_dynamics: Any
+    _system: Any
+    _least_norm: Any
     _project: Any
     _call: Any
     _read_state: Any

@@ -26,8 +26,14 @@ class Applications(Trace):
     # -- time steps ------------------------------------------------------------------------------------------------
     def step(self, qdd: bool = False, status: bool = False, how: Any = None) -> list[Store]:
         """out = qd', q_out = q', qdd_out, status; ``how`` loops are embedded, see :class:`.embedded.Embedding`."""
+        if "multipliers" in self.given:
+            return closed_step.MultiplierStep(self).stores(qdd, status)
         which = step.Step(self) if how is None else closed_step.ClosedStep(self, how)
         return which.stores(qdd, status)
+
+    def step_system(self) -> list[Store]:
+        """What the multipliers of a step solve; as :meth:`.multipliers.Multipliers.loop_system`."""
+        return closed_step.MultiplierStep(self).system()
 
     def integrate(self) -> list[Store]:
         return step.integrate(self)

@@ -1,6 +1,6 @@
-"""A time step of a scene whose loops are embedded: implicit in all hinges, and put back onto the closures.
+"""Time steps of scenes whose loops are closed: implicit in all hinges, and put back onto the closures.
 
-What the laws of a hinge leave of themselves is armature and force, of hinges inside a cluster as of others: its
+Embedded: what the laws of a hinge leave of themselves is armature and force, of hinges inside a cluster as of others: its
 D = X* (Mass + h R) X then holds the share of every dof that a loop ties. The state after the step leaves the closures
 by O(h^2) of what turns; Newton's steps along the shortest way take it back, position first, then velocity, all with the
 one factorisation of Y where the step ended: the second is left O(h^4), the third O(h^6).
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from ..errors import UnsupportedError
 from ..trace.emit import Store
 from ..trace.graph import Value, less
 from ..trace.spatial import total
@@ -18,7 +19,7 @@ from . import clusters
 from .closures import Ratio
 from .clusters import Cluster, Columns
 from .integration import moved
-from .links import placed
+from .links import Link, placed
 from .step import Step
 
 NEWTON_STEPS = 2  # of position and of velocity, where a loop joint is; couplings are linear and take one
@@ -26,7 +27,7 @@ RESOLVED = 4.0  # roundings: a margin that is no larger may be rounding alone
 
 
 class ClosedStep(Step):
-    """The step as a trace.
+    """The step as a trace, loops embedded.
 
     Args:
         trace: a :class:`.embedded.Embedded`. how: its rows that count.
@@ -72,3 +73,32 @@ class ClosedStep(Step):
     def _unresolved(self) -> Value:
         least = RESOLVED * self.trace.epsilon
         return total(1.0 - less(least, margin) for margin in self.margins)
+
+
+class MultiplierStep(Step):
+    """The step of the open tree as a trace, under the array "multipliers", of a :class:`.multipliers.Multipliers`."""
+
+    def system(self) -> list[Store]:
+        """out, right, size: what the multipliers solve."""
+        self.trace.stiffened = self._stiffened
+        tau = self.trace.vector("tau")
+        return self.trace.loop_system(lambda dof: tau(dof) + self.forces[dof])
+
+    def _stiffened(self, link: Link) -> Link:
+        stiff = super()._stiffened(link)
+        for dof in link.dofs:
+            if any(law.bends for law in self.laws[dof]):
+                label = self.trace.links.scene.dof_labels[dof]
+                what = f"a limit, friction or a bound on {label!r} with loops='multipliers'"
+                raise UnsupportedError("Dynamics.step", what, "use loops='embed'")
+        return stiff
+
+    def _accelerations(self, tau: Callable[[int], Value]) -> Columns:
+        trace = self.trace
+        trace.place_links(moves=True)
+        loads = trace._combined(trace.vector("multipliers"))
+        done, rates, _ = trace.reduce(lambda dof: tau(dof) + loads.get(dof, 0.0), moves=True, loads=True)
+        return {item.index[0]: item.value for item in trace.expand(done, rates, trace.base)}
+
+    def _unresolved(self) -> Value:
+        return 1.0 - less(self.trace.epsilon**0.5, self.trace.graph.input("resolved", 0))
