@@ -214,6 +214,7 @@ def test_reactions_and_derivatives_are_refused(device):
         dyn = spo.Dynamics(MECHANISMS["fourbar"](), 3, device=device, loops=loops)
         with pytest.raises(UnsupportedError, match="body_reactions"):
             dyn.body_reactions(s.q, s.qd, s.qdd)
+    spo.Dynamics(MECHANISMS["fourbar"](), 3, device=device, loops="cut").step(s.q, s.qd, None, H)  # it stays open
     torch = pytest.importorskip("torch")
     q, qd = (torch.tensor(x, dtype=torch.float32) for x in (s.q, s.qd))
     dyn = spo.Dynamics(MECHANISMS["fourbar"](), 3, device="cpu", loops="embed")

@@ -377,21 +377,6 @@ def test_mistakes_are_explained(device):
         spo.Dynamics(limited, 1, device=device).step(limited.neutral_q[None], np.zeros((1, 3)), None, H)
 
 
-@pytest.mark.parametrize("operation", ["step", "body_reactions"])
-def test_closed_loops_are_refused(operation, device):
-    """What a loop transmits is not in them; loops that are cut stay open."""
-    body = spo.Body(1.0, (0.5, 0.0, 0.0), np.eye(3))
-    loop = spo.Loop("ball", -1, 1, parent_pose=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
-    hinges = [spo.Hinge("revolute", k - 1, k, axis=(0, 1, 0)) for k in range(2)]
-    scene = spo.Scene([body, body], hinges, loops=[loop])
-    q, rate = np.zeros((1, 2)), np.zeros((1, 2))
-    last = H if operation == "step" else rate
-    with pytest.raises(UnsupportedError, match=f"{operation}"):
-        getattr(spo.Dynamics(scene, 1, device=device, loops="multipliers"), operation)(q, rate, rate, last)
-    if operation == "step":
-        spo.Dynamics(scene, 1, device=device, loops="cut").step(q, rate, rate, H)
-
-
 def test_a_scene_that_cannot_move(device):
     scene = spo.Scene([spo.Body(1.0)], [spo.Hinge("fixed", -1, 0)])
     status = np.full(2, -1, dtype=np.int32)
