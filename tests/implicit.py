@@ -10,6 +10,7 @@ from warp_spo.reference import Dense
 
 CREEP, HOLD = 1e-4, 1e3  # what Dynamics.step documents
 NONE = 1e6
+NEAR = 1e-7  # step of a slope, in rates: far below CREEP
 
 
 def hinge_force(d, h, qd, target_q, target_qd):
@@ -98,9 +99,10 @@ def closed_step(closed, independent, h, qd, tau, body_f=None, target_q=None, tar
         return column @ (M @ qdd - load - np.array([force(i, v) for i, v in enumerate(rate)]))
 
     for _ in range(30):  # of Newton: near the answer soon, as a rule; the sweeps say whether
-        rate, e = qd + h * qdd, 1e-7
-        f, slope = (np.array([g(i, v) for i, v in enumerate(rate)]) for g in (
-            force, lambda i, v: 0.5 * (force(i, v + e) - force(i, v - e)) / e))  # fmt: skip
+        f, ahead, behind = (
+            np.array([force(i, v + e) for i, v in enumerate(qd + h * qdd)]) for e in (0.0, NEAR, -NEAR)
+        )
+        slope = 0.5 * (ahead - behind) / NEAR
         qdd = qdd - X @ np.linalg.solve(X.T @ (M - h * np.diag(slope)) @ X, X.T @ (M @ qdd - load - f))
     for _ in range(sweeps):
         before = qdd.copy()

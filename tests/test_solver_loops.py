@@ -1,4 +1,4 @@
-"""SolverSPO with loop joints and mimics of a Newton model: they hold, and everything around a step goes on as it did."""
+"""SolverSPO with loop joints and mimics of a Newton model: they hold; what is around a step goes on as it did."""
 
 import newton
 import numpy as np
@@ -12,7 +12,8 @@ from test_solver import advance, replicated
 
 import warp_spo as spo
 from warp_spo.errors import UnsupportedError
-from warp_spo.newton import SolverSPO, solver as solvers
+from warp_spo.newton import SolverSPO
+from warp_spo.newton import solver as solvers
 
 CLOSED = 1e-6  # [m]: rounding of float32 at angles of up to 8 rad, and of the chain of bars
 OPEN = (0.3, -1.3, 2.0)  # joint angles that do not meet
@@ -59,7 +60,7 @@ def gap(solver, state):
 # -- loop joints -------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("seconds", [1.0, pytest.param(10.0, marks=pytest.mark.slow)])
 def test_a_loop_joint_holds(pinned, seconds):
-    """At 1 ms, under gravity; bodies meet at the pin, energy stays within what order 1 leaves; its entry is nobody's."""
+    """At 1 ms, under gravity: bodies meet at the pin, energy drifts as order 1 does; the pin's entry is nobody's."""
     model, solver = pinned
     state, worst = start(model, solver), 0.0
     first = total_energy(model, state)
@@ -93,7 +94,7 @@ def total_energy(model, state):
 def test_a_loop_that_is_cut_does_not_hold():
     """What the test above would see if nothing closed it."""
     model = replicated(fourbar(), 2)
-    with pytest.raises(ValueError, match="1 loop joint.*'embed'"):
+    with pytest.raises(ValueError, match=r"1 loop joint.*'embed'"):
         SolverSPO(model)
     solver, closed = SolverSPO(model, loops="cut"), SolverSPO(model, loops="multipliers")
     state = start(model, closed)
@@ -218,7 +219,7 @@ def one_finger(x, v, target, h):
 def test_a_gripper_moves_as_its_reduced_reference():
     """Masses, the follower's damper and its stop act on the leader as if they were its own."""
     model = replicated(gripper(), 2)
-    with pytest.raises(UnsupportedError, match="mimic joints: slide1.*loops='embed' closes them"):
+    with pytest.raises(UnsupportedError, match=r"mimic joints: slide1.*loops='embed' closes them"):
         SolverSPO(model)
     solver, control = SolverSPO(model, loops="embed"), model.control()
     targets = np.array([0.05, 0.0, 0.2, 0.0], np.float32)
@@ -242,7 +243,7 @@ def test_ratios_that_change_rebuild():
     coeffs = model.joint_mimic_coeffs.numpy()
     coeffs[1] = 0.1, -2.0
     model.joint_mimic_coeffs.assign(coeffs)
-    with pytest.raises(ValueError, match="joint_mimic_coeffs.*CONSTRAINT_PROPERTIES"):
+    with pytest.raises(ValueError, match=r"joint_mimic_coeffs.*CONSTRAINT_PROPERTIES"):
         solver.check_model()
     with pytest.warns(UserWarning, match="joint_mimic_coeffs folded"):
         solver.notify_model_changed(ModelFlags.CONSTRAINT_PROPERTIES)

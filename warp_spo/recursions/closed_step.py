@@ -1,9 +1,12 @@
 """Time steps of scenes whose loops are closed: implicit in all hinges, and put back onto the closures.
 
-Embedded: what the laws of a hinge leave of themselves is armature and force, of hinges inside a cluster as of others: its
-D = X* (Mass + h R) X then holds the share of every dof that a loop ties. The state after the step leaves the closures
-by O(h^2) of what turns; Newton's steps along the shortest way take it back, position first, then velocity, all with the
-one factorisation of Y where the step ended: the second is left O(h^4), the third O(h^6).
+Embedded: what the laws of a hinge leave of themselves is armature and force, inside a cluster as elsewhere, so that
+D = X* (Mass + h R) X holds the share of every dof that a loop ties. The state after the step leaves the closures by
+O(h^2) of what turns. Newton's steps take it back along the shortest way, position first, then velocity, all with one
+factorisation of Y, where the step ended: the first leaves O(h^4), the second O(h^6).
+
+By multipliers: Mass + h R is the open tree's, (Y (Mass + h R)^-1 Y*) lambda = -(Y qdd(0) + Y' qd) a system between two
+kernels. Passes would have to span them all, so that laws that bend are refused.
 """
 
 from __future__ import annotations
@@ -30,8 +33,10 @@ class ClosedStep(Step):
     """The step as a trace, loops embedded.
 
     Args:
-        trace: a :class:`.embedded.Embedded`. how: its rows that count.
+        trace: an :class:`.embedded.Embedded`. how: its rows that count, an :class:`.embedded.Embedding`.
     """
+
+    trace: Any
 
     def __init__(self, trace: Any, how: Any):
         super().__init__(trace)
@@ -77,6 +82,8 @@ class ClosedStep(Step):
 
 class MultiplierStep(Step):
     """The step of the open tree as a trace, under the array "multipliers", of a :class:`.multipliers.Multipliers`."""
+
+    trace: Any
 
     def system(self) -> list[Store]:
         """out, right, size: what the multipliers solve."""

@@ -172,7 +172,8 @@ def factor(
         for child in link.children:
             if id(child) in carried:
                 P = P + carried[id(child)]
-        for dof, armature, H in zip(link.dofs, stiffened(link).armature, articulated.columns(link, places[key]), strict=True):
+        H_T = articulated.columns(link, places[key])
+        for dof, armature, H in zip(link.dofs, stiffened(link).armature, H_T, strict=True):
             n, f = P.apply(Vector(H[:3]), Vector(H[3:]))
             over: Link | None = link
             while over is not None and id(over) in inside:

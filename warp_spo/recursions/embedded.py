@@ -143,7 +143,8 @@ class Embedded(Applications):
                 through = [(self.places[id(c)].pose, swept.links[id(c)].P) for c in link.children if id(c) in apart]
                 through += [(HERE, inner[other]) for other in bundles]
                 place = self.places[key]
-                swept.links[key] = done = articulated.factor(self.stiffened(link), place, carried, through, self.epsilon)
+                stiff = self.stiffened(link)
+                swept.links[key] = done = articulated.factor(stiff, place, carried, through, self.epsilon)
                 self.at(link, "z")
                 right = [tau(dof) for dof in link.dofs]
                 inner[key] = done.in_parent
