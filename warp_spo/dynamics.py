@@ -88,8 +88,9 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
         granularity: None (the plan chooses), "node", "segment" or "tree", see :class:`warp_spo.plan.Plan`.
         loops: what to do with the scene's loop joints and couplings. "raise": loop joints are refused. "cut": they stay
             open. "embed": they hold, what they tie being one node of the tree; mass_matrix and its relatives are then
-            of :attr:`independent_dofs`. "multipliers": they hold by multipliers of the open tree in forward_dynamics;
-            mass_matrix, inverse_dynamics and the others remain the open tree's. "raise" and "cut" ignore couplings.
+            of :attr:`independent_dofs`. "multipliers": they hold by multipliers of the open tree in forward_dynamics
+            and step; mass_matrix, inverse_dynamics and the others remain the open tree's. "raise" and "cut" ignore
+            couplings.
         independent: with loops embedded, the dofs (indices or labels) that are to be :attr:`independent_dofs`, such as
             those that have motors: as many as move, those that no loop ties among them. None: they are chosen.
         refine: steps of iterative refinement in forward_dynamics and solve_mass_matrix, which then solve in float32 and
