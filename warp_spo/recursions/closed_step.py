@@ -6,7 +6,7 @@ O(h^2) of what turns. Newton's steps take it back along the shortest way, positi
 factorisation of Y, where the step ended: the first leaves O(h^4), the second O(h^6).
 
 By multipliers: Mass + h R is the open tree's, (Y (Mass + h R)^-1 Y*) lambda = -(Y qdd(0) + Y' qd) a system between two
-kernels. Passes would have to span them all, so that laws that bend are refused.
+launches. Passes would have to span them all, so that laws that bend are refused.
 """
 
 from __future__ import annotations
