@@ -15,7 +15,7 @@ import warp_spo as spo
 from warp_spo.embedding import Closing
 from warp_spo.errors import UnsupportedError
 from warp_spo.examples.parts import energy
-from warp_spo.recursions import closed_step, clusters, step
+from warp_spo.recursions import closed_step, clusters, impedance, step
 from warp_spo.recursions.multipliers import Multipliers
 
 H = 2e-3
@@ -168,6 +168,25 @@ def test_a_limit_on_a_dependent_dof_holds(device):
     N = closed.null_space(closed.jacobian)
     assert 0.0 < depth < 1e-4 and np.abs(qd.numpy()).max() < 1e-6
     np.testing.assert_allclose(N[2] * ke * depth, N.T @ closed.dense.bias_force(np.zeros(3)), rtol=1e-4)
+
+
+WAYS = [
+    (clusters, "expanded", "k.get(dof, 0.0) + ", "", "energy"),
+    (closed_step.ClosedStep, "_close", "qd[dof] + change", "qd[dof] + 1.001 * change", "closure"),
+    (impedance.Impedance, "_limits", "depth = inward *", "depth = -1.0 * inward *", "limit"),
+]
+
+
+@pytest.mark.parametrize(("owner", "name", "old", "new", "law"), WAYS)
+def test_a_bug_along_the_way_is_seen(monkeypatch, device, owner, name, old, new, law):
+    symbolic.plant(monkeypatch, owner, name, old, new)
+    with pytest.raises(AssertionError):
+        if law == "energy":
+            test_energy_drifts_as_its_integrator_says("rk4", 4, device)
+        elif law == "closure":
+            test_closure_is_rounding("float64", device)
+        else:
+            test_a_limit_on_a_dependent_dof_holds(device)
 
 
 # -- as users call it --------------------------------------------------------------------------------------------------

@@ -75,7 +75,7 @@ def test_a_loop_joint_holds(pinned, seconds):
         np.testing.assert_allclose(tip, [1.0, 0.0, 0.0], atol=2.0 * CLOSED)
     np.testing.assert_array_equal(state.joint_q.numpy()[[3, 7]], np.float32(0.25))
     assert np.abs(state.joint_qd.numpy()).max() > 0.5
-    assert np.abs(total_energy(model, state) - first).max() < 0.03 * seconds  # of 10 J that come and go
+    assert np.abs(total_energy(model, state) - first).max() < 0.03 * seconds  # of 5 J that come and go
 
 
 def total_energy(model, state):
