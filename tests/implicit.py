@@ -10,6 +10,7 @@ from warp_spo.reference import Dense
 
 CREEP, HOLD = 1e-4, 1e3  # what Dynamics.step documents
 NONE = 1e6
+NEAR = 1e-7  # step of a slope, in rates: far below CREEP
 
 
 def hinge_force(d, h, qd, target_q, target_qd):
@@ -79,3 +80,39 @@ def _root(f, start):
         if middle in (low, high):
             return middle
         low, high = (low, middle) if f(middle) > 0.0 else (middle, high)
+
+
+def closed_step(closed, independent, h, qd, tau, body_f=None, target_q=None, target_qd=None, sweeps=50):
+    """q', qd' and qdd of a :class:`mechanisms.Closed`, in the null space of its Jacobian, then put back onto it.
+
+    With qdd = k + X y, X* (Mass qdd - load - f(q', qd')) = 0 is the gradient of a convex function of y.
+    """
+    d, X = closed.dense, closed.columns(independent)
+    target_q = closed.scene.neutral_q if target_q is None else target_q
+    target_qd = np.zeros(d.dof_count) if target_qd is None else target_qd
+    force = hinge_force(d, h, qd, target_q, target_qd)
+    M, load = d.mass_matrix, tau - d.bias_force(qd, body_f)
+    qdd = -np.linalg.pinv(closed.jacobian, rcond=1e-8) @ closed.bias(qd)
+
+    def gradient(column, qdd):
+        rate = qd + h * qdd
+        return column @ (M @ qdd - load - np.array([force(i, v) for i, v in enumerate(rate)]))
+
+    for _ in range(30):  # of Newton: near the answer soon, as a rule; the sweeps say whether
+        f, ahead, behind = (
+            np.array([force(i, v + e) for i, v in enumerate(qd + h * qdd)]) for e in (0.0, NEAR, -NEAR)
+        )
+        slope = 0.5 * (ahead - behind) / NEAR
+        qdd = qdd - X @ np.linalg.solve(X.T @ (M - h * np.diag(slope)) @ X, X.T @ (M @ qdd - load - f))
+    for _ in range(sweeps):
+        before = qdd.copy()
+        for column in X.T:
+            qdd = qdd + column * _root(lambda x, c=column, a=qdd: gradient(c, a + x * c), 0.0)
+        if np.abs(qdd - before).max() <= 1e-13 * np.abs(qdd).max():
+            break
+    qd = qd + h * qdd
+    closed = type(closed)(closed.scene, d.integrate(qd, h), closed.world)
+    for _ in range(3):
+        back = -np.linalg.pinv(closed.jacobian, rcond=1e-8) @ closed.error
+        closed = type(closed)(closed.scene, closed.dense.integrate(back, 1.0), closed.world)
+    return closed.dense.q, closed.consistent(qd), qdd

@@ -28,13 +28,14 @@ def run(scene, operation, arrays, given, shapes, dtype="float64", trace=Applicat
     return results
 
 
-def advance(scene, arrays, h, dtype="float64", most=16, **options):
+def advance(scene, arrays, h, dtype="float64", most=16, trace=Applications, **options):
     """One step: q', qd' [world, ...] and in how many passes each world's pieces held, ``most`` + 1 if they never did.
 
     Args:
         arrays: q, qd and what else the step gets, [world, ...] by name.
+        trace: the class that has the step.
     """
-    trace = Applications(Links(scene), dtype, tuple(arrays))
+    trace = trace(Links(scene), dtype, tuple(arrays))
     stores = trace.step(**options)
     worlds = len(arrays["q"])
     known = arrays | {"dt": np.full((worlds, 1), h)}

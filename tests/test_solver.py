@@ -451,8 +451,6 @@ def test_models_that_are_refused():
     with pytest.raises(UnsupportedError, match="mimic joints: arm_joint2"):
         SolverSPO(finalize(mimic))
     SolverSPO(finalize(mimic), loops="cut")
-    with pytest.raises(UnsupportedError, match="loops='multipliers' of 1 loop joint"):
-        SolverSPO(finalize(fourbar()), loops="multipliers")
     odd = newton.ModelBuilder()
     for joints in (2, 3):
         odd.begin_world()

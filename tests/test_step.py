@@ -187,7 +187,7 @@ BUGS = [
     (impedance.Impedance, "_limits", "(0.0, None) if inward > 0.0 else (None, 0.0)", "None, None"),
     (impedance.Law, "piece", "select(over, 0.0, resistance)", "resistance"),
     (impedance.Law, "missed", "self.at(u) - piece.line(u)", "0.0 * u"),
-    (step.Step, "_swept", "self.h * piece.resistance", "piece.resistance"),
+    (step.Step, "_stiffened", "self.h * piece.resistance", "piece.resistance"),
     (joint_space.JointSpace, "solve", "U[i, j] - column[i]", "U[i, j] + column[i]"),
     (integration, "moved", "+ shift[i]", ""),
     (integration, "turned", "half = turn * 0.5", "half = turn"),
@@ -389,21 +389,6 @@ def test_mistakes_are_explained(device):
     limited = zoo.single_body("ball").with_values(joint_limit_upper=np.ones(3))
     with pytest.raises(UnsupportedError, match="a limit on 'joint_0:0', a dof of a ball or free hinge"):
         spo.Dynamics(limited, 1, device=device).step(limited.neutral_q[None], np.zeros((1, 3)), None, H)
-
-
-@pytest.mark.parametrize("operation", ["step", "body_reactions"])
-def test_closed_loops_are_refused(operation, device):
-    """What a loop transmits is not in them; loops that are cut stay open."""
-    body = spo.Body(1.0, (0.5, 0.0, 0.0), np.eye(3))
-    loop = spo.Loop("ball", -1, 1, parent_pose=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
-    hinges = [spo.Hinge("revolute", k - 1, k, axis=(0, 1, 0)) for k in range(2)]
-    scene = spo.Scene([body, body], hinges, loops=[loop])
-    q, rate = np.zeros((1, 2)), np.zeros((1, 2))
-    last = H if operation == "step" else rate
-    with pytest.raises(UnsupportedError, match=f"{operation}"):
-        getattr(spo.Dynamics(scene, 1, device=device, loops="multipliers"), operation)(q, rate, rate, last)
-    if operation == "step":
-        spo.Dynamics(scene, 1, device=device, loops="cut").step(q, rate, rate, H)
 
 
 def test_a_scene_that_cannot_move(device):

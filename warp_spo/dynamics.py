@@ -91,9 +91,9 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
         loops: what to do with the scene's loop joints and couplings. "raise": they are refused. "cut": they stay open.
             "embed": they hold, what they tie being one node of the tree. Mass matrices, Jacobians, momentum matrices
             and forces of inverse_dynamics, bias_force and gravity_force are then of :attr:`independent_dofs`: X* Mass
-            X, J X, X* tau. "multipliers": they hold by multipliers of the open tree in forward_dynamics; mass_matrix,
-            inverse_dynamics, jacobian and so on remain the open tree's, the terms of Mass qdd + bias_force = tau + Y*
-            lambda. What would be wrong with the loops left out raises.
+            X, J X, X* tau. "multipliers": they hold by multipliers of the open tree in forward_dynamics and step;
+            mass_matrix, inverse_dynamics, jacobian and so on remain the open tree's, the terms of
+            Mass qdd + bias_force = tau + Y* lambda. What would be wrong with the loops left out raises.
         independent: with loops embedded, the dofs (indices or labels) that are to be :attr:`independent_dofs`, such as
             those that have motors: as many as move, those that no loop ties among them. None: they are chosen.
         refine: steps of iterative refinement in forward_dynamics and solve_mass_matrix, which then solve in float32 and

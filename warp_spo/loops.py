@@ -3,7 +3,8 @@
 ``loops="embed"``: links that loops and couplings tie are one node of the tree (:mod:`.recursions.clusters`), closures
 hold exactly. ``loops="multipliers"``: the tree stays open, multipliers close it (:mod:`.recursions.multipliers`), which
 serves loops of any extent and redundant ones, at the square of the closures' condition. Both run as kernels of their
-scene, a thread a world, at every granularity. Neither pulls back what has drifted: call ``project`` once a step.
+scene, a thread a world, at every granularity. ``step`` keeps them closed; who integrates accelerations by other means
+calls ``project`` once a step.
 """
 
 from __future__ import annotations
@@ -46,7 +47,6 @@ OF_TREES = {
         "mass_matrix_packed",
         "mass_matrix_inverse_packed",
         "operators",
-        "step",
         "body_reactions",
     ),
     "multipliers": (
@@ -55,7 +55,6 @@ OF_TREES = {
         "operational_inertia_inverse_product",
         "operational_inertia",
         "fixman_torque",
-        "step",
         "body_reactions",
     ),
 }
@@ -127,8 +126,8 @@ class Loops(Applications):
     def project(self, q: Any, qd: Any = None, hold: bool = False, iterations: int = 2, out: Any = None) -> Any:
         """The nearest state that closes the loops: Newton steps q - Y^+ g, then qd - Y^+ Y qd, Y the Jacobian of g.
 
-        g is :meth:`closure_error`. Nearest in the sum of squares of the dofs, rad and m alike. Call it once a time
-        step; to close a state by hand, with more ``iterations``.
+        g is :meth:`closure_error`. Nearest in the sum of squares of the dofs, rad and m alike. :meth:`step` does as
+        much by itself; to close a state by hand, ask for more ``iterations``.
 
         Args:
             q, qd: [world, coordinate], [world, dof]; qd None is left out.

@@ -54,6 +54,7 @@ TREE_ONLY = (
     "forward_dynamics_jvp",
     "inverse_dynamics_jvp",
     "step",
+    "step_system",
     "integrate",
     "passive_force",
     "hinge_force",

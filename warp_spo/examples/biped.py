@@ -3,7 +3,7 @@
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, bar, step
+from warp_spo.examples.parts import at, bar
 
 THIGH, SHANK, ROD, CRANK = 0.4, 0.4, 0.3, 0.06  # [m]
 
@@ -46,7 +46,7 @@ def main(seconds=0.2, dt=1e-3):
     print(f"{dyn.scene.dof_count} dofs, {len(dyn.independent_dofs)} independent; embedding and multipliers differ by "
           f"{np.abs(one - two).max() / np.abs(one).max():.1e}")
     for _ in range(round(seconds / dt)):
-        q, qd = step(dyn, q, qd, None, dt)
+        q, qd = dyn.step(q, qd, None, dt)
     print(f"after {seconds} s of free fall the rods are open by {np.abs(dyn.closure_error(q)).max():.1e} m")
 
 

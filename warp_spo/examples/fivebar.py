@@ -3,7 +3,7 @@
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, bar, step
+from warp_spo.examples.parts import at, bar
 
 UPPER, LOWER, APART = 0.3, 0.5, 0.2  # [m]
 
@@ -35,7 +35,7 @@ def main():
     print(f"accelerations then: {np.abs(dyn.forward_dynamics(q, qd, tau)).max():.1e} rad/s^2")
     tau[:, free[0]] += 0.05
     for _ in range(500):
-        q, qd = step(dyn, q, qd, tau, 1e-3)
+        q, qd = dyn.step(q, qd, tau, 1e-3)
     print(f"pushed for 0.5 s: tip moves, open by {np.abs(dyn.closure_error(q)).max():.1e} m; q {np.round(q[0], 3)} rad")
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, bar, energy, step
+from warp_spo.examples.parts import at, bar, energy
 
 CRANK, COUPLER, ROCKER, GROUND = 0.4, 0.9, 0.7, 1.0  # [m]
 
@@ -29,7 +29,7 @@ def main(seconds=1.0, dt=1e-3):
     qd = np.zeros_like(q)
     before = energy(dyn, q, qd)
     for _ in range(round(seconds / dt)):
-        q, qd = step(dyn, q, qd, None, dt)
+        q, qd = dyn.step(q, qd, None, dt)
     drift = np.abs(energy(dyn, q, qd) - before).max()
     print(f"after {seconds} s: pin open by {np.abs(dyn.closure_error(q)).max():.1e} m, energy off by {drift:.1e} J")
 

@@ -1,4 +1,4 @@
-"""What the examples share: bars, anchors, energy, a time step, and pictures."""
+"""What the examples share: bars, anchors, energy, and pictures."""
 
 import argparse
 import contextlib
@@ -38,12 +38,6 @@ def turned(quaternion, vector):
     """``vector`` rotated by quaternions xyzw."""
     u, w = quaternion[..., :3], quaternion[..., 3:]
     return vector + 2.0 * np.cross(u, np.cross(u, vector) + w * vector)
-
-
-def step(dyn, q, qd, tau, dt):
-    """Semi-implicit Euler, and a projection."""
-    qd = qd + dt * dyn.forward_dynamics(q, qd, tau)
-    return dyn.project(dyn.integrate(q, qd, dt), qd)
 
 
 def command(main):

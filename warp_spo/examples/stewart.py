@@ -6,7 +6,7 @@ Each leg stands on a universal joint and slides; the first one carries the platf
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.examples.parts import about, at, bar, step
+from warp_spo.examples.parts import about, at, bar
 
 BASE, PLATFORM, HEIGHT = 1.0, 0.5, 1.0  # [m]
 
@@ -44,7 +44,7 @@ def main(seconds=0.5, dt=1e-3):
     q = dyn.scene.neutral_q[None]
     qd = np.zeros((1, dyn.scene.dof_count))
     for _ in range(round(seconds / dt)):
-        q, qd = step(dyn, q, qd, dyn.passive_force(q, qd), dt)
+        q, qd = dyn.step(q, qd, None, dt)
     x, y, z = dyn.body_poses(q)[0, 12, :3]
     print(f"after {seconds} s the platform is at {x:.4f}, {y:.4f}, {z:.4f} m; balls open by "
           f"{np.abs(dyn.closure_error(q)).max():.1e} m")

@@ -12,6 +12,7 @@ from newton import ModelFlags
 from newton.solvers.experimental.coupled import CouplingInterface
 
 from ..dynamics import Dynamics
+from ..errors import UnsupportedError
 from ..frames import Frame
 from .layout import Layout
 from .model import _host
@@ -31,6 +32,7 @@ class Plugs(CouplingInterface):
 
             response.refresh_from_solve(solver.solve_inverse(state), dof_map=solver.dof_map)
         """
+        self._check_open("solve_inverse")
         q = self._q.read(state.joint_q, "q")
         return lambda x, y: self.dynamics.solve_mass_matrix(q, y, out=x) and None
 
@@ -48,6 +50,7 @@ class Plugs(CouplingInterface):
         Args:
             frame: of the tool: a body's index or label, or (body, pose in the body).
         """
+        self._check_open("operational_space")
         dyn, q = self.dynamics, self._q.read(state.joint_q, "q")
         worlds, dofs = dyn.worlds, dyn.scene.dof_count
         dyn.jacobian(q, [frame], out=inputs.jacobian_tool_world.reshape((worlds, 1, 6, dofs)))
@@ -94,6 +97,7 @@ class Plugs(CouplingInterface):
         Raises:
             ValueError: an endpoint that is no body.
         """
+        self._check_open("coupling_eval_effective_mass_block")
         kinds, bodies = endpoint_kind.numpy(), endpoint_index.numpy()
         if kinds.any():
             raise ValueError("SolverSPO: a coupling endpoint that is no body; expected kinds of BODY alone")
@@ -118,6 +122,12 @@ class Plugs(CouplingInterface):
         out_mass.assign(mass)
         if out_inertia is not None and len(out_inertia):
             out_inertia.assign(inertia)
+
+    def _check_open(self, call: str) -> None:
+        """What these calls mean by the mass matrix is that of a tree."""
+        if self.dynamics.closed:
+            what = f"loops={self.dynamics.loops!r}"
+            raise UnsupportedError(f"SolverSPO.{call}", what, "ask solver.dynamics, or a solver with loops='cut'")
 
     def coupling_prepare_proxy_contacts(self, *_: Any, **__: Any) -> Any:
         """Refused: contacts are not computed."""

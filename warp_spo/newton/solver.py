@@ -16,7 +16,8 @@ from newton.solvers import SolverBase
 from ..dynamics import Dynamics
 from ..errors import UnsupportedError
 from ..kernels import declare, exchange
-from ..parts import DOF_VALUES, FREE
+from ..parts import DOF_VALUES, FREE, UNLIMITED
+from ..recursions.impedance import DEFAULT_BOUND
 from ..scene import Scene
 from ..steps import INTEGRATORS
 from .layout import Layout
@@ -42,10 +43,12 @@ FLAGS = {
     ModelFlags.JOINT_REFERENCE_POSE_PROPERTIES: ("joint_rest_q",),
     ModelFlags.JOINT_DOF_PROPERTIES: (*DOF_VALUES, "joint_target_mode", "joint_rest_q"),
     ModelFlags.JOINT_PROPERTIES: ("joint_X_p", "joint_X_c", "joint_axis"),
+    ModelFlags.CONSTRAINT_PROPERTIES: ("joint_mimic_coeffs",),
     ModelFlags.MODEL_PROPERTIES: ("gravity",),
 }
 """Arrays of the model that each flag speaks of. Flags that are not here speak of nothing that a step depends on."""
 WATCHED = tuple(dict.fromkeys(name for names in FLAGS.values() for name in names))
+CLOSING_STEPS = 8  # Newton's steps onto the closures in a reset; each squares the error
 
 
 @dataclasses.dataclass(eq=False)
@@ -70,17 +73,25 @@ class SolverSPO(Plugs, SolverBase):
     allocates nothing, reads nothing back and is bitwise repeatable; a CUDA graph may capture any number of them.
     A world with a NaN is NaN alone.
 
+    Loop joints, which belong to no articulation, and mimics hold if ``loops`` says so, after every step to float32's
+    rounding. A loop joint is a constraint alone: its entries of joint_q and joint_qd stay as they are, as in Newton's
+    eval_ik, those of joint_f are not applied, and drives, springs, damping, friction, limits and armature of it are
+    refused. Bring a first state onto the closures with :meth:`reset`, or by hand with ``solver.dynamics.project``; a
+    step takes an open one there along the shortest way.
+
     Args:
         model: finalized; all worlds have one topology. ``model.requires_grad`` is not looked at.
         variable: names of arrays of the model that :meth:`notify_model_changed` refreshes by launches alone. All others
             fold into the kernels.
-        loops: "raise", or "cut": leaves loop joints and mimics open.
+        loops: "raise": loop joints and mimics are refused, for the choice is yours. "embed": they hold, one sweep a
+            step. "multipliers": they hold by multipliers, see :meth:`warp_spo.Dynamics.step`. "cut": they stay open.
         integrator: as :meth:`warp_spo.Dynamics.step`; "midpoint" and "rk4" give no observables.
         granularity: as :class:`warp_spo.Dynamics`.
 
     Raises:
         UnsupportedError: what :func:`warp_spo.from_newton` refuses, worlds that differ in topology among it, naming the
-            first difference; mimic joints; particles; position limits on BALL, FREE or DISTANCE joints.
+            first difference; mimic joints with loops="raise"; loop joints with more than a constraint; particles;
+            position limits on BALL, FREE or DISTANCE joints.
         ValueError: an unknown name or option, loop joints.
     """
 
@@ -111,9 +122,11 @@ class SolverSPO(Plugs, SolverBase):
     def _build(self) -> None:
         model = self.model
         scene = from_newton(model)
-        if scene.couplings and self._options["loops"] != "cut":
+        if scene.couplings and self._options["loops"] == "raise":
             names = ", ".join(scene.joint_labels[c.hinge] for c in scene.couplings)
-            raise UnsupportedError("SolverSPO", f"mimic joints: {names}", "loops='cut' leaves them open")
+            raise UnsupportedError(
+                "SolverSPO", f"mimic joints: {names}", "loops='embed' closes them, loops='cut' leaves them open"
+            )
         worlds = _Worlds(model)
         modes = _host(model, "joint_target_mode")[scene.dof_index]
         if (modes != modes[:1]).any():
@@ -125,8 +138,7 @@ class SolverSPO(Plugs, SolverBase):
         W, device = scene.worlds, model.device
         self.dynamics = Dynamics(scene, W, device, "float32", variable, **self._options)
         if self.dynamics.closed:
-            what = f"loops={self._options['loops']!r} of {len(scene.loops)} loop joint(s)"
-            raise UnsupportedError("SolverSPO", what, "loops='cut' leaves them open")
+            _check_loop_joints(model, worlds.loops)
         declare(exchange, wp.float32)
         factor: Any = lambda mask: wp.array(mask, dtype=wp.float32, device=device)  # noqa: E731
         self._factors = {
@@ -171,10 +183,16 @@ class SolverSPO(Plugs, SolverBase):
         """Compile and allocate all that steps need."""
         state, control = self.model.state(), self.model.control()
         if self.integrator == "semi_implicit":
-            self.step(state, state, control, None, 1e-3, observables=self.observables(self.SUPPORTED_OBSERVABLES))
+            self.step(state, state, control, None, 1e-3, observables=self.observables(self.supported_observables))
         self.step(state, state, control, None, 1e-3)
         self.reset(state)
         self._refresh(self.dynamics.variable)
+
+    @property
+    def supported_observables(self) -> frozenset[str]:
+        """All of them; but what a body receives through its joint is not known where loops are closed."""
+        lost = {SolverBase.ObservableKind.BODY_PARENT_F} if self.dynamics.closed else set()
+        return self.SUPPORTED_OBSERVABLES - lost
 
     # -- steps -----------------------------------------------------------------------------------------------------
     def step(
@@ -280,6 +298,10 @@ class SolverSPO(Plugs, SolverBase):
     def reset(self, state: newton.State, world_mask: Any = None, flags: Any = None) -> None:
         """Put worlds back to the model's ``joint_q`` and ``joint_qd``, and their bodies where these put them.
 
+        Loops and mimics that hold are closed: what is put back goes to the nearest state, see
+        :meth:`warp_spo.Dynamics.project`; a world where that is not found is NaN, or open still: a start nearer to it
+        is needed.
+
         Args:
             state: changed in place.
             world_mask: bool [world_count + 1], the last entry for what belongs to no world; None is all worlds.
@@ -296,6 +318,14 @@ class SolverSPO(Plugs, SolverBase):
         if flags & StateFlags.JOINT_QD:
             wp.copy(self._qd.buffer("first"), self._qd.read(self.model.joint_qd, "first"))
             self._qd.write(self._qd.buffer("first"), state.joint_qd, mask)
+        if self.dynamics.closed and flags & (StateFlags.JOINT_Q | StateFlags.JOINT_QD):
+            q, qd = self._q.read(state.joint_q, "q"), self._qd.read(state.joint_qd, "qd")
+            closed = self._q.buffer("closed"), self._qd.buffer("closed")
+            self.dynamics.project(q, qd, iterations=CLOSING_STEPS if flags & StateFlags.JOINT_Q else 0, out=closed)
+            if flags & StateFlags.JOINT_Q:
+                self._q.write(closed[0], state.joint_q, mask)
+            if flags & StateFlags.JOINT_QD:
+                self._qd.write(closed[1], state.joint_qd, mask)
         if flags & StateFlags.BODY_F and state.body_f is not None:
             self._wrenches.write(self._wrenches.buffer("none"), state.body_f, mask)
         if flags & (StateFlags.BODY_Q | StateFlags.BODY_QD):
@@ -375,6 +405,25 @@ class SolverSPO(Plugs, SolverBase):
             return ""
         at = tuple(differ[0].tolist())
         return f"is {held[at]} at {list(at)} where the solver uses {used[at]}"
+
+
+def _check_loop_joints(model: newton.Model, joints: np.ndarray) -> None:
+    """Raise if a loop joint, rows [world, joint] of the model, is more than a constraint."""
+    read = lambda name: _host(model, f"joint_{name}")  # noqa: E731
+    driven = np.isin(read("target_mode"), (JointTargetMode.NONE, JointTargetMode.EFFORT), invert=True)
+    acts = {name: read(name) != 0.0 for name in ("damping", "stiffness", "friction", "armature")}
+    acts |= {name: (read(name) != 0.0) & driven for name in ("target_ke", "target_kd")}
+    bounds = {"limit_lower": UNLIMITED, "limit_upper": UNLIMITED, "velocity_limit": DEFAULT_BOUND}
+    acts |= {name: np.abs(read(name)) < none for name, none in bounds.items()}
+    start = read("qd_start")
+    for joint in joints.ravel():
+        for name, mask in acts.items():
+            if mask[start[joint] : start[joint + 1]].any():
+                raise UnsupportedError(
+                    "SolverSPO",
+                    f"joint_{name} of loop joint {model.joint_label[joint]!r}, which is a constraint alone,",
+                    "make it a joint of the articulation, and close the loop at another one",
+                )
 
 
 def _with_drives(scene: Scene, position: np.ndarray, driven: np.ndarray) -> Scene:

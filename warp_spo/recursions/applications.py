@@ -8,7 +8,7 @@ from typing import Any
 from ..trace.emit import Store
 from ..trace.graph import Value, reciprocal, sqrt
 from ..trace.spatial import ZERO, Articulated, Rigid, Vector, cross, dot
-from . import articulated, composite, determinant, hybrid, motion, newton_euler, reactions, step
+from . import articulated, closed_step, composite, determinant, hybrid, motion, newton_euler, reactions, step
 from .hybrid import Given
 from .links import Link
 from .motion import STILL
@@ -29,9 +29,16 @@ class Applications(Trace):
         return Operators(self).stores(expression)
 
     # -- time steps ------------------------------------------------------------------------------------------------
-    def step(self, qdd: bool = False, status: bool = False) -> list[Store]:
-        """out = qd', q_out = q', qdd_out, status"""
-        return step.Step(self).stores(qdd, status)
+    def step(self, qdd: bool = False, status: bool = False, how: Any = None) -> list[Store]:
+        """out = qd', q_out = q', qdd_out, status; ``how`` loops are embedded, see :class:`.embedded.Embedding`."""
+        if "multipliers" in self.given:
+            return closed_step.MultiplierStep(self).stores(qdd, status)
+        which = step.Step(self) if how is None else closed_step.ClosedStep(self, how)
+        return which.stores(qdd, status)
+
+    def step_system(self) -> list[Store]:
+        """What the multipliers of a step solve; as :meth:`.multipliers.Multipliers.loop_system`."""
+        return closed_step.MultiplierStep(self).system()
 
     def integrate(self) -> list[Store]:
         return step.integrate(self)

@@ -16,6 +16,7 @@ the inertia that the parent feels, t and z the forces of the hinges and on the p
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 from ..trace.graph import Value, absolute, guarded, reciprocal, sqrt
@@ -151,9 +152,17 @@ class Factor:
 
 
 def factor(
-    cluster: Cluster, space: NullSpace | Basis, places: dict[int, Placed], own: dict[int, Articulated], epsilon: float
+    cluster: Cluster,
+    space: NullSpace | Basis,
+    places: dict[int, Placed],
+    own: dict[int, Articulated],
+    epsilon: float,
+    stiffened: Callable[[Link], Link],
 ) -> Factor:
-    """Eliminate the rates of a cluster from the articulated inertias that its links carry, ``own``."""
+    """Eliminate the rates of a cluster from the articulated inertias that its links carry, ``own``.
+
+    ``stiffened``: a link with all that its pivots feel beside its inertia.
+    """
     X, inside = space.basis, set(map(id, cluster.links))
     carried: dict[int, Articulated] = {}
     handed, M, F = NO_INERTIA, {}, {}
@@ -163,7 +172,8 @@ def factor(
         for child in link.children:
             if id(child) in carried:
                 P = P + carried[id(child)]
-        for dof, armature, H in zip(link.dofs, link.armature, articulated.columns(link, places[key]), strict=True):
+        H_T = articulated.columns(link, places[key])
+        for dof, armature, H in zip(link.dofs, stiffened(link).armature, H_T, strict=True):
             n, f = P.apply(Vector(H[:3]), Vector(H[3:]))
             over: Link | None = link
             while over is not None and id(over) in inside:
@@ -218,6 +228,7 @@ def hinge_forces(
     own: dict[int, Articulated],
     loads: dict[int, Vector],
     qdd: Any,
+    stiffened: Callable[[Link], Link] = lambda link: link,
 ) -> tuple[Columns, Vector]:
     """t by dof, and z in the parent's frame, at ``qdd`` and alpha(p) = 0; ``loads`` are the z that links carry."""
     alpha: dict[int, tuple[Vector, Vector]] = {}
@@ -235,7 +246,7 @@ def hinge_forces(
             if id(child) in passed:
                 force = force + passed[id(child)]
         n, f = Vector(force[:3]), Vector(force[3:])
-        tau |= zip(link.dofs, newton_euler.hinge_force(link, places[key], n, f, qdd), strict=True)
+        tau |= zip(link.dofs, newton_euler.hinge_force(stiffened(link), places[key], n, f, qdd), strict=True)
         if link.parent is None:
             continue
         n, f = places[key].pose.force_to_parent(n, f)

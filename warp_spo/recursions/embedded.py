@@ -145,7 +145,8 @@ class Embedded(Applications):
                 through = [(self.places[id(c)].pose, swept.links[id(c)].P) for c in link.children if id(c) in apart]
                 through += [(HERE, inner[other]) for other in bundles]
                 place = self.places[key]
-                swept.links[key] = done = articulated.factor(link, place, carried, through, self.epsilon)
+                stiff = self.stiffened(link)
+                swept.links[key] = done = articulated.factor(stiff, place, carried, through, self.epsilon)
                 self.at(link, "z")
                 right = [tau(dof) for dof in link.dofs]
                 inner[key] = done.in_parent
@@ -178,10 +179,12 @@ class Embedded(Applications):
         key = id(cluster)
         swept.demanded[key] = k
         self.at_cluster(cluster, "D")
-        swept.clusters[key] = done = aggregates.factor(cluster, space, self.places, own, self.epsilon)
+        swept.clusters[key] = done = aggregates.factor(
+            cluster, space, self.places, own, self.epsilon, self.stiffened
+        )
         self.at_cluster(cluster, "z")
         t, force = aggregates.hinge_forces(
-            cluster, self.places, self.motions, own, z, lambda dof: k.get(dof, 0.0)
+            cluster, self.places, self.motions, own, z, lambda dof: k.get(dof, 0.0), self.stiffened
         )
         eps = [done.nothing + total(x * (tau(dof) - t[dof]) for dof, x in column.items()) for column in done.X]
         swept.cluster_rates[key] = rates = done.solve(eps)

@@ -6,6 +6,7 @@ tau + Y* lambda. Y touches only what lies between a loop's ends; loops may span 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from ..trace.emit import Store
@@ -27,10 +28,10 @@ class Multipliers(Embedded):
         found = [row for constraint in self.constraints for row in constraint.jacobian(self.places)]
         return [{dof: x for dof, x in row.items() if not (x.__class__ is float and x == 0.0)} for row in found]
 
-    def loop_system(self) -> list[Store]:
-        """out [row, row] = Y Mass^-1 Y*; right [row] = Y qdd(0) + Y' qd; size [row]"""
+    def loop_system(self, tau: Callable[[int], Value] | None = None) -> list[Store]:
+        """out [row, row] = Y Mass^-1 Y*; right [row] = Y qdd(0) + Y' qd; size [row]; for ``tau`` or the array."""
         moves = "qd" in self.given
-        done, rates, _ = self.reduce(self.vector("tau"), moves, loads=True)
+        done, rates, _ = self.reduce(tau or self.vector("tau"), moves, loads=True)
         open_ = {item.index[0]: item.value for item in self.expand(done, rates, self.base)}
         qd = self.vector("qd") if moves else None
         self.graph.step = "loops|g"

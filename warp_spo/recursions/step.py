@@ -23,7 +23,7 @@ GUESS, GAIN, MISSED = "guess", "gain", "missed"
 """Variables of a loop over passes, zero at first: by dof, the guess of u, and u; whether a guess missed a piece."""
 LOOPED = (GUESS, GAIN, MISSED)
 SHORT = 10  # dofs up to which passes solve a system that is formed once
-NOT_POSITIVE, NOT_FINITE, NOT_SETTLED = 1, 2, 5  # status words; those of warp_spo.status but for the last
+NOT_POSITIVE, NOT_FINITE, NOT_SETTLED, CHANGE_POINT = 1, 2, 5, 6  # status words; the first two as warp_spo.status
 
 
 class Step:
@@ -50,11 +50,15 @@ class Step:
             vector("target_qd"),
         )
         self.laws: dict[int, list[Law]] = {}  # by dof
+        self.forces: dict[int, Value] = {}
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
         """out = qd', q_out = q'; with ``qdd`` qdd_out = (qd' - qd) / h, with ``status`` the word of each world."""
         trace = self.trace
-        gains = self._in_joint_space() if self._short else self._swept()
+        trace.stiffened = self._stiffened
+        tau = trace.vector("tau")
+        found = self._accelerations(lambda dof: tau(dof) + self.forces[dof])
+        gains = {dof: self.h * value for dof, value in found.items()}
         looped = self._looped(gains)
         if looped:
             gains = {dof: trace.graph.input(GAIN, dof) for dof in gains}
@@ -67,10 +71,18 @@ class Step:
             stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
             if qdd:
                 stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
+        stores = self._put_back(stores)
         if status:
             trace.graph.step = "status|s"
             stores.append(Store("status", (), self._word([item.value for item in stores], bool(looped))))
         return looped + stores
+
+    def _accelerations(self, tau: Callable[[int], Value]) -> dict[int, Value]:
+        """qdd by dof for ``tau``, the pieces that hold at the guess in Mass."""
+        if self._short:
+            return self._in_joint_space(tau)
+        done, rates, _ = self.trace.reduce(tau, moves=True, loads=True)
+        return {item.index[0]: item.value for item in self.trace.expand(done, rates, self.trace.base)}
 
     @property
     def _short(self) -> bool:
@@ -79,35 +91,34 @@ class Step:
             return False
         return any(law.bends for link in self.links for laws in self.impedance.laws(link) for law in laws)
 
-    def _swept(self) -> dict[int, Value]:
-        """u by dof, by sweeps over the tree."""
-        trace, tau, forces = self.trace, self.trace.vector("tau"), {}
-
-        def stiffened(link: Link) -> Link:
-            pieces = self._pieces(link)
-            forces.update({dof: piece.force for dof, piece in zip(link.dofs, pieces, strict=True)})
-            armature = (a + self.h * piece.resistance for a, piece in zip(link.armature, pieces, strict=True))
-            return dataclasses.replace(link, armature=tuple(armature))
-
-        trace.stiffened = stiffened
-        done, rates, _ = trace.reduce(lambda dof: tau(dof) + forces[dof], moves=True, loads=True)
-        return {item.index[0]: self.h * item.value for item in trace.expand(done, rates, trace.base)}
-
-    def _in_joint_space(self) -> dict[int, Value]:
-        """u by dof, of a system that is formed once for all passes."""
-        tau, system = self.trace.vector("tau"), JointSpace(self.trace)
+    def _in_joint_space(self, tau: Callable[[int], Value]) -> dict[int, Value]:
+        """The same, of a system that is formed once for all passes."""
+        system = JointSpace(self.trace)
         pieces: dict[int, Law] = {}
         self.trace.ahead = [*system.mass.values(), *system.bias.values()]
         for link in self.links:
             self.trace.at(link, "r")
             pieces.update(zip(link.dofs, self._pieces(link), strict=True))
-        qdd = system.solve(lambda dof: self.h * pieces[dof].resistance, lambda dof: tau(dof) + pieces[dof].force)
-        return {dof: self.h * value for dof, value in enumerate(qdd)}
+        return dict(enumerate(system.solve(lambda dof: self.h * pieces[dof].resistance, tau)))
+
+    def _put_back(self, stores: list[Store]) -> list[Store]:
+        """The stores with what constrains the state after the step seen to."""
+        return stores
+
+    def _unresolved(self) -> Value:
+        """Not 0 where constraints lose rank."""
+        return 0.0
+
+    def _stiffened(self, link: Link) -> Link:
+        pieces = zip(link.armature, self._pieces(link), strict=True)
+        return dataclasses.replace(link, armature=tuple(a + self.h * piece.resistance for a, piece in pieces))
 
     def _pieces(self, link: Link) -> list[Law]:
         """What holds at the guess, of each dof."""
         self.laws |= dict(zip(link.dofs, self.impedance.laws(link), strict=True))
-        return [added([law.piece(self._guess(dof)) for law in self.laws[dof]]) for dof in link.dofs]
+        pieces = [added([law.piece(self._guess(dof)) for law in self.laws[dof]]) for dof in link.dofs]
+        self.forces |= {dof: piece.force for dof, piece in zip(link.dofs, pieces, strict=True)}
+        return pieces
 
     def _guess(self, dof: int) -> Value:
         """Of u; what the pass before has found, unless a law asked for another."""
@@ -148,7 +159,7 @@ class Step:
                 inputs += [trace.graph.input(name, body, c) for body in range(scene.body_count) for c in range(6)]
         settled = less(trace.graph.input(MISSED, 0), 0.5) if looped else 1.0
         word = select(_finite(results), select(settled, 0.0, NOT_SETTLED), NOT_POSITIVE)
-        return select(_finite(inputs), word, NOT_FINITE)
+        return select(_finite(inputs), select(self._unresolved(), CHANGE_POINT, word), NOT_FINITE)
 
 
 def _finite(values: list[Value]) -> Value:
