@@ -647,7 +647,7 @@ def test_every_granularity_closes_loops(granularity, device):
     dyn = spo.Dynamics(scene, 1, device=device, dtype="float64", loops="embed", granularity=granularity)
     other = spo.Dynamics(scene, 1, device=device, dtype="float64", loops="embed")
     np.testing.assert_array_equal(dyn.forward_dynamics(q, q, q), other.forward_dynamics(q, q, q))
-    for name in ("mass_matrix_inverse", "solve_mass_matrix", "project", "closure_error"):
+    for name in ("mass_matrix_inverse", "solve_mass_matrix", "operational_inertia", "project", "closure_error"):
         dyn.prepare(name)
 
 

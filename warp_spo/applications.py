@@ -149,7 +149,7 @@ class Applications:
         """J qdd + J' qd: how the frames accelerate, in one outward sweep; with forward_dynamics, task-space dynamics.
 
         Acceleration of each frame's origin [m/s^2], then angular acceleration [rad/s^2], inertial axes. Gravity is not
-        in it. qd and qdd None are zero.
+        in it. qd and qdd None are zero. They are of all dofs whatever ties them, as forward_dynamics gives them.
 
         Returns:
             [world, frame, 6]
@@ -164,6 +164,8 @@ class Applications:
 
     def operational_inertia_inverse_product(self, q: Any, x: Any, frames: Sequence[Frame], out: Any = None) -> Any:
         """J Mass^-1 J* x in O(dof), nothing formed: what wrenches x on the frames make these accelerate.
+
+        With loops embedded they hold, as in :meth:`operational_inertia`.
 
         Args:
             q: coordinates [world, coordinate].
