@@ -299,10 +299,10 @@ def test_no_world_too_many_dofs_and_none(device):
 
 
 # -- operations --------------------------------------------------------------------------------------------------------
-PINNED = {"arm7": (2522, 1456, 1814), "quadruped": (10155, 7857, 6864), "humanoid": (22824, 26883, 12968)}
+PINNED = {"arm7": (2522, 1456, 2502), "quadruped": (10155, 7857, 8770), "humanoid": (22824, 26883, 15998)}
 """Scene of the benchmarks -> operations of a world: derivatives of inverse dynamics, of Mass; J* y of forward dynamics.
 
-The last is 1.2 to 1.7 times forward dynamics.
+The last, with the accelerations that it takes, is 1.9 to 2.3 times forward dynamics.
 """
 
 
@@ -316,7 +316,7 @@ def test_operations_are_no_more_than_they_were(name):
     found = (
         find("inverse_dynamics_derivatives", state, (1, 3, n, n)),
         find("mass_matrix_derivative", {"q": q}, (1, n, n, n)),
-        find("forward_dynamics_vjp", {**state, "cotangent": rate}, q, bars, wrt=("q", "qd", "tau")),
+        find("forward_dynamics_vjp", {"q": q, "qd": rate, "tau": rate, "cotangent": rate}, q, bars, wrt=("q", "qd", "tau")),
     )
     counts = tuple(program.operations for program in found)
     assert all(a <= b for a, b in zip(counts, PINNED[name], strict=True)), counts

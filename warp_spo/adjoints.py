@@ -1,6 +1,7 @@
 """Products with Jacobians of the dynamics, J* y and J x: methods of :class:`warp_spo.Dynamics`.
 
-No recording: the reverse of forward dynamics is its own solve and one Newton-Euler recursion backwards, in one kernel.
+No recording: forward dynamics is gone back through by its own solve and one Newton-Euler recursion backwards, in one
+kernel, or in two where a warp works on a limb.
 """
 
 from __future__ import annotations
@@ -92,10 +93,10 @@ class Adjoints:
         wrt: Sequence[str] = ("q", "qd", "tau"),
         out: dict[str, Any] | None = None,
     ) -> dict[str, Any]:
-        """Gradients of cotangent . qdd: J* cotangent of :meth:`forward_dynamics`, in one kernel.
+        """Gradients of cotangent . qdd: J* cotangent of :meth:`forward_dynamics`, about twice its operations.
 
-        With lambda = Mass^-1 cotangent it is lambda for tau, and -(d tau / d x)* lambda, one Newton-Euler recursion in
-        reverse, for everything else.
+        With lambda = Mass^-1 cotangent, which the factors that give qdd give too, it is lambda for tau, and
+        -(d tau / d x)* lambda, one Newton-Euler recursion in reverse, for everything else.
 
         Args:
             q, qd, tau, body_f: as there.

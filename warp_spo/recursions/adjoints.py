@@ -123,12 +123,11 @@ class Adjoints(Derivatives):
 
         self.stiffened = stiffened
         solved = self.solved(lambda dof: h * rates[dof])
-        tau = self.inverse_dynamics()
-        missing = [item.value - forces[item.index[0]] for item in tau]
-        inputs = [x for x in ordered(missing) if x.op == "input"]
-        seeds = [-solved[item.index[0]] for item in tau]
-        for x, value in zip(inputs, reverse(missing, inputs, seeds), strict=True):
-            found[x.args] = found.get(x.args, 0.0) + value
+        power = Power(self, lambda dof: -solved[dof], qdd)
+        inputs = [x for x in ordered(forces.values()) if x.op == "input"]
+        ways = reverse(forces.values(), inputs, [solved[dof] for dof in forces])
+        for entry, way in [*power.ways.items(), *zip((x.args for x in inputs), ways, strict=True)]:
+            found[entry] = found.get(entry, 0.0) + way
         for dof in dofs:
             found["qd", dof] = found.get(("qd", dof), 0.0) + rates[dof]
             found["tau", dof] = solved[dof]
