@@ -22,7 +22,8 @@ def derive(s) -> wp.Kernel:
     @wp.func
     def placed(pose: wp.array3d[wp.float64], world: int, i: int):
         p = vec3(pose[world, i, 0], pose[world, i, 1], pose[world, i, 2])
-        return d.pose(d.quaternion_rotation(pose[world, i, 3], pose[world, i, 4], pose[world, i, 5], pose[world, i, 6]), p)
+        R = d.quaternion_rotation(pose[world, i, 3], pose[world, i, 4], pose[world, i, 5], pose[world, i, 6])
+        return d.pose(R, p)
 
     @wp.kernel(module=f"warp_spo_parameters_{T.__name__}", enable_backward=False)
     def kernel(

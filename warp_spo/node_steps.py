@@ -155,8 +155,7 @@ def velocity(pose: Vector, v: Vector, arm: Vector) -> list[Value]:
 @step(pose=POSE, v=MOTION)
 def motion_to_child(pose: Vector, v: Vector) -> list[Value]:
     """phi*(p, k) v"""
-    w, v = _pose(pose).motion_to_child(*_parts(v))
-    return [*w, *v]
+    return [x for part in _pose(pose).motion_to_child(*_parts(v)) for x in part]
 
 
 @step(pose=POSE, above=MOTION, own=MOTION)
@@ -239,7 +238,7 @@ def eliminated(P: Vector, h: Vector, armature: Value, least: Value) -> list[Valu
 @step(P=ARTICULATED, U=MOTION, D=SCALAR)
 def less(P: Vector, U: Vector, D: Value) -> list[Value]:
     """P - U D^-1 U*"""
-    return Articulated.unpacked(P).less(U, U * reciprocal(D)).packed
+    return bodies.without(Articulated.unpacked(P), U, D).packed
 
 
 @step(coupling=SCALAR, share=SCALAR, size=SCALAR)

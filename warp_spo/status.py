@@ -17,9 +17,9 @@ def write(
 ) -> None:
     """Fill ``status`` [world] for forward dynamics that has just run: one sweep inward, and a launch over the worlds.
 
-    Reads pose, axis, articulated, gain and pivot. Sweeps have left them in the workspace (``factored``); for a recursion that
-    keeps them elsewhere the factorisation is swept now. What that loses bounds what the other form loses, whose hinges
-    lie along axes.
+    Reads pose, axis, articulated, gain and pivot. Sweeps have left them in the workspace (``factored``); for a
+    recursion that keeps them elsewhere the factorisation is swept now. What that loses bounds what the other form
+    loses, whose hinges lie along axes.
     """
     declare(kernels, run.steps)
     if not factored:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..trace.graph import Value, absolute, guarded, is_constant, reciprocal
+from ..trace.graph import Value, absolute, guarded, is_constant, quotient, reciprocal
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Rigid, Vector, cross, dot, magnitude, symmetric, total
 from .links import BALL, FREE, SLIDE, TURN, Link, Placed
 from .motion import NONE, Motion, carried, in_hinge, in_link
@@ -32,6 +32,10 @@ class Pivot(NamedTuple):
     U: Vector
     D: Value
     inverse: Value
+
+    def share(self, x: Value) -> Value:
+        """D^-1 x"""
+        return quotient(x, self.D) if self.unit is None else x * self.inverse
 
 
 @dataclasses.dataclass
@@ -177,8 +181,12 @@ def eliminate(P: Articulated, column: Vector, armature: Value, least: Value) -> 
     n, f = P.apply(Vector(column[:3]), Vector(column[3:]))
     U = Vector((*n, *f))
     D = guarded(guarded(dot(column, U) + armature, least), 0.0)
-    inverse = reciprocal(D)
-    return Pivot(None, column, U, D, inverse), P.less(U, U * inverse)
+    return Pivot(None, column, U, D, reciprocal(D)), without(P, U, D)
+
+
+def without(P: Articulated, U: Vector, D: Value) -> Articulated:
+    """P - U D^-1 U*; along an axis its row and column vanish without a rest."""
+    return P.less(U, Vector(quotient(u, D) for u in U))
 
 
 def brought(coupling: Value, share: Value, size: Value) -> Value:
@@ -212,13 +220,13 @@ def reduced(
 
 def taken(pivot: Pivot, z: Vector, b: Value) -> tuple[Value, Vector]:
     """D^-1 eps of a pivot, eps = b - H z, and z + G eps."""
-    rate = (b - (z[pivot.unit] if pivot.unit is not None else dot(pivot.column, z))) * pivot.inverse
+    rate = pivot.share(b - (z[pivot.unit] if pivot.unit is not None else dot(pivot.column, z)))
     return rate, z + pivot.U * rate
 
 
 def released(pivot: Pivot, alpha: Sequence[Value], rate: Value) -> tuple[Value, list[Value]]:
     """qdd of a pivot, D^-1 eps - G* alpha, and alpha + H* qdd."""
-    qdd = rate - pivot.inverse * dot(pivot.U, alpha)
+    qdd = rate - pivot.share(dot(pivot.U, alpha))
     if pivot.unit is None:
         return qdd, [a + h * qdd for a, h in zip(alpha, pivot.column, strict=True)]
     return qdd, [a + qdd if i == pivot.unit else a for i, a in enumerate(alpha)]
