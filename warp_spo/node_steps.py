@@ -29,6 +29,11 @@ from .trace.graph import Graph, Value, reciprocal
 from .trace.spatial import Articulated, Matrix, Pose, Rigid, Vector
 
 SCALAR = 1
+FUSED = """\
+#if defined(__clang__)
+#pragma clang fp contract(fast)
+#endif
+"""  # as CUDA's compiler does: a product that is added is not rounded first
 STEPS: dict[str, tuple[dict[str, int], Callable]] = {}
 
 
@@ -73,7 +78,7 @@ def _emitted(name: str, sizes: dict[str, int], step: Callable, T: type) -> wp.Fu
     shape = {SCALAR: c}.get(len(values), f"wp::vec_t<{len(values)}, {c}>")
     shape = f"wp::mat_t<3, 3, {c}>" if isinstance(found, Matrix) else shape
     types_of = {array: T if size == SCALAR else wp.types.vector(size, T) for array, size in sizes.items()}
-    native = f"{NATIVE[c]}{shape} result;\n{statements}\nreturn result;"
+    native = f"{FUSED}{NATIVE[c]}{shape} result;\n{statements}\nreturn result;"
     return straight.function(f"{name}_{dtype}", native, types_of, kind)
 
 
