@@ -7,7 +7,6 @@ columns H*, (omega; v) in the node frame each. Quantities are vectors, packed as
 from __future__ import annotations
 
 import functools
-import types
 from collections.abc import Callable
 from typing import Any
 
@@ -37,25 +36,25 @@ FUSED = """\
 STEPS: dict[str, tuple[dict[str, int], Callable]] = {}
 
 
-class Steps(types.SimpleNamespace):
-    """Warp functions by name.
+class Steps:
+    """Warp functions by name, and the types that they take.
 
     Attributes:
-        T: their scalar type. wide: the same in float64.
+        T: the scalar type. wide: the same in float64.
         least: share of what cancels in a pivot that it must exceed.
     """
 
-    __hash__ = object.__hash__  # kernels are made once for each
+    def __init__(self, T: type):
+        self.T, self.least = T, bodies.LEAST * EPSILON[T.__name__]
+        self.wide: Steps = self if T is wp.float64 else steps(wp.float64)
+        vars(self).update(vars(spatial(T)))
+        vars(self).update({name: _emitted(name, sizes, step, T) for name, (sizes, step) in STEPS.items()})
 
 
 @functools.cache
 def steps(T: type) -> Steps:
     """Types, loads, stores and steps for scalars of type ``T`` (wp.float32 or wp.float64)."""
-    found = Steps(**vars(spatial(T)), least=bodies.LEAST * EPSILON[T.__name__])
-    found.wide = found if T is wp.float64 else steps(wp.float64)
-    emitted = {name: _emitted(name, sizes, step, T) for name, (sizes, step) in STEPS.items()}
-    vars(found).update(emitted)
-    return found
+    return Steps(T)
 
 
 def _emitted(name: str, sizes: dict[str, int], step: Callable, T: type) -> wp.Function:
@@ -262,5 +261,5 @@ def taken(h: Vector, U: Vector, D: Value, z: Vector, b: Value) -> list[Value]:
 @step(h=MOTION, U=MOTION, D=SCALAR, alpha=MOTION, rate=SCALAR)
 def released(h: Vector, U: Vector, D: Value, alpha: Vector, rate: Value) -> list[Value]:
     """alpha + H* qdd, then qdd = rate - G* alpha."""
-    qdd, alpha = bodies.released(Pivot(None, h, U, D, reciprocal(D)), alpha, rate)
-    return [*alpha, qdd]
+    qdd, after = bodies.released(Pivot(None, h, U, D, reciprocal(D)), alpha, rate)
+    return [*after, qdd]
