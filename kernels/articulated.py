@@ -110,8 +110,8 @@ def reduce(s) -> wp.Kernel:
                 right = T(1.0)
             h, U = s.load_motion(axis, dof, world), s.load_motion(gain, dof, world)
             found = s.taken(h, U, pivot[dof, world], z, right)
-            z = found[0:6]
-            out[world, dof, column] = found[6]
+            z = found[1:7]
+            out[world, dof, column] = found[0]
         if topology.parent[node] >= 0:
             s.store_motion(z_out, node, lane, s.force_to_parent(s.load_pose(pose, node, world), z))
 
@@ -152,8 +152,8 @@ def expand(s) -> wp.Kernel:
         for dof in range(first, first + topology.dof_count[node]):
             h, U = s.load_motion(axis, dof, world), s.load_motion(gain, dof, world)
             found = s.released(h, U, pivot[dof, world], alpha, out[world, dof, column])
-            alpha = found[0:6]
-            out[world, dof, column] = found[6]
+            alpha = found[1:7]
+            out[world, dof, column] = found[0]
         s.store_motion(alpha_out, node, lane, alpha)
 
     return kernel

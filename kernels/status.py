@@ -135,7 +135,7 @@ def digits(s) -> wp.Kernel:
             S_J += wp.outer(n_D, error * n_D - n_S) - wp.outer(n_S, n_D)
             S_C += wp.outer(n_D, error * f_D - f_S) - wp.outer(n_S, f_D)
             S_m += wp.outer(f_D, error * f_D - f_S) - wp.outer(f_S, f_D)
-            P = s.less(P, U, D)
+            P = s.without(P, U, D)
             J, C, m = s.J_of(P), s.C_of(P), s.m_of(P)
             if along:
                 own = T(0.0)
