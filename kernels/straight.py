@@ -316,6 +316,18 @@ def looped(ahead: str, a_pass: str, last: str, names: tuple[str, str, str], entr
     return "\n".join([ahead, *declared, loop, last])
 
 
+def function(name: str, native: str, arguments: dict[str, type], result: type | None = None) -> wp.Function:
+    """A Warp function of ``arguments``, by name, that runs ``native``."""
+    types = {f"type_of_{argument}": kind for argument, kind in arguments.items()} | {"type_of_result": result}
+    declared = ", ".join(f"{argument}: type_of_{argument}" for argument in arguments)
+    source = f"@wp.func_native(native)\ndef {name}({declared}){' -> type_of_result' if result else ''}: ...\n"
+    file = f"<{name}>"
+    linecache.cache[file] = len(source), None, source.splitlines(True), file  # where Warp looks for the source
+    space = types | {"wp": wp, "native": native, "__name__": name}
+    exec(compile(source, file, "exec"), space)
+    return space[name]
+
+
 def kernel(
     name: str, native: str, arrays: list[tuple[str, int]], T, registers: int | None = None, wide: tuple = ()
 ) -> wp.Kernel:
