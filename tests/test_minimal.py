@@ -238,8 +238,8 @@ def test_what_speaks_of_independent_dofs_fits_what_speaks_of_all(device):
     np.testing.assert_allclose(np.einsum("b,wbi->wi", scene.values["body_mass"][0], moves), force[:, :3], atol=1e-8)
 
 
-OF_ALL_DOFS = {"forward_dynamics", "passive_force", "body_poses", "body_velocities", "integrate", "frame_accelerations",
-               "body_accelerations", "closure_error", "project"}
+OF_ALL_DOFS = {"forward_dynamics", "passive_force", "body_poses", "body_velocities", "body_states", "integrate",
+               "frame_accelerations", "body_accelerations", "closure_error", "project"}
 """What speaks of all dofs, or of bodies, whatever ties them."""
 OF_MULTIPLIERS = {"inverse_dynamics", "mass_matrix", "mass_matrix_inverse", "solve_mass_matrix", "bias_force",
                   "gravity_force", "log_det_mass_matrix", "log_det_mass_matrix_gradient", "mass_matrix_packed",

@@ -321,7 +321,8 @@ class Adjoints:
             return
         results = [zeros(shape) for shape in self.result_shapes(operation, **more)]
         if operation == "forward_dynamics":
-            self.forward_dynamics_vjp(**given, cotangent=results[0], wrt=wrt or tuple(given))
+            for qdd in (None, results[0]):
+                self.forward_dynamics_vjp(**given, cotangent=results[0], qdd=qdd, wrt=wrt or tuple(given))
         else:
             cotangents = results[: 2 if operation == "step" else 1]
             self.pulled_back(operation, given, more, results, cotangents, wrt or tuple(given))
