@@ -256,13 +256,12 @@ def _held(frame: Frame, c: str) -> list[str]:
 def _each(n: int, team: int, statement: str) -> str:
     """``statement`` for every entry i of the rows of the worlds that are present, the whole team side by side."""
     turns = -(-WARP * n // team)
-    loop = f"for (int k = 0; k < {turns}; ++k) {{ const int i = member + {team} * k;"
     some = "" if turns * team == WARP * n else f"if (i < {WARP * n}) "
     return f"""if (present == 32) {{
     #pragma unroll
-    {loop} {some}{statement} }}
+    for (int k = 0; k < {turns}; ++k) {{ const int i = member + {team} * k; {some}{statement} }}
 }} else {{
-    {loop} if (i < present * {n}) {statement} }}
+    for (int i = member; i < present * {n}; i += {team}) {{ {statement} }}
 }}"""
 
 
