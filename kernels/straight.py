@@ -12,8 +12,8 @@ from typing import NamedTuple
 import warp as wp
 
 from .elementary import NATIVE
+from .spreading import TAKE, TILE, WARP, Spread
 
-WARP = 32
 LONG_COPY = 64  # entries of a row from which it is copied to shared memory without passing through registers
 ON_ITS_WAY = """\
 #define ON_ITS_WAY(to, from) asm volatile("cp.async.ca.shared.global [%0], [%1], %2;" \
@@ -22,10 +22,10 @@ ARRIVED = 'asm volatile("cp.async.wait_all;" ::: "memory");'
 SHARED_BYTES = 46 * 1024  # that a block may declare: 48 KiB less what Warp takes
 C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
 MASKS = ("prescribed",)  # arrays of booleans
-INTEGERS = ("place", "shifts", "status")  # arrays of whole numbers, one axis
+INTEGERS = ("place", "shifts", "status", "seats")  # arrays of whole numbers, one axis
 MOST_PASSES = 16  # of a loop; 13 were needed at most, see CONTRIBUTING
-IN_PLACE, STAGED, MAPPED, TILED, DIRECT = "in place", "staged", "mapped", "tiled", "direct"
-TILE = 8  # worlds of a tile: an entry of theirs fills a sector of 32 bytes
+IN_PLACE, STAGED, MAPPED, RELAYED, TILED, DIRECT = "in place", "staged", "mapped", "relayed", "tiled", "direct"
+SPREAD = (MAPPED, RELAYED)  # by a table
 
 
 class Row(NamedTuple):
@@ -41,15 +41,20 @@ class Result(NamedTuple):
 
     Attributes:
         way: IN_PLACE: entry by entry over ``row``, which is read first; STAGED: through shared memory, as it is;
-            MAPPED: through shared memory, ``slots`` values that a table ``place`` [entry] spreads, -1 being zero;
-            TILED: the same values to memory as [tile, slot, world of the tile], for the kernels of .tiles; DIRECT: each
-            entry to memory by itself.
+            MAPPED: through shared memory, ``slots`` values that a table ``place`` spreads; RELAYED: the same through
+            memory first, a few worlds at a time; both see .spreading; TILED: those values to memory as [tile, slot,
+            world of the tile], for the kernels of .tiles; DIRECT: each entry to memory by itself.
     """
 
     way: str
     array: Row
     row: str = ""
     slots: int = 0
+
+    @property
+    def spread(self) -> Spread:
+        """How a MAPPED or RELAYED one is spread."""
+        return Spread(self.array.entries, self.slots, WARP if self.way == MAPPED else TILE)
 
 
 def pitch(entries: int) -> int:
@@ -98,18 +103,25 @@ class Frame(NamedTuple):
     def scalars(self) -> int:
         """Scalars of shared memory that a group takes."""
         rows = sum(pitch(row.entries) for row in self.rows) if self.staged else 0
-        extra = {STAGED: self.result.array.entries, MAPPED: self.result.slots | 1}.get(self.result.way)
         rows += sum(pitch(row.entries) for row in self.leaving)
-        return WARP * (rows + (0 if extra is None else pitch(extra)) + self.sent + sum(map(len, self.held)))
+        rows += pitch(self.result.array.entries) if self.result.way == STAGED else 0
+        scalars = WARP * (rows + self.sent + sum(map(len, self.held)))
+        if self.result.way == RELAYED:
+            return max(scalars, self.result.spread.scalars) + 1  # when all else has been read; and its seat
+        return scalars + (self.result.spread.scalars if self.result.way == MAPPED else 0)
 
     @property
     def leaving(self) -> tuple[Row, ...]:
         """Further results that leave through shared memory."""
         return tuple(row for row in self.more if self.gathered and row.name not in INTEGERS)
 
+    def bytes(self, T) -> int:
+        """Of shared memory that a block takes."""
+        return self.scalars * self.groups * wp.types.type_size_in_bytes(T)
+
     def fits(self, T) -> bool:
         """Shared memory holds what is staged."""
-        return self.scalars * self.groups * wp.types.type_size_in_bytes(T) <= SHARED_BYTES
+        return self.bytes(T) <= SHARED_BYTES
 
 
 def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
@@ -153,13 +165,17 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     if result.way == IN_PLACE:
         start, width = offset[result.row], pitch(next(row.entries for row in frame.rows if row.name == result.row))
     else:
-        width = pitch(result.slots | 1 if result.way == MAPPED else out.entries)
-        start, at = at, at + (0 if result.way in (DIRECT, TILED) else WARP * width)
+        width = result.spread.pitch if result.way == MAPPED else pitch(out.entries)
+        start, at = at, at + (WARP * width if result.way in (STAGED, MAPPED) else 0)
     own_row = f"{c}* result_row = out.data + world * {out.entries};"
     if result.way == TILED:
         own_row = f"{c}* result_row = out.data + world / {TILE} * {result.slots * TILE} + world % {TILE};"
     if result.way in (DIRECT, TILED):
         text += [own_row]
+    elif result.way == RELAYED:
+        group = f"((long long)seat * {frame.groups} + threadIdx.x / {team})"
+        text += [TAKE, f"{c}* relayed = relay.data + {group} * {WARP * result.slots};"]
+        text += ["#define RELAY(i) relayed[(i) * 32 + lane]"]
     else:
         text += [f"{c}* result_row = stage + {start} + lane * {width};"]
     if frame.sent:
@@ -171,22 +187,25 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
         text += [sync, _stage_out(out, start, width, c, team)]
         text += [_stage_out(row, offset[row.name], pitch(row.entries), c, team) for row in frame.leaving]
     if result.way == MAPPED:
-        text += [sync, _spread_out(result, start, c, team)]
+        text += ["const int done = 0;", f"result_row[{result.slots}] = 0;", sync]
+        text += [result.spread.rows("out", f"(stage + {start})", team, T)]
+    if result.way == RELAYED:
+        text += [result.spread.tiles("relayed", "stage", team, sync, T)]
     text += ["#undef FIELD"] if frame.held else []
     text += ["#else", "const long long world = thread;", "const bool mine = true;"]
     text += [_own_row(row, c) for row in frame.rows]
     text += [_own_result(row, c) for row in frame.more]
-    if result.way == MAPPED:
-        text += [f"{c} result_row[{result.slots}];"]
+    if result.way in SPREAD:
+        text += [f"{c} result_row[{result.slots + 1}];", "#define RELAY(i) result_row[i]"]
     else:
         text += [own_row]
     if frame.sent:
         text += [f"{c} sent[{frame.sent}];", "#define SENT(i) sent[i]"]
     text += [*(_places(frame) if frame.held else []), *_fields(frame.fields, c, bool(frame.held)), cpu]
-    if result.way == MAPPED:
-        text += [f"for (int i = 0; i < {out.entries}; ++i) {{", "    const int slot = place.data[i];",
-                 f"    out.data[world * {out.entries} + i] = slot < 0 ? 0 : result_row[slot];", "}"]
-    text += ["#endif", "#undef SENT", *(["#undef FIELD"] if frame.fields else []), ""]
+    if result.way in SPREAD:
+        text += [f"result_row[{result.slots}] = 0;", f"{c}* row = out.data + world * {out.entries};"]
+        text += [f"for (int i = 0; i < {out.entries}; ++i) row[i] = result_row[place.data[i]];"]
+    text += ["#endif", "#undef SENT", "#undef RELAY", *(["#undef FIELD"] if frame.fields else []), ""]
     return "\n".join(text)
 
 
@@ -279,24 +298,6 @@ def _stage_out(out: Row, offset: int, width: int, c: str, team: int) -> str:
     n = out.entries
     copy = _each(n, team, f"to[i] = from[{_slot('i', n, width)}];")
     return f"{{\n{c}* to = {out.name}.data + first * {n};\nconst {c}* from = stage + {offset};\n{copy}\n}}"
-
-
-def _spread_out(result: Result, offset: int, c: str, team: int) -> str:
-    n, width = result.array.entries, result.slots | 1  # odd: its threads meet in no bank
-    turns = min(8, -(-n // team))  # entries of the table that a thread fetches at once
-    return f"""for (int start = member; start < {n}; start += {turns * team}) {{
-    int slot[{turns}];
-    #pragma unroll
-    for (int u = 0; u < {turns}; ++u) slot[u] = start + {team} * u < {n} ? __ldg(place.data + start + {team} * u) : -1;
-    #pragma unroll
-    for (int u = 0; u < {turns}; ++u) {{
-        if (start + {team} * u >= {n}) break;
-        {c}* to = out.data + first * {n} + start + {team} * u;
-        const {c}* from = stage + {offset} + (slot[u] < 0 ? 0 : slot[u]);
-        #pragma unroll 8
-        for (int k = 0; k < present; ++k) to[k * {n}] = slot[u] < 0 ? ({c})0 : from[k * {width}];
-    }}
-}}"""
 
 
 def _slot(i: str, entries: int, distance: int) -> str:

@@ -202,14 +202,14 @@ def test_equals_reference(name, granularity, dtype, operation, device):
 
 
 @pytest.mark.parametrize("granularity", GRANULARITIES)
-def test_a_long_result_by_tiles(granularity, device, monkeypatch):
-    """Values that go through memory, some worlds at a time, and parameters with them."""
+def test_a_long_result_that_shared_memory_cannot_hold(granularity, device, monkeypatch):
+    """Values that go through memory first, and parameters with them."""
     dyn = dynamics("two arms", granularity, MANY, "float64", device, varied=True)
     monkeypatch.setattr(straight, "SHARED_BYTES", 10_000)
-    dyn.programs.tiled, dyn.programs.tiled_worlds = True, 16
+    dyn.programs.relays = True
     for operation in ("mass_matrix", "mass_matrix_inverse"):
         equals_reference(dyn, operation, states(dyn), laws.TOLERANCE["float64"])
-    assert all(program.tiles is not None for program in dyn.programs._programs.values())
+    assert all("relay" in program.kernel.adj.arg_types for program in dyn.programs._programs.values())
 
 
 @pytest.mark.parametrize("worlds", [1, 3])

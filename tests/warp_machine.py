@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warp_spo.kernels.straight import IN_PLACE, MAPPED, TILED, Frame
+from warp_spo.kernels.straight import IN_PLACE, SPREAD, TILED, Frame
 from warp_spo.programs import Programs
 from warp_spo.teams import BARRIER
 
@@ -37,7 +37,7 @@ def recorded(monkeypatch):
     texts, finished = [], Programs._finished
 
     def record(self, operation, frame, cuda, cpu, tables, operations, *more):
-        held = {name: array.numpy() for name, array in tables.items()}
+        held = {name: np.array(values) for name, values in tables.items()}
         texts.append(Text(operation, frame, cuda, cpu, held, operations))
         return finished(self, operation, frame, cuda, cpu, tables, operations, *more)
 
@@ -110,7 +110,7 @@ def run(text, arrays, backwards=False, further=None):
         for entry, value in rows[f"{row.name}_row"].values.items():
             further[row.name][:, entry] = value
     whole = np.zeros((frame.result.array.entries, worlds))
-    places = text.tables["place"] if frame.result.way in (MAPPED, TILED) else range(len(whole))
+    places = text.tables["place"] if frame.result.way in (*SPREAD, TILED) else range(len(whole))
     for entry, slot in enumerate(places):
         whole[entry] = 0.0 if slot < 0 else result.values[slot]
     return whole.T
@@ -183,4 +183,5 @@ def _statement(line):
 
 def _sent(line):
     line = re.sub(r"result_row\[\(([^()]*)\) \* \d+\]", r"result_row[\1]", line)
+    line = re.sub(r"RELAY\(([^()]*)\)", r"result_row[\1]", line)
     return re.sub(r"SENT\(([^()]*)\)", r"sent[\1]", line)

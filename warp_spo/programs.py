@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from . import link_values
-from .kernels import straight, tiles
-from .kernels.straight import DIRECT, IN_PLACE, MAPPED, STAGED, TILE, TILED, WARP, Frame, Result, Row
+from .kernels import straight
+from .kernels.spreading import SEATS, TILE, WARP
+from .kernels.straight import DIRECT, IN_PLACE, INTEGERS, MAPPED, RELAYED, SPREAD, STAGED, TILED, Frame, Result, Row
 from .levels import Recursions
 from .parts import DOF_VALUES
 from .plan import MOST_WARPS, SHARED, TREE_ONLY, Plan
@@ -51,8 +52,7 @@ THREE, ENOUGH = 3, 168  # blocks on it, and registers of a thread that the solut
 APART = ("forward_dynamics", "forward_dynamics_and_solve")
 """Operations that can take velocity terms first."""
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
-TILED_SLOTS = 256  # different values of a result from which they go through memory, not through shared memory,
-TILED_WORLDS = 1 << 20  # of so many worlds at a time
+RELAYED_SLOTS = 256  # different values of a result from which they go through memory first
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
@@ -71,7 +71,6 @@ class Program(NamedTuple):
         operations: floating-point operations of one world.
         slots: values of one world in the tiles that it writes; entry: where each entry of the result is among them, -1
             being zero. See :mod:`.kernels.tiles`.
-        tiles: those of some worlds at a time, if they are to be spread at once.
     """
 
     kernel: wp.Kernel
@@ -83,7 +82,6 @@ class Program(NamedTuple):
     operations: int
     slots: int = 0
     entry: Any = None
-    tiles: Any = None
 
 
 class Programs:
@@ -96,13 +94,12 @@ class Programs:
         registers: a cap on the registers of a thread.
 
     Attributes:
-        tiled: a result that is too long for shared memory goes through memory. tiled_worlds: of so many at a time,
-            a multiple of 8.
+        relays: a result that is too long for shared memory goes through memory.
     """
 
     def __init__(self, run: Recursions, plan: Plan, block: int = WARP, registers: int | None = None):
         self.run, self.plan, self.block, self.registers = run, plan, block, registers
-        self.tiled, self.tiled_worlds = run.device.is_cuda, TILED_WORLDS
+        self.relays = run.device.is_cuda
         self._programs: dict[Any, Program | None] = {}
         self._links: Links | None = None
 
@@ -142,25 +139,10 @@ class Programs:
     def launch(self, program: Program, arrays: dict[str, Any], out: wp.array, *more: wp.array) -> None:
         rows = [arrays[name] for name in program.rows]
         fields = [self.field(name) for name in program.fields]
-        if program.tiles is None:
-            self._launch(program, self.run.worlds, [*rows, *fields], [out, *more])
-            return
-        some, size = program.tiles.shape[0] * TILE, out.size // self.run.worlds
-        for first in range(0, self.run.worlds, some):
-            part = slice(first, min(first + some, self.run.worlds))
-            inputs = [row[part] if isinstance(row, wp.array) else row for row in rows]
-            inputs += [field[:, part] for field in fields]
-            worlds = part.stop - first
-            self._launch(program, worlds, inputs, [program.tiles, *(array[part] for array in more)])
-            dim, result = (-(-worlds // TILE), size), out[part].reshape((worlds, size))
-            self.run.launch(tiles.spread, dim, [program.tiles, program.entry, 0], [result])
-
-    def _launch(self, program: Program, worlds: int, inputs: list, outputs: list) -> None:
-        device, block = self.run.device, program.block
+        inputs, worlds, block = [*rows, *fields, *program.tables], self.run.worlds, program.block
         of_block = block // program.warps
-        threads = -(-worlds // of_block) * block if device.is_cuda else worlds
-        inputs = [worlds, *inputs, *program.tables]
-        wp.launch(program.kernel, threads, inputs, outputs, device=device, block_dim=block)
+        threads = -(-worlds // of_block) * block if self.run.device.is_cuda else worlds
+        wp.launch(program.kernel, threads, [worlds, *inputs], [out, *more], device=self.run.device, block_dim=block)
 
     def field(self, name: str) -> wp.array:
         """One of FIELDS."""
@@ -223,7 +205,7 @@ class Programs:
             result = Result(TILED, frame.result.array, slots=_solid(stores))
             frame = frame._replace(staged=self.plan.staged, result=result)
         once = operation == "step" or any(item.array in LOOPED for item in stores)  # may write over what it reads
-        frame = frame._replace(again=not once and not frame.staged and frame.result.way in (DIRECT, TILED))
+        frame = frame._replace(again=not once and not frame.staged and frame.result.way in (DIRECT, TILED, RELAYED))
         placed, table = _placed(outs, frame.result)
         placed += apart
         emitter, looped = self._emitter(shapes, frame), [item for item in stores if item.array in LOOPED]
@@ -233,7 +215,7 @@ class Programs:
             ahead, a_pass = before
             body = straight.looped(ahead, a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
         frame = frame._replace(again=frame.again and "farthest" in body)
-        tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
+        tables = {} if table is None else {"place": table}
         return self._finished(operation, frame, body, body, tables, emitter.operations)
 
     def _segment_program(
@@ -276,10 +258,8 @@ class Programs:
         cuda = team.cuda()  # fills the tables
         registers = REGISTERS // (THREE * frame.block) // 8 * 8
         fits = operation.endswith("_apart") and dtype == "float32" and registers >= ENOUGH
-        lists = ("place", table, int), ("table", team.table, self.run.dtype), ("shifts", team.shifts, int)
-        tables: dict[str, Any] = {
-            name: wp.array(values, dtype=kind, device=self.run.device) for name, values, kind in lists if values
-        }
+        lists = {"place": table, "table": team.table, "shifts": team.shifts}
+        tables = {name: values for name, values in lists.items() if values}
         return self._finished(
             operation, frame, cuda, team.cpu(), tables, team.operations, registers if fits else None
         )
@@ -296,17 +276,25 @@ class Programs:
         rows, fields = (*(row.name for row in frame.rows), *frame.numbers), tuple(frame.fields)
         arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 0) for name in frame.numbers]
         arrays += [(name, 2) for name in fields]
-        result, entry, tiles = frame.result, None, None
+        result, entry = frame.result, None
+        if result.way in SPREAD:
+            tables = tables | {"place": result.spread.table(tables["place"], self.run.dtype)}
+        held: dict[str, wp.array] = {
+            name: wp.array(values, dtype=int if name in INTEGERS else self.run.dtype, device=self.run.device)
+            for name, values in tables.items()
+        }
         if result.way == TILED:
-            entry = tables.pop("place")
-            if operation not in TILES:
-                shape = -(-min(self.run.worlds, self.tiled_worlds) // TILE), max(result.slots, 1), TILE
-                tiles = wp.empty(shape, dtype=self.run.dtype, device=self.run.device)
-        arrays += [(name, 1) for name in tables] + [("out", result.array.ndim if entry is None else 3)]
-        arrays += [(row.name, row.ndim) for row in frame.more]
+            entry = held.pop("place")
+        if result.way == RELAYED:
+            device = self.run.device
+            values = device.sm_count * SEATS * frame.groups * result.slots
+            held["seats"] = wp.zeros(device.sm_count, dtype=int, device=device)
+            held["relay"] = wp.empty((values, WARP), dtype=self.run.dtype, device=device)
+        arrays += [(name, array.ndim) for name, array in held.items()]
+        arrays += [("out", result.array.ndim if entry is None else 3)] + [(row.name, row.ndim) for row in frame.more]
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers or registers)
-        return Program(kernel, rows, fields, tuple(tables.values()), frame.warps, frame.block, operations, result.slots,
-                       entry, tiles)
+        return Program(kernel, rows, fields, tuple(held.values()), frame.warps, frame.block, operations, result.slots,
+                       entry)
 
     def _emitter(self, shapes: dict, frame: Frame) -> Emitter:
         result = frame.result
@@ -323,6 +311,8 @@ class Programs:
         def store(array: str, entry: str, value: str) -> str:
             if array in (INWARD, OUTWARD):
                 return f"SENT({entry}) = {value};"
+            if array == "out" and result.way == RELAYED:
+                return f"RELAY({entry}) = {value};"
             if array == "out" and result.way == TILED:
                 return f"if (mine) result_row[({entry}) * {TILE}] = {value};"
             if array == "out":
@@ -351,7 +341,7 @@ class Programs:
         dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
         over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
         over = [name for name in over if _read_before(stores, everything or stores, name)]
-        slots = len({_name(item.value) for item in stores})
+        slots = _solid(stores)
         fields = {name: tuple(sorted(used[name])) for name in FIELDS if name in used}
         held = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
         staged, ways = self.plan.staged, [(False, Result(DIRECT, out))]
@@ -363,8 +353,8 @@ class Programs:
         if out.entries > LONG_ROW and not (dense and staged and over == ["x"]):
             mapped = Result(MAPPED, out, slots=slots)
             ways = [(staged, mapped), (False, mapped), *ways]
-            if self.tiled:
-                ways.insert(0 if slots >= TILED_SLOTS else -1, (False, Result(TILED, out, slots=_solid(stores))))
+            if self.relays:
+                ways.insert(0 if slots >= RELAYED_SLOTS else -1, (False, Result(RELAYED, out, slots=slots)))
         further = tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more)
         frames = [
             Frame(rows, staged, list(fields), result, sent, warps, block, further, gathered, False, entries, numbers)
@@ -399,13 +389,13 @@ def _called(key: tuple) -> str:
 
 
 def _placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int] | None]:
-    """Flat stores as the result wants them, and the table of a MAPPED or TILED one."""
+    """Flat stores as the result wants them, and the slot of each entry, -1 being zero, where values are numbered."""
     out = result.array
-    if result.way in (MAPPED, TILED):
+    if result.way in (*SPREAD, TILED):
         slots: dict[Any, int] = {}
         table = [-1] * out.entries
         for item in stores:
-            if result.way != TILED or not _is_zero(item.value):
+            if not _is_zero(item.value):
                 table[item.index[0]] = slots.setdefault(_name(item.value), len(slots))
         return _by_slot(stores, table), table
     done = {item.index for item in stores}

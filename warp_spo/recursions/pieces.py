@@ -68,12 +68,16 @@ class Piece:
     def looks_at(self, other: Piece) -> bool:
         """Whether this piece, not ``other``, works out what two branches have in common.
 
-        One of the two does: a leaf; then the later one.
+        One of the two does: a leaf; then the one with less of its own to do; then the later one.
         """
         fork = self.fork(other)
         if fork is None or fork in (self, other):
             return False
-        return (bool(self.children), -self.index) < (bool(other.children), -other.index)
+        return self._burden < other._burden
+
+    @property
+    def _burden(self) -> tuple[bool, int, int]:
+        return bool(self.children), len(self.all_dofs), -self.index
 
 
 class Pieces:
