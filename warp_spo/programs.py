@@ -225,13 +225,13 @@ class Programs:
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         everything: list[Store] = []
         traced: list[list[Store]] = []
-        apart: list[tuple[list[Store], dict[int, list[Store]]]] = []
+        apart: list[tuple[list[Value], list[Store], dict[int, list[Store]]]] = []
         for index in range(len(pieces.pieces)):
             links = self.links.opened()  # its own: pieces of equal structure then give equal text
             trace = Traces(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)(**options)])
             flat = {at: [self._flattened(item, shapes) for item in items] for at, items in trace.across.items()}
-            apart.append((trace.news, flat))
+            apart.append((trace.ahead, trace.news, flat))
             everything += traced[-1] + trace.news + [item for items in flat.values() for item in items]
         frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
                             WARP * pieces.warps, everything, more)
@@ -244,7 +244,7 @@ class Programs:
         whole = [item for item in everything if item.array == "out"]
         placed, table = _placed(whole, frame.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
-        for piece, stores, items, (news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
+        for piece, stores, items, (ahead, news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
             emitter = self._emitter(shapes, frame)
             inward = [item for item in stores if item.array == INWARD]
             outward = [item for item in stores if item.array == OUTWARD]
@@ -252,7 +252,7 @@ class Programs:
             last += items if table is None else _by_slot(items, table)
             last += [item for item in stores if item.array in more]
             meetings = {at: found if table is None else _by_slot(found, table) for at, found in others.items()}
-            regions = emitter.region(inward), emitter.region(outward)
+            regions = emitter.region(inward), emitter.region([], ahead), emitter.region(outward)
             branches = emitter.branch(news), {at: emitter.branch(found) for at, found in meetings.items()}
             team.add(Work(piece, *regions, *branches), emitter.operations)
         cuda = team.cuda()  # fills the tables

@@ -9,20 +9,26 @@ from .recursions.pieces import Piece, Pieces
 from .trace.emit import Listing, filled, literal, literals
 
 BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
+ARRIVE, AWAIT = 'asm volatile("bar.arrive {}, {};" ::: "memory");', 'asm volatile("bar.sync {}, {};" ::: "memory");'
+INSIDE, OUTSIDE = 1, 2  # barriers before and behind what one warp does for all
 
 
 class Work(NamedTuple):
-    """What one piece has to do: going in, coming out, telling the others, and with each of those that it meets."""
+    """What one piece has to do: going in, meanwhile, coming out, telling the others, and with each that it meets.
+
+    Meanwhile is while those further in work: what needs none of them.
+    """
 
     piece: Piece
     inward: Listing
+    meanwhile: Listing
     outward: Listing
     news: Listing
     across: dict[int, Listing]
 
     @property
-    def text(self) -> tuple[str, str]:
-        return self.inward.text, self.outward.text
+    def text(self) -> tuple[str, ...]:
+        return self.inward.text, self.meanwhile.text, self.outward.text
 
 
 class Team:
@@ -53,7 +59,7 @@ class Team:
     def _last(self) -> int:
         """The last stage in which there is something to do."""
         stages = [0]
-        for piece, inward, outward, _, across in self._work.values():
+        for piece, inward, _, outward, _, across in self._work.values():
             stages += [piece.inward] if inward.text else []
             stages += [piece.outward] if outward.text else []
             stages += [self.pieces.stages - 1] if across else []  # pieces further in meet in the last one
@@ -68,11 +74,15 @@ class Team:
                     text.append(literals(self._work[piece.index].inward, self.dtype, f"p{piece.index}_"))
             for piece in self.pieces.pieces:
                 if piece.outward == stage:
+                    text.append(literals(self._work[piece.index].meanwhile, self.dtype, f"p{piece.index}_"))
                     text.append(literals(self._work[piece.index].outward, self.dtype, f"p{piece.index}_"))
-                    text.append(literals(self._work[piece.index].news, self.dtype, f"p{piece.index}_"))
+                    text.append(self._inside_braces(self._work[piece.index].news, piece))
         for work in self._work.values():
-            text += [literals(listing, self.dtype, f"p{work.piece.index}_") for listing in work.across.values()]
+            text += [self._inside_braces(listing, work.piece) for listing in work.across.values()]
         return "\n".join(text)
+
+    def _inside_braces(self, listing: Listing, piece: Piece) -> str:
+        return "{\n" + literals(listing, self.dtype, f"p{piece.index}_") + "\n}"
 
     def cuda(self) -> str:
         """A branch for each kind of leaf piece, which its warps enter together."""
@@ -83,15 +93,38 @@ class Team:
         text: list[str] = []
         for alike in kinds.values():
             text.append(f"{'else ' if text else ''}if ({_any_of([work.piece.warp for work in alike])}) {{")
-            inward, outward = self._shared(alike)
-            text += [inward, self._inner([work.piece.warp for work in alike]), outward]
+            inward, meanwhile, outward = self._shared(alike)
+            text += [inward, *self._inner([work.piece.warp for work in alike], meanwhile), outward]
             if any(work.across for works in kinds.values() for work in works):
                 text += [self._apart(alike, [work.news for work in alike], "n_"), BARRIER, self._across(alike)]
             text.append("}")
         return "\n".join(text)
 
-    def _inner(self, warps: list[int]) -> str:
+    @property
+    def _inside(self) -> int | None:
+        """The warp that does all there is between the leaves' way in and their way out, if others can work meanwhile."""
+        warps = {work.piece.warp for work in self._work.values() if work.piece.children}
+        meanwhile = any(work.meanwhile.text for work in self._work.values())
+        return warps.pop() if meanwhile and len(warps) == 1 and self._last == 2 else None
+
+    def _inner(self, warps: list[int], meanwhile: str) -> list[str]:
         """The stages between the leaves' way in and their way out, with the pieces that some of ``warps`` take on."""
+        if self._inside is None:
+            return [self._stages(warps), meanwhile]
+        threads = 32 * self.pieces.warps
+        arrive, wait = ([form.format(at, threads) for at in (INSIDE, OUTSIDE)] for form in (ARRIVE, AWAIT))
+        if self._inside not in warps:
+            return [arrive[0], meanwhile, wait[1]]
+        inner = [work for work in self._work.values() if work.piece.children]
+        shared = [self._shared([work], f"i{at}_") for at, work in enumerate(inner)]
+        news = [self._apart([work], [work.news], f"i{at}_n_", f"i{at}_") for at, work in enumerate(inner)]
+        text = [f"if (warp == {self._inside}) {{", wait[0], *(inward for inward, *_ in reversed(shared))]
+        for (_, before, outward), told in zip(shared, news, strict=True):
+            text += [before, outward, told]
+        text += [arrive[1], "}", f"if (warp != {self._inside}) {{", arrive[0], "}"]
+        return [*text, meanwhile, f"if (warp != {self._inside}) {{", wait[1], "}"]
+
+    def _stages(self, warps: list[int]) -> str:
         owners: dict[tuple, list[list[Work]]] = {}
         for warp in warps:
             mine = [work for work in self._work.values() if work.piece.children and work.piece.warp == warp]
@@ -104,10 +137,10 @@ class Team:
             for stage in range(1, self._last + 1):
                 text.append(BARRIER)
                 order = list(zip(chains[0], shared, strict=True))
-                text += [inward for work, (inward, _) in reversed(order) if work.piece.inward == stage]
-                for at, (alike, (_, outward)) in enumerate(zip(zip(*chains, strict=True), shared, strict=True)):
+                text += [inward for work, (inward, *_) in reversed(order) if work.piece.inward == stage]
+                for at, (alike, (_, before, outward)) in enumerate(zip(zip(*chains, strict=True), shared, strict=True)):
                     if alike[0].piece.outward == stage:
-                        text += [outward, self._apart(alike, [work.news for work in alike], f"i{at}_n_", f"i{at}_")]
+                        text += [before, outward, self._apart(alike, [work.news for work in alike], f"i{at}_n_", f"i{at}_")]
             text += [self._across(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
             text.append("}")
         idle = [BARRIER] * self._last
@@ -134,11 +167,11 @@ class Team:
             text.append("\n".join([f"{condition}{{", head, body, "}"]))
         return "\n".join(text)
 
-    def _shared(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str]:
-        """One text, in and out, for pieces of equal structure."""
-        both = [[work.inward for work in alike], [work.outward for work in alike]]
-        head, (inward, outward) = self._filled(alike, both, prefix, prefix)
-        return f"{head}\n{inward}" if head else inward, outward
+    def _shared(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str, str]:
+        """One text, in, meanwhile and out, for pieces of equal structure."""
+        listings = [[work.inward for work in alike], [work.meanwhile for work in alike], [work.outward for work in alike]]
+        head, (inward, meanwhile, outward) = self._filled(alike, listings, prefix, prefix)
+        return f"{head}\n{inward}" if head else inward, meanwhile, outward
 
     def _filled(
         self, alike: Sequence[Work], regions: list[list[Listing]], prefix: str, tables: str

@@ -323,7 +323,7 @@ class Trace:
         inverse = Inverse(self)
         across = {other: self._both(entries) for other, entries in inverse.across.items()}
         if self.piece is not None:
-            self.across, self.news, across = across, inverse.news, {}
+            self.ahead, self.across, self.news, across = inverse.ahead, across, inverse.news, {}
         return inverse.stores + self._both(inverse.entries) + [item for stores in across.values() for item in stores]
 
     def inward(self, done: dict, link: Link, force: Vector, right: list[Value]) -> dict[int, list[Value]]:

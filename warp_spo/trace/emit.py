@@ -94,9 +94,9 @@ class Emitter:
 
     def branch(self, stores: Iterable[Store]) -> Listing:
         """A region inside braces: no later one uses what it computes."""
-        known = dict(self._names)
+        known, count = dict(self._names), self._count
         listing = self.region(stores)
-        self._names = known
+        self._names, self._count = known, count
         return listing
 
     def region(self, stores: Iterable[Store], ahead: Iterable[Value] = ()) -> Listing:
