@@ -225,13 +225,13 @@ class Programs:
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         everything: list[Store] = []
         traced: list[list[Store]] = []
-        apart: list[tuple[list[Value], list[Store], dict[int, list[Store]]]] = []
+        apart: list[tuple[list[list[Value]], list[Store], dict[int, list[Store]]]] = []
         for index in range(len(pieces.pieces)):
             links = self.links.opened()  # its own: pieces of equal structure then give equal text
             trace = Traces(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)(**options)])
             flat = {at: [self._flattened(item, shapes) for item in items] for at, items in trace.across.items()}
-            apart.append((trace.ahead, trace.news, flat))
+            apart.append(([trace.ahead, trace.known], trace.news, flat))
             everything += traced[-1] + trace.news + [item for items in flat.values() for item in items]
         frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
                             WARP * pieces.warps, everything, more)
@@ -252,9 +252,14 @@ class Programs:
             last += items if table is None else _by_slot(items, table)
             last += [item for item in stores if item.array in more]
             meetings = {at: found if table is None else _by_slot(found, table) for at, found in others.items()}
-            regions = emitter.region(inward), emitter.region([], ahead), emitter.region(outward)
-            branches = emitter.branch(news), {at: emitter.branch(found) for at, found in meetings.items()}
-            team.add(Work(piece, *regions, *branches), emitter.operations)
+            first = emitter.region(inward), *(emitter.region([], values) for values in ahead)
+            if not piece.children:
+                told = emitter.branch(news)
+            then = emitter.region(outward)
+            if piece.children:
+                told = emitter.branch(news)
+            across = {at: emitter.branch(found) for at, found in meetings.items()}
+            team.add(Work(piece, *first, then, told, across), emitter.operations)
         cuda = team.cuda()  # fills the tables
         registers = REGISTERS // (THREE * frame.block) // 8 * 8
         fits = operation.endswith("_apart") and dtype == "float32" and registers >= ENOUGH

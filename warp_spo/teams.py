@@ -22,13 +22,14 @@ class Work(NamedTuple):
     piece: Piece
     inward: Listing
     meanwhile: Listing
+    known: Listing
     outward: Listing
     news: Listing
     across: dict[int, Listing]
 
     @property
     def text(self) -> tuple[str, ...]:
-        return self.inward.text, self.meanwhile.text, self.outward.text
+        return self.inward.text, self.meanwhile.text, self.known.text, self.outward.text
 
 
 class Team:
@@ -59,7 +60,7 @@ class Team:
     def _last(self) -> int:
         """The last stage in which there is something to do."""
         stages = [0]
-        for piece, inward, _, outward, _, across in self._work.values():
+        for piece, inward, _, _, outward, _, across in self._work.values():
             stages += [piece.inward] if inward.text else []
             stages += [piece.outward] if outward.text else []
             stages += [self.pieces.stages - 1] if across else []  # pieces further in meet in the last one
@@ -75,6 +76,7 @@ class Team:
             for piece in self.pieces.pieces:
                 if piece.outward == stage:
                     text.append(literals(self._work[piece.index].meanwhile, self.dtype, f"p{piece.index}_"))
+                    text.append(literals(self._work[piece.index].known, self.dtype, f"p{piece.index}_"))
                     text.append(literals(self._work[piece.index].outward, self.dtype, f"p{piece.index}_"))
                     text.append(self._inside_braces(self._work[piece.index].news, piece))
         for work in self._work.values():
@@ -93,10 +95,19 @@ class Team:
         text: list[str] = []
         for alike in kinds.values():
             text.append(f"{'else ' if text else ''}if ({_any_of([work.piece.warp for work in alike])}) {{")
-            inward, meanwhile, outward = self._shared(alike)
-            text += [inward, *self._inner([work.piece.warp for work in alike], meanwhile), outward]
-            if any(work.across for works in kinds.values() for work in works):
-                text += [self._apart(alike, [work.news for work in alike], "n_"), BARRIER, self._across(alike)]
+            inward, meanwhile, known, outward = self._shared(alike)
+            warps = [work.piece.warp for work in alike]
+            text += [inward, *self._inner(warps, meanwhile), known, self._apart(alike, [work.news for work in alike], "n_")]
+            if self._inside is not None and not next(w for works in kinds.values() for w in works if w.piece.warp == self._inside).across:
+                threads = 32 * self.pieces.warps
+                if self._inside in warps:
+                    text += [f"if (warp == {self._inside}) {{", ARRIVE.format(3, threads), "}"]
+                text += [outward, f"if (warp != {self._inside}) {{", AWAIT.format(3, threads), "}"]
+                text += [self._across(alike)]
+            elif any(work.across for works in kinds.values() for work in works):
+                text += [outward, BARRIER, self._across(alike)]
+            else:
+                text += [outward]
             text.append("}")
         return "\n".join(text)
 
@@ -119,8 +130,8 @@ class Team:
         shared = [self._shared([work], f"i{at}_") for at, work in enumerate(inner)]
         news = [self._apart([work], [work.news], f"i{at}_n_", f"i{at}_") for at, work in enumerate(inner)]
         text = [f"if (warp == {self._inside}) {{", wait[0], *(inward for inward, *_ in reversed(shared))]
-        for (_, before, outward), told in zip(shared, news, strict=True):
-            text += [before, outward, told]
+        for (*_, outward), told in zip(shared, news, strict=True):
+            text += [outward, told]
         text += [arrive[1], "}", f"if (warp != {self._inside}) {{", arrive[0], "}"]
         return [*text, meanwhile, f"if (warp != {self._inside}) {{", wait[1], "}"]
 
@@ -138,9 +149,9 @@ class Team:
                 text.append(BARRIER)
                 order = list(zip(chains[0], shared, strict=True))
                 text += [inward for work, (inward, *_) in reversed(order) if work.piece.inward == stage]
-                for at, (alike, (_, before, outward)) in enumerate(zip(zip(*chains, strict=True), shared, strict=True)):
+                for at, (alike, (*_, outward)) in enumerate(zip(zip(*chains, strict=True), shared, strict=True)):
                     if alike[0].piece.outward == stage:
-                        text += [before, outward, self._apart(alike, [work.news for work in alike], f"i{at}_n_", f"i{at}_")]
+                        text += [outward, self._apart(alike, [work.news for work in alike], f"i{at}_n_", f"i{at}_")]
             text += [self._across(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
             text.append("}")
         idle = [BARRIER] * self._last
@@ -167,11 +178,11 @@ class Team:
             text.append("\n".join([f"{condition}{{", head, body, "}"]))
         return "\n".join(text)
 
-    def _shared(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str, str]:
-        """One text, in, meanwhile and out, for pieces of equal structure."""
-        listings = [[work.inward for work in alike], [work.meanwhile for work in alike], [work.outward for work in alike]]
-        head, (inward, meanwhile, outward) = self._filled(alike, listings, prefix, prefix)
-        return f"{head}\n{inward}" if head else inward, meanwhile, outward
+    def _shared(self, alike: Sequence[Work], prefix: str = "") -> list[str]:
+        """One text for each region of pieces of equal structure."""
+        listings = [[work[at] for work in alike] for at in range(1, 5)]
+        head, (inward, *others) = self._filled(alike, listings, prefix, prefix)
+        return [f"{head}\n{inward}" if head else inward, *others]
 
     def _filled(
         self, alike: Sequence[Work], regions: list[list[Listing]], prefix: str, tables: str

@@ -51,6 +51,7 @@ class Inverse:
         self.ahead += [] if own[0].children else [x for force in self._forces.values() for x in force]
         for piece in own:
             self._come_back(piece)
+        self.known = [] if own[0].children else [x for column in self._columns.values() for x in column]
         for piece in own:
             for other in self.pieces:
                 if piece.looks_at(other):

@@ -51,6 +51,7 @@ class Trace:
         self.news: list[Store] = []
         self.across: dict[int, list[Store]] = {}
         self.ahead: list[Value] = []
+        self.known: list[Value] = []
         self._mail: dict[tuple[str, int], list[Value]] = {}  # messages between pieces of this trace
         self.own = set(map(id, links.links if piece is None else piece.links))
         self.active = set(self.own)
@@ -323,7 +324,8 @@ class Trace:
         inverse = Inverse(self)
         across = {other: self._both(entries) for other, entries in inverse.across.items()}
         if self.piece is not None:
-            self.ahead, self.across, self.news, across = inverse.ahead, across, inverse.news, {}
+            self.ahead, self.known = inverse.ahead, inverse.known
+            self.across, self.news, across = across, inverse.news, {}
         return inverse.stores + self._both(inverse.entries) + [item for stores in across.values() for item in stores]
 
     def inward(self, done: dict, link: Link, force: Vector, right: list[Value]) -> dict[int, list[Value]]:
