@@ -4,22 +4,20 @@ import functools
 
 import warp as wp
 
-from .spatial import spatial
 from .topology import Topology
 
 SCREWS, BALL, FREE = wp.constant(0), wp.constant(1), wp.constant(2)
 
 
 @functools.cache
-def hinge(T) -> wp.Kernel:
+def hinge(s) -> wp.Kernel:
     """Pose of node k in its parent's node frame, columns of H*(k), and with ``qd`` the hinge's velocity and bias.
 
     One thread for each (node, world), all in the node frame: ``velocity = H* qd``, and ``bias``, the angular
     acceleration of the node and the acceleration of its origin as seen from the hinge's parent, qd being constant. A
     chain of screws is built inboard to outboard: each new screw carries what came before into its own frame.
     """
-    s = spatial(T)
-    vec3 = s.vec3
+    T, vec3, vec6 = s.T, s.vec3, s.vec6
 
     @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
     def kernel(
@@ -38,75 +36,58 @@ def hinge(T) -> wp.Kernel:
         motion = topology.motion[node]
         first = topology.qd_start[node]
         coord = topology.q_start[node]
-        R = wp.identity(n=3, dtype=T)
-        p = vec3()
-        w, v, dw, dv = vec3(), vec3(), vec3(), vec3()
+        pose = s.load_pose(tree, node, world)
+        velocity, bias = vec6(), vec6()
         if motion == SCREWS:
             for i in range(topology.dof_count[node]):
                 axis = vec3(screw[first + i, 0], screw[first + i, 1], screw[first + i, 2])
-                turn = axis * screw[first + i, 3]
-                slide = axis * screw[first + i, 4]
+                turn, slide = screw[first + i, 3], screw[first + i, 4]
                 x = q[world, coord + i]
-                R_i = s.rotation(axis, x * screw[first + i, 3])
-                p_i = slide * x
+                inner = s.pose(s.rotation(axis, x * turn), axis * slide * x)
                 for j in range(i):
-                    w_j, v_j = s.motion_to_child(
-                        R_i, p_i, s.load(axis_out, first + j, 0, world), s.load(axis_out, first + j, 3, world)
-                    )
-                    s.store(axis_out, first + j, 0, world, w_j)
-                    s.store(axis_out, first + j, 3, world, v_j)
-                s.store(axis_out, first + i, 0, world, turn)
-                s.store(axis_out, first + i, 3, world, slide)
-                p += R * p_i
-                R = R * R_i
+                    carried = s.motion_to_child(inner, s.load_motion(axis_out, first + j, world))
+                    s.store_motion(axis_out, first + j, world, carried)
+                h = s.motion(axis * turn, axis * slide)
+                s.store_motion(axis_out, first + i, world, h)
+                pose = s.placed_on(pose, inner)
                 if velocity_out:
-                    rate = qd[world, first + i]
-                    dw, dv = s.acceleration_to_child(R_i, p_i, w, dw, dv)
-                    w, v = s.motion_to_child(R_i, p_i, w, v)
-                    dw += wp.cross(w, turn) * rate
-                    dv += wp.cross(w, slide) * (T(2.0) * rate)
-                    w += turn * rate
-                    v += slide * rate
+                    own = h * qd[world, first + i]
+                    bias = s.accelerated(inner, velocity, bias, own, vec6())
+                    velocity = s.moved(inner, velocity, own)
         else:
             angular = first
             at = coord
+            p = vec3()
+            r = vec3()  # the node's reference point: a free hinge moves the CoM
             if motion == FREE:
                 p = vec3(q[world, coord], q[world, coord + 1], q[world, coord + 2])
+                r = s.load3(com, node, world)
                 at += 3
                 angular += 3
             R = s.quaternion_rotation(q[world, at], q[world, at + 1], q[world, at + 2], q[world, at + 3])
-            r = vec3()  # the node's reference point: a free hinge moves the CoM
-            if motion == FREE:
-                r = s.load(com, node, 0, world)
+            w = vec3()
             for i in range(3):
                 column = vec3(R[i, 0], R[i, 1], R[i, 2])
-                s.store(axis_out, angular + i, 0, world, column)
-                s.store(axis_out, angular + i, 3, world, wp.cross(r, column))
+                s.store_motion(axis_out, angular + i, world, s.motion(column, wp.cross(r, column)))
                 if motion == FREE:
-                    s.store(axis_out, first + i, 0, world, vec3())
-                    s.store(axis_out, first + i, 3, world, column)
-            if velocity_out:
-                Rt = wp.transpose(R)
-                w = Rt * vec3(qd[world, angular], qd[world, angular + 1], qd[world, angular + 2])
-                v = wp.cross(r, w)
-                if motion == FREE:
-                    dv = wp.cross(w, v)  # about the CoM, which moves straight
-                    v += Rt * vec3(qd[world, first], qd[world, first + 1], qd[world, first + 2])
-
-        R_tree = s.load_matrix(tree, node, 0, world)
-        s.store_matrix(pose_out, node, 0, world, R_tree * R)
-        s.store(pose_out, node, 9, world, s.load(tree, node, 9, world) + R_tree * p)
+                    s.store_motion(axis_out, first + i, world, s.motion(vec3(), column))
+                if velocity_out:
+                    w += column * qd[world, angular + i]
+                    if motion == FREE:
+                        velocity += s.motion(vec3(), column * qd[world, first + i])
+            velocity += s.motion(w, wp.cross(r, w))
+            bias = s.motion(vec3(), wp.cross(w, wp.cross(r, w)))  # about the CoM, which moves straight
+            pose = s.placed_on(pose, s.pose(R, p))
+        s.store_pose(pose_out, node, world, pose)
         if velocity_out:
-            s.store(velocity_out, node, 0, world, w)
-            s.store(velocity_out, node, 3, world, v)
-            s.store(bias_out, node, 0, world, dw)
-            s.store(bias_out, node, 3, world, dv)
+            s.store_motion(velocity_out, node, world, velocity)
+            s.store_motion(bias_out, node, world, bias)
 
     return kernel
 
 
 @functools.cache
-def motion(T) -> wp.Kernel:
+def motion(s) -> wp.Kernel:
     """Outward, one level: V(k) = phi* V(p) + H* qd, alpha(k) = phi* alpha(p) + H* qdd + a(k); what is absent is zero.
 
     ``velocity_out`` comes in as H* qd and leaves as V; gravity is the acceleration -g of the inertial frame. Without
@@ -116,7 +97,7 @@ def motion(T) -> wp.Kernel:
     v): Jain's alpha and V's linear part both grow with the distance from the root, and what they add to the force
     cancels. From this form v is gone: a(k) consists of omega and of what lies between k and p alone.
     """
-    s = spatial(T)
+    T, vec6 = s.T, s.vec6
 
     @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
     def kernel(
@@ -133,80 +114,65 @@ def motion(T) -> wp.Kernel:
         i, world = wp.tid()
         node = topology.order[level + i]
         parent = topology.parent[node]
-        R, l = s.load_matrix(pose, node, 0, world), s.load(pose, node, 9, world)
-        w_p, w_j, v_j = s.vec3(), s.vec3(), s.vec3()
+        place = s.load_pose(pose, node, world)
+        above, own, a = vec6(), vec6(), vec6()
         if velocity_out:
-            w_j, v_j = s.load(velocity_out, node, 0, world), s.load(velocity_out, node, 3, world)
-            w, v = s.vec3(), s.vec3()
+            own = s.load_motion(velocity_out, node, world)
             if parent >= 0:
-                w_p, v = s.load(velocity_out, parent, 0, world), s.load(velocity_out, parent, 3, world)
-                w, v = s.motion_to_child(R, l, w_p, v)
-            s.store(velocity_out, node, 0, world, w + w_j)
-            s.store(velocity_out, node, 3, world, v + v_j)
+                above = s.load_motion(velocity_out, parent, world)
+            s.store_motion(velocity_out, node, world, s.moved(place, above, own))
         if acceleration_out:
-            dw, dv = s.vec3(), s.vec3()
+            alpha = s.base(gravity, world)
             if parent >= 0:
-                dw, dv = s.load(acceleration_out, parent, 0, world), s.load(acceleration_out, parent, 3, world)
-            elif gravity:
-                dv = -s.vec3(gravity[0, world], gravity[1, world], gravity[2, world])
+                alpha = s.load_motion(acceleration_out, parent, world)
             if velocity_out:
-                dw, dv = s.acceleration_to_child(R, l, w_p, dw, dv)
-                w = wp.transpose(R) * w_p
-                dw += s.load(bias, node, 0, world) + wp.cross(w, w_j)
-                dv += s.load(bias, node, 3, world) + T(2.0) * wp.cross(w, v_j)
-            else:
-                dw, dv = s.motion_to_child(R, l, dw, dv)
+                a = s.load_motion(bias, node, world)
+            alpha = s.accelerated(place, above, alpha, own, a)
             if qdd:
                 first = topology.qd_start[node]
                 for dof in range(first, first + topology.dof_count[node]):
-                    dw += s.load(axis, dof, 0, world) * qdd[world, dof]
-                    dv += s.load(axis, dof, 3, world) * qdd[world, dof]
-            s.store(acceleration_out, node, 0, world, dw)
-            s.store(acceleration_out, node, 3, world, dv)
+                    alpha += s.load_motion(axis, dof, world) * qdd[world, dof]
+            s.store_motion(acceleration_out, node, world, alpha)
 
     return kernel
 
 
 @functools.cache
-def poses(T) -> wp.Kernel:
+def poses(s) -> wp.Kernel:
     """Outward, one level: pose of every node frame in the inertial frame."""
-    s = spatial(T)
+    T = s.T
 
     @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
     def kernel(topology: Topology, level: int, pose: wp.array3d[T], world_pose_out: wp.array3d[T]):
         i, world = wp.tid()
         node = topology.order[level + i]
         parent = topology.parent[node]
-        R, p = s.load_matrix(pose, node, 0, world), s.load(pose, node, 9, world)
+        found = s.load_pose(pose, node, world)
         if parent >= 0:
-            R_p = s.load_matrix(world_pose_out, parent, 0, world)
-            p = s.load(world_pose_out, parent, 9, world) + R_p * p
-            R = R_p * R
-        s.store_matrix(world_pose_out, node, 0, world, R)
-        s.store(world_pose_out, node, 9, world, p)
+            found = s.placed_on(s.load_pose(world_pose_out, parent, world), found)
+        s.store_pose(world_pose_out, node, world, found)
 
     return kernel
 
 
 @functools.cache
-def body_poses(T) -> wp.Kernel:
+def body_poses(s) -> wp.Kernel:
     """Position and quaternion (xyzw) of every frame that sits at ``anchor`` in the node frame's inverse sense.
 
     One thread for each (node, world): with ``anchor`` the body's pose is node pose * anchor^-1, as Newton's body_q;
     without it the pose is the node frame's own.
     """
-    s = spatial(T)
+    T = s.T
 
     @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
     def kernel(world_pose: wp.array3d[T], anchor: wp.array3d[T], out: wp.array3d[T]):
         node, world = wp.tid()
-        R, p = s.load_matrix(world_pose, node, 0, world), s.load(world_pose, node, 9, world)
+        pose = s.load_pose(world_pose, node, world)
         if anchor:
-            R = R * wp.transpose(s.load_matrix(anchor, node, 0, world))
-            p -= R * s.load(anchor, node, 9, world)
-        quaternion = wp.quat_from_matrix(R)
+            pose = s.placed_under(pose, s.load_pose(anchor, node, world))
+        quaternion = wp.quat_from_matrix(s.rotation_of(pose))
         for c in range(3):
-            out[world, node, c] = p[c]
+            out[world, node, c] = pose[9 + c]
         for c in range(4):
             out[world, node, 3 + c] = quaternion[c]
 
@@ -214,32 +180,29 @@ def body_poses(T) -> wp.Kernel:
 
 
 @functools.cache
-def body_velocities(T) -> wp.Kernel:
+def body_velocities(s) -> wp.Kernel:
     """CoM velocity and angular velocity in inertial axes, as Newton's body_qd; one thread for each (node, world)."""
-    s = spatial(T)
+    T = s.T
 
     @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
     def kernel(world_pose: wp.array3d[T], com: wp.array3d[T], velocity: wp.array3d[T], out: wp.array3d[T]):
         node, world = wp.tid()
-        R = s.load_matrix(world_pose, node, 0, world)
-        w = s.load(velocity, node, 0, world)
-        v = R * (s.load(velocity, node, 3, world) + wp.cross(w, s.load(com, node, 0, world)))
-        w = R * w
-        for c in range(3):
+        V = s.load_motion(velocity, node, world)
+        v = s.velocity(s.load_pose(world_pose, node, world), V, s.load3(com, node, world))
+        for c in range(6):
             out[world, node, c] = v[c]
-            out[world, node, 3 + c] = w[c]
 
     return kernel
 
 
 @functools.cache
-def jacobian(T) -> wp.Kernel:
+def jacobian(s) -> wp.Kernel:
     """Velocity of a frame's origin, then angular velocity, in inertial axes, for unit velocity of every hinge.
 
     One thread for each (frame, world) walks from the frame's body to its root. The lever arm is carried along in the
     axes of each ancestor, so that the distance from the world's origin never enters.
     """
-    s = spatial(T)
+    T, vec3 = s.T, s.vec3
 
     @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
     def kernel(
@@ -254,25 +217,22 @@ def jacobian(T) -> wp.Kernel:
     ):
         frame, world = wp.tid()
         node = frame_node[frame]
-        offset = s.vec3(frame_offset[frame, 0], frame_offset[frame, 1], frame_offset[frame, 2])
-        offset -= s.load(anchor, node, 9, world)
-        r = wp.transpose(s.load_matrix(anchor, node, 0, world)) * offset
+        arm = vec3(frame_offset[frame, 0], frame_offset[frame, 1], frame_offset[frame, 2])
+        arm = s.point_to_child(s.load_pose(anchor, node, world), arm)
         for dof in range(jacobian_out.shape[3]):
             for c in range(6):
                 jacobian_out[world, frame, c, dof] = T(0.0)
         while node >= 0:
-            R = s.load_matrix(world_pose, node, 0, world)
+            place = s.load_pose(world_pose, node, world)
             first = topology.qd_start[node]
             for dof in range(first, first + topology.dof_count[node]):
-                h = s.load(axis, dof, 0, world)
-                w = R * h
-                v = R * (s.load(axis, dof, 3, world) + wp.cross(h, r))
-                for c in range(3):
+                v = s.velocity(place, s.load_motion(axis, dof, world), arm)
+                for c in range(6):
                     jacobian_out[world, frame, c, dof] = v[c]
-                    jacobian_out[world, frame, 3 + c, dof] = w[c]
-            r = s.load(pose, node, 9, world) + s.load_matrix(pose, node, 0, world) * r
+            arm = s.point_to_parent(s.load_pose(pose, node, world), arm)
             node = topology.parent[node]
 
     return kernel
+
 
 KERNELS = (hinge, motion, poses, body_poses, body_velocities, jacobian)

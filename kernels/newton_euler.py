@@ -4,19 +4,18 @@ import functools
 
 import warp as wp
 
-from .spatial import spatial
 from .topology import Topology
 
 
 @functools.cache
-def body_force(T) -> wp.Kernel:
+def body_force(s) -> wp.Kernel:
     """M alpha + crf(V) M V - (external wrench) of every node, in its frame; one thread for each (node, world).
 
     With alpha as the kernel ``motion`` gives it, (d omega/dt; dv/dt) of the node's origin, crf(V) M V loses its linear
     velocity: (omega x J omega; omega x (omega x m c)).
     ``body_f`` is force, then torque, in inertial axes at the CoM; ``world_pose`` belongs to it.
     """
-    s = spatial(T)
+    T, vec6 = s.T, s.vec6
 
     @wp.kernel(module=f"warp_spo_newton_euler_{T.__name__}", enable_backward=False)
     def kernel(
@@ -29,34 +28,25 @@ def body_force(T) -> wp.Kernel:
         force_out: wp.array3d[T],
     ):
         node, world = wp.tid()
-        mass = rigid[node, 0, world]
-        moment = s.load(rigid, node, 1, world)
-        inertia = s.load_symmetric(rigid, node, 4, world)
-        n, f = s.vec3(), s.vec3()
-        if acceleration:
-            n, f = s.rigid_apply(
-                mass, moment, inertia, s.load(acceleration, node, 0, world), s.load(acceleration, node, 3, world)
-            )
+        f, V = vec6(), vec6()
         if velocity:
-            w = s.load(velocity, node, 0, world)
-            n += wp.cross(w, inertia * w)
-            f += wp.cross(w, wp.cross(w, moment))
+            V = s.load_motion(velocity, node, world)
+        if acceleration:
+            f = s.body_force(s.load_rigid(rigid, node, world), V, s.load_motion(acceleration, node, world))
         if body_f:
-            Rt = wp.transpose(s.load_matrix(world_pose, node, 0, world))
-            external = Rt * s.vec3(body_f[world, node, 0], body_f[world, node, 1], body_f[world, node, 2])
-            torque = Rt * s.vec3(body_f[world, node, 3], body_f[world, node, 4], body_f[world, node, 5])
-            n -= torque + wp.cross(s.load(com, node, 0, world), external)
-            f -= external
-        s.store(force_out, node, 0, world, n)
-        s.store(force_out, node, 3, world, f)
+            external = vec6()
+            for c in range(6):
+                external[c] = body_f[world, node, c]
+            f -= s.wrench(s.load_pose(world_pose, node, world), s.load3(com, node, world), external)
+        s.store_motion(force_out, node, world, f)
 
     return kernel
 
 
 @functools.cache
-def force(T) -> wp.Kernel:
+def force(s) -> wp.Kernel:
     """Inward, one level: f(k) = body force + sum over children phi(k, j) f(j), in place; tau = H f + Delta qdd."""
-    s = spatial(T)
+    T = s.T
 
     @wp.kernel(module=f"warp_spo_newton_euler_{T.__name__}", enable_backward=False)
     def kernel(
@@ -71,22 +61,14 @@ def force(T) -> wp.Kernel:
     ):
         i, world = wp.tid()
         node = topology.order[level + i]
-        n, f = s.load(force_out, node, 0, world), s.load(force_out, node, 3, world)
+        f = s.load_motion(force_out, node, world)
         for c in range(topology.child_start[node], topology.child_start[node + 1]):
             child = topology.children[c]
-            n_c, f_c = s.force_to_parent(
-                s.load_matrix(pose, child, 0, world),
-                s.load(pose, child, 9, world),
-                s.load(force_out, child, 0, world),
-                s.load(force_out, child, 3, world),
-            )
-            n += n_c
-            f += f_c
-        s.store(force_out, node, 0, world, n)
-        s.store(force_out, node, 3, world, f)
+            f += s.force_to_parent(s.load_pose(pose, child, world), s.load_motion(force_out, child, world))
+        s.store_motion(force_out, node, world, f)
         first = topology.qd_start[node]
         for dof in range(first, first + topology.dof_count[node]):
-            tau = wp.dot(s.load(axis, dof, 0, world), n) + wp.dot(s.load(axis, dof, 3, world), f)
+            tau = wp.dot(s.load_motion(axis, dof, world), f)
             if qdd:
                 tau += armature[dof, world] * qdd[world, dof]
             tau_out[world, dof] = tau

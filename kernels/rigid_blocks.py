@@ -5,14 +5,13 @@ import functools
 import warp as wp
 
 from .factorization import BlockTables
-from .spatial import spatial
 from .topology import Topology
 
 
 @functools.cache
-def fill(T) -> wp.Kernel:
+def fill(s) -> wp.Kernel:
     """One thread for each (node, world) writes the node's blocks; see kernels/factorization.py for their places."""
-    s = spatial(T)
+    T = s.T
 
     @wp.func
     def put(out: wp.array2d[T], world: int, first: int, row: int, column: int, m: s.mat33):
@@ -35,19 +34,19 @@ def fill(T) -> wp.Kernel:
     ):
         node, world = wp.tid()
         if topology.parent[node] >= 0:
-            R = s.load_matrix(pose, node, 0, world)
+            place = s.load_pose(pose, node, world)
+            R, l = s.rotation_of(place), s.vec3(place[9], place[10], place[11])
             at = tables.weight[node]
             put(weight_out, world, at, 0, 0, R)
-            put(weight_out, world, at, 0, 3, s.skew(s.load(pose, node, 9, world)) * R)
+            put(weight_out, world, at, 0, 3, s.skew(l) * R)
             put(weight_out, world, at, 3, 0, s.mat33())
             put(weight_out, world, at, 3, 3, R)
-        mass = rigid[node, 0, world]
-        moment = s.skew(s.load(rigid, node, 1, world))
+        M = s.articulated(s.load_rigid(rigid, node, world))
         at = tables.square[node]
-        put(M_out, world, at, 0, 0, s.load_symmetric(rigid, node, 4, world))
-        put(M_out, world, at, 0, 3, moment)
-        put(M_out, world, at, 3, 0, wp.transpose(moment))
-        put(M_out, world, at, 3, 3, wp.diag(s.vec3(mass, mass, mass)))
+        put(M_out, world, at, 0, 0, s.J_of(M))
+        put(M_out, world, at, 0, 3, s.C_of(M))
+        put(M_out, world, at, 3, 0, wp.transpose(s.C_of(M)))
+        put(M_out, world, at, 3, 3, s.m_of(M))
         first, count = topology.qd_start[node], topology.dof_count[node]
         for i in range(count):
             for c in range(6):

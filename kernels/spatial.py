@@ -1,8 +1,9 @@
-"""Spatial algebra in the paper's order, V = (omega; v) and f = (n; f), for one scalar type.
+"""Spatial quantities in memory and in registers, in the paper's order, V = (omega; v) and f = (n; f).
 
-A spatial vector is a pair of 3-vectors, a rigid inertia is (mass, first moment, inertia about the frame's origin), and
-an articulated inertia P = [[J, C], [C^T, m]] keeps its 21 numbers: J and m symmetric, C full. Arrays inside the library
-are ``[node or dof, component, world]``, worlds neighbouring, so that the threads of a warp read neighbouring addresses.
+A quantity of a node is a vector: a pose (R by rows, l), a motion or force, a rigid inertia (mass, first moment, inertia
+about the frame's origin: xx, yy, zz, xy, xz, yz), an articulated inertia (the upper triangle of P by rows). Arrays
+inside the library are ``[node or dof, component, world]``, worlds neighbouring, so that the threads of a warp read
+neighbouring addresses. What is done with them comes from the traces, see :mod:`warp_spo.node_steps`.
 """
 
 import functools
@@ -10,49 +11,73 @@ import types
 
 import warp as wp
 
+from .straight import C_TYPE, function
+
 POSE, MOTION, RIGID, ARTICULATED = 12, 6, 10, 21  # components of one of each
+ENTRY = "const long long part = a.strides[1]; {c}* at = ({c}*)((char*)a.data + i * (long long)a.strides[0]\n" \
+    "    + world * (long long)a.strides[2]);\n"
+COMPONENT = "*({c}*)((char*)at + {k} * part)"
 
 
 @functools.cache
 def spatial(T) -> types.SimpleNamespace:
     """The types and functions below for scalars of type ``T`` (wp.float32 or wp.float64)."""
     vec3 = wp.types.vector(3, T)
+    vec6 = wp.types.vector(MOTION, T)
+    vec10 = wp.types.vector(RIGID, T)
+    vec12 = wp.types.vector(POSE, T)
+    vec21 = wp.types.vector(ARTICULATED, T)
     mat33 = wp.types.matrix((3, 3), T)
 
-    @wp.func
-    def load(a: wp.array3d[T], i: int, c: int, world: int):
-        return vec3(a[i, c, world], a[i, c + 1, world], a[i, c + 2, world])
+    load3, store3 = _memory(3, T)
+    load_pose, store_pose = _memory(POSE, T)
+    load_motion, store_motion = _memory(MOTION, T)
+    load_rigid, store_rigid = _memory(RIGID, T)
+    load_articulated, store_articulated = _memory(ARTICULATED, T)
 
     @wp.func
-    def store(a: wp.array3d[T], i: int, c: int, world: int, v: vec3):
-        a[i, c, world] = v[0]
-        a[i, c + 1, world] = v[1]
-        a[i, c + 2, world] = v[2]
+    def pose(R: mat33, l: vec3):
+        return vec12(
+            R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2], l[0], l[1], l[2]
+        )  # fmt: skip
 
     @wp.func
-    def load_matrix(a: wp.array3d[T], i: int, c: int, world: int):
-        return wp.matrix_from_rows(load(a, i, c, world), load(a, i, c + 3, world), load(a, i, c + 6, world))
+    def rotation_of(x: vec12):
+        return mat33(x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7], x[8])
 
     @wp.func
-    def store_matrix(a: wp.array3d[T], i: int, c: int, world: int, m: mat33):
-        for row in range(3):
-            for column in range(3):
-                a[i, c + 3 * row + column, world] = m[row, column]
+    def motion(w: vec3, v: vec3):
+        return vec6(w[0], w[1], w[2], v[0], v[1], v[2])
 
     @wp.func
-    def load_symmetric(a: wp.array3d[T], i: int, c: int, world: int):
-        xx, yy, zz = a[i, c, world], a[i, c + 1, world], a[i, c + 2, world]
-        xy, xz, yz = a[i, c + 3, world], a[i, c + 4, world], a[i, c + 5, world]
-        return mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+    def base(gravity: wp.array2d[T], world: int):
+        """Acceleration of the inertial frame: gravity's, the other way; without gravity none."""
+        v = vec3()
+        if gravity:
+            v = -vec3(gravity[0, world], gravity[1, world], gravity[2, world])
+        return motion(vec3(), v)
 
     @wp.func
-    def store_symmetric(a: wp.array3d[T], i: int, c: int, world: int, m: mat33):
-        a[i, c, world] = m[0, 0]
-        a[i, c + 1, world] = m[1, 1]
-        a[i, c + 2, world] = m[2, 2]
-        a[i, c + 3, world] = m[0, 1]
-        a[i, c + 4, world] = m[0, 2]
-        a[i, c + 5, world] = m[1, 2]
+    def packed(J: mat33, C: mat33, m: mat33):
+        """P = [[J, C], [C*, m]]"""
+        return vec21(
+            J[0, 0], J[0, 1], J[0, 2], C[0, 0], C[0, 1], C[0, 2],
+            J[1, 1], J[1, 2], C[1, 0], C[1, 1], C[1, 2],
+            J[2, 2], C[2, 0], C[2, 1], C[2, 2],
+            m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2],
+        )  # fmt: skip
+
+    @wp.func
+    def J_of(P: vec21):
+        return mat33(P[0], P[1], P[2], P[1], P[6], P[7], P[2], P[7], P[11])
+
+    @wp.func
+    def C_of(P: vec21):
+        return mat33(P[3], P[4], P[5], P[8], P[9], P[10], P[12], P[13], P[14])
+
+    @wp.func
+    def m_of(P: vec21):
+        return mat33(P[15], P[16], P[17], P[16], P[18], P[19], P[17], P[19], P[20])
 
     @wp.func
     def skew(v: vec3):
@@ -67,48 +92,15 @@ def spatial(T) -> types.SimpleNamespace:
         a = skew(axis)
         return wp.identity(n=3, dtype=T) + (T(2.0) * s * c) * a + (T(2.0) * s * s) * (a * a)
 
-    @wp.func
-    def quaternion_rotation(x: T, y: T, z: T, w: T):
-        """Rotation of the quaternion after normalising it; NaN for a zero quaternion."""
-        s = T(2.0) / (x * x + y * y + z * z + w * w)
-        return mat33(
-            T(1.0) - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
-            s * (x * y + w * z), T(1.0) - s * (x * x + z * z), s * (y * z - w * x),
-            s * (x * z - w * y), s * (y * z + w * x), T(1.0) - s * (x * x + y * y),
-        )  # fmt: skip
+    return types.SimpleNamespace(**locals())
 
-    @wp.func
-    def force_to_parent(R: mat33, l: vec3, n: vec3, f: vec3):
-        """phi(p, k) (n; f)"""
-        f_p = R * f
-        return R * n + wp.cross(l, f_p), f_p
 
-    @wp.func
-    def motion_to_child(R: mat33, l: vec3, w: vec3, v: vec3):
-        """phi*(p, k) (omega; v)"""
-        Rt = wp.transpose(R)
-        return Rt * w, Rt * (v + wp.cross(w, l))
-
-    @wp.func
-    def acceleration_to_child(R: mat33, l: vec3, w: vec3, dw: vec3, dv: vec3):
-        """(d omega/dt; dv/dt) of a frame at (R, l) fixed to a body with angular velocity w, as an observer sees it."""
-        Rt = wp.transpose(R)
-        return Rt * dw, Rt * (dv + wp.cross(dw, l) + wp.cross(w, wp.cross(w, l)))
-
-    @wp.func
-    def rigid_apply(mass: T, moment: vec3, inertia: mat33, w: vec3, v: vec3):
-        """(n; f) = M (omega; v)"""
-        return inertia * w + wp.cross(moment, v), mass * v - wp.cross(moment, w)
-
-    @wp.func
-    def articulated_to_parent(R: mat33, l: vec3, J: mat33, C: mat33, m: mat33):
-        """phi(p, k) P phi*(p, k), block by block."""
-        Rt = wp.transpose(R)
-        m_p = R * m * Rt
-        C_r = R * C * Rt
-        L = skew(l)
-        C_p = C_r + L * m_p
-        J_p = R * J * Rt + L * wp.transpose(C_r) - C_p * L
-        return J_p, C_p, m_p
-
-    return types.SimpleNamespace(**{name: f for name, f in locals().items() if name != "T"})
+def _memory(n: int, T):
+    """Functions that load, and store, the ``n`` components a[i, :, world] as one vector."""
+    c, vector, array = C_TYPE[T], wp.types.vector(n, T), wp.array3d[T]
+    entry, places = ENTRY.format(c=c), [COMPONENT.format(c=c, k=k) for k in range(n)]
+    loads = "".join(f"v[{k}] = {place};\n" for k, place in enumerate(places))
+    stores = "".join(f"{place} = v[{k}];\n" for k, place in enumerate(places))
+    where = {"a": array, "i": int, "world": int}
+    load = function(f"load_{n}_{T.__name__}", f"{entry}wp::vec_t<{n}, {c}> v;\n{loads}return v;", where, vector)
+    return load, function(f"store_{n}_{T.__name__}", entry + stores, where | {"v": vector})

@@ -13,7 +13,6 @@ import functools
 import warp as wp
 
 from .kinematics import SCREWS
-from .spatial import spatial
 from .topology import Topology
 
 FINE, NOT_POSITIVE, NOT_FINITE, DIGITS_LOST, OUT_OF_RANGE = range(5)  # the words
@@ -22,7 +21,7 @@ NORMAL = {wp.float32: (2.0**-126, 2.0**127), wp.float64: (2.0**-1022, 2.0**1023)
 
 
 @functools.cache
-def digits(T) -> wp.Kernel:
+def digits(s) -> wp.Kernel:
     """Inward, one level, after ``factor``: lost = (H S H* + |H| |P| |H*| + |Delta|) / D, the error of D in eps.
 
     In place of the number: -NOT_POSITIVE where D is NaN for want of a positive pivot, -OUT_OF_RANGE where D or what it
@@ -33,8 +32,7 @@ def digits(T) -> wp.Kernel:
     cancels its own row to zero without; an oblique one multiplies by how far |H| |P| |H*| lies above D. A rotation
     about a frame axis keeps small entries, any other does not.
     """
-    s = spatial(T)
-    vec3, mat33 = s.vec3, s.mat33
+    T, vec3, mat33 = s.T, s.vec3, s.mat33
     smallest = T(NORMAL[T][0] / EPSILON[T])  # below, products that carry the last digit of D are subnormal
     largest = T(NORMAL[T][1])
 
@@ -84,25 +82,20 @@ def digits(T) -> wp.Kernel:
         rigid: wp.array3d[T],
         armature: wp.array2d[T],
         articulated: wp.array3d[T],
+        gain: wp.array3d[T],
         pivot: wp.array2d[T],
         rounding_out: wp.array3d[T],  # S of P+ in the parent's frame
         lost_out: wp.array2d[T],
     ):
         i, world = wp.tid()
         node = topology.order[level + i]
-        mass = rigid[node, 0, world]
-        J = s.load_symmetric(rigid, node, 4, world)
-        C = s.skew(s.load(rigid, node, 1, world))
-        m = wp.diag(vec3(mass, mass, mass))
-        S_J, S_C, S_m = mat33(), mat33(), mat33()
+        P = s.articulated(s.load_rigid(rigid, node, world))
+        S = s.vec21()
         for c in range(topology.child_start[node], topology.child_start[node + 1]):
-            child = topology.children[c]
-            J += s.load_symmetric(articulated, child, 0, world)
-            C += s.load_matrix(articulated, child, 6, world)
-            m += s.load_symmetric(articulated, child, 15, world)
-            S_J += s.load_symmetric(rounding_out, child, 0, world)
-            S_C += s.load_matrix(rounding_out, child, 6, world)
-            S_m += s.load_symmetric(rounding_out, child, 15, world)
+            P += s.load_articulated(articulated, topology.children[c], world)
+            S += s.load_articulated(rounding_out, topology.children[c], world)
+        J, C, m = s.J_of(P), s.C_of(P), s.m_of(P)
+        S_J, S_C, S_m = s.J_of(S), s.C_of(S), s.m_of(S)
         terms = wp.sqrt(T(1 + topology.child_start[node + 1] - topology.child_start[node]))
         d_n, d_f = root_of_diagonal(J), root_of_diagonal(m)
         S_J += terms * wp.diag(wp.cw_mul(d_n, d_n))
@@ -112,8 +105,9 @@ def digits(T) -> wp.Kernel:
         count = topology.dof_count[node]
         for e in range(count):
             dof = first + count - 1 - e
-            w, v = s.load(axis, dof, 0, world), s.load(axis, dof, 3, world)
-            n, f = J * w + C * v, wp.transpose(C) * w + m * v
+            h, U = s.load_motion(axis, dof, world), s.load_motion(gain, dof, world)
+            w, v = h[0:3], h[3:6]
+            n, f = U[0:3], U[3:6]
             D, delta = pivot[dof, world], wp.abs(armature[dof, world])
             w_a, v_a = wp.abs(w), wp.abs(v)
             n_a = absolute(J) * w_a + absolute(C) * v_a
@@ -141,9 +135,8 @@ def digits(T) -> wp.Kernel:
             S_J += wp.outer(n_D, error * n_D - n_S) - wp.outer(n_S, n_D)
             S_C += wp.outer(n_D, error * f_D - f_S) - wp.outer(n_S, f_D)
             S_m += wp.outer(f_D, error * f_D - f_S) - wp.outer(f_S, f_D)
-            J -= wp.outer(n, n_D)
-            C -= wp.outer(n, f_D)
-            m -= wp.outer(f, f_D)
+            P = s.without(P, U, D)
+            J, C, m = s.J_of(P), s.C_of(P), s.m_of(P)
             if along:
                 own = T(0.0)
                 if delta > T(0.0):  # which leaves P Delta / D of the row, as the difference of two larger numbers
@@ -155,28 +148,28 @@ def digits(T) -> wp.Kernel:
                 S_J += scale * scale * wp.diag(wp.cw_mul(d_n, d_n))
                 S_m += scale * scale * wp.diag(wp.cw_mul(d_f, d_f))
         if topology.parent[node] >= 0:
-            R, l = s.load_matrix(pose, node, 0, world), s.load(pose, node, 9, world)
-            R_a = mixing(R, s.load_matrix(tree, node, 0, world), wp.where(topology.motion[node] == SCREWS, 1, 0))
+            place = s.load_pose(pose, node, world)
+            l = vec3(place[9], place[10], place[11])
+            R_tree = s.rotation_of(s.load_pose(tree, node, world))
+            R_a = mixing(s.rotation_of(place), R_tree, wp.where(topology.motion[node] == SCREWS, 1, 0))
             f_d = R_a * root_of_diagonal(m)
             n_d = R_a * root_of_diagonal(J) + absolute(s.skew(l)) * f_d
-            S_J, S_C, S_m = s.articulated_to_parent(R, l, S_J, S_C, S_m)
-            S_J += wp.diag(wp.cw_mul(n_d, n_d))
-            S_m += wp.diag(wp.cw_mul(f_d, f_d))
-            s.store_symmetric(rounding_out, node, 0, world, S_J)
-            s.store_matrix(rounding_out, node, 6, world, S_C)
-            s.store_symmetric(rounding_out, node, 15, world, S_m)
+            S = s.articulated_to_parent(place, s.packed(S_J, S_C, S_m))
+            S += s.packed(wp.diag(wp.cw_mul(n_d, n_d)), mat33(), wp.diag(wp.cw_mul(f_d, f_d)))
+            s.store_articulated(rounding_out, node, world, S)
 
     return kernel
 
 
 @functools.cache
-def word(T) -> wp.Kernel:
+def word(s) -> wp.Kernel:
     """The worst of what is true of a world, one thread for each: NOT_FINITE, NOT_POSITIVE, OUT_OF_RANGE, DIGITS_LOST.
 
     DIGITS_LOST: D may have lost half of the digits of T, lost > 2 eps^-1/2: measured errors are .02 to .8 of ``lost``.
     NOT_POSITIVE as the sweeps see it; and where a result is not finite and D may be rounding alone, since another form
     of the recursion refuses other pivots. OUT_OF_RANGE also where the result overflows, or all of it is subnormal.
     """
+    T = s.T
     most = T(2.0 * EPSILON[T] ** -0.5)
     none = T(0.1 / EPSILON[T])
     tiny = T(NORMAL[T][0])

@@ -256,13 +256,12 @@ def _held(frame: Frame, c: str) -> list[str]:
 def _each(n: int, team: int, statement: str) -> str:
     """``statement`` for every entry i of the rows of the worlds that are present, the whole team side by side."""
     turns = -(-WARP * n // team)
-    loop = f"for (int k = 0; k < {turns}; ++k) {{ const int i = member + {team} * k;"
     some = "" if turns * team == WARP * n else f"if (i < {WARP * n}) "
     return f"""if (present == 32) {{
     #pragma unroll
-    {loop} {some}{statement} }}
+    for (int k = 0; k < {turns}; ++k) {{ const int i = member + {team} * k; {some}{statement} }}
 }} else {{
-    {loop} if (i < present * {n}) {statement} }}
+    for (int i = member; i < present * {n}; i += {team}) {{ {statement} }}
 }}"""
 
 
@@ -346,6 +345,18 @@ def alone(a_pass: str, c: str) -> str:
         f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{", "missed_row[0] = 0;", a_pass,
         "if (!(missed_row[0] > 0)) break;", "}",
     ])
+
+
+def function(name: str, native: str, arguments: dict[str, type], result: type | None = None) -> wp.Function:
+    """A Warp function of ``arguments``, by name, that runs ``native``."""
+    types = {f"type_of_{argument}": kind for argument, kind in arguments.items()} | {"type_of_result": result}
+    declared = ", ".join(f"{argument}: type_of_{argument}" for argument in arguments)
+    source = f"@wp.func_native(native)\ndef {name}({declared}){' -> type_of_result' if result else ''}: ...\n"
+    file = f"<{name}>"
+    linecache.cache[file] = len(source), None, source.splitlines(True), file  # where Warp looks for the source
+    space = types | {"wp": wp, "native": native, "__name__": name}
+    exec(compile(source, file, "exec"), space)
+    return space[name]
 
 
 def kernel(

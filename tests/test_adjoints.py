@@ -26,17 +26,18 @@ SCENES = {
     "two roots": lambda: zoo.from_parents([-1, -1, 1], ["ball", "planar", "revolute"], 62),
 }
 WARPS = {"limbs": lambda: SCENES["limbs"](), "fork": zoo.fork, "hand": hand}
-NAMES = ("tangent", "qd", "tau")
+CASES = [("limbs", "float64", "tree"), ("limbs", "float64", "segment"), ("limbs", "float32", "segment"),
+         ("two roots", "float64", "segment")]  # fmt: skip
 
 
 @functools.cache
 def scene_of(name):
-    return zoo.varied(SCENES[name](), WORLDS)
+    return SCENES[name]()
 
 
-def built(name, granularity, dtype="float64", device=None):
-    """Dynamics and the arrays of a state; ``y`` is the cotangent, qdd the accelerations of the state."""
-    scene = scene_of(name)
+def built(name, granularity, dtype="float64", device=None, varied=False):
+    """Dynamics and the arrays of a state; ``y`` is the cotangent."""
+    scene = zoo.varied(scene_of(name), WORLDS) if varied else scene_of(name)
     dyn = spo.Dynamics(scene, WORLDS, device=device, dtype=dtype, granularity=granularity)
     arrays = laws.states(scene, WORLDS, dtype=dtype)
     arrays["y"] = np.ascontiguousarray(arrays["b"][:, :, 0])
@@ -48,34 +49,45 @@ def poisoned(dyn, name):
     return wp.full((WORLDS, width), float("nan"), dtype=dyn.dtype, device=dyn.device)
 
 
-def error(got, J, y):
-    return laws.error(got.numpy(), np.einsum("wij,wi->wj", np.asarray(J, dtype=np.float64), y))
+def mul(J, y):
+    """J* y of every world."""
+    return np.einsum("wij,wi->wj", J, y)
 
 
-@pytest.mark.parametrize("granularity", ["tree", "segment"])
-@pytest.mark.parametrize("name, dtype", [("limbs", "float64"), ("limbs", "float32"), ("two roots", "float64")])
+def dense(scene, a, given=("q", "qd", "qdd")):
+    """d tau / d q along tangent coordinates, d tau / d qd, Mass: [3, world, dof, dof]."""
+    shape = {"out": (3, scene.dof_count, scene.dof_count)}
+    J = symbolic.run(scene, "inverse_dynamics_derivatives", a, given, shape, trace=Adjoints)["out"]
+    return np.nan_to_num(J).swapaxes(0, 1)  # what is not stored is zero
+
+
+@pytest.mark.parametrize("name, dtype, granularity", CASES)
 def test_forward_dynamics(name, dtype, granularity, device):
     """Accelerations made on the way, or given; external forces, or none."""
     dyn, a = built(name, granularity, dtype, device)
-    on = laws.to_device(dyn, a)
-    for body_f in (None, on["body_f"]):
-        state = on["q"], on["qd"], on["tau"], body_f
-        J = [block.numpy() for block in dyn.forward_dynamics_derivatives(*state)]
-        for qdd in (None, dyn.forward_dynamics(*state)):
-            out = {key: poisoned(dyn, key) for key in NAMES}
-            dyn.forward_dynamics_vjp(*state, cotangent=on["y"], qdd=qdd, wrt=NAMES, out=out)
-            for key, block in zip(NAMES, J, strict=True):
-                assert error(out[key], block, a["y"]) <= TOLERANCE[dtype], (key, body_f is None, qdd is None)
+    on, scene = laws.to_device(dyn, a), scene_of(name)
+    for body_f in (None, "body_f") if dtype == "float64" else (None,):
+        state = on["q"], on["qd"], on["tau"], on.get(body_f)
+        known = dyn.forward_dynamics(*state)
+        a["qdd"] = known.numpy().astype(np.float64)
+        by_q, by_qd, mass = dense(scene, a, ("q", "qd", "qdd", *([body_f] if body_f else ())))
+        weights = np.linalg.solve(mass, a["y"][..., None])[..., 0]
+        wanted = {"tangent": -mul(by_q, weights), "qd": -mul(by_qd, weights), "tau": weights}
+        for qdd in (None, known):
+            out = {key: poisoned(dyn, key) for key in wanted}
+            dyn.forward_dynamics_vjp(*state, cotangent=on["y"], qdd=qdd, wrt=tuple(wanted), out=out)
+            for key, value in wanted.items():
+                assert laws.error(out[key].numpy(), value) <= TOLERANCE[dtype], (key, body_f, qdd is None)
     lines = [line for line in dyn.programs.described() if "forward_dynamics_vjp" in line]
     assert any("segment" in line for line in lines) == (granularity == "segment")
 
 
 @pytest.mark.parametrize("wrt", [("qd", "q"), ("tau",), ("tau", "tangent"), ("body_f", "q")])
 def test_what_is_asked_for_by_limbs(wrt, device):
-    """Any part of it, in any order, is what a thread for the whole tree gives."""
+    """Any part of it, in any order, is what a thread for the whole tree gives; values differ between worlds."""
     found = []
     for granularity in ("segment", "tree"):
-        dyn, a = built("limbs", granularity, device=device)
+        dyn, a = built("limbs", granularity, device=device, varied=True)
         body_f = a["body_f"] if "body_f" in wrt else None
         given = {"cotangent": a["y"], "wrt": wrt}
         found.append(dyn.forward_dynamics_vjp(a["q"], a["qd"], a["tau"], body_f, **given))
@@ -86,14 +98,12 @@ def test_what_is_asked_for_by_limbs(wrt, device):
 
 @pytest.mark.parametrize("granularity", ["tree", "segment"])
 def test_inverse_dynamics(granularity, device):
-    dyn, a = built("limbs", granularity, device=device)
+    dyn, a = built("two roots", granularity, device=device)
     on = laws.to_device(dyn, a)
-    state, wrt = (on["q"], on["qd"], on["qdd"]), ("tangent", "qd", "qdd")
-    J = [block.numpy() for block in dyn.inverse_dynamics_derivatives(*state)]
-    out = {key: poisoned(dyn, key) for key in wrt}
-    dyn.inverse_dynamics_vjp(*state, cotangent=on["y"], wrt=wrt, out=out)
-    for key, block in zip(wrt, J, strict=True):
-        assert error(out[key], block, a["y"]) <= TOLERANCE["float64"], key
+    out = {key: poisoned(dyn, key) for key in ("tangent", "qd", "qdd")}
+    dyn.inverse_dynamics_vjp(on["q"], on["qd"], on["qdd"], cotangent=on["y"], wrt=tuple(out), out=out)
+    for got, J in zip(out.values(), dense(dyn.scene, a), strict=True):
+        assert laws.error(got.numpy(), mul(J, a["y"])) <= TOLERANCE["float64"]
 
 
 def test_a_world_without_a_solution_stays_alone(device):
@@ -120,9 +130,9 @@ def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
     dyn = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="segment")
     a, rate, wide = laws.states(scene, WORLDS), (WORLDS, scene.dof_count), (WORLDS, scene.coord_count)
     a["cotangent"] = a["b"][:, :, 0].copy()
-    dense = [Dense(scene, a["q"][w]) for w in range(WORLDS)]
-    qdd = np.array([dense[w].forward_dynamics(a["qd"][w], a["tau"][w]) for w in range(WORLDS)])
-    solved = np.array([np.linalg.solve(dense[w].mass_matrix, a["cotangent"][w]) for w in range(WORLDS)])
+    reference = [Dense(scene, q) for q in a["q"]]
+    qdd = np.array([reference[w].forward_dynamics(a["qd"][w], a["tau"][w]) for w in range(WORLDS)])
+    solved = np.array([np.linalg.solve(reference[w].mass_matrix, a["cotangent"][w]) for w in range(WORLDS)])
     state, find, further = {"q": wide, "qd": rate}, dyn.programs.find, {}
     program = find("forward_dynamics_and_solve", state | {"tau": rate, "cotangent": rate}, rate, {"solved": rate})
     assert program.warps > 1 and texts[-1].frame.staged == texts[-1].frame.gathered == staged
@@ -130,9 +140,7 @@ def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
         assert laws.error(warp_machine.run(texts[-1], a, backwards, further), qdd) <= TOLERANCE["float64"]
         assert laws.error(further.pop("solved"), solved) <= TOLERANCE["float64"]
     a |= {"qdd": qdd, "solved": solved}
-    n = scene.dof_count
-    J = symbolic.run(scene, "inverse_dynamics_derivatives", a, ("q", "qd", "qdd"), {"out": (3, n, n)}, trace=Adjoints)
-    by_q, by_qd, _ = -np.einsum("wbij,wi->bwj", np.nan_to_num(J["out"]), solved)
+    by_q, by_qd = (-mul(J, solved) for J in dense(scene, a)[:2])
     state |= {"qdd": rate, "solved": rate}
     program = find("forward_dynamics_vjp", state, rate, {"qd_bar": rate}, wrt=("tangent", "qd"))
     assert program.warps > 1
@@ -160,9 +168,9 @@ def test_a_planted_bug_is_seen(bug, monkeypatch):
     scene = SCENES["limbs"]()
     n, a = scene.dof_count, laws.states(scene, 1)
     a["cotangent"] = np.ascontiguousarray(a["b"][:, :, 0])
-    run, state = functools.partial(symbolic.run, scene, trace=Adjoints), ("q", "qd", "qdd")
-    J = np.nan_to_num(run("inverse_dynamics_derivatives", a, state, {"out": (3, n, n)})["out"])[0]
-    shapes, wrt = {"out": (n,), "qd_bar": (n,), "qdd_bar": (n,)}, ("tangent", "qd", "qdd")
-    got = run("inverse_dynamics_vjp", a, (*state, "cotangent"), shapes, wrt=wrt)
-    worst = max(laws.error(x[0], J[i].T @ a["cotangent"][0]) for i, x in enumerate(got.values()))
-    assert worst <= 1e-11 if bug == "none" else worst > 1e-3
+    state, wrt = ("q", "qd", "qdd"), ("tangent", "qd", "qdd")
+    shapes = {"out": (n,), "qd_bar": (n,), "qdd_bar": (n,)}
+    got = symbolic.run(scene, "inverse_dynamics_vjp", a, (*state, "cotangent"), shapes, trace=Adjoints, wrt=wrt)
+    pairs = zip(got.values(), dense(scene, a), strict=True)
+    worst = max(laws.error(value, mul(J, a["cotangent"])) for value, J in pairs)
+    assert worst <= TOLERANCE["float64"] if bug == "none" else worst > 1e-3

@@ -104,6 +104,7 @@ RULES = {
     "cos": lambda x, y: g.cos(x * y),
     "sqrt": lambda x, y: g.sqrt(x * x + y * y),
     "reciprocal": lambda x, y: g.reciprocal(x + 3.0 * y),
+    "quotient": lambda x, y: g.quotient(x * y, x + 3.0 * y),
     "reduced": lambda x, y: g.cos(g.reduced(x)) * y,
     "absolute": lambda x, y: g.absolute(x * y),
     "guarded": lambda x, y: g.guarded(x * x + 2.0, y * y) * y,

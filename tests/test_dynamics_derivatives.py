@@ -312,12 +312,12 @@ def test_operations_are_no_more_than_they_were(name):
     find = spo.Dynamics(scene, 1, device="cpu", granularity="tree").programs.find
     q, rate, n = (1, scene.coord_count), (1, scene.dof_count), scene.dof_count
     state = {"q": q, "qd": rate, "qdd": rate}
+    pulled = {"q": q, "qd": rate, "tau": rate, "cotangent": rate}
     bars = {"qd_bar": rate, "tau_bar": rate}
     found = (
         find("inverse_dynamics_derivatives", state, (1, 3, n, n)),
         find("mass_matrix_derivative", {"q": q}, (1, n, n, n)),
-        find("forward_dynamics_vjp", {"q": q, "qd": rate, "tau": rate, "cotangent": rate}, q, bars,
-             wrt=("q", "qd", "tau")),
+        find("forward_dynamics_vjp", pulled, q, bars, wrt=("q", "qd", "tau")),
     )
     counts = tuple(program.operations for program in found)
     assert all(a <= b for a, b in zip(counts, PINNED[name], strict=True)), counts

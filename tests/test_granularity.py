@@ -476,3 +476,9 @@ def test_velocity_terms_first(name, granularity, device):
     laws.equals_reference(direct, "forward_dynamics", arrays, laws.TOLERANCE["float64"])
     one, other = (next(iter(each.programs._programs.values())).kernel.key for each in (dyn, direct))
     assert one != other
+    back = [
+        each.forward_dynamics_vjp(*(arrays[n] for n in ("q", "qd", "tau")), cotangent=arrays["qdd"], wrt=("q", "qd"))
+        for each in (dyn, direct)
+    ]
+    for got, wanted in zip(*(each.values() for each in back), strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=0.0, atol=1e-9 * np.abs(wanted).max())

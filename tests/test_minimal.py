@@ -13,8 +13,8 @@ from test_loops import traced
 
 import warp_spo as spo
 from warp_spo import loops
-from warp_spo.dynamics import OPERATIONS
 from warp_spo.embedding import Closing, embedding
+from warp_spo.preparation import TAKES
 from warp_spo.recursions import minimal
 
 DIFFERENCES = 1e-9  # what differences of order 8 leave of second derivatives; conditioning of the draws
@@ -238,8 +238,8 @@ def test_what_speaks_of_independent_dofs_fits_what_speaks_of_all(device):
     np.testing.assert_allclose(np.einsum("b,wbi->wi", scene.values["body_mass"][0], moves), force[:, :3], atol=1e-8)
 
 
-OF_ALL_DOFS = {"forward_dynamics", "passive_force", "body_poses", "body_velocities", "integrate", "frame_accelerations",
-               "body_accelerations", "closure_error", "project"}
+OF_ALL_DOFS = {"forward_dynamics", "passive_force", "body_poses", "body_velocities", "body_states", "integrate",
+               "frame_accelerations", "body_accelerations", "closure_error", "project"}
 """What speaks of all dofs, or of bodies, whatever ties them."""
 OF_MULTIPLIERS = {"inverse_dynamics", "mass_matrix", "mass_matrix_inverse", "solve_mass_matrix", "bias_force",
                   "gravity_force", "log_det_mass_matrix", "log_det_mass_matrix_gradient", "mass_matrix_packed",
@@ -254,8 +254,8 @@ def test_no_operation_forgets_the_loops(how, device):
     dyn = spo.Dynamics(MECHANISMS["gripper"](), 1, device=device, loops=how)
     known = {"embed": {*loops.EMBEDDED, "bias_force", "gravity_force", "operational_inertia"} | OF_ALL_DOFS,
              "multipliers": OF_ALL_DOFS | OF_MULTIPLIERS}[how]
-    assert known <= set(OPERATIONS)
-    for operation in set(OPERATIONS) - known - {"step"}:  # which has tests of its own
+    assert known <= set(TAKES)
+    for operation in set(TAKES) - known - {"step"}:  # which has tests of its own
         with pytest.raises(spo.UnsupportedError, match=r"use|loops='cut'|loops='multipliers'|independent"):
             dyn.prepare(operation)
     q = np.zeros((1, dyn.scene.coord_count))

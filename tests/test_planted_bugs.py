@@ -10,7 +10,7 @@ from laws import TOLERANCE
 from mutants import mutant
 
 import warp_spo as spo
-from warp_spo import blocks, levels, teams
+from warp_spo import blocks, levels, node_steps, teams
 from warp_spo.kernels import straight
 from warp_spo.recursions import articulated, inverse, links, messages, newton_euler, pieces, traced
 from warp_spo.trace import graph, spatial
@@ -69,24 +69,20 @@ def test_worlds_that_leak_into_each_other(plant, device):
     plant(
         levels,
         "kinematics",
-        "dw, dv = s.load(acceleration_out, parent, 0, world), ",
-        "dw, dv = s.load(acceleration_out, parent, 0, wp.max(world - 1, 0)), ",
+        "alpha = s.load_motion(acceleration_out, parent, world)",
+        "alpha = s.load_motion(acceleration_out, parent, wp.max(world - 1, 0))",
     )
     dyn, arrays = dynamics(device)
     with pytest.raises(AssertionError):
         laws.worlds_do_not_touch_each_other(dyn, "inverse_dynamics", arrays)
 
 
-def test_a_wrong_gyroscopic_sign(plant, device):
+def test_a_wrong_gyroscopic_sign(monkeypatch, device):
     """It does no work and forward dynamics shares it: only an independent bias force sees it."""
     dyn, arrays = dynamics(device, "screw_tree")
     laws.bias_force_is_christoffel(dyn, arrays, 1e-6)
-    plant(
-        levels,
-        "newton_euler",
-        "            n += wp.cross(w, inertia * w)\n            f += wp.cross(w, wp.cross(w, moment))",
-        "            n -= wp.cross(w, inertia * w)\n            f -= wp.cross(w, wp.cross(w, moment))",
-    )
+    symbolic.plant(monkeypatch, newton_euler, "body_force", "+ cross(motion.spin", "- cross(motion.spin")
+    monkeypatch.setattr(levels, "steps", node_steps.Steps)
     dyn, arrays = dynamics(device, "screw_tree")
     laws.forward_undoes_inverse_dynamics(dyn, arrays, TOLERANCE["float64"])  # blind, as theory says
     with pytest.raises(AssertionError):

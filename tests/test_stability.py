@@ -62,4 +62,24 @@ def test_one_robot():
             raise
         pytest.skip("example-robot-data is not installed")
     assert cells["robot"] == "z1 (7)" and cells["2 ms"] == "0.00 %"
-    assert float(cells["ours at its step"].rstrip(" %")) < 1e-9
+    assert numbered(cells["ours at its step"]) < 1e-9 and numbered(cells["ours from MuJoCo, both at 2 ms"]) < 1e-9
+    itself, ours, midpoint = map(numbered, cells["from MuJoCo, 2 ms: itself / ours / midpoint"].split(" / "))
+    assert itself == ours < 1.0 and midpoint < 0.1 and abs(float(cells["order"]) - 1.0) < 0.15
+
+
+def numbered(cell):
+    return float(cell.rstrip(" %"))
+
+
+def test_an_arm_is_as_far_from_a_fine_step_as_mujoco_is():
+    """Ours is MuJoCo's scheme, so its error at 2 ms is MuJoCo's, of order 1; a step of order 2 is within a percent."""
+    scene = zoo.from_parents([-1, 0, 1], ["revolute"] * 3, 8).with_values(
+        joint_damping=np.full(3, 0.05), joint_limit_upper=np.full(3, 0.1), joint_stiffness=np.zeros(3),
+        joint_armature=np.zeros(3),
+    )
+    errors = stability.mujoco_errors(scene, np.array([0.3, -0.2, 0.5]), np.array([1.0, -1.0, 0.5]))
+    for dt in (stability.FINE, *stability.STEPS):
+        assert errors["apart", dt] <= 1e-9
+    assert errors["MuJoCo", 2e-3] == pytest.approx(errors["semi_implicit", 2e-3], rel=1e-6)
+    assert errors["midpoint", 2e-3] <= 0.01 < errors["semi_implicit", 5e-3]
+    assert abs(stability.observed_order(errors) - 1.0) < 0.15

@@ -47,8 +47,6 @@ ENTERING: dict[str, tuple[str, ...]] = {
 }
 """Values that enter an operation, where they are not those that links are made of."""
 OPTIONAL = ("body_f", "target_q", "target_qd")
-PRODUCTS = (*(f"{operation}_vjp" for operation in ARGUMENTS), "forward_dynamics_jvp", "inverse_dynamics_jvp")
-"""What ``prepare`` takes besides operations."""
 
 
 def differentiable(method: Callable) -> Callable:
@@ -301,30 +299,6 @@ class Adjoints:
                 else:
                     found.setdefault("b", result.clone())[..., c] = gradient
         return found
-
-    def _prepare_product(self, product: str, options: dict[str, Any]) -> None:
-        """See ``prepare``."""
-        operation, way = product[:-4], product[-3:]
-        wrt = tuple(options.pop("wrt", ()) if way == "vjp" else ())
-        along = tuple(options.pop("along", ("dq", "dqd", f"d{ARGUMENTS[operation][2]}")) if way == "jvp" else ())
-        asked = (name for name in ARGUMENTS[operation]
-                 if name not in OPTIONAL or options.pop(name, name in wrt or f"d{name}" in along))  # fmt: skip
-        zeros = lambda shape: wp.zeros(shape, dtype=self.dtype, device=self.device)  # noqa: E731
-        given: dict[str, Any] = {name: zeros(self._shape_of(name)) for name in asked}
-        given["q"].assign([self.scene.neutral_q] * self.worlds)
-        more: dict[str, Any] = {"frames": options.pop("frames", [0])} if operation == "jacobian" else {"dt": 1e-3}
-        if options:
-            raise ValueError(f"Dynamics.prepare: {product} has no option {', '.join(options)}")
-        if way == "jvp":
-            rates = {name: zeros(self._shape_of(name[1:] if name == "dbody_f" else "qd")) for name in along}
-            getattr(self, product)(**given, **rates)
-            return
-        results = [zeros(shape) for shape in self.result_shapes(operation, **more)]
-        if operation == "forward_dynamics":
-            self.forward_dynamics_vjp(**given, cotangent=results[0], wrt=wrt or tuple(given))
-        else:
-            cotangents = results[: 2 if operation == "step" else 1]
-            self.pulled_back(operation, given, more, results, cotangents, wrt or tuple(given))
 
     @contextlib.contextmanager
     def held(self, values: dict[str, Any]) -> Iterator[None]:

@@ -17,7 +17,7 @@ import warp as wp
 from . import nodes
 from . import plan as plans
 from . import status as words
-from .adjoints import PRODUCTS, Adjoints, differentiable
+from .adjoints import Adjoints, differentiable
 from .arrays import Call, Values, parse_device, parse_dtype, recorded, shape_of
 from .derivatives import Derivatives
 from .errors import UnsupportedError
@@ -25,55 +25,17 @@ from .frames import Frame, checked
 from .levels import Recursions
 from .loops import EMBEDDED, Loops
 from .parameters import RIGID_VALUES, VARIABLE
+from .preparation import Preparation
 from .programs import Programs
 from .refinement import Refinement
 from .scene import Scene
 from .spatial_operators import SpatialOperators
 from .steps import Steps
 
-OPERATIONS = (
-    "forward_dynamics",
-    "inverse_dynamics",
-    "mass_matrix",
-    "mass_matrix_inverse",
-    "solve_mass_matrix",
-    "bias_force",
-    "gravity_force",
-    "passive_force",
-    "log_det_mass_matrix",
-    "body_poses",
-    "body_velocities",
-    "body_states",
-    "jacobian",
-    "operational_inertia_inverse",
-    "integrate",
-    "hybrid_dynamics",
-    "operational_inertia",
-    "jacobian_bias",
-    "frame_accelerations",
-    "operational_inertia_inverse_product",
-    "com_jacobian",
-    "centroidal_momentum_matrix",
-    "centroidal_momentum_bias",
-    "quasi_velocities",
-    "log_det_mass_matrix_gradient",
-    "fixman_torque",
-    "mass_matrix_packed",
-    "mass_matrix_inverse_packed",
-    "inverse_dynamics_derivatives",
-    "forward_dynamics_derivatives",
-    "mass_matrix_derivative",
-    "step",
-    "body_accelerations",
-    "body_reactions",
-    "closure_error",
-    "project",
-    "loop_multipliers",
-)
 LOOPS = ("raise", "cut", "embed", "multipliers")
 
 
-class Dynamics(Loops, Steps, Derivatives, Adjoints):
+class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
     """Dynamics of one scene in many worlds.
 
     Arrays are torch tensors, Warp arrays or NumPy arrays, [world, ...] and C-contiguous; the kind of the first one is
@@ -198,82 +160,6 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints):
         self.recursions.replace_values(self.scene)
         self.programs.forget()
         self._refinement = Refinement(self, self.refine) if self.refine else None
-
-    def prepare(self, operation: str, **options: Any) -> None:
-        """Compile and allocate all that ``operation`` needs, so that its next call only launches.
-
-        Args:
-            operation: name of a method, such as "forward_dynamics".
-            options: ``frames=`` for operations that take frames, ``columns=`` for solve_mass_matrix, ``prescribed=``
-                for hybrid_dynamics, ``integrator=`` for step, ``hold=`` for project, and ``body_f=True``,
-                ``status=True``, ``qdd=True``, ``target_q=True``, ``target_qd=True`` if they will be given.
-
-        Of the way back from an operation, torch's too, the name is "<operation>_vjp", such as "step_vjp", with ``wrt=``
-        the names of arguments and then of values in their order; default: all arguments that are given. For
-        "forward_dynamics_jvp" and "inverse_dynamics_jvp" ``along=`` names directions; default: all but "dbody_f".
-        """
-        if operation in PRODUCTS:
-            self._prepare_product(operation, options)
-            return
-        if operation not in OPERATIONS:
-            raise ValueError(f"Dynamics.prepare: no operation {operation!r}; expected one of {', '.join(OPERATIONS)}")
-        q: Any = wp.array(np.tile(self.scene.neutral_q, (self.worlds, 1)), dtype=self.dtype, device=self.device)
-        rate = wp.zeros((self.worlds, self.scene.dof_count), dtype=self.dtype, device=self.device)
-        extra: dict[str, Any] = {}
-        loaded = ("forward_dynamics", "inverse_dynamics", "bias_force", "hybrid_dynamics", "step", "body_reactions",
-                  "inverse_dynamics_derivatives", "forward_dynamics_derivatives", "loop_multipliers")  # fmt: skip
-        if operation == "project":
-            extra["hold"] = options.pop("hold", False)
-        if operation in loaded and options.pop("body_f", False):
-            shape = (self.worlds, self.scene.body_count, 6)
-            extra["body_f"] = wp.zeros(shape, dtype=self.dtype, device=self.device)
-        if operation == "step":
-            extra |= {name: array for name, array in (("target_q", q), ("target_qd", rate)) if options.pop(name, False)}
-            extra["integrator"] = options.pop("integrator", "semi_implicit")
-        if operation == "step" and options.pop("qdd", False):
-            extra["qdd"] = wp.zeros_like(rate)
-        if operation in ("forward_dynamics", "step") and options.pop("status", False):
-            extra["status"] = wp.zeros(self.worlds, dtype=wp.int32, device=self.device)
-        arguments: dict[str, tuple] = {
-            "forward_dynamics": (q, rate, rate),
-            "inverse_dynamics": (q, rate, rate),
-            "bias_force": (q, rate),
-            "passive_force": (q, rate),
-            "body_velocities": (q, rate),
-            "body_states": (q, rate),
-            "integrate": (q, rate, 0.0),
-            "hybrid_dynamics": (q, rate, rate, rate),
-            "step": (q, rate, rate, 1e-3),
-            "body_accelerations": (q, rate, rate),
-            "body_reactions": (q, rate, rate),
-            "jacobian_bias": (q, rate),
-            "frame_accelerations": (q, rate, rate),
-            "centroidal_momentum_bias": (q, rate),
-            "quasi_velocities": (q, rate),
-            "inverse_dynamics_derivatives": (q, rate, rate),
-            "forward_dynamics_derivatives": (q, rate, rate),
-            "project": (q, rate),
-            "loop_multipliers": (q, rate, rate),
-        }
-        given = arguments.get(operation, (q,))
-        if operation == "solve_mass_matrix":
-            columns = options.pop("columns", None)
-            if columns is not None and (not isinstance(columns, int) or columns < 0):
-                raise ValueError(f"Dynamics.prepare: columns is {columns!r}; expected how many right-hand sides")
-            sides = () if columns is None else (columns,)
-            shape = (self.worlds, self._minimal, *sides)
-            given = (q, wp.zeros(shape, dtype=self.dtype, device=self.device))
-        if operation == "hybrid_dynamics":
-            extra["prescribed"] = options.pop("prescribed", [False] * self.scene.dof_count)
-        if operation in ("jacobian", "operational_inertia_inverse", "operational_inertia", "jacobian_bias",
-                         "frame_accelerations", "operational_inertia_inverse_product"):  # fmt: skip
-            extra["frames"] = options.pop("frames", [0])
-        if operation == "operational_inertia_inverse_product":
-            wrenches = self.worlds, 6 * len(extra["frames"])
-            given = (q, wp.zeros(wrenches, dtype=self.dtype, device=self.device))
-        if options:
-            raise ValueError(f"Dynamics.prepare: {operation} has no option {', '.join(options)}")
-        getattr(self, operation)(*given, **extra)
 
     # -- dynamics --------------------------------------------------------------------------------------------------
     @differentiable

@@ -16,6 +16,7 @@ import warp as wp
 from .kernels import articulated, composite, declare, kinematics, newton_euler, parameters, rigid_blocks, tiles
 from .kernels.spatial import ARTICULATED, MOTION, POSE, RIGID
 from .kernels.topology import Topology
+from .node_steps import steps
 from .parameters import Parameters
 from .plan import Plan
 from .scene import Scene
@@ -27,12 +28,15 @@ class Recursions:
     Attributes:
         topology: the tree's tables on the device.
         parameters: the scene's values on the device.
+        steps: what kernels at node granularity do at a node.
     """
 
     def __init__(self, scene: Scene, plan: Plan, device: wp.Device, dtype: type, variable: tuple[str, ...]):
         self.scene, self.plan, self.device, self.dtype = scene, plan, device, dtype
-        for file in (parameters, kinematics, newton_euler, articulated, composite, rigid_blocks, tiles):
-            declare(file, dtype)
+        self.steps = steps(dtype)
+        declare(tiles, dtype)
+        for file in (parameters, kinematics, newton_euler, articulated, composite, rigid_blocks):
+            declare(file, self.steps)
         self.worlds = plan.worlds
         self.topology = _topology(scene, device)
         screw = np.column_stack([scene.dof_axis, scene.dof_angular, scene.dof_linear])
@@ -72,9 +76,13 @@ class Recursions:
     def launch(self, factory: Callable, dim: Any, inputs: list, outputs: list) -> None:
         wp.launch(factory(self.dtype), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
+    def launch_nodes(self, factory: Callable, dim: Any, inputs: list, outputs: list) -> None:
+        """Launch a kernel that takes the steps."""
+        wp.launch(factory(self.steps), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
     def _sweep(self, factory: Callable, levels: Sequence[tuple[int, int]], inputs: list, outputs: list) -> None:
         """One launch a level, one thread for each (node, world)."""
-        kernel = factory(self.dtype)
+        kernel = factory(self.steps)
         for first, count in levels:
             arguments = [self.topology, first, *inputs]
             wp.launch(kernel, (count, self.worlds), arguments, outputs, device=self.device)
@@ -83,7 +91,7 @@ class Recursions:
         self, factory: Callable, levels: Sequence, columns: tuple[int, int], inputs: list, outputs: list
     ) -> None:
         """One launch a level, one thread for each (node, column, world); ``columns`` = (first, count)."""
-        kernel = factory(self.dtype)
+        kernel = factory(self.steps)
         for first, count in levels:
             arguments = [self.topology, first, columns[0], *inputs]
             wp.launch(kernel, (count, columns[1], self.worlds), arguments, outputs, device=self.device)
@@ -98,7 +106,7 @@ class Recursions:
             None if qd is None else self._per_node("bias", MOTION),
         ]
         inputs = [self.topology, self._screw, self.parameters.tree, self.parameters.com, q, qd]
-        self.launch(kinematics.hinge, self.nodes, inputs, outputs)
+        self.launch_nodes(kinematics.hinge, self.nodes, inputs, outputs)
 
     def velocities(self) -> wp.array:
         """V = phi* H* qd, after hinges with qd."""
@@ -134,7 +142,7 @@ class Recursions:
         """Jacobians of frames, [world, frame, 6, dof]."""
         where = [frame_nodes, frame_offsets, self.parameters.anchor]
         inputs = [self.topology, *where, self.array("pose"), self.world_poses(), self.array("axis")]
-        self.launch(kinematics.jacobian, (len(frame_nodes), self.worlds), inputs, [out])
+        self.launch_nodes(kinematics.jacobian, (len(frame_nodes), self.worlds), inputs, [out])
 
     # -- Newton-Euler ----------------------------------------------------------------------------------------------
     def body_forces(self, acceleration: Any, velocity: Any, body_f: Any) -> wp.array:
@@ -142,7 +150,7 @@ class Recursions:
         force = self._per_node("force", MOTION)
         world_pose = None if body_f is None else self.world_poses()
         inputs = [self.parameters.rigid, self.parameters.com, acceleration, velocity, body_f, world_pose]
-        self.launch(newton_euler.body_force, self.nodes, inputs, [force])
+        self.launch_nodes(newton_euler.body_force, self.nodes, inputs, [force])
         return force
 
     def hinge_forces(self, qdd: wp.array | None, force: wp.array, out: wp.array) -> None:
@@ -157,7 +165,7 @@ class Recursions:
         self._sweep(composite.composite, self.plan.inward, [pose, self.parameters.rigid], [bodies])
         out.zero_()
         inputs = [self.topology, pose, axis, self.parameters.field("joint_armature"), bodies]
-        self.launch(composite.mass_matrix, (self.scene.dof_count, self.worlds), inputs, [out])
+        self.launch_nodes(composite.mass_matrix, (self.scene.dof_count, self.worlds), inputs, [out])
 
     def factor(self) -> wp.array:
         """Mass = [I + H phi K] D [I + H phi K]*; returns the pivots of D [dof, world]."""
@@ -193,7 +201,7 @@ class Recursions:
         half = self.array(("half", columns), self.worlds, self.scene.dof_count, columns)
         for chunk, work in self._chunks(columns):
             self._reduce(chunk, None, b, b is None, work, half)
-        self.launch(articulated.weighted_product, out.shape, [half, self.array("pivot")], [out])
+        self.launch_nodes(articulated.weighted_product, out.shape, [half, self.array("pivot")], [out])
 
     @property
     def _factors(self) -> list[wp.array]:

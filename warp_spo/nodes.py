@@ -53,18 +53,18 @@ def solve_mass_matrix(run: Recursions, out: wp.array, q: wp.array, b: wp.array) 
 
 def log_det_mass_matrix(run: Recursions, out: wp.array, q: wp.array) -> None:
     run.hinges(q)
-    run.launch(articulated.log_determinant, run.worlds, [run.factor()], [out])
+    run.launch_nodes(articulated.log_determinant, run.worlds, [run.factor()], [out])
 
 
 def body_poses(run: Recursions, out: wp.array, q: wp.array) -> None:
     run.hinges(q)
-    run.launch(kinematics.body_poses, run.nodes, [run.world_poses(), run.parameters.anchor], [out])
+    run.launch_nodes(kinematics.body_poses, run.nodes, [run.world_poses(), run.parameters.anchor], [out])
 
 
 def body_velocities(run: Recursions, out: wp.array, q: wp.array, qd: wp.array) -> None:
     run.hinges(q, qd)
     inputs = [run.world_poses(), run.parameters.com, run.velocities()]
-    run.launch(kinematics.body_velocities, run.nodes, inputs, [out])
+    run.launch_nodes(kinematics.body_velocities, run.nodes, inputs, [out])
 
 
 def jacobian(run: Recursions, out: wp.array, q: wp.array, frames: tuple) -> None:

@@ -15,6 +15,7 @@ import warp as wp
 from .kernels import parameters as kernels
 from .kernels.spatial import POSE, RIGID
 from .kernels.topology import Topology
+from .node_steps import steps
 from .scene import Scene
 
 VARIABLE = (
@@ -109,7 +110,7 @@ class Parameters:
                 for components in (POSE, POSE, 3, RIGID)
             ]
             inputs, dim = [self._topology, self._hinge_of, *values], (scene.body_count, worlds)
-            fill = lambda: wp.launch(kernels.derive(self.dtype), dim, inputs, own, device=self.device)  # noqa: E731
+            fill = lambda: wp.launch(kernels.derive(steps(self.dtype)), dim, inputs, own, device=self.device)  # noqa: E731
             return Derived([spread(array, 2, self.worlds) for array in own], RIGID_VALUES, fill)
 
         return self.derived("bodies", build)
@@ -136,7 +137,7 @@ class Parameters:
         def build() -> Derived:
             value = self._values[name]
             own: Any = wp.empty(value.shape[::-1], dtype=self.dtype, device=self.device)
-            kernel = kernels.transpose(self.dtype)
+            kernel = kernels.transpose(steps(self.dtype))
             fill = lambda: wp.launch(kernel, own.shape, [value], [own], device=self.device)  # noqa: E731
             return Derived([spread(own, 1, self.worlds)], (name,), fill)
 
@@ -162,7 +163,7 @@ class Parameters:
         else:
             flat = spread(value.reshape((1, size)), 0, self.worlds)
         wp.launch(
-            kernels.widen(self.dtype),
+            kernels.widen(steps(self.dtype)),
             dim=(self.worlds, size),
             inputs=[flat],
             outputs=[own.reshape((self.worlds, size))],

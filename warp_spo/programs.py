@@ -48,6 +48,8 @@ TILES = ("inverse_dynamics_derivatives", "mass_matrix_derivative")
 """Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
 REGISTERS = 65536  # of a multiprocessor
 THREE, ENOUGH = 3, 168  # blocks on it, and registers of a thread that the solution by limbs needs for that
+APART = ("forward_dynamics", "forward_dynamics_and_solve")
+"""Operations that can take velocity terms first."""
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
 TILED_SLOTS = 256  # different values of a result from which they go through memory, not through shared memory,
 TILED_WORLDS = 1 << 20  # of so many worlds at a time
@@ -202,8 +204,8 @@ class Programs:
         shared = self.plan.of(operation) == "segment" and messages.shared(operation, shapes, options.get("wrt", ()))
         if operation == "step":
             shared = shared and by_pieces(self.run.scene, shapes, options.get("how"))
-        if operation == "forward_dynamics" and self.plan.apart and "qd" in shapes:
-            operation = "forward_dynamics_apart"
+        if operation in APART and self.plan.apart and "qd" in shapes:
+            operation += "_apart"
         if shared:
             pieces = Pieces(links)
             several = 1 < pieces.warps <= MOST_WARPS
@@ -284,7 +286,7 @@ class Programs:
                      sum(each.operations for each in {emitter, checking, later}))
         cuda = team.cuda()  # fills the tables
         registers = REGISTERS // (THREE * frame.block) // 8 * 8
-        fits = operation == "forward_dynamics_apart" and dtype == "float32" and registers >= ENOUGH
+        fits = operation.endswith("_apart") and dtype == "float32" and registers >= ENOUGH
         lists = ("place", table, int), ("table", team.table, self.run.dtype), ("shifts", team.shifts, int)
         tables: dict[str, Any] = {
             name: wp.array(values, dtype=kind, device=self.run.device) for name, values, kind in lists if values

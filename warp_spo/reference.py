@@ -21,12 +21,10 @@ def skew(vector):
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def rotation_exp(vector):
-    """Rotation matrix (3, 3) of a rotation vector [rad]."""
-    angle, k = np.linalg.norm(vector), skew(vector)
-    if angle == 0.0:
-        return np.eye(3)
-    return np.eye(3) + np.sin(angle) / angle * k + 0.5 * (np.sin(0.5 * angle) / (0.5 * angle)) ** 2 * k @ k
+def rotation_about(axis, angle):
+    """Rotation matrix (3, 3) by an angle [rad], of any size, about a unit vector."""
+    k = skew(axis)
+    return np.eye(3) + np.sin(angle) * k + 2.0 * np.sin(0.5 * angle) ** 2 * k @ k
 
 
 def rotation(quaternion):
@@ -129,7 +127,7 @@ class Dense:
             else:
                 for (axis, angular, linear), x in zip(hinge.screws, q, strict=True):
                     step = np.eye(4)
-                    step[:3, :3], step[:3, 3] = rotation_exp(angular * x * axis), linear * x * axis
+                    step[:3, :3], step[:3, 3] = rotation_about(axis, angular * x), linear * x * axis
                     self.stages[k].append(self.stages[k][-1] @ step)
             self.node_matrix[k] = self.stages[k][-1]
             self.body_matrix[k] = self.node_matrix[k] @ np.linalg.inv(homogeneous(self.value("joint_X_c")[h]))

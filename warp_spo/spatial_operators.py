@@ -102,9 +102,9 @@ class SpatialOperators(Letters):
         armature = run.parameters.field("joint_armature")
         inputs = [run.topology, f.tables, run.array("pose"), run.array("axis"), run.parameters.rigid, armature]
         outputs = [memory(operator.stored) for operator in (self.E_phi, self.H, self.M, self.Delta)]
-        run.launch(rigid_blocks.fill, run.nodes, inputs, outputs)
+        run.launch_nodes(rigid_blocks.fill, run.nodes, inputs, outputs)
         f.update()
-        run.launch(kinematics.body_poses, run.nodes, [run.world_poses(), None], [self._frames])
+        run.launch_nodes(kinematics.body_poses, run.nodes, [run.world_poses(), None], [self._frames])
 
     def run(self, expression: Any, x: wp.array, out: wp.array) -> bool:
         if not self._fused or x.shape[0] != self._recursions.worlds:

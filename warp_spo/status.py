@@ -17,11 +17,11 @@ def write(
 ) -> None:
     """Fill ``status`` [world] for forward dynamics that has just run: one sweep inward, and a launch over the worlds.
 
-    Reads pose, axis, articulated and pivot. Sweeps have left them in the workspace (``factored``); for a recursion that
-    keeps them elsewhere the factorisation is swept now. What that loses bounds what the other form loses, whose hinges
-    lie along axes.
+    Reads pose, axis, articulated, gain and pivot. Sweeps have left them in the workspace (``factored``); for a
+    recursion that keeps them elsewhere the factorisation is swept now. What that loses bounds what the other form
+    loses, whose hinges lie along axes.
     """
-    declare(kernels, run.dtype)
+    declare(kernels, run.steps)
     if not factored:
         run.hinges(q)
         run.factor()
@@ -29,10 +29,11 @@ def write(
     armature, pose, axis = p.field("joint_armature"), run.array("pose"), run.array("axis")
     rounding = run.array("rounding", run.scene.body_count, ARTICULATED, run.worlds)
     lost = run.array("lost", dofs, run.worlds)
-    inputs = [p.tree, pose, axis, p.rigid, armature, run.array("articulated"), run.array("pivot")]
-    kernel = kernels.digits(run.dtype)
+    factors = [run.array(name) for name in ("articulated", "gain", "pivot")]
+    inputs = [p.tree, pose, axis, p.rigid, armature, *factors]
+    kernel = kernels.digits(run.steps)
     for first, count in run.plan.inward:
         arguments = [run.topology, first, *inputs]
         wp.launch(kernel, (count, run.worlds), arguments, [rounding, lost], device=run.device)
     values = [p.tree, p.com, p.rigid, armature, p.gravity]
-    run.launch(kernels.word, run.worlds, [q, qd, tau, body_f, *values, lost, qdd], [status])
+    run.launch_nodes(kernels.word, run.worlds, [q, qd, tau, body_f, *values, lost, qdd], [status])

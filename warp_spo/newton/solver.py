@@ -16,11 +16,11 @@ from newton.solvers import SolverBase
 from ..dynamics import Dynamics
 from ..errors import UnsupportedError
 from ..kernels import declare, exchange
-from ..parts import DOF_VALUES, FREE, UNLIMITED
-from ..recursions.impedance import DEFAULT_BOUND
+from ..parts import DOF_VALUES, FREE
 from ..scene import Scene
 from ..steps import INTEGRATORS
 from .layout import Layout
+from .loop_joints import check_loop_joints
 from .model import _host, _Worlds, from_newton
 from .plugs import Plugs
 
@@ -138,7 +138,7 @@ class SolverSPO(Plugs, SolverBase):
         W, device = scene.worlds, model.device
         self.dynamics = Dynamics(scene, W, device, "float32", variable, **self._options)
         if self.dynamics.closed:
-            _check_loop_joints(model, worlds.loops)
+            check_loop_joints(model, worlds.loops)
         declare(exchange, wp.float32)
         factor: Any = lambda mask: wp.array(mask, dtype=wp.float32, device=device)  # noqa: E731
         self._factors = {
@@ -405,25 +405,6 @@ class SolverSPO(Plugs, SolverBase):
             return ""
         at = tuple(differ[0].tolist())
         return f"is {held[at]} at {list(at)} where the solver uses {used[at]}"
-
-
-def _check_loop_joints(model: newton.Model, joints: np.ndarray) -> None:
-    """Raise if a loop joint, rows [world, joint] of the model, is more than a constraint."""
-    read = lambda name: _host(model, f"joint_{name}")  # noqa: E731
-    driven = np.isin(read("target_mode"), (JointTargetMode.NONE, JointTargetMode.EFFORT), invert=True)
-    acts = {name: read(name) != 0.0 for name in ("damping", "stiffness", "friction", "armature")}
-    acts |= {name: (read(name) != 0.0) & driven for name in ("target_ke", "target_kd")}
-    bounds = {"limit_lower": UNLIMITED, "limit_upper": UNLIMITED, "velocity_limit": DEFAULT_BOUND}
-    acts |= {name: np.abs(read(name)) < none for name, none in bounds.items()}
-    start = read("qd_start")
-    for joint in joints.ravel():
-        for name, mask in acts.items():
-            if mask[start[joint] : start[joint + 1]].any():
-                raise UnsupportedError(
-                    "SolverSPO",
-                    f"joint_{name} of loop joint {model.joint_label[joint]!r}, which is a constraint alone,",
-                    "make it a joint of the articulation, and close the loop at another one",
-                )
 
 
 def _with_drives(scene: Scene, position: np.ndarray, driven: np.ndarray) -> Scene:

@@ -8,11 +8,12 @@ is not positive becomes NaN.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..trace.graph import Value, guarded, is_constant, reciprocal
+from ..trace.graph import Value, absolute, guarded, is_constant, quotient, reciprocal
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Rigid, Vector, cross, dot, magnitude, symmetric, total
 from .links import BALL, FREE, SLIDE, TURN, Link, Placed
 from .motion import NONE, Motion, carried, in_hinge, in_link
@@ -31,6 +32,10 @@ class Pivot(NamedTuple):
     U: Vector
     D: Value
     inverse: Value
+
+    def share(self, x: Value) -> Value:
+        """D^-1 x"""
+        return quotient(x, self.D) if self.unit is None else x * self.inverse
 
 
 @dataclasses.dataclass
@@ -82,13 +87,17 @@ def factor(
             pivot, P = eliminate_unit(P, unit, armature, LEAST * epsilon * sizes[at])
             pivots.append(pivot)
             for later in range(at + 1, len(units) if link.motion == BALL else 0):
-                share = pivot.U[units[later]] * pivot.inverse  # what D lost it loses again in what it is taken from
-                sizes[later] = sizes[later] + share * pivot.U[units[later]] * (2.0 + sizes[at] * pivot.inverse)
+                U = pivot.U[units[later]]
+                sizes[later] = sizes[later] + brought(U, U * pivot.inverse, sizes[at])
     else:
-        H = columns(link, place)
-        for column, armature in zip(H[::-1], link.armature[::-1], strict=True):
-            pivot, P = eliminate(P, column, armature, LEAST * epsilon)
+        H, whole_P = columns(link, place)[::-1], P
+        sizes = [magnitude(h, P, h) + absolute(a) for h, a in zip(H, link.armature[::-1], strict=True)]
+        for at, (column, armature) in enumerate(zip(H, link.armature[::-1], strict=True)):
+            pivot, P = eliminate(P, column, armature, LEAST * epsilon * sizes[at])
             pivots.append(pivot)
+            for later in range(at + 1, len(H)):
+                share = absolute(dot(H[later], pivot.U)) * pivot.inverse
+                sizes[later] = sizes[later] + brought(magnitude(H[later], whole_P, column), share, sizes[at])
     nothing: Value = 0.0
     if link.inertia is None and not link.children:  # it moves no inertia, so nobody would notice a lost pivot
         nothing = total(lost(pivot.D) for pivot in pivots)
@@ -168,13 +177,26 @@ def eliminate_unit(P: Articulated, unit: int, armature: Value, least: Value) -> 
     return Pivot(unit, column, U, D, inverse), Articulated.build(entry)
 
 
-def eliminate(P: Articulated, column: Vector, armature: Value, least: float) -> tuple[Pivot, Articulated]:
+def eliminate(P: Articulated, column: Vector, armature: Value, least: Value) -> tuple[Pivot, Articulated]:
     n, f = P.apply(Vector(column[:3]), Vector(column[3:]))
     U = Vector((*n, *f))
-    D = dot(column, U) + armature
-    size = magnitude(column, P, column) + armature
-    inverse = reciprocal(guarded(guarded(D, least * size), 0.0))
-    return Pivot(None, column, U, D, inverse), P.less(U, U * inverse)
+    D = guarded(guarded(dot(column, U) + armature, least), 0.0)
+    return Pivot(None, column, U, D, reciprocal(D)), without(P, U, D)
+
+
+def without(P: Articulated, U: Vector, D: Value) -> Articulated:
+    """P - U D^-1 U*; along an axis its row and column vanish without a rest."""
+    return P.less(U, Vector(quotient(u, D) for u in U))
+
+
+def brought(coupling: Value, share: Value, size: Value) -> Value:
+    """What an eliminated pivot brings to what may cancel in a later one: that loses again what D lost.
+
+    Args:
+        coupling: what D's column and the other one have in common. share: the same as a part of D.
+        size: of what cancels in D.
+    """
+    return share * (2.0 * coupling + share * size)
 
 
 def reduced(
@@ -189,13 +211,25 @@ def reduced(
     else:
         given = list(tau)
     for pivot, b in zip(done.pivots, given[::-1], strict=True):
-        e = b - (z[pivot.unit] if pivot.unit is not None else dot(pivot.column, z))
-        rate = e * pivot.inverse
+        rate, z = taken(pivot, z, b)
         eps.append(rate)
-        z = z + pivot.U * rate
     if link.parent is not None and done.whole:  # nothing but the force that the hinge itself transmits
         z = Vector((*place.turned.T @ Vector(tau[3:]), *place.turned.T @ Vector(tau[:3])))  # type: ignore[union-attr]
     return eps, handed_to_parent(link, place, done, motion, z)
+
+
+def taken(pivot: Pivot, z: Vector, b: Value) -> tuple[Value, Vector]:
+    """D^-1 eps of a pivot, eps = b - H z, and z + G eps."""
+    rate = pivot.share(b - (z[pivot.unit] if pivot.unit is not None else dot(pivot.column, z)))
+    return rate, z + pivot.U * rate
+
+
+def released(pivot: Pivot, alpha: Sequence[Value], rate: Value) -> tuple[Value, list[Value]]:
+    """qdd of a pivot, D^-1 eps - G* alpha, and alpha + H* qdd."""
+    qdd = rate - pivot.share(dot(pivot.U, alpha))
+    if pivot.unit is None:
+        return qdd, [a + h * qdd for a, h in zip(alpha, pivot.column, strict=True)]
+    return qdd, [a + qdd if i == pivot.unit else a for i, a in enumerate(alpha)]
 
 
 def handed_to_parent(link: Link, place: Placed, done: Factor, motion: Motion, z: Vector) -> Vector:
@@ -221,11 +255,8 @@ def expanded(
     alpha = [0.0] * 6 if done.whole else [a + b for a, b in zip((*w, *v), bias, strict=True)]
     qdd = []
     for pivot, rate in zip(done.pivots[::-1], rates[::-1], strict=True):
-        qdd.append(rate - pivot.inverse * dot(pivot.U, alpha))
-        if pivot.unit is not None:
-            alpha[pivot.unit] = alpha[pivot.unit] + qdd[-1]
-        else:
-            alpha = [a + h * qdd[-1] for a, h in zip(alpha, pivot.column, strict=True)]
+        one, alpha = released(pivot, alpha, rate)
+        qdd.append(one)
     w, v = Vector(alpha[:3]), Vector(alpha[3:])
     if done.whole:  # the body's acceleration less its parent's, in the hinge's axes
         matrix = IDENTITY if link.matrix is None else link.matrix

@@ -58,10 +58,15 @@ def relative_quaternion(link: Link, q: Any) -> Quaternion:
     return multiplied(rest, Vector((x, y, z, w)) * scale)
 
 
-def carried_velocity(link: Link, place: Placed, parent: tuple[Vector, Vector], hinge: tuple) -> tuple[Vector, Vector]:
+def carried_velocity(place: Placed, parent: tuple[Vector, Vector], hinge: tuple) -> tuple[Vector, Vector]:
     """(omega; v) of the link's frame, in its axes, for its parent's and the hinge's own."""
     w, v = place.pose.motion_to_child(*parent)
     return w + hinge[0], v + hinge[1]
+
+
+def velocity(axes: Matrix, w: Any, v: Any, arm: Any) -> Vector:
+    """In inertial axes, of a point at ``arm`` from the origin of a frame that moves with (w; v), in its ``axes``."""
+    return axes @ (v + cross(w, arm))
 
 
 def columns(link: Link, parent_axes: Matrix, axes: Matrix, arm: Vector) -> list[tuple[Vector, Vector]]:
@@ -71,7 +76,7 @@ def columns(link: Link, parent_axes: Matrix, axes: Matrix, arm: Vector) -> list[
     """
     z = axes.T[2]
     if link.motion == TURN:
-        return [(z, axes @ cross(IDENTITY[2], arm))]
+        return [(z, velocity(axes, IDENTITY[2], ZERO, arm))]
     if link.motion == SLIDE:
         return [(ZERO, z)]
     if link.motion == HELIX:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from ..trace.graph import Value
-from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, symmetric
+from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Vector, cross, symmetric
 from .links import BALL, HELIX, SLIDE, TURN, Link, Placed
 
 NONE = Matrix.of([[0.0] * 3] * 3)
@@ -73,11 +73,14 @@ def moved(link: Link, place: Placed, parent: Motion | None, qd: Any) -> Motion:
     """Motion of ``link`` on a parent that moves as ``parent`` (None: the inertial frame) with rates ``qd(dof)``."""
     if qd is None:
         return STILL
-    parent = parent or STILL
-    carried = place.pose.to_child(parent.spin)
-    w, v = in_link(link, place, qd)
+    return joined(place.pose, parent or STILL, *in_link(link, place, qd))
+
+
+def joined(pose: Pose, parent: Motion, w: Vector, v: Vector) -> Motion:
+    """Motion of a frame at ``pose`` on its parent, relative to which it moves with (w; v) in its own axes."""
+    carried = pose.to_child(parent.spin)
     spin = carried + w
-    return Motion(spin, whirl(spin), cross(carried, w), 2.0 * cross(carried, v), parent.whirl @ place.pose.l)
+    return Motion(spin, whirl(spin), cross(carried, w), 2.0 * cross(carried, v), parent.whirl @ pose.l)
 
 
 def carried(place: Placed, motion: Motion, acceleration: tuple[Vector, Vector]) -> tuple[Vector, Vector]:

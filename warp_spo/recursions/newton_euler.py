@@ -26,6 +26,12 @@ def body_force(inertia: Rigid, motion: Motion, w: Vector, v: Vector) -> Vector:
     return Vector((*n, *(inertia.mass * v + rotation @ inertia.moment)))
 
 
+def wrench(axes: Matrix, com: Vector, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
+    """(n; f) about the frame's origin, in its ``axes``, of a force at ``com`` and a torque, both in inertial axes."""
+    f, n = axes.T @ force, axes.T @ torque
+    return n + cross(com, f), f
+
+
 def hinge_force(link: Link, place: Placed, n: Vector, f: Vector, qdd: Any) -> list[Value]:
     """tau of the link's dofs for the force (n; f) that its hinge transmits."""
     forces = in_hinge(link, place, n, f)

@@ -384,9 +384,8 @@ class Operators:
             linear = list(back @ Vector(right[:3])) if link.motion == FREE else []
             right = [*linear, *(back @ Vector(right[-3:]))]
         for pivot, b in zip(done.pivots, right[::-1], strict=True):
-            acting = z[pivot.unit] if pivot.unit is not None else dot(pivot.column, z)
-            rates.append((b - acting) * pivot.inverse)
-            z = z + pivot.U * rates[-1]
+            rate, z = articulated.taken(pivot, z, b)
+            rates.append(rate)
         return rates, z
 
     def _released(self, link: Link, v: Vector, given: list[Value] | None = None) -> tuple[list[Value], Vector]:

@@ -95,13 +95,13 @@ class Trace:
         n, f = ZERO, ZERO
         if "body_f" not in self.given:
             return Vector((*n, *f))
-        back = self.axes[id(link)].T
+        axes = self.axes[id(link)]
         for body in self.bodies.get(id(link), ()):
             seat = self.links.seats[body]
-            force = back @ Vector(self.graph.input("body_f", body, c) for c in range(3))
-            torque = back @ Vector(self.graph.input("body_f", body, c) for c in range(3, 6))
+            given = Vector(self.graph.input("body_f", body, c) for c in range(6))
             com = seat.offset + seat.matrix @ self.links.nodes[body].com
-            n, f = n + torque + cross(com, force), f + force
+            n_body, f_body = newton_euler.wrench(axes, com, Vector(given[:3]), Vector(given[3:]))
+            n, f = n + n_body, f + f_body
         return Vector((*n, *f))
 
     # -- pieces ----------------------------------------------------------------------------------------------------
@@ -170,9 +170,15 @@ class Trace:
 
     def forward_dynamics_and_solve(self) -> list[Store]:
         """out = Mass^-1 (tau - bias_force), solved = Mass^-1 cotangent, by one factorisation"""
-        stores = self.forward_dynamics()
+        return self.forward_dynamics() + self._solved()
+
+    def forward_dynamics_and_solve_apart(self) -> list[Store]:
+        return self.forward_dynamics_apart() + self._solved()
+
+    def _solved(self) -> list[Store]:
+        """solved = Mass^-1 cotangent, by factors that are there"""
         done, rates, sent = self.reduce(self.vector("cotangent"), moves=False, loads=False, letters="y")
-        return stores + sent + self.expand(done, rates, (ZERO, ZERO), "b", "solved")
+        return sent + self.expand(done, rates, (ZERO, ZERO), "b", "solved")
 
     def factor(self) -> dict[int, articulated.Factor]:
         return self.factors()[0]
@@ -379,7 +385,7 @@ class Trace:
                 ):
                     stores += [Store("out", (index, c, dof), value) for c, value in enumerate((*v, *w))]
                 pose = self.places[id(link)].pose
-                arm, link = pose.l + pose.to_parent(arm), link.parent
+                arm, link = pose.point_to_parent(arm), link.parent
         return stores
 
     def operational_inertia_inverse(self, frames: tuple) -> list[Store]:
@@ -433,14 +439,14 @@ class Trace:
             self.at(link, "v")
             place, over = self.places[id(link)], None if link.parent is None else id(link.parent)
             hinge = motion.in_link(link, place, self.vector("qd"))
-            velocity[id(link)] = kinematics.carried_velocity(link, place, velocity[over], hinge)
+            velocity[id(link)] = kinematics.carried_velocity(place, velocity[over], hinge)
         stores = []
         for body, seat in self.links.seats.items():
             key = None if seat.link is None else id(seat.link)
             w, v = velocity[key]
             R = IDENTITY if key is None else self.axes[key]
             com = seat.offset + seat.matrix @ self.links.nodes[body].com
-            values = (*(R @ (v + cross(w, com))), *(R @ w))
+            values = (*kinematics.velocity(R, w, v, com), *(R @ w))
             stores += [Store("out", (body, c), value) for c, value in enumerate(values)]
         return stores
 

@@ -81,6 +81,8 @@ def partial(scalar: Scalar, at: int) -> Value:
         return 0.5 * reciprocal(scalar)
     if op == "reciprocal":
         return -(scalar * scalar)
+    if op == "quotient":
+        return reciprocal(args[1]) if at == 0 else -(scalar * reciprocal(args[1]))
     if op == "absolute":
         return args[0] * reciprocal(scalar)
     if op == "select":

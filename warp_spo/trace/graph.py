@@ -179,6 +179,13 @@ def reciprocal(x: Value) -> Value:
     return function("reciprocal", x)
 
 
+def quotient(x: Value, y: Value) -> Value:
+    """x / y, rounded once: 1 where they are equal, which a product with the reciprocal need not be."""
+    if is_constant(y) or (is_constant(x) and x == 0.0):
+        return multiply(x, reciprocal(y)) if is_constant(y) else 0.0
+    return y.graph.make("quotient", x, y)
+
+
 def guarded(x: Value, least: Value) -> Value:
     """``x``, or NaN if it is not above ``least``."""
     if is_constant(x) and is_constant(least):

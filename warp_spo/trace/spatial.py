@@ -199,6 +199,10 @@ class Pose(NamedTuple):
             v = Vector((c * v[0] + s * v[1], c * v[1] - s * v[0], v[2]))
         return Vector(v)
 
+    def point_to_parent(self, r: Any) -> Vector:
+        """Where a point at ``r`` from the link's origin lies, from the parent's."""
+        return self.l + self.to_parent(r)
+
     @property
     def rotation(self) -> Matrix:
         """The product of the turns: the link's axes in the parent's."""
