@@ -334,6 +334,38 @@ def looped(ahead: str, a_pass: str, last: str, names: tuple[str, str, str], entr
     return "\n".join([ahead, *declared, loop, last])
 
 
+def voted(a_pass: str, flags: int, warps: int, c: str) -> str:
+    """``a_pass`` of a team until, in all its worlds, no warp has added to ``missed_row[0]``.
+
+    A world that is done is not ``open``: what it keeps stays, so that a pass for its neighbours finds the same again.
+    The vote is the barrier before the next pass. Flags take turns in 2 ``warps`` entries of SENT from ``flags`` on, for
+    a warp may write the next ones while another still reads.
+    """
+    every = " + ".join(f"SENT(now + {warp})" for warp in range(warps))
+    return "\n".join([
+        "bool open = true;", f"{c} missed_row[1] = {{}};",
+        f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{", "missed_row[0] = 0;", a_pass,
+        f"const int now = {flags} + (turn & 1) * {warps};",
+        "SENT(now + warp) = missed_row[0];",
+        "const int going = __syncthreads_or(missed_row[0] > 0);",
+        f"missed_row[0] = {every};", "open = missed_row[0] > 0;", "if (!going) break;", "}",
+    ])
+
+
+def once(a_pass: str, barrier: str, c: str) -> str:
+    """``a_pass`` of a team that has nothing to guess."""
+    return "\n".join(["const bool open = true;", f"const {c} missed_row[1] = {{}};", "{", a_pass, "}", barrier])
+
+
+def alone(a_pass: str, c: str) -> str:
+    """As :func:`voted`, by one thread for a world of its own."""
+    return "\n".join([
+        "const bool open = true;", f"{c} missed_row[1] = {{}};",
+        f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{", "missed_row[0] = 0;", a_pass,
+        "if (!(missed_row[0] > 0)) break;", "}",
+    ])
+
+
 def function(name: str, native: str, arguments: dict[str, type], result: type | None = None) -> wp.Function:
     """A Warp function of ``arguments``, by name, that runs ``native``."""
     types = {f"type_of_{argument}": kind for argument, kind in arguments.items()} | {"type_of_result": result}

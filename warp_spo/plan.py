@@ -53,7 +53,6 @@ TREE_ONLY = (
     "body_velocities_vjp",
     "forward_dynamics_jvp",
     "inverse_dynamics_jvp",
-    "step",
     "step_system",
     "integrate",
     "passive_force",
@@ -84,7 +83,7 @@ TREE_ONLY = (
     "closure_step",
 )
 """Operations that exist as traces alone: each is a kernel of its scene, a thread a world, whatever the plan."""
-SHARED = ("forward_dynamics_and_solve", "forward_dynamics_vjp", "inverse_dynamics_vjp")
+SHARED = ("step", "forward_dynamics_and_solve", "forward_dynamics_vjp", "inverse_dynamics_vjp")
 """Traces alone, too, that a warp a limb can share."""
 
 

@@ -26,9 +26,9 @@ from .recursions.minimal import Minimal
 from .recursions.multipliers import Multipliers
 from .recursions.operators import meet, written
 from .recursions.pieces import Pieces
-from .recursions.step import LOOPED
-from .teams import Team, Work
-from .trace.emit import Angles, Emitter, Store, literals
+from .recursions.step import GAIN, GUESS, LOOPED, MISSED, by_pieces
+from .teams import Passes, Team, Work
+from .trace.emit import PREFIX, Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
 FIELDS = (*TABLES, *DOF_VALUES, "joint_rest_q")
@@ -202,6 +202,8 @@ class Programs:
             return None
         shapes = {**shapes, "out": out_shape}
         shared = self.plan.of(operation) == "segment" and messages.shared(operation, shapes, options.get("wrt", ()))
+        if operation == "step":
+            shared = shared and by_pieces(self.run.scene, shapes, options.get("how"))
         if operation in APART and self.plan.apart and "qd" in shapes:
             operation += "_apart"
         if shared:
@@ -243,36 +245,45 @@ class Programs:
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         everything: list[Store] = []
         traced: list[list[Store]] = []
-        apart: list[tuple[list[Store], dict[int, list[Store]]]] = []
+        apart: list[tuple[list[Store], list[Store], dict[int, list[Store]]]] = []
         for index in range(len(pieces.pieces)):
             links = self.links.opened()  # its own: pieces of equal structure then give equal text
             trace = Traces(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)(**options)])
             flat = {at: [self._flattened(item, shapes) for item in items] for at, items in trace.across.items()}
-            apart.append((trace.news, flat))
-            everything += traced[-1] + trace.news + [item for items in flat.values() for item in items]
+            news = [self._flattened(item, shapes) for item in trace.news]
+            apart.append((trace.checks, news, flat))
+            everything += traced[-1] + trace.checks + news + [item for items in flat.values() for item in items]
+        bends = any(item.array == MISSED for item in everything)
+        passes = Passes((GUESS, GAIN), sent if bends else None) if operation == "step" else None
+        sent += 2 * pieces.warps if bends else 0
         frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
                             WARP * pieces.warps, everything, more)
         if frame.result.way == DIRECT and frame.result.array.entries > LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
         if not frame.fits(self.run.dtype):
             return None  # nor for what limbs tell each other
-        team = Team(pieces, dtype)
+        team = Team(pieces, dtype, passes)
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
         whole = [item for item in everything if item.array == "out"]
         placed, table = _placed(whole, frame.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
-        for piece, stores, items, (news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
-            emitter = self._emitter(shapes, frame)
+        by_slot = lambda found: found if table is None else _by_slot(found, table)  # noqa: E731
+        for piece, stores, items, (checks, news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
+            emitter, checking = self._emitter(shapes, frame), self._emitter(shapes, frame)
+            later = self._emitter(shapes, frame) if passes else emitter
             inward = [item for item in stores if item.array == INWARD]
             outward = [item for item in stores if item.array == OUTWARD]
             last = outward if set(SENDS[operation]) & set(messages.OUTWARD_LETTERS) else inward
-            last += items if table is None else _by_slot(items, table)
-            last += [item for item in stores if item.array in more]
-            meetings = {at: found if table is None else _by_slot(found, table) for at, found in others.items()}
+            last += by_slot(items)
+            last += [item for item in stores if item.array in (*more, GAIN)]
+            meetings = {at: by_slot(found) for at, found in others.items()}
             regions = emitter.region(inward), emitter.region(outward)
-            branches = emitter.branch(news), {at: emitter.branch(found) for at, found in meetings.items()}
-            team.add(Work(piece, *regions, *branches), emitter.operations)
+            ends = [item for item in news if item.array == "out"]
+            news = [item for item in news if item.array != "out"] + by_slot(ends)
+            branches = later.branch(news), {at: later.branch(found) for at, found in meetings.items()}
+            team.add(Work(piece, *regions, checking.region(checks), *branches),
+                     sum(each.operations for each in {emitter, checking, later}))
         cuda = team.cuda()  # fills the tables
         registers = REGISTERS // (THREE * frame.block) // 8 * 8
         fits = operation.endswith("_apart") and dtype == "float32" and registers >= ENOUGH
@@ -316,6 +327,8 @@ class Programs:
         def load(array: str, entry: str) -> str:
             if array in (INWARD, OUTWARD):
                 return f"SENT({entry})"
+            if array in LOOPED and frame.warps > 1:
+                return f"{'' if array == MISSED else PREFIX}{array}_row[{entry}]"
             if array in FIELDS:
                 return f"FIELD({array}, {entry})"
             return f"{array}_row[{entry}]"
@@ -323,6 +336,10 @@ class Programs:
         def store(array: str, entry: str, value: str) -> str:
             if array in (INWARD, OUTWARD):
                 return f"SENT({entry}) = {value};"
+            if array == MISSED and frame.warps > 1:
+                return f"missed_row[0] += {value};"
+            if array in LOOPED and frame.warps > 1:
+                return f"{'if (open) ' if array == GUESS else ''}{load(array, entry)} = {value};"
             if array == "out" and result.way == TILED:
                 return f"if (mine) result_row[({entry}) * {TILE}] = {value};"
             if array == "out":
