@@ -46,7 +46,7 @@ TRACED = (
 )
 TILES = ("inverse_dynamics_derivatives", "mass_matrix_derivative")
 """Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
-REGISTERS = 65536  # of a multiprocessor
+REGISTERS, MOST_REGISTERS = 65536, 255  # of a multiprocessor, and of a thread
 THREE, ENOUGH = 3, 168  # blocks on it, and registers of a thread that the solution by limbs needs for that
 APART = ("forward_dynamics", "forward_dynamics_and_solve")
 """Operations that can take velocity terms first."""
@@ -285,15 +285,15 @@ class Programs:
             team.add(Work(piece, *regions, checking.region(checks), *branches),
                      sum(each.operations for each in {emitter, checking, later}))
         cuda = team.cuda()  # fills the tables
-        registers = REGISTERS // (THREE * frame.block) // 8 * 8
-        fits = operation.endswith("_apart") and dtype == "float32" and registers >= ENOUGH
+        registers, three = (REGISTERS // (blocks * frame.block) // 8 * 8 for blocks in (1, THREE))
+        if operation.endswith("_apart") and dtype == "float32" and three >= ENOUGH:
+            registers = three
         lists = ("place", table, int), ("table", team.table, self.run.dtype), ("shifts", team.shifts, int)
         tables: dict[str, Any] = {
             name: wp.array(values, dtype=kind, device=self.run.device) for name, values, kind in lists if values
         }
-        return self._finished(
-            operation, frame, cuda, team.cpu(), tables, team.operations, registers if fits else None
-        )
+        cap = registers if registers < MOST_REGISTERS else None
+        return self._finished(operation, frame, cuda, team.cpu(), tables, team.operations, cap)
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
