@@ -45,6 +45,7 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     p.add_argument("--budget", type=float, default=3600.0, metavar="S", help="[s] of --everything; default: 3600")
     p.add_argument("--jobs", type=int, metavar="N", help="processes that compile at a time; default: nearly all cores")
+    p.add_argument("--gpus", type=int, default=1, metavar="N", help="--everything takes so many, the last to compile")
     p.add_argument("--check", action="store_true", help="compare with the reference, time nothing")
     p.add_argument("--compile", action="store_true", help="evaluate once: kernels come into Warp's cache")
     p.add_argument("--json", type=Path, metavar="OUT", help="write the run to this file, or by date into this folder")
@@ -82,7 +83,7 @@ def main(argv: list[str] | None = None) -> int:
             device = find_device(options.device)
             chosen = parts.choose(options.filter, device.is_cuda, str(device))
             out = options.json or evidence.RESULTS
-            _, left_out = everything.run(chosen, device, options.budget, options.jobs, out)
+            _, left_out = everything.run(chosen, device, options.budget, options.jobs, out, options.gpus)
             if left_out:
                 return 1
         if options.readme:

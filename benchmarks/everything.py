@@ -1,8 +1,8 @@
 """``python -m benchmarks --everything``: every number and picture of the README, ours and the peers', in one go.
 
 The work is cut into parts, each a process with a file of rows. Kernels of all parts are compiled side by side, on all
-cores; what is compiled is measured, one part at a time and nothing else beside it. Parts come in order of importance:
-what the time budget leaves out is named, and the same command goes on from there.
+cores; what is compiled is measured, one part at a time on a GPU. Parts come in order of importance: what the time
+budget leaves out is named, and the same command goes on from there.
 """
 
 from __future__ import annotations
@@ -34,28 +34,41 @@ class Part(NamedTuple):
         measure: arguments of ``python -m``, to which ``--json FILE`` is added.
         compile: the same for what compiles its kernels and measures nothing; None: nothing is worth it.
         seconds: most that measuring may take.
+        alone: it measures the host's cores: nothing is compiled or measured beside it.
     """
 
     name: str
     measure: Sequence[str]
     compile: Sequence[str] | None = None
     seconds: float = 60.0
+    alone: bool = False
+
+
+class Measuring(NamedTuple):
+    """A part that is being measured, until ``end``."""
+
+    part: Part
+    job: subprocess.Popen
+    begin: float
+    end: float
 
 
 class Lanes:
-    """Processes of parts: many that compile, one that measures.
+    """Processes of parts: many that compile, and one that measures on each GPU.
 
     Args:
         folder: for rows and logs; a part that has its ``.done`` there is not run again.
         budget: [s] from now.
         jobs: how many compile at a time.
         alone: measure nothing until everything is compiled, as where both need the same cores.
+        gpus: to measure on. Of several the last one is left to what compiles.
     """
 
-    def __init__(self, folder: Path, budget: float, jobs: int, alone: bool):
-        self.folder, self.end, self.jobs, self.alone = folder, time.monotonic() + budget, jobs, alone
-        self.begin, self.used = time.monotonic(), {}
+    def __init__(self, folder: Path, budget: float, jobs: int, alone: bool, gpus: int = 1):
+        self.folder, self.end, self.jobs, self.alone, self.gpus = folder, time.monotonic() + budget, jobs, alone, gpus
+        self.begin = time.monotonic()
         self.compiling: dict[str, subprocess.Popen] = {}
+        self.measuring: dict[int, Measuring] = {}
         folder.mkdir(parents=True, exist_ok=True)
 
     @property
@@ -65,11 +78,12 @@ class Lanes:
     def say(self, text: str) -> None:
         print(f"[{time.monotonic() - self.begin:4.0f} s, {max(0.0, self.left):4.0f} s left] {text}", flush=True)
 
-    def start(self, arguments: Sequence[str], log: Path) -> subprocess.Popen:
-        """``python -m arguments``, in a process group of its own."""
+    def start(self, arguments: Sequence[str], log: Path, gpu: int) -> subprocess.Popen:
+        """``python -m arguments``, in a process group of its own, which sees one of several GPUs."""
+        sees = {"CUDA_VISIBLE_DEVICES": str(gpu)} if self.gpus > 1 else {}
         with log.open("w") as out:
             return subprocess.Popen([sys.executable, "-m", *arguments], cwd=ROOT, stdout=out, stderr=subprocess.STDOUT,
-                                    start_new_session=True)  # fmt: skip
+                                    start_new_session=True, env=os.environ | sees)  # fmt: skip
 
     def run(self, parts: Sequence[Part]) -> list[Part]:
         """Compile and measure; returns the parts that the budget left out or cut short."""
@@ -77,50 +91,60 @@ class Lanes:
         if len(waiting) < len(parts):
             self.say(f"{len(parts) - len(waiting)} parts are there already, in {self.folder}")
         queue, unfinished = [part for part in waiting if part.compile], []
+        lanes = range(max(1, self.gpus - 1))
         try:
-            while waiting and self.left > LAST:
+            while self.measuring or (waiting and self.left > LAST):
                 while queue and sum(job.poll() is None for job in self.compiling.values()) < self.jobs:
                     part = queue.pop(0)
-                    self.compiling[part.name] = self.start(part.compile or (), self.folder / f"{part.name}.compile.log")
-                part = self._ready(waiting, bool(queue))
-                if part is None:
-                    time.sleep(0.1)
-                    continue
-                waiting.remove(part)
-                if not self.measure(part):
-                    unfinished.append(part)
+                    log = self.folder / f"{part.name}.compile.log"
+                    self.compiling[part.name] = self.start(part.compile or (), log, self.gpus - 1)
+                unfinished += [part for lane in list(self.measuring) if (part := self._ended(lane))]
+                for lane in lanes:
+                    part = self._ready(waiting, bool(queue)) if self.left > LAST else None
+                    if lane not in self.measuring and part:
+                        waiting.remove(part)
+                        self._measure(part, lane)
+                time.sleep(0.1)
         finally:
-            for job in self.compiling.values():
+            for job in [*self.compiling.values(), *(each.job for each in self.measuring.values())]:
                 stop(job, 1.0)
         return unfinished + waiting
 
     def _ready(self, waiting: list[Part], queued: bool) -> Part | None:
         """The first part whose kernels are compiled."""
         busy = {name for name, job in self.compiling.items() if job.poll() is None}
-        if self.alone and (busy or queued):
+        if any(each.part.alone for each in self.measuring.values()):
+            return None
+        idle = not (busy or queued)
+        if self.alone and not idle:
             return None
         compiled = self.compiling.keys() - busy
-        return next((part for part in waiting if part.name in compiled or not part.compile), None)
+        return next((part for part in waiting if (part.name in compiled or not part.compile)
+                     and (not part.alone or (idle and not self.measuring))), None)  # fmt: skip
 
-    def measure(self, part: Part) -> bool:
-        """Whether the part came to its end in time."""
+    def _measure(self, part: Part, lane: int) -> None:
         file, log, begin = self.folder / f"{part.name}.json", self.folder / f"{part.name}.log", time.monotonic()
-        job = self.start([*part.measure, "--json", str(file)], log)
-        try:
-            code = job.wait(max(1.0, min(part.seconds, self.left)))
-        except subprocess.TimeoutExpired:
-            code = None
-        finally:
-            stop(job, GRACE)
-        self.used[part.name] = time.monotonic() - begin
+        job = self.start([*part.measure, "--json", str(file)], log, lane)
+        self.measuring[lane] = Measuring(part, job, begin, begin + max(1.0, min(part.seconds, self.left)))
+
+    def _ended(self, lane: int) -> Part | None:
+        """Report what the lane has measured, once that is over; returns a part that did not come to its end."""
+        part, job, begin, end = self.measuring[lane]
+        code = job.poll()
+        if code is None and time.monotonic() < end:
+            return None
+        stop(job, GRACE)
+        del self.measuring[lane]
+        file, log = self.folder / f"{part.name}.json", self.folder / f"{part.name}.log"
         rows = len(json.loads(file.read_text())["rows"]) if file.exists() else 0
         how = "stopped, out of time" if code is None else "" if code == 0 else f"returned {code}"
         reasons = [line for line in log.read_text().splitlines() if line.startswith(("skipped", "benchmarks:"))]
-        self.say("; ".join([f"{part.name}: {rows} rows in {self.used[part.name]:.0f} s", *filter(None, [how])]))
+        self.say("; ".join([f"{part.name}: {rows} rows in {time.monotonic() - begin:.0f} s", *filter(None, [how])]))
         print("".join(f"    {line[:200]}\n" for line in dict.fromkeys(reasons)), end="", flush=True)
-        if code in (0, 1):  # 1: measured, and something is beyond its tolerance, as the log says
-            (self.folder / f"{part.name}.done").touch()
-        return code in (0, 1)
+        if code not in (0, 1):  # 1: measured, and something is beyond its tolerance, as the log says
+            return part
+        (self.folder / f"{part.name}.done").touch()
+        return None
 
 
 def stop(job: subprocess.Popen, grace: float) -> None:
@@ -152,7 +176,9 @@ def short(machine: dict) -> str:
     return machine["device"].split()[-1].lower() if "device_memory_GiB" in machine else "cpu"
 
 
-def run(parts: Sequence[Part], device: Any, budget: float, jobs: int | None, out: Path) -> tuple[Path, list[Part]]:
+def run(
+    parts: Sequence[Part], device: Any, budget: float, jobs: int | None, out: Path, gpus: int = 1
+) -> tuple[Path, list[Part]]:
     """Run parts, write their rows as one run into the file or folder ``out``; returns the file, and parts left out.
 
     Raises:
@@ -164,7 +190,7 @@ def run(parts: Sequence[Part], device: Any, budget: float, jobs: int | None, out
     os.environ.setdefault(PEERS_FOLDER, str(FOLDER / "peers"))
     Path(os.environ[PEERS_FOLDER]).mkdir(parents=True, exist_ok=True)
     cores = os.cpu_count() or 1
-    lanes = Lanes(folder, budget, jobs or (max(1, cores - 2) if cuda else cores), alone=not cuda)
+    lanes = Lanes(folder, budget, jobs or (max(1, cores - 2) if cuda else cores), alone=not cuda, gpus=gpus)
     most = sum(part.seconds for part in parts)
     lanes.say(f"{found['device']}: {len(parts)} parts, at most {most:.0f} s of measuring")
     left_out = lanes.run(parts)

@@ -68,7 +68,7 @@ struct on
 
     static CUDA_CALLABLE inline float sqrt(float x) { return sqrtf(x); }
     static CUDA_CALLABLE inline float arctangent(float y, float x) { return atan2f(y, x); }
-    static CUDA_CALLABLE inline float absolute(float x) { return x < 0.0f ? -x : x; }
+    static CUDA_CALLABLE inline float absolute(float x) { return fabsf(x); }
     static CUDA_CALLABLE inline double log(double x) { return ::log(x); }
 
     static CUDA_CALLABLE inline float reduced(float x)

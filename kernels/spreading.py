@@ -5,9 +5,8 @@ entries of a row are. Rows of 32 worlds are one stretch of memory that begins at
 ``period`` of worlds each entry again lies as far from such a multiple. So a thread looks up a group of neighbouring
 entries once and writes it for each period, in one store.
 
-Where the values of 32 worlds do not fit, they go through memory: ``relay`` [seat, slot, 32 worlds], from where TILE
-worlds at a time come back. A block takes a seat of its multiprocessor's and leaves it to a later one, so that all that
-memory is small and stays in the L2 cache.
+Where the values of 32 worlds do not fit, those of each TILE worlds wait in these worlds' rows, which have room for
+them. A block fetches a tile after the other and writes its rows over it: what waits is in the L2 cache.
 """
 
 import math
@@ -16,27 +15,10 @@ from typing import NamedTuple
 import warp as wp
 
 WARP = 32
-TILE = 8  # worlds of a tile: an entry of theirs fills a sector of 32 bytes
+TILE = 16  # worlds of a tile that is fetched; a multiple of 8, whose entries fill a sector of 32 bytes
 BATCH = 8  # reads of a thread that are on their way together
 LOOKUPS = 4  # likewise, of the table
-SEATS = 8  # of a multiprocessor, at most 31; a block that finds none waits for one
 STORE = "__stcs"  # what goes out leaves the cache to what comes back
-TAKE = f"""\
-__shared__ int seat;
-if (threadIdx.x == 0) {{
-    unsigned int processor;
-    asm volatile("mov.u32 %0, %%smid;" : "=r"(processor));
-    processor %= seats.shape[0];
-    int free;
-    do {{
-        free = __ffs(~*(volatile int*)(seats.data + processor) & {(1 << SEATS) - 1});
-    }} while (free == 0 || atomicOr(seats.data + processor, 1 << (free - 1)) >> (free - 1) & 1);
-    seat = processor * {SEATS} + free - 1;
-}}
-__syncthreads();"""
-LEAVE = f"""\
-__syncthreads();
-if (threadIdx.x == 0) atomicAnd(seats.data + seat / {SEATS}, ~(1 << seat % {SEATS}));"""
 VECTORS: dict[type, tuple[str, str]] = {wp.float32: ("float4", "int4"), wp.float64: ("double2", "int2")}  # and places
 
 
@@ -58,7 +40,7 @@ class Spread(NamedTuple):
 
         Odd where each lane writes a world; where they come as tiles, such that these meet in no bank.
         """
-        return (self.slots + 1) | 1 if self.worlds == WARP else (self.slots + 4) // 8 * 8 + 4
+        return (self.slots + 1) | 1 if self.worlds == WARP else (self.slots + 8) // 8 * 8 + WARP // self.worlds
 
     @property
     def scalars(self) -> int:
@@ -120,35 +102,47 @@ for (int start = member; start < limit; start += {lookups * team}) {{
 }}
 }}"""
 
-    def tiles(self, relay: str, stage: str, team: int, sync: str, T) -> str:
-        """Fetch a tile of values, [slot, 32 worlds] from ``relay`` on, write its rows, and so on."""
-        vector, wide, parts = VECTORS[T][0], _wide(T), "xyzw"[: _wide(T)]
-        of_slot, count = TILE // wide, self.slots * TILE // wide
-        source = f"{relay} + done + part / {of_slot} * {WARP} + part % {of_slot} * {wide}"
+    def tiles(self, stage: str, team: int, sync: str, T) -> str:
+        """Fetch the values of a tile's worlds from their rows, write these rows, and so on."""
+        c, vector, wide = _c(T), VECTORS[T][0], _wide(T)
+        of_slot, count = self.worlds // wide, self.slots * self.worlds // wide
         batch = min(BATCH, -(-count // team))
-        store = " ".join(f"to[{j * self.pitch}] = v[u].{x};" for j, x in enumerate(parts))
-        return f"""for (int done = 0; done < present; done += {TILE}) {{
+        store = " ".join(f"to[{j * self.pitch}] = v[u].{x};" for j, x in enumerate("xyzw"[:wide]))
+        return f"""for (int done = 0; done < present; done += {self.worlds}) {{
+const int width = present - done < {self.worlds} ? present - done : {self.worlds};
+const {c}* from = out.data + (first + done) * {self.entries};
 {sync}
-if (member < {TILE}) {stage}[member * {self.pitch} + {self.slots}] = 0;
-for (int start = member; start < {count}; start += {batch * team}) {{
-    {vector} v[{batch}];
-    #pragma unroll
-    for (int u = 0; u < {batch}; ++u) {{
-        const int part = start + {team} * u;
-        if (part < {count}) v[u] = *(const {vector}*)({source});
+if (member < {self.worlds}) {stage}[member * {self.pitch} + {self.slots}] = 0;
+if (width == {self.worlds} && (size_t)from % 16 == 0) {{
+    for (int start = member; start < {count}; start += {batch * team}) {{
+        {vector} v[{batch}];
+        #pragma unroll
+        for (int u = 0; u < {batch}; ++u) {{
+            const int part = start + {team} * u;
+            if (part < {count}) v[u] = ((const {vector}*)from)[part];
+        }}
+        #pragma unroll
+        for (int u = 0; u < {batch}; ++u) {{
+            const int part = start + {team} * u;
+            if (part >= {count}) break;
+            {c}* to = {stage} + part % {of_slot} * {wide * self.pitch} + part / {of_slot};
+            {store}
+        }}
     }}
-    #pragma unroll
-    for (int u = 0; u < {batch}; ++u) {{
-        const int part = start + {team} * u;
-        if (part >= {count}) break;
-        {_c(T)}* to = {stage} + part % {of_slot} * {wide * self.pitch} + part / {of_slot};
-        {store}
-    }}
+}} else for (int i = member; i < {self.slots} * width; i += {team}) {{
+    {stage}[i % width * {self.pitch} + i / width] = from[i];
 }}
 {sync}
 {self.rows("out", stage, team, T)}
-}}
-{LEAVE}"""
+}}"""
+
+    def relay(self, T) -> str:
+        """RELAY(slot): where in its tile's rows a world's value waits, [slot, world of the tile]."""
+        c, tile = _c(T), self.worlds
+        return f"""const int tile = (mine ? lane : 0) / {tile} * {tile};
+const int width = present - tile < {tile} ? present - tile : {tile};
+{c}* relayed = out.data + (first + tile) * {self.entries} + (mine ? lane : 0) % {tile};
+#define RELAY(i) relayed[(i) * width]"""
 
 
 def _c(T) -> str:

@@ -366,6 +366,28 @@ def test_a_part_that_takes_too_long_is_stopped(tmp_path, capsys, monkeypatch):
     assert "endless: 0 rows" in capsys.readouterr().out and 2.0 < time.monotonic() - begin < 20.0
 
 
+def test_parts_share_several_gpus(tmp_path, capsys, monkeypatch):
+    """Two of three GPUs measure at the same time, the third compiles; what measures the host runs by itself."""
+    (tmp_path / "one_part.py").write_text(
+        "import json, os, sys, time\n"
+        "begin = time.time()\n"
+        "time.sleep(0.5)\n"
+        "row = dict(gpu=os.environ['CUDA_VISIBLE_DEVICES'], begin=begin, end=time.time())\n"
+        "open(sys.argv[-1], 'w').write(json.dumps(dict(rows=[row])))\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    compiling = ["one_part", str(tmp_path / "compiled.json")]
+    found = [everything.Part("host", ["one_part"], alone=True), everything.Part("first", ["one_part"], compiling)]
+    found += [everything.Part(name, ["one_part"]) for name in ("second", "third")]
+    assert everything.Lanes(tmp_path, 60.0, 2, alone=False, gpus=3).run(found) == []
+    rows = {part.name: json.loads((tmp_path / f"{part.name}.json").read_text())["rows"][0] for part in found}
+    assert {rows["second"]["gpu"], rows["third"]["gpu"]} == {"0", "1"}
+    assert max(rows[name]["begin"] for name in ("second", "third")) < min(row["end"] for row in rows.values())
+    assert json.loads((tmp_path / "compiled.json").read_text())["rows"][0]["gpu"] == "2"
+    host = rows.pop("host")
+    assert all(row["end"] < host["begin"] or host["end"] < row["begin"] for row in rows.values())
+
+
 def test_parts_are_cases_that_there_are():
     """Every command of every part names cases, peers and options that exist."""
     for found in (parts.choose("", True, "cuda:0"), parts.choose("", False, "cpu")):

@@ -14,7 +14,7 @@ import warp as wp
 
 from . import link_values
 from .kernels import straight
-from .kernels.spreading import SEATS, TILE, WARP
+from .kernels.spreading import WARP
 from .kernels.straight import DIRECT, IN_PLACE, INTEGERS, MAPPED, RELAYED, SPREAD, STAGED, TILED, Frame, Result, Row
 from .levels import Recursions
 from .parts import DOF_VALUES
@@ -27,9 +27,9 @@ from .recursions.minimal import Minimal
 from .recursions.multipliers import Multipliers
 from .recursions.operators import meet, written
 from .recursions.pieces import Pieces
-from .recursions.step import LOOPED
-from .teams import Team, Work
-from .trace.emit import Angles, Emitter, Store, literals
+from .recursions.step import GAIN, GUESS, LOOPED, MISSED, by_pieces
+from .teams import Passes, Team, Work
+from .trace.emit import PREFIX, Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
 FIELDS = (*TABLES, *DOF_VALUES, "joint_rest_q")
@@ -47,12 +47,11 @@ TRACED = (
 )
 TILES = ("inverse_dynamics_derivatives", "mass_matrix_derivative")
 """Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
-REGISTERS = 65536  # of a multiprocessor
+REGISTERS, MOST_REGISTERS = 65536, 255  # of a multiprocessor, and of a thread
 THREE, ENOUGH = 3, 168  # blocks on it, and registers of a thread that the solution by limbs needs for that
 APART = ("forward_dynamics", "forward_dynamics_and_solve")
 """Operations that can take velocity terms first."""
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
-RELAYED_SLOTS = 256  # different values of a result from which they go through memory first
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
@@ -94,7 +93,7 @@ class Programs:
         registers: a cap on the registers of a thread.
 
     Attributes:
-        relays: a result that is too long for shared memory goes through memory.
+        relays: what is too long for shared memory waits in the rows of the result.
     """
 
     def __init__(self, run: Recursions, plan: Plan, block: int = WARP, registers: int | None = None):
@@ -184,6 +183,8 @@ class Programs:
             return None
         shapes = {**shapes, "out": out_shape}
         shared = self.plan.of(operation) == "segment" and messages.shared(operation, shapes, options.get("wrt", ()))
+        if operation == "step":
+            shared = shared and by_pieces(self.run.scene, shapes, options.get("how"))
         if operation in APART and self.plan.apart and "qd" in shapes:
             operation += "_apart"
         if shared:
@@ -225,49 +226,56 @@ class Programs:
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         everything: list[Store] = []
         traced: list[list[Store]] = []
-        apart: list[tuple[list[list[Value]], list[Store], dict[int, list[Store]]]] = []
+        apart: list[tuple[list[list[Value]], list[Store], list[Store], dict[int, list[Store]]]] = []
         for index in range(len(pieces.pieces)):
             links = self.links.opened()  # its own: pieces of equal structure then give equal text
             trace = Traces(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)(**options)])
             flat = {at: [self._flattened(item, shapes) for item in items] for at, items in trace.across.items()}
-            apart.append(([trace.ahead, trace.known], trace.news, flat))
-            everything += traced[-1] + trace.news + [item for items in flat.values() for item in items]
+            news = [self._flattened(item, shapes) for item in trace.news]
+            apart.append(([trace.ahead, trace.known], trace.checks, news, flat))
+            everything += traced[-1] + trace.checks + news + [item for items in flat.values() for item in items]
+        bends = any(item.array == MISSED for item in everything)
+        passes = Passes((GUESS, GAIN), sent if bends else None) if operation == "step" else None
+        sent += 2 * pieces.warps if bends else 0
         frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
                             WARP * pieces.warps, everything, more)
         if frame.result.way == DIRECT and frame.result.array.entries > LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
         if not frame.fits(self.run.dtype):
             return None  # nor for what limbs tell each other
-        team = Team(pieces, dtype)
+        team = Team(pieces, dtype, passes)
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
         whole = [item for item in everything if item.array == "out"]
         placed, table = _placed(whole, frame.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
-        for piece, stores, items, (ahead, news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
-            emitter = self._emitter(shapes, frame)
+        by_slot = lambda found: found if table is None else _by_slot(found, table)  # noqa: E731
+        for piece, stores, items, (ahead, checks, news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
+            emitter, checking = self._emitter(shapes, frame), self._emitter(shapes, frame)
+            later = self._emitter(shapes, frame) if passes else emitter
             inward = [item for item in stores if item.array == INWARD]
             outward = [item for item in stores if item.array == OUTWARD]
             last = outward if set(SENDS[operation]) & set(messages.OUTWARD_LETTERS) else inward
-            last += items if table is None else _by_slot(items, table)
-            last += [item for item in stores if item.array in more]
-            meetings = {at: found if table is None else _by_slot(found, table) for at, found in others.items()}
+            last += by_slot(items)
+            last += [item for item in stores if item.array in (*more, GAIN)]
+            meetings = {at: by_slot(found) for at, found in others.items()}
+            ends = [item for item in news if item.array == "out"]
+            news = [item for item in news if item.array != "out"] + by_slot(ends)
             first = emitter.region(inward), *(emitter.region([], values) for values in ahead)
-            if not piece.children:
-                told = emitter.branch(news)
-            then = emitter.region(outward)
-            if piece.children:
-                told = emitter.branch(news)
-            across = {at: emitter.branch(found) for at, found in meetings.items()}
-            team.add(Work(piece, *first, then, told, across), emitter.operations)
+            told = None if piece.children else later.branch(news)  # of what is known so far
+            then = emitter.region(outward), checking.region(checks)
+            told = told or later.branch(news)
+            across = {at: later.branch(found) for at, found in meetings.items()}
+            team.add(Work(piece, *first, *then, told, across),
+                     sum(each.operations for each in {emitter, checking, later}))
         cuda = team.cuda()  # fills the tables
-        registers = REGISTERS // (THREE * frame.block) // 8 * 8
-        fits = operation.endswith("_apart") and dtype == "float32" and registers >= ENOUGH
+        registers, three = (REGISTERS // (blocks * frame.block) // 8 * 8 for blocks in (1, THREE))
+        if operation.endswith("_apart") and dtype == "float32" and three >= ENOUGH:
+            registers = three
         lists = {"place": table, "table": team.table, "shifts": team.shifts}
         tables = {name: values for name, values in lists.items() if values}
-        return self._finished(
-            operation, frame, cuda, team.cpu(), tables, team.operations, registers if fits else None
-        )
+        cap = registers if registers < MOST_REGISTERS else None
+        return self._finished(operation, frame, cuda, team.cpu(), tables, team.operations, cap)
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
@@ -290,11 +298,6 @@ class Programs:
         }
         if result.way == TILED:
             entry = held.pop("place")
-        if result.way == RELAYED:
-            device = self.run.device
-            values = device.sm_count * SEATS * frame.groups * result.slots
-            held["seats"] = wp.zeros(device.sm_count, dtype=int, device=device)
-            held["relay"] = wp.empty((values, WARP), dtype=self.run.dtype, device=device)
         arrays += [(name, array.ndim) for name, array in held.items()]
         arrays += [("out", result.array.ndim if entry is None else 3)] + [(row.name, row.ndim) for row in frame.more]
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers or registers)
@@ -309,6 +312,8 @@ class Programs:
         def load(array: str, entry: str) -> str:
             if array in (INWARD, OUTWARD):
                 return f"SENT({entry})"
+            if array in LOOPED and frame.warps > 1:
+                return f"{'' if array == MISSED else PREFIX}{array}_row[{entry}]"
             if array in FIELDS:
                 return f"FIELD({array}, {entry})"
             return f"{array}_row[{entry}]"
@@ -318,8 +323,12 @@ class Programs:
                 return f"SENT({entry}) = {value};"
             if array == "out" and result.way == RELAYED:
                 return f"RELAY({entry}) = {value};"
+            if array == MISSED and frame.warps > 1:
+                return f"missed_row[0] += {value};"
+            if array in LOOPED and frame.warps > 1:
+                return f"{'if (open) ' if array == GUESS else ''}{load(array, entry)} = {value};"
             if array == "out" and result.way == TILED:
-                return f"if (mine) result_row[({entry}) * {TILE}] = {value};"
+                return f"if (mine) result_row[({entry}) * {straight.TILE}] = {value};"
             if array == "out":
                 return f"{guard}result_row[{entry}] = {value};"
             return f"if (mine) {array}_row[{entry}] = {value};"
@@ -358,16 +367,24 @@ class Programs:
         if out.entries > LONG_ROW and not (dense and staged and over == ["x"]):
             mapped = Result(MAPPED, out, slots=slots)
             ways = [(staged, mapped), (False, mapped), *ways]
-            if self.relays:
-                ways.insert(0 if slots >= RELAYED_SLOTS else -1, (False, Result(RELAYED, out, slots=slots)))
+            if self.relays and _apart(rows, out):
+                ways.insert(-1, (False, Result(RELAYED, out, slots=slots)))
         further = tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more)
+        roomy = self.relays and sent <= out.entries and _apart(rows, out)
         frames = [
-            Frame(rows, staged, list(fields), result, sent, warps, block, further, gathered, False, entries, numbers)
+            Frame(rows, staged, list(fields), result, sent, warps, block, further, gathered, False, entries, numbers,
+                  through)
             for staged, result in ways
+            for through in ((False, True) if roomy and result.way == MAPPED and not staged and sent else (False,))
             for gathered in ((True, False) if further and result.way in (IN_PLACE, STAGED) else (False,))
             for entries in held[::-1]
         ]
         return next((frame for frame in frames if frame.fits(self.run.dtype)), frames[-1])
+
+
+def _apart(rows: list[Row], out: Row) -> bool:
+    """No row is the result's array, so that it can be written before all is read."""
+    return all(row.entries != out.entries for row in rows)
 
 
 def _read_before(stores: list[Store], everything: list[Store], row: str) -> bool:

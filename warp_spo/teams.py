@@ -5,18 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from .kernels import straight
 from .recursions.pieces import Piece, Pieces
-from .trace.emit import Listing, filled, literal, literals
+from .trace.emit import C_TYPE, Listing, filled, literal, literals
 
 BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
 ARRIVE, AWAIT = 'asm volatile("bar.arrive {}, {};" ::: "memory");', 'asm volatile("bar.sync {}, {};" ::: "memory");'
 INSIDE, OUTSIDE = 1, 2  # barriers before and behind what one warp does for all
+OVERLAPS = False  # the others work meanwhile
 
 
 class Work(NamedTuple):
-    """What one piece has to do: going in, meanwhile, coming out, telling the others, and with each that it meets.
+    """What one piece has to do: going in, two things meanwhile, coming out, checking a pass, telling the others, and
+    with each that it meets.
 
-    Meanwhile is while those further in work: what needs none of them.
+    Meanwhile is while those further in work: what needs none of them; then what it tells and needs no more than they
+    sent. Of work in passes, the last two come when all passes are done.
     """
 
     piece: Piece
@@ -24,12 +28,31 @@ class Work(NamedTuple):
     meanwhile: Listing
     known: Listing
     outward: Listing
+    check: Listing
     news: Listing
     across: dict[int, Listing]
 
     @property
     def text(self) -> tuple[str, ...]:
-        return self.inward.text, self.meanwhile.text, self.known.text, self.outward.text
+        return tuple(listing.text for listing in self[1:6])
+
+
+class Passes(NamedTuple):
+    """Passes in which a team goes round all its work, until every warp's guesses were right.
+
+    Attributes:
+        kept: names of what a piece keeps from pass to pass, by dof of its own: arrays of a thread whose indices are
+            constants, so that they live in registers.
+        flags: where in the memory that warps share the flags begin; None: there is nothing to guess, one pass will do.
+    """
+
+    kept: tuple[str, ...]
+    flags: int | None
+
+    def declared(self, entries: dict[str, int], c: str) -> str:
+        """What pieces keep, by the prefix of their names: so many entries each."""
+        sizes = entries.items()
+        return "\n".join(f"{c} {prefix}{name}_row[{count}] = {{}};" for prefix, count in sizes for name in self.kept)
 
 
 class Team:
@@ -37,6 +60,7 @@ class Team:
 
     Args:
         pieces, dtype: of the scene.
+        passes: the work is done in passes, see :class:`Passes`.
 
     Attributes:
         table: constants in which equal pieces differ. shifts: likewise, distances of the entries that they read and
@@ -44,8 +68,8 @@ class Team:
         operations: floating-point operations of one world.
     """
 
-    def __init__(self, pieces: Pieces, dtype: str):
-        self.pieces, self.dtype = pieces, dtype
+    def __init__(self, pieces: Pieces, dtype: str, passes: Passes | None = None):
+        self.pieces, self.dtype, self.c, self.passes = pieces, dtype, C_TYPE[dtype], passes
         self.table: list[float] = []
         self.shifts: list[int] = []
         self.operations = 0
@@ -60,15 +84,16 @@ class Team:
     def _last(self) -> int:
         """The last stage in which there is something to do."""
         stages = [0]
-        for piece, inward, _, _, outward, _, across in self._work.values():
+        for piece, inward, _, _, outward, _, _, across in self._work.values():
             stages += [piece.inward] if inward.text else []
             stages += [piece.outward] if outward.text else []
-            stages += [self.pieces.stages - 1] if across else []  # pieces further in meet in the last one
+            if across and not self.passes:
+                stages.append(self.pieces.stages - 1)  # pieces further in meet in the last one
         return max(stages)
 
     def cpu(self) -> str:
         """Everything in order, by one thread."""
-        text = []
+        text, later = [], []
         for stage in range(self._last + 1):
             for piece in reversed(self.pieces.pieces):
                 if piece.inward == stage:
@@ -78,10 +103,15 @@ class Team:
                     text.append(literals(self._work[piece.index].meanwhile, self.dtype, f"p{piece.index}_"))
                     text.append(literals(self._work[piece.index].known, self.dtype, f"p{piece.index}_"))
                     text.append(literals(self._work[piece.index].outward, self.dtype, f"p{piece.index}_"))
-                    text.append(self._inside_braces(self._work[piece.index].news, piece))
+                    if self._work[piece.index].check.text:
+                        text.append(self._inside_braces(self._work[piece.index].check, piece))
+                    (later if self.passes else text).append(self._inside_braces(self._work[piece.index].news, piece))
         for work in self._work.values():
-            text += [self._inside_braces(listing, work.piece) for listing in work.across.values()]
-        return "\n".join(text)
+            later += [self._inside_braces(listing, work.piece) for listing in work.across.values()]
+        if self.passes:
+            kept = {f"p{piece.index}_": piece.weight for piece in self.pieces.pieces}
+            text = [self.passes.declared(kept, self.c), straight.alone("\n".join(text), self.c)]
+        return "\n".join(text + later)
 
     def _inside_braces(self, listing: Listing, piece: Piece) -> str:
         return "{\n" + literals(listing, self.dtype, f"p{piece.index}_") + "\n}"
@@ -97,26 +127,57 @@ class Team:
             text.append(f"{'else ' if text else ''}if ({_any_of([work.piece.warp for work in alike])}) {{")
             inward, meanwhile, known, outward = self._shared(alike)
             warps = [work.piece.warp for work in alike]
-            text += [inward, *self._inner(warps, meanwhile), known, self._apart(alike, [work.news for work in alike], "n_")]
-            if self._inside is not None and not next(w for works in kinds.values() for w in works if w.piece.warp == self._inside).across:
+            text += [inward, *self._inner(warps, meanwhile), known]
+            text += [] if self.passes else [self._apart(alike, [work.news for work in alike], "n_")]
+            met = not self.passes and any(work.across for works in kinds.values() for work in works)
+            if met and self._inside is not None and not self._looks(self._inside):
                 threads = 32 * self.pieces.warps
                 if self._inside in warps:
                     text += [f"if (warp == {self._inside}) {{", ARRIVE.format(3, threads), "}"]
-                text += [outward, f"if (warp != {self._inside}) {{", AWAIT.format(3, threads), "}"]
-                text += [self._across(alike)]
-            elif any(work.across for works in kinds.values() for work in works):
-                text += [outward, BARRIER, self._across(alike)]
+                text += [outward, f"if (warp != {self._inside}) {{", AWAIT.format(3, threads), "}", self._across(alike)]
             else:
-                text += [outward]
+                text += [outward, *([BARRIER, self._across(alike)] if met else [])]
             text.append("}")
+        return self._in_passes("\n".join(text)) if self.passes else "\n".join(text)
+
+    def _in_passes(self, a_pass: str) -> str:
+        """``a_pass`` until all agree, then every piece's news, and what the first makes of them."""
+        assert self.passes is not None
+        leaves = [work for work in self._work.values() if not work.piece.children]
+        inner = [work for work in self._work.values() if work.piece.children]
+        ranks: list[dict[int, Work]] = [{leaf.piece.warp: leaf for leaf in leaves}]  # by warp: one of its pieces
+        for work in inner:
+            warp = work.piece.warp
+            free = next((rank for rank in ranks if warp not in rank), None)
+            if free is None:
+                ranks.append(free := {})
+            free[warp] = work
+        names = ["", *(f"i{at}_" for at in range(len(ranks) - 1))]
+        kept = {name: max(work.piece.weight for work in rank.values()) for name, rank in zip(names, ranks, strict=True)}
+        text = [self.passes.declared(kept, self.c)]
+        text += [straight.once(a_pass, BARRIER, self.c) if self.passes.flags is None else
+                 straight.voted(a_pass, self.passes.flags, self.pieces.warps, self.c)]
+        for last in (False, True):
+            found = []
+            for at, (name, rank) in enumerate(zip(names, ranks, strict=True)):
+                said = [rank.get(leaf.piece.warp) for leaf in leaves]
+                its = [None if one is None else one.across.get(0) if last else one.news for one in said]
+                found.append(self._apart(leaves, its, f"c{at}_", name))
+            if last and any(found):
+                text.append(BARRIER)
+            text += found
         return "\n".join(text)
 
     @property
     def _inside(self) -> int | None:
-        """The warp that does all there is between the leaves' way in and their way out, if others can work meanwhile."""
+        """The warp that does all between the leaves' way in and their way out, if others can work meanwhile."""
         warps = {work.piece.warp for work in self._work.values() if work.piece.children}
-        meanwhile = any(work.meanwhile.text for work in self._work.values())
+        meanwhile = OVERLAPS and any(work.meanwhile.text for work in self._work.values())
         return warps.pop() if meanwhile and len(warps) == 1 and self._last == 2 else None
+
+    def _looks(self, warp: int) -> bool:
+        """Whether its limb works out what it has in common with others."""
+        return any(work.across for work in self._work.values() if work.piece.warp == warp)
 
     def _inner(self, warps: list[int], meanwhile: str) -> list[str]:
         """The stages between the leaves' way in and their way out, with the pieces that some of ``warps`` take on."""
@@ -151,8 +212,11 @@ class Team:
                 text += [inward for work, (inward, *_) in reversed(order) if work.piece.inward == stage]
                 for at, (alike, (*_, outward)) in enumerate(zip(zip(*chains, strict=True), shared, strict=True)):
                     if alike[0].piece.outward == stage:
-                        text += [outward, self._apart(alike, [work.news for work in alike], f"i{at}_n_", f"i{at}_")]
-            text += [self._across(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
+                        text.append(outward)
+                        if not self.passes:
+                            text.append(self._apart(alike, [work.news for work in alike], f"i{at}_n_", f"i{at}_"))
+            if not self.passes:
+                text += [self._across(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
             text.append("}")
         idle = [BARRIER] * self._last
         if text and len(warps) > sum(map(len, owners.values())):
@@ -180,9 +244,10 @@ class Team:
 
     def _shared(self, alike: Sequence[Work], prefix: str = "") -> list[str]:
         """One text for each region of pieces of equal structure."""
-        listings = [[work[at] for work in alike] for at in range(1, 5)]
-        head, (inward, *others) = self._filled(alike, listings, prefix, prefix)
-        return [f"{head}\n{inward}" if head else inward, *others]
+        listings = [[work[at] for work in alike] for at in range(1, 6)]
+        head, (inward, *others, outward, check) = self._filled(alike, listings, prefix, prefix)
+        outward = "\n".join([outward, "{", check, "}"]) if check else outward
+        return [f"{head}\n{inward}" if head else inward, *others, outward]
 
     def _filled(
         self, alike: Sequence[Work], regions: list[list[Listing]], prefix: str, tables: str
@@ -218,9 +283,8 @@ class Team:
             member = " : ".join(f"warp == {warp} ? {at}" for at, warp in enumerate(warps[:-1])) + f" : {len(warps) - 1}"
             head.append(f"const int {tables}who = {member};")
         if constants.columns:
-            c = {"float32": "float", "float64": "double"}[self.dtype]
             first, count = len(self.table), len(constants.columns)
-            head.append(f"const {c}* {tables}numbers = table.data + {first} + {tables}who * {count};")
+            head.append(f"const {self.c}* {tables}numbers = table.data + {first} + {tables}who * {count};")
             self.table += [value for row in zip(*constants.columns, strict=True) for value in row]
         if shifts.columns:
             first, count = len(self.shifts), len(shifts.columns)
@@ -229,6 +293,7 @@ class Team:
             head += [f"{tables}shift[{k}] = {read.format(first + k, tables, count)};" for k in range(count)]
             self.shifts += [value for row in zip(*shifts.columns, strict=True) for value in row]
         return "\n".join(head), texts
+
 
 class _Columns:
     """Distinct tuples, one value for each member, in the order in which they were met."""

@@ -21,7 +21,7 @@ from .lumped import Robot
 
 WARM_UP = 0.05  # [s] of evaluations before anything is timed
 GRAPH_SECONDS = 0.02  # a graph goes through all sets of inputs up to ROUNDS times, fewer where that would take longer
-ROUNDS = 8
+ROUNDS = 64
 REPEATS = 20
 BUDGET = 0.4  # [s]: fewer repeats, 3 at least, where they would take longer
 SLOW = 0.5  # [s]: an operation that takes longer is not measured at more worlds
