@@ -261,12 +261,12 @@ class Programs:
             meetings = {at: by_slot(found) for at, found in others.items()}
             ends = [item for item in news if item.array == "out"]
             news = [item for item in news if item.array != "out"] + by_slot(ends)
-            first = emitter.region(inward), *(emitter.region([], values) for values in ahead)
+            first, (meanwhile, known) = emitter.region(inward), [emitter.region([], values) for values in ahead]
             told = None if piece.children else later.branch(news)  # of what is known so far
-            then = emitter.region(outward), checking.region(checks)
+            then, check = emitter.region(outward), checking.region(checks)
             told = told or later.branch(news)
             across = {at: later.branch(found) for at, found in meetings.items()}
-            team.add(Work(piece, *first, *then, told, across),
+            team.add(Work(piece, first, meanwhile, known, then, check, told, across),
                      sum(each.operations for each in {emitter, checking, later}))
         cuda = team.cuda()  # fills the tables
         registers, three = (REGISTERS // (blocks * frame.block) // 8 * 8 for blocks in (1, THREE))

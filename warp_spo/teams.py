@@ -34,7 +34,12 @@ class Work(NamedTuple):
 
     @property
     def text(self) -> tuple[str, ...]:
-        return tuple(listing.text for listing in self[1:6])
+        return tuple(listing.text for listing in self.regions)
+
+    @property
+    def regions(self) -> tuple[Listing, ...]:
+        """What equal pieces share."""
+        return self.inward, self.meanwhile, self.known, self.outward, self.check
 
 
 class Passes(NamedTuple):
@@ -93,7 +98,8 @@ class Team:
 
     def cpu(self) -> str:
         """Everything in order, by one thread."""
-        text, later = [], []
+        text: list[str] = []
+        later: list[str] = []
         for stage in range(self._last + 1):
             for piece in reversed(self.pieces.pieces):
                 if piece.inward == stage:
@@ -244,7 +250,7 @@ class Team:
 
     def _shared(self, alike: Sequence[Work], prefix: str = "") -> list[str]:
         """One text for each region of pieces of equal structure."""
-        listings = [[work[at] for work in alike] for at in range(1, 6)]
+        listings = [list(found) for found in zip(*(work.regions for work in alike), strict=True)]
         head, (inward, *others, outward, check) = self._filled(alike, listings, prefix, prefix)
         outward = "\n".join([outward, "{", check, "}"]) if check else outward
         return [f"{head}\n{inward}" if head else inward, *others, outward]
