@@ -11,8 +11,8 @@ from .trace.emit import C_TYPE, Listing, filled, literal, literals
 
 BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
 ARRIVE, AWAIT = 'asm volatile("bar.arrive {}, {};" ::: "memory");', 'asm volatile("bar.sync {}, {};" ::: "memory");'
-INSIDE, OUTSIDE = 1, 2  # barriers before and behind what one warp does for all
-OVERLAPS = False  # the others work meanwhile
+INSIDE, OUTSIDE, TOLD = 1, 2, 3  # barriers before and behind what one warp does for all, and before what limbs share
+OVERLAPS = False  # whether the others work meanwhile: to be measured
 
 
 class Work(NamedTuple):
@@ -139,8 +139,8 @@ class Team:
             if met and self._inside is not None and not self._looks(self._inside):
                 threads = 32 * self.pieces.warps
                 if self._inside in warps:
-                    text += [f"if (warp == {self._inside}) {{", ARRIVE.format(3, threads), "}"]
-                text += [outward, f"if (warp != {self._inside}) {{", AWAIT.format(3, threads), "}", self._across(alike)]
+                    text += [f"if (warp == {self._inside}) {{", ARRIVE.format(TOLD, threads), "}"]
+                text += [outward, f"if (warp != {self._inside}) {{", AWAIT.format(TOLD, threads), "}", self._across(alike)]
             else:
                 text += [outward, *([BARRIER, self._across(alike)] if met else [])]
             text.append("}")
