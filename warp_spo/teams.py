@@ -140,7 +140,8 @@ class Team:
                 threads = 32 * self.pieces.warps
                 if self._inside in warps:
                     text += [f"if (warp == {self._inside}) {{", ARRIVE.format(TOLD, threads), "}"]
-                text += [outward, f"if (warp != {self._inside}) {{", AWAIT.format(TOLD, threads), "}", self._across(alike)]
+                text += [outward, f"if (warp != {self._inside}) {{", AWAIT.format(TOLD, threads), "}"]
+                text += [self._across(alike)]
             else:
                 text += [outward, *([BARRIER, self._across(alike)] if met else [])]
             text.append("}")
