@@ -50,6 +50,7 @@ REGISTERS, MOST_REGISTERS = 65536, 255  # of a multiprocessor, and of a thread
 THREE, ENOUGH = 3, 168  # blocks on it, and registers of a thread that the solution by limbs needs for that
 APART = ("forward_dynamics", "forward_dynamics_and_solve")
 """Operations that can take velocity terms first."""
+PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
 TILED_SLOTS = 256  # different values of a result from which they go through memory, not through shared memory,
 TILED_WORLDS = 1 << 20  # of so many worlds at a time
@@ -92,7 +93,6 @@ class Programs:
     Args:
         run: its sweeps, whose parameters the programs read.
         plan: which granularity each operation has.
-        block: threads of a block at tree granularity, on CUDA.
         registers: a cap on the registers of a thread.
 
     Attributes:
@@ -100,8 +100,8 @@ class Programs:
             a multiple of 8.
     """
 
-    def __init__(self, run: Recursions, plan: Plan, block: int = WARP, registers: int | None = None):
-        self.run, self.plan, self.block, self.registers = run, plan, block, registers
+    def __init__(self, run: Recursions, plan: Plan, registers: int | None = None):
+        self.run, self.plan, self.registers = run, plan, registers
         self.tiled, self.tiled_worlds = run.device.is_cuda, TILED_WORLDS
         self._programs: dict[Any, Program | None] = {}
         self._links: Links | None = None
@@ -220,7 +220,7 @@ class Programs:
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         outs = [item for item in stores if item.array == "out"]
-        frame = self._frame(outs, shapes, 0, 1, self.block, stores, more)
+        frame = self._frame(outs, shapes, 0, 1, WARP, stores, more)
         if operation in TILES:
             result = Result(TILED, frame.result.array, slots=_solid(stores))
             frame = frame._replace(staged=self.plan.staged, result=result)
@@ -234,7 +234,8 @@ class Programs:
         if looped:
             ahead, a_pass = before
             body = straight.looped(ahead, a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
-        frame = frame._replace(again=frame.again and "farthest" in body)
+        block = WARP if frame.scalars else PAIR * WARP
+        frame = frame._replace(again=frame.again and "farthest" in body, block=block)
         tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
         return self._finished(operation, frame, body, body, tables, emitter.operations)
 
