@@ -139,7 +139,7 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     # not from the thread's index: before Warp has that, it asks whether to divide, 0.1 us of a kernel of 1.5
     text += [f"const int start = blockIdx.x * {frame.block // frame.warps} + threadIdx.x / {team} * {WARP};"]
     text += ["const int present = worlds - start < 32 ? worlds - start : 32;", "const bool mine = lane < present;"]
-    text += ["const long long first = start, world = start + (mine ? lane : 0);"]
+    text += ["const long long first = start, world = mine ? start + lane : worlds - 1;"]
     if frame.scalars:
         text += [f"__shared__ __align__(16) {c} shared[{frame.groups * frame.scalars}];"]
         text += [f"{c}* stage = shared + (threadIdx.x / {team}) * {frame.scalars};"]

@@ -51,6 +51,7 @@ REGISTERS, MOST_REGISTERS = 65536, 255  # of a multiprocessor, and of a thread
 THREE, ENOUGH = 3, 168  # blocks on it, and registers of a thread that the solution by limbs needs for that
 APART = ("forward_dynamics", "forward_dynamics_and_solve")
 """Operations that can take velocity terms first."""
+PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
@@ -89,15 +90,14 @@ class Programs:
     Args:
         run: its sweeps, whose parameters the programs read.
         plan: which granularity each operation has.
-        block: threads of a block at tree granularity, on CUDA.
         registers: a cap on the registers of a thread.
 
     Attributes:
         relays: what is too long for shared memory waits in the rows of the result.
     """
 
-    def __init__(self, run: Recursions, plan: Plan, block: int = WARP, registers: int | None = None):
-        self.run, self.plan, self.block, self.registers = run, plan, block, registers
+    def __init__(self, run: Recursions, plan: Plan, registers: int | None = None):
+        self.run, self.plan, self.registers = run, plan, registers
         self.relays = run.device.is_cuda
         self._programs: dict[Any, Program | None] = {}
         self._links: Links | None = None
@@ -201,7 +201,7 @@ class Programs:
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         outs = [item for item in stores if item.array == "out"]
-        frame = self._frame(outs, shapes, 0, 1, self.block, stores, more)
+        frame = self._frame(outs, shapes, 0, 1, WARP, stores, more)
         if operation in TILES:
             result = Result(TILED, frame.result.array, slots=_solid(stores))
             frame = frame._replace(staged=self.plan.staged, result=result)
@@ -215,7 +215,8 @@ class Programs:
         if looped:
             ahead, a_pass = before
             body = straight.looped(ahead, a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
-        frame = frame._replace(again=frame.again and "farthest" in body)
+        block = WARP if frame.scalars else PAIR * WARP
+        frame = frame._replace(again=frame.again and "farthest" in body, block=block)
         tables = {} if table is None else {"place": table}
         return self._finished(operation, frame, body, body, tables, emitter.operations)
 
