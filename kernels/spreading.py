@@ -56,8 +56,8 @@ class Spread(NamedTuple):
         row = [self.slots if slot < 0 else slot for slot in slots]
         return [world * self.pitch + slot for world in range(self.period(T)) for slot in row]
 
-    def rows(self, out: str, stage: str, team: int, T) -> str:
-        """Write the rows of the worlds from ``first + done`` on that are in shared memory, ``present`` in all."""
+    def rows(self, stage: str, team: int, T) -> str:
+        """Write the rows of the worlds from ``first + done`` on, whose values are at ``stage``; ``present`` in all."""
         c, (vector, places), parts = _c(T), VECTORS[T], "xyzw"[: _wide(T)]
         groups, turns = self.period(T) * self.entries // _wide(T), self.worlds // self.period(T)
         step, row = self.period(T) * self.pitch, groups * _wide(T)
@@ -75,7 +75,7 @@ class Spread(NamedTuple):
         )
         return f"""{{
 const int left = (present - done < {self.worlds} ? present - done : {self.worlds}) * {self.entries};
-{c}* rows = {out}.data + (first + done) * {self.entries};
+{c}* rows = out.data + (first + done) * {self.entries};
 const bool whole = left == {self.worlds * self.entries} && (size_t)rows % 16 == 0;
 const int limit = {limit};
 for (int start = member; start < limit; start += {lookups * team}) {{
@@ -133,15 +133,16 @@ if (width == {self.worlds} && (size_t)from % 16 == 0) {{
     {stage}[i % width * {self.pitch} + i / width] = from[i];
 }}
 {sync}
-{self.rows("out", stage, team, T)}
+{self.rows(stage, team, T)}
 }}"""
 
     def relay(self, T) -> str:
         """RELAY(slot): where in its tile's rows a world's value waits, [slot, world of the tile]."""
         c, tile = _c(T), self.worlds
-        return f"""const int tile = (mine ? lane : 0) / {tile} * {tile};
+        return f"""const int own = mine ? lane : present - 1;  // of the world that an idle lane works out too
+const int tile = own / {tile} * {tile};
 const int width = present - tile < {tile} ? present - tile : {tile};
-{c}* relayed = out.data + (first + tile) * {self.entries} + (mine ? lane : 0) % {tile};
+{c}* relayed = out.data + (first + tile) * {self.entries} + own % {tile};
 #define RELAY(i) relayed[(i) * width]"""
 
 

@@ -44,9 +44,10 @@ class Result(NamedTuple):
 
     Attributes:
         way: IN_PLACE: entry by entry over ``row``, which is read first; STAGED: through shared memory, as it is;
-            MAPPED: through shared memory, ``slots`` values that a table ``place`` spreads; RELAYED: the same a few
-            worlds at a time, for which they wait in their rows; both see .spreading; TILED: those values to memory as
-            [tile, slot, world of the tile], for the kernels of .tiles; DIRECT: each entry to memory by itself.
+            MAPPED: through shared memory, ``slots`` different values that a table ``place`` spreads; RELAYED: the same
+            a few worlds at a time, as the others wait in the rows of the result; for both see .spreading; TILED: those
+            values to memory as [tile, slot, world of the tile], for the kernels of .tiles; DIRECT: each entry to memory
+            by itself.
     """
 
     way: str
@@ -74,7 +75,7 @@ class Frame(NamedTuple):
         fields: arrays [entry, world] to read: ``FIELD(name, entry)``.
         result: how ``result_row[i]`` leaves.
         again: the statements run once more, with ``again`` set, if they left ``farthest`` beyond reach.
-        sent: values that warps send each other, ``SENT(i)``. through: they wait in the result's rows.
+        sent: values that warps send each other, ``SENT(i)``.
         warps: how many work on 32 worlds.
         block: threads of a block.
         more: further results, ``name_row[i]``. gathered: they leave through shared memory, as rows; otherwise, and if
@@ -96,7 +97,6 @@ class Frame(NamedTuple):
     again: bool = False
     held: tuple[tuple[int, ...], ...] = ()
     numbers: tuple[str, ...] = ()
-    through: bool = False
 
     @property
     def groups(self) -> int:
@@ -105,13 +105,13 @@ class Frame(NamedTuple):
 
     @property
     def scalars(self) -> int:
-        """Scalars of shared memory that a group takes."""
+        """Scalars of shared memory that a group takes; tiles of a RELAYED result lie over what has been read."""
         rows = sum(pitch(row.entries) for row in self.rows) if self.staged else 0
         rows += sum(pitch(row.entries) for row in self.leaving)
         rows += pitch(self.result.array.entries) if self.result.way == STAGED else 0
-        scalars = WARP * (rows + (0 if self.through else self.sent) + sum(map(len, self.held)))
+        scalars = WARP * (rows + self.sent + sum(map(len, self.held)))
         if self.result.way == RELAYED:
-            return max(scalars, self.result.spread.scalars)  # when all else has been read
+            return max(scalars, self.result.spread.scalars)
         return scalars + (self.result.spread.scalars if self.result.way == MAPPED else 0)
 
     @property
@@ -119,13 +119,9 @@ class Frame(NamedTuple):
         """Further results that leave through shared memory."""
         return tuple(row for row in self.more if self.gathered and row.name not in INTEGERS)
 
-    def bytes(self, T) -> int:
-        """Of shared memory that a block takes."""
-        return self.scalars * self.groups * wp.types.type_size_in_bytes(T)
-
     def fits(self, T) -> bool:
         """Shared memory holds what is staged."""
-        return self.bytes(T) <= SHARED_BYTES
+        return self.scalars * self.groups * wp.types.type_size_in_bytes(T) <= SHARED_BYTES
 
 
 def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
@@ -181,10 +177,7 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
         text += [result.spread.relay(T)]
     else:
         text += [f"{c}* result_row = stage + {start} + lane * {width};"]
-    if frame.sent and frame.through:
-        text += [f"{c}* sent = out.data + first * {out.entries} + (mine ? lane : 0);"]
-        text += ["#define SENT(i) sent[(i) * present]"]
-    elif frame.sent:
+    if frame.sent:
         text += [f"{c}* sent = stage + {at} + lane;", "#define SENT(i) sent[(i) * 32]"]
     if frame.again:
         cuda = f"for (int again = 0;; ++again) {{\n{cuda}\nif (again || !(farthest > on::reach())) break;\n}}"
@@ -194,7 +187,7 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
         text += [_stage_out(row, offset[row.name], pitch(row.entries), c, team) for row in frame.leaving]
     if result.way == MAPPED:
         text += ["const int done = 0;", f"result_row[{result.slots}] = 0;", sync]
-        text += [result.spread.rows("out", f"(stage + {start})", team, T)]
+        text += [result.spread.rows(f"(stage + {start})", team, T)]
     if result.way == RELAYED:
         text += [result.spread.tiles("stage", team, sync, T)]
     text += ["#undef FIELD"] if frame.held else []

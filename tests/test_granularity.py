@@ -215,6 +215,33 @@ def test_a_long_result_that_shared_memory_cannot_hold(granularity, device, monke
     assert {text.frame.result.way for text in texts} == {straight.RELAYED}
 
 
+@pytest.mark.parametrize("way", [straight.MAPPED, straight.RELAYED])
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("granularity", GRANULARITIES)
+def test_long_results_that_begin_anywhere(granularity, dtype, way, device, monkeypatch):
+    """Of worlds that fill no warp, no tile and no 16 bytes; nothing is written in front of the result or behind it."""
+    operation = "mass_matrix" if granularity == "tree" else "mass_matrix_inverse"
+    texts = warp_machine.recorded(monkeypatch)
+    if way == straight.RELAYED:
+        monkeypatch.setattr(straight, "SHARED_BYTES", 5_000 if dtype == "float32" else 10_000)
+    for worlds in (1, 3, 33, 70):
+        dyn = dynamics("two arms", granularity, worlds, dtype, device)
+        dyn.programs.relays = True
+        arrays, size = states(dyn), dyn.scene.dof_count**2 * worlds
+        wanted = equals_reference(dyn, operation, arrays, laws.TOLERANCE[dtype])
+        q = laws.to_device(dyn, arrays)["q"]
+        for at in range(5):
+            memory = wp.full(at + size + 5, math.nan, dtype=dyn.dtype, device=device)
+            getattr(dyn, operation)(q, out=memory[at : at + size].reshape(wanted.shape))
+            np.testing.assert_array_equal(memory[at : at + size].numpy(), wanted.ravel())
+            rest = np.concatenate([memory[:at].numpy() if at else [], memory[at + size :].numpy()])
+            assert np.isnan(rest).all()
+        if granularity == "segment" and worlds == 3:
+            by_warps = warp_machine.run(texts[-1], {"q": arrays["q"]}).reshape(wanted.shape)
+            assert laws.error(by_warps, wanted) <= laws.TOLERANCE[dtype]
+    assert {text.frame.result.way for text in texts} == {way}
+
+
 @pytest.mark.parametrize("worlds", [1, 3])
 @pytest.mark.parametrize("granularity", GRANULARITIES)
 def test_equals_reference_where_a_warp_is_not_full(granularity, worlds, device):

@@ -227,14 +227,14 @@ class Programs:
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         everything: list[Store] = []
         traced: list[list[Store]] = []
-        apart: list[tuple[list[list[Value]], list[Store], list[Store], dict[int, list[Store]]]] = []
+        apart: list[tuple[list[Store], list[Store], dict[int, list[Store]]]] = []
         for index in range(len(pieces.pieces)):
             links = self.links.opened()  # its own: pieces of equal structure then give equal text
             trace = Traces(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)(**options)])
             flat = {at: [self._flattened(item, shapes) for item in items] for at, items in trace.across.items()}
             news = [self._flattened(item, shapes) for item in trace.news]
-            apart.append(([trace.ahead, trace.known], trace.checks, news, flat))
+            apart.append((trace.checks, news, flat))
             everything += traced[-1] + trace.checks + news + [item for items in flat.values() for item in items]
         bends = any(item.array == MISSED for item in everything)
         passes = Passes((GUESS, GAIN), sent if bends else None) if operation == "step" else None
@@ -251,7 +251,7 @@ class Programs:
         placed, table = _placed(whole, frame.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
         by_slot = lambda found: found if table is None else _by_slot(found, table)  # noqa: E731
-        for piece, stores, items, (ahead, checks, news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
+        for piece, stores, items, (checks, news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
             emitter, checking = self._emitter(shapes, frame), self._emitter(shapes, frame)
             later = self._emitter(shapes, frame) if passes else emitter
             inward = [item for item in stores if item.array == INWARD]
@@ -260,14 +260,11 @@ class Programs:
             last += by_slot(items)
             last += [item for item in stores if item.array in (*more, GAIN)]
             meetings = {at: by_slot(found) for at, found in others.items()}
+            regions = emitter.region(inward), emitter.region(outward)
             ends = [item for item in news if item.array == "out"]
             news = [item for item in news if item.array != "out"] + by_slot(ends)
-            first, (meanwhile, known) = emitter.region(inward), [emitter.region([], values) for values in ahead]
-            told = None if piece.children else later.branch(news)  # of what is known so far
-            then, check = emitter.region(outward), checking.region(checks)
-            told = told or later.branch(news)
-            across = {at: later.branch(found) for at, found in meetings.items()}
-            team.add(Work(piece, first, meanwhile, known, then, check, told, across),
+            branches = later.branch(news), {at: later.branch(found) for at, found in meetings.items()}
+            team.add(Work(piece, *regions, checking.region(checks), *branches),
                      sum(each.operations for each in {emitter, checking, later}))
         cuda = team.cuda()  # fills the tables
         registers, three = (REGISTERS // (blocks * frame.block) // 8 * 8 for blocks in (1, THREE))
@@ -371,12 +368,9 @@ class Programs:
             if self.relays and _apart(rows, out):
                 ways.insert(-1, (False, Result(RELAYED, out, slots=slots)))
         further = tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more)
-        roomy = self.relays and sent <= out.entries and _apart(rows, out)
         frames = [
-            Frame(rows, staged, list(fields), result, sent, warps, block, further, gathered, False, entries, numbers,
-                  through)
+            Frame(rows, staged, list(fields), result, sent, warps, block, further, gathered, False, entries, numbers)
             for staged, result in ways
-            for through in ((False, True) if roomy and result.way == MAPPED and not staged and sent else (False,))
             for gathered in ((True, False) if further and result.way in (IN_PLACE, STAGED) else (False,))
             for entries in held[::-1]
         ]

@@ -10,36 +10,24 @@ from .recursions.pieces import Piece, Pieces
 from .trace.emit import C_TYPE, Listing, filled, literal, literals
 
 BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
-ARRIVE, AWAIT = 'asm volatile("bar.arrive {}, {};" ::: "memory");', 'asm volatile("bar.sync {}, {};" ::: "memory");'
-INSIDE, OUTSIDE, TOLD = 1, 2, 3  # barriers before and behind what one warp does for all, and before what limbs share
-OVERLAPS = False  # whether the others work meanwhile: to be measured
 
 
 class Work(NamedTuple):
-    """What one piece has to do: going in, two things meanwhile, coming out, checking a pass, telling the others, and
-    with each that it meets.
+    """What one piece has to do: going in, coming out, checking a pass, telling the others, and with each that it meets.
 
-    Meanwhile is while those further in work: what needs none of them; then what it tells and needs no more than they
-    sent. Of work in passes, the last two come when all passes are done.
+    Of work in passes, the last two come when all passes are done.
     """
 
     piece: Piece
     inward: Listing
-    meanwhile: Listing
-    known: Listing
     outward: Listing
     check: Listing
     news: Listing
     across: dict[int, Listing]
 
     @property
-    def text(self) -> tuple[str, ...]:
-        return tuple(listing.text for listing in self.regions)
-
-    @property
-    def regions(self) -> tuple[Listing, ...]:
-        """What equal pieces share."""
-        return self.inward, self.meanwhile, self.known, self.outward, self.check
+    def text(self) -> tuple[str, str, str]:
+        return self.inward.text, self.outward.text, self.check.text
 
 
 class Passes(NamedTuple):
@@ -89,7 +77,7 @@ class Team:
     def _last(self) -> int:
         """The last stage in which there is something to do."""
         stages = [0]
-        for piece, inward, _, _, outward, _, _, across in self._work.values():
+        for piece, inward, outward, _, _, across in self._work.values():
             stages += [piece.inward] if inward.text else []
             stages += [piece.outward] if outward.text else []
             if across and not self.passes:
@@ -106,21 +94,19 @@ class Team:
                     text.append(literals(self._work[piece.index].inward, self.dtype, f"p{piece.index}_"))
             for piece in self.pieces.pieces:
                 if piece.outward == stage:
-                    text.append(literals(self._work[piece.index].meanwhile, self.dtype, f"p{piece.index}_"))
-                    text.append(literals(self._work[piece.index].known, self.dtype, f"p{piece.index}_"))
                     text.append(literals(self._work[piece.index].outward, self.dtype, f"p{piece.index}_"))
                     if self._work[piece.index].check.text:
-                        text.append(self._inside_braces(self._work[piece.index].check, piece))
-                    (later if self.passes else text).append(self._inside_braces(self._work[piece.index].news, piece))
+                        text.append(self._branch(piece, self._work[piece.index].check))
+                    (later if self.passes else text).append(self._branch(piece, self._work[piece.index].news))
         for work in self._work.values():
-            later += [self._inside_braces(listing, work.piece) for listing in work.across.values()]
+            later += [self._branch(work.piece, listing) for listing in work.across.values()]
         if self.passes:
             kept = {f"p{piece.index}_": piece.weight for piece in self.pieces.pieces}
             text = [self.passes.declared(kept, self.c), straight.alone("\n".join(text), self.c)]
         return "\n".join(text + later)
 
-    def _inside_braces(self, listing: Listing, piece: Piece) -> str:
-        return "{\n" + literals(listing, self.dtype, f"p{piece.index}_") + "\n}"
+    def _branch(self, piece: Piece, listing: Listing) -> str:
+        return "\n".join(["{", literals(listing, self.dtype, f"p{piece.index}_"), "}"])
 
     def cuda(self) -> str:
         """A branch for each kind of leaf piece, which its warps enter together."""
@@ -131,19 +117,10 @@ class Team:
         text: list[str] = []
         for alike in kinds.values():
             text.append(f"{'else ' if text else ''}if ({_any_of([work.piece.warp for work in alike])}) {{")
-            inward, meanwhile, known, outward = self._shared(alike)
-            warps = [work.piece.warp for work in alike]
-            text += [inward, *self._inner(warps, meanwhile), known]
-            text += [] if self.passes else [self._apart(alike, [work.news for work in alike], "n_")]
-            met = not self.passes and any(work.across for works in kinds.values() for work in works)
-            if met and self._inside is not None and not self._looks(self._inside):
-                threads = 32 * self.pieces.warps
-                if self._inside in warps:
-                    text += [f"if (warp == {self._inside}) {{", ARRIVE.format(TOLD, threads), "}"]
-                text += [outward, f"if (warp != {self._inside}) {{", AWAIT.format(TOLD, threads), "}"]
-                text += [self._across(alike)]
-            else:
-                text += [outward, *([BARRIER, self._across(alike)] if met else [])]
+            inward, outward = self._shared(alike)
+            text += [inward, self._inner([work.piece.warp for work in alike]), outward]
+            if not self.passes and any(work.across for works in kinds.values() for work in works):
+                text += [self._apart(alike, [work.news for work in alike], "n_"), BARRIER, self._across(alike)]
             text.append("}")
         return self._in_passes("\n".join(text)) if self.passes else "\n".join(text)
 
@@ -175,35 +152,8 @@ class Team:
             text += found
         return "\n".join(text)
 
-    @property
-    def _inside(self) -> int | None:
-        """The warp that does all between the leaves' way in and their way out, if others can work meanwhile."""
-        warps = {work.piece.warp for work in self._work.values() if work.piece.children}
-        meanwhile = OVERLAPS and any(work.meanwhile.text for work in self._work.values())
-        return warps.pop() if meanwhile and len(warps) == 1 and self._last == 2 else None
-
-    def _looks(self, warp: int) -> bool:
-        """Whether its limb works out what it has in common with others."""
-        return any(work.across for work in self._work.values() if work.piece.warp == warp)
-
-    def _inner(self, warps: list[int], meanwhile: str) -> list[str]:
+    def _inner(self, warps: list[int]) -> str:
         """The stages between the leaves' way in and their way out, with the pieces that some of ``warps`` take on."""
-        if self._inside is None:
-            return [self._stages(warps), meanwhile]
-        threads = 32 * self.pieces.warps
-        arrive, wait = ([form.format(at, threads) for at in (INSIDE, OUTSIDE)] for form in (ARRIVE, AWAIT))
-        if self._inside not in warps:
-            return [arrive[0], meanwhile, wait[1]]
-        inner = [work for work in self._work.values() if work.piece.children]
-        shared = [self._shared([work], f"i{at}_") for at, work in enumerate(inner)]
-        news = [self._apart([work], [work.news], f"i{at}_n_", f"i{at}_") for at, work in enumerate(inner)]
-        text = [f"if (warp == {self._inside}) {{", wait[0], *(inward for inward, *_ in reversed(shared))]
-        for (*_, outward), told in zip(shared, news, strict=True):
-            text += [outward, told]
-        text += [arrive[1], "}", f"if (warp != {self._inside}) {{", arrive[0], "}"]
-        return [*text, meanwhile, f"if (warp != {self._inside}) {{", wait[1], "}"]
-
-    def _stages(self, warps: list[int]) -> str:
         owners: dict[tuple, list[list[Work]]] = {}
         for warp in warps:
             mine = [work for work in self._work.values() if work.piece.children and work.piece.warp == warp]
@@ -216,8 +166,8 @@ class Team:
             for stage in range(1, self._last + 1):
                 text.append(BARRIER)
                 order = list(zip(chains[0], shared, strict=True))
-                text += [inward for work, (inward, *_) in reversed(order) if work.piece.inward == stage]
-                for at, (alike, (*_, outward)) in enumerate(zip(zip(*chains, strict=True), shared, strict=True)):
+                text += [inward for work, (inward, _) in reversed(order) if work.piece.inward == stage]
+                for at, (alike, (_, outward)) in enumerate(zip(zip(*chains, strict=True), shared, strict=True)):
                     if alike[0].piece.outward == stage:
                         text.append(outward)
                         if not self.passes:
@@ -249,12 +199,12 @@ class Team:
             text.append("\n".join([f"{condition}{{", head, body, "}"]))
         return "\n".join(text)
 
-    def _shared(self, alike: Sequence[Work], prefix: str = "") -> list[str]:
-        """One text for each region of pieces of equal structure."""
-        listings = [list(found) for found in zip(*(work.regions for work in alike), strict=True)]
-        head, (inward, *others, outward, check) = self._filled(alike, listings, prefix, prefix)
+    def _shared(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str]:
+        """One text, in and out, for pieces of equal structure."""
+        regions = [[work.inward for work in alike], [work.outward for work in alike], [work.check for work in alike]]
+        head, (inward, outward, check) = self._filled(alike, regions, prefix, prefix)
         outward = "\n".join([outward, "{", check, "}"]) if check else outward
-        return [f"{head}\n{inward}" if head else inward, *others, outward]
+        return f"{head}\n{inward}" if head else inward, outward
 
     def _filled(
         self, alike: Sequence[Work], regions: list[list[Listing]], prefix: str, tables: str

@@ -47,11 +47,8 @@ class Inverse:
                     trace.graph.step = f"column {dof}|y"
                     unit = [1.0 if j == i else 0.0 for j in range(len(link.dofs))]
                     self._rates[dof], self._forces[dof] = self._inward(piece.links[: at + 1], NO_FORCE, unit)
-        self.ahead = [] if own[0].children else [x for rates in self._rates.values() for x in rates]
-        self.ahead += [] if own[0].children else [x for force in self._forces.values() for x in force]
         for piece in own:
             self._come_back(piece)
-        self.known = [] if own[0].children else [x for column in self._columns.values() for x in column]
         for piece in own:
             for other in self.pieces:
                 if piece.looks_at(other):

@@ -52,7 +52,6 @@ class Trace:
         self.news: list[Store] = []
         self.across: dict[int, list[Store]] = {}
         self.ahead: list[Value] = []
-        self.known: list[Value] = []
         self.checks: list[Store] = []
         self._mail: dict[tuple[str, int], list[Value]] = {}  # messages between pieces of this trace
         self.own = set(map(id, links.links if piece is None else piece.links))
@@ -326,7 +325,6 @@ class Trace:
         inverse = Inverse(self)
         across = {other: self._both(entries) for other, entries in inverse.across.items()}
         if self.piece is not None:
-            self.ahead, self.known = inverse.ahead, inverse.known
             self.across, self.news, across = across, inverse.news, {}
         return inverse.stores + self._both(inverse.entries) + [item for stores in across.values() for item in stores]
 
