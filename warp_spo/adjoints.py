@@ -46,6 +46,10 @@ ENTERING: dict[str, tuple[str, ...]] = {
     "step": (*LINK_VALUES, *GAINS),
 }
 """Values that enter an operation, where they are not those that links are made of."""
+OF_TREE = ("body_poses", "body_velocities", "integrate")
+"""Operations that know nothing of loops, and have no use for them."""
+EMBEDDED = ("forward_dynamics", "inverse_dynamics", "bias_force", "gravity_force", "step")
+"""Operations of which there are products with the Jacobian where loops are embedded."""
 OPTIONAL = ("body_f", "target_q", "target_qd")
 
 
@@ -77,6 +81,8 @@ class Adjoints:
     programs: Programs
     values: Values
     closed: bool
+    embedding: Any
+    _minimal: int
 
     # -- backwards -------------------------------------------------------------------------------------------------
     def forward_dynamics_vjp(
@@ -145,7 +151,7 @@ class Adjoints:
         with self._call("inverse_dynamics_vjp") as call:
             q, qd = self._read_state(call, q, qd)
             qdd, body_f = self._read_rate(call, "qdd", qdd), self._read_body_f(call, body_f)
-            cotangent = self._read_rate(call, "cotangent", cotangent, False)
+            cotangent = call.read("cotangent", cotangent, (self.worlds, self._minimal), "[world, dof]")
             given = {"q": q, "qd": qd, "qdd": qdd, "body_f": body_f}
             names, outs = self._gradients(call, "inverse_dynamics", given, wrt, out)
             self._pull("inverse_dynamics", names, outs, {**given, "cotangent": cotangent})
@@ -181,7 +187,8 @@ class Adjoints:
             given = {"q": q, "qd": qd, "tau": self._read_rate(call, "tau", tau)}
             given["body_f"] = self._read_body_f(call, body_f)
             qdd = self._accelerations(self._read_rate(call, "qdd", qdd), given)
-            del given["tau"]
+            if self.embedding is None:
+                del given["tau"]
             self._push(call, "forward_dynamics", {**given, "qdd": qdd}, dq, dqd, ("tau", dtau), dbody_f, out)
         return call.result
 
@@ -217,6 +224,7 @@ class Adjoints:
         scene, worlds = self.scene, self.worlds
         q, rate = (worlds, scene.coord_count), (worlds, scene.dof_count)
         shapes: dict[str, tuple[int, ...]] = {
+            **dict.fromkeys(("inverse_dynamics", "bias_force", "gravity_force"), (worlds, self._minimal)),
             "body_poses": (worlds, scene.body_count, 7),
             "body_velocities": (worlds, scene.body_count, 6),
             "mass_matrix": (*rate, scene.dof_count),
@@ -229,7 +237,7 @@ class Adjoints:
     def check_gradient(self, operation: str) -> None:
         """Raise UnsupportedError where an operation has no gradient on this scene."""
         call = self._call(f"{operation}, backwards")
-        self._check_size(call)
+        self._check_size(call, operation)
         if operation == "body_poses" and self.scene.dof_count and self.programs.links.turns_vary:
             what = "the gradient of poses where anchors vary"
             raise UnsupportedError(call.name, what, "keep joint_X_p and joint_X_c folded")
@@ -284,7 +292,8 @@ class Adjoints:
             for name, like, array in zip(("q_cotangent", "qd_cotangent"), ("q", "qd"), cotangents, strict=True):
                 arrays[name] = call.read(name, array, self._shape_of(like))
             names, outs = self._gradients(call, "step", arrays, wrt, None)
-            arrays.pop("tau", None)
+            if self.embedding is None:
+                arrays.pop("tau", None)
             self._pull("step", names, outs, arrays)
         return _by_name(names, call.result)
 
@@ -334,22 +343,26 @@ class Adjoints:
         for array, what in (("qd", "qd_dot"), ("qdd", "qdd_dot"), ("body_f", "body_f_dot")):
             if arrays.get(array) is None and arrays.get(what) is not None:
                 raise ValueError(f"{call.name}: d{array} is given and {array} is None; expected both; pass zeros")
-        self._check_size(call)
-        result = call.write(out, (self.worlds, self.scene.dof_count), "[world, dof]")
+        self._check_size(call, operation)
+        rows = self._minimal if operation == "inverse_dynamics" else self.scene.dof_count
+        result = call.write(out, (self.worlds, rows), "[world, dof]")
         self._launch(f"{operation}_jvp", result, **arrays)
 
     def _accelerations(self, qdd: Any, given: dict[str, Any]) -> Any:
         """``qdd``, or what forward dynamics makes it."""
         if qdd is None and self.scene.dof_count:
             qdd = self.recursions.array("qdd of derivatives", self.worlds, self.scene.dof_count)
-            self._run("forward_dynamics", qdd, **given)
+            if self.embedding is None:
+                self._run("forward_dynamics", qdd, **given)
+            else:
+                self._closed_forward_dynamics(qdd, None, **given)
         return qdd
 
     def _gradients(
         self, call: Call, operation: str, given: dict[str, Any], wrt: Sequence[str], out: dict[str, Any] | None
     ) -> tuple[tuple[str, ...], list[wp.array]]:
         """The checked names, and an array for each."""
-        self._check_size(call)
+        self._check_size(call, operation)
         names, out = (wrt,) if isinstance(wrt, str) else tuple(wrt), out or {}
         arguments = ARGUMENTS[operation]
         entering = self.entering(operation)
@@ -401,6 +414,10 @@ class Adjoints:
         """In one kernel; where a warp works on a limb, in one for qdd and lambda and another one for what follows."""
         qdd, cotangent = given["qdd"], given["cotangent"]
         state = {name: given[name] for name in ("q", "qd", "body_f")}
+        if self.embedding is not None:  # whose closures bear what tau leaves, too
+            arrays = {**state, "tau": given["tau"]}
+            self._pull("forward_dynamics", names, outs, {**given, "qdd": self._accelerations(qdd, arrays)})
+            return
         forces = {"tau": given["tau"]} if qdd is None else {"qdd": qdd}
         if self.scene.dof_count == 0 or self.programs.plan.of("forward_dynamics_vjp") != "segment":
             self._pull("forward_dynamics", names, outs, {**state, **forces, "cotangent": cotangent})
@@ -417,9 +434,13 @@ class Adjoints:
         if results:
             self._pull("forward_dynamics", tuple(results), [*results.values()], {**state, "qdd": qdd, "solved": solved})
 
-    def _check_size(self, call: Call) -> None:
-        if self.closed:
-            raise UnsupportedError(call.name, "a derivative with closed loops", "loops='cut' leaves them open")
+    def _check_size(self, call: Call, operation: str = "") -> None:
+        """``operation``: whose derivative is a product."""
+        if self.closed and operation not in (*OF_TREE, *(EMBEDDED if self.embedding is not None else ())):
+            way = "loops='cut' leaves them open"
+            if operation in EMBEDDED:
+                way = f"use loops='embed'; {way}"
+            raise UnsupportedError(call.name, "a derivative with closed loops", way)
         if self.scene.dof_count > MOST_DOFS:
             what = f"a scene of {self.scene.dof_count} dof"
             raise UnsupportedError(call.name, what, f"derivatives are straight-line code, of up to {MOST_DOFS} dof")
@@ -430,6 +451,7 @@ class Adjoints:
     _read_body_f: Any
     _run: Any
     _launch: Any
+    _closed_forward_dynamics: Any
 
 
 def _by_name(names: tuple[str, ...], results: Any) -> dict[str, Any]:
