@@ -210,14 +210,14 @@ class Adjoints(Derivatives):
     def _pushed_forward(self) -> dict[int, Value]:
         tau = self.inverse_dynamics()
         outputs = [item.value for item in tau]
-        return {item.index[0]: rate for item, rate in zip(tau, self.pushed(outputs), strict=True)}
+        return {item.index[0]: rate for item, rate in zip(tau, self.along(outputs), strict=True)}
 
-    def pushed(self, outputs: list[Value], still: Iterable[Scalar] = ()) -> list[Value]:
+    def along(self, outputs: list[Value], still: Iterable[Scalar] = ()) -> list[Value]:
         """How values change along the direction; what is ``still`` does not."""
         still = list(still)
         inputs = [x for x in ordered(outputs, still) if x.op == "input"]
-        along = self.raw(self.vector("q_dot"))
-        seeds = [along.get(x.args[1], 0.0) if x.args[0] == "q" else self._seed(x) for x in inputs]
+        raw = self.raw(self.vector("q_dot"))
+        seeds = [raw.get(x.args[1], 0.0) if x.args[0] == "q" else self._seed(x) for x in inputs]
         return forward(outputs, [*inputs, *still], [*seeds, *[0.0] * len(still)])
 
     def _seed(self, x: Scalar) -> Value:

@@ -12,6 +12,8 @@ of X has a jump. Inverse dynamics in independent dofs has the same form, with co
 
 from __future__ import annotations
 
+from typing import Any
+
 from ..trace.derivative import forward, reverse
 from ..trace.emit import Store
 from ..trace.graph import cut, is_constant, ordered
@@ -29,10 +31,10 @@ class EmbeddedAdjoints(Adjoints, Minimal):
     """The operations of :class:`.adjoints.Adjoints` and :class:`Minimal`, and products with Jacobians of the latter.
 
     Attributes:
-        how: the embedding, in an operation with loops embedded. held: dofs that closures do not move there.
+        how: the embedding, where an operation has its loops embedded. held: dofs that closures do not move there.
     """
 
-    how: Embedding | None = None
+    how: Any = None
     held: tuple[int, ...] = ()
 
     @property
@@ -131,19 +133,19 @@ class EmbeddedAdjoints(Adjoints, Minimal):
         that is demanded meanwhile."""
         forces = {item.index[0]: item.value for item in self.inverse_dynamics(qdd=qdd.__getitem__)}
         left, still = dict(forces), [x for x in qdd.values() if not is_constant(x)]
-        spaces, demands = [], []
+        tied, demands = [], []
         for cluster in self.clusters:
-            tied = self.tied(cluster, self.how, self.held)
+            one = self.tied(cluster, self.how, self.held)
             self.at_cluster(cluster, "m")
-            mu = [cut(x) for x in tied.space.multipliers(lambda dof: forces[dof] - tau(dof))]
+            mu = [cut(x) for x in one.space.multipliers(lambda dof: forces[dof] - tau(dof))]
             for dof in cluster.dofs:
-                left[dof] = left[dof] - total(row.get(dof, 0.0) * x for row, x in zip(tied.rows, mu, strict=True))
+                left[dof] = left[dof] - total(row.get(dof, 0.0) * x for row, x in zip(one.rows, mu, strict=True))
             still += [x for x in mu if not is_constant(x)]
-            demands += tied.accelerations(self.places, self.rates, qdd.__getitem__)
-            spaces.append(tied)
-        pushed = iter(self.pushed([*left.values(), *demands], {x.key: x for x in still}.values()))
+            demands += one.accelerations(self.places, self.rates, qdd.__getitem__)
+            tied.append(one)
+        pushed = iter(self.along([*left.values(), *demands], {x.key: x for x in still}.values()))
         rates = {dof: next(pushed) for dof in left}
         steps: Columns = {}
-        for tied in spaces:
-            steps |= tied.space.particular([-next(pushed) for _ in tied.numbers])
+        for one in tied:
+            steps |= one.space.particular([-next(pushed) for _ in one.numbers])
         return forces, rates, steps
