@@ -1,7 +1,7 @@
 """Products with Jacobians of the dynamics, J* y and J x: methods of :class:`warp_spo.Dynamics`.
 
 No recording: forward dynamics is gone back through by its own solve and one Newton-Euler recursion backwards, in one
-kernel, or in two where a warp works on a limb.
+kernel, or in two where a warp works on a limb. Loops that are embedded: see :mod:`.recursions.embedded_adjoints`.
 """
 
 from __future__ import annotations
@@ -120,8 +120,13 @@ class Adjoints:
         Returns:
             The gradients by name. NaN in worlds where Mass has no inverse.
 
+        With loops embedded, states come in consistent. The gradient is that of the function as it is computed, which
+        goes on beside the closures, so that it has a part across them that no motion of the mechanism sees: its product
+        with what they allow, X* times the gradient, is physical. lambda obeys the closures, whose own forces and
+        accelerations add a solve of their rows.
+
         Raises:
-            ValueError: a name that is none of these. UnsupportedError: more than 128 dof.
+            ValueError: a name that is none of these. UnsupportedError: more than 128 dof; loops by multipliers.
         """
         with self._call("forward_dynamics_vjp") as call:
             q, qd = self._read_state(call, q, qd)
@@ -147,6 +152,7 @@ class Adjoints:
         """Gradients of cotangent . tau: J* cotangent of :meth:`inverse_dynamics`, a recursion forwards, one in reverse.
 
         Args and returns: as :meth:`forward_dynamics_vjp`, with "qdd" for "tau"; it must be given if it is in ``wrt``.
+        With loops embedded cotangent is [world, independent dof], and the gradient by qdd zero at other dofs.
         """
         with self._call("inverse_dynamics_vjp") as call:
             q, qd = self._read_state(call, q, qd)
@@ -179,6 +185,8 @@ class Adjoints:
             dqd, dtau, dbody_f: of the arrays' shapes. None is zero and costs nothing.
             qdd: what forward_dynamics gives here, if it is known: saves computing it.
 
+        With loops embedded, directions may leave what the closures allow; see :meth:`forward_dynamics_vjp`.
+
         Returns:
             [world, dof]
         """
@@ -205,7 +213,10 @@ class Adjoints:
         dbody_f: Any = None,
         out: Any = None,
     ) -> Any:
-        """How tau changes along a direction; as :meth:`forward_dynamics_jvp`, with dqdd for dtau [world, dof]."""
+        """How tau changes along a direction; as :meth:`forward_dynamics_jvp`, with dqdd for dtau [world, dof].
+
+        With loops embedded [world, independent dof].
+        """
         with self._call("inverse_dynamics_jvp") as call:
             q, qd = self._read_state(call, q, qd)
             given = {"q": q, "qd": qd, "qdd": self._read_rate(call, "qdd", qdd)}
