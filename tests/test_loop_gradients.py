@@ -1,5 +1,5 @@
-"""Derivatives where loops are embedded, against differences: of the function in every entry, off the closures too, and of
-Lagrange's equations along what the closures allow. J* y against J x; torch, through rollouts."""
+"""Derivatives where loops are embedded, against differences: of the function in every entry, off the closures too, and
+of Lagrange's equations along what the closures allow. J* y against J x; torch, through rollouts."""
 
 import mechanisms
 import numpy as np
@@ -31,7 +31,7 @@ SINGLE = 2e-5  # float32 beside float64; measured 2e-6
 
 def arrays_of(name, seed=0):
     """A state off the closures, and what acts on it; a cotangent y of each dof, "minimal" of the independent ones."""
-    scene, how, s, _ = mechanisms.case(name)
+    _, how, s, _ = mechanisms.case(name)
     rng = np.random.default_rng(seed)
     q, qd = s.q + 0.03 * rng.normal(size=s.q.shape), rng.normal(size=s.qd.shape)
     y, minimal = rng.normal(size=qd.shape), rng.normal(size=(len(q), len(how.dofs)))
