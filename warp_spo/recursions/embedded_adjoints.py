@@ -12,11 +12,12 @@ of X has a jump. Inverse dynamics in independent dofs has the same form, with co
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
-from ..trace.derivative import forward, reverse
+from ..trace.derivative import reverse
 from ..trace.emit import Store
-from ..trace.graph import cut, is_constant, ordered
+from ..trace.graph import Scalar, Value, cut, is_constant, ordered
 from ..trace.spatial import ZERO, total
 from .adjoints import Adjoints
 from .closed_step import ClosedStep
@@ -90,11 +91,12 @@ class EmbeddedAdjoints(Adjoints, Minimal):
             weights = {dof: cut(solved[dof]) for dof in cluster.dofs}
             outputs = tied.accelerations(self.places, None, weights.__getitem__)
             outputs += tied.accelerations(self.places, self.rates, rates.__getitem__)
-            stops = {("qdd", dof): x for dof, x in rates.items() if not is_constant(x)}
-            stops |= {("weight", dof): x for dof, x in weights.items() if not is_constant(x)}
-            stops |= {x.args: x for x in ordered(outputs, stops.values()) if x.op == "input"}
-            back = reverse(outputs, stops.values(), [*mu, *(-x for x in nu)])
-            for entry, way in zip(stops, back, strict=True):
+            stops = _apart([*rates.values(), *weights.values()])
+            leaves = [x for x in ordered(outputs, stops) if x.op == "input"]
+            back = reverse(outputs, [*leaves, *stops], [*mu, *(-x for x in nu)])
+            found = [(x.args, way) for x, way in zip(leaves, back, strict=False)]
+            found += [(("qdd", dof), -(x * y)) for row, y in zip(tied.rows, nu, strict=True) for dof, x in row.items()]
+            for entry, way in found:
                 power.ways[entry] = power.ways.get(entry, 0.0) + way
         return power.ways
 
@@ -104,7 +106,7 @@ class EmbeddedAdjoints(Adjoints, Minimal):
         self.how, qdd, push = how, self.vector("qdd"), self.vector("tau_dot")
         self.place_links("qd" in self.given)
         still = {dof: qdd(dof) for dof in range(self.links.scene.dof_count)}
-        _, rates, steps = self._pushed_apart(still, self.vector("tau"))
+        rates, steps = self._pushed_apart(still, self.vector("tau"))
 
         def allowed(cluster: Cluster) -> tuple[NullSpace, Columns]:
             return self.tied(cluster, how).space, steps
@@ -116,23 +118,23 @@ class EmbeddedAdjoints(Adjoints, Minimal):
         """out [independent dof] = J x of inverse dynamics, x as in :meth:`inverse_dynamics_jvp`"""
         self.how, self.held, push = how, how.dofs, self.vector("qdd_dot")
         self.place_links("qd" in self.given)
-        still = {dof: self.graph.make("cut", x) for dof, x in self.minimal_accelerations(how).items()}
-        forces, rates, steps = self._pushed_apart(still, lambda dof: 0.0)
+        still = {dof: cut(x) for dof, x in self.minimal_accelerations(how).items()}
+        rates, steps = self._pushed_apart(still, lambda dof: 0.0)
         X, change = self.minimal_columns(how), {dof: steps.get(dof, 0.0) for dof in still}
         for free, column in X.items():
             for dof, x in column.items():
                 change[dof] = change[dof] + x * push(free)
-        moved = forward(forces.values(), still.values(), change.values())  # Mass times the change
-        rates = {dof: rates[dof] + x for dof, x in zip(forces, moved, strict=True)}
+        self.given = ("q",)  # at rest, without loads: Mass times the change
+        for item in self.inverse_dynamics(gravity=False, qdd=change.__getitem__):
+            rates[item.index[0]] = rates[item.index[0]] + item.value
         return [
             Store("out", (i,), total(x * rates[dof] for dof, x in X[free].items())) for i, free in enumerate(how.dofs)
         ]
 
-    def _pushed_apart(self, qdd: Columns, tau: Entry) -> tuple[Columns, Columns, Columns]:
-        """By dof: Mass qdd + bias_force; how that, less Y* mu, changes while ``qdd`` and mu stay; the change of qdd
-        that is demanded meanwhile."""
+    def _pushed_apart(self, qdd: Columns, tau: Entry) -> tuple[Columns, Columns]:
+        """By dof, while ``qdd`` and mu stay: how Mass qdd + bias_force - Y* mu changes; what qdd has to change by."""
         forces = {item.index[0]: item.value for item in self.inverse_dynamics(qdd=qdd.__getitem__)}
-        left, still = dict(forces), [x for x in qdd.values() if not is_constant(x)]
+        left, still = dict(forces), [*qdd.values()]
         tied, demands = [], []
         for cluster in self.clusters:
             one = self.tied(cluster, self.how, self.held)
@@ -140,12 +142,17 @@ class EmbeddedAdjoints(Adjoints, Minimal):
             mu = [cut(x) for x in one.space.multipliers(lambda dof: forces[dof] - tau(dof))]
             for dof in cluster.dofs:
                 left[dof] = left[dof] - total(row.get(dof, 0.0) * x for row, x in zip(one.rows, mu, strict=True))
-            still += [x for x in mu if not is_constant(x)]
+            still += mu
             demands += one.accelerations(self.places, self.rates, qdd.__getitem__)
             tied.append(one)
-        pushed = iter(self.along([*left.values(), *demands], {x.key: x for x in still}.values()))
+        pushed = iter(self.along([*left.values(), *demands], _apart(still)))
         rates = {dof: next(pushed) for dof in left}
         steps: Columns = {}
         for one in tied:
             steps |= one.space.particular([-next(pushed) for _ in one.numbers])
-        return forces, rates, steps
+        return rates, steps
+
+
+def _apart(values: Iterable[Value]) -> list[Scalar]:
+    """The scalars among values, each once."""
+    return [*{x.key: x for x in values if not is_constant(x)}.values()]
