@@ -61,7 +61,7 @@ class Lanes:
         budget: [s] from now.
         jobs: how many compile at a time.
         alone: measure nothing until everything is compiled, as where both need the same cores.
-        gpus: to measure on. Of several the last one is left to what compiles.
+        gpus: to measure on. Of three or more the last one is left to what compiles.
     """
 
     def __init__(self, folder: Path, budget: float, jobs: int, alone: bool, gpus: int = 1):
@@ -91,7 +91,7 @@ class Lanes:
         if len(waiting) < len(parts):
             self.say(f"{len(parts) - len(waiting)} parts are there already, in {self.folder}")
         queue, unfinished = [part for part in waiting if part.compile], []
-        lanes = range(max(1, self.gpus - 1))
+        lanes = range(self.gpus - 1 if self.gpus > 2 else self.gpus)
         try:
             while self.measuring or (waiting and self.left > LAST):
                 while queue and sum(job.poll() is None for job in self.compiling.values()) < self.jobs:

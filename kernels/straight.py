@@ -21,6 +21,7 @@ ON_ITS_WAY = """\
 ARRIVED = 'asm volatile("cp.async.wait_all;" ::: "memory");'
 SHARED_BYTES = 46 * 1024  # that a block may declare: 48 KiB less what Warp takes
 C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
+VECTORS = {"float": ("float4", "xyzw"), "double": ("double2", "xy")}  # 16 bytes, and the names of their parts
 MASKS = ("prescribed",)  # arrays of booleans
 INTEGERS = ("place", "shifts", "status")  # arrays of whole numbers, one axis
 MOST_PASSES = 16  # of a loop; 13 were needed at most, see CONTRIBUTING
@@ -123,9 +124,9 @@ def assemble(frame: Frame, cuda: str, cpu: str, T) -> str:
     # not from the thread's index: before Warp has that, it asks whether to divide, 0.1 us of a kernel of 1.5
     text += [f"const int start = blockIdx.x * {frame.block // frame.warps} + threadIdx.x / {team} * {WARP};"]
     text += ["const int present = worlds - start < 32 ? worlds - start : 32;", "const bool mine = lane < present;"]
-    text += ["const long long first = start, world = start + (mine ? lane : 0);"]
+    text += ["const long long first = start, world = mine ? start + lane : worlds - 1;"]
     if frame.scalars:
-        text += [f"__shared__ {c} shared[{frame.groups * frame.scalars}];"]
+        text += [f"__shared__ __align__(16) {c} shared[{frame.groups * frame.scalars}];"]
         text += [f"{c}* stage = shared + (threadIdx.x / {team}) * {frame.scalars};"]
     for row in frame.rows:
         if frame.staged:
@@ -254,31 +255,48 @@ def _held(frame: Frame, c: str) -> list[str]:
     return text
 
 
-def _each(n: int, team: int, statement: str) -> str:
-    """``statement`` for every entry i of the rows of the worlds that are present, the whole team side by side."""
-    turns = -(-WARP * n // team)
-    some = "" if turns * team == WARP * n else f"if (i < {WARP * n}) "
-    return f"""if (present == 32) {{
+def _each(n: int, team: int, caller: str, one: str, several: str = "", wide: int = 1) -> str:
+    """``one`` for every entry i of the rows of the worlds that are present, the whole team side by side.
+
+    ``several``: for ``wide`` of them, 16 bytes, from entry ``wide`` i on, where all worlds are present and the
+    ``caller``'s array begins at a multiple of 16 bytes.
+    """
+    count, aligned = (WARP * n // wide, f" && ((size_t){caller} & 15) == 0") if several else (WARP * n, "")
+    turns = -(-count // team)
+    some = "" if turns * team == count else f"if (i < {count}) "
+    return f"""if (present == 32{aligned}) {{
     #pragma unroll
-    for (int k = 0; k < {turns}; ++k) {{ const int i = member + {team} * k; {some}{statement} }}
+    for (int k = 0; k < {turns}; ++k) {{ const int i = member + {team} * k; {some}{several or one} }}
 }} else {{
-    for (int i = member; i < present * {n}; i += {team}) {{ {statement} }}
+    for (int i = member; i < present * {n}; i += {team}) {{ {one} }}
 }}"""
 
 
 def _stage_in(row: Row, offset: int, c: str, team: int) -> str:
-    n = row.entries
-    if n >= LONG_COPY and row.name not in MASKS:
-        copy = _each(n, team, f"{{ ON_ITS_WAY(to + {_slot('i', n, pitch(n))}, from + i); }}")
-    else:
-        copy = _each(n, team, f"to[{_slot('i', n, pitch(n))}] = __ldg(from + i);")
-    kind, start = _source(row, c)
+    n, (kind, start), (vector, names) = row.entries, _source(row, c), VECTORS[c]
+    padded, to_one = n != pitch(n), f"to + {_slot('i', n, pitch(n))}"
+    one, several = f"*({to_one}) = __ldg(from + i);", f"(({vector}*)to)[i] = __ldg((const {vector}*)from + i);"
+    if padded:
+        parts = " ".join(f"at[{k}] = v.{name};" for k, name in enumerate(names))
+        at = _slot(f"({len(names)} * i)", n, pitch(n))
+        several = f"{{ const {vector} v = __ldg((const {vector}*)from + i); {c}* at = to + {at}; {parts} }}"
+    if row.name in MASKS:
+        several = ""
+    elif n >= LONG_COPY:
+        one = f"{{ ON_ITS_WAY({to_one}, from + i); }}"
+        several = "" if padded else f"{{ ON_ITS_WAY(({vector}*)to + i, (const {vector}*)from + i); }}"
+    copy = _each(n, team, "from", one, several, len(names))
     return f"{{\nconst {kind}* from = {start} + first * {n};\n{c}* to = stage + {offset};\n{copy}\n}}"
 
 
 def _stage_out(out: Row, offset: int, width: int, c: str, team: int) -> str:
-    n = out.entries
-    copy = _each(n, team, f"to[i] = from[{_slot('i', n, width)}];")
+    n, (vector, names) = out.entries, VECTORS[c]
+    several = f"(({vector}*)to)[i] = (({vector}*)from)[i];"
+    if n != width:
+        parts = ", ".join(f"at[{k}]" for k in range(len(names)))
+        at = _slot(f"({len(names)} * i)", n, width)
+        several = f"{{ const {c}* at = from + {at}; (({vector}*)to)[i] = make_{vector}({parts}); }}"
+    copy = _each(n, team, "to", f"to[i] = from[{_slot('i', n, width)}];", several, len(names))
     return f"{{\n{c}* to = {out.name}.data + first * {n};\nconst {c}* from = stage + {offset};\n{copy}\n}}"
 
 
@@ -314,6 +332,38 @@ def looped(ahead: str, a_pass: str, last: str, names: tuple[str, str, str], entr
     declared = [f"{c} {name}_row[{entries}] = {{}};" for name in names[:-1]] + [f"{c} {missed}_row[1] = {{}};"]
     loop = f"for (int pass = 0; pass < {MOST_PASSES}; ++pass) {{\n{a_pass}\nif (!({missed}_row[0] > 0)) break;\n}}"
     return "\n".join([ahead, *declared, loop, last])
+
+
+def voted(a_pass: str, flags: int, warps: int, c: str) -> str:
+    """``a_pass`` of a team until, in all its worlds, no warp has added to ``missed_row[0]``.
+
+    A world that is done is not ``open``: what it keeps stays, so that a pass for its neighbours finds the same again.
+    The vote is the barrier before the next pass. Flags take turns in 2 ``warps`` entries of SENT from ``flags`` on, for
+    a warp may write the next ones while another still reads.
+    """
+    every = " + ".join(f"SENT(now + {warp})" for warp in range(warps))
+    return "\n".join([
+        "bool open = true;", f"{c} missed_row[1] = {{}};",
+        f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{", "missed_row[0] = 0;", a_pass,
+        f"const int now = {flags} + (turn & 1) * {warps};",
+        "SENT(now + warp) = missed_row[0];",
+        "const int going = __syncthreads_or(missed_row[0] > 0);",
+        f"missed_row[0] = {every};", "open = missed_row[0] > 0;", "if (!going) break;", "}",
+    ])
+
+
+def once(a_pass: str, barrier: str, c: str) -> str:
+    """``a_pass`` of a team that has nothing to guess."""
+    return "\n".join(["const bool open = true;", f"const {c} missed_row[1] = {{}};", "{", a_pass, "}", barrier])
+
+
+def alone(a_pass: str, c: str) -> str:
+    """As :func:`voted`, by one thread for a world of its own."""
+    return "\n".join([
+        "const bool open = true;", f"{c} missed_row[1] = {{}};",
+        f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{", "missed_row[0] = 0;", a_pass,
+        "if (!(missed_row[0] > 0)) break;", "}",
+    ])
 
 
 def function(name: str, native: str, arguments: dict[str, type], result: type | None = None) -> wp.Function:

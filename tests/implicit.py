@@ -8,7 +8,7 @@ import numpy as np
 
 from warp_spo.reference import Dense
 
-CREEP, HOLD = 1e-4, 1e3  # what Dynamics.step documents
+CREEP, HOLD = 1e-4, 300.0  # what Dynamics.step documents
 NONE = 1e6
 NEAR = 1e-7  # step of a slope, in rates: far below CREEP
 
@@ -26,7 +26,7 @@ def hinge_force(d, h, qd, target_q, target_qd):
     for hinge, q, v in zip(scene.hinges, scene.q_start, scene.qd_start, strict=False):
         if hinge.kind not in ("ball", "free"):
             position[v : v + hinge.dof_count] = d.q[q : q + hinge.dof_count]
-    heavy = HOLD * Dense(one, scene.neutral_q).mass_matrix.diagonal() / h
+    heavy = HOLD / np.linalg.inv(Dense(one, scene.neutral_q).mass_matrix).diagonal() / h
 
     def force(i, v):
         f = turn["spring"][i] - value("joint_stiffness")[i] * h * v - value("joint_damping")[i] * v

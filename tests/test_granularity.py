@@ -12,6 +12,7 @@ import zoo
 from robots import ROBOTS
 
 import warp_spo as spo
+from warp_spo import plan
 from warp_spo.kernels import straight
 
 GRANULARITIES = ("tree", "segment")
@@ -482,3 +483,29 @@ def test_velocity_terms_first(name, granularity, device):
     ]
     for got, wanted in zip(*(each.values() for each in back), strict=True):
         np.testing.assert_allclose(got, wanted, rtol=0.0, atol=1e-9 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("name", ["chain_helical", "chain_universal"])
+def test_rows_that_begin_anywhere(name, dtype, device, monkeypatch):
+    """Rows come in and out 16 bytes at a time where memory allows it; slices begin between such places."""
+    for limit in ("FEW_WORLDS", "SHORT_ROWS", "LONG_ROWS"):
+        monkeypatch.setattr(plan, limit, 0)
+    scene = zoo.SCENES[name]()
+    dyn = spo.Dynamics(scene, 70, device=device, dtype=dtype)
+    assert dyn.plan.staged or not device.is_cuda
+    given = laws.states(scene, 70)
+
+    def beginning(values, at):
+        flat = wp.array(np.concatenate([np.full(at, np.nan), np.ravel(values)]), dtype=dyn.dtype, device=device)
+        return flat[at:].reshape(values.shape)
+
+    for operation, third in (("forward_dynamics", "tau"), ("inverse_dynamics", "qdd")):
+        results = []
+        for at in range(5):
+            arrays = [beginning(given[key], at) for key in ("q", "qd", third)]
+            out = beginning(np.full((70, scene.dof_count), np.nan), at)
+            results.append(getattr(dyn, operation)(*arrays, out=out).numpy())
+        assert np.isfinite(results[0]).all()
+        for result in results[1:]:
+            np.testing.assert_array_equal(result, results[0])

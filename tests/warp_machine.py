@@ -72,7 +72,7 @@ class Shared:
         self.values[entry], self.writer[entry] = value, self.now
 
 
-def run(text, arrays, backwards=False, further=None):
+def run(text, arrays, backwards=False, further=None, over=None):
     """The result of a kernel, [world, entry].
 
     Args:
@@ -80,27 +80,33 @@ def run(text, arrays, backwards=False, further=None):
         arrays: by name: the callers' [world, ...], the tables of what the links are made of [entry, world].
         backwards: between barriers the last warp goes first.
         further: receives the other results, by name.
+        over: results that are written over an array that is read, by name.
     """
-    frame = text.frame
-    worlds = len(next(array for name, array in arrays.items() if name not in frame.fields))
+    frame, over = text.frame, over or {}
+    worlds = len(next(array for name, array in arrays.items() if name not in (*frame.fields, *frame.numbers)))
     rows = {f"{row.name}_row": Shared(row.name, arrays[row.name].reshape(worlds, -1).T) for row in frame.rows}
-    rows |= {f"{row.name}_row": Shared(row.name) for row in frame.more}
+    rows |= {f"{row.name}_row": rows[f"{over[row.name]}_row"] if row.name in over else Shared(row.name)
+             for row in frame.more}
     result = rows[f"{frame.result.row}_row"] if frame.result.way == IN_PLACE else Shared("result")
-    sent = Shared("sent")
+    result, sent = rows[f"{over['out']}_row"] if "out" in over else result, Shared("sent")
     fields = {name: arrays[name] for name in frame.fields}
     space = FUNCTIONS | rows | fields | {"result_row": result, "sent": sent}
-    space |= {name: text.tables.get(name) for name in ("table", "shifts")}
+    space |= {f"{name}_row": [arrays[name]] for name in frame.numbers}
+    space |= {name: text.tables.get(name) for name in ("table", "shifts")} | {"worlds": np.arange(worlds)}
     exec(translated(text.cuda), space)
-    stretch, going = 0, {warp: space["work"](warp) for warp in range(frame.warps)}
+    stretch, going, ayes = 0, {warp: space["work"](warp) for warp in range(frame.warps)}, None
     while going:
-        stopped = set()
+        stopped, votes = set(), []
         for warp in sorted(going, reverse=backwards):
             for memory in (*rows.values(), result, sent):
                 memory.now = (stretch, warp)
             try:
-                next(going[warp])
+                votes.append(going[warp].send(ayes))
             except StopIteration:
                 stopped.add(warp)
+        if None in votes and votes.count(None) < len(votes):
+            raise Race(f"after {stretch} barriers some warps vote and others do not")
+        ayes = None if None in votes else any(votes)
         if stopped and stopped != set(going):
             raise Race(f"warps {sorted(stopped)} of {sorted(going)} end after {stretch} barriers, the others do not")
         going = {} if stopped else going
@@ -123,16 +129,23 @@ def _sincos(x):
 FUNCTIONS = {
     "where": np.where, "nan": np.nan, "infinity": np.inf, "reciprocal": lambda x: 1.0 / x, "sqrt": np.sqrt,
     "absolute": np.abs, "reduced": lambda x: x, "log": np.log, "sincos": _sincos, "sincos_any": _sincos, "mine": True,
-    "again": False,
+    "again": False, "arctangent": np.arctan2, "sin": np.sin, "cos": np.cos,
 }  # fmt: skip
 
 
 FORMS = [
+    (r"^const int going = __syncthreads_or\((.*)\);$", r"going = yield bool((\1).any())"),
+    (r"^(?:const )?bool (\w+) = true;$", r"\1 = worlds == worlds"),
+        (r"^if \(open\) (\w+_row\[\d+\]) = (.*);$", r"\1 = where(open, \2, \1)"),
+    (r"^if \(!going\) break;$", "if not going: break"),
+    (r"^const int going = (.*);$", r"going = (\1).any()"),
+    (r"^(?:const )?(?:float|double) (\w+)\[(\d+)\] = \{\};$", r"\1 = [0.0 * worlds] * \2"),
+    (r"^const int (now) = (.*);$", r"\1 = \2"),
     (r"^const \w+\* (\w+) = table\.data \+ (.*);$", r"\1 = \2"),
     (r"^int (\w+)\[\d+\];$", r"\1 = {}"),
     (r"^on::(sincos\w*)\((\w+), (\w+), (\w+)\);$", r"\3, \4 = \1(\2)"),
     (r"^if \(mine\) (.*);$", r"\1"),
-    (r"^(?:const )?(?:float|double) (\w+) = (.*) (>|!=) (.*) \? (.*) : (.*);$", r"\1 = where(\2 \3 \4, \5, \6)"),
+    (r"^(?:const )?(?:float|double) (\w+) = (.*) (>|!=|<) (.*) \? (.*) : (.*);$", r"\1 = where(\2 \3 \4, \5, \6)"),
     (r"^(?:const )?(?:float|double) (\w+ = .*);$", r"\1"),
     (r"^(?:float|double) [\w, ]+;$", "pass"),
     (r"^(.*);$", r"\1"),
@@ -151,6 +164,11 @@ def translated(cuda):
         if line == BARRIER:
             lines.append("    " * depth + "yield")
             continue
+        loop = re.match(r"^for \(int (\w+) = 0; \w+ < (\d+); \+\+\w+\) \{$", line)
+        if loop:
+            lines.append("    " * depth + f"for {loop[1]} in range({loop[2]}):")
+            depth += 1
+            continue
         branch = re.match(r"^(else )?(?:if \((.*)\) )?\{$", line)
         if branch:
             condition = "False" if "reach" in (branch[2] or "") else (branch[2] or "").replace("||", "or")
@@ -166,7 +184,7 @@ def translated(cuda):
 def _statement(line):
     if "farthest" in line:
         return "pass"  # turns are not taken off here
-    who = re.match(r"^const int (\w+) = (.*);$", line)
+    who = re.match(r"^const int (\w+) = (warp == .*);$", line)
     if who:
         return f"{who[1]} = " + re.sub(r"warp == (\d+) \? (\d+) : ", r"\2 if warp == \1 else ", who[2])
     for form, python in FORMS:

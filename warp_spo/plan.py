@@ -18,6 +18,7 @@ FEW_WORLDS = 32768  # so many leave a GPU waiting: a warp for each limb, and row
 MOST_DOFS = 128  # straight-line code of more takes too long to compile
 SPILLS = {"float32": 32, "float64": 15}  # dofs at which one thread no longer holds a whole tree in registers,
 SOLVES = {"float32": 32, "float64": 20}  # and at which it does not without velocities
+ALIKE = {"float32": 0.5, "float64": 0.0}  # share of limbs with shared code, with less a thread a world is faster then
 HELD = 16  # dofs of which a thread holds the variable values, too
 SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as through shared memory,
 LONG_ROWS = 24  # in segments; longer rows come in together already at fewer worlds
@@ -53,7 +54,6 @@ TREE_ONLY = (
     "body_velocities_vjp",
     "forward_dynamics_jvp",
     "inverse_dynamics_jvp",
-    "step",
     "step_system",
     "integrate",
     "passive_force",
@@ -89,7 +89,7 @@ TREE_ONLY = (
     "closure_step",
 )
 """Operations that exist as traces alone: each is a kernel of its scene, a thread a world, whatever the plan."""
-SHARED = ("forward_dynamics_and_solve", "forward_dynamics_vjp", "inverse_dynamics_vjp")
+SHARED = ("step", "forward_dynamics_and_solve", "forward_dynamics_vjp", "inverse_dynamics_vjp")
 """Traces alone, too, that a warp a limb can share."""
 
 
@@ -139,7 +139,7 @@ class Plan:
     def _rule(self, operation: str) -> str:
         if self.granularity == "node" or self.limbs == 1 or self.limbs > MOST_WARPS:
             return self.granularity
-        if operation in LONG_RESULTS:
+        if operation in (*LONG_RESULTS, "step"):  # of a step a thread holds too little even of a dozen dofs
             return "segment"
         if self.granularity == "segment" and self.worlds > FEW_WORLDS:
             if operation in SHORT or (operation == "solve_mass_matrix" and self.dofs <= SOLVES[self.dtype]):
@@ -166,8 +166,10 @@ def choose(
         raise ValueError(f"Dynamics: granularity is {granularity!r}; expected None or one of {names}")
     asked = granularity or DEFAULT
     side_by_side = cuda and asked != "node" and 0 < scene.dof_count <= MOST_DOFS
-    limbs = Pieces(Links(scene)).warps if side_by_side else 1
-    chosen, reason = (asked, "asked for") if asked else _chosen(scene.dof_count, limbs, worlds, cuda, dtype, varies)
+    pieces = Pieces(Links(scene)) if side_by_side else None
+    limbs, alike = (pieces.warps, pieces.alike >= ALIKE[dtype]) if pieces else (1, True)
+    rule = _chosen(scene.dof_count, limbs, alike, worlds, cuda, dtype, varies)
+    chosen, reason = (asked, "asked for") if asked else rule
     rows = SHORT_ROWS if chosen == "tree" else LONG_ROWS
     staged = scene.dof_count > rows and worlds > (FEW_WORLDS if scene.dof_count <= LONG_ROWS else FEW_WORLDS // 16)
     outward, first = [], 0
@@ -190,7 +192,9 @@ def _depth(scene: Scene) -> int:
     return max(depth.values())
 
 
-def _chosen(dofs: int, limbs: int, worlds: int, cuda: bool, dtype: str, varies: bool) -> tuple[str, str]:
+def _chosen(
+    dofs: int, limbs: int, alike: bool, worlds: int, cuda: bool, dtype: str, varies: bool
+) -> tuple[str, str]:
     if dofs == 0:
         return "node", "nothing moves"
     if dofs > MOST_DOFS:
@@ -204,6 +208,8 @@ def _chosen(dofs: int, limbs: int, worlds: int, cuda: bool, dtype: str, varies: 
     if worlds <= FEW_WORLDS:
         return "segment", f"up to {FEW_WORLDS} worlds, {limbs} limbs side by side take less time"
     if dofs > (min(HELD, SPILLS[dtype]) if varies else SPILLS[dtype]):
+        if not alike:
+            return "tree", f"{limbs} limbs with code of their own each do not fit into the instruction cache"
         return "segment", f"{dofs} dof in {dtype} do not fit into one thread's registers"
     return "tree", f"more than {FEW_WORLDS} worlds keep the GPU busy with a thread each"
 

@@ -25,9 +25,9 @@ from .recursions.messages import INWARD, OUTWARD, SENDS
 from .recursions.multipliers import Multipliers
 from .recursions.operators import meet, written
 from .recursions.pieces import Pieces
-from .recursions.step import LOOPED
-from .teams import Team, Work
-from .trace.emit import Angles, Emitter, Store, literals
+from .recursions.step import GAIN, GUESS, LOOPED, MISSED, by_pieces
+from .teams import Passes, Team, Work
+from .trace.emit import PREFIX, Angles, Emitter, Store, literals
 from .trace.graph import Value, is_constant, ordered
 
 FIELDS = (*TABLES, *DOF_VALUES, "joint_rest_q")
@@ -45,10 +45,11 @@ TRACED = (
 )
 TILES = ("inverse_dynamics_derivatives", "mass_matrix_derivative")
 """Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
-REGISTERS = 65536  # of a multiprocessor
+REGISTERS, MOST_REGISTERS = 65536, 255  # of a multiprocessor, and of a thread
 THREE, ENOUGH = 3, 168  # blocks on it, and registers of a thread that the solution by limbs needs for that
 APART = ("forward_dynamics", "forward_dynamics_and_solve")
 """Operations that can take velocity terms first."""
+PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
 TILED_SLOTS = 256  # different values of a result from which they go through memory, not through shared memory,
 TILED_WORLDS = 1 << 20  # of so many worlds at a time
@@ -91,7 +92,6 @@ class Programs:
     Args:
         run: its sweeps, whose parameters the programs read.
         plan: which granularity each operation has.
-        block: threads of a block at tree granularity, on CUDA.
         registers: a cap on the registers of a thread.
 
     Attributes:
@@ -99,8 +99,8 @@ class Programs:
             a multiple of 8.
     """
 
-    def __init__(self, run: Recursions, plan: Plan, block: int = WARP, registers: int | None = None):
-        self.run, self.plan, self.block, self.registers = run, plan, block, registers
+    def __init__(self, run: Recursions, plan: Plan, registers: int | None = None):
+        self.run, self.plan, self.registers = run, plan, registers
         self.tiled, self.tiled_worlds = run.device.is_cuda, TILED_WORLDS
         self._programs: dict[Any, Program | None] = {}
         self._links: Links | None = None
@@ -201,6 +201,8 @@ class Programs:
             return None
         shapes = {**shapes, "out": out_shape}
         shared = self.plan.of(operation) == "segment" and messages.shared(operation, shapes, options.get("wrt", ()))
+        if operation == "step":
+            shared = shared and by_pieces(self.run.scene, shapes, options.get("how"))
         if operation in APART and self.plan.apart and "qd" in shapes:
             operation += "_apart"
         if shared:
@@ -217,7 +219,7 @@ class Programs:
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         outs = [item for item in stores if item.array == "out"]
-        frame = self._frame(outs, shapes, 0, 1, self.block, stores, more)
+        frame = self._frame(outs, shapes, 0, 1, WARP, stores, more)
         if operation in TILES:
             result = Result(TILED, frame.result.array, slots=_solid(stores))
             frame = frame._replace(staged=self.plan.staged, result=result)
@@ -231,7 +233,8 @@ class Programs:
         if looped:
             ahead, a_pass = before
             body = straight.looped(ahead, a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
-        frame = frame._replace(again=frame.again and "farthest" in body)
+        block = WARP if frame.scalars else PAIR * WARP
+        frame = frame._replace(again=frame.again and "farthest" in body, block=block)
         tables: dict[str, Any] = {} if table is None else {"place": wp.array(table, dtype=int, device=self.run.device)}
         return self._finished(operation, frame, body, body, tables, emitter.operations)
 
@@ -242,46 +245,55 @@ class Programs:
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         everything: list[Store] = []
         traced: list[list[Store]] = []
-        apart: list[tuple[list[Store], dict[int, list[Store]]]] = []
+        apart: list[tuple[list[Store], list[Store], dict[int, list[Store]]]] = []
         for index in range(len(pieces.pieces)):
             links = self.links.opened()  # its own: pieces of equal structure then give equal text
             trace = Traces(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)(**options)])
             flat = {at: [self._flattened(item, shapes) for item in items] for at, items in trace.across.items()}
-            apart.append((trace.news, flat))
-            everything += traced[-1] + trace.news + [item for items in flat.values() for item in items]
+            news = [self._flattened(item, shapes) for item in trace.news]
+            apart.append((trace.checks, news, flat))
+            everything += traced[-1] + trace.checks + news + [item for items in flat.values() for item in items]
+        bends = any(item.array == MISSED for item in everything)
+        passes = Passes((GUESS, GAIN), sent if bends else None) if operation == "step" else None
+        sent += 2 * pieces.warps if bends else 0
         frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
                             WARP * pieces.warps, everything, more)
         if frame.result.way == DIRECT and frame.result.array.entries > LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
         if not frame.fits(self.run.dtype):
             return None  # nor for what limbs tell each other
-        team = Team(pieces, dtype)
+        team = Team(pieces, dtype, passes)
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
         whole = [item for item in everything if item.array == "out"]
         placed, table = _placed(whole, frame.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
-        for piece, stores, items, (news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
-            emitter = self._emitter(shapes, frame)
+        by_slot = lambda found: found if table is None else _by_slot(found, table)  # noqa: E731
+        for piece, stores, items, (checks, news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
+            emitter, checking = self._emitter(shapes, frame), self._emitter(shapes, frame)
+            later = self._emitter(shapes, frame) if passes else emitter
             inward = [item for item in stores if item.array == INWARD]
             outward = [item for item in stores if item.array == OUTWARD]
             last = outward if set(SENDS[operation]) & set(messages.OUTWARD_LETTERS) else inward
-            last += items if table is None else _by_slot(items, table)
-            last += [item for item in stores if item.array in more]
-            meetings = {at: found if table is None else _by_slot(found, table) for at, found in others.items()}
+            last += by_slot(items)
+            last += [item for item in stores if item.array in (*more, GAIN)]
+            meetings = {at: by_slot(found) for at, found in others.items()}
             regions = emitter.region(inward), emitter.region(outward)
-            branches = emitter.branch(news), {at: emitter.branch(found) for at, found in meetings.items()}
-            team.add(Work(piece, *regions, *branches), emitter.operations)
+            ends = [item for item in news if item.array == "out"]
+            news = [item for item in news if item.array != "out"] + by_slot(ends)
+            branches = later.branch(news), {at: later.branch(found) for at, found in meetings.items()}
+            team.add(Work(piece, *regions, checking.region(checks), *branches),
+                     sum(each.operations for each in {emitter, checking, later}))
         cuda = team.cuda()  # fills the tables
-        registers = REGISTERS // (THREE * frame.block) // 8 * 8
-        fits = operation.endswith("_apart") and dtype == "float32" and registers >= ENOUGH
+        registers, three = (REGISTERS // (blocks * frame.block) // 8 * 8 for blocks in (1, THREE))
+        if operation.endswith("_apart") and dtype == "float32" and three >= ENOUGH:
+            registers = three
         lists = ("place", table, int), ("table", team.table, self.run.dtype), ("shifts", team.shifts, int)
         tables: dict[str, Any] = {
             name: wp.array(values, dtype=kind, device=self.run.device) for name, values, kind in lists if values
         }
-        return self._finished(
-            operation, frame, cuda, team.cpu(), tables, team.operations, registers if fits else None
-        )
+        cap = registers if registers < MOST_REGISTERS else None
+        return self._finished(operation, frame, cuda, team.cpu(), tables, team.operations, cap)
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
@@ -315,6 +327,8 @@ class Programs:
         def load(array: str, entry: str) -> str:
             if array in (INWARD, OUTWARD):
                 return f"SENT({entry})"
+            if array in LOOPED and frame.warps > 1:
+                return f"{'' if array == MISSED else PREFIX}{array}_row[{entry}]"
             if array in FIELDS:
                 return f"FIELD({array}, {entry})"
             return f"{array}_row[{entry}]"
@@ -322,6 +336,10 @@ class Programs:
         def store(array: str, entry: str, value: str) -> str:
             if array in (INWARD, OUTWARD):
                 return f"SENT({entry}) = {value};"
+            if array == MISSED and frame.warps > 1:
+                return f"missed_row[0] += {value};"
+            if array in LOOPED and frame.warps > 1:
+                return f"{'if (open) ' if array == GUESS else ''}{load(array, entry)} = {value};"
             if array == "out" and result.way == TILED:
                 return f"if (mine) result_row[({entry}) * {TILE}] = {value};"
             if array == "out":

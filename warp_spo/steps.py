@@ -54,7 +54,7 @@ class Steps:
         * limits: limit_ke (limit - q') where q' is outside, and -limit_kd qd' where q is; they never pull inward.
           Of ball and free hinges: UnsupportedError.
         * dry friction: at most joint_friction against the motion; a hinge that sticks creeps by up to 1e-4 rad/s, m/s.
-        * velocity limit: what exceeds it shrinks about a thousandfold in a step.
+        * velocity limit: what a step would exceed it by shrinks about three hundredfold.
 
         Effort and velocity limits of 1e6 and more, Newton's default, bound nothing; position limits of 1e10 neither.
         What is zero or unbounded in the scene has no instruction in the kernel. The forces are implicit, at one

@@ -5,24 +5,47 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from .kernels import straight
 from .recursions.pieces import Piece, Pieces
-from .trace.emit import Listing, filled, literal, literals
+from .trace.emit import C_TYPE, Listing, filled, literal, literals
 
 BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
 
 
 class Work(NamedTuple):
-    """What one piece has to do: going in, coming out, telling the others, and with each of those that it meets."""
+    """What one piece has to do: going in, coming out, checking a pass, telling the others, and with each that it meets.
+
+    Of work in passes, the last two come when all passes are done.
+    """
 
     piece: Piece
     inward: Listing
     outward: Listing
+    check: Listing
     news: Listing
     across: dict[int, Listing]
 
     @property
-    def text(self) -> tuple[str, str]:
-        return self.inward.text, self.outward.text
+    def text(self) -> tuple[str, str, str]:
+        return self.inward.text, self.outward.text, self.check.text
+
+
+class Passes(NamedTuple):
+    """Passes in which a team goes round all its work, until every warp's guesses were right.
+
+    Attributes:
+        kept: names of what a piece keeps from pass to pass, by dof of its own: arrays of a thread whose indices are
+            constants, so that they live in registers.
+        flags: where in the memory that warps share the flags begin; None: there is nothing to guess, one pass will do.
+    """
+
+    kept: tuple[str, ...]
+    flags: int | None
+
+    def declared(self, entries: dict[str, int], c: str) -> str:
+        """What pieces keep, by the prefix of their names: so many entries each."""
+        sizes = entries.items()
+        return "\n".join(f"{c} {prefix}{name}_row[{count}] = {{}};" for prefix, count in sizes for name in self.kept)
 
 
 class Team:
@@ -30,6 +53,7 @@ class Team:
 
     Args:
         pieces, dtype: of the scene.
+        passes: the work is done in passes, see :class:`Passes`.
 
     Attributes:
         table: constants in which equal pieces differ. shifts: likewise, distances of the entries that they read and
@@ -37,8 +61,8 @@ class Team:
         operations: floating-point operations of one world.
     """
 
-    def __init__(self, pieces: Pieces, dtype: str):
-        self.pieces, self.dtype = pieces, dtype
+    def __init__(self, pieces: Pieces, dtype: str, passes: Passes | None = None):
+        self.pieces, self.dtype, self.c, self.passes = pieces, dtype, C_TYPE[dtype], passes
         self.table: list[float] = []
         self.shifts: list[int] = []
         self.operations = 0
@@ -53,15 +77,16 @@ class Team:
     def _last(self) -> int:
         """The last stage in which there is something to do."""
         stages = [0]
-        for piece, inward, outward, _, across in self._work.values():
+        for piece, inward, outward, _, _, across in self._work.values():
             stages += [piece.inward] if inward.text else []
             stages += [piece.outward] if outward.text else []
-            stages += [self.pieces.stages - 1] if across else []  # pieces further in meet in the last one
+            if across and not self.passes:
+                stages.append(self.pieces.stages - 1)  # pieces further in meet in the last one
         return max(stages)
 
     def cpu(self) -> str:
         """Everything in order, by one thread."""
-        text = []
+        text, later = [], []
         for stage in range(self._last + 1):
             for piece in reversed(self.pieces.pieces):
                 if piece.inward == stage:
@@ -69,10 +94,20 @@ class Team:
             for piece in self.pieces.pieces:
                 if piece.outward == stage:
                     text.append(literals(self._work[piece.index].outward, self.dtype, f"p{piece.index}_"))
-                    text.append(literals(self._work[piece.index].news, self.dtype, f"p{piece.index}_"))
+                    if self._work[piece.index].check.text:
+                        check = literals(self._work[piece.index].check, self.dtype, f"p{piece.index}_")
+                        text += ["{", check, "}"]
+                    news = literals(self._work[piece.index].news, self.dtype, f"p{piece.index}_")
+                    if self.passes:
+                        later.append(f"{{\n{news}\n}}")
+                    else:
+                        text.append(news)
         for work in self._work.values():
-            text += [literals(listing, self.dtype, f"p{work.piece.index}_") for listing in work.across.values()]
-        return "\n".join(text)
+            later += [literals(listing, self.dtype, f"p{work.piece.index}_") for listing in work.across.values()]
+        if self.passes:
+            kept = {f"p{piece.index}_": piece.weight for piece in self.pieces.pieces}
+            text = [self.passes.declared(kept, self.c), straight.alone("\n".join(text), self.c)]
+        return "\n".join(text + later)
 
     def cuda(self) -> str:
         """A branch for each kind of leaf piece, which its warps enter together."""
@@ -85,9 +120,37 @@ class Team:
             text.append(f"{'else ' if text else ''}if ({_any_of([work.piece.warp for work in alike])}) {{")
             inward, outward = self._shared(alike)
             text += [inward, self._inner([work.piece.warp for work in alike]), outward]
-            if any(work.across for works in kinds.values() for work in works):
+            if not self.passes and any(work.across for works in kinds.values() for work in works):
                 text += [self._apart(alike, [work.news for work in alike], "n_"), BARRIER, self._across(alike)]
             text.append("}")
+        return self._in_passes("\n".join(text)) if self.passes else "\n".join(text)
+
+    def _in_passes(self, a_pass: str) -> str:
+        """``a_pass`` until all agree, then every piece's news, and what the first makes of them."""
+        assert self.passes is not None
+        leaves = [work for work in self._work.values() if not work.piece.children]
+        inner = [work for work in self._work.values() if work.piece.children]
+        ranks: list[dict[int, Work]] = [{leaf.piece.warp: leaf for leaf in leaves}]  # by warp: one of its pieces
+        for work in inner:
+            warp = work.piece.warp
+            free = next((rank for rank in ranks if warp not in rank), None)
+            if free is None:
+                ranks.append(free := {})
+            free[warp] = work
+        names = ["", *(f"i{at}_" for at in range(len(ranks) - 1))]
+        kept = {name: max(work.piece.weight for work in rank.values()) for name, rank in zip(names, ranks, strict=True)}
+        text = [self.passes.declared(kept, self.c)]
+        text += [straight.once(a_pass, BARRIER, self.c) if self.passes.flags is None else
+                 straight.voted(a_pass, self.passes.flags, self.pieces.warps, self.c)]
+        for last in (False, True):
+            found = []
+            for at, (name, rank) in enumerate(zip(names, ranks, strict=True)):
+                said = [rank.get(leaf.piece.warp) for leaf in leaves]
+                its = [None if one is None else one.across.get(0) if last else one.news for one in said]
+                found.append(self._apart(leaves, its, f"c{at}_", name))
+            if last and any(found):
+                text.append(BARRIER)
+            text += found
         return "\n".join(text)
 
     def _inner(self, warps: list[int]) -> str:
@@ -107,8 +170,11 @@ class Team:
                 text += [inward for work, (inward, _) in reversed(order) if work.piece.inward == stage]
                 for at, (alike, (_, outward)) in enumerate(zip(zip(*chains, strict=True), shared, strict=True)):
                     if alike[0].piece.outward == stage:
-                        text += [outward, self._apart(alike, [work.news for work in alike], f"i{at}_n_", f"i{at}_")]
-            text += [self._across(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
+                        text.append(outward)
+                        if not self.passes:
+                            text.append(self._apart(alike, [work.news for work in alike], f"i{at}_n_", f"i{at}_"))
+            if not self.passes:
+                text += [self._across(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
             text.append("}")
         idle = [BARRIER] * self._last
         if text and len(warps) > sum(map(len, owners.values())):
@@ -136,8 +202,9 @@ class Team:
 
     def _shared(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str]:
         """One text, in and out, for pieces of equal structure."""
-        both = [[work.inward for work in alike], [work.outward for work in alike]]
-        head, (inward, outward) = self._filled(alike, both, prefix, prefix)
+        regions = [[work.inward for work in alike], [work.outward for work in alike], [work.check for work in alike]]
+        head, (inward, outward, check) = self._filled(alike, regions, prefix, prefix)
+        outward = "\n".join([outward, "{", check, "}"]) if check else outward
         return f"{head}\n{inward}" if head else inward, outward
 
     def _filled(
@@ -174,9 +241,8 @@ class Team:
             member = " : ".join(f"warp == {warp} ? {at}" for at, warp in enumerate(warps[:-1])) + f" : {len(warps) - 1}"
             head.append(f"const int {tables}who = {member};")
         if constants.columns:
-            c = {"float32": "float", "float64": "double"}[self.dtype]
             first, count = len(self.table), len(constants.columns)
-            head.append(f"const {c}* {tables}numbers = table.data + {first} + {tables}who * {count};")
+            head.append(f"const {self.c}* {tables}numbers = table.data + {first} + {tables}who * {count};")
             self.table += [value for row in zip(*constants.columns, strict=True) for value in row]
         if shifts.columns:
             first, count = len(self.shifts), len(shifts.columns)
@@ -185,6 +251,7 @@ class Team:
             head += [f"{tables}shift[{k}] = {read.format(first + k, tables, count)};" for k in range(count)]
             self.shifts += [value for row in zip(*shifts.columns, strict=True) for value in row]
         return "\n".join(head), texts
+
 
 class _Columns:
     """Distinct tuples, one value for each member, in the order in which they were met."""

@@ -28,8 +28,8 @@ from .links import BALL, FREE, Link, Links
 CREEP = 1e-4  # rate [rad/s, m/s] below which dry friction sticks: there it is a damper, which this rate saturates
 TURNING = (BALL, FREE)  # motions with a quaternion
 DEFAULT_BOUND = 1e6  # effort and velocity limits from here on bound nothing: Newton's value where nothing is said
-HOLD = 1e3  # resistance of a velocity limit, in M / h: what exceeds the limit shrinks by this in a step
-NOISE = 64.0  # roundings of a law's terms by which two of its pieces may differ where they meet
+HOLD = 300.0  # resistance of a velocity limit, in inertias / h: what a step would exceed it by shrinks by this
+NOISE = 4.0  # roundings of a law's terms by which two of its pieces may differ where they meet
 
 
 class Law(NamedTuple):
@@ -164,7 +164,7 @@ class Impedance:
         return float(self.scene.neutral_q[coordinate])
 
     def _inertia(self, dof: int) -> float:
-        """Diagonal entry of the mass matrix at the neutral configuration, of world 0."""
+        """What a force at the dof feels at the neutral configuration, all others being free, of world 0."""
         if self._inertias is None:
             self._inertias = neutral_inertias(self.scene)
         return float(self._inertias[dof])
@@ -242,14 +242,16 @@ def _is(x: Value, number: float) -> bool:
 
 
 def neutral_inertias(scene: Scene) -> np.ndarray:
-    """Diagonal of the mass matrix at the neutral configuration, of world 0 [dof]."""
+    """1 / diagonal of Mass^-1 at the neutral configuration, of world 0 [dof]; of Mass, where it has no inverse."""
     from ..trace.evaluate import evaluate
     from .traced import Trace
 
     one = scene.with_values(**{name: array[:1] for name, array in scene.values.items()})
-    entries = [item for item in Trace(Links(one), "float64", ("q",)).mass_matrix() if item.index[0] == item.index[1]]
+    entries = Trace(Links(one), "float64", ("q",)).mass_matrix()
+    mass = np.zeros((scene.dof_count, scene.dof_count))
     values = evaluate([item.value for item in entries], lambda array, index: scene.neutral_q[index[0]])
-    found = np.zeros(scene.dof_count)
     for item, value in zip(entries, values, strict=True):
-        found[item.index[0]] = value
-    return found
+        mass[item.index] = value
+    with np.errstate(all="ignore"):
+        found = 1.0 / np.diagonal(np.linalg.pinv(mass))
+    return np.where((found > 0.0) & (found <= np.diagonal(mass)), found, np.diagonal(mass))

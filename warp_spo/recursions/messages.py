@@ -3,7 +3,7 @@
 Letters: inward P = phi P+ phi*, z and y = phi z+ or a force, f = a force, R = the composite inertia, B = how a sum
 changes with the parent's motion; outward a and b = alpha, and for Mass^-1 N = the rates of all pivots further in for
 each unit force on the last link, D = the piece's own pivots, V = D times its columns of Y, Y = the part of its columns
-that lies further in.
+that lies further in. From all to the first piece, when all is done: S = a status word.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ SENDS = {
     "inverse_dynamics": "z",
     "forward_dynamics_and_solve": "Pzayb",
     "forward_dynamics_and_solve_apart": "fPzayb",
+    "step": "PzaS",
     "forward_dynamics_vjp": "B",
     "inverse_dynamics_vjp": "B",
     "mass_matrix": "R",
@@ -28,7 +29,7 @@ SENDS = {
 INWARD, OUTWARD = "sent", "returned"
 """The array that messages go through, by either name."""
 OUTWARD_LETTERS = "abNDVY"
-SIZES = {"P": 21, "z": 6, "f": 6, "y": 6, "R": 10, "B": 24, "a": 6, "b": 6}
+SIZES = {"P": 21, "z": 6, "f": 6, "y": 6, "R": 10, "B": 24, "a": 6, "b": 6, "S": 1}
 SHORT_WAYS = ("q", "tangent", "qd", "qdd", "tau")  # arguments whose gradient a piece knows by itself
 
 
@@ -76,6 +77,8 @@ def slots(operation: str, pieces: Pieces) -> tuple[dict[tuple[str, int], int], i
 
 
 def _sends(letter: str, piece: Piece, tree: list[Piece]) -> bool:
+    if letter == "S":
+        return True
     if letter == "Y":
         return any(other.looks_at(piece) for other in tree)
     return bool(piece.children) if letter in OUTWARD_LETTERS else piece.parent is not None

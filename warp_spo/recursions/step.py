@@ -3,25 +3,32 @@
 R and F are what the hinges' laws leave of themselves, see :mod:`.impedance`; where laws bend, a pass solves for the
 pieces at its guess of u = qd' - qd and says whether they were the right ones. Passes share one text, run in a loop
 until they were: sweeps over the tree, or with few dofs the solution of a system that is formed before the loop.
+
+Pieces that work side by side keep the guesses of their own dofs, and their state after the step follows the last pass:
+no other piece needs the state before it any more.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from typing import Any
 
+from ..scene import Scene
 from ..trace.emit import Store
 from ..trace.graph import Value, less, reciprocal, select
 from ..trace.spatial import total
 from .impedance import Impedance, Law, added
 from .integration import coordinate_rates, moved
 from .joint_space import JointSpace
-from .links import Link
+from .links import BALL, FREE, Link
+from .pieces import Piece, Pieces
 from .traced import Trace
 
 GUESS, GAIN, MISSED = "guess", "gain", "missed"
-"""Variables of a loop over passes, zero at first: by dof, the guess of u, and u; whether a guess missed a piece."""
+"""Variables of a loop over passes, zero at first: by dof of a piece, the guess of u, and u; whether one missed."""
 LOOPED = (GUESS, GAIN, MISSED)
+WIDE = {BALL: 4, FREE: 7}  # coordinates of a hinge with a quaternion
 SHORT = 10  # dofs up to which passes solve a system that is formed once
 NOT_POSITIVE, NOT_FINITE, NOT_SETTLED, CHANGE_POINT = 1, 2, 5, 6  # status words; the first two as warp_spo.status
 
@@ -34,7 +41,7 @@ class Step:
     """
 
     def __init__(self, trace: Trace):
-        self.trace, self.links = trace, trace.links.links
+        self.trace, self.links = trace, trace.outward
         vector, given = trace.vector, trace.given
         self.h = trace.graph.input("dt", 0)
         apart = "q_from" in given
@@ -51,9 +58,14 @@ class Step:
         )
         self.laws: dict[int, list[Law]] = {}  # by dof
         self.forces: dict[int, Value] = {}
+        self.messages: list[Store] = []  # to other pieces
+        self._kept = {dof: at for at, dof in enumerate(trace.piece.dofs)} if trace.piece else {}
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
-        """out = qd', q_out = q'; with ``qdd`` qdd_out = (qd' - qd) / h, with ``status`` the word of each world."""
+        """out = qd', q_out = q'; with ``qdd`` qdd_out = (qd' - qd) / h, with ``status`` the word of each world.
+
+        Of a piece, a pass; what comes after the last one is news.
+        """
         trace = self.trace
         trace.stiffened = self._stiffened
         tau = trace.vector("tau")
@@ -61,7 +73,7 @@ class Step:
         gains = {dof: self.h * value for dof, value in found.items()}
         looped = self._looped(gains)
         if looped:
-            gains = {dof: trace.graph.input(GAIN, dof) for dof in gains}
+            gains = {dof: self._kept_as(GAIN, dof) for dof in gains}
         rates_after = {dof: self.qd(dof) + gain for dof, gain in gains.items()}
         stores: list[Store] = []
         for link in self.links:
@@ -72,22 +84,28 @@ class Step:
             if qdd:
                 stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
         stores = self.put_back(stores)
+        results = [item.value for item in stores]
+        if trace.piece is not None:
+            trace.news = stores + (self._words(trace.piece, results) if status else [])
+            return self.messages + looped
         if status:
             trace.graph.step = "status|s"
-            stores.append(Store("status", (), self._word([item.value for item in stores], bool(looped))))
+            stores.append(Store("status", (), self._word(results, bool(looped))))
         return looped + stores
 
     def _accelerations(self, tau: Callable[[int], Value]) -> dict[int, Value]:
         """qdd by dof for ``tau``, the pieces that hold at the guess in Mass."""
         if self._short:
             return self._in_joint_space(tau)
-        done, rates, _ = self.trace.reduce(tau, moves=True, loads=True)
-        return {item.index[0]: item.value for item in self.trace.expand(done, rates, self.trace.base)}
+        done, rates, sent = self.trace.reduce(tau, moves=True, loads=True)
+        stores = sent + self.trace.expand(done, rates, self.trace.base)
+        self.messages = [item for item in stores if item.array != "out"]
+        return {item.index[0]: item.value for item in stores if item.array == "out"}
 
     @property
     def _short(self) -> bool:
-        """Several passes over few dofs."""
-        if self.trace.links.scene.dof_count > SHORT:
+        """Several passes over few dofs, by one thread."""
+        if self.trace.links.scene.dof_count > SHORT or self.trace.piece is not None:
             return False
         return any(law.bends for link in self.links for laws in self.impedance.laws(link) for law in laws)
 
@@ -121,20 +139,35 @@ class Step:
         return pieces
 
     def _guess(self, dof: int) -> Value:
-        """Of u; what the pass before has found, unless a law asked for another."""
+        """Of u; what the pass before has found, unless a law asked for another; of a piece, by itself.
+
+        A piece finds u anew in every pass, and until then has its registers for other things.
+        """
         apart = any(law.least is not None and law.most is not None for law in self.laws[dof])
-        return self.trace.graph.input(GUESS if apart else GAIN, dof)
+        apart = apart or self.trace.piece is not None
+        return self._kept_as(GUESS if apart else GAIN, dof)
+
+    def _kept_as(self, name: str, dof: int) -> Value:
+        return self.trace.graph.input(name, self._kept.get(dof, dof))
 
     def _looped(self, gains: dict[int, Value]) -> list[Store]:
-        """What a pass leaves behind; nothing if no law bends."""
-        if not any(law.bends for laws in self.laws.values() for law in laws):
+        """What a pass leaves behind; of the whole tree, nothing if no law bends.
+
+        A piece has few registers left in its pass: it checks its guesses afterwards, with what it reads anew.
+        """
+        bends = any(law.bends for laws in self.laws.values() for law in laws)
+        if not bends and self.trace.piece is None:
             return []
-        stores, missed = [], []
+        stores, missed, found = [], [], []
         for link in self.links:
             self.trace.at(link, "u")
             for dof in link.dofs:
-                gain, laws = gains[dof], self.laws[dof]
-                stores.append(Store(GAIN, (dof,), gain))
+                gain, laws, at = gains[dof], self.laws[dof], self._kept.get(dof, dof)
+                found.append(Store(GAIN, (at,), gain))
+                if self.trace.piece is None:
+                    stores.append(found[-1])
+                else:
+                    gain = self._kept_as(GAIN, dof)
                 if not any(law.bends for law in laws):
                     continue
                 guess = self._guess(dof)
@@ -143,23 +176,54 @@ class Step:
                     after = gain
                     for law in laws:
                         after = select(law.skipped(guess, gain), law.middle, after)
-                    stores.append(Store(GUESS, (dof,), after))
-        return [*stores, Store(MISSED, (0,), total(missed))]
+                    stores.append(Store(GUESS, (at,), after))
+        stores += [Store(MISSED, (0,), total(missed))] if bends else []
+        if self.trace.piece is None:
+            return stores
+        self.trace.checks = stores
+        return found
 
     def _word(self, results: list[Value], looped: bool) -> Value:
         """The worst that is true of the world."""
-        trace, scene = self.trace, self.trace.links.scene
-        sizes = {"q": scene.coord_count, "target_q": scene.coord_count, "q_from": scene.coord_count}
-        inputs = [self.h]
-        for name in trace.given:
-            if name in ("qd", "tau", "target_qd", "qd_from", *sizes):
-                entry = trace.vector(name)
-                inputs += [entry(i) for i in range(sizes.get(name, scene.dof_count))]
-            if name == "body_f":
-                inputs += [trace.graph.input(name, body, c) for body in range(scene.body_count) for c in range(6)]
-        settled = less(trace.graph.input(MISSED, 0), 0.5) if looped else 1.0
+        settled = less(self.trace.graph.input(MISSED, 0), 0.5) if looped else 1.0
         word = select(_finite(results), select(settled, 0.0, NOT_SETTLED), NOT_POSITIVE)
-        return select(_finite(inputs), select(self._unresolved(), CHANGE_POINT, word), NOT_FINITE)
+        return select(_finite(self._inputs()), select(self._unresolved(), CHANGE_POINT, word), NOT_FINITE)
+
+    def _words(self, own: Piece, results: list[Value]) -> list[Store]:
+        """What a piece says to the first one, which makes one word of what all say: the larger, the worse."""
+        trace, graph = self.trace, self.trace.graph
+        graph.step = "status|s"
+        finite = select(_finite(self._inputs()), select(_finite(results), 0.0, NOT_POSITIVE), NOT_FINITE)
+        if own.index == 0:
+            worst: Value = 0.0
+            for piece in Pieces(trace.links).pieces:
+                (word,) = trace.receive("S", piece)
+                worst = select(less(worst, word), word, worst)
+            settled = less(graph.input(MISSED, 0), 0.5)
+            trace.across = {0: [Store("status", (), select(worst, worst, select(settled, 0.0, NOT_SETTLED)))]}
+        return trace.post("S", own, [finite])
+
+    def _inputs(self) -> list[Value]:
+        """What the links are given; the first piece has the bodies that do not move, too."""
+        trace, inputs = self.trace, [self.h]
+        dofs = sorted(dof for link in self.links for dof in link.dofs)
+        wide = ((link.coordinate, WIDE.get(link.motion, 1)) for link in self.links)
+        coordinates = sorted(first + c for first, count in wide for c in range(count))
+        own = {*map(id, self.links)} | (set() if trace.piece and trace.piece.index else {id(None)})
+        bodies = sorted(body for body, seat in trace.links.seats.items() if id(seat.link) in own)
+        for name in trace.given:
+            if name in ("q", "target_q", "q_from"):
+                inputs += map(trace.vector(name), coordinates)
+            if name in ("qd", "tau", "target_qd", "qd_from"):
+                inputs += map(trace.vector(name), dofs)
+            if name == "body_f":
+                inputs += [trace.graph.input(name, body, c) for body in bodies for c in range(6)]
+        return inputs
+
+
+def by_pieces(scene: Scene, given: Iterable[str], how: Any) -> bool:
+    """Whether pieces can share the work of a step: no loops are closed, and sweeps serve its passes."""
+    return how is None and "multipliers" not in given and scene.dof_count > SHORT
 
 
 def _finite(values: list[Value]) -> Value:

@@ -36,6 +36,7 @@ class Trace:
         news: what a piece sends to those that meet it, apart: pieces of equal structure do not all send it.
         across: what a piece has to store after that, by the other piece that it is about.
         ahead: what the passes of a loop share, formed once before it.
+        checks: what a piece makes of a pass, apart: it keeps nothing for that.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class Trace:
         self.news: list[Store] = []
         self.across: dict[int, list[Store]] = {}
         self.ahead: list[Value] = []
+        self.checks: list[Store] = []
         self._mail: dict[tuple[str, int], list[Value]] = {}  # messages between pieces of this trace
         self.own = set(map(id, links.links if piece is None else piece.links))
         self.active = set(self.own)
