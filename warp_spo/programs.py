@@ -19,10 +19,9 @@ from .levels import Recursions
 from .parts import DOF_VALUES
 from .plan import MOST_WARPS, SHARED, TREE_ONLY, Plan
 from .recursions import messages
-from .recursions.adjoints import Adjoints
+from .recursions.embedded_adjoints import EmbeddedAdjoints
 from .recursions.links import TABLES, Links
 from .recursions.messages import INWARD, OUTWARD, SENDS
-from .recursions.minimal import Minimal
 from .recursions.multipliers import Multipliers
 from .recursions.operators import meet, written
 from .recursions.pieces import Pieces
@@ -57,7 +56,7 @@ FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
 
 
-class Traces(Adjoints, Minimal, Multipliers):
+class Traces(EmbeddedAdjoints, Multipliers):
     """Every operation that is traced."""
 
 
