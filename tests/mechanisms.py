@@ -205,6 +205,12 @@ def ancestors():
     return spo.Scene(open_scene.bodies, open_scene.hinges, couplings=couplings)
 
 
+def geared():
+    """A chain of which one hinge turns as another does: what is computed of both is one scalar."""
+    open_scene = zoo.from_parents([-1, 0, 1, 1], ["revolute", "revolute", "revolute", "prismatic"], 41)
+    return spo.Scene(open_scene.bodies, open_scene.hinges, couplings=[spo.Coupling(2, 1, 1.0, 0.0)])
+
+
 MECHANISMS = {name: importlib.import_module(f"warp_spo.examples.{name}").scene
               for name in ("fourbar", "fivebar", "slider_crank", "stewart", "biped", "gripper")}
 MECHANISMS |= {
@@ -215,6 +221,7 @@ MECHANISMS |= {
     "cassie_leg": cassie_leg,
     "far_loop": far_loop,
     "ancestors": ancestors,
+    "geared": geared,
 }
 
 

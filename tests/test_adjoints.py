@@ -82,9 +82,11 @@ def test_forward_dynamics(name, dtype, granularity, device):
     assert any("segment" in line for line in lines) == (granularity == "segment")
 
 
+@pytest.mark.parametrize("few", [0, plan.FEW_WORLDS])
 @pytest.mark.parametrize("wrt", [("qd", "q"), ("tau",), ("tau", "tangent"), ("body_f", "q")])
-def test_what_is_asked_for_by_limbs(wrt, device):
+def test_what_is_asked_for_by_limbs(wrt, few, device, monkeypatch):
     """Any part of it, in any order, is what a thread for the whole tree gives; values differ between worlds."""
+    monkeypatch.setattr(plan, "FEW_WORLDS", few)  # both solutions in two kernels, or in one
     found = []
     for granularity in ("segment", "tree"):
         dyn, a = built("limbs", granularity, device=device, varied=True)

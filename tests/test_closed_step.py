@@ -227,15 +227,10 @@ def test_change_points_have_a_word(device):
             assert np.isfinite(x[0]).all() and np.isnan(x[1:]).all()
 
 
-def test_reactions_and_derivatives_are_refused(device):
+def test_reactions_are_refused(device):
     _, _, s, _ = mechanisms.case("fourbar")
     for loops in ("embed", "multipliers"):
         dyn = spo.Dynamics(MECHANISMS["fourbar"](), 3, device=device, loops=loops)
         with pytest.raises(UnsupportedError, match="body_reactions"):
             dyn.body_reactions(s.q, s.qd, s.qdd)
     spo.Dynamics(MECHANISMS["fourbar"](), 3, device=device, loops="cut").step(s.q, s.qd, None, H)  # it stays open
-    torch = pytest.importorskip("torch")
-    q, qd = (torch.tensor(x, dtype=torch.float32) for x in (s.q, s.qd))
-    dyn = spo.Dynamics(MECHANISMS["fourbar"](), 3, device="cpu", loops="embed")
-    with pytest.raises(UnsupportedError, match="a derivative with closed loops"):
-        dyn.step(q, qd.requires_grad_(), None, H)

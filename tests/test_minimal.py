@@ -13,8 +13,9 @@ from test_loops import traced
 
 import warp_spo as spo
 from warp_spo import loops
+from warp_spo.adjoints import OF_TREE
 from warp_spo.embedding import Closing, embedding
-from warp_spo.preparation import TAKES
+from warp_spo.preparation import PRODUCTS, TAKES
 from warp_spo.recursions import minimal
 
 DIFFERENCES = 1e-9  # what differences of order 8 leave of second derivatives; conditioning of the draws
@@ -241,6 +242,7 @@ def test_what_speaks_of_independent_dofs_fits_what_speaks_of_all(device):
 OF_ALL_DOFS = {"forward_dynamics", "passive_force", "body_poses", "body_velocities", "body_states", "integrate",
                "frame_accelerations", "body_accelerations", "closure_error", "project"}
 """What speaks of all dofs, or of bodies, whatever ties them."""
+OF_INVERSE = {"bias_force", "gravity_force", "bias_force_vjp", "gravity_force_vjp"}
 OF_MULTIPLIERS = {"inverse_dynamics", "mass_matrix", "mass_matrix_inverse", "solve_mass_matrix", "bias_force",
                   "gravity_force", "log_det_mass_matrix", "log_det_mass_matrix_gradient", "mass_matrix_packed",
                   "mass_matrix_inverse_packed", "jacobian", "jacobian_bias", "com_jacobian",
@@ -252,10 +254,11 @@ OF_MULTIPLIERS = {"inverse_dynamics", "mass_matrix", "mass_matrix_inverse", "sol
 def test_no_operation_forgets_the_loops(how, device):
     """Each is known here, embedded, of all dofs, or it raises and names a way out."""
     dyn = spo.Dynamics(MECHANISMS["gripper"](), 1, device=device, loops=how)
-    known = {"embed": {*loops.EMBEDDED, "bias_force", "gravity_force", "operational_inertia"} | OF_ALL_DOFS,
-             "multipliers": OF_ALL_DOFS | OF_MULTIPLIERS}[how]
-    assert known <= set(TAKES)
-    for operation in set(TAKES) - known - {"step"}:  # which has tests of its own
+    of_tree = {f"{operation}_vjp" for operation in OF_TREE}
+    known = {"embed": {*loops.EMBEDDED, *OF_INVERSE, "operational_inertia", "forward_dynamics_derivatives"},
+             "multipliers": OF_MULTIPLIERS}[how] | OF_ALL_DOFS | of_tree
+    assert known <= {*TAKES, *PRODUCTS}
+    for operation in {*TAKES, *PRODUCTS} - known - {"step"}:  # which has tests of its own
         with pytest.raises(spo.UnsupportedError, match=r"use|loops='cut'|loops='multipliers'|independent"):
             dyn.prepare(operation)
     q = np.zeros((1, dyn.scene.coord_count))

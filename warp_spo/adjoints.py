@@ -1,7 +1,7 @@
 """Products with Jacobians of the dynamics, J* y and J x: methods of :class:`warp_spo.Dynamics`.
 
 No recording: forward dynamics is gone back through by its own solve and one Newton-Euler recursion backwards, in one
-kernel, or in two where a warp works on a limb.
+kernel, or in two where a warp works on a limb. Loops that are embedded: see :mod:`.recursions.embedded_adjoints`.
 """
 
 from __future__ import annotations
@@ -46,6 +46,10 @@ ENTERING: dict[str, tuple[str, ...]] = {
     "step": (*LINK_VALUES, *GAINS),
 }
 """Values that enter an operation, where they are not those that links are made of."""
+OF_TREE = ("body_poses", "body_velocities", "integrate")
+"""Operations that know nothing of loops, and have no use for them."""
+EMBEDDED = ("forward_dynamics", "inverse_dynamics", "bias_force", "gravity_force", "step")
+"""Operations of which there are products with the Jacobian where loops are embedded."""
 OPTIONAL = ("body_f", "target_q", "target_qd")
 
 
@@ -77,6 +81,8 @@ class Adjoints:
     programs: Programs
     values: Values
     closed: bool
+    embedding: Any
+    _minimal: int
 
     # -- backwards -------------------------------------------------------------------------------------------------
     def forward_dynamics_vjp(
@@ -114,8 +120,13 @@ class Adjoints:
         Returns:
             The gradients by name. NaN in worlds where Mass has no inverse.
 
+        With loops embedded, states come in consistent. The gradient is that of the function as it is computed, which
+        goes on beside the closures, so that it has a part across them that no motion of the mechanism sees: its product
+        with what they allow, X* times the gradient, is physical. lambda obeys the closures, whose own forces and
+        accelerations add a solve of their rows.
+
         Raises:
-            ValueError: a name that is none of these. UnsupportedError: more than 128 dof.
+            ValueError: a name that is none of these. UnsupportedError: more than 128 dof; loops by multipliers.
         """
         with self._call("forward_dynamics_vjp") as call:
             q, qd = self._read_state(call, q, qd)
@@ -141,11 +152,12 @@ class Adjoints:
         """Gradients of cotangent . tau: J* cotangent of :meth:`inverse_dynamics`, a recursion forwards, one in reverse.
 
         Args and returns: as :meth:`forward_dynamics_vjp`, with "qdd" for "tau"; it must be given if it is in ``wrt``.
+        With loops embedded cotangent is [world, independent dof], and the gradient by qdd zero at other dofs.
         """
         with self._call("inverse_dynamics_vjp") as call:
             q, qd = self._read_state(call, q, qd)
             qdd, body_f = self._read_rate(call, "qdd", qdd), self._read_body_f(call, body_f)
-            cotangent = self._read_rate(call, "cotangent", cotangent, False)
+            cotangent = call.read("cotangent", cotangent, (self.worlds, self._minimal), "[world, dof]")
             given = {"q": q, "qd": qd, "qdd": qdd, "body_f": body_f}
             names, outs = self._gradients(call, "inverse_dynamics", given, wrt, out)
             self._pull("inverse_dynamics", names, outs, {**given, "cotangent": cotangent})
@@ -173,6 +185,8 @@ class Adjoints:
             dqd, dtau, dbody_f: of the arrays' shapes. None is zero and costs nothing.
             qdd: what forward_dynamics gives here, if it is known: saves computing it.
 
+        With loops embedded, directions may leave what the closures allow; see :meth:`forward_dynamics_vjp`.
+
         Returns:
             [world, dof]
         """
@@ -181,7 +195,8 @@ class Adjoints:
             given = {"q": q, "qd": qd, "tau": self._read_rate(call, "tau", tau)}
             given["body_f"] = self._read_body_f(call, body_f)
             qdd = self._accelerations(self._read_rate(call, "qdd", qdd), given)
-            del given["tau"]
+            if self.embedding is None:
+                del given["tau"]
             self._push(call, "forward_dynamics", {**given, "qdd": qdd}, dq, dqd, ("tau", dtau), dbody_f, out)
         return call.result
 
@@ -198,7 +213,10 @@ class Adjoints:
         dbody_f: Any = None,
         out: Any = None,
     ) -> Any:
-        """How tau changes along a direction; as :meth:`forward_dynamics_jvp`, with dqdd for dtau [world, dof]."""
+        """How tau changes along a direction; as :meth:`forward_dynamics_jvp`, with dqdd for dtau [world, dof].
+
+        With loops embedded [world, independent dof].
+        """
         with self._call("inverse_dynamics_jvp") as call:
             q, qd = self._read_state(call, q, qd)
             given = {"q": q, "qd": qd, "qdd": self._read_rate(call, "qdd", qdd)}
@@ -217,6 +235,7 @@ class Adjoints:
         scene, worlds = self.scene, self.worlds
         q, rate = (worlds, scene.coord_count), (worlds, scene.dof_count)
         shapes: dict[str, tuple[int, ...]] = {
+            **dict.fromkeys(("inverse_dynamics", "bias_force", "gravity_force"), (worlds, self._minimal)),
             "body_poses": (worlds, scene.body_count, 7),
             "body_velocities": (worlds, scene.body_count, 6),
             "mass_matrix": (*rate, scene.dof_count),
@@ -229,7 +248,7 @@ class Adjoints:
     def check_gradient(self, operation: str) -> None:
         """Raise UnsupportedError where an operation has no gradient on this scene."""
         call = self._call(f"{operation}, backwards")
-        self._check_size(call)
+        self._check_size(call, operation)
         if operation == "body_poses" and self.scene.dof_count and self.programs.links.turns_vary:
             what = "the gradient of poses where anchors vary"
             raise UnsupportedError(call.name, what, "keep joint_X_p and joint_X_c folded")
@@ -284,7 +303,8 @@ class Adjoints:
             for name, like, array in zip(("q_cotangent", "qd_cotangent"), ("q", "qd"), cotangents, strict=True):
                 arrays[name] = call.read(name, array, self._shape_of(like))
             names, outs = self._gradients(call, "step", arrays, wrt, None)
-            arrays.pop("tau", None)
+            if self.embedding is None:
+                arrays.pop("tau", None)
             self._pull("step", names, outs, arrays)
         return _by_name(names, call.result)
 
@@ -334,22 +354,26 @@ class Adjoints:
         for array, what in (("qd", "qd_dot"), ("qdd", "qdd_dot"), ("body_f", "body_f_dot")):
             if arrays.get(array) is None and arrays.get(what) is not None:
                 raise ValueError(f"{call.name}: d{array} is given and {array} is None; expected both; pass zeros")
-        self._check_size(call)
-        result = call.write(out, (self.worlds, self.scene.dof_count), "[world, dof]")
+        self._check_size(call, operation)
+        rows = self._minimal if operation == "inverse_dynamics" else self.scene.dof_count
+        result = call.write(out, (self.worlds, rows), "[world, dof]")
         self._launch(f"{operation}_jvp", result, **arrays)
 
     def _accelerations(self, qdd: Any, given: dict[str, Any]) -> Any:
         """``qdd``, or what forward dynamics makes it."""
         if qdd is None and self.scene.dof_count:
             qdd = self.recursions.array("qdd of derivatives", self.worlds, self.scene.dof_count)
-            self._run("forward_dynamics", qdd, **given)
+            if self.embedding is None:
+                self._run("forward_dynamics", qdd, **given)
+            else:
+                self._closed_forward_dynamics(qdd, None, **given)
         return qdd
 
     def _gradients(
         self, call: Call, operation: str, given: dict[str, Any], wrt: Sequence[str], out: dict[str, Any] | None
     ) -> tuple[tuple[str, ...], list[wp.array]]:
         """The checked names, and an array for each."""
-        self._check_size(call)
+        self._check_size(call, operation)
         names, out = (wrt,) if isinstance(wrt, str) else tuple(wrt), out or {}
         arguments = ARGUMENTS[operation]
         entering = self.entering(operation)
@@ -401,6 +425,10 @@ class Adjoints:
         """In one kernel; where a warp works on a limb, in one for qdd and lambda and another one for what follows."""
         qdd, cotangent = given["qdd"], given["cotangent"]
         state = {name: given[name] for name in ("q", "qd", "body_f")}
+        if self.embedding is not None:  # whose closures bear what tau leaves, too
+            arrays = {**state, "tau": given["tau"]}
+            self._pull("forward_dynamics", names, outs, {**given, "qdd": self._accelerations(qdd, arrays)})
+            return
         forces = {"tau": given["tau"]} if qdd is None else {"qdd": qdd}
         if self.scene.dof_count == 0 or self.programs.plan.of("forward_dynamics_vjp") != "segment":
             self._pull("forward_dynamics", names, outs, {**state, **forces, "cotangent": cotangent})
@@ -409,17 +437,25 @@ class Adjoints:
         solved = results.pop("tau", None)
         if solved is None:
             solved = self.recursions.array("lambda of derivatives", *shape)
-        if qdd is None and results:
+        asked = qdd is None and bool(results)
+        if asked:
             qdd = self.recursions.array("qdd of derivatives", *shape)
+        if asked and self.programs.plan.few:
             self._launch("forward_dynamics_and_solve", qdd, {"solved": solved}, **state, **forces, cotangent=cotangent)
-        else:
+        else:  # each with less code, of which an instruction cache holds more
+            if asked:
+                self._run("forward_dynamics", qdd, **state, **forces)
             self._run("solve_mass_matrix", solved, q=given["q"], b=cotangent)
         if results:
             self._pull("forward_dynamics", tuple(results), [*results.values()], {**state, "qdd": qdd, "solved": solved})
 
-    def _check_size(self, call: Call) -> None:
-        if self.closed:
-            raise UnsupportedError(call.name, "a derivative with closed loops", "loops='cut' leaves them open")
+    def _check_size(self, call: Call, operation: str = "") -> None:
+        """``operation``: whose derivative is a product."""
+        if self.closed and operation not in (*OF_TREE, *(EMBEDDED if self.embedding is not None else ())):
+            way = "loops='cut' leaves them open"
+            if operation in EMBEDDED:
+                way = f"use loops='embed'; {way}"
+            raise UnsupportedError(call.name, "a derivative with closed loops", way)
         if self.scene.dof_count > MOST_DOFS:
             what = f"a scene of {self.scene.dof_count} dof"
             raise UnsupportedError(call.name, what, f"derivatives are straight-line code, of up to {MOST_DOFS} dof")
@@ -430,6 +466,7 @@ class Adjoints:
     _read_body_f: Any
     _run: Any
     _launch: Any
+    _closed_forward_dynamics: Any
 
 
 def _by_name(names: tuple[str, ...], results: Any) -> dict[str, Any]:

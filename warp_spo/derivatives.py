@@ -7,6 +7,7 @@ about it, in the axes of the parent anchor.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -82,18 +83,23 @@ class Derivatives:
 
         Returns:
             q, qd, tau [world, dof, dof]: column j is the derivative by entry j; q along tangent coordinates, see
-            :mod:`warp_spo.derivatives`. tau is the inverse mass matrix. NaN in worlds where that does not exist.
+            :mod:`warp_spo.derivatives`. tau is the inverse mass matrix, with loops embedded X (X* Mass X)^-1 X*. NaN in
+            worlds where that does not exist.
+
+        Loops that are embedded: row by row, a launch for each dof; see :meth:`forward_dynamics_vjp`.
 
         Raises:
-            UnsupportedError: more than 128 dof.
+            UnsupportedError: more than 128 dof; loops by multipliers.
         """
         with self._call("forward_dynamics_derivatives") as call:
             arrays, outs = self._read_derivative(call, q, qd, "tau", tau, body_f, out)
             qdd = self._accelerations(None, arrays)
-            arrays = {"q": arrays["q"], "qd": arrays["qd"], "qdd": qdd, "body_f": arrays["body_f"]}
-            program, rates = self._tiled("inverse_dynamics_derivatives", (3, *self._square), **arrays)
             n, (by_q, by_qd, inverse) = self.scene.dof_count, outs
-            if n:
+            if self.embedding is not None:
+                self._row_by_row({**arrays, "qdd": qdd}, outs)
+            elif n:
+                arrays = {"q": arrays["q"], "qd": arrays["qd"], "qdd": qdd, "body_f": arrays["body_f"]}
+                program, rates = self._tiled("inverse_dynamics_derivatives", (3, *self._square), **arrays)
                 self._run("mass_matrix_inverse", inverse, q=arrays["q"])
                 inputs = [inverse, rates, program.entry.reshape((3, n, n))]
                 self.recursions.launch(tiles.product, (len(rates), n, n), inputs, [by_q, by_qd])
@@ -126,7 +132,7 @@ class Derivatives:
         self, call: Call, q: Any, qd: Any, name: str, third: Any, body_f: Any, out: Any
     ) -> tuple[dict[str, Any], tuple[wp.array, ...]]:
         """The arguments by name, and the three results."""
-        self._check_size(call)
+        self._check_size(call, "forward_dynamics" if name == "tau" else "")
         if not isinstance(out, tuple | list) or len(out) != 3:
             raise TypeError(f"{call.name}: out is {out!r}; expected three arrays or None, (q, qd, {name})")
         q, qd = self._read_state(call, q, qd)
@@ -136,6 +142,19 @@ class Derivatives:
             call.write(array, shape, "[world, dof, dof]", name=f"out[{i}]") for i, array in enumerate(out)
         )
         return {"q": q, "qd": qd, name: third, "body_f": body_f}, outs
+
+    def _row_by_row(self, given: dict[str, Any], outs: Sequence[wp.array]) -> None:
+        """Derivatives of forward dynamics by the way back from each of its results."""
+        shape = self.worlds, self.scene.dof_count
+        names = "tangent", "qd", "tau"
+        rows = [self.recursions.array(f"row by {name}", *shape) for name in names]
+        unit = self.recursions.array("unit cotangent", *shape)
+        for dof in range(self.scene.dof_count):
+            unit.zero_()
+            unit[:, dof].fill_(1.0)
+            self._pull("forward_dynamics", names, rows, {**given, "cotangent": unit})
+            for row, out in zip(rows, outs, strict=True):
+                wp.copy(out[:, dof], row)
 
     def _tiled(self, operation: str, shape: tuple[int, ...], **given: Any) -> tuple[Any, Any]:
         """Run a program whose result, of ``shape`` in a world, is left in tiles."""
@@ -164,3 +183,5 @@ class Derivatives:
     _run: Any
     _accelerations: Any
     _check_size: Any
+    _pull: Any
+    embedding: Any

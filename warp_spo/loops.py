@@ -37,6 +37,11 @@ EMBEDDED = (
     "com_jacobian",
     "centroidal_momentum_matrix",
     "centroidal_momentum_bias",
+    "forward_dynamics_vjp",
+    "forward_dynamics_jvp",
+    "inverse_dynamics_vjp",
+    "inverse_dynamics_jvp",
+    "step_vjp",
 )
 """Operations that have a form of their own where loops are embedded, most of them in the independent dofs."""
 OF_TREES = {

@@ -75,6 +75,11 @@ TREE_ONLY = (
     "embedded_com_jacobian",
     "embedded_centroidal_momentum_matrix",
     "embedded_centroidal_momentum_bias",
+    "embedded_forward_dynamics_vjp",
+    "embedded_forward_dynamics_jvp",
+    "embedded_inverse_dynamics_vjp",
+    "embedded_inverse_dynamics_jvp",
+    "embedded_step_vjp",
     "closure_error",
     "project_position",
     "project_velocity",
@@ -118,6 +123,11 @@ class Plan:
     apart: bool = False
 
     @property
+    def few(self) -> bool:
+        """So few worlds that a GPU waits for latency, not for instructions."""
+        return self.worlds <= FEW_WORLDS
+
+    @property
     def inward(self) -> tuple[tuple[int, int], ...]:
         """The levels from the deepest to the roots."""
         return self.outward[::-1]
@@ -136,7 +146,7 @@ class Plan:
             return self.granularity
         if operation in (*LONG_RESULTS, "step"):  # of a step a thread holds too little even of a dozen dofs
             return "segment"
-        if self.granularity == "segment" and self.worlds > FEW_WORLDS:
+        if self.granularity == "segment" and not self.few:
             if operation in SHORT or (operation == "solve_mass_matrix" and self.dofs <= SOLVES[self.dtype]):
                 return "tree"
         return self.granularity

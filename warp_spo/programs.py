@@ -20,10 +20,9 @@ from .levels import Recursions
 from .parts import DOF_VALUES
 from .plan import MOST_WARPS, SHARED, TREE_ONLY, Plan
 from .recursions import messages
-from .recursions.adjoints import Adjoints
+from .recursions.embedded_adjoints import EmbeddedAdjoints
 from .recursions.links import TABLES, Links
 from .recursions.messages import INWARD, OUTWARD, SENDS
-from .recursions.minimal import Minimal
 from .recursions.multipliers import Multipliers
 from .recursions.operators import meet, written
 from .recursions.pieces import Pieces
@@ -49,8 +48,6 @@ TILES = ("inverse_dynamics_derivatives", "mass_matrix_derivative")
 """Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
 REGISTERS, MOST_REGISTERS = 65536, 255  # of a multiprocessor, and of a thread
 THREE, ENOUGH = 3, 168  # blocks on it, and registers of a thread that the solution by limbs needs for that
-APART = ("forward_dynamics", "forward_dynamics_and_solve")
-"""Operations that can take velocity terms first."""
 PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
 SHORT_ROW = 36  # entries of a result that a thread writes by itself
 LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
@@ -58,7 +55,7 @@ FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
 
 
-class Traces(Adjoints, Minimal, Multipliers):
+class Traces(EmbeddedAdjoints, Multipliers):
     """Every operation that is traced."""
 
 
@@ -185,8 +182,8 @@ class Programs:
         shared = self.plan.of(operation) == "segment" and messages.shared(operation, shapes, options.get("wrt", ()))
         if operation == "step":
             shared = shared and by_pieces(self.run.scene, shapes, options.get("how"))
-        if operation in APART and self.plan.apart and "qd" in shapes:
-            operation += "_apart"
+        if operation == "forward_dynamics" and self.plan.apart and "qd" in shapes:
+            operation = "forward_dynamics_apart"
         if shared:
             pieces = Pieces(links)
             several = 1 < pieces.warps <= MOST_WARPS
@@ -268,7 +265,7 @@ class Programs:
                      sum(each.operations for each in {emitter, checking, later}))
         cuda = team.cuda()  # fills the tables
         registers, three = (REGISTERS // (blocks * frame.block) // 8 * 8 for blocks in (1, THREE))
-        if operation.endswith("_apart") and dtype == "float32" and three >= ENOUGH:
+        if operation == "forward_dynamics_apart" and dtype == "float32" and three >= ENOUGH:
             registers = three
         lists = {"place": table, "table": team.table, "shifts": team.shifts}
         tables = {name: values for name, values in lists.items() if values}

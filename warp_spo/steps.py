@@ -64,7 +64,8 @@ class Steps:
         Where Dynamics closes loops, accelerations obey them, with all of the above on every dof, those that a loop
         moves among them; then q', and qd' there, take two of Newton's steps onto the closures, which leave
         O((h rate)^6), 1e-10 at 1 ms and 30 rad/s. An open state is drawn together in a few steps; ``project`` closes
-        it at once. With loops embedded all of this is one kernel. loops="multipliers" takes a launch for each part, and
+        it at once. With loops embedded all of this is one kernel, and gradients are exact through rollouts: the way
+        back onto the closures is part of them. loops="multipliers" takes a launch for each part, has no gradient, and
         no law that bends (limits, friction, effort and velocity limits): UnsupportedError.
 
         Args:

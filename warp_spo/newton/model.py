@@ -1,4 +1,4 @@
-"""Scenes from Newton: a finalized ``newton.Model``, or a robot file read by Newton's importers.
+"""Scenes from a finalized ``newton.Model``.
 
 Newton keeps all worlds in flat float32 arrays. :func:`from_newton` finds the rows of each world, checks that all worlds
 have one topology, and copies world 0 into a :class:`Scene`; values that differ between worlds stay one per world.
@@ -7,11 +7,8 @@ Nothing is assumed about the order of bodies and joints: a body's hinge is found
 
 from __future__ import annotations
 
-import os
 import warnings
-from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import ParseError
 
 import newton
 import numpy as np
@@ -19,16 +16,6 @@ from newton import JointType
 
 from ..errors import DirectedLoopError, UnsupportedError
 from ..parts import DOF_VALUES, UNLIMITED, Body, Coupling, Hinge, Loop
-from ..robot_files import (
-    MISREAD,
-    mjcf_gravity,
-    mjcf_misread,
-    mjcf_source,
-    mjcf_tree,
-    mjcf_weighs_by_mesh,
-    robot_format,
-    urdf_source,
-)
 from ..scene import Scene
 
 KINDS = {
@@ -43,28 +30,7 @@ KINDS = {
 ROUNDING = 1e-3  # relative: a quaternion or axis nearer than this to unit length is a rounded unit vector
 ASYMMETRY = 1e-6  # relative: R I R^T in float32 leaves a few 1e-7
 OBLIQUE = 1e-3  # cosine: D6 axes nearer than this to a right angle are orthogonal up to a file's digits
-REPAIR = 1e-5  # relative: an inertia that finalize moved by more was repaired, not rounded
 
-SHIPPED = {
-    "humanoid": "nv_humanoid.xml",
-    "ant": "nv_ant.xml",
-    "quadruped": "quadruped.urdf",
-    "cartpole": "cartpole.urdf",
-}
-
-
-def shipped(name: str) -> Path:
-    """Path of a robot that comes with Newton: "humanoid", "ant", "quadruped" or "cartpole".
-
-    Raises:
-        ValueError: another name.
-    """
-    if name not in SHIPPED:
-        raise ValueError(f"shipped: unknown robot {name!r}; expected one of {', '.join(SHIPPED)}, or load(path)")
-    return Path(newton.__file__).parent / "examples" / "assets" / SHIPPED[name]
-
-
-# -- a model -----------------------------------------------------------------------------------------------------------
 def from_newton(model: newton.Model) -> Scene:
     """The scene of a finalized model.
 
@@ -91,13 +57,13 @@ def from_newton(model: newton.Model) -> Scene:
     if not isinstance(model, newton.Model):
         raise TypeError(f"from_newton: got {type(model).__name__}; expected newton.Model, from ModelBuilder.finalize()")
     _refuse_what_no_scene_holds(model)
-    worlds = _Worlds(model)
+    worlds = Worlds(model)
     worlds.check_equal()
 
     # Flat entries of q and qd that each world's hinges own.
     q_index, dof_index = _entries(worlds.q_start, worlds.hinges), _entries(worlds.qd_start, worlds.hinges)
 
-    read = lambda name, rows: _host(model, name)[rows].astype(np.float64)  # noqa: E731
+    read = lambda name, rows: host(model, name)[rows].astype(np.float64)  # noqa: E731
     values = {name: read(name, worlds.bodies) for name in ("body_mass", "body_com", "body_inertia")}
     values["body_inertia"] = _symmetric(values["body_inertia"])
     values |= {name: _unit_pose(read(name, worlds.hinges)) for name in ("joint_X_p", "joint_X_c")}
@@ -105,7 +71,7 @@ def from_newton(model: newton.Model) -> Scene:
     for name in ("joint_limit_lower", "joint_limit_upper", "joint_effort_limit", "joint_velocity_limit"):
         values[name] = values[name].clip(-UNLIMITED, UNLIMITED)  # USD files give infinities
     values["joint_rest_q"] = read("joint_rest_q", q_index)
-    gravity = _host(model, "gravity").astype(np.float64) + 0.0  # no -0.0
+    gravity = host(model, "gravity").astype(np.float64) + 0.0  # no -0.0
     values["gravity"] = gravity[: worlds.count] if worlds.declared else gravity[-1:]  # last: bodies outside worlds
 
     body_labels = worlds.labels(model.body_label, worlds.bodies)
@@ -132,7 +98,7 @@ def from_newton(model: newton.Model) -> Scene:
     try:
         scene = Scene(bodies, hinges, values["gravity"][0], loops, couplings)
     except DirectedLoopError as error:
-        names = _names([body_labels[body] for body in error.cycle])
+        names = names_of([body_labels[body] for body in error.cycle])
         raise DirectedLoopError(f"from_newton, the joints of bodies {names}", error.cycle) from None
     differing = {name: array for name, array in values.items() if (array != array[:1]).any()}
     scene = scene.with_values(**differing)
@@ -142,7 +108,7 @@ def from_newton(model: newton.Model) -> Scene:
 
 def _refuse_what_no_scene_holds(model: newton.Model) -> None:
     def refuse(what: str, labels: list[str], way_out: str) -> None:
-        raise UnsupportedError("from_newton", f"{what} {_names(labels)}".rstrip(), way_out)
+        raise UnsupportedError("from_newton", f"{what} {names_of(labels)}".rstrip(), way_out)
 
     if model.tendon_count:
         refuse("a model with tendons:", list(model.tendon_label), "build it without them")
@@ -152,7 +118,7 @@ def _refuse_what_no_scene_holds(model: newton.Model) -> None:
         refuse("a model with MuJoCo tendons (model.mujoco.tendon_*):", labels, "remove <tendon> from the file")
     if model.custom_frequency_counts.get("mujoco:equality_constraint", 0):
         # target_kind 0: no loop joint and no mimic stands for the row
-        lost = (_host(mujoco, "equality_constraint_target_kind") == 0) & _host(mujoco, "equality_constraint_enabled")
+        lost = (host(mujoco, "equality_constraint_target_kind") == 0) & host(mujoco, "equality_constraint_enabled")
         labels = [str(mujoco.equality_constraint_label[row]) for row in np.flatnonzero(lost)]
         if labels:
             refuse(
@@ -161,7 +127,7 @@ def _refuse_what_no_scene_holds(model: newton.Model) -> None:
                 "import with convert_mjc_equality_constraints=True, or remove it from the file",
             )
     if model.joint_count:
-        for joint, kind in enumerate(_host(model, "joint_type")):
+        for joint, kind in enumerate(host(model, "joint_type")):
             if kind not in KINDS:
                 refuse(
                     f"a {JointType(kind).name} joint:",
@@ -170,19 +136,19 @@ def _refuse_what_no_scene_holds(model: newton.Model) -> None:
                 )
 
 
-class _Worlds:
+class Worlds:
     """Rows of a model's flat arrays by world: ``bodies``, ``hinges`` and ``loops``, each [world, n]."""
 
     def __init__(self, model: newton.Model):
         if model.body_count == 0:
             raise ValueError("from_newton: the model has no bodies; expected one or more")
         self.model = model
-        read = lambda name: _host(model, f"joint_{name}") if model.joint_count else np.zeros(0, dtype=int)  # noqa: E731
+        read = lambda name: host(model, f"joint_{name}") if model.joint_count else np.zeros(0, dtype=int)  # noqa: E731
         self.type, self.parent, self.child = read("type"), read("parent"), read("child")
         self.articulation, self.enabled = read("articulation"), read("enabled").astype(bool)
         self.dof_dim, self.X_p, self.X_c = read("dof_dim"), read("X_p"), read("X_c")
         self.q_start, self.qd_start = read("q_start"), read("qd_start")
-        self.axis = _host(model, "joint_axis") if model.joint_dof_count else np.zeros((0, 3))
+        self.axis = host(model, "joint_axis") if model.joint_dof_count else np.zeros((0, 3))
         body_world = self._world_of_bodies()
         joint_world = body_world[self.child]
         is_hinge = self._carries()
@@ -216,7 +182,7 @@ class _Worlds:
         self.hinge_slot[self.hinges] = np.arange(self.hinges.shape[1])
 
     def _world_of_bodies(self) -> np.ndarray:
-        world = _host(self.model, "body_world")
+        world = host(self.model, "body_world")
         outside = np.flatnonzero(world < 0)
         self.declared = len(outside) < len(world)
         if not self.declared:
@@ -240,7 +206,7 @@ class _Worlds:
         if len(lost):
             raise UnsupportedError(
                 "from_newton",
-                f"a body that is the child of no joint ({_names([self.model.body_label[body] for body in lost])})",
+                f"a body that is the child of no joint ({names_of([self.model.body_label[body] for body in lost])})",
                 "add ModelBuilder.add_joint_free(child=body), or add_joint_fixed if it stands still",
             )
         self.carrier = np.zeros(self.model.body_count, dtype=int)
@@ -273,7 +239,7 @@ class _Worlds:
             "a disabled joint of the tree",
             "enable it, or build the model with a free joint in its place",
         )
-        flags = _host(self.model, "body_flags")[self.child] & int(newton.BodyFlags.KINEMATIC)
+        flags = host(self.model, "body_flags")[self.child] & int(newton.BodyFlags.KINEMATIC)
         refuse(
             is_hinge & (flags != 0) & (self.type != JointType.FIXED),
             "which carries a kinematic body",
@@ -285,12 +251,12 @@ class _Worlds:
         model = self.model
         if model.joint_count == 0:
             return np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros((0, 2))
-        reference, coeffs = _host(model, "joint_mimic_joint"), _host(model, "joint_mimic_coeffs").reshape(-1, 2)
+        reference, coeffs = host(model, "joint_mimic_joint"), host(model, "joint_mimic_coeffs").reshape(-1, 2)
         follower = np.flatnonzero(reference >= 0)
         reference, coeffs = reference[follower], coeffs[follower]
         if model.constraint_mimic_count:  # the older, separate list
-            on = _host(model, "constraint_mimic_enabled").astype(bool)
-            old = lambda name: _host(model, f"constraint_mimic_{name}")[on]  # noqa: E731
+            on = host(model, "constraint_mimic_enabled").astype(bool)
+            old = lambda name: host(model, f"constraint_mimic_{name}")[on]  # noqa: E731
             follower, reference = np.append(follower, old("joint0")), np.append(reference, old("joint1"))
             coeffs = np.concatenate([coeffs, np.stack([old("coef0"), old("coef1")], axis=1)])
         return follower.astype(int), reference.astype(int), coeffs.astype(np.float64)
@@ -391,11 +357,11 @@ class _Worlds:
         return rests if own else first
 
 
-def _host(owner: Any, name: str) -> np.ndarray:
+def host(owner: Any, name: str) -> np.ndarray:
     return getattr(owner, name).numpy()
 
 
-def _names(labels: list[str]) -> str:
+def names_of(labels: list[str]) -> str:
     return ", ".join(repr(label) for label in labels[:8]) + (f" and {len(labels) - 8} more" if len(labels) > 8 else "")
 
 
@@ -437,120 +403,3 @@ def _drop_distance_limits(label: str, values: dict[str, np.ndarray], dofs: slice
             stacklevel=3,
         )
     values["joint_limit_lower"][:, dofs], values["joint_limit_upper"][:, dofs] = -UNLIMITED, UNLIMITED
-
-
-# -- a file ------------------------------------------------------------------------------------------------------------
-def load(path: str | os.PathLike, floating: bool | None = None) -> Scene:
-    """The scene of a robot file: URDF (.urdf), MJCF (.xml, .mjcf) or USD (.usd, .usda, .usdc, .usdz).
-
-    Visuals and collision shapes are skipped, so meshes are read only where a body that moves takes its mass from them.
-
-    Args:
-        path: the file.
-        floating: whether the root body floats (True) or is fixed to the world (False); None: as the format says (URDF:
-            fixed, MJCF: as its joints say, USD: floating unless a joint holds it).
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: a suffix, or contents, that no importer reads.
-        ImportError: a package for meshes or USD is missing; names the extra that installs it.
-        UnsupportedError, DirectedLoopError: as :func:`from_newton`.
-        UnsupportedError: MJCF that Newton 1.8 misreads: in one body a slide after a hinge or joints with different
-            ``pos``, a joint's ``ref``, ``shellinertia`` where shapes give the mass, ``settotalmass``.
-
-    Warns:
-        UserWarning: Newton replaced a mass or an inertia that no rigid body has; names the bodies.
-    """
-    file = Path(path)
-    importer = robot_format(file)
-    try:
-        builder = {"urdf": _read_urdf, "mjcf": _read_mjcf, "usd": _read_usd}[importer](file, floating)
-    except ParseError as error:
-        raise ValueError(f"load: {str(file)!r} is not XML: {error}; expected {importer.upper()}") from None
-    except ImportError as error:
-        extra = "usd" if importer == "usd" else "meshes"
-        reason = "USD" if importer == "usd" else "a body that moves has no <inertial>, and meshes that give its mass"
-        raise ImportError(
-            f"load: {str(file)!r} needs a package that is missing ({error}) to read {reason}; "
-            f"pip install warp_spo[{extra}]"
-        ) from error
-    return from_newton(_finalize(builder))
-
-
-def _finalize(builder: newton.ModelBuilder) -> newton.Model:
-    """The model on the CPU; a warning that names the bodies replaces Newton's, which counts them."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Inertia validation corrected", category=newton.NewtonWarning)
-        # from_newton checks the topology itself, and takes joints outside articulations, which USD files have
-        model = builder.finalize(device="cpu", skip_validation_joints=True)
-    if builder.body_count == 0:
-        return model
-    before, after = np.array(builder.body_inertia, dtype=np.float64).reshape(-1, 3, 3), _host(model, "body_inertia")
-    scale = np.maximum(np.abs(before).max(axis=(1, 2)), np.finfo(np.float32).tiny)
-    moved = np.abs(after - before).max(axis=(1, 2)) > REPAIR * scale
-    moved |= ~np.isclose(builder.body_mass, _host(model, "body_mass"), rtol=REPAIR, atol=0.0)
-    if moved.any():
-        names = _names([builder.body_label[body] for body in np.flatnonzero(moved)])
-        warnings.warn(
-            f"load: Newton replaced the mass or inertia of {names}: as written no rigid body has them "
-            "(negative, or one principal moment above the sum of the others); correct the file",
-            UserWarning,
-            stacklevel=3,
-        )
-    return model
-
-
-def _read_urdf(file: Path, floating: bool | None) -> newton.ModelBuilder:
-    builder = newton.ModelBuilder()
-    builder.add_urdf(urdf_source(file, floating), floating=floating)
-    return builder
-
-
-def _read_mjcf(file: Path, floating: bool | None) -> newton.ModelBuilder:
-    root = mjcf_tree(file)
-    misread = mjcf_misread(root, floating)
-    if misread:
-        features = [
-            f"{feature} ({'class' if '<default>' in feature else 'body'} {_names(where)})"
-            for feature, where in misread.items()
-        ]
-        ways_out = dict.fromkeys(MISREAD[feature] for feature in misread)
-        raise UnsupportedError("load", f"{str(file)!r} with {', '.join(features)}", "; ".join(ways_out))
-
-    source, weighs_by_mesh = mjcf_source(file, root), mjcf_weighs_by_mesh(root)
-    if weighs_by_mesh and source != str(file):
-        raise UnsupportedError(
-            "load",
-            f"{str(file)!r} with a default class 'main' beside masses from meshes",
-            "remove class='main', which is what the outermost <default> is, or write the <inertial> of each body",
-        )
-
-    def import_with(parse_mujoco_options: bool) -> newton.ModelBuilder:
-        builder = newton.ModelBuilder()
-        builder.add_mjcf(
-            source,
-            floating=floating,
-            parse_visuals=False,
-            parse_meshes=weighs_by_mesh,
-            parse_mujoco_options=parse_mujoco_options,
-        )
-        return builder
-
-    try:
-        builder = import_with(parse_mujoco_options=True)
-    except ValueError as error:
-        # gymnasium's solver="pgs" is one of MuJoCo's options that Newton 1.8 cannot read; a scene has no such options
-        try:
-            builder = import_with(parse_mujoco_options=False)
-        except ValueError:
-            raise error from None
-    gravity = mjcf_gravity(root)  # which Newton 1.8 does not read
-    if gravity is not None:
-        builder.gravity = gravity
-    return builder
-
-
-def _read_usd(file: Path, floating: bool | None) -> newton.ModelBuilder:
-    builder = newton.ModelBuilder()
-    builder.add_usd(str(file), floating=floating, load_visual_shapes=False, skip_mesh_approximation=True)
-    return builder

@@ -15,7 +15,7 @@ from ..dynamics import Dynamics
 from ..errors import UnsupportedError
 from ..frames import Frame
 from .layout import Layout
-from .model import _host
+from .model import host
 
 
 class Plugs(CouplingInterface):
@@ -107,7 +107,7 @@ class Plugs(CouplingInterface):
         J = dyn.jacobian(q, frames).astype(np.float64)
         poses, minv = dyn.body_poses(q), dyn.mass_matrix_inverse(q).astype(np.float64)
         at = {int(body): divmod(i, scene.body_count) for i, body in enumerate(self._body_rows.ravel())}
-        com, own = _host(self.model, "body_com"), _host(self.model, "body_inertia")
+        com, own = host(self.model, "body_com"), host(self.model, "body_inertia")
         mass, inertia = np.zeros(len(bodies), np.float32), own[bodies].astype(np.float32)
         for i, (body, place) in enumerate(zip(bodies, endpoint_local_pos.numpy(), strict=True)):
             world, k = at[int(body)]

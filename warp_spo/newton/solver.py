@@ -21,7 +21,7 @@ from ..scene import Scene
 from ..steps import INTEGRATORS
 from .layout import Layout
 from .loop_joints import check_loop_joints
-from .model import _host, _Worlds, from_newton
+from .model import Worlds, from_newton, host
 from .plugs import Plugs
 
 DEFAULT_VARIABLE = (
@@ -127,8 +127,8 @@ class SolverSPO(Plugs, SolverBase):
             raise UnsupportedError(
                 "SolverSPO", f"mimic joints: {names}", "loops='embed' closes them, loops='cut' leaves them open"
             )
-        worlds = _Worlds(model)
-        modes = _host(model, "joint_target_mode")[scene.dof_index]
+        worlds = Worlds(model)
+        modes = host(model, "joint_target_mode")[scene.dof_index]
         if (modes != modes[:1]).any():
             raise UnsupportedError("SolverSPO", "joint_target_mode that differs between worlds", "set gains to zero")
         position = np.isin(modes[0], (JointTargetMode.POSITION, JointTargetMode.POSITION_VELOCITY))
@@ -149,7 +149,7 @@ class SolverSPO(Plugs, SolverBase):
         self._driven, self._tracks_rates = bool((position | rate).any()), bool(rate.any())
         bodies, hinges = worlds.bodies, worlds.hinges
         self._body_rows = bodies
-        gravity = np.arange(W) if worlds.declared else np.full(W, len(_host(model, "gravity")) - 1)
+        gravity = np.arange(W) if worlds.declared else np.full(W, len(host(model, "gravity")) - 1)
         self._mask_from = 0 if worlds.declared else -1  # bodies outside worlds go with the last entry of a mask
         layout = lambda rows, *shape: Layout(rows, (*rows.shape[1:], *shape), device)  # noqa: E731
         self._q, self._qd = layout(scene.q_index), layout(scene.dof_index)

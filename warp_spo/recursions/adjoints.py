@@ -17,7 +17,7 @@ from .derivatives import Derivatives
 from .impedance import Impedance
 from .integration import moved
 from .links import BALL, FREE, SCREW_MOTIONS, Link
-from .power import Entry, Power
+from .power import Entry, Power, Ways
 
 COORDINATES = {BALL: 4, FREE: 7}  # of a hinge; of the others one each
 
@@ -99,39 +99,51 @@ class Adjoints(Derivatives):
         links = self.links.links
         dofs = [dof for link in links for dof in link.dofs]
         after = {dof: qd(dof) + h * qdd(dof) for dof in dofs}
-        coordinates, seeds = [], []
+        state = [Store("out", (dof,), rate) for dof, rate in after.items()]
         for link in links:
             self.at(link, "q")
             values = moved(link, self.vector("q"), after.__getitem__, h)
-            coordinates += values
-            seeds += [pushed[0](link.coordinate + c) for c in range(len(values))]
-        ends = [x for x in ordered(coordinates) if x.op == "input" and x.args[0] not in ("qd", "qdd", "dt")]
-        back = reverse(coordinates, [*after.values(), *ends], seeds)
-        along, found = back[: len(dofs)], dict(zip((x.args for x in ends), back[len(dofs) :], strict=True))
-        rates = {dof: pushed[1](dof) + value for dof, value in zip(dofs, along, strict=True)}
+            state += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(values)]
+        state = self.put_back(state)
+        seeds = [pushed[item.array == "out"](item.index[0]) for item in state]
+        results = [item.value for item in state]
+        ends = [x for x in ordered(results, after.values()) if x.op == "input" and x.args[0] != "dt"]
+        back = reverse(results, [*after.values(), *ends], seeds)
+        found = dict(zip((x.args for x in ends), back[len(dofs) :], strict=True))
+        rates = dict(zip(dofs, back, strict=False))
         impedance = Impedance(self.links, h, self.vector("q"), qd, None,
                               self.vector("target_q") if "target_q" in self.given else None, self.vector("target_qd"))
         forces: dict[int, Value] = {}
+        stiff: dict[int, Value] = {}
 
         def stiffened(link: Link) -> Link:
-            armature = []
-            for dof, laws, inertia in zip(link.dofs, impedance.laws(link), link.armature, strict=True):
+            for dof, laws in zip(link.dofs, impedance.laws(link), strict=True):
                 u = h * qdd(dof)
                 forces[dof] = total(law.at(u) for law in laws)
-                armature.append(inertia + h * total(law.piece(u).resistance for law in laws))
+                stiff[dof] = h * total(law.piece(u).resistance for law in laws)
+            armature = (a + stiff[dof] for a, dof in zip(link.armature, link.dofs, strict=True))
             return dataclasses.replace(link, armature=tuple(armature))
 
         self.stiffened = stiffened
-        solved = self.solved(lambda dof: h * rates[dof])
-        power = Power(self, lambda dof: -solved[dof], qdd)
+        solved, tau = self.solved(lambda dof: h * rates[dof]), self.vector("tau")
+        right = {dof: h * rates[dof] - stiff[dof] * solved[dof] for dof in dofs}
+        ways = self.ways(solved, qdd, lambda dof: tau(dof) + forces[dof], right.__getitem__)
         inputs = [x for x in ordered(forces.values()) if x.op == "input"]
-        ways = reverse(forces.values(), inputs, [solved[dof] for dof in forces])
-        for entry, way in [*power.ways.items(), *zip((x.args for x in inputs), ways, strict=True)]:
+        back = reverse(forces.values(), inputs, [solved[dof] for dof in forces])
+        for entry, way in [*ways.items(), *zip((x.args for x in inputs), back, strict=True)]:
             found[entry] = found.get(entry, 0.0) + way
         for dof in dofs:
             found["qd", dof] = found.get(("qd", dof), 0.0) + rates[dof]
             found["tau", dof] = solved[dof]
         return [Store(_named(name, wrt), index, value) for name in wrt for index, value in self.entries(name, found)]
+
+    def put_back(self, stores: list[Store]) -> list[Store]:
+        """A state after a step, "q_out" and "out", with what constrains it seen to."""
+        return stores
+
+    def ways(self, solved: dict[int, Value], qdd: Entry, tau: Entry, right: Entry) -> Ways:
+        """How solved . (tau - Mass qdd - bias_force) changes with what tau does not hold; Mass solved = ``right``."""
+        return Power(self, lambda dof: -solved[dof], qdd).ways
 
     def solved(self, right: str | Entry) -> dict[int, Value]:
         """Mass^-1 times an array, by dof."""
@@ -198,10 +210,15 @@ class Adjoints(Derivatives):
     def _pushed_forward(self) -> dict[int, Value]:
         tau = self.inverse_dynamics()
         outputs = [item.value for item in tau]
-        inputs = [x for x in ordered(outputs) if x.op == "input"]
-        along = self.raw(self.vector("q_dot"))
-        seeds = [along.get(x.args[1], 0.0) if x.args[0] == "q" else self._seed(x) for x in inputs]
-        return {item.index[0]: rate for item, rate in zip(tau, forward(outputs, inputs, seeds), strict=True)}
+        return {item.index[0]: rate for item, rate in zip(tau, self.along(outputs), strict=True)}
+
+    def along(self, outputs: list[Value], still: Iterable[Scalar] = ()) -> list[Value]:
+        """How values change along the direction; what is ``still`` does not."""
+        still = list(still)
+        inputs = [x for x in ordered(outputs, still) if x.op == "input"]
+        raw = self.raw(self.vector("q_dot"))
+        seeds = [raw.get(x.args[1], 0.0) if x.args[0] == "q" else self._seed(x) for x in inputs]
+        return forward(outputs, [*inputs, *still], [*seeds, *[0.0] * len(still)])
 
     def _seed(self, x: Scalar) -> Value:
         name, *index = x.args

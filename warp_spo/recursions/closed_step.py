@@ -48,7 +48,7 @@ class ClosedStep(Step):
         self.margins += swept.margins
         return self.trace.outward_accelerations(swept, self.trace.base)
 
-    def _put_back(self, stores: list[Store]) -> list[Store]:
+    def put_back(self, stores: list[Store]) -> list[Store]:
         """The stores with q' and qd' on the closures."""
         q, qd = ({s.index[0]: s.value for s in stores if s.array == array} for array in ("q_out", "out"))
         for cluster in self.trace.clusters:

@@ -91,11 +91,11 @@ class Tied:
     rows: list[Columns]
     numbers: list[int]  # of the rows, within the cluster
 
-    def accelerations(self, places: dict[int, Placed], qd: Any) -> list[Value]:
-        """Y' qd"""
-        values = [
-            value for _, c in self.cluster.constraints for value in c.acceleration(places, qd, lambda dof: 0.0)
-        ]
+    def accelerations(
+        self, places: dict[int, Placed], qd: Any, qdd: Callable[[int], Value] = lambda dof: 0.0
+    ) -> list[Value]:
+        """Y qdd + Y' qd"""
+        values = [value for _, c in self.cluster.constraints for value in c.acceleration(places, qd, qdd)]
         return [values[i] for i in self.numbers]
 
     def errors(self, places: dict[int, Placed], q: Any) -> list[Value]:

@@ -18,7 +18,6 @@ SENDS = {
     "solve_mass_matrix": "Pza",
     "inverse_dynamics": "z",
     "forward_dynamics_and_solve": "Pzayb",
-    "forward_dynamics_and_solve_apart": "fPzayb",
     "step": "PzaS",
     "forward_dynamics_vjp": "B",
     "inverse_dynamics_vjp": "B",

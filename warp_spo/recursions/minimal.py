@@ -53,6 +53,15 @@ class Minimal(Embedded):
             found |= self.demanded(self.tied(cluster, how, how.dofs))
         return found
 
+    def minimal_accelerations(self, how: Embedding) -> Columns:
+        """X qdd + k by dof, of the independent entries of "qdd"; after the links are placed."""
+        moves, given = "qd" in self.given, self.vector("qdd")
+        qdd = self.minimal_demand(how) if moves else dict.fromkeys(range(self.links.scene.dof_count), 0.0)
+        for free, column in self.minimal_columns(how).items():
+            for dof, x in column.items():
+                qdd[dof] = qdd[dof] + x * given(free)
+        return qdd
+
     def _of_independent(self, how: Embedding, stores: list[Store]) -> list[Store]:
         """What the stores hold per dof, their last index, per independent dof: times X."""
         X = self.minimal_columns(how)
@@ -96,13 +105,8 @@ class Minimal(Embedded):
 
     def embedded_inverse_dynamics(self, how: Embedding) -> list[Store]:
         """out [independent dof] = X* (Mass qdd + bias_force); of ``qdd`` the independent entries are read."""
-        moves, given = "qd" in self.given, self.vector("qdd")
-        self.place_links(moves)
-        X = self.minimal_columns(how)
-        qdd = self.minimal_demand(how) if moves else dict.fromkeys(range(self.links.scene.dof_count), 0.0)
-        for free, column in X.items():
-            for dof, x in column.items():
-                qdd[dof] = qdd[dof] + x * given(free)
+        self.place_links("qd" in self.given)
+        X, qdd = self.minimal_columns(how), self.minimal_accelerations(how)
         tau = {item.index[0]: item.value for item in self.inverse_dynamics(qdd=qdd.__getitem__)}
         return [
             Store("out", (i,), total(x * tau[dof] for dof, x in X[free].items())) for i, free in enumerate(how.dofs)

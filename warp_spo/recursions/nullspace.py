@@ -8,6 +8,7 @@ alone the rows are dependent, and NaN says so.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from ..trace.graph import Value, absolute, guarded, is_constant, reciprocal, select, sqrt
@@ -53,6 +54,7 @@ class NullSpace:
     """
 
     def __init__(self, rows: list[dict[int, Value]], sizes: list[Value], columns: list[int], epsilon: float):
+        self._columns = columns
         self._steps: list[tuple[int, int, Value, Reflection | None]] = []  # row, column, 1 / L, reflection
         self._rows = [{c: x for c, x in row.items() if not _vanishes(x)} for row in rows]
         self.margins: list[Value] = []
@@ -98,6 +100,17 @@ class NullSpace:
             known = total(self._rows[row].get(column, 0.0) * x for column, x in found.items())
             found[pivot] = (right[row] - known) * inverse
         return self._turned(found)
+
+    def multipliers(self, force: Callable[[int], Value]) -> list[Value]:
+        """What Y* has to be times, by row, to give the part of a force, by column, that X* does not see."""
+        x = {column: force(column) for column in self._columns}
+        for _, _, _, reflection in self._steps:
+            x = x if reflection is None else reflection.apply(x)
+        found: dict[int, Value] = {}
+        for row, pivot, inverse, _ in reversed(self._steps):
+            known = total(self._rows[other].get(pivot, 0.0) * y for other, y in found.items())
+            found[row] = (x[pivot] - known) * inverse
+        return [found[row] for row in range(len(found))]
 
 
 def _vanishes(x: Value) -> bool:

@@ -87,11 +87,12 @@ class Power:
 
     Attributes:
         ways: how it changes with entries of "q", "qd", "qdd", "body_f" and of the scene's values, each by the name and
-            the index of that input. stores: what other pieces need of it.
+            the index of that input. stores: what other pieces need of it. forces: tau, by dof.
     """
 
     def __init__(self, trace: Trace, multiplier: Entry, qdd: Entry):
         self.trace, self.ways, self.stores = trace, Ways(), list[Store]()
+        self.forces: dict[int, Value] = {}
         self.multiplier, self.qdd = lambda dof: cut(multiplier(dof)), lambda dof: cut(qdd(dof))
         base = Moving(ZERO, *trace.base, ZERO, ZERO)
         seen: dict[int | None, Seen] = {None: Seen(base, Matrix(), turning_of(base))}
@@ -140,6 +141,7 @@ class Power:
         bars, axes = self._back([*_flat(moved), *forces], [*bars[:15], *weights], ends), bars[15:]
         for dof, bar in zip(dofs, bars[15:], strict=False):
             self._add(("qdd", dof), bar)
+        self.forces |= {dof: bar + f for dof, bar, f in zip(dofs, bars[15 + len(dofs) :], forces, strict=True)}
         bars = [*bars[:15], *axes]
 
         turn = self.trace.places[id(link)].pose.turn or ()

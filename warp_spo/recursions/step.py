@@ -83,7 +83,7 @@ class Step:
             stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
             if qdd:
                 stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
-        stores = self._put_back(stores)
+        stores = self.put_back(stores)
         results = [item.value for item in stores]
         if trace.piece is not None:
             trace.news = stores + (self._words(trace.piece, results) if status else [])
@@ -119,7 +119,7 @@ class Step:
             pieces.update(zip(link.dofs, self._pieces(link), strict=True))
         return dict(enumerate(system.solve(lambda dof: self.h * pieces[dof].resistance, tau)))
 
-    def _put_back(self, stores: list[Store]) -> list[Store]:
+    def put_back(self, stores: list[Store]) -> list[Store]:
         """The stores with what constrains the state after the step seen to."""
         return stores
 

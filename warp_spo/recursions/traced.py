@@ -170,15 +170,9 @@ class Trace:
 
     def forward_dynamics_and_solve(self) -> list[Store]:
         """out = Mass^-1 (tau - bias_force), solved = Mass^-1 cotangent, by one factorisation"""
-        return self.forward_dynamics() + self._solved()
-
-    def forward_dynamics_and_solve_apart(self) -> list[Store]:
-        return self.forward_dynamics_apart() + self._solved()
-
-    def _solved(self) -> list[Store]:
-        """solved = Mass^-1 cotangent, by factors that are there"""
+        stores = self.forward_dynamics()
         done, rates, sent = self.reduce(self.vector("cotangent"), moves=False, loads=False, letters="y")
-        return sent + self.expand(done, rates, (ZERO, ZERO), "b", "solved")
+        return stores + sent + self.expand(done, rates, (ZERO, ZERO), "b", "solved")
 
     def factor(self) -> dict[int, articulated.Factor]:
         return self.factors()[0]

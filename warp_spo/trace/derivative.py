@@ -22,11 +22,9 @@ def forward(outputs: Iterable[Value], inputs: Iterable[Scalar], seeds: Iterable[
         inputs: scalars that move by themselves: inputs of the graph, or anything between.
         seeds: one for each input.
     """
-    outputs = list(outputs)
+    outputs, inputs = list(outputs), list(inputs)
     rates: dict[tuple, Value] = {x.key: seed for x, seed in zip(inputs, seeds, strict=True)}
-    for scalar in ordered(outputs):
-        if scalar.key in rates:
-            continue
+    for scalar in ordered(outputs, inputs):
         with _Step(scalar):
             rate: Value = 0.0
             for at, argument in enumerate(scalar.args):
@@ -84,7 +82,7 @@ def partial(scalar: Scalar, at: int) -> Value:
     if op == "quotient":
         return reciprocal(args[1]) if at == 0 else -(scalar * reciprocal(args[1]))
     if op == "absolute":
-        return args[0] * reciprocal(scalar)
+        return select(args[0] + scalar, 1.0, -1.0)  # of zero, too
     if op == "select":
         return select(args[0], 1.0, 0.0) if at == 1 else select(args[0], 0.0, 1.0) if at == 2 else 0.0
     if op == "arctangent":
