@@ -30,7 +30,7 @@ def entries_read(monkeypatch, scene, operation="forward_dynamics", **options):
     dyn = spo.Dynamics(scene, device="cpu", granularity="tree", **options)
     stores = []
     frame = dyn.programs._frame
-    monkeypatch.setattr(dyn.programs, "_frame", lambda *given: stores.extend(given[5]) or frame(*given))
+    monkeypatch.setattr(dyn.programs, "_frame", lambda *given: stores.extend(given[1]) or frame(*given))
     find(dyn, operation)
     symbols = (item.value for item in stores if not isinstance(item.value, float))
     return [s.args for s in ordered(symbols) if s.op == "input" and s.args[0] in dyn.programs.links.tables]

@@ -14,9 +14,9 @@ from robots import ROBOTS
 
 import warp_spo as spo
 from warp_spo import reference
-from warp_spo.programs import _read_before
 from warp_spo.recursions.applications import Applications
 from warp_spo.recursions.links import Links
+from warp_spo.staging import read_before
 from warp_spo.trace.emit import Store
 from warp_spo.trace.evaluate import evaluate
 from warp_spo.trace.graph import Graph
@@ -297,7 +297,7 @@ def test_long_rows_go_through_shared_memory(expression, device, monkeypatch):
 def test_no_result_is_written_over_what_is_still_to_be_read():
     graph = Graph()
     x = [graph.input("x", i) for i in range(2)]
-    before = lambda *stores: _read_before(list(stores), list(stores), "x")  # noqa: E731
+    before = lambda *stores: read_before(list(stores), list(stores), "x")  # noqa: E731
     assert before(Store("out", (0,), x[0] + x[1]), Store("out", (1,), 2.0 * x[1]))
     assert not before(Store("out", (0,), 0.0), Store("out", (1,), x[0] * x[1]))
     early = 3.0 * graph.input("x", 5)

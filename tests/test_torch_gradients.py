@@ -16,8 +16,8 @@ from torch.autograd import gradcheck
 import warp_spo as spo
 from warp_spo import torch as spo_torch
 from warp_spo.plan import MOST_DOFS
-from warp_spo.programs import _read_before
 from warp_spo.recursions.adjoints import Adjoints
+from warp_spo.staging import read_before
 
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
 
@@ -380,7 +380,7 @@ def test_a_result_is_not_written_over_what_is_read_later():
     trace = Adjoints(dyn.programs.links.opened(), "float32", tuple(shapes))
     stores = trace.forward_dynamics_vjp(("tau", "q"))
     first = [item for item in stores if item.array == "out"]
-    free = {name: _read_before(first, stores, name) for name in ("cotangent", "qd", "qdd")}
+    free = {name: read_before(first, stores, name) for name in ("cotangent", "qd", "qdd")}
     del first, stores  # which pytest would write out
     assert free == {"cotangent": True, "qd": False, "qdd": False}
 

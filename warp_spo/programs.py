@@ -7,17 +7,15 @@ table.
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import warp as wp
 
-from . import link_values
+from . import link_values, staging
 from .kernels import straight
 from .kernels.spreading import WARP
-from .kernels.straight import DIRECT, IN_PLACE, INTEGERS, MAPPED, RELAYED, SPREAD, STAGED, TILED, Frame, Result, Row
+from .kernels.straight import DIRECT, INTEGERS, RELAYED, SPREAD, TILED, Frame, Result
 from .levels import Recursions
-from .parts import DOF_VALUES
 from .plan import MOST_WARPS, SHARED, TREE_ONLY, Plan
 from .recursions import messages
 from .recursions.embedded_adjoints import EmbeddedAdjoints
@@ -27,12 +25,10 @@ from .recursions.multipliers import Multipliers
 from .recursions.operators import meet, written
 from .recursions.pieces import Pieces
 from .recursions.step import GAIN, GUESS, LOOPED, MISSED, by_pieces
+from .staging import FIELDS
 from .teams import Passes, Team, Work
 from .trace.emit import PREFIX, Angles, Emitter, Store, literals
-from .trace.graph import Value, is_constant, ordered
 
-FIELDS = (*TABLES, *DOF_VALUES, "joint_rest_q")
-"""Values of the scene as kernels read them, [entry, world]: what links are made of, and Newton's own."""
 TRACED = (
     *SENDS,
     "log_det_mass_matrix",
@@ -49,8 +45,6 @@ TILES = ("inverse_dynamics_derivatives", "mass_matrix_derivative")
 REGISTERS, MOST_REGISTERS = 65536, 255  # of a multiprocessor, and of a thread
 THREE, ENOUGH = 3, 168  # blocks on it, and registers of a thread that the solution by limbs needs for that
 PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
-SHORT_ROW = 36  # entries of a result that a thread writes by itself
-LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
 
@@ -198,13 +192,13 @@ class Programs:
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         outs = [item for item in stores if item.array == "out"]
-        frame = self._frame(outs, shapes, 0, 1, WARP, stores, more)
+        frame = self._frame(outs, stores, shapes, more)
         if operation in TILES:
-            result = Result(TILED, frame.result.array, slots=_solid(stores))
+            result = Result(TILED, frame.result.array, slots=staging.solid(stores))
             frame = frame._replace(staged=self.plan.staged, result=result)
         once = operation == "step" or any(item.array in LOOPED for item in stores)  # may write over what it reads
         frame = frame._replace(again=not once and not frame.staged and frame.result.way in (DIRECT, TILED, RELAYED))
-        placed, table = _placed(outs, frame.result)
+        placed, table = staging.placed(outs, frame.result)
         placed += apart
         emitter, looped = self._emitter(shapes, frame), [item for item in stores if item.array in LOOPED]
         regions = [emitter.region([], trace.ahead), emitter.branch(looped)] if looped else []
@@ -236,18 +230,17 @@ class Programs:
         bends = any(item.array == MISSED for item in everything)
         passes = Passes((GUESS, GAIN), sent if bends else None) if operation == "step" else None
         sent += 2 * pieces.warps if bends else 0
-        frame = self._frame([item for item in everything if item.array == "out"], shapes, sent, pieces.warps,
-                            WARP * pieces.warps, everything, more)
-        if frame.result.way == DIRECT and frame.result.array.entries > LONG_ROW:
+        whole = [item for item in everything if item.array == "out"]
+        frame = self._frame(whole, everything, shapes, more, sent, pieces.warps)
+        if frame.result.way == DIRECT and frame.result.array.entries > staging.LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
         if not frame.fits(self.run.dtype):
             return None  # nor for what limbs tell each other
         team = Team(pieces, dtype, passes)
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
-        whole = [item for item in everything if item.array == "out"]
-        placed, table = _placed(whole, frame.result)
+        placed, table = staging.placed(whole, frame.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
-        by_slot = lambda found: found if table is None else _by_slot(found, table)  # noqa: E731
+        by_slot = lambda found: found if table is None else staging.by_slot(found, table)  # noqa: E731
         for piece, stores, items, (checks, news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
             emitter, checking = self._emitter(shapes, frame), self._emitter(shapes, frame)
             later = self._emitter(shapes, frame) if passes else emitter
@@ -276,7 +269,7 @@ class Programs:
     def _flattened(item: Store, shapes: dict) -> Store:
         if item.array in (INWARD, OUTWARD, *LOOPED):
             return item
-        return item._replace(index=(_flat(item.index, shapes[item.array][1:]),))
+        return item._replace(index=(staging.flat(item.index, shapes[item.array][1:]),))
 
     def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int,
                   registers: int | None = None) -> Program:
@@ -298,6 +291,12 @@ class Programs:
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers or registers)
         return Program(kernel, rows, fields, tuple(held.values()), frame.warps, frame.block, operations, result.slots,
                        entry)
+
+    def _frame(
+        self, stores: list[Store], everything: list[Store], shapes: dict, more: tuple, sent: int = 0, warps: int = 1
+    ) -> Frame:
+        how = self.run.dtype, self.plan.staged, self.relays
+        return staging.frame(stores, everything, shapes, more, sent, warps, *how)
 
     def _emitter(self, shapes: dict, frame: Frame) -> Emitter:
         result = frame.result
@@ -336,62 +335,9 @@ class Programs:
         def flat(array: str, index: tuple) -> int:
             if array in places:
                 return places[array][index[0]]
-            return index[0] if len(index) == 1 else _flat(index, shapes[array][1:])
+            return index[0] if len(index) == 1 else staging.flat(index, shapes[array][1:])
 
         return Emitter(self.run.dtype.__name__, load, store, flat, angles, FIELDS)
-
-    def _frame(self, stores: list[Store], shapes: dict, sent: int, warps: int, block: int,
-               everything: list[Store] | None = None, more: tuple = ()) -> Frame:
-        """How rows come in and the result, of flat ``stores``, goes out: through shared memory where it has room."""
-        used = _reads(everything or stores)
-        rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used and shape]
-        numbers = tuple(name for name, shape in shapes.items() if name in used and not shape)
-        out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
-        dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
-        over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
-        over = [name for name in over if _read_before(stores, everything or stores, name)]
-        slots = _solid(stores)
-        fields = {name: tuple(sorted(used[name])) for name in FIELDS if name in used}
-        held = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
-        staged, ways = self.plan.staged, [(False, Result(DIRECT, out))]
-        staged = staged or any(row.name in ("x", "body_f") and row.entries > SHORT_ROW for row in rows)
-        if dense and (staged or out.entries > SHORT_ROW):
-            ways = [(staged, Result(STAGED, out)), (False, Result(STAGED, out)), *ways]
-        if dense and staged:
-            ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), *ways]
-        if out.entries > LONG_ROW and not (dense and staged and over == ["x"]):
-            mapped = Result(MAPPED, out, slots=slots)
-            ways = [(staged, mapped), (False, mapped), *ways]
-            if self.relays and _apart(rows, out):
-                ways.insert(-1, (False, Result(RELAYED, out, slots=slots)))
-        further = tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more)
-        frames = [
-            Frame(rows, staged, list(fields), result, sent, warps, block, further, gathered, False, entries, numbers)
-            for staged, result in ways
-            for gathered in ((True, False) if further and result.way in (IN_PLACE, STAGED) else (False,))
-            for entries in held[::-1]
-        ]
-        return next((frame for frame in frames if frame.fits(self.run.dtype)), frames[-1])
-
-
-def _apart(rows: list[Row], out: Row) -> bool:
-    """No row is the result's array, so that it can be written before all is read."""
-    return all(row.entries != out.entries for row in rows)
-
-
-def _read_before(stores: list[Store], everything: list[Store], row: str) -> bool:
-    """Every entry of ``row`` that is read at all is read before the same entry of the result is written over it."""
-    graphs: dict[int, list[Value]] = {}  # of pieces, which write their own entries when all others have read
-    for item in everything:
-        if not is_constant(item.value):
-            graphs.setdefault(id(item.value.graph), []).append(item.value)
-    for symbols in graphs.values():
-        read = {s.args[1]: s.number for s in ordered(symbols) if s.op == "input" and s.args[0] == row}
-        done = {item.index[0]: item.value.number if not is_constant(item.value) else -1 for item in stores
-                if is_constant(item.value) or item.value.graph is symbols[0].graph}
-        if any(number > done.get(entry, number) for entry, number in read.items()):
-            return False
-    return True
 
 
 def _called(key: tuple) -> str:
@@ -400,57 +346,3 @@ def _called(key: tuple) -> str:
         return written(key[-1])
     without_qdd = {("q",): "gravity_force", ("q", "qd"): "bias_force", ("q", "qd", "body_f"): "bias_force"}
     return without_qdd.get(key[1], key[0]) if key[0] == "inverse_dynamics" else key[0]
-
-
-def _placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int] | None]:
-    """Flat stores as the result wants them, and the slot of each entry, -1 being zero, where values are numbered."""
-    out = result.array
-    if result.way in (*SPREAD, TILED):
-        slots: dict[Any, int] = {}
-        table = [-1] * out.entries
-        for item in stores:
-            if not _is_zero(item.value):
-                table[item.index[0]] = slots.setdefault(_name(item.value), len(slots))
-        return _by_slot(stores, table), table
-    done = {item.index for item in stores}
-    return stores + [Store("out", (i,), 0.0) for i in range(out.entries) if (i,) not in done], None
-
-
-def _by_slot(stores: list[Store], table: list[int]) -> list[Store]:
-    values = {table[item.index[0]]: item.value for item in stores if table[item.index[0]] >= 0}
-    return [Store("out", (slot,), value) for slot, value in sorted(values.items())]
-
-
-def _solid(stores: list[Store]) -> int:
-    """Different values that are not the constant zero."""
-    return len({_name(item.value) for item in stores if not _is_zero(item.value)})
-
-
-def _is_zero(value: Value) -> bool:
-    return is_constant(value) and value == 0.0
-
-
-def _name(value: Value) -> Any:
-    return value if is_constant(value) else (id(value.graph), value.key)
-
-
-def _flat(index: tuple, shape: tuple) -> int:
-    at = 0
-    for i, size in zip(index, shape, strict=True):
-        at = at * size + i
-    return at
-
-
-def _reads(stores: list[Store]) -> dict[str, set[int]]:
-    """Names of the arrays that are read, and which first indices."""
-    graphs: dict[int, list[Value]] = {}
-    for item in stores:
-        if not is_constant(item.value):
-            graphs.setdefault(id(item.value.graph), []).append(item.value)
-    read: dict[str, set[int]] = {}
-    for values in graphs.values():
-        for scalar in ordered(values):
-            if scalar.op == "input":
-                array, index = scalar.args[:2]
-                read.setdefault(array, set()).add(index)
-    return read
