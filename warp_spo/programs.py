@@ -42,7 +42,8 @@ TRACED = (
 )
 TILES = ("inverse_dynamics_derivatives", "mass_matrix_derivative")
 """Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
-REGISTERS, MOST_REGISTERS = 65536, 255  # of a multiprocessor, and of a thread
+REGISTERS, PARTS = 65536, 4  # of a multiprocessor
+MOST_REGISTERS = 255  # of a thread
 THREE, ENOUGH = 3, 168  # blocks on it, and registers of a thread that the solution by limbs needs for that
 PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
@@ -257,7 +258,7 @@ class Programs:
             team.add(Work(piece, *regions, checking.region(checks), *branches),
                      sum(each.operations for each in {emitter, checking, later}))
         cuda = team.cuda()  # fills the tables
-        registers, three = (REGISTERS // (blocks * frame.block) // 8 * 8 for blocks in (1, THREE))
+        registers, three = (_registers(blocks * pieces.warps) for blocks in (1, THREE))
         if operation == "forward_dynamics_apart" and dtype == "float32" and three >= ENOUGH:
             registers = three
         lists = {"place": table, "table": team.table, "shifts": team.shifts}
@@ -338,6 +339,11 @@ class Programs:
             return index[0] if len(index) == 1 else staging.flat(index, shapes[array][1:])
 
         return Emitter(self.run.dtype.__name__, load, store, flat, angles, FIELDS)
+
+
+def _registers(warps: int) -> int:
+    """Of a thread, if a multiprocessor is to hold so many warps: its parts share them, each with its own registers."""
+    return REGISTERS // PARTS // (WARP * -(-warps // PARTS)) // 8 * 8
 
 
 def _called(key: tuple) -> str:
