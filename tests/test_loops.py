@@ -672,6 +672,8 @@ def test_mistakes_are_explained(device):
         make("cut", independent=[0])
     with pytest.raises(ValueError, match="names 'knee'; expected dofs"):
         make(independent=["knee"])
+    with pytest.raises(ValueError, match=r"names 0\.5; expected dofs"):
+        make(independent=[0.5])
     with pytest.raises(ValueError, match=r"independent names \['crank', 'rocker'\].*expected 1"):
         make(independent=["crank", "rocker"])
     loop = lambda **more: spo.Scene(scene.bodies, scene.hinges, loops=[spo.Loop(**more)])  # noqa: E731

@@ -163,7 +163,7 @@ def _numbers(scene: Scene, asked: Sequence[int | str], call: str) -> set[int]:
     labels, found = scene.dof_labels, set()
     for dof in asked:
         number = labels.index(dof) if isinstance(dof, str) and dof in labels else dof
-        if isinstance(number, str) or not 0 <= number < scene.dof_count:
+        if not isinstance(number, int | np.integer) or not 0 <= number < scene.dof_count:
             raise ValueError(f"{call}: independent names {dof!r}; expected dofs, 0 to {scene.dof_count - 1}, or labels "
                              f"among {', '.join(labels)}")
         found.add(int(number))
