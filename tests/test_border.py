@@ -362,6 +362,19 @@ def test_frames_by_label_index_and_pose_are_the_same(operation, device):
     np.testing.assert_array_equal(run(range(2)), run([0, 1]))
 
 
+def test_a_frame_by_the_end_of_its_label(device):
+    """Importers put paths before what a file calls a body."""
+    labels = "robot/arm", "robot/left/hand", "robot/right/hand"
+    bodies = [spo.Body(1.0, inertia=np.eye(3), label=label) for label in labels]
+    hinges = [spo.Hinge("revolute", parent, child, axis=(1, 0, 0)) for child, parent in enumerate((-1, 0, 0))]
+    dyn = spo.Dynamics(spo.Scene(bodies, hinges), 1, device=device)
+    q = np.ones((1, 3), np.float32)
+    np.testing.assert_array_equal(dyn.jacobian(q, ["arm"]), dyn.jacobian(q, [0]))
+    for label, words in (("hand", "2 bodies have the label 'hand'"), ("arn", "such as 'arm'")):
+        with pytest.raises(ValueError, match=words):
+            dyn.jacobian(q, [label])
+
+
 BAD_FRAMES = {
     "none": (None, ValueError, "frames is None; expected a list of bodies"),
     "empty": ([], ValueError, "frames is []; expected a list of bodies"),

@@ -7,6 +7,7 @@ import laws
 import numpy as np
 import pytest
 import symbolic
+import torch
 import warp as wp
 import zoo
 from allocations import no_warp_allocation
@@ -187,7 +188,7 @@ BUGS = [
     (impedance.Impedance, "_spring", "+ self.ahead(link.dofs[i])", ""),
     (impedance.Impedance, "_limits", "(0.0, None) if inward > 0.0 else (None, 0.0)", "None, None"),
     (impedance.Law, "piece", "select(over, 0.0, resistance)", "resistance"),
-    (impedance.Law, "missed", "self.at(u) - piece.line(u)", "0.0 * u"),
+    (impedance.Law, "missed", "one.at(u) - piece.line(u)", "0.0 * u"),
     (step.Step, "_stiffened", "self.h * piece.resistance", "piece.resistance"),
     (joint_space.JointSpace, "solve", "U[i, j] - column[i]", "U[i, j] + column[i]"),
     (integration, "moved", "+ shift[i]", ""),
@@ -234,6 +235,20 @@ def test_passes_that_states_need():
 
 
 # -- integrators -------------------------------------------------------------------------------------------------------
+def test_a_slope_by_friction_where_there_is_none(device):
+    """Of one dof that moves: a force of -friction, whatever friction is; where an identification starts it is zero."""
+    hinge = spo.Hinge("prismatic", -1, 0, axis=(1, 0, 0))
+    scene = spo.Scene([spo.Body(2.0, inertia=np.eye(3))], [hinge], gravity=(0, 0, 0))
+    for friction in (0.0, 1e-12, 0.5):
+        dyn = spo.Dynamics(scene, 2, device=device, dtype="float64", variable=("joint_friction",))
+        value = torch.full((2, 1), friction, dtype=torch.float64, device=wp.device_to_torch(device), requires_grad=True)
+        dyn.set(joint_friction=value)
+        q, qd = (torch.tensor(x, dtype=torch.float64, device=value.device) for x in ([[0.0], [0.0]], [[1.0], [-10.0]]))
+        rates = dyn.step(q, qd, None, H)[1]
+        rates.sum().backward()
+        np.testing.assert_allclose(value.grad.cpu().numpy(), [[-H / 2.0], [H / 2.0]], rtol=1e-12)
+
+
 def test_float32_settles_on_the_same_pieces(device):
     """Of a stiff law a rounding of u is a force: a velocity limit that may pull a little moves a light link a lot.
 
@@ -400,6 +415,19 @@ def test_mistakes_are_explained(device):
     limited = zoo.single_body("ball").with_values(joint_limit_upper=np.ones(3))
     with pytest.raises(UnsupportedError, match="a limit on 'joint_0:0', a dof of a ball or free hinge"):
         spo.Dynamics(limited, 1, device=device).step(limited.neutral_q[None], np.zeros((1, 3)), None, H)
+
+
+def test_values_and_times_that_no_step_has():
+    scene = slider()
+    for name in ("joint_friction", "joint_effort_limit", "joint_velocity_limit"):
+        with pytest.raises(ValueError, match=f"{name} holds -1"):
+            scene.with_values(**{name: [-1.0]})
+    with pytest.raises(ValueError, match="joint_friction holds -2"):
+        slider(friction=-2.0)
+    dyn = spo.Dynamics(scene, 1, device="cpu")
+    for dt in (0.0, -1e-3, float("nan")):
+        with pytest.raises(ValueError, match=r"dt is .* expected more than zero"):
+            dyn.step(np.zeros((1, 1)), np.zeros((1, 1)), None, dt)
 
 
 def test_a_scene_that_cannot_move(device):

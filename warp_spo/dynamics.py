@@ -60,7 +60,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
             those that have motors: as many as move, those that no loop ties among them. None: they are chosen.
         refine: steps of iterative refinement in forward_dynamics and solve_mass_matrix, which then solve in float32 and
             take the residual in float64. With dtype "float32" the result is right up to its rounding, where the
-            condition of Mass is below 1e9 or so; with "float64" its error is that of float32 to the power refine + 1.
+            condition of Mass is below 1e8 or so; with "float64" its error is that of float32 to the power refine + 1.
 
     Raises:
         ValueError, UnsupportedError: see each argument.

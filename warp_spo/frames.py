@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import operator
 from collections.abc import Sequence
@@ -10,7 +11,7 @@ from typing import Any
 from .parts import IDENTITY_POSE
 from .scene import Scene
 
-Frame = Any  # a body (index or label), or (body, pose in the body)
+Frame = Any  # a body (index, label, or what is behind a label's last slash), or (body, pose in the body)
 
 
 def checked(scene: Scene, call: str, frames: Sequence[Frame]) -> tuple[tuple[int, tuple[float, ...]], ...]:
@@ -28,13 +29,17 @@ def _checked(scene: Scene, call: str, frame: Frame) -> tuple[int, tuple[float, .
     body, pose = frame if isinstance(frame, tuple | list) and len(frame) == 2 else (frame, IDENTITY_POSE)
     labels = scene.body_labels
     if isinstance(body, str):
-        if body not in labels:
-            raise ValueError(f"{call}: no body {body!r} in the scene; expected one of scene.body_labels")
-        if labels.count(body) > 1:
+        found = [at for at, label in enumerate(labels) if label == body]
+        found = found or [at for at, label in enumerate(labels) if label.rpartition("/")[2] == body]
+        if not found:
+            near = difflib.get_close_matches(body, [label.rpartition("/")[2] for label in labels], 3)
+            such = f", such as {', '.join(map(repr, near))}" if near else ""
+            raise ValueError(f"{call}: no body {body!r} in the scene; expected one of scene.body_labels{such}")
+        if len(found) > 1:
             raise ValueError(
-                f"{call}: {labels.count(body)} bodies have the label {body!r}; expected one; pass the body's index"
+                f"{call}: {len(found)} bodies have the label {body!r}; expected one; pass the body's index"
             )
-        body = labels.index(body)
+        body = found[0]
     try:
         body, pose = operator.index(body), tuple(float(number) for number in pose)
     except (TypeError, ValueError):

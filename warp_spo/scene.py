@@ -27,6 +27,13 @@ from .parts import (
 )
 from .tree import Tree
 
+NOT_NEGATIVE = ("body_mass", "joint_armature", "joint_friction", "joint_effort_limit", "joint_velocity_limit")
+
+
+def _refuse_negative(call: str, name: str, array: np.ndarray) -> None:
+    if name in NOT_NEGATIVE and array.size and array.min() < 0.0:
+        raise ValueError(f"{call}: {name} holds {array.min()}; expected zero or more")
+
 
 def _parts(name: str, given: Any, kind: type) -> tuple:
     parts = tuple(given) if isinstance(given, Iterable) else (given,)
@@ -91,6 +98,7 @@ class Scene:
         for name in DOF_VALUES:
             field = name.removeprefix("joint_")
             values[name] = np.concatenate([getattr(hinge, field) for hinge in self.hinges])[None]
+            _refuse_negative("Scene", name, values[name])
         for array in values.values():
             read_only(array)
         self.values = MappingProxyType(values)
@@ -239,8 +247,7 @@ class Scene:
             array[..., 3:] = checked_unit(call, f"the quaternions of {name}", array[..., 3:])
         if name == "body_inertia":
             array = checked_inertia(call, array)
-        if name == "body_mass" and array.min() < 0.0:
-            raise ValueError(f"{call}: body_mass has {array.min()} kg; expected zero or more")
+        _refuse_negative(call, name, array)
         return read_only(array)
 
     def __repr__(self) -> str:

@@ -54,7 +54,9 @@ class Steps:
         * limits: limit_ke (limit - q') where q' is outside, and -limit_kd qd' where q is; they never pull inward.
           Of ball and free hinges: UnsupportedError.
         * dry friction: at most joint_friction against the motion; a hinge that sticks creeps by up to 1e-4 rad/s, m/s.
-        * velocity limit: what a step would exceed it by shrinks about three hundredfold.
+        * velocity limit: a damper on what exceeds it, 300 / dt times the inertia that the hinge feels at the neutral q
+          of world 0, all others being free: there what a step would exceed it by shrinks about three hundredfold, less
+          where the hinge carries more.
 
         Effort and velocity limits of 1e6 and more, Newton's default, bound nothing; position limits of 1e10 neither.
         What is zero or unbounded in the scene has no instruction in the kernel. The forces are implicit, at one
@@ -103,6 +105,8 @@ class Steps:
                 if array is not None and integrator != "semi_implicit":
                     raise ValueError(f"{call.name}: {name} with integrator={integrator!r}; expected 'semi_implicit'")
             dt = _seconds(call.name, dt)
+            if not dt > 0.0:
+                raise ValueError(f"{call.name}: dt is {dt} s; expected more than zero")
             q, qd = self._read_state(call, q, qd, optional=False)
             forces = {
                 "tau": self._read_rate(call, "tau", tau),

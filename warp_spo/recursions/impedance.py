@@ -33,12 +33,16 @@ NOISE = 4.0  # roundings of a law's terms by which two of its pieces may differ 
 
 
 class Law(NamedTuple):
-    """f(u) = force - resistance u, not below ``least`` and not above ``most`` (None: unbounded)."""
+    """f(u) = scale (force - resistance u), that not below ``least`` and not above ``most`` (None: unbounded).
+
+    ``scale``, not below zero, has no say in which piece holds: where it vanishes, slopes by it are those of the piece.
+    """
 
     force: Value
     resistance: Value
     least: Value | None = None
     most: Value | None = None
+    scale: Value = 1.0
 
     @property
     def bends(self) -> bool:
@@ -56,7 +60,7 @@ class Law(NamedTuple):
 
     def at(self, u: Value) -> Value:
         """The force itself."""
-        return self.bounded(self.line(u))
+        return self.scale * self.bounded(self.line(u))
 
     def piece(self, u: Value) -> Law:
         """The piece that holds at ``u``, as a law that does not bend."""
@@ -70,15 +74,16 @@ class Law(NamedTuple):
         if self.least is not None:
             under = less(line, self.least)
             force, resistance = select(under, self.least, force), select(under, 0.0, resistance)
-        return Law(force, resistance)
+        return Law(self.scale * force, self.scale * resistance)
 
     def missed(self, guess: Value, u: Value, epsilon: float) -> Value:
         """Not 0 where the piece that was taken at ``guess`` is not the law at ``u``, by more than rounding."""
         if not self.bends:
             return 0.0
-        piece = self.piece(guess)
+        one = self._replace(scale=1.0)
+        piece = one.piece(guess)
         size = absolute(piece.force) + absolute(piece.resistance * u)
-        return less(NOISE * epsilon * size, absolute(self.at(u) - piece.line(u)))
+        return less(NOISE * epsilon * size, absolute(one.at(u) - piece.line(u)))
 
     def skipped(self, guess: Value, u: Value) -> Value:
         """Not 0 where the way from ``guess`` to ``u`` leads from one bound to the other."""
@@ -226,7 +231,7 @@ class Impedance:
     def _friction(self, dof: int) -> list[Law]:
         """A force of at most ``joint_friction`` against the motion; below CREEP, as a damper."""
         f = self.value("joint_friction", dof)
-        return [] if _is(f, 0.0) else [Law(-(f * (1.0 / CREEP)) * self.qd(dof), f * (1.0 / CREEP), -f, f)]
+        return [] if _is(f, 0.0) else [Law(-(1.0 / CREEP) * self.qd(dof), 1.0 / CREEP, -1.0, 1.0, f)]
 
     def _rate_limit(self, dof: int) -> list[Law]:
         """Dampers on what exceeds the velocity limit, HOLD times as heavy as the inertia is in a step."""
