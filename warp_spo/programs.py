@@ -207,7 +207,7 @@ class Programs:
         if looped:
             ahead, a_pass = before
             body = straight.looped(ahead, a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
-        block = WARP if frame.scalars else PAIR * WARP
+        block = PAIR * WARP if self.plan.few and not frame.scalars else WARP
         frame = frame._replace(again=frame.again and "farthest" in body, block=block)
         tables = {} if table is None else {"place": table}
         return self._finished(operation, frame, body, body, tables, emitter.operations)
