@@ -196,7 +196,7 @@ REFUSED = {
     "grad": (dict(gravity=torch.zeros(3).requires_grad_()), ValueError, r"gravity requires grad.*gravity.detach\(\)"),
     "device": (dict(gravity=torch.zeros(3, device="meta")), ValueError, "gravity is .*on meta; expected it on"),
     "strides": (dict(body_mass=torch.zeros(12, 3).T), ValueError, r"C-contiguous.*body_mass.contiguous\(\)"),
-    "negative": (dict(body_mass=-np.ones(12)), ValueError, "Dynamics.set: body_mass has -1.0 kg; expected zero"),
+    "negative": (dict(body_mass=-np.ones(12)), ValueError, "Dynamics.set: body_mass holds -1.0; expected zero"),
     "nan": (dict(body_com=np.full((12, 3), np.nan)), ValueError, "Dynamics.set: body_com holds NaN or infinity"),
     "asymmetric": (dict(body_inertia=np.tile(np.triu(np.ones((3, 3))), (12, 1, 1))), ValueError, "not symmetric"),
     "quaternion": (dict(joint_X_c=np.ones((12, 7))), ValueError, "Dynamics.set: the quaternions of joint_X_c is"),

@@ -27,7 +27,7 @@ from .parts import (
 )
 from .tree import Tree
 
-NOT_NEGATIVE = ("body_mass", "joint_armature", "joint_friction", "joint_effort_limit", "joint_velocity_limit")
+NOT_NEGATIVE = ("body_mass", "joint_friction", "joint_effort_limit", "joint_velocity_limit")
 
 
 def _refuse_negative(call: str, name: str, array: np.ndarray) -> None:
