@@ -5,6 +5,9 @@ Sine and cosine reduce by three parts of pi / 2 and evaluate a polynomial, to ab
 float64; ``sincos_any`` looks for itself. The reciprocal is the hardware's, refined once (twice in float64).
 """
 
+import warp as wp
+
+C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
 NATIVE = {
     "float": r"""
 struct on

@@ -14,12 +14,14 @@ from typing import NamedTuple
 
 import warp as wp
 
+from .elementary import C_TYPE
+
 WARP = 32
 TILE = 16  # worlds of a tile that is fetched; a multiple of 8, whose entries fill a sector of 32 bytes
 BATCH = 8  # reads of a thread that are on their way together
 LOOKUPS = 4  # likewise, of the table
 STORE = "__stcs"  # what goes out leaves the cache to what comes back
-VECTORS: dict[type, tuple[str, str]] = {wp.float32: ("float4", "int4"), wp.float64: ("double2", "int2")}  # and places
+VECTORS = {"float": ("float4", "int4", "xyzw"), "double": ("double2", "int2", "xy")}  # 16 bytes, their places, parts
 
 
 class Spread(NamedTuple):
@@ -58,7 +60,8 @@ class Spread(NamedTuple):
 
     def rows(self, stage: str, team: int, T) -> str:
         """Write the rows of the worlds from ``first + done`` on, whose values are at ``stage``; ``present`` in all."""
-        c, (vector, places), parts = _c(T), VECTORS[T], "xyzw"[: _wide(T)]
+        c = C_TYPE[T]
+        vector, places, parts = VECTORS[c]
         groups, turns = self.period(T) * self.entries // _wide(T), self.worlds // self.period(T)
         step, row = self.period(T) * self.pitch, groups * _wide(T)
         shares = [n for n in range(1, turns + 1) if turns % n == 0]  # of a group's turns, to a thread each
@@ -104,10 +107,11 @@ for (int start = member; start < limit; start += {lookups * team}) {{
 
     def tiles(self, stage: str, team: int, sync: str, T) -> str:
         """Fetch the values of a tile's worlds from their rows, write these rows, and so on."""
-        c, vector, wide = _c(T), VECTORS[T][0], _wide(T)
+        c, wide = C_TYPE[T], _wide(T)
+        vector, _, parts = VECTORS[c]
         of_slot, count = self.worlds // wide, self.slots * self.worlds // wide
         batch = min(BATCH, -(-count // team))
-        store = " ".join(f"to[{j * self.pitch}] = v[u].{x};" for j, x in enumerate("xyzw"[:wide]))
+        store = " ".join(f"to[{j * self.pitch}] = v[u].{x};" for j, x in enumerate(parts))
         return f"""for (int done = 0; done < present; done += {self.worlds}) {{
 const int width = present - done < {self.worlds} ? present - done : {self.worlds};
 const {c}* from = out.data + (first + done) * {self.entries};
@@ -138,16 +142,12 @@ if (width == {self.worlds} && (size_t)from % 16 == 0) {{
 
     def relay(self, T) -> str:
         """RELAY(slot): where in its tile's rows a world's value waits, [slot, world of the tile]."""
-        c, tile = _c(T), self.worlds
+        c, tile = C_TYPE[T], self.worlds
         return f"""const int own = mine ? lane : present - 1;  // of the world that an idle lane works out too
 const int tile = own / {tile} * {tile};
 const int width = present - tile < {tile} ? present - tile : {tile};
 {c}* relayed = out.data + (first + tile) * {self.entries} + own % {tile};
 #define RELAY(i) relayed[(i) * width]"""
-
-
-def _c(T) -> str:
-    return "float" if T is wp.float32 else "double"
 
 
 def _wide(T) -> int:

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import warp as wp
 
 from . import spreading
-from .elementary import NATIVE
-from .spreading import WARP, Spread
+from .elementary import C_TYPE, NATIVE
+from .spreading import VECTORS, WARP, Spread
 
 LONG_COPY = 64  # entries of a row from which it is copied to shared memory without passing through registers
 ON_ITS_WAY = """\
@@ -21,8 +21,6 @@ ON_ITS_WAY = """\
     :: "r"((unsigned)__cvta_generic_to_shared(to)), "l"(from), "n"(sizeof(*(to))) : "memory")"""
 ARRIVED = 'asm volatile("cp.async.wait_all;" ::: "memory");'
 SHARED_BYTES = 46 * 1024  # that a block may declare: 48 KiB less what Warp takes
-C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
-VECTORS = {"float": ("float4", "xyzw"), "double": ("double2", "xy")}  # 16 bytes, and the names of their parts
 MASKS = ("prescribed",)  # arrays of booleans
 INTEGERS = ("place", "shifts", "status")  # arrays of whole numbers, one axis
 MOST_PASSES = 16  # of a loop; 13 were needed at most, see CONTRIBUTING
@@ -289,7 +287,7 @@ def _each(n: int, team: int, caller: str, one: str, several: str = "", wide: int
 
 
 def _stage_in(row: Row, offset: int, c: str, team: int) -> str:
-    n, (kind, start), (vector, names) = row.entries, _source(row, c), VECTORS[c]
+    n, (kind, start), (vector, _, names) = row.entries, _source(row, c), VECTORS[c]
     padded, to_one = n != pitch(n), f"to + {_slot('i', n, pitch(n))}"
     one, several = f"*({to_one}) = __ldg(from + i);", f"(({vector}*)to)[i] = __ldg((const {vector}*)from + i);"
     if padded:
@@ -306,7 +304,7 @@ def _stage_in(row: Row, offset: int, c: str, team: int) -> str:
 
 
 def _stage_out(out: Row, offset: int, width: int, c: str, team: int) -> str:
-    n, (vector, names) = out.entries, VECTORS[c]
+    n, (vector, _, names) = out.entries, VECTORS[c]
     several = f"(({vector}*)to)[i] = (({vector}*)from)[i];"
     if n != width:
         parts = ", ".join(f"at[{k}]" for k in range(len(names)))

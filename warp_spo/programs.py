@@ -82,14 +82,13 @@ class Programs:
     Args:
         run: its sweeps, whose parameters the programs read.
         plan: which granularity each operation has.
-        registers: a cap on the registers of a thread.
 
     Attributes:
         relays: what is too long for shared memory waits in the rows of the result.
     """
 
-    def __init__(self, run: Recursions, plan: Plan, registers: int | None = None):
-        self.run, self.plan, self.registers = run, plan, registers
+    def __init__(self, run: Recursions, plan: Plan):
+        self.run, self.plan = run, plan
         self.relays = run.device.is_cuda
         self._programs: dict[Any, Program | None] = {}
         self._links: Links | None = None
@@ -289,7 +288,7 @@ class Programs:
             entry = held.pop("place")
         arrays += [(name, array.ndim) for name, array in held.items()]
         arrays += [("out", result.array.ndim if entry is None else 3)] + [(row.name, row.ndim) for row in frame.more]
-        kernel = straight.kernel(operation, native, arrays, self.run.dtype, self.registers or registers)
+        kernel = straight.kernel(operation, native, arrays, self.run.dtype, registers)
         return Program(kernel, rows, fields, tuple(held.values()), frame.warps, frame.block, operations, result.slots,
                        entry)
 
