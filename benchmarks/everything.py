@@ -111,7 +111,7 @@ class Lanes:
         return unfinished + waiting
 
     def _ready(self, waiting: list[Part], queued: bool) -> Part | None:
-        """The first part whose kernels are compiled."""
+        """The first part whose kernels are compiled; what compiles its own comes when all others' are."""
         busy = {name for name, job in self.compiling.items() if job.poll() is None}
         if any(each.part.alone for each in self.measuring.values()):
             return None
@@ -119,7 +119,7 @@ class Lanes:
         if self.alone and not idle:
             return None
         compiled = self.compiling.keys() - busy
-        return next((part for part in waiting if (part.name in compiled or not part.compile)
+        return next((part for part in waiting if (part.name in compiled or (idle and not part.compile))
                      and (not part.alone or (idle and not self.measuring))), None)  # fmt: skip
 
     def _measure(self, part: Part, lane: int) -> None:
