@@ -1,4 +1,4 @@
-"""Forms of forward dynamics that the library does not offer, in NumPy float32, for contrast (theory.md 4.1).
+"""Forms of forward dynamics that the library does not offer, in NumPy float32, for contrast.
 
 Each is a function ``(scene, q, tau) -> (qdd, D)``, [world, dof], D None where the form has none. NaN where it breaks
 down.

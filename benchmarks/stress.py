@@ -44,7 +44,7 @@ def rows(
                 raise
             except Exception as error:
                 yield dict(case=case.name, parameters=case.parameters, precision=precision, granularity=granularity,
-                           source=f"theory.md {case.source}", verdict="FAILS", why=f"{type(error).__name__}: {error}")
+                           source=case.source, verdict="FAILS", why=f"{type(error).__name__}: {error}")
         yield from contrasts(case)
 
 

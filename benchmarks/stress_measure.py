@@ -162,7 +162,7 @@ def row(case: Case, subject: Subject, precision: str, timed: bool = False) -> di
                  metric=case.metric, reference=sweep.arithmetic.name, max_error=float(error.max()),
                  granularity=subject.granularity,
                  median_error=float(np.median(error)), law=float(law[np.argmax(error / law)]) if judged else None,
-                 formula=case.formula, source=f"theory.md {case.source}", ratio=ratio,
+                 formula=case.formula, source=case.source, ratio=ratio,
                  pivot=float((np.abs(sweep.D) / sweep.P_trace).astype(np.float64).min()),
                  status=sorted({int(word) for word in status}), flagged=int((status != 0).sum()),
                  misjudged=int((~case.expects(status, dtype, law)).sum()))

@@ -1,4 +1,4 @@
-"""Scenes and states of the stress suite (theory.md 4.3).
+"""Scenes and states of the stress suite.
 
 Base: rods of 1 m and 1 kg, inertia diag(.01, 1/12, 1/12) about the CoM, hinges about z and y in turn, angles uniform in
 (-.6, .6) [rad] of seed 2, forces normal of seed 3 [N m]; further worlds have further seeds. Every number is rounded to

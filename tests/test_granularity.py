@@ -23,7 +23,7 @@ OPERATIONS = (*SEGMENTED, "bias_force", "gravity_force", "log_det_mass_matrix", 
               "body_velocities", "jacobian", "operational_inertia_inverse")  # fmt: skip
 MANY = 33  # one more than a warp has threads
 
-MEDIAN, WORST = 3e-7, 2e-6  # error line of issue 4, relative in the 2-norm: median of all, 99th percentile of qdd
+MEDIAN, WORST = 3e-7, 2e-6  # of an error, relative in the 2-norm: median of all, 99th percentile of qdd
 
 
 # -- scenes ------------------------------------------------------------------------------------------------------------

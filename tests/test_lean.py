@@ -18,7 +18,7 @@ from benchmarks import cases
 
 GIVEN = {"forward_dynamics": ("qd", "tau"), "inverse_dynamics": ("qd", "qdd"), "solve_mass_matrix": ("b",),
          "mass_matrix": (), "mass_matrix_inverse": (), "log_det_mass_matrix": ()}  # fmt: skip
-ALIGNED, PLANAR = 0.55, 0.20  # issue 4: of the same arm with skewed axes
+ALIGNED, PLANAR = 0.55, 0.20  # of the operations of the same arm with skewed axes
 
 
 def program(scene, operation, given=None, granularity="tree", worlds=1, **options):

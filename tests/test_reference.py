@@ -18,7 +18,7 @@ from warp_spo.scene import Scene
 ORACLE = 1e-11  # float64 against float64, forward dynamics loses cond(M) eps; measured 4e-13, cond up to 5e3
 ALGEBRA = 1e-11  # dense identities with inverses; measured 2e-13
 DIFFERENCE = 1e-9  # five-point stencil of step h = STENCIL: h^4 f^(5) / 30 and eps / h; measured 1e-11
-PUBLISHED = 1e-9  # digits printed in theory.md 5.2
+PUBLISHED = 1e-9  # digits that are given
 FLOAT32 = 1e-5  # Newton's forward kinematics, a chain of 8; measured 5e-7
 
 STENCIL = 3e-4  # of unit time: 1e-3 loses a factor 100 where accelerations reach 1e3, 1e-4 meets eps / h
@@ -184,7 +184,7 @@ def test_coordinates_are_newtons():
     close(d.body_velocities(), state.body_qd.numpy(), FLOAT32)
 
 
-# -- closed forms, theory.md 5.2 ---------------------------------------------------------------------------------------
+# -- closed forms ------------------------------------------------------------------------------------------------------
 def test_double_pendulum():
     m, l, g, q, qd = 1.3, 0.7, 9.81, np.array([0.4, 1.1]), np.array([0.3, -0.8])
     d = Dense(zoo.double_pendulum(m, l), q, qd)
@@ -431,7 +431,7 @@ def test_equation_1(name):
 
 @every_scene
 def test_resolvent_and_weights(name):
-    """Eq. 6-9, 13-14, 34 and 35 of theory.md's list."""
+    """Eq. 6-9, 13-14, 34 and 35."""
     scene, d, _ = case(name)
     one, strict = np.eye(len(d.phi)), d.phi - np.eye(len(d.phi))
     close(strict, d.E_phi @ d.phi, ALGEBRA)
@@ -470,7 +470,7 @@ def test_riccati_equation(name):
 
 @every_scene
 def test_operational_inertia_inverse(name):
-    """J M^-1 J* of frames on bodies, from psi* H* D^-1 H psi at the nodes (eq. of theory.md 2.6)."""
+    """J M^-1 J* of frames on bodies, from psi* H* D^-1 H psi at the nodes."""
     scene, d, _ = case(name)
     rng = np.random.default_rng(2)
     frames = [(int(k), zoo.random_pose(rng)) for k in rng.integers(0, scene.body_count, 3)]
@@ -501,7 +501,7 @@ def test_renumbering(name):
 
 
 def test_two_robots_are_two_models():
-    """Row 2 of theory.md: trees of a forest do not meet."""
+    """Trees of a forest do not meet."""
     _, d, _ = case("forest")
     one, other = (np.concatenate([d.dofs[k] for k in bodies]) for bodies in trees(d).values())
     assert len(one) and len(other) and len(one) + len(other) == d.dof_count

@@ -1,4 +1,4 @@
-"""The stress suite of theory.md 4.3: every case within 10 times its law, what cannot be computed flagged, bits kept."""
+"""The stress suite: every case within 10 times its law, what cannot be computed flagged, bits kept."""
 
 import sys
 from pathlib import Path

@@ -143,7 +143,7 @@ def plain(n=6, seed=6):
     return Scene([random_body(rng) for _ in range(n)], hinges)
 
 
-# -- closed forms (theory.md 5.2) and the stress suite's base chain (4.3) ----------------------------------------------
+# -- closed forms, and the stress suite's base chain ------------------------------------------------------------------
 def rod(mass, length, thin=True):
     """A uniform rod along +x from the body frame's origin; ``thin``: no inertia about its own axis."""
     inertia = mass * length**2 / 12.0
@@ -170,7 +170,7 @@ def cart_pole(cart=2.0, bob=0.5, length=0.8):
 
 
 def rod_chain(n):
-    """The base chain of theory.md 4.3: rods L = 1 m, m = 1 kg, Ic = diag(.01, 1/12, 1/12), axes alternately z and y.
+    """The base chain: rods L = 1 m, m = 1 kg, Ic = diag(.01, 1/12, 1/12), axes alternately z and y.
 
     Returns:
         scene; q [n] uniform in (-0.6, 0.6) of seed 2; tau [n] normal of seed 3.
