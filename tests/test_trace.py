@@ -13,7 +13,7 @@ import zoo
 from robots import ROBOTS
 
 import warp_spo as spo
-from warp_spo import plan
+from warp_spo import plan, teams
 from warp_spo.kernels import straight
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.pieces import Pieces
@@ -375,7 +375,7 @@ def test_pieces_wait_for_each_other(name):
 
 
 SEGMENTED = {"forward_dynamics": ("qd", "tau", "body_f"), "inverse_dynamics": ("qd", "qdd", "body_f"),
-             "solve_mass_matrix": ("b",), "mass_matrix": ()}  # fmt: skip
+             "solve_mass_matrix": ("b",), "mass_matrix": (), "mass_matrix_inverse": ()}  # fmt: skip
 
 
 def built(texts, scene, operation, worlds=3, dtype="float64", given=None, **options):
@@ -386,7 +386,7 @@ def built(texts, scene, operation, worlds=3, dtype="float64", given=None, **opti
     names = SEGMENTED[operation] if given is None else given
     shapes = {name: arrays[name].shape for name in ("q", *names)}
     dofs = scene.dof_count
-    out = (worlds, dofs, dofs) if operation == "mass_matrix" else (worlds, dofs)
+    out = (worlds, dofs, dofs) if operation.startswith("mass_matrix") else (worlds, dofs)
     program = dyn.programs.find(operation, shapes, out)
     fields = {name: dyn.programs.field(name).numpy() for name in program.fields}
     state = {name: array if name in ("q", *names) else np.zeros_like(array) for name, array in arrays.items()}
@@ -415,6 +415,19 @@ def test_results_over_rows_that_warps_share(name, operation, monkeypatch):
     for backwards in (False, True):
         got = warp_machine.run(text, arrays, backwards)
         assert laws.error(got, wanted.reshape(got.shape)) <= laws.TOLERANCE["float64"]
+
+
+@pytest.mark.parametrize("name", ["fork", "hand"])
+def test_turns_are_loops_where_code_is_long(name, monkeypatch):
+    """Columns that meet one another's, in a row and in loops."""
+    texts, got = warp_machine.recorded(monkeypatch), []
+    for most in (teams.CACHED, 0):
+        monkeypatch.setattr(teams, "CACHED", most)
+        text, arrays, wanted = built(texts, TREES[name](), "mass_matrix_inverse")
+        assert ("++turn" in text.cuda) == (most == 0)
+        got.append(warp_machine.run(text, arrays))
+        assert laws.error(got[-1], wanted.reshape(got[-1].shape)) <= laws.TOLERANCE["float64"]
+    assert np.array_equal(*got)
 
 
 def test_values_of_each_world_reach_the_warps(monkeypatch):

@@ -118,7 +118,7 @@ def run(text, arrays, backwards=False, further=None, over=None):
     whole = np.zeros((frame.result.array.entries, worlds))
     places = text.tables["place"] if frame.result.way in (*SPREAD, TILED) else range(len(whole))
     for entry, slot in enumerate(places):
-        whole[entry] = 0.0 if slot < 0 else result.values[slot]
+        whole[entry] = 0.0 if slot < 0 else result.values.get(slot, np.nan)
     return whole.T
 
 
@@ -164,9 +164,9 @@ def translated(cuda):
         if line == BARRIER:
             lines.append("    " * depth + "yield")
             continue
-        loop = re.match(r"^for \(int (\w+) = 0; \w+ < (\d+); \+\+\w+\) \{$", line)
+        loop = re.match(r"^for \(int (\w+) = 0; \w+ < (.*); \+\+\w+\) \{$", line)
         if loop:
-            lines.append("    " * depth + f"for {loop[1]} in range({loop[2]}):")
+            lines.append("    " * depth + f"for {loop[1]} in range({_chosen(loop[2])}):")
             depth += 1
             continue
         branch = re.match(r"^(else )?(?:if \((.*)\) )?\{$", line)
@@ -184,9 +184,9 @@ def translated(cuda):
 def _statement(line):
     if "farthest" in line:
         return "pass"  # turns are not taken off here
-    who = re.match(r"^const int (\w+) = (warp == .*);$", line)
+    who = re.match(r"^const int (\w*(?:who|first)) = (.*);$", line)
     if who:
-        return f"{who[1]} = " + re.sub(r"warp == (\d+) \? (\d+) : ", r"\2 if warp == \1 else ", who[2])
+        return f"{who[1]} = {_chosen(who[2])}"
     for form, python in FORMS:
         if re.match(form, line):
             line = re.sub(form, python, line)
@@ -197,6 +197,10 @@ def _statement(line):
     line = re.sub(r"__ldg\(shifts\.data \+ (.*?)\)", r"int(shifts[\1])", line)
     line = re.sub(r"__ldg\((\w+ \+ \d+)\)", r"table[\1]", line)
     return _sent(line)
+
+
+def _chosen(number):
+    return re.sub(r"warp == (\d+) \? (\d+) : ", r"\2 if warp == \1 else ", number)
 
 
 def _sent(line):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from .kernels.spreading import WARP
 from .parts import FREE
 from .recursions.links import Links
 from .recursions.pieces import Pieces
@@ -22,10 +23,12 @@ ALIKE = {"float32": 0.5, "float64": 0.0}  # share of limbs that share code; belo
 HELD = 16  # dofs of which a thread holds the variable values, too
 SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as through shared memory,
 LONG_ROWS = 24  # in segments; longer rows come in together already at fewer worlds
+FEW_RESULTS = 2  # short ones that a thread writes by itself
 MOST_WARPS = 16
 DEEPEST = 12  # dofs from a root to a leaf, a free hinge one, up to which velocity terms that come first are as accurate
 APART = {"chain": 2048, "tree": 4 * FEW_WORLDS, "segment": FEW_WORLDS}  # worlds beyond which they are faster
 SHORT = ("inverse_dynamics", "bias_force", "gravity_force")  # little code: a thread for the whole tree does not spill
+GATHERED = ("forward_dynamics", "forward_dynamics_apart")  # by limbs: work enough that a barrier more does not count
 LONG_RESULTS = ("mass_matrix", "mass_matrix_inverse")  # writing them is most of the work, and goes faster by many warps
 
 SEGMENTED = ("forward_dynamics", "solve_mass_matrix", *LONG_RESULTS, *SHORT)
@@ -102,13 +105,14 @@ class Plan:
             works on one serial chain of 32 worlds, a block on 32 worlds. "tree": one thread works on one world.
         reason: why.
         forced: the user asked for it.
-        staged: rows of many worlds come in through shared memory.
+        staged: rows of many worlds come in through shared memory, see :meth:`stages`.
         outward: (first, count) into the nodes ordered by level, roots first.
         worlds: number of worlds.
         dtype: "float32" or "float64".
         dofs: of the scene.
         limbs: serial chains that end in a leaf; counted where it matters.
         apart: forward dynamics takes velocity terms and loads first, and keeps no link's velocity for the rest.
+        varies: inertias or hinge frames come from memory.
     """
 
     granularity: str
@@ -121,6 +125,7 @@ class Plan:
     dofs: int
     limbs: int = 1
     apart: bool = False
+    varies: bool = False
 
     @property
     def few(self) -> bool:
@@ -150,6 +155,19 @@ class Plan:
             if operation in SHORT or (operation == "solve_mass_matrix" and self.dofs <= SOLVES[self.dtype]):
                 return "tree"
         return self.granularity
+
+    def stages(self, operation: str, warps: int) -> bool:
+        """Whether rows come in through shared memory; ``warps`` share 32 worlds."""
+        return self.staged and (warps == 1 or self.worlds > FEW_WORLDS // 4 or operation == "step")
+
+    def gathers(self, operation: str, warps: int, results: int) -> bool:
+        """Whether short results, so many, leave through shared memory, though rows do not come in so.
+
+        ``warps`` share 32 worlds.
+        """
+        if warps > 1:
+            return operation in GATHERED or (self.dofs > LONG_ROWS and self.worlds > WARP)
+        return results > FEW_RESULTS or (not self.few and (self.varies or operation in SHORT))
 
     def column_chunk(self, columns: int, bytes_per_column: int) -> int:
         """Right-hand sides that go through a solve at once."""
@@ -183,7 +201,8 @@ def choose(
         first += len(level)
     apart = side_by_side and not varies and worlds > APART["chain" if limbs == 1 else chosen]
     apart = apart and _depth(scene) <= DEEPEST
-    return Plan(chosen, reason, asked is not None, staged, tuple(outward), worlds, dtype, scene.dof_count, limbs, apart)
+    levels, dofs = tuple(outward), scene.dof_count
+    return Plan(chosen, reason, asked is not None, staged, levels, worlds, dtype, dofs, limbs, apart, varies)
 
 
 def _depth(scene: Scene) -> int:
@@ -222,6 +241,7 @@ def _chosen(
 def describe(plan: Plan) -> str:
     """One line: the choice, why, and what else there is."""
     others = ", ".join(name for name in GRANULARITIES if name != plan.granularity)
-    rows = "through shared memory" if plan.staged else "each by its thread"
+    staged = plan.stages("forward_dynamics", plan.limbs if plan.granularity == "segment" else 1)
+    rows = "through shared memory" if staged else "each by its thread"
     first = "forward dynamics takes velocity terms first; " if plan.apart else ""
     return f"{plan.granularity}: {plan.reason}; rows are read {rows}; {first}granularity= can force {others}"

@@ -44,7 +44,8 @@ TILES = ("inverse_dynamics_derivatives", "mass_matrix_derivative")
 """Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
 REGISTERS, PARTS = 65536, 4  # of a multiprocessor
 MOST_REGISTERS = 255  # of a thread
-THREE, ENOUGH = 3, 168  # blocks on it, and registers of a thread that the solution by limbs needs for that
+BLOCKS = {"forward_dynamics_apart": (3, 168), "solve_mass_matrix": (4, 128)}
+"""Blocks of limbs for it, if they leave a thread so many registers, where there are many worlds."""
 PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
@@ -192,7 +193,7 @@ class Programs:
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         outs = [item for item in stores if item.array == "out"]
-        frame = self._frame(outs, stores, shapes, more)
+        frame = self._frame(operation, outs, stores, shapes, more)
         if operation in TILES:
             result = Result(TILED, frame.result.array, slots=staging.solid(stores))
             frame = frame._replace(staged=self.plan.staged, result=result)
@@ -218,20 +219,20 @@ class Programs:
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         everything: list[Store] = []
         traced: list[list[Store]] = []
-        apart: list[tuple[list[Store], list[Store], dict[int, list[Store]]]] = []
+        apart: list[tuple[list[Store], list[Store], list[list[Store]]]] = []
         for index in range(len(pieces.pieces)):
             links = self.links.opened()  # its own: pieces of equal structure then give equal text
             trace = Traces(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)(**options)])
-            flat = {at: [self._flattened(item, shapes) for item in items] for at, items in trace.across.items()}
+            rounds = [[self._flattened(item, shapes) for item in turn] for turn in trace.rounds]
             news = [self._flattened(item, shapes) for item in trace.news]
-            apart.append((trace.checks, news, flat))
-            everything += traced[-1] + trace.checks + news + [item for items in flat.values() for item in items]
+            apart.append((trace.checks, news, rounds))
+            everything += traced[-1] + trace.checks + news + [item for turn in rounds for item in turn]
         bends = any(item.array == MISSED for item in everything)
         passes = Passes((GUESS, GAIN), sent if bends else None) if operation == "step" else None
         sent += 2 * pieces.warps if bends else 0
         whole = [item for item in everything if item.array == "out"]
-        frame = self._frame(whole, everything, shapes, more, sent, pieces.warps)
+        frame = self._frame(operation, whole, everything, shapes, more, sent, pieces.warps)
         if frame.result.way == DIRECT and frame.result.array.entries > staging.LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
         if not frame.fits(self.run.dtype):
@@ -241,7 +242,7 @@ class Programs:
         placed, table = staging.placed(whole, frame.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
         by_slot = lambda found: found if table is None else staging.by_slot(found, table)  # noqa: E731
-        for piece, stores, items, (checks, news, others) in zip(pieces.pieces, traced, outs, apart, strict=True):
+        for piece, stores, items, (checks, news, rounds) in zip(pieces.pieces, traced, outs, apart, strict=True):
             emitter, checking = self._emitter(shapes, frame), self._emitter(shapes, frame)
             later = self._emitter(shapes, frame) if passes else emitter
             inward = [item for item in stores if item.array == INWARD]
@@ -249,17 +250,18 @@ class Programs:
             last = outward if set(SENDS[operation]) & set(messages.OUTWARD_LETTERS) else inward
             last += by_slot(items)
             last += [item for item in stores if item.array in (*more, GAIN)]
-            meetings = {at: by_slot(found) for at, found in others.items()}
             regions = emitter.region(inward), emitter.region(outward)
             ends = [item for item in news if item.array == "out"]
             news = [item for item in news if item.array != "out"] + by_slot(ends)
-            branches = later.branch(news), {at: later.branch(found) for at, found in meetings.items()}
+            branches = later.branch(news), [later.branch(by_slot(turn)) for turn in rounds]
             team.add(Work(piece, *regions, checking.region(checks), *branches),
                      sum(each.operations for each in {emitter, checking, later}))
         cuda = team.cuda()  # fills the tables
-        registers, three = (_registers(blocks * pieces.warps) for blocks in (1, THREE))
-        if operation == "forward_dynamics_apart" and dtype == "float32" and three >= ENOUGH:
-            registers = three
+        registers = _registers(pieces.warps)
+        if operation in BLOCKS and dtype == "float32" and not self.plan.few:
+            blocks, enough = BLOCKS[operation]
+            fewer = _registers(blocks * pieces.warps)
+            registers = fewer if fewer >= enough else registers
         lists = {"place": table, "table": team.table, "shifts": team.shifts}
         tables = {name: values for name, values in lists.items() if values}
         cap = registers if registers < MOST_REGISTERS else None
@@ -293,10 +295,11 @@ class Programs:
                        entry)
 
     def _frame(
-        self, stores: list[Store], everything: list[Store], shapes: dict, more: tuple, sent: int = 0, warps: int = 1
+        self, operation: str, stores: list[Store], everything: list[Store], shapes: dict, more: tuple,
+        sent: int = 0, warps: int = 1,
     ) -> Frame:
-        how = self.run.dtype, self.plan.staged, self.relays
-        return staging.frame(stores, everything, shapes, more, sent, warps, *how)
+        ways = self.plan.stages(operation, warps), self.plan.gathers(operation, warps, 1 + len(more))
+        return staging.frame(stores, everything, shapes, more, sent, warps, self.run.dtype, *ways, self.relays)
 
     def _emitter(self, shapes: dict, frame: Frame) -> Emitter:
         result = frame.result

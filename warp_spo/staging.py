@@ -28,6 +28,7 @@ def frame(
     warps: int,
     T: type,
     staged: bool,
+    gathered: bool,
     relays: bool,
 ) -> Frame:
     """What surrounds the kernel whose result flat ``stores`` make, out of ``everything`` that it stores.
@@ -35,7 +36,8 @@ def frame(
     Args:
         shapes: of what is given and of the results, by name. more: names of further results.
         sent: values that limbs tell each other. warps: that share 32 worlds.
-        T: the scalar. staged: rows come in through shared memory, if they have room there.
+        T: the scalar. staged: rows come in through shared memory, if they have room there. gathered: short results
+            leave through it though they are not.
         relays: a result that has none waits in its own rows.
     """
     used = _reads(everything)
@@ -50,7 +52,7 @@ def frame(
     held = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
     ways = [(False, Result(DIRECT, out))]
     staged = staged or any(row.name in ("x", "body_f") and row.entries > SHORT_ROW for row in rows)
-    if dense and (staged or out.entries > SHORT_ROW):
+    if dense and (staged or gathered or out.entries > SHORT_ROW):
         ways = [(staged, Result(STAGED, out)), (False, Result(STAGED, out)), *ways]
     if dense and staged:
         ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), *ways]
@@ -61,9 +63,9 @@ def frame(
             ways.insert(-1, (False, Result(RELAYED, out, slots=slots)))
     further = tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more)
     frames = [
-        Frame(rows, staged, list(fields), result, sent, warps, WARP * warps, further, gathered, False, entries, numbers)
+        Frame(rows, staged, list(fields), result, sent, warps, WARP * warps, further, together, False, entries, numbers)
         for staged, result in ways
-        for gathered in ((True, False) if further and result.way in (IN_PLACE, STAGED) else (False,))
+        for together in ((True, False) if further and result.way in (IN_PLACE, STAGED) else (False,))
         for entries in held[::-1]
     ]
     return next((one for one in frames if one.fits(T)), frames[-1])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from .kernels import straight
@@ -10,10 +12,11 @@ from .recursions.pieces import Piece, Pieces
 from .trace.emit import C_TYPE, Listing, filled, literal, literals
 
 BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
+CACHED = 8192  # operations of a world whose code an instruction cache holds
 
 
 class Work(NamedTuple):
-    """What one piece has to do: going in, coming out, checking a pass, telling the others, and with each that it meets.
+    """What one piece has to do: going in, coming out, checking a pass, telling others, and, in rounds, what those said.
 
     Of work in passes, the last two come when all passes are done.
     """
@@ -23,7 +26,7 @@ class Work(NamedTuple):
     outward: Listing
     check: Listing
     news: Listing
-    across: dict[int, Listing]
+    rounds: list[Listing]
 
     @property
     def text(self) -> tuple[str, str, str]:
@@ -69,7 +72,7 @@ class Team:
         self._work: dict[int, Work] = {}
 
     def add(self, work: Work, operations: int) -> None:
-        """Take on the work of a piece; what is ``across``, by the other piece's index, may use all that others sent."""
+        """Take on the work of a piece, whose ``rounds`` may use all that others sent."""
         self._work[work.piece.index] = work
         self.operations += operations
 
@@ -77,10 +80,10 @@ class Team:
     def _last(self) -> int:
         """The last stage in which there is something to do."""
         stages = [0]
-        for piece, inward, outward, _, _, across in self._work.values():
+        for piece, inward, outward, _, _, rounds in self._work.values():
             stages += [piece.inward] if inward.text else []
             stages += [piece.outward] if outward.text else []
-            if across and not self.passes:
+            if rounds and not self.passes:
                 stages.append(self.pieces.stages - 1)  # pieces further in meet in the last one
         return max(stages)
 
@@ -99,7 +102,7 @@ class Team:
                         text.append(self._branch(piece, self._work[piece.index].check))
                     (later if self.passes else text).append(self._branch(piece, self._work[piece.index].news))
         for work in self._work.values():
-            later += [self._branch(work.piece, listing) for listing in work.across.values()]
+            later += [self._branch(work.piece, listing) for listing in work.rounds]
         if self.passes:
             kept = {f"p{piece.index}_": piece.weight for piece in self.pieces.pieces}
             text = [self.passes.declared(kept, self.c), straight.alone("\n".join(text), self.c)]
@@ -119,8 +122,8 @@ class Team:
             text.append(f"{'else ' if text else ''}if ({_any_of([work.piece.warp for work in alike])}) {{")
             inward, outward = self._shared(alike)
             text += [inward, self._inner([work.piece.warp for work in alike]), outward]
-            if not self.passes and any(work.across for works in kinds.values() for work in works):
-                text += [self._apart(alike, [work.news for work in alike], "n_"), BARRIER, self._across(alike)]
+            if not self.passes and any(work.rounds for works in kinds.values() for work in works):
+                text += [self._apart(alike, [[work.news] for work in alike], "n_"), BARRIER, self._rounds(alike)]
             text.append("}")
         return self._in_passes("\n".join(text)) if self.passes else "\n".join(text)
 
@@ -145,7 +148,7 @@ class Team:
             found = []
             for at, (name, rank) in enumerate(zip(names, ranks, strict=True)):
                 said = [rank.get(leaf.piece.warp) for leaf in leaves]
-                its = [None if one is None else one.across.get(0) if last else one.news for one in said]
+                its = [[] if one is None else one.rounds if last else [one.news] for one in said]
                 found.append(self._apart(leaves, its, f"c{at}_", name))
             if last and any(found):
                 text.append(BARRIER)
@@ -171,48 +174,62 @@ class Team:
                     if alike[0].piece.outward == stage:
                         text.append(outward)
                         if not self.passes:
-                            text.append(self._apart(alike, [work.news for work in alike], f"i{at}_n_", f"i{at}_"))
+                            text.append(self._apart(alike, [[work.news] for work in alike], f"i{at}_n_", f"i{at}_"))
             if not self.passes:
-                text += [self._across(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
+                text += [self._rounds(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
             text.append("}")
         idle = [BARRIER] * self._last
         if text and len(warps) > sum(map(len, owners.values())):
             text += ["else {", *idle, "}"]
         return "\n".join(text or idle)
 
-    def _across(self, alike: Sequence[Work], prefix: str = "") -> str:
-        """What pieces of equal structure have to do with each other piece."""
-        others = sorted({index for work in alike for index in work.across})
-        met = [(other, [work.across.get(other) for work in alike]) for other in others]
-        return "\n".join(self._apart(alike, listings, f"{prefix}x{other}_", prefix) for other, listings in met)
+    def _rounds(self, alike: Sequence[Work], prefix: str = "") -> str:
+        """What pieces of equal structure make of what the others said."""
+        return self._apart(alike, [work.rounds for work in alike], f"{prefix}x_", prefix)
 
-    def _apart(self, alike: Sequence[Work], listings: list[Listing | None], tables: str, prefix: str = "") -> str:
-        """What some pieces of equal structure do, a branch for those that do the same."""
-        kinds: dict[str, list[tuple[Work, Listing]]] = {}
-        for work, listing in zip(alike, listings, strict=True):
-            if listing is not None and listing.text:
-                kinds.setdefault(listing.text, []).append((work, listing))
+    def _apart(self, alike: Sequence[Work], turns: list[list[Listing]], tables: str, prefix: str = "") -> str:
+        """What pieces of equal structure do each for themselves, in turns: those that do the same share its text."""
+        kinds: dict[str, list[tuple[int, Listing]]] = {}
+        for work, listings in zip(alike, turns, strict=True):
+            for at, listing in enumerate(listings):
+                if listing.text:
+                    kind = listing.text if self._loops else f"{at} {listing.text}"
+                    kinds.setdefault(kind, []).append((work.piece.warp, listing))
         text: list[str] = []
-        for some in kinds.values():
-            head, (body,) = self._filled([work for work, _ in some], [[listing for _, listing in some]], prefix, tables)
-            condition = "" if len(some) == len(alike) else f"if ({_any_of([work.piece.warp for work, _ in some])}) "
-            text.append("\n".join([f"{condition}{{", head, body, "}"]))
+        for at, some in enumerate(kinds.values()):
+            counts = Counter(warp for warp, _ in some)
+            warps, name = list(counts), f"{tables}{at}_"
+            several = max(counts.values()) > 1
+            who = f"{name}first + turn" if several else _chosen(warps, range(len(warps)))
+            head, (body,) = self._filled([[listing for _, listing in some]], prefix, name, who)
+            condition = "" if len(warps) == len(alike) else f"if ({_any_of(warps)}) "
+            inside = [head, body]
+            if several:
+                starts = itertools.accumulate(counts.values(), initial=0)
+                inside = [f"const int {name}first = {_chosen(warps, starts)};", "#pragma unroll 1",
+                          f"for (int turn = 0; turn < {_chosen(warps, counts.values())}; ++turn) {{", *inside, "}"]
+            text.append("\n".join([f"{condition}{{", *inside, "}"]))
         return "\n".join(text)
+
+    @property
+    def _loops(self) -> bool:
+        """Turns are loops, slower than statements in a row that an instruction cache holds."""
+        return self.operations > CACHED
 
     def _shared(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str]:
         """One text, in and out, for pieces of equal structure."""
         regions = [[work.inward for work in alike], [work.outward for work in alike], [work.check for work in alike]]
-        head, (inward, outward, check) = self._filled(alike, regions, prefix, prefix)
+        who = _chosen([work.piece.warp for work in alike], range(len(alike)))
+        head, (inward, outward, check) = self._filled(regions, prefix, prefix, who)
         outward = "\n".join([outward, "{", check, "}"]) if check else outward
         return f"{head}\n{inward}" if head else inward, outward
 
-    def _filled(
-        self, alike: Sequence[Work], regions: list[list[Listing]], prefix: str, tables: str
-    ) -> tuple[str, list[str]]:
-        """The text of each region, one listing for each of ``alike``; what differs comes from the tables.
+    def _filled(self, regions: list[list[Listing]], prefix: str, tables: str, who: str) -> tuple[str, list[str]]:
+        """The text of each region, for any of those whose listings it has; what differs comes from the tables.
 
         Args:
             prefix: of the names of values. tables: of the names of what is read from the tables.
+            who: C++ for which of the listings it is.
 
         Returns:
             What comes first, and the regions.
@@ -236,9 +253,7 @@ class Team:
             texts.append(filled(listings[0], numbers, entries, names, prefix))
         head = []
         if constants.columns or shifts.columns:
-            warps = [work.piece.warp for work in alike]
-            member = " : ".join(f"warp == {warp} ? {at}" for at, warp in enumerate(warps[:-1])) + f" : {len(warps) - 1}"
-            head.append(f"const int {tables}who = {member};")
+            head.append(f"const int {tables}who = {who};")
         if constants.columns:
             first, count = len(self.table), len(constants.columns)
             head.append(f"const {self.c}* {tables}numbers = table.data + {first} + {tables}who * {count};")
@@ -268,3 +283,11 @@ class _Columns:
 
 def _any_of(warps: list[int]) -> str:
     return " || ".join(f"warp == {warp}" for warp in warps)
+
+
+def _chosen(warps: Sequence[int], numbers: Iterable[int]) -> str:
+    """C++ for the number of this warp, one of ``warps``."""
+    *others, last = zip(warps, numbers, strict=False)
+    if all(number == last[1] for _, number in others):
+        return str(last[1])
+    return f"({' : '.join([*(f'warp == {warp} ? {number}' for warp, number in others), str(last[1])])})"

@@ -27,14 +27,14 @@ class Inverse:
 
     Attributes:
         entries: by (row, column), one of the two triangles' entries each.
-        across: by index of another piece: the entries that it has in common with the trace's own.
+        rounds: the entries that the trace's own piece has in common with others, those of one dof of theirs at a time.
         stores: what is sent. news: likewise, to the pieces that meet this one.
     """
 
     def __init__(self, trace: Any):
         self.trace, self.pieces = trace, Pieces(trace.links).pieces
         self.entries: dict[tuple[int, int], Value] = {}
-        self.across: dict[int, dict[tuple[int, int], Value]] = {}
+        self.rounds: list[dict[tuple[int, int], Value]] = []
         self.done, self.stores = trace.factors()
         self.news: list[Store] = []
         self._rates: dict[int, list[Value]] = {}  # the part of Y_j in j's own piece
@@ -51,7 +51,7 @@ class Inverse:
             self._come_back(piece)
         for piece in own:
             for other in self.pieces:
-                if piece.looks_at(other):
+                if other in piece.ancestors or piece.looks_at(other):
                     self._meet(piece, other)
 
     def _inward(self, links: list[Link], force: Vector, right: list[Value]) -> tuple[list[Value], Vector]:
@@ -66,7 +66,7 @@ class Inverse:
         return rates, NO_FORCE if links[0].parent is None else force
 
     def _come_back(self, piece: Piece) -> None:
-        """Complete the columns of a piece, multiply them with one another and with those further in."""
+        """Complete the columns of a piece and multiply them with one another."""
         trace = self.trace
         further = [one for one in reversed(piece.ancestors)]
         N = [] if piece.parent is None else _sixes(trace.receive("N", piece.parent))
@@ -83,13 +83,6 @@ class Inverse:
             trace.graph.step = f"column {j}|m"
             for i in piece.dofs[: at + 1]:
                 self.entries[i, j] = _meeting(weighted[i], self._columns[j])
-        for one in further:
-            known = trace.receive("V", one)
-            for i in one.dofs:
-                theirs, known = known[: one.reach(i)], known[one.reach(i) :]
-                for j in piece.dofs:
-                    trace.graph.step = f"column {j}|m"
-                    self.entries[i, j] = _meeting(theirs, self._columns[j])
         if not piece.children:
             return
         trace.at(piece.links[-1], "n")
@@ -100,21 +93,21 @@ class Inverse:
             columns.append([dot(row, force) for row in N] + rates)
         self.stores += trace.post("N", piece, [x for row in zip(*columns, strict=True) for x in row])
         self.stores += trace.post("D", piece, D[len(N) :])
-        self.stores += trace.post("V", piece, [x for j in piece.dofs for x in weighted[j]])
+        rest = {j: [0.0] * (len(D) - len(self._columns[j])) for j in piece.dofs}
+        self.stores += trace.post("V", piece, [x for j in piece.dofs for x in self._columns[j] + rest[j]])
 
     def _meet(self, piece: Piece, other: Piece) -> None:
-        """The entries of two branches: their columns meet in the pivots up to where they part."""
+        """The entries of two branches, or of one and what carries it: columns meet in the pivots that both have."""
         fork = piece.fork(other)
-        assert fork is not None and other.parent is not None
-        common, heads = len(fork.all_dofs), len(other.parent.all_dofs)
+        assert fork is not None
+        common = len(fork.all_dofs)
         D = [d for one in reversed([fork, *fork.ancestors]) for d in self.trace.receive("D", one)]
-        sent = self.trace.receive("Y", other)
-        found = self.across[other.index] = self.across.get(other.index, {})
+        sent = self.trace.receive("V" if fork is other else "Y", other)
+        length = len(sent) // other.weight
         for at, i in enumerate(other.dofs):
             self.trace.graph.step = f"column {i}|m"
-            theirs = [d * y for d, y in zip(D, sent[heads * at : heads * at + common], strict=True)]
-            for j in piece.dofs:
-                found[i, j] = _meeting(theirs, self._columns[j])
+            theirs = [d * y for d, y in zip(D, sent[length * at : length * at + common], strict=True)]
+            self.rounds.append({(i, j): _meeting(theirs, self._columns[j]) for j in piece.dofs})
 
 
 def _meeting(first: list[Value], second: list[Value]) -> Value:

@@ -2,8 +2,8 @@
 
 Letters: inward P = phi P+ phi*, z and y = phi z+ or a force, f = a force, R = the composite inertia, B = how a sum
 changes with the parent's motion; outward a and b = alpha, and for Mass^-1 N = the rates of all pivots further in for
-each unit force on the last link, D = the piece's own pivots, V = D times its columns of Y, Y = the part of its columns
-that lies further in. From all to the first piece, when all is done: S = a status word.
+each unit force on the last link, D = the piece's own pivots, V = its columns of Y, Y = the part of them that lies
+further in. From all to the first piece, when all is done: S = a status word.
 """
 
 from __future__ import annotations
@@ -49,9 +49,8 @@ def size(letter: str, piece: Piece) -> int:
     if letter in SIZES:
         return SIZES[letter]
     further = sum(one.weight for one in piece.ancestors)
-    if letter == "V":
-        return sum(piece.reach(dof) for dof in piece.dofs)
-    return {"N": 6 * (further + piece.weight), "D": piece.weight, "Y": further * piece.weight}[letter]
+    whole = further + piece.weight
+    return {"N": 6 * whole, "D": piece.weight, "V": whole * piece.weight, "Y": further * piece.weight}[letter]
 
 
 def slots(operation: str, pieces: Pieces) -> tuple[dict[tuple[str, int], int], int]:

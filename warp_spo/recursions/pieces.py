@@ -68,16 +68,18 @@ class Piece:
     def looks_at(self, other: Piece) -> bool:
         """Whether this piece, not ``other``, works out what two branches have in common.
 
-        One of the two does: a leaf; then the one with less of its own to do; then the later one.
+        One of the two does: a leaf; then the one with less of its own to do; then now the earlier, now the later one.
         """
         fork = self.fork(other)
         if fork is None or fork in (self, other):
             return False
-        return self._burden < other._burden
+        if self._burden != other._burden:
+            return self._burden < other._burden
+        return (self.index < other.index) == ((self.index + other.index) % 2 == 0)
 
     @property
-    def _burden(self) -> tuple[bool, int, int]:
-        return bool(self.children), len(self.all_dofs), -self.index
+    def _burden(self) -> tuple[bool, int]:
+        return bool(self.children), len(self.all_dofs)
 
 
 class Pieces:

@@ -200,7 +200,7 @@ class Step:
                 (word,) = trace.receive("S", piece)
                 worst = select(less(worst, word), word, worst)
             settled = less(graph.input(MISSED, 0), 0.5)
-            trace.across = {0: [Store("status", (), select(worst, worst, select(settled, 0.0, NOT_SETTLED)))]}
+            trace.rounds = [[Store("status", (), select(worst, worst, select(settled, 0.0, NOT_SETTLED)))]]
         return trace.post("S", own, [finite])
 
     def _inputs(self) -> list[Value]:

@@ -34,7 +34,7 @@ class Trace:
 
     Attributes:
         news: what a piece sends to those that meet it, apart: pieces of equal structure do not all send it.
-        across: what a piece has to store after that, by the other piece that it is about.
+        rounds: what a piece has to store after that, in turns of which many may be alike.
         ahead: what the passes of a loop share, formed once before it.
         checks: what a piece makes of a pass, apart: it keeps nothing for that.
     """
@@ -50,7 +50,7 @@ class Trace:
         self.links, self.graph, self.epsilon, self.given = links, links.graph, EPSILON[dtype], given
         self.piece, self.slot = piece, slot
         self.news: list[Store] = []
-        self.across: dict[int, list[Store]] = {}
+        self.rounds: list[list[Store]] = []
         self.ahead: list[Value] = []
         self.checks: list[Store] = []
         self._mail: dict[tuple[str, int], list[Value]] = {}  # messages between pieces of this trace
@@ -317,10 +317,10 @@ class Trace:
     def mass_matrix_inverse(self) -> list[Store]:
         """out = Mass^-1, both triangles"""
         inverse = Inverse(self)
-        across = {other: self._both(entries) for other, entries in inverse.across.items()}
+        rounds = [self._both(entries) for entries in inverse.rounds]
         if self.piece is not None:
-            self.across, self.news, across = across, inverse.news, {}
-        return inverse.stores + self._both(inverse.entries) + [item for stores in across.values() for item in stores]
+            self.rounds, self.news, rounds = rounds, inverse.news, []
+        return inverse.stores + self._both(inverse.entries) + [item for stores in rounds for item in stores]
 
     def inward(self, done: dict, link: Link, force: Vector, right: list[Value]) -> dict[int, list[Value]]:
         """D^-1 [I - H psi K] of ``right`` at a link's dofs and a ``force`` on it: by link, on the way to the root."""
