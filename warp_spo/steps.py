@@ -9,7 +9,7 @@ import warp as wp
 from .adjoints import differentiable
 from .arrays import Call
 from .errors import UnsupportedError
-from .kernels import combination
+from .kernels import combination, loops
 from .levels import Recursions
 from .recursions.closed_step import NEWTON_STEPS
 from .recursions.impedance import DEFAULT_BOUND
@@ -88,6 +88,11 @@ class Steps:
                 * 2 = an input is NaN or infinite.
                 * 1 = the result is not finite though the inputs are: as 1 and 4 in :meth:`forward_dynamics`.
                 * 6 = the closures lose rank, or half of the dtype's digits: a change point, see there.
+                * 7 = the closures are open after the step, or q' and qd' do not agree: by more than 1e-5 rad, or 1e-5 of
+                  the distance to the hinges that move the joint, or 1e-5 of the rates. The state stands: Newton's steps
+                  did not take it back. Bars turn too far in the step (half a radian), which wants a shorter dt; or it
+                  started open, see :meth:`project`; or angles of many turns are rounded by as much, which wants
+                  float64, or full turns taken off.
                 * 5 = the last pass still found a law in another part than it had assumed: the step stands, with a force
                   that a shorter dt would correct.
                 * 0 = none of these.
@@ -205,6 +210,10 @@ class Steps:
         known = {"multipliers": found, **({"resolved": resolved} if "status" in option else {})}
         self._launch("step", qd, {"q_out": q, **asked}, **known, **given, **option)
         self._project(q, qd, False, NEWTON_STEPS, q_out, qd_out)
+        if "status" in asked:
+            left = self.recursions.array("closures open", self.worlds, 1)
+            self._launch("closures_open", left, q=q_out, qd=qd_out)
+            self.recursions.launch(loops.opened, self.worlds, [left], [asked["status"]])
 
     def _midpoint(self, call: Call, q: Any, qd: Any, q_out: Any, qd_out: Any, dt: float, **forces: Any) -> None:
         """The midpoint is a half step whose sweep and laws are taken at the midpoint itself."""

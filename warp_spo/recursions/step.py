@@ -30,7 +30,7 @@ GUESS, GAIN, MISSED = "guess", "gain", "missed"
 LOOPED = (GUESS, GAIN, MISSED)
 WIDE = {BALL: 4, FREE: 7}  # coordinates of a hinge with a quaternion
 SHORT = 10  # dofs up to which passes solve a system that is formed once
-NOT_POSITIVE, NOT_FINITE, NOT_SETTLED, CHANGE_POINT = 1, 2, 5, 6  # status words; the first two as warp_spo.status
+NOT_POSITIVE, NOT_FINITE, NOT_SETTLED, CHANGE_POINT, OPEN = 1, 2, 5, 6, 7  # status words; two as warp_spo.status
 
 
 class Step:
@@ -127,6 +127,10 @@ class Step:
         """Not 0 where constraints lose rank."""
         return 0.0
 
+    def _open(self) -> Value:
+        """Not 0 where constraints do not hold after the step."""
+        return 0.0
+
     def _stiffened(self, link: Link) -> Link:
         pieces = zip(link.armature, self._pieces(link), strict=True)
         return dataclasses.replace(link, armature=tuple(a + self.h * piece.resistance for a, piece in pieces))
@@ -186,7 +190,8 @@ class Step:
     def _word(self, results: list[Value], looped: bool) -> Value:
         """The worst that is true of the world."""
         settled = less(self.trace.graph.input(MISSED, 0), 0.5) if looped else 1.0
-        word = select(_finite(results), select(settled, 0.0, NOT_SETTLED), NOT_POSITIVE)
+        word = select(self._open(), OPEN, select(settled, 0.0, NOT_SETTLED))
+        word = select(_finite(results), word, NOT_POSITIVE)
         return select(_finite(self._inputs()), select(self._unresolved(), CHANGE_POINT, word), NOT_FINITE)
 
     def _words(self, own: Piece, results: list[Value]) -> list[Store]:
