@@ -270,9 +270,9 @@ def test_the_word_sees_each_coordinate_and_rate(device):
     scene = MECHANISMS["fourbar"]()
     closing = Closing(scene)
     q, qd = crank_turning(closing, 3)
-    for old, new in (("[-rate for rate in rates]", "[-0.5 * rate for rate in rates]"), ("[-g for g", "[-0.5 * g for g")):
+    for of in ("rate for rate", "g for g"):
         with pytest.MonkeyPatch.context() as patch:
-            symbolic.plant(patch, closed_step.ClosedStep, "_close", old, new)
+            symbolic.plant(patch, closed_step.ClosedStep, "_close", f"[-{of}", f"[-0.5 * {of}")
             dyn = spo.Dynamics(scene, 3, device=device, loops="embed")
             status = np.full(3, -1, np.int32)
             dyn.step(q, qd, None, 0.02, status=status)

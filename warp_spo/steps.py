@@ -88,7 +88,7 @@ class Steps:
                 * 2 = an input is NaN or infinite.
                 * 1 = the result is not finite though the inputs are: as 1 and 4 in :meth:`forward_dynamics`.
                 * 6 = the closures lose rank, or half of the dtype's digits: a change point, see there.
-                * 7 = the closures are open after the step, or q' and qd' do not agree: by more than 1e-5 rad, or 1e-5 of
+                * 7 = the closures are open after the step, or q' and qd' do not agree: by more than 1e-5 rad, 1e-5 of
                   the distance to the hinges that move the joint, or 1e-5 of the rates. The state stands: Newton's steps
                   did not take it back. Bars turn too far in the step (half a radian), which wants a shorter dt; or it
                   started open, see :meth:`project`; or angles of many turns are rounded by as much, which wants

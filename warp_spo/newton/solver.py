@@ -59,6 +59,10 @@ class Observables(SolverBase.Observables):
         dtype=wp.float32, frequency=newton.Model.AttributeFrequency.JOINT_DOF
     )
     """(qd after - qd before) / dt [m/s^2, rad/s^2], shape (joint_dof_count,)."""
+    status: Any = SolverBase.Observables.field(  # noqa: RUF009
+        dtype=wp.int32, frequency=newton.Model.AttributeFrequency.WORLD
+    )
+    """Whether the step can be trusted, 0 if so: the words of :meth:`warp_spo.Dynamics.step`, shape (world_count,)."""
 
 
 class SolverSPO(Plugs, SolverBase):
@@ -77,7 +81,7 @@ class SolverSPO(Plugs, SolverBase):
     rounding. A loop joint is a constraint alone: its entries of joint_q and joint_qd stay as they are, as in Newton's
     eval_ik, those of joint_f are not applied, and drives, springs, damping, friction, limits and armature of it are
     refused. Bring a first state onto the closures with :meth:`reset`, or by hand with ``solver.dynamics.project``; a
-    step takes an open one there along the shortest way.
+    step takes an open one there along the shortest way. The observable ``status`` is 7 where it did not get there.
 
     Args:
         model: finalized; all worlds have one topology. ``model.requires_grad`` is not looked at.
@@ -97,7 +101,7 @@ class SolverSPO(Plugs, SolverBase):
 
     Observables = Observables
     SUPPORTED_OBSERVABLES: ClassVar[frozenset[str]] = frozenset(
-        {"joint_qdd", SolverBase.ObservableKind.BODY_QDD, SolverBase.ObservableKind.BODY_PARENT_F}
+        {"joint_qdd", "status", SolverBase.ObservableKind.BODY_QDD, SolverBase.ObservableKind.BODY_PARENT_F}
     )
 
     def __init__(
@@ -164,6 +168,7 @@ class SolverSPO(Plugs, SolverBase):
             "gravity": Layout(gravity[:, None], (3,), device),
         }
         self._used = {name: wp.clone(getattr(model, name)) for name in WATCHED}
+        self._status = wp.zeros(W, dtype=wp.int32, device=device)  # where none is asked for: one kernel serves both
         self._turned = self._turned_hinges(scene)
         self._prepare()
 
@@ -231,7 +236,8 @@ class SolverSPO(Plugs, SolverBase):
             self.dynamics.step(q, qd, dt=dt, integrator=self.integrator, out=(q_out, qd_out), **given)
         else:  # they need the state before the step, too
             q_out, qd_out, qdd = self._q.buffer("q_out"), self._qd.buffer("qd_out"), self._qd.buffer("qdd")
-            self.dynamics.step(q, qd, dt=dt, out=(q_out, qd_out), qdd=qdd, **given)
+            status = self._status if observables.status is None else observables.status
+            self.dynamics.step(q, qd, dt=dt, out=(q_out, qd_out), qdd=qdd, status=status, **given)
             self._observe(observables, q, qd, qdd, body_f)
         if state_out is not state_in and not self._q.plain:  # entries of loop joints stay as they are
             for name in ("joint_q", "joint_qd"):
