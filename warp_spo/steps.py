@@ -56,7 +56,7 @@ class Steps:
         * dry friction: at most joint_friction against the motion; a hinge that sticks creeps by up to 1e-4 rad/s, m/s.
         * velocity limit: a damper on what exceeds it, 300 / dt times the inertia that the hinge feels at the neutral q
           of world 0, all others being free: there what a step would exceed it by shrinks about three hundredfold, less
-          where the hinge carries more.
+          where the hinge carries more. Of a hinge that feels none, 300 times what its other laws resist.
 
         Effort and velocity limits of 1e6 and more, Newton's default, bound nothing; position limits of 1e10 neither.
         What is zero or unbounded in the scene has no instruction in the kernel. The forces are implicit, at one
@@ -86,7 +86,8 @@ class Steps:
             status: int32 [world], of the semi-implicit step, written with the worst that is true of the world:
 
                 * 2 = an input is NaN or infinite.
-                * 1 = the result is not finite though the inputs are: as 1 and 4 in :meth:`forward_dynamics`.
+                * 1 = the result is not finite though the inputs are: as 1 and 4 in :meth:`forward_dynamics`. A hinge
+                  that carries nothing, without armature, is where its forces cancel: NaN where no law can hold it.
                 * 6 = the closures lose rank, or half of the dtype's digits: a change point, see there.
                 * 7 = the closures are open after the step, or q' and qd' do not agree: by more than 1e-5 rad, 1e-5 of
                   the distance to the hinges that move the joint, or 1e-5 of the rates. The state stands: Newton's steps

@@ -77,6 +77,10 @@ class ClosedStep(Step):
             step = tied.space.particular([-rate for rate in rates])
             qd |= {dof: qd[dof] + change for dof, change in step.items()}
 
+    def _weightless(self, link: Link) -> bool:
+        """What a loop ties may carry what is on its other side."""
+        return id(link) not in self.trace.cluster_of and super()._weightless(link)
+
     def _unresolved(self) -> Value:
         least = RESOLVED * self.trace.epsilon
         return total(1.0 - less(least, margin) for margin in self.margins)
