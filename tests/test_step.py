@@ -121,6 +121,29 @@ def test_friction_sticks_and_slides():
     np.testing.assert_allclose(qd[[2, 3, 5]], [1.0 - H * 2.0, -1.0 + H * 2.0, H * 0.5], rtol=1e-12)
 
 
+@pytest.mark.parametrize(("dtype", "share"), [("float32", 0.1), ("float64", 1e-9)])
+def test_friction_stays_below_its_bound(dtype, share):
+    """Two links stopped from 10 rad/s in a step, by about as much friction as that needs: what held each, from the
+    change of the rates, is no more than its bound, and in float32 by rounding no more than the docstring says."""
+    worlds, rng = 200, np.random.default_rng(3)
+    scene = zoo.chain(2).with_values(joint_damping=np.zeros(2), joint_stiffness=np.zeros(2))
+    q = rng.uniform(-1.0, 1.0, (worlds, 2)).astype(np.float32).astype(float)
+    qd = (rng.choice([-10.0, 10.0], q.shape) * rng.uniform(0.8, 1.0, q.shape)).astype(np.float32).astype(float)
+
+    def held(after):
+        dense = [Dense(scene, x) for x in q]
+        moved = zip(dense, qd, after, strict=True)
+        return np.array([d.mass_matrix @ (b - a) / H + d.bias_force(a) for d, a, b in moved])
+
+    bound = np.abs(held(np.zeros_like(qd))) * rng.choice([0.9, 0.98, 1.02, 2.0], q.shape)
+    bound = bound.astype(np.float32).astype(float)
+    scene = scene.with_values(joint_friction=bound)
+    arrays = {"q": q, "qd": qd, "tau": np.zeros_like(qd), "joint_friction": bound}
+    _, after, passes = symbolic.advance(scene, arrays, H, dtype)
+    assert (passes <= 8).all() and (np.abs(after) < 2.0 * impedance.CREEP).any()
+    assert (np.abs(held(after)) <= (1.0 + share) * bound).all()
+
+
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_velocity_limits(dtype):
     _, qd = slide(slider(velocity_limit=2.0), 0.0, [1.0, 1.99, 5.0, -5.0, 2.0], [0.0, 1e3, 0.0, 0.0, -1e3], dtype=dtype)
