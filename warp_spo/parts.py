@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from .errors import UnsupportedError
+from .errors import UnsupportedError, refuse_masked
 
 IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 UNLIMITED = 1e10
@@ -47,6 +47,7 @@ DOF_VALUES = {
 
 
 def checked_array(call: str, name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    refuse_masked(call, name, value)
     try:
         array = np.array(value, dtype=np.float64)  # a copy: what the caller does to his later changes nothing here
     except (TypeError, ValueError):
@@ -134,6 +135,7 @@ def _axes(call: str, kind: str, axis: Any, linear: Any, angular: Any, pitch: flo
     """The screws of a hinge, inboard first."""
 
     def rows(name: str, value: Any, counts: Sequence[int]) -> np.ndarray:
+        refuse_masked(call, name, value)
         try:
             array = np.atleast_2d(np.array(() if value is None else value, dtype=np.float64))
         except (TypeError, ValueError):

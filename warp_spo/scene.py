@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from .errors import refuse_masked
 from .parts import (
     DOF_VALUES,
     FREE,
@@ -232,6 +233,7 @@ class Scene:
         if name not in self.values:
             raise ValueError(f"{call}: unknown value {name!r}; expected one of {', '.join(sorted(self.values))}")
         shape = self.values[name].shape[1:]
+        refuse_masked(call, name, value)
         try:
             array = np.array(value, dtype=np.float64)
         except (TypeError, ValueError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from .adjoints import differentiable
@@ -19,6 +20,9 @@ INTEGRATORS = ("semi_implicit", "midpoint", "rk4")
 MIDPOINT_ITERATIONS = 6  # after the first guess; each gains an order in dt of the velocity terms
 RK4 = ((0.0, 1.0 / 6.0), (0.5, 1.0 / 3.0), (0.5, 1.0 / 3.0), (1.0, 1.0 / 6.0))
 """Where each stage starts, in dt along the one before, and its weight."""
+FORMATS = ((wp.float32, np.finfo(np.float32)), (wp.float64, np.finfo(np.float64)))
+SECONDS = {dtype: (float(held.tiny), float(held.max)) for dtype, held in FORMATS}
+"""Least and largest normal number of each dtype."""
 
 
 class Steps:
@@ -112,7 +116,7 @@ class Steps:
             for name, array in (("status", status), ("qdd", qdd)):
                 if array is not None and integrator != "semi_implicit":
                     raise ValueError(f"{call.name}: {name} with integrator={integrator!r}; expected 'semi_implicit'")
-            dt = _seconds(call.name, dt)
+            dt = _seconds(call, dt)
             if not dt > 0.0:
                 raise ValueError(f"{call.name}: dt is {dt} s; expected more than zero")
             q, qd = self._read_state(call, q, qd, optional=False)
@@ -185,7 +189,7 @@ class Steps:
         with self._call("integrate") as call:
             q, qd = self._read_state(call, q, qd, optional=False)
             out = call.write(out, (self.worlds, self.scene.coord_count), "[world, coordinate]")
-            self._launch("integrate", out, q=q, qd=qd, dt=_seconds(call.name, dt))
+            self._launch("integrate", out, q=q, qd=qd, dt=_seconds(call, dt))
         return call.result
 
     # -- integrators -----------------------------------------------------------------------------------------------
@@ -287,10 +291,17 @@ class Steps:
     _launch: Any
 
 
-def _seconds(call: str, dt: Any) -> float:
+def _seconds(call: Call, dt: Any) -> float:
+    name = call.name
     if getattr(dt, "requires_grad", False):
-        raise ValueError(f"{call}: dt requires grad; derivatives are not available through this call; pass float(dt)")
+        raise ValueError(f"{name}: dt requires grad; derivatives are not available through this call; pass float(dt)")
     try:
-        return float(dt)
+        if isinstance(dt, str | bytes | bool):
+            raise TypeError
+        seconds = float(dt)
     except (TypeError, ValueError):
-        raise TypeError(f"{call}: dt is {dt!r}; expected a number of seconds, the same in all worlds") from None
+        raise TypeError(f"{name}: dt is {dt!r}; expected a number of seconds, the same in all worlds") from None
+    least, most = SECONDS[call.dtype]
+    if seconds != 0.0 and not least <= abs(seconds) <= most:
+        raise ValueError(f"{name}: dt is {seconds} s; expected a number that {call.dtype.__name__} holds, finite")
+    return seconds
