@@ -660,6 +660,13 @@ BAD_SCENES = {
     "axis": (lambda: spo.Hinge("revolute", -1, 0, axis="z"), ValueError, "Hinge('revolute'): axis is 'z'; expected"),
     "kind": (lambda: spo.Hinge(["fixed"], -1, 0), ValueError, "unknown kind; expected one of fixed"),
     "armature": (lambda: spo.Hinge("ball", -1, 0, armature="much"), ValueError, "armature is 'much'; expected"),
+    "complex": (lambda: scene().with_values(gravity=np.ones(3) * 1j), ValueError, "gravity is array([0.+1.j, "),
+    "text": (lambda: spo.Body("1"), ValueError, "Body: mass [kg] is '1'; expected numbers"),
+    "complex mass": (lambda: spo.Body(1 + 1j), ValueError, "Body: mass [kg] is (1+1j); expected numbers"),
+    "ratio": (
+        lambda: spo.Scene(scene().bodies, scene().hinges, couplings=[spo.Coupling(0, 1, np.nan)]),
+        ValueError, "Scene: a coupling's ratio is nan; expected finite numbers",
+    ),
     "value": (lambda: scene().with_values(gravity="down"), ValueError, "Scene.with_values: gravity is 'down'"),
 }
 

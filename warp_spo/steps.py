@@ -21,7 +21,7 @@ MIDPOINT_ITERATIONS = 6  # after the first guess; each gains an order in dt of t
 RK4 = ((0.0, 1.0 / 6.0), (0.5, 1.0 / 3.0), (0.5, 1.0 / 3.0), (1.0, 1.0 / 6.0))
 """Where each stage starts, in dt along the one before, and its weight."""
 FORMATS = ((wp.float32, np.finfo(np.float32)), (wp.float64, np.finfo(np.float64)))
-SECONDS = {dtype: (float(held.tiny), float(held.max)) for dtype, held in FORMATS}
+SECONDS: dict[Any, tuple[float, float]] = {dtype: (float(held.tiny), float(held.max)) for dtype, held in FORMATS}
 """Least and largest normal number of each dtype."""
 
 

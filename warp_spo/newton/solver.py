@@ -236,8 +236,7 @@ class SolverSPO(Plugs, SolverBase):
             self.dynamics.step(q, qd, dt=dt, integrator=self.integrator, out=(q_out, qd_out), **given)
         else:  # they need the state before the step, too
             q_out, qd_out, qdd = self._q.buffer("q_out"), self._qd.buffer("qd_out"), self._qd.buffer("qdd")
-            status = self._status if observables.status is None else observables.status
-            self.dynamics.step(q, qd, dt=dt, out=(q_out, qd_out), qdd=qdd, status=status, **given)
+            self.dynamics.step(q, qd, dt=dt, out=(q_out, qd_out), qdd=qdd, status=self._words(observables), **given)
             self._observe(observables, q, qd, qdd, body_f)
         if state_out is not state_in and not self._q.plain:  # entries of loop joints stay as they are
             for name in ("joint_q", "joint_qd"):
@@ -275,6 +274,9 @@ class SolverSPO(Plugs, SolverBase):
             rates = self._qd.read(control.joint_target_qd, "joint_target_qd")
             found["target_qd"] = self._qd.scaled(rates, self._factors["joint_target_qd"], "target_qd")
         return found
+
+    def _words(self, observables: Any) -> wp.array:
+        return self._status if observables.status is None else observables.status
 
     def _observe(self, observables: Any, q: wp.array, qd: wp.array, qdd: wp.array, body_f: Any) -> None:
         kinds = SolverBase.ObservableKind
