@@ -669,7 +669,7 @@ def test_mistakes_are_explained(device):
     with pytest.raises(ValueError, match="iterations is -1"):
         make().project(q, iterations=-1)
     for out in ((), (None, None, None), (None, q.copy())):
-        with pytest.raises(TypeError, match=r"project: out is \(.*; expected an array for q, there being no qd"):
+        with pytest.raises(TypeError, match=r"(?s)project: out is \(.*; expected an array for q, there being no qd"):
             make().project(q, out=out)
     with pytest.raises(TypeError, match=r"project: out is \(None,\); expected a pair of arrays or None, \(q, qd\)"):
         make().project(q, q, out=(None,))

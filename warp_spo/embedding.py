@@ -165,8 +165,7 @@ def _numbers(scene: Scene, asked: Sequence[int | str], call: str) -> set[int]:
         raise TypeError(f"{call}: independent is {asked!r}; expected a list of dofs, indices or labels")
     for dof in asked:
         number = labels.index(dof) if isinstance(dof, str) and dof in labels else dof
-        whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
-        if not whole or not 0 <= number < scene.dof_count:
+        if not isinstance(number, int | np.integer) or isinstance(number, bool) or not 0 <= number < scene.dof_count:
             raise ValueError(f"{call}: independent names {dof!r}; expected dofs, 0 to {scene.dof_count - 1}, or labels "
                              f"among {', '.join(labels)}")
         found.add(int(number))
