@@ -516,7 +516,7 @@ def test_values_and_times_that_no_step_has():
         slider(friction=-2.0)
     dyn = spo.Dynamics(scene, 1, device="cpu")
     for dt in (0.0, -1e-3, float("nan")):
-        with pytest.raises(ValueError, match=r"dt is .* expected more than zero"):
+        with pytest.raises(ValueError, match=r"dt is .* expected (more than zero|a number that float32 holds, finite)"):
             dyn.step(np.zeros((1, 1)), np.zeros((1, 1)), None, dt)
 
 

@@ -20,7 +20,7 @@ class Layout:
         like: the model's array; those that come later are of its size.
     """
 
-    def __init__(self, rows: np.ndarray, shape: tuple[int, ...], device: wp.Device, like: wp.array):
+    def __init__(self, rows: np.ndarray, shape: tuple[int, ...], device: wp.Device, like: Any):
         components = int(np.prod(shape)) // max(1, rows.shape[1])
         flat = (rows[..., None] * components + np.arange(components)).reshape(len(rows), -1)
         self.device, self.shape, self._flat_shape = device, (len(rows), *shape), flat.shape
