@@ -324,7 +324,8 @@ class Call:
     def _check_writeable(self, name, array):
         if not array.flags.writeable:
             raise ValueError(f"{self.name}: {name} is a read-only NumPy array; expected one to write into; pass a copy")
-        if array.size and any(stride == 0 and size > 1 for stride, size in zip(array.strides, array.shape, strict=True)):
+        extents = zip(array.strides, array.shape, strict=True)
+        if array.size and any(stride == 0 and size > 1 for stride, size in extents):
             raise ValueError(
                 f"{self.name}: {name} is a NumPy array with strides {array.strides}, whose entries share memory; "
                 f"expected one entry for each number of the result; pass a fresh array"
