@@ -6,7 +6,8 @@ import warp as wp
 
 from .status import FINE, NOT_FINITE, NOT_POSITIVE
 
-LOOPS = 6  # the word: the closures lose rank, or half of the digits, here
+LOOPS, OPEN = 6, 7  # words: the closures lose rank, or half of the digits, here; they are open
+NOT_SETTLED = 5  # of a step; OPEN is worse
 EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
 SWEEPS = 10  # of Jacobi's rotations: quadratic convergence; 6 to 8 do for 36 rows
 NOISE = 32.0  # times rows and eps: eigenvalues below this share of the largest are zero
@@ -185,4 +186,21 @@ def word(T) -> wp.Kernel:
     return kernel
 
 
-KERNELS = (least_norm, word)
+@functools.cache
+def opened(T) -> wp.Kernel:
+    """The word OPEN for worlds in which closures are open, and nothing worse is true."""
+
+    @wp.kernel(module=f"warp_spo_loops_{T.__name__}", enable_backward=False)
+    def kernel(
+        rows: wp.array2d[T],
+        status_out: wp.array[wp.int32],
+    ):
+        world = wp.tid()
+        found = status_out[world]
+        if rows[world, 0] > T(0.0) and (found == FINE or found == NOT_SETTLED):
+            status_out[world] = OPEN
+
+    return kernel
+
+
+KERNELS = (least_norm, word, opened)

@@ -293,6 +293,119 @@ def test_dt_is_one_number_and_is_never_detached(device):
             assert np.abs(np.linalg.norm(far[:, end - 4 : end], axis=1) - 1.0).max() <= SAME["float64"]
 
 
+BAD_DT = [np.nan, np.inf, 1e-60, 1e60]
+
+
+@pytest.mark.parametrize("operation", ["step", "integrate"])
+def test_dt_is_a_number_that_the_dtype_holds(operation, device):
+    """Rounded to zero or infinity it would be a step of another length, or NaN in all worlds."""
+    dyn = dynamics(device, "float32")
+    a = laws.states(dyn.scene, WORLDS)
+    arguments = (a["q"], a["qd"], a["tau"])[: 3 if operation == "step" else 2]
+    for dt in BAD_DT:
+        with explained(ValueError, f"Dynamics.{operation}", f"dt is {dt} s", "float32", "finite"):
+            getattr(dyn, operation)(*arguments, dt)
+    for dt in ("1e-3", True):
+        with explained(TypeError, f"Dynamics.{operation}", f"dt is {dt!r}", "expected a number of seconds"):
+            getattr(dyn, operation)(*arguments, dt)
+
+
+# -- arrays that are not what they seem --------------------------------------------------------------------------------
+def test_a_masked_array_is_refused_wherever_an_array_goes(device):
+    """What is under its mask would be taken for numbers."""
+    dyn = spo.Dynamics(scene(), WORLDS, device=device, dtype="float64", variable=("body_mass",))
+    hide = lambda x: np.ma.masked_array(x, mask=np.arange(np.size(x)).reshape(np.shape(x)) == 0)  # noqa: E731
+    q, mass = laws.states(dyn.scene, WORLDS)["q"], dyn.scene.values["body_mass"][0]
+    shape = (WORLDS, dyn.scene.dof_count)
+    calls = {
+        "q": lambda: dyn.gravity_force(hide(q)),
+        "tau": lambda: dyn.forward_dynamics(q, tau=hide(np.zeros(shape))),
+        "out": lambda: dyn.gravity_force(q, out=hide(np.zeros(shape))),
+        "status": lambda: dyn.forward_dynamics(q, status=hide(np.zeros(WORLDS, np.int32))),
+        "prescribed": lambda: dyn.hybrid_dynamics(q, prescribed=hide(np.zeros(shape[1], bool))),
+        "body_mass": lambda: dyn.set(body_mass=hide(mass)),
+        "joint_damping": lambda: dyn.set(joint_damping=hide(np.ones(shape[1]))),
+        "gravity": lambda: dyn.scene.with_values(gravity=hide(np.ones(3))),
+        "com": lambda: spo.Body(1.0, hide(np.ones(3)), np.eye(3)),
+        "axis": lambda: spo.Hinge("revolute", -1, 0, axis=hide(np.eye(3)[0])),
+        "a frame's pose": lambda: dyn.jacobian(q, [(0, hide(np.array(POSE)))]),
+    }
+    for name, call in calls.items():
+        with explained(TypeError, f"{name}", "is a masked array", "expected a plain NumPy array", ".filled(number)"):
+            call()
+    np.testing.assert_array_equal(dyn.gravity_force(hide(q).data), dyn.gravity_force(q))
+
+
+def test_results_in_arrays_with_strides(device):
+    """NumPy's are filled; of a tensor a contiguous copy is no way out: it would be filled in its place."""
+    dyn = dynamics(device)
+    q = laws.states(dyn.scene, WORLDS)["q"]
+    wanted, dofs = dyn.gravity_force(q), dyn.scene.dof_count
+    for out in (np.full((WORLDS, 2 * dofs), np.nan)[:, ::2], np.full((dofs, WORLDS), np.nan).T,
+                np.full((WORLDS, dofs), np.nan)[::-1, ::-1], np.full((WORLDS, dofs), np.nan, ">f8")):  # fmt: skip
+        assert dyn.gravity_force(q, out=out) is out
+        np.testing.assert_array_equal(out, wanted)
+    words = np.full(2 * WORLDS, -1, np.int32)
+    dyn.forward_dynamics(q, status=words[::2])
+    np.testing.assert_array_equal(words, [0, -1] * WORLDS)
+    for kind, title in (("torch", "torch"), ("warp", "Warp")):
+        out = made(kind, np.zeros((WORLDS, 2 * dofs)), dyn)[:, ::2]
+        way = "copy it into out: out.contiguous() is not out"
+        with explained(ValueError, "Dynamics.gravity_force", f"out is a {title} array", "C-contiguous", way):
+            dyn.gravity_force(made(kind, q, dyn), out=out)
+    shared = np.lib.stride_tricks.as_strided(np.zeros(dofs), (WORLDS, dofs), (0, 8))
+    with explained(ValueError, "Dynamics.gravity_force", "out is a NumPy array", "share memory", "fresh array"):
+        dyn.gravity_force(q, out=shared)
+
+
+def test_numpy_arrays_to_be_filled_have_the_dtype_of_what_fills_them(device):
+    """A status of bools or a qdd of integers would lose what is written."""
+    dyn = dynamics(device)
+    a = laws.states(dyn.scene, WORLDS)
+    for dtype in (bool, np.int8, np.int64, np.float64):
+        for call in (lambda s: dyn.forward_dynamics(a["q"], status=s),
+                     lambda s: dyn.step(a["q"], a["qd"], None, 1e-3, status=s)):  # fmt: skip
+            with explained(ValueError, "status is a NumPy array", np.dtype(dtype).name, "expected int32", "convert it"):
+                call(np.zeros(WORLDS, dtype))
+    for dtype in (int, np.float32):
+        with explained(ValueError, "Dynamics.step: qdd is a NumPy array", "expected float64", "convert it"):
+            dyn.step(a["q"], a["qd"], None, 1e-3, qdd=np.zeros(a["qd"].shape, dtype))
+
+
+def test_masks_are_bools_and_tensors_are_dense(device):
+    dyn = dynamics(device)
+    q = laws.states(dyn.scene, WORLDS)["q"]
+    shape = (WORLDS, dyn.scene.dof_count)
+    for mask in (np.zeros(shape, int), np.zeros(shape, np.uint8), np.zeros(shape)):
+        with explained(ValueError, "prescribed is a NumPy array", "expected bool", "convert it to bool"):
+            dyn.hybrid_dynamics(q, prescribed=mask)
+    with explained(ValueError, "prescribed is [[True], [True, False]]; expected bools"):
+        dyn.hybrid_dynamics(q, prescribed=[[True], [True, False]])
+    sparse = given("torch", dyn)["q"].to_sparse()
+    with explained(ValueError, "Dynamics.gravity_force", "q is a torch array", "expected a dense one", "q.to_dense()"):
+        dyn.gravity_force(sparse)
+
+
+BAD_RESULTS = {
+    "unknown": (dict(out={"q": None, "mass": None}), ValueError, "out has 'mass'; expected names out of wrt: q, qd, "),
+    "not asked for": (dict(wrt=("q",), out={"qd": None}), ValueError, "out has 'qd'; expected names out of wrt: q"),
+    "a list": (dict(out=[None, None, None]), TypeError, "out is of type list; expected a dict"),
+    "an array": (dict(out=np.zeros(3)), TypeError, "out is of type ndarray; expected a dict"),
+    "no wrt": (dict(wrt=()), ValueError, "wrt is (); expected one name or more, each once"),
+    "twice": (dict(wrt=("q", "q")), ValueError, "wrt is ('q', 'q'); expected one name or more, each once"),
+    "a number": (dict(wrt=3), TypeError, "wrt is 3; expected names"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_RESULTS)
+@pytest.mark.parametrize("operation", ["forward_dynamics_vjp", "inverse_dynamics_vjp"])
+def test_results_by_name_are_those_that_were_asked_for(operation, case, device):
+    options, error, words = BAD_RESULTS[case]
+    a = laws.states(dynamics(device).scene, WORLDS)
+    with explained(error, f"Dynamics.{operation}: {words}"):
+        getattr(dynamics(device), operation)(a["q"], a["qd"], a["qd"], cotangent=a["qd"], **options)
+
+
 # -- quaternions -------------------------------------------------------------------------------------------------------
 def turned_scene():
     return zoo.random_tree(12, 3)  # a free and a ball hinge, free ones inside the tree too
@@ -383,6 +496,7 @@ BAD_FRAMES = {
     "no such label": (["nobody"], ValueError, "no body 'nobody' in the scene; expected one of scene.body_labels"),
     "beyond": ([5], ValueError, "a frame's body is 5; expected 0 to 4"),
     "negative": ([-1], ValueError, "a frame's body is -1; expected 0 to 4"),
+    "yes": ([True], TypeError, "a frame is True; expected a body (index or label) or (body, pose in the body)"),
     "half": ([0.5], TypeError, "a frame is 0.5; expected a body (index or label) or (body, pose in the body)"),
     "a point": ([(0, (0, 0, 0))], ValueError, "expected x, y, z and a unit quaternion"),
     "long quaternion": ([(0, (0, 0, 0, 0, 0, 0, 2))], ValueError, "expected x, y, z and a unit quaternion"),
@@ -414,8 +528,9 @@ BAD_ARGUMENTS = {
     "loops": [("open", ValueError), (None, ValueError), ([], ValueError)],
     "variable": [(("mass",), ValueError), ("mass", ValueError), ((3,), ValueError), (3, TypeError), (None, TypeError)],
     "dtype": [("float16", ValueError), (float, ValueError), (None, ValueError), (torch.float16, ValueError)],
-    "worlds": [(0, ValueError), (-1, ValueError), (2.5, TypeError), ("3", TypeError)],
-    "device": [("gpu", ValueError), ("cuda:99", ValueError), (torch.device("meta"), ValueError), (3, ValueError)],
+    "worlds": [(0, ValueError), (-1, ValueError), (2.5, TypeError), ("3", TypeError), (True, TypeError)],
+    "refine": [(-1, ValueError), (True, ValueError), ("1", ValueError)],
+    "device": [(name, ValueError) for name in ("gpu", [], "cuda:99", torch.device("meta"), 3)],
 }
 
 
@@ -496,13 +611,15 @@ BAD_PREPARE = {
     "status": (dict(operation="inverse_dynamics", status=True), "inverse_dynamics has no option status"),
     "columns": (dict(operation="solve_mass_matrix", columns="many"), "columns is 'many'"),
     "negative": (dict(operation="solve_mass_matrix", columns=-1), "columns is -1"),
+    "a list": (dict(operation=["step"]), "no operation ['step']; expected one of forward_dynamics"),
+    "along": (dict(operation="forward_dynamics_jvp", along=("dx",)), "along names 'dx'", "some of dq, dqd"),
 }
 
 
 @pytest.mark.parametrize("case", BAD_PREPARE)
 def test_bad_prepare_is_refused_in_words(case, device):
-    arguments, words = BAD_PREPARE[case]
-    with explained(ValueError, "Dynamics.prepare", words):
+    arguments, *words = BAD_PREPARE[case]
+    with explained(ValueError, "Dynamics.prepare", *words):
         dynamics(device).prepare(**arguments)
 
 
@@ -543,6 +660,13 @@ BAD_SCENES = {
     "axis": (lambda: spo.Hinge("revolute", -1, 0, axis="z"), ValueError, "Hinge('revolute'): axis is 'z'; expected"),
     "kind": (lambda: spo.Hinge(["fixed"], -1, 0), ValueError, "unknown kind; expected one of fixed"),
     "armature": (lambda: spo.Hinge("ball", -1, 0, armature="much"), ValueError, "armature is 'much'; expected"),
+    "complex": (lambda: scene().with_values(gravity=np.ones(3) * 1j), ValueError, "gravity is array([0.+1.j, "),
+    "text": (lambda: spo.Body("1"), ValueError, "Body: mass [kg] is '1'; expected numbers"),
+    "complex mass": (lambda: spo.Body(1 + 1j), ValueError, "Body: mass [kg] is (1+1j); expected numbers"),
+    "ratio": (
+        lambda: spo.Scene(scene().bodies, scene().hinges, couplings=[spo.Coupling(0, 1, np.nan)]),
+        ValueError, "Scene: a coupling's ratio is nan; expected finite numbers",
+    ),
     "value": (lambda: scene().with_values(gravity="down"), ValueError, "Scene.with_values: gravity is 'down'"),
 }
 

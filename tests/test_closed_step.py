@@ -227,6 +227,58 @@ def test_change_points_have_a_word(device):
             assert np.isfinite(x[0]).all() and np.isnan(x[1:]).all()
 
 
+def crank_turning(closing, worlds=8, rate=10.0):
+    """The four-bar in all its positions, its fastest bar turning at ``rate`` [rad/s]."""
+    crank = np.linspace(0.0, 3.0, worlds)
+    q = closing.closed(np.stack([crank, -1.0 - crank, np.full(worlds, 2.0)], axis=1))
+    qd = np.stack([np.linalg.svd(Y)[2][-1] for Y in closing.at(q)[1]])
+    return q, qd * (rate / np.abs(qd).max(axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("loops", ["embed", "multipliers"])
+def test_what_stays_open_has_a_word(loops, dtype, device):
+    """Bars at 10 rad/s: steps of up to 20 ms close, steps of 0.1 s do not; nor does an open state, at once. The word is
+    there exactly where closures, as shares of the bars' lengths, are open by more than what it names."""
+    scene = MECHANISMS["fourbar"]()
+    closing = Closing(scene)
+    q, qd = crank_turning(closing)
+    worlds = len(q)
+    dyn = spo.Dynamics(scene, worlds, device=device, dtype=dtype, loops=loops)
+    dyn.prepare("step", status=True)
+    plain = spo.Dynamics(scene, worlds, device=device, dtype=dtype, loops=loops)
+    seen = set()
+    for start, h in [(q, h) for h in (1e-3, 5e-3, 0.02, 0.05, 0.1, 0.2, 0.3)] + [(q + 0.3, 1e-3)]:
+        status = np.full(worlds, -1, np.int32)
+        after = dyn.step(start, qd, None, h, status=status)
+        for x, y in zip(after, plain.step(start, qd, None, h), strict=True):
+            np.testing.assert_array_equal(x, y)
+        error, Y = closing.at(after[0].astype(np.float64))[:2]
+        apart = np.maximum(np.abs(error).max(axis=1), np.abs(np.einsum("wri,wi->wr", Y, after[1])).max(axis=1)
+                           / np.linalg.norm(after[1], axis=1))  # fmt: skip
+        assert (status[apart > 2e-5] == 7).all() and not status[apart < 1e-6].any()  # arms of 0.2 to 2 m
+        if h <= 0.02 and start is q:
+            assert not status.any()
+        elif h >= 0.2:
+            assert (status == 7).all()
+        seen |= set(status.tolist())
+    assert seen == {0, 7}
+
+
+def test_the_word_sees_each_coordinate_and_rate(device):
+    """A bug of either way back alone: the position's, the rates'."""
+    scene = MECHANISMS["fourbar"]()
+    closing = Closing(scene)
+    q, qd = crank_turning(closing, 3)
+    for of in ("rate for rate", "g for g"):
+        with pytest.MonkeyPatch.context() as patch:
+            symbolic.plant(patch, closed_step.ClosedStep, "_close", f"[-{of}", f"[-0.5 * {of}")
+            dyn = spo.Dynamics(scene, 3, device=device, loops="embed")
+            status = np.full(3, -1, np.int32)
+            dyn.step(q, qd, None, 0.02, status=status)
+            assert (status == 7).all()
+
+
 def test_reactions_are_refused(device):
     _, _, s, _ = mechanisms.case("fourbar")
     for loops in ("embed", "multipliers"):

@@ -668,6 +668,17 @@ def test_mistakes_are_explained(device):
         make("multipliers").project(q, hold=True)
     with pytest.raises(ValueError, match="iterations is -1"):
         make().project(q, iterations=-1)
+    for out in ((), (None, None, None), (None, q.copy())):
+        with pytest.raises(TypeError, match=r"(?s)project: out is \(.*; expected an array for q, there being no qd"):
+            make().project(q, out=out)
+    with pytest.raises(TypeError, match=r"project: out is \(None,\); expected a pair of arrays or None, \(q, qd\)"):
+        make().project(q, q, out=(None,))
+    with pytest.raises(TypeError, match="loop_multipliers: out is None; expected a pair of arrays or None"):
+        make("multipliers").loop_multipliers(q, out=None)
+    with pytest.raises(TypeError, match="independent is 0; expected a list of dofs"):
+        make(independent=0)
+    with pytest.raises(ValueError, match="names True; expected dofs"):
+        make(independent=[True])
     with pytest.raises(ValueError, match="independent= belongs to"):
         make("cut", independent=[0])
     with pytest.raises(ValueError, match="names 'knee'; expected dofs"):

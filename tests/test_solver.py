@@ -266,6 +266,33 @@ def test_observables_belong_to_their_solver(turned):
         solver.observables({SolverBase.ObservableKind.CONTACT_F}, contacts=model.contacts())
 
 
+@pytest.mark.parametrize("case", ["long", "double", "NumPy", "strides", "nothing", "state", "control", "model"])
+def test_what_is_not_the_models_is_refused(turned, case):
+    """Arrays are read where they are: of another size or type, that would be other memory, or other numbers."""
+    model, solver = turned
+    state, control, n = moving(model), model.control(), model.joint_dof_count
+    words, error = "SolverSPO: joint_f is .*; expected a Warp array float32 of", ValueError
+    if case == "nothing":
+        state.joint_q, words, error = None, "SolverSPO: joint_q is of type NoneType; expected a Warp array", TypeError
+    elif case == "state":
+        state, words, error = 3, "SolverSPO.step: state_in is of type int; expected a newton.State", TypeError
+    elif case == "control":
+        control, words, error = 3, "SolverSPO.step: control is of type int; expected a newton.Control", TypeError
+    elif case == "model":
+        with pytest.raises(TypeError, match=r"SolverSPO: model is of type NoneType; expected a newton.Model"):
+            SolverSPO(None)
+        with pytest.raises(TypeError, match="SolverSPO: variable is 3; expected names"):
+            SolverSPO(model, variable=3)
+        return
+    else:
+        made = {"long": lambda: wp.zeros(n + 1), "double": lambda: wp.zeros(n, dtype=wp.float64),
+                "NumPy": lambda: np.zeros(n, np.float32), "strides": lambda: wp.zeros(2 * n)[::2]}  # fmt: skip
+        with wp.ScopedDevice(model.device):
+            control.joint_f, error = made[case](), TypeError if case == "NumPy" else ValueError
+    with pytest.raises(error, match=words):
+        solver.step(state, moving(model), control, None, H)
+
+
 # -- states ------------------------------------------------------------------------------------------------------------
 def test_in_place_is_the_same_and_nothing_is_allocated(turned):
     model, solver = turned

@@ -165,6 +165,22 @@ def test_observables(pinned):
         np.testing.assert_allclose(getattr(seen, name).numpy(), rate, atol=0.02 * np.abs(rate).max())
 
 
+@pytest.mark.parametrize("loops", ["embed", "multipliers"])
+def test_what_stays_open_is_told(loops):
+    """Of the observables, ``status``: 7 in the world that starts open, 2 in one with a NaN, 0 in one that is closed."""
+    model = replicated(fourbar(), 3)
+    solver = SolverSPO(model, loops=loops)
+    state = start(model, solver)
+    q = state.joint_q.numpy().reshape(3, -1)
+    q[0, :3] += 0.5
+    q[1, 0] = np.nan
+    state.joint_q.assign(q.ravel())
+    seen = solver.observables({"status"})
+    seen.status.fill_(-1)
+    advance(solver, state, 1, h=1e-3, observables=seen)
+    assert seen.status.numpy().tolist() == [7, 2, 0]
+
+
 def test_a_graph_of_steps_and_resets_is_the_same(device):
     if not device.is_cuda:
         pytest.skip("graphs are captured on CUDA")

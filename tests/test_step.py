@@ -121,11 +121,89 @@ def test_friction_sticks_and_slides():
     np.testing.assert_allclose(qd[[2, 3, 5]], [1.0 - H * 2.0, -1.0 + H * 2.0, H * 0.5], rtol=1e-12)
 
 
+@pytest.mark.parametrize(("dtype", "share"), [("float32", 0.1), ("float64", 1e-9)])
+def test_friction_stays_below_its_bound(dtype, share):
+    """Two links stopped from 10 rad/s in a step, by about as much friction as that needs: what held each, from the
+    change of the rates, is no more than its bound, and in float32 by rounding no more than the docstring says."""
+    worlds, rng = 200, np.random.default_rng(3)
+    scene = zoo.chain(2).with_values(joint_damping=np.zeros(2), joint_stiffness=np.zeros(2))
+    q = rng.uniform(-1.0, 1.0, (worlds, 2)).astype(np.float32).astype(float)
+    qd = (rng.choice([-10.0, 10.0], q.shape) * rng.uniform(0.8, 1.0, q.shape)).astype(np.float32).astype(float)
+
+    def held(after):
+        dense = [Dense(scene, x) for x in q]
+        moved = zip(dense, qd, after, strict=True)
+        return np.array([d.mass_matrix @ (b - a) / H + d.bias_force(a) for d, a, b in moved])
+
+    bound = np.abs(held(np.zeros_like(qd))) * rng.choice([0.9, 0.98, 1.02, 2.0], q.shape)
+    bound = bound.astype(np.float32).astype(float)
+    scene = scene.with_values(joint_friction=bound)
+    arrays = {"q": q, "qd": qd, "tau": np.zeros_like(qd), "joint_friction": bound}
+    _, after, passes = symbolic.advance(scene, arrays, H, dtype)
+    assert (passes <= 8).all() and (np.abs(after) < 2.0 * impedance.CREEP).any()
+    assert (np.abs(held(after)) <= (1.0 + share) * bound).all()
+
+
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_velocity_limits(dtype):
     _, qd = slide(slider(velocity_limit=2.0), 0.0, [1.0, 1.99, 5.0, -5.0, 2.0], [0.0, 1e3, 0.0, 0.0, -1e3], dtype=dtype)
     np.testing.assert_allclose(qd, [1.0, 2.0, 2.0, -2.0, 1.0], atol=3.1 / impedance.HOLD)
     assert abs(qd[4] - 1.0) < 1e-5  # braking is nothing that it resists
+
+
+def weightless(count, **values):
+    """Sliders of 1 kg in a row, without gravity; the last one carries nothing, and has what is given."""
+    bodies = [spo.Body(float(k < count - 1), inertia=np.eye(3) * (k < count - 1)) for k in range(count)]
+    hinges = [spo.Hinge("prismatic", k - 1, k, axis=(1, 0, 0)) for k in range(count - 1)]
+    return spo.Scene(bodies, [*hinges, spo.Hinge("prismatic", count - 2, count - 1, axis=(1, 0, 0), **values)],
+                     gravity=(0, 0, 0))  # fmt: skip
+
+
+def balance(q, qd, tau, drive=(0.0, 0.0, np.inf), friction=0.0, limit=np.inf, limit_ke=0.0, fastest=np.inf):
+    """The rate after a step at which the forces on nothing cancel, by bisection; NaN where none is bounded."""
+    ke, kd, effort = drive
+    hold = impedance.HOLD * (H * ke + kd + friction / impedance.CREEP + (H * limit_ke if limit < np.inf else 0.0))
+
+    def excess(v):
+        f = np.clip(-ke * (q + H * v) - kd * v, -effort, effort) - friction * np.clip(v / impedance.CREEP, -1.0, 1.0)
+        f -= limit_ke * max(0.0, q + H * v - limit) if limit < np.inf else 0.0
+        f -= hold * (max(v - fastest, 0.0) - max(-fastest - v, 0.0)) if fastest < np.inf else 0.0
+        return -tau - f
+
+    return implicit._root(excess, qd) if excess(1e9) > 0.0 > excess(-1e9) else np.nan
+
+
+DRIVE, FRICTION, LIMIT = (100.0, 1.0, 1.5), 0.7, dict(limit=0.2, limit_ke=1e4)
+WEIGHTLESS = [
+    dict(drive=DRIVE),
+    dict(friction=FRICTION),
+    dict(drive=DRIVE, friction=FRICTION),
+    dict(friction=FRICTION, fastest=2.0),
+    dict(drive=DRIVE, friction=FRICTION, fastest=2.0, **LIMIT),
+]
+
+
+@pytest.mark.parametrize("laws_of_it", WEIGHTLESS, ids=lambda given: "-".join(given))
+@pytest.mark.parametrize("count", [2, 12])
+def test_what_moves_nothing_is_where_its_forces_balance(laws_of_it, count):
+    """No mass, no armature: a step is solved wherever a law holds the hinge, though at its start all are at their
+    bounds; NaN where it pulls beyond them. In joint space, and by sweeps."""
+    drive = dict(zip(("target_ke", "target_kd", "effort_limit"), laws_of_it.get("drive", ()), strict=False))
+    names = dict(friction="friction", limit="limit_upper", limit_ke="limit_ke", fastest="velocity_limit")
+    bounds = {names[name]: x for name, x in laws_of_it.items() if name in names}
+    scene = weightless(count, limit_kd=0.0, **drive, **bounds)
+    rng = np.random.default_rng(count)
+    q, qd, tau = (rng.uniform(-size, size, (60, count)) for size in (0.4, 3.0, 3.0))
+    qd[::3], tau[::4] = 0.0, 0.0
+    for dtype in ("float64", "float32"):
+        arrays = {name: x.astype(dtype).astype(float) for name, x in (("q", q), ("qd", qd), ("tau", tau))}
+        _, after, passes = symbolic.advance(scene, arrays, H, dtype)
+        wanted = np.array([balance(*(arrays[name][w, -1] for name in arrays), **laws_of_it) for w in range(60)])
+        assert "fastest" in laws_of_it or (np.isnan(wanted).any() and not np.isnan(wanted).all())
+        size = np.maximum(1.0, np.abs(qd[:, -1]))
+        error = np.abs(after[:, -1] - wanted) / size
+        np.testing.assert_array_equal(np.isnan(after[:, -1]), np.isnan(wanted))
+        assert np.nanmax(error) <= 1e3 * np.finfo(dtype).eps and (passes <= 8).all(), (np.nanmax(error), passes)
 
 
 def test_what_a_scene_does_not_have_costs_nothing():
@@ -190,7 +268,7 @@ BUGS = [
     (impedance.Law, "piece", "select(over, 0.0, resistance)", "resistance"),
     (impedance.Law, "missed", "one.at(u) - piece.line(u)", "0.0 * u"),
     (step.Step, "_stiffened", "self.h * piece.resistance", "piece.resistance"),
-    (joint_space.JointSpace, "solve", "U[i, j] - column[i]", "U[i, j] + column[i]"),
+    (joint_space.JointSpace, "solve", "U.get((i, j), 0.0) - column[i]", "U.get((i, j), 0.0) + column[i]"),
     (integration, "moved", "+ shift[i]", ""),
     (integration, "turned", "half = turn * 0.5", "half = turn"),
 ]
@@ -224,6 +302,18 @@ def test_passes_in_joint_space_equal_sweeps(monkeypatch, name, dtype):
         results.append(symbolic.advance(scene, a, H, dtype)[:2])
     for swept, short in zip(*results, strict=True):
         np.testing.assert_allclose(short, swept, rtol=0.0, atol=TOLERANCE[dtype])
+
+
+def test_passes_in_joint_space_with_hinges_listed_child_first(monkeypatch):
+    """The root's dofs are the last ones: eliminating them first fills in what two branches have in common."""
+    scene, results = furnished(zoo.from_parents([2, 2, -1], ["prismatic", "revolute", "free"], 4)), []
+    assert scene.hinges[-1].parent == -1 and scene.dof_count == 8
+    a = states(scene, 8)
+    for short in (0, 99):
+        monkeypatch.setattr(step, "SHORT", short)
+        results.append(symbolic.advance(scene, a, H)[:2])
+    for swept, short in zip(*results, strict=True):
+        np.testing.assert_allclose(short, swept, rtol=0.0, atol=TOLERANCE["float64"])
 
 
 def test_passes_that_states_need():
@@ -426,7 +516,7 @@ def test_values_and_times_that_no_step_has():
         slider(friction=-2.0)
     dyn = spo.Dynamics(scene, 1, device="cpu")
     for dt in (0.0, -1e-3, float("nan")):
-        with pytest.raises(ValueError, match=r"dt is .* expected more than zero"):
+        with pytest.raises(ValueError, match=r"dt is .* expected (more than zero|a number that float32 holds, finite)"):
             dyn.step(np.zeros((1, 1)), np.zeros((1, 1)), None, dt)
 
 

@@ -405,6 +405,29 @@ def test_what_has_no_gradient_says_so(tree):
         folded.forward_dynamics_vjp(q, qd, cotangent=qd, wrt="colour")
 
 
+BAD_OPS = {
+    "no Dynamics": (lambda dyn: spo_torch.custom_op(3, "step"), "custom_op: dyn is of type int; expected a Dynamics"),
+    "no option": (lambda dyn: spo_torch.custom_op(dyn, "step", dt=DT, colour=3), "colour=3 is no option; expected dt="),
+    "filled": (lambda dyn: spo_torch.custom_op(dyn, "step", dt=DT, status=0), "status=0 is no option"),
+    "integrator": (lambda dyn: spo_torch.custom_op(dyn, "step", dt=DT, integrator="rk4"), "'rk4' is no option"),
+    "no dt": (lambda dyn: spo_torch.custom_op(dyn, "step"), "dt is missing; expected dt="),
+    "no frames": (lambda dyn: spo_torch.custom_op(dyn, "jacobian"), "frames is missing; expected frames="),
+    "too many": (lambda dyn: spo_torch.custom_op(dyn, "gravity_force")(None, None), "2 tensors .*; expected q, each"),
+    "twice": (lambda dyn: spo_torch.custom_op(dyn, "gravity_force")(None, q=None), "1 tensors .* q by name; expect"),
+    "no tensor": (lambda dyn: spo_torch.custom_op(dyn, "gravity_force")(np.ones(3)), "q is of type ndarray; expected"),
+    "no module": (lambda dyn: spo_torch.Module(3), "Module: dyn is of type int; expected a Dynamics"),
+    "no names": (lambda dyn: spo_torch.Module(dyn, 3), "Module: names is 3; expected names of values"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_OPS)
+def test_bad_ops_and_modules_are_refused_in_words(tree, case):
+    make, words = BAD_OPS[case]
+    with pytest.raises(TypeError, match=words):
+        make(tree[0])
+    assert len(list(spo_torch.Module(tree[0], "body_mass").parameters())) == 1
+
+
 # -- planted bugs ------------------------------------------------------------------------------------------------------
 BUGS = {
     "the slope of the forces": ("step_vjp", "h * total(law.piece", "0.0 * total(law.piece"),

@@ -374,6 +374,10 @@ class Adjoints:
     ) -> tuple[tuple[str, ...], list[wp.array]]:
         """The checked names, and an array for each."""
         self._check_size(call, operation)
+        if not isinstance(wrt, str | list | tuple):
+            raise TypeError(f"{call.name}: wrt is {wrt!r}; expected names, such as {ARGUMENTS[operation][:2]}")
+        if not isinstance(out, dict | None):
+            raise TypeError(f"{call.name}: out is of type {type(out).__name__}; expected a dict, arrays by name of wrt")
         names, out = (wrt,) if isinstance(wrt, str) else tuple(wrt), out or {}
         arguments = ARGUMENTS[operation]
         entering = self.entering(operation)
@@ -386,8 +390,11 @@ class Adjoints:
                 raise ValueError(f"{call.name}: wrt names {name!r}; expected some of {', '.join(known)}")
             if name in given and given[name] is None and name != "tau":
                 raise ValueError(f"{call.name}: wrt names {name!r}, which is None; pass zeros to differentiate by it")
-        if not names or len(set(names)) < len(names) or set(out) - set(names):
-            raise ValueError(f"{call.name}: wrt is {names!r} and out has {tuple(out)!r}; expected names, each once")
+        if not names or len(set(names)) < len(names):
+            raise ValueError(f"{call.name}: wrt is {names!r}; expected one name or more, each once")
+        for name in out:
+            if name not in names:
+                raise ValueError(f"{call.name}: out has {name!r}; expected names out of wrt: {', '.join(names)}")
         shapes = {name: self._shape_of(name) for name in names}
         return names, [call.write(out.get(n), shapes[n], f"[world, ...] like {n}", name=f"out[{n!r}]") for n in names]
 

@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from .arrays import Call, shape_of
+from .errors import refuse_masked
 from .frames import Frame, checked
 from .kernels import cholesky
 from .levels import Recursions
@@ -85,7 +86,11 @@ class Applications:
         """The mask as an array [world, dof], or as a tuple of bools that folds."""
         dofs = self.scene.dof_count
         if isinstance(mask, list | tuple):
-            mask = np.asarray(mask, dtype=bool if len(mask) == 0 else None)
+            try:
+                mask = np.asarray(mask, dtype=bool if len(mask) == 0 else None)
+            except ValueError:
+                raise ValueError(f"{call.name}: prescribed is {mask!r}; expected bools, one for each dof") from None
+        refuse_masked(call.name, "prescribed", mask)
         if isinstance(mask, np.ndarray) and mask.ndim == 1:
             if mask.shape != (dofs,) or mask.dtype != bool:
                 raise ValueError(

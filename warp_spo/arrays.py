@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .errors import refuse_masked
+
 NUMPY, WARP, TORCH = "NumPy", "Warp", "torch"
 _DTYPES = {"float32": wp.float32, "float64": wp.float64}
 
@@ -40,7 +42,7 @@ def parse_device(device=None, call: str = "device") -> wp.Device:
         if device is not None and type(device).__module__ == "torch":
             return wp.get_device(_torch().device_name(device))
         return wp.get_device(device)
-    except (ValueError, RuntimeError, AssertionError):  # AssertionError: torch without CUDA
+    except (TypeError, ValueError, RuntimeError, AssertionError):  # AssertionError: torch without CUDA
         known = ", ".join(repr(known.alias) for known in wp.get_devices())
         raise ValueError(f"{call}: device is {device!r}; expected one of this machine's: {known}") from None
 
@@ -54,6 +56,7 @@ def kind_of(array, call: str, name: str) -> str:
     if isinstance(array, wp.array):
         return WARP
     if isinstance(array, np.ndarray):
+        refuse_masked(call, name, array)
         return NUMPY
     if "torch" in sys.modules and _torch().is_tensor(array):
         return TORCH
@@ -247,14 +250,14 @@ class Call:
                 same = True
             self._check(name, array, kind, came, shape, meaning, dtype, same)
             if array.device != self.device or not array.is_contiguous:
-                self._refuse_place(name, array, kind, array.is_contiguous)
+                self._refuse_place(name, array, kind, array.is_contiguous, change)
             if array.requires_grad and wp._src.context.runtime.tape is not None:
                 self._refuse_grad(name, "is recorded by wp.Tape", "leave the tape's block")
             return array if array.dtype is dtype else view(array.ptr, came, dtype, self.device.alias)
         torch = _torch()
         self._check(name, array, kind, array.shape, shape, meaning, dtype, torch.has_dtype(array, dtype))
         if not torch.is_on(array, self.device) or not array.is_contiguous():
-            self._refuse_place(name, array, kind, array.is_contiguous())
+            self._refuse_place(name, array, kind, array.is_contiguous(), change)
         if array.is_neg():  # the memory holds the numbers with the other sign
             raise ValueError(
                 f"{self.name}: {name} is a lazy negative view; expected plain memory; pass {name}.resolve_neg()"
@@ -268,8 +271,9 @@ class Call:
         return view(array.data_ptr(), tuple(array.shape), dtype, self.device.alias)
 
     def _take_numpy(self, name, array, shape, meaning, dtype, change):
-        kinds = "biuf" if dtype in (wp.float32, wp.float64) else "biu"
-        self._check(name, array, NUMPY, array.shape, shape, meaning, dtype, array.dtype.kind in kinds)
+        kinds = {wp.float32: "biuf", wp.float64: "biuf", wp.bool: "b"}.get(dtype, "iu")
+        fits = array.dtype.name == dtype.__name__ if change else array.dtype.kind in kinds
+        self._check(name, array, NUMPY, array.shape, shape, meaning, dtype, fits)
         if change:
             self._check_writeable(name, array)
         if self.device.is_capturing:
@@ -298,13 +302,20 @@ class Call:
         expected = f"{dtype.__name__} ({sizes}) {meaning}".rstrip()
         raise ValueError(f"{self.name}: {name} is {_describe(array, kind)}; expected {expected}; {way}")
 
-    def _refuse_place(self, name, array, kind, contiguous):
+    def _refuse_place(self, name, array, kind, contiguous, change):
+        if kind == TORCH and not _torch().is_dense(array):
+            raise ValueError(
+                f"{self.name}: {name} is {_describe(array, kind)}, {array.layout}; expected a dense one; "
+                f"pass {name}.to_dense()"
+            )
         if contiguous:
             way = f"move it there, or build the object with device={str(array.device)!r}"
             raise ValueError(f"{self.name}: {name} is {_describe(array, kind)}; expected it on {self.device}; {way}")
+        way = f"pass {name}.contiguous()"
+        if change:
+            way = f"pass a contiguous array, then copy it into {name}: {name}.contiguous() is not {name}"
         raise ValueError(
-            f"{self.name}: {name} is {_describe(array, kind)} with strides; expected a C-contiguous array; "
-            f"pass {name}.contiguous()"
+            f"{self.name}: {name} is {_describe(array, kind)} with strides; expected a C-contiguous array; {way}"
         )
 
     def _refuse_grad(self, name, what, way_out):
@@ -313,6 +324,12 @@ class Call:
     def _check_writeable(self, name, array):
         if not array.flags.writeable:
             raise ValueError(f"{self.name}: {name} is a read-only NumPy array; expected one to write into; pass a copy")
+        extents = zip(array.strides, array.shape, strict=True)
+        if array.size and any(stride == 0 and size > 1 for stride, size in extents):
+            raise ValueError(
+                f"{self.name}: {name} is a NumPy array with strides {array.strides}, whose entries share memory; "
+                f"expected one entry for each number of the result; pass a fresh array"
+            )
 
     def _add_output(self, name, array, taken, over=""):
         same = [other for other in self._inputs if other[0] == over and _same_memory(taken, other[2])]

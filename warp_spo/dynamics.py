@@ -95,7 +95,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
         self.programs = Programs(self.recursions, self.plan)
         self.values = Values()
         self._close(loops, independent)
-        if not isinstance(refine, int) or refine < 0:
+        if not isinstance(refine, int) or isinstance(refine, bool) or refine < 0:
             raise ValueError(f"Dynamics: refine is {refine!r}; expected how many steps, 0 or more")
         if refine and self.closed:
             raise UnsupportedError("Dynamics", f"refine={refine} with loops={loops!r}", "dtype='float64'")
@@ -120,6 +120,8 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
                     raise ValueError(f"Dynamics.set: unknown value {name!r}; expected one of {', '.join(VARIABLE)}")
                 if not hasattr(value, "shape"):
                     try:
+                        if value is None:
+                            raise TypeError
                         value = np.asarray(value, dtype=np.float64)
                     except (TypeError, ValueError):
                         raise TypeError(f"Dynamics.set: {name} is {value!r}; expected an array of numbers") from None
@@ -459,6 +461,8 @@ def _world_count(scene: Scene, worlds: Any) -> int:
     if worlds is None:
         return scene.worlds
     try:
+        if isinstance(worlds, bool):
+            raise TypeError
         count = operator.index(worlds)
     except TypeError:
         raise TypeError(f"Dynamics: worlds is {worlds!r}; expected an integer") from None
@@ -476,7 +480,7 @@ def _variable_names(variable: Any) -> tuple[str, ...]:
     for name in names:
         if name not in VARIABLE:
             raise ValueError(f"Dynamics: variable names {name!r}; expected some of {', '.join(VARIABLE)}")
-    return names
+    return tuple(dict.fromkeys(names))
 
 
 def _check_loops(scene: Scene, loops: str) -> None:

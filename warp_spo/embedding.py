@@ -161,9 +161,11 @@ def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str 
 
 def _numbers(scene: Scene, asked: Sequence[int | str], call: str) -> set[int]:
     labels, found = scene.dof_labels, set()
+    if not isinstance(asked, Sequence | np.ndarray) or isinstance(asked, str):
+        raise TypeError(f"{call}: independent is {asked!r}; expected a list of dofs, indices or labels")
     for dof in asked:
         number = labels.index(dof) if isinstance(dof, str) and dof in labels else dof
-        if not isinstance(number, int | np.integer) or not 0 <= number < scene.dof_count:
+        if not isinstance(number, int | np.integer) or isinstance(number, bool) or not 0 <= number < scene.dof_count:
             raise ValueError(f"{call}: independent names {dof!r}; expected dofs, 0 to {scene.dof_count - 1}, or labels "
                              f"among {', '.join(labels)}")
         found.add(int(number))

@@ -1,5 +1,18 @@
 """The errors a caller may want to tell apart; every other mistake is a plain ValueError or TypeError."""
 
+from typing import Any
+
+import numpy as np
+
+
+def refuse_masked(call: str, name: str, array: Any) -> None:
+    """Raise TypeError of a NumPy masked array: its mask would be dropped in silence."""
+    if isinstance(array, np.ma.MaskedArray):
+        raise TypeError(
+            f"{call}: {name} is a masked array, whose mask nothing here looks at; expected a plain NumPy array; pass "
+            f"its .filled(number), or its .data to use what is under the mask"
+        )
+
 
 class DirectedLoopError(ValueError):
     """The edges contain a directed loop, so that (I - E)^-1 has no meaning as a sum over paths.

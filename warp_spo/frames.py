@@ -8,6 +8,7 @@ import operator
 from collections.abc import Sequence
 from typing import Any
 
+from .errors import refuse_masked
 from .parts import IDENTITY_POSE
 from .scene import Scene
 
@@ -40,7 +41,10 @@ def _checked(scene: Scene, call: str, frame: Frame) -> tuple[int, tuple[float, .
                 f"{call}: {len(found)} bodies have the label {body!r}; expected one; pass the body's index"
             )
         body = found[0]
+    refuse_masked(call, "a frame's pose", pose)
     try:
+        if isinstance(body, bool):
+            raise TypeError
         body, pose = operator.index(body), tuple(float(number) for number in pose)
     except (TypeError, ValueError):
         raise TypeError(

@@ -148,9 +148,12 @@ class Loops(Applications):
             self._check_closed(call)
             if hold and self.embedding is None:
                 raise UnsupportedError(call.name, "hold=True with loops='multipliers'", "use loops='embed'")
-            if not isinstance(iterations, int) or iterations < 0:
+            if not isinstance(iterations, int) or isinstance(iterations, bool) or iterations < 0:
                 raise ValueError(f"{call.name}: iterations is {iterations!r}; expected how many Newton steps")
             both = out if isinstance(out, tuple | list) else (out, None)
+            if len(both) != 2 or (qd is None and both[1] is not None):
+                pair = "a pair of arrays or None, (q, qd)" if qd is not None else "an array for q, there being no qd"
+                raise TypeError(f"{call.name}: out is {out!r}; expected {pair}")
             q, qd = self._read_state(call, q, qd)
             q_out = call.write(both[0], q.shape, "[world, coordinate]", name="out[0]")
             qd_out = None if qd is None else call.write(both[1], qd.shape, "[world, dof]", name="out[1]")
@@ -201,6 +204,8 @@ class Loops(Applications):
             if not self.closed or self.loops != "multipliers":
                 raise UnsupportedError(call.name, f"loops={self.loops!r} without multipliers",
                                        "build Dynamics with loops='multipliers'")
+            if not isinstance(out, tuple | list) or len(out) != 2:
+                raise TypeError(f"{call.name}: out is {out!r}; expected a pair of arrays or None, (multipliers, rank)")
             q, qd = self._read_state(call, q, qd)
             tau, body_f = self._read_rate(call, "tau", tau), self._read_body_f(call, body_f)
             found = call.write(out[0], (self.worlds, self.closure_rows), "[world, row]", name="out[0]")

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from .errors import UnsupportedError
+from .errors import UnsupportedError, refuse_masked
 
 IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 UNLIMITED = 1e10
@@ -47,8 +47,9 @@ DOF_VALUES = {
 
 
 def checked_array(call: str, name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    refuse_masked(call, name, value)
     try:
-        array = np.array(value, dtype=np.float64)  # a copy: what the caller does to his later changes nothing here
+        array = real(value)
     except (TypeError, ValueError):
         raise ValueError(f"{call}: {name} is {value!r}; expected numbers of shape {shape}") from None
     if array.shape != shape:
@@ -56,6 +57,14 @@ def checked_array(call: str, name: str, value: Any, shape: tuple[int, ...]) -> n
     if not np.isfinite(array).all():
         raise ValueError(f"{call}: {name} is {array.tolist()}; expected finite numbers")
     return read_only(array)
+
+
+def real(value: Any) -> np.ndarray:
+    """A copy in float64: what the caller does to his later changes nothing. TypeError of text and complex numbers."""
+    array = np.array(value)
+    if array.dtype.kind not in "biufO":
+        raise TypeError
+    return array.astype(np.float64)
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
@@ -134,8 +143,9 @@ def _axes(call: str, kind: str, axis: Any, linear: Any, angular: Any, pitch: flo
     """The screws of a hinge, inboard first."""
 
     def rows(name: str, value: Any, counts: Sequence[int]) -> np.ndarray:
+        refuse_masked(call, name, value)
         try:
-            array = np.atleast_2d(np.array(() if value is None else value, dtype=np.float64))
+            array = np.atleast_2d(real(() if value is None else value))
         except (TypeError, ValueError):
             raise ValueError(f"{call}: {name} is {value!r}; expected vector(s) of 3 numbers") from None
         if array.size == 0:

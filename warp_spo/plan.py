@@ -90,6 +90,7 @@ TREE_ONLY = (
     "loop_forward_dynamics",
     "closure_system",
     "closure_step",
+    "closures_open",
 )
 """Operations that exist as traces alone: each is a kernel of its scene, a thread a world, whatever the plan."""
 SHARED = ("step", "forward_dynamics_and_solve", "forward_dynamics_vjp", "inverse_dynamics_vjp")

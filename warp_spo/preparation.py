@@ -94,10 +94,10 @@ class Preparation:
         Raises:
             ValueError: no such operation or option.
         """
-        if operation in PRODUCTS:
+        if isinstance(operation, str) and operation in PRODUCTS:
             self._prepare_product(operation, options)
             return
-        if operation not in TAKES:
+        if not isinstance(operation, str) or operation not in TAKES:
             raise ValueError(f"Dynamics.prepare: no operation {operation!r}; expected one of {', '.join(TAKES)}")
         takes = TAKES[operation]
         asked = {name: options.pop(name, default) for name, default in takes.options.items()}
@@ -131,8 +131,13 @@ class Preparation:
 
     def _prepare_product(self, product: str, options: dict[str, Any]) -> None:
         operation, way = product[:-4], product[-3:]
-        wrt = tuple(options.pop("wrt", ()) if way == "vjp" else ())
-        along = tuple(options.pop("along", ("dq", "dqd", f"d{ARGUMENTS[operation][2]}")) if way == "jvp" else ())
+        wrt = self._names("wrt", options.pop("wrt", ()) if way == "vjp" else ())
+        default = ("dq", "dqd", f"d{ARGUMENTS[operation][2]}") if way == "jvp" else ()
+        along = self._names("along", options.pop("along", default) if default else ())
+        for name in along:
+            if name not in (*default, "dbody_f"):
+                expected = ", ".join((*default, "dbody_f"))
+                raise ValueError(f"Dynamics.prepare: along names {name!r} for {product}; expected some of {expected}")
         named = {*wrt, *(name[1:] for name in along)}
         given: dict[str, Any] = {
             name: self._stand_in(name, {"columns": None})
@@ -152,6 +157,12 @@ class Preparation:
         else:
             cotangents = results[: 2 if operation == "step" else 1]
             self.pulled_back(operation, given, more, results, cotangents, wrt or tuple(given))
+
+    @staticmethod
+    def _names(option: str, names: Any) -> tuple[str, ...]:
+        if not isinstance(names, str | list | tuple):
+            raise TypeError(f"Dynamics.prepare: {option} is {names!r}; expected names, such as ('q', 'qd')")
+        return (names,) if isinstance(names, str) else tuple(names)
 
     @staticmethod
     def _refuse_rest(operation: str, options: dict[str, Any]) -> None:

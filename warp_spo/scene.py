@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from .errors import refuse_masked
 from .parts import (
     DOF_VALUES,
     FREE,
@@ -24,6 +25,7 @@ from .parts import (
     checked_inertia,
     checked_unit,
     read_only,
+    real,
 )
 from .tree import Tree
 
@@ -142,6 +144,8 @@ class Scene:
         for coupling in self.couplings:
             if coupling.hinge == coupling.reference:
                 raise ValueError(f"Scene: a coupling ties hinge {coupling.hinge} to itself; expected two hinges")
+            for name in ("ratio", "offset"):
+                checked_array("Scene", f"a coupling's {name}", getattr(coupling, name), ())
             for index in (coupling.hinge, coupling.reference):
                 if not 0 <= index < len(self.hinges) or self.hinges[index].coord_count != 1:
                     raise ValueError(f"Scene: a coupling names hinge {index}; expected one of {len(self.hinges)} "
@@ -232,8 +236,9 @@ class Scene:
         if name not in self.values:
             raise ValueError(f"{call}: unknown value {name!r}; expected one of {', '.join(sorted(self.values))}")
         shape = self.values[name].shape[1:]
+        refuse_masked(call, name, value)
         try:
-            array = np.array(value, dtype=np.float64)
+            array = real(value)
         except (TypeError, ValueError):
             raise ValueError(f"{call}: {name} is {value!r}; expected numbers of shape {shape}") from None
         if array.shape == shape:

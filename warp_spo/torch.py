@@ -34,7 +34,11 @@ def has_dtype(tensor: torch.Tensor, dtype: type) -> bool:
 
 def is_on(tensor: torch.Tensor, device: wp.Device) -> bool:
     """Whether the tensor lies in memory of ``device``."""
-    return tensor.device == _device(device.alias) and tensor.layout is torch.strided
+    return tensor.device == _device(device.alias) and is_dense(tensor)
+
+
+def is_dense(tensor: torch.Tensor) -> bool:
+    return tensor.layout is torch.strided
 
 
 def empty(shape: tuple, dtype: type, device: wp.Device) -> torch.Tensor:
@@ -199,8 +203,12 @@ class Module(torch.nn.Module):
 
     def __init__(self, dyn: Any, names: Sequence[str] | None = None):
         super().__init__()
+        if not hasattr(dyn, "differentiable_values"):
+            raise TypeError(f"Module: dyn is of type {type(dyn).__name__}; expected a Dynamics")
+        if not isinstance(names, str | list | tuple | None):
+            raise TypeError(f"Module: names is {names!r}; expected names of values, such as ('body_mass',)")
         self.dyn = dyn
-        names = dyn.differentiable_values if names is None else tuple(names)
+        names = (names,) if isinstance(names, str) else dyn.differentiable_values if names is None else tuple(names)
         for name in names:
             if name not in dyn.differentiable_values:
                 raise ValueError(
@@ -232,6 +240,20 @@ class Module(torch.nn.Module):
 
 
 _made = itertools.count()
+WRITTEN = ("out", "qdd", "status")  # arguments that a call fills: a graph of torch would not know of it
+
+
+def _check_options(operation: str, method: Any, by: tuple[str, ...], options: dict[str, Any]) -> None:
+    """Raise TypeError unless ``options`` are all that an operation needs besides the tensors ``by`` name."""
+    takes = inspect.signature(method).parameters
+    rest = {n: p.default for n, p in takes.items() if n not in (*by, *WRITTEN, "self", "integrator")}
+    expected = ", ".join(f"{n}=" for n in rest) or "none"
+    for name in options:
+        if name not in rest and (name, options[name]) != ("integrator", "semi_implicit"):
+            raise TypeError(f"custom_op({operation!r}): {name}={options[name]!r} is no option; expected {expected}")
+    for name, default in rest.items():
+        if default is inspect.Parameter.empty and name not in options:
+            raise TypeError(f"custom_op({operation!r}): {name} is missing; expected {expected}")
 
 
 def custom_op(dyn: Any, operation: str, **options: Any) -> Any:
@@ -254,11 +276,14 @@ def custom_op(dyn: Any, operation: str, **options: Any) -> Any:
         ValueError: another operation.
         RuntimeError: when called, if a value of ``dyn`` is set to a tensor that requires grad: it is no input here.
     """
-    known = dyn.differentiable_by
-    if operation not in known:
+    known = getattr(dyn, "differentiable_by", None)
+    if known is None:
+        raise TypeError(f"custom_op: dyn is of type {type(dyn).__name__}; expected a Dynamics")
+    if not isinstance(operation, str) or operation not in known:
         raise ValueError(f"custom_op: operation is {operation!r}; expected one of {', '.join(known)}")
-    dyn.check_gradient(operation)
     by, method = known[operation], inspect.unwrap(getattr(type(dyn), operation))
+    _check_options(operation, method, by, options)
+    dyn.check_gradient(operation)
     name = f"warp_spo::{operation}_{next(_made)}"
 
     def plain(names: str) -> _Plain:
@@ -311,7 +336,16 @@ def custom_op(dyn: Any, operation: str, **options: Any) -> Any:
     ahead.register_autograd(pulled, setup_context=setup)
 
     def call(*args: Any, **more: Any) -> Any:
-        given = {n: x for n, x in (*zip(by, args, strict=False), *more.items()) if x is not None}
+        named = (*zip(by, args, strict=False), *more.items())
+        given = {n: x for n, x in named if x is not None}
+        if len(args) > len(by) or len(named) > len(dict(named)) or not all(n in by for n in more):
+            raise TypeError(
+                f"custom_op({operation!r}): {len(args)} tensors by position and {', '.join(more) or 'none'} by name; "
+                f"expected {', '.join(by)}, each once at most"
+            )
+        for n, x in given.items():
+            if not is_tensor(x):
+                raise TypeError(f"custom_op({operation!r}): {n} is of type {type(x).__name__}; expected a torch tensor")
         found = ahead(" ".join(given), list(given.values()))
         return tuple(found[:results]) if results > 1 else found[0]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,14 @@ class Layout:
 
     Args:
         rows: [world, n], rows of the model's array. shape: of one world, n rows of components.
+        like: the model's array; those that come later are of its size.
     """
 
-    def __init__(self, rows: np.ndarray, shape: tuple[int, ...], device: wp.Device):
+    def __init__(self, rows: np.ndarray, shape: tuple[int, ...], device: wp.Device, like: Any):
         components = int(np.prod(shape)) // max(1, rows.shape[1])
         flat = (rows[..., None] * components + np.arange(components)).reshape(len(rows), -1)
         self.device, self.shape, self._flat_shape = device, (len(rows), *shape), flat.shape
+        self._count = like.size * _components(like.dtype)
         self.plain = bool(np.array_equal(flat.ravel(), np.arange(flat.size)))
         self._index: Any = wp.array(flat, dtype=wp.int32, device=device)
         self._buffers: dict[str, wp.array] = {}
@@ -34,6 +37,7 @@ class Layout:
 
     def read(self, flat: Any, name: str) -> wp.array:
         """The entries as [world, ...]: a view, or gathered into the buffer of that name."""
+        self._check(flat, name)
         if self.plain:
             return view(flat.ptr, self.shape, wp.float32, self.device.alias)
         out = self.buffer(name)
@@ -42,6 +46,7 @@ class Layout:
 
     def target(self, flat: Any, name: str) -> wp.array:
         """Where to write what :meth:`write` brings into ``flat``."""
+        self._check(flat, name)
         return view(flat.ptr, self.shape, wp.float32, self.device.alias) if self.plain else self.buffer(name)
 
     def write(self, array: wp.array, flat: Any, mask: Any = None) -> None:
@@ -55,6 +60,17 @@ class Layout:
         self._launch(exchange.scale, [factor, array], out)
         return out
 
+    def _check(self, flat: Any, name: str) -> None:
+        """Raise unless the memory of an array is what is read or written there: nothing behind it would be noticed."""
+        expected = f"a Warp array float32 of {self._count} numbers on {self.device}, as the model has it"
+        if not isinstance(flat, wp.array):
+            raise TypeError(f"SolverSPO: {name} is of type {type(flat).__name__}; expected {expected}")
+        count, scalar = flat.size * _components(flat.dtype), getattr(flat.dtype, "_wp_scalar_type_", flat.dtype)
+        if count != self._count or scalar is not wp.float32 or flat.device != self.device or not flat.is_contiguous:
+            strides = "" if flat.is_contiguous else " with strides"
+            came = f"a Warp array {scalar.__name__} of {count} numbers on {flat.device}{strides}"
+            raise ValueError(f"SolverSPO: {name} is {came}; expected {expected}; take it from this solver's model")
+
     def _launch(self, factory: Any, inputs: list, out: wp.array) -> None:
         if self._index.size:
             wp.launch(factory(wp.float32), self._flat_shape, inputs, [out], device=self.device)
@@ -62,5 +78,9 @@ class Layout:
 
 def _scalars(flat: Any) -> wp.array:
     """An array of vectors, matrices or transforms as one of its numbers."""
-    components = int(np.prod(getattr(flat.dtype, "_shape_", ()) or (1,)))
-    return view(flat.ptr, (flat.size * components,), wp.float32, flat.device.alias)
+    return view(flat.ptr, (flat.size * _components(flat.dtype),), wp.float32, flat.device.alias)
+
+
+@functools.cache
+def _components(dtype: Any) -> int:
+    return int(np.prod(getattr(dtype, "_shape_", ()) or (1,)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar
 
 import newton
@@ -59,6 +59,10 @@ class Observables(SolverBase.Observables):
         dtype=wp.float32, frequency=newton.Model.AttributeFrequency.JOINT_DOF
     )
     """(qd after - qd before) / dt [m/s^2, rad/s^2], shape (joint_dof_count,)."""
+    status: Any = SolverBase.Observables.field(  # noqa: RUF009
+        dtype=wp.int32, frequency=newton.Model.AttributeFrequency.WORLD
+    )
+    """Whether the step can be trusted, 0 if so: the words of :meth:`warp_spo.Dynamics.step`, shape (world_count,)."""
 
 
 class SolverSPO(Plugs, SolverBase):
@@ -77,7 +81,7 @@ class SolverSPO(Plugs, SolverBase):
     rounding. A loop joint is a constraint alone: its entries of joint_q and joint_qd stay as they are, as in Newton's
     eval_ik, those of joint_f are not applied, and drives, springs, damping, friction, limits and armature of it are
     refused. Bring a first state onto the closures with :meth:`reset`, or by hand with ``solver.dynamics.project``; a
-    step takes an open one there along the shortest way.
+    step takes an open one there along the shortest way. The observable ``status`` is 7 where it did not get there.
 
     Args:
         model: finalized; all worlds have one topology. ``model.requires_grad`` is not looked at.
@@ -97,7 +101,7 @@ class SolverSPO(Plugs, SolverBase):
 
     Observables = Observables
     SUPPORTED_OBSERVABLES: ClassVar[frozenset[str]] = frozenset(
-        {"joint_qdd", SolverBase.ObservableKind.BODY_QDD, SolverBase.ObservableKind.BODY_PARENT_F}
+        {"joint_qdd", "status", SolverBase.ObservableKind.BODY_QDD, SolverBase.ObservableKind.BODY_PARENT_F}
     )
 
     def __init__(
@@ -109,6 +113,10 @@ class SolverSPO(Plugs, SolverBase):
         integrator: str = "semi_implicit",
         granularity: str | None = None,
     ):
+        if not hasattr(model, "particle_count"):
+            raise TypeError(f"SolverSPO: model is of type {type(model).__name__}; expected a newton.Model")
+        if not isinstance(variable, str | Iterable):
+            raise TypeError(f"SolverSPO: variable is {variable!r}; expected names such as ('body_mass',)")
         super().__init__(model)
         if integrator not in INTEGRATORS:
             raise ValueError(f"SolverSPO: integrator is {integrator!r}; expected one of {', '.join(INTEGRATORS)}")
@@ -151,19 +159,24 @@ class SolverSPO(Plugs, SolverBase):
         self._body_rows = bodies
         gravity = np.arange(W) if worlds.declared else np.full(W, len(host(model, "gravity")) - 1)
         self._mask_from = 0 if worlds.declared else -1  # bodies outside worlds go with the last entry of a mask
-        layout = lambda rows, *shape: Layout(rows, (*rows.shape[1:], *shape), device)  # noqa: E731
-        self._q, self._qd = layout(scene.q_index), layout(scene.dof_index)
-        self._poses, self._wrenches, self._anchors = layout(bodies, 7), layout(bodies, 6), layout(hinges, 7)
+
+        def layout(like: str, rows: np.ndarray, *shape: int) -> Layout:
+            return Layout(rows, (*rows.shape[1:], *shape), device, getattr(model, like))
+
+        self._q, self._qd = layout("joint_q", scene.q_index), layout("joint_qd", scene.dof_index)
+        self._poses, self._wrenches = layout("body_q", bodies, 7), layout("body_qd", bodies, 6)
+        self._anchors = layout("joint_X_p", hinges, 7)
         self._layouts = {name: self._qd for name in DOF_VALUES} | {
             "joint_rest_q": self._q,
             "joint_X_p": self._anchors,
             "joint_X_c": self._anchors,
-            "body_mass": layout(bodies),
-            "body_com": layout(bodies, 3),
-            "body_inertia": layout(bodies, 3, 3),
-            "gravity": Layout(gravity[:, None], (3,), device),
+            "body_mass": layout("body_mass", bodies),
+            "body_com": layout("body_com", bodies, 3),
+            "body_inertia": layout("body_inertia", bodies, 3, 3),
+            "gravity": Layout(gravity[:, None], (3,), device, model.gravity),
         }
         self._used = {name: wp.clone(getattr(model, name)) for name in WATCHED}
+        self._status = wp.zeros(W, dtype=wp.int32, device=device)  # where none is asked for: one kernel serves both
         self._turned = self._turned_hinges(scene)
         self._prepare()
 
@@ -216,6 +229,11 @@ class SolverSPO(Plugs, SolverBase):
             ValueError: observables of another solver, or with an integrator that has none.
         """
         self.validate_observables(observables)
+        for name, state in (("state_in", state_in), ("state_out", state_out)):
+            if not hasattr(state, "joint_q"):
+                raise TypeError(f"SolverSPO.step: {name} is of type {type(state).__name__}; expected a newton.State")
+        if control is not None and not hasattr(control, "joint_f"):
+            raise TypeError(f"SolverSPO.step: control is of type {type(control).__name__}; expected a newton.Control")
         self._refuse_contacts(contacts)
         if observables is not None and observables.kinds and self.integrator != "semi_implicit":
             raise ValueError(
@@ -223,7 +241,7 @@ class SolverSPO(Plugs, SolverBase):
             )
         if control is None:
             control = self.model.control(clone_variables=False)
-        q, qd = self._q.read(state_in.joint_q, "q"), self._qd.read(state_in.joint_qd, "qd")
+        q, qd = self._q.read(state_in.joint_q, "joint_q"), self._qd.read(state_in.joint_qd, "joint_qd")
         body_f = None if state_in.body_f is None else self._wrenches.read(state_in.body_f, "body_f")
         given = dict(tau=self._joint_force(control, q), body_f=body_f, **self._targets(control))
         if observables is None or not observables.kinds:
@@ -231,7 +249,7 @@ class SolverSPO(Plugs, SolverBase):
             self.dynamics.step(q, qd, dt=dt, integrator=self.integrator, out=(q_out, qd_out), **given)
         else:  # they need the state before the step, too
             q_out, qd_out, qdd = self._q.buffer("q_out"), self._qd.buffer("qd_out"), self._qd.buffer("qdd")
-            self.dynamics.step(q, qd, dt=dt, out=(q_out, qd_out), qdd=qdd, **given)
+            self.dynamics.step(q, qd, dt=dt, out=(q_out, qd_out), qdd=qdd, status=self._words(observables), **given)
             self._observe(observables, q, qd, qdd, body_f)
         if state_out is not state_in and not self._q.plain:  # entries of loop joints stay as they are
             for name in ("joint_q", "joint_qd"):
@@ -241,7 +259,7 @@ class SolverSPO(Plugs, SolverBase):
         self._write_bodies(q_out, qd_out, state_out)
 
     def _write_bodies(self, q: wp.array, qd: wp.array, state: newton.State) -> None:
-        poses, rates = self._poses.target(state.body_q, "poses"), self._wrenches.target(state.body_qd, "rates")
+        poses, rates = self._poses.target(state.body_q, "body_q"), self._wrenches.target(state.body_qd, "body_qd")
         self.dynamics.body_states(q, qd, out=(poses, rates))
         self._poses.write(poses, state.body_q)
         self._wrenches.write(rates, state.body_qd)
@@ -264,11 +282,14 @@ class SolverSPO(Plugs, SolverBase):
     def _targets(self, control: newton.Control) -> dict[str, Any]:
         if not self._driven:
             return {}
-        found = {"target_q": self._q.read(control.joint_target_q, "target_q")}
+        found = {"target_q": self._q.read(control.joint_target_q, "joint_target_q")}
         if self._tracks_rates:
             rates = self._qd.read(control.joint_target_qd, "joint_target_qd")
             found["target_qd"] = self._qd.scaled(rates, self._factors["joint_target_qd"], "target_qd")
         return found
+
+    def _words(self, observables: Any) -> wp.array:
+        return self._status if observables.status is None else observables.status
 
     def _observe(self, observables: Any, q: wp.array, qd: wp.array, qdd: wp.array, body_f: Any) -> None:
         kinds = SolverBase.ObservableKind

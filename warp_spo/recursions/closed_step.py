@@ -19,7 +19,7 @@ from ..trace.emit import Store
 from ..trace.graph import Value, less
 from ..trace.spatial import total
 from . import clusters
-from .closures import Ratio
+from .closures import Ratio, opened
 from .clusters import Cluster, Columns
 from .integration import moved
 from .links import Link, placed
@@ -42,6 +42,7 @@ class ClosedStep(Step):
         super().__init__(trace)
         self.how = how
         self.margins: list[Value] = []
+        self.after: tuple[Columns, Columns] = {}, {}  # q', qd'
 
     def _accelerations(self, tau: Callable[[int], Value]) -> Columns:
         swept = self.trace.sweep(self.how, tau, moves=True, loads=True)
@@ -54,6 +55,7 @@ class ClosedStep(Step):
         for cluster in self.trace.clusters:
             self.trace.at_cluster(cluster, "c")
             self._close(cluster, q, qd)
+        self.after = q, qd
         closed = {"q_out": q, "out": qd}
         return [s._replace(value=closed[s.array][s.index[0]]) if s.array in closed else s for s in stores]
 
@@ -75,9 +77,18 @@ class ClosedStep(Step):
             step = tied.space.particular([-rate for rate in rates])
             qd |= {dof: qd[dof] + change for dof, change in step.items()}
 
+    def _weightless(self, link: Link) -> bool:
+        """What a loop ties may carry what is on its other side."""
+        return id(link) not in self.trace.cluster_of and super()._weightless(link)
+
     def _unresolved(self) -> Value:
         least = RESOLVED * self.trace.epsilon
         return total(1.0 - less(least, margin) for margin in self.margins)
+
+    def _open(self) -> Value:
+        q, qd = self.after
+        places = {id(link): placed(link, q.__getitem__) for cluster in self.trace.clusters for link in cluster.links}
+        return opened(self.trace.constraints, places, q.__getitem__, qd.__getitem__)
 
 
 class MultiplierStep(Step):

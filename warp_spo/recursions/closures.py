@@ -15,13 +15,14 @@ import numpy as np
 
 from ..errors import UnsupportedError
 from ..parts import Coupling, Loop, in_plane
-from ..trace.graph import Value, reciprocal
-from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, dot
+from ..trace.graph import Value, less, reciprocal
+from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, dot, total
 from . import articulated
 from .links import Link, Links, Placed, Seat
 from .motion import in_link
 
 PARALLEL = 1e-6  # sine of the angle between two axes of a loop joint, below which they are one
+OPEN = 1e-5  # [rad], or distance over arm, beyond which a closure is open: float32 rounds a few turns by less
 
 
 class State(NamedTuple):
@@ -260,6 +261,21 @@ def closures(links: Links) -> list[Closure | Ratio]:
         follower, leader = (by_dof[int(scene.qd_start[h])] for h in (coupling.hinge, coupling.reference))
         found.append(_ratio(follower, leader, coupling))
     return found
+
+
+def opened(
+    constraints: list[Closure | Ratio], places: dict[int, Placed], q: Callable[[int], Value], qd: Callable[[int], Value]
+) -> Value:
+    """How many rows are open by more than OPEN, in g, or in Y qd as a share of the rates; measured by their sizes."""
+    found = []
+    for constraint in constraints:
+        dofs = [dof for link in constraint.path for dof in link.dofs]
+        speed = total(qd(dof) * qd(dof) for dof in dofs)
+        rows = zip(constraint.error(places, q), constraint.jacobian(places), constraint.sizes(places), strict=True)
+        for error, row, size in rows:
+            rate = total(x * qd(dof) for dof, x in row.items())
+            found += [less(OPEN**2 * size, error * error), less(OPEN**2 * size * speed, rate * rate)]
+    return total(found)
 
 
 def _ratio(follower: Link, leader: Link, coupling: Coupling) -> Ratio:

@@ -85,6 +85,14 @@ class Law(NamedTuple):
         size = absolute(piece.force) + absolute(piece.resistance * u)
         return less(NOISE * epsilon * size, absolute(one.at(u) - piece.line(u)))
 
+    def holding(self, u: Value, epsilon: float) -> Value:
+        """What the law resists at ``u``; where a bound begins, within rounding, as short of it."""
+        if not self.bends:
+            return self.resistance
+        line, size = self.line(u), absolute(self.force) + absolute(self.resistance * u)
+        cut = less(NOISE * epsilon * size, absolute(self.bounded(line) - line))
+        return select(cut, 0.0, self.scale * self.resistance)
+
     def skipped(self, guess: Value, u: Value) -> Value:
         """Not 0 where the way from ``guess`` to ``u`` leads from one bound to the other."""
         if self.least is None or self.most is None:
@@ -136,7 +144,8 @@ class Impedance:
         every = []
         for i, dof in enumerate(link.dofs):
             straight = [*self._damper(dof), *self._spring(link, i, "joint_stiffness", self._rest)]
-            found = [*self._drive(link, i), *self._limits(link, i), *self._friction(dof), *self._rate_limit(dof)]
+            found = [*self._drive(link, i), *self._limits(link, i), *self._friction(dof)]
+            found += self._rate_limit(dof, straight + found)
             straight += [law for law in found if not law.bends]
             every.append([added(straight)] * bool(straight) + [law for law in found if law.bends])
         return every
@@ -177,12 +186,12 @@ class Impedance:
     # -- laws ------------------------------------------------------------------------------------------------------
     def _damper(self, dof: int) -> list[Law]:
         d = self.value("joint_damping", dof)
-        return [] if _is(d, 0.0) else [Law(-(d * self.qd(dof)), d)]
+        return [] if is_number(d, 0.0) else [Law(-(d * self.qd(dof)), d)]
 
     def _spring(self, link: Link, i: int, name: str, rest: Callable[[int], Value]) -> list[Law]:
         """-k (q' - rest), q' = q + h (qd + u)"""
         k = self.value(name, link.dofs[i])
-        if _is(k, 0.0):
+        if is_number(k, 0.0):
             return []
         stretch = self._stretch(link, i, rest)
         return [Law(-k * (stretch + self.ahead(link.dofs[i])), self.h * k)]
@@ -201,11 +210,11 @@ class Impedance:
         dof = link.dofs[i]
         kd = self.value("joint_target_kd", dof)
         laws = self._spring(link, i, "joint_target_ke", self.target_q)
-        laws += [] if _is(kd, 0.0) else [Law(kd * (self.target_qd(dof) - self.qd(dof)), kd)]
+        laws += [] if is_number(kd, 0.0) else [Law(kd * (self.target_qd(dof) - self.qd(dof)), kd)]
         if not laws:
             return []
         effort, law = self._bound("joint_effort_limit", dof, DEFAULT_BOUND), added(laws)
-        if effort is not None and _is(effort, 0.0):
+        if effort is not None and is_number(effort, 0.0):
             return []
         return [law] if effort is None else [law._replace(least=-effort, most=effort)]
 
@@ -231,18 +240,24 @@ class Impedance:
     def _friction(self, dof: int) -> list[Law]:
         """A force of at most ``joint_friction`` against the motion; below CREEP, as a damper."""
         f = self.value("joint_friction", dof)
-        return [] if _is(f, 0.0) else [Law(-(1.0 / CREEP) * self.qd(dof), 1.0 / CREEP, -1.0, 1.0, f)]
+        return [] if is_number(f, 0.0) else [Law(-(1.0 / CREEP) * self.qd(dof), 1.0 / CREEP, -1.0, 1.0, f)]
 
-    def _rate_limit(self, dof: int) -> list[Law]:
-        """Dampers on what exceeds the velocity limit, HOLD times as heavy as the inertia is in a step."""
+    def _rate_limit(self, dof: int, others: list[Law]) -> list[Law]:
+        """Dampers on what exceeds the velocity limit, HOLD times as heavy as the inertia is in a step.
+
+        Without inertia, as what the ``others`` resist.
+        """
         bound = self._bound("joint_velocity_limit", dof, DEFAULT_BOUND)
-        if bound is None or _is(self.h, 0.0):
+        if bound is None or is_number(self.h, 0.0):
             return []
-        qd, r = self.qd(dof), HOLD * self._inertia(dof) * reciprocal(self.h)
+        qd, inertia = self.qd(dof), self._inertia(dof)
+        r = HOLD * inertia * reciprocal(self.h)
+        if inertia == 0.0:
+            r = HOLD * total(law.scale * law.resistance for law in others)
         return [Law(r * (bound - qd), r, None, 0.0), Law(-(r * (bound + qd)), r, 0.0, None)]
 
 
-def _is(x: Value, number: float) -> bool:
+def is_number(x: Value, number: float) -> bool:
     return is_constant(x) and x == number
 
 

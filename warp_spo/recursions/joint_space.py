@@ -2,7 +2,7 @@
 
 The sweeps find the same factors, [I + H phi K] D [I + H phi K]*, in O(dof), and start from the links each time. Where
 only Delta changes from solve to solve and dofs are few, the entries of Mass give them with less work. What the tree
-leaves out of Mass stays out: eliminating from the leaves fills nothing in.
+leaves out of Mass stays out: eliminating from the leaves fills nothing in; where dofs are numbered otherwise, a little.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class JointSpace:
                 x[i] = x[i] - column[i] * x[k]
                 for j in above:
                     if i <= j:
-                        U[i, j] = U[i, j] - column[i] * U[j, k]
+                        U[i, j] = U.get((i, j), 0.0) - column[i] * U[j, k]
             U |= {(i, k): column[i] for i in above}
         for k in self.dofs:
             self.trace.graph.step = f"dof {k}|u"

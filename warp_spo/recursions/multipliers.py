@@ -13,6 +13,7 @@ from ..trace.emit import Store
 from ..trace.graph import Value
 from ..trace.spatial import ZERO, Vector, total
 from . import articulated
+from .closures import opened
 from .clusters import Columns
 from .embedded import Embedded
 from .motion import STILL
@@ -103,3 +104,8 @@ class Multipliers(Embedded):
             qd = self.vector("qd")
             return [Store("out", (dof,), qd(dof) + step.get(dof, 0.0)) for dof in range(self.links.scene.dof_count)]
         return self.moved_all(step)
+
+    def closures_open(self) -> list[Store]:
+        """out [1] = how many rows are open"""
+        self.place_links()
+        return [Store("out", (0,), opened(self.constraints, self.places, self.vector("q"), self.vector("qd")))]

@@ -11,6 +11,7 @@ no other piece needs the state before it any more.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -18,7 +19,7 @@ from ..scene import Scene
 from ..trace.emit import Store
 from ..trace.graph import Value, less, reciprocal, select
 from ..trace.spatial import total
-from .impedance import Impedance, Law, added
+from .impedance import Impedance, Law, added, is_number
 from .integration import coordinate_rates, moved
 from .joint_space import JointSpace
 from .links import BALL, FREE, Link
@@ -30,7 +31,8 @@ GUESS, GAIN, MISSED = "guess", "gain", "missed"
 LOOPED = (GUESS, GAIN, MISSED)
 WIDE = {BALL: 4, FREE: 7}  # coordinates of a hinge with a quaternion
 SHORT = 10  # dofs up to which passes solve a system that is formed once
-NOT_POSITIVE, NOT_FINITE, NOT_SETTLED, CHANGE_POINT = 1, 2, 5, 6  # status words; the first two as warp_spo.status
+FAINT = 1e-12  # share of its laws' resistances that holds a weightless dof in a pass in which none of them does
+NOT_POSITIVE, NOT_FINITE, NOT_SETTLED, CHANGE_POINT, OPEN = 1, 2, 5, 6, 7  # status words; two as warp_spo.status
 
 
 class Step:
@@ -73,7 +75,7 @@ class Step:
         gains = {dof: self.h * value for dof, value in found.items()}
         looped = self._looped(gains)
         if looped:
-            gains = {dof: self._kept_as(GAIN, dof) for dof in gains}
+            gains = self._solved({dof: self._kept_as(GAIN, dof) for dof in gains})
         rates_after = {dof: self.qd(dof) + gain for dof, gain in gains.items()}
         stores: list[Store] = []
         for link in self.links:
@@ -127,16 +129,38 @@ class Step:
         """Not 0 where constraints lose rank."""
         return 0.0
 
+    def _open(self) -> Value:
+        """Not 0 where constraints do not hold after the step."""
+        return 0.0
+
     def _stiffened(self, link: Link) -> Link:
         pieces = zip(link.armature, self._pieces(link), strict=True)
         return dataclasses.replace(link, armature=tuple(a + self.h * piece.resistance for a, piece in pieces))
 
     def _pieces(self, link: Link) -> list[Law]:
-        """What holds at the guess, of each dof."""
+        """What holds at the guess, of each dof; of a weightless one where nothing does, what drives it on."""
         self.laws |= dict(zip(link.dofs, self.impedance.laws(link), strict=True))
         pieces = [added([law.piece(self._guess(dof)) for law in self.laws[dof]]) for dof in link.dofs]
+        if self._weightless(link):
+            faint = FAINT * total(law.scale * law.resistance for law in self.laws[link.dofs[0]])
+            held = pieces[0].resistance
+            pieces = [pieces[0]._replace(resistance=select(less(0.0, held), held, faint))]
         self.forces |= {dof: piece.force for dof, piece in zip(link.dofs, pieces, strict=True)}
         return pieces
+
+    def _weightless(self, link: Link) -> bool:
+        """Whether forces alone move the link's one dof, as far as a law that bends lets them: it carries nothing."""
+        bare = len(link.dofs) == 1 and is_number(link.armature[0], 0.0) and carries_nothing(link)
+        return bare and any(law.bends for law in self.laws[link.dofs[0]])
+
+    def _solved(self, gains: dict[int, Value]) -> dict[int, Value]:
+        """u, NaN of a weightless dof that no law holds."""
+        for link in self.links:
+            if self._weightless(link):
+                (dof,) = link.dofs
+                held = total(law.holding(gains[dof], self.trace.epsilon) for law in self.laws[dof])
+                gains[dof] = select(less(0.0, held), gains[dof], math.nan)
+        return gains
 
     def _guess(self, dof: int) -> Value:
         """Of u; what the pass before has found, unless a law asked for another; of a piece, by itself.
@@ -186,7 +210,8 @@ class Step:
     def _word(self, results: list[Value], looped: bool) -> Value:
         """The worst that is true of the world."""
         settled = less(self.trace.graph.input(MISSED, 0), 0.5) if looped else 1.0
-        word = select(_finite(results), select(settled, 0.0, NOT_SETTLED), NOT_POSITIVE)
+        word = select(self._open(), OPEN, select(settled, 0.0, NOT_SETTLED))
+        word = select(_finite(results), word, NOT_POSITIVE)
         return select(_finite(self._inputs()), select(self._unresolved(), CHANGE_POINT, word), NOT_FINITE)
 
     def _words(self, own: Piece, results: list[Value]) -> list[Store]:
@@ -224,6 +249,11 @@ class Step:
 def by_pieces(scene: Scene, given: Iterable[str], how: Any) -> bool:
     """Whether pieces can share the work of a step: no loops are closed, and sweeps serve its passes."""
     return how is None and "multipliers" not in given and scene.dof_count > SHORT
+
+
+def carries_nothing(link: Link) -> bool:
+    """Whether no mass and no inertia, in any world, is on a link or further out."""
+    return link.inertia is None and all(map(carries_nothing, link.children))
 
 
 def _finite(values: list[Value]) -> Value:
