@@ -28,7 +28,7 @@ MOST_WARPS = 16
 DEEPEST = 12  # dofs from a root to a leaf, a free hinge one, up to which velocity terms that come first are as accurate
 APART = {"chain": 2048, "tree": 4 * FEW_WORLDS, "segment": FEW_WORLDS}  # worlds beyond which they are faster
 SHORT = ("inverse_dynamics", "bias_force", "gravity_force")  # little code: a thread for the whole tree does not spill
-GATHERED = ("forward_dynamics", "forward_dynamics_apart")  # by limbs: work enough that a barrier more does not count
+GATHERED = ("forward_dynamics", "forward_dynamics_apart")  # by limbs with short rows: work enough for a barrier more
 LONG_RESULTS = ("mass_matrix", "mass_matrix_inverse")  # writing them is most of the work, and goes faster by many warps
 
 SEGMENTED = ("forward_dynamics", "solve_mass_matrix", *LONG_RESULTS, *SHORT)
@@ -167,7 +167,7 @@ class Plan:
         ``warps`` share 32 worlds.
         """
         if warps > 1:
-            return operation in GATHERED or (self.dofs > LONG_ROWS and self.worlds > WARP)
+            return self.worlds > WARP if self.dofs > LONG_ROWS else operation in GATHERED
         return results > FEW_RESULTS or (not self.few and (self.varies or operation in SHORT))
 
     def column_chunk(self, columns: int, bytes_per_column: int) -> int:
