@@ -417,6 +417,23 @@ def test_results_over_rows_that_warps_share(name, operation, monkeypatch):
         assert laws.error(got, wanted.reshape(got.shape)) <= laws.TOLERANCE["float64"]
 
 
+def test_results_that_leave_through_shared_memory(monkeypatch):
+    """Three of a thread, or one that takes little work in many worlds; rows are read by their threads all the same."""
+    texts, scene = warp_machine.recorded(monkeypatch), zoo.SCENES["chain7"]()
+    q, qd, tau = (laws.states(scene, 3)[name] for name in ("q", "qd", "tau"))
+
+    def frame(call, few=plan.FEW_WORLDS):
+        monkeypatch.setattr(plan, "FEW_WORLDS", few)
+        call(spo.Dynamics(scene, 3, device="cpu", granularity="tree"))
+        return texts[-1].frame
+
+    for wrt, ways in ((("q", "qd", "tau"), (straight.STAGED, 2)), (("q", "qd"), (straight.DIRECT, 0))):
+        found = frame(lambda dyn, wrt=wrt: dyn.forward_dynamics_vjp(q, qd, tau, cotangent=tau, wrt=wrt))
+        assert (found.result.way, len(found.leaving)) == ways and not found.staged
+    assert frame(lambda dyn: dyn.inverse_dynamics(q, qd, tau)).result.way == straight.DIRECT
+    assert frame(lambda dyn: dyn.inverse_dynamics(q, qd, tau), few=0).result.way == straight.STAGED
+
+
 @pytest.mark.parametrize("name", ["fork", "hand"])
 def test_turns_are_loops_where_code_is_long(name, monkeypatch):
     """Columns that meet one another's, in a row and in loops."""
