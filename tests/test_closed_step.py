@@ -14,7 +14,7 @@ from test_step import FORCES, furnished
 import warp_spo as spo
 from warp_spo.embedding import Closing
 from warp_spo.errors import UnsupportedError
-from warp_spo.examples.parts import energy
+from warp_spo.examples.parts import at, bar, energy
 from warp_spo.recursions import closed_step, clusters, impedance, step
 from warp_spo.recursions.multipliers import Multipliers
 
@@ -263,6 +263,22 @@ def test_what_stays_open_has_a_word(loops, dtype, device):
             assert (status == 7).all()
         seen |= set(status.tolist())
     assert seen == {0, 7}
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("loops", ["embed", "multipliers"])
+def test_a_truss_is_closed(loops, dtype, device):
+    """Where nothing can move, rates are rounding, and no share of them says that closures are open."""
+    y, tip = (0, 1, 0), {"parent_pose": at(0.9), "child_pose": at(0.7)}
+    hinges = [spo.Hinge("revolute", -1, k, axis=y, parent_pose=at(x)) for k, x in enumerate((0.0, 1.0, 2.0))]
+    scene = spo.Scene([bar(0.9), bar(0.7), bar(0.5)], hinges, loops=[spo.Loop("revolute", 0, 1, axis=y, **tip)])
+    dyn = spo.Dynamics(scene, 2, device=device, dtype=dtype, loops=loops)
+    q = np.array([[-1.0, -2.3, 0.1], [-0.8, -2.0, 0.3]], dtype)
+    (q, qd), status = dyn.project(q, np.zeros((2, 3), dtype)), np.full(2, -1, np.int32)
+    for _ in range(20):
+        q, qd = dyn.step(q, qd, None, 1e-3, status=status)
+        assert not status.any()
+    assert (np.abs(qd[:, 2]) > 0.1).all()  # the pendulum beside it falls
 
 
 def test_the_word_sees_each_coordinate_and_rate(device):

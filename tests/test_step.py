@@ -415,6 +415,13 @@ def test_in_place_and_without_allocation(device):
         np.testing.assert_array_equal(array.numpy(), on[name].numpy())
     with pytest.raises(ValueError, match="overlaps"):
         dyn.step(on["q"], on["qd"], on["tau"], H, out=(out[0], on["tau"]))
+    q, qd, tau = (states(scene, worlds, "float32")[name].astype(np.float32) for name in ("q", "qd", "tau"))
+    after = dyn.step(q, qd, tau, H)
+    assert dyn.step(q, qd, tau, H, out=(q, qd))[0] is q
+    for got, wanted in zip((q, qd), after, strict=True):
+        np.testing.assert_array_equal(got, wanted)
+    with pytest.raises(ValueError, match="overlaps"):
+        dyn.step(q, qd, tau, H, out=(q, tau))
 
 
 def test_a_step_in_place_reads_its_state_once(device, monkeypatch):

@@ -10,7 +10,7 @@ import contextlib
 import functools
 import inspect
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import warp as wp
@@ -374,9 +374,9 @@ class Adjoints:
     ) -> tuple[tuple[str, ...], list[wp.array]]:
         """The checked names, and an array for each."""
         self._check_size(call, operation)
-        if not isinstance(wrt, str | list | tuple):
+        if not isinstance(wrt, Iterable):
             raise TypeError(f"{call.name}: wrt is {wrt!r}; expected names, such as {ARGUMENTS[operation][:2]}")
-        if not isinstance(out, dict | None):
+        if not isinstance(out, Mapping | None):
             raise TypeError(f"{call.name}: out is of type {type(out).__name__}; expected a dict, arrays by name of wrt")
         names, out = (wrt,) if isinstance(wrt, str) else tuple(wrt), out or {}
         arguments = ARGUMENTS[operation]

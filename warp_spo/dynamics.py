@@ -95,7 +95,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
         self.programs = Programs(self.recursions, self.plan)
         self.values = Values()
         self._close(loops, independent)
-        if not isinstance(refine, int) or isinstance(refine, bool) or refine < 0:
+        if not isinstance(refine, int | np.integer) or isinstance(refine, bool) or refine < 0:
             raise ValueError(f"Dynamics: refine is {refine!r}; expected how many steps, 0 or more")
         if refine and self.closed:
             raise UnsupportedError("Dynamics", f"refine={refine} with loops={loops!r}", "dtype='float64'")

@@ -93,13 +93,14 @@ class Steps:
 
                 * 2 = an input is NaN or infinite.
                 * 1 = the result is not finite though the inputs are: as 1 and 4 in :meth:`forward_dynamics`. A hinge
-                  that carries nothing, without armature, is where its forces cancel: NaN where no law can hold it.
+                  that carries nothing, without armature, is where its forces cancel: NaN where no law can hold it, and
+                  where its mass or armature is variable or differs between worlds.
                 * 6 = the closures lose rank, or half of the dtype's digits: a change point, see there.
                 * 7 = the closures are open after the step, or q' and qd' do not agree: by more than 1e-5 rad, 1e-5 of
                   the distance to the hinges that move the joint, or 1e-5 of the rates. The state stands: Newton's steps
                   did not take it back. Bars turn too far in the step (half a radian), which wants a shorter dt; or it
-                  started open, see :meth:`project`; or angles of many turns are rounded by as much, which wants
-                  float64, or full turns taken off.
+                  started open, see :meth:`project`; or angles of many turns, or places 100 m away, are rounded by as
+                  much, which wants float64, full turns taken off, an origin nearby.
                 * 5 = the last pass still found a law in another part than it had assumed: the step stands, with a force
                   that a shorter dt would correct.
                 * 0 = none of these.
@@ -296,7 +297,7 @@ def _seconds(call: Call, dt: Any) -> float:
     if getattr(dt, "requires_grad", False):
         raise ValueError(f"{name}: dt requires grad; derivatives are not available through this call; pass float(dt)")
     try:
-        if isinstance(dt, str | bytes | bool):
+        if isinstance(dt, str | bytes | bool | np.bool_ | complex):
             raise TypeError
         seconds = float(dt)
     except (TypeError, ValueError):

@@ -23,6 +23,7 @@ from .motion import in_link
 
 PARALLEL = 1e-6  # sine of the angle between two axes of a loop joint, below which they are one
 OPEN = 1e-5  # [rad], or distance over arm, beyond which a closure is open: float32 rounds a few turns by less
+SLOW = 1e-4  # [rad/s, m/s]: of slower rates no share is asked, those of a truss are rounding alone
 
 
 class State(NamedTuple):
@@ -270,7 +271,7 @@ def opened(
     found = []
     for constraint in constraints:
         dofs = [dof for link in constraint.path for dof in link.dofs]
-        speed = total(qd(dof) * qd(dof) for dof in dofs)
+        speed = SLOW**2 + total(qd(dof) * qd(dof) for dof in dofs)
         rows = zip(constraint.error(places, q), constraint.jacobian(places), constraint.sizes(places), strict=True)
         for error, row, size in rows:
             rate = total(x * qd(dof) for dof, x in row.items())
