@@ -416,7 +416,7 @@ BAD_OPS = {
     "twice": (lambda dyn: spo_torch.custom_op(dyn, "gravity_force")(None, q=None), "1 tensors .* q by name; expect"),
     "no tensor": (lambda dyn: spo_torch.custom_op(dyn, "gravity_force")(np.ones(3)), "q is of type ndarray; expected"),
     "no module": (lambda dyn: spo_torch.Module(3), "Module: dyn is of type int; expected a Dynamics"),
-    "no names": (lambda dyn: spo_torch.Module(dyn, 3), "Module: names is 3; expected names of values"),
+    "no names": (lambda dyn: spo_torch.Module(dyn, 3), "Module: names is 3; expected names, such as"),
 }
 
 

@@ -10,14 +10,14 @@ import contextlib
 import functools
 import inspect
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import warp as wp
 
 from . import link_values
 from .arrays import Call, Values, differentiated, recorded
-from .errors import UnsupportedError
+from .errors import UnsupportedError, names_of
 from .frames import checked
 from .levels import Recursions
 from .plan import MOST_DOFS
@@ -374,11 +374,10 @@ class Adjoints:
     ) -> tuple[tuple[str, ...], list[wp.array]]:
         """The checked names, and an array for each."""
         self._check_size(call, operation)
-        if not isinstance(wrt, Iterable):
-            raise TypeError(f"{call.name}: wrt is {wrt!r}; expected names, such as {ARGUMENTS[operation][:2]}")
+        names = names_of(call.name, "wrt", wrt, ARGUMENTS[operation][:2])
         if not isinstance(out, Mapping | None):
             raise TypeError(f"{call.name}: out is of type {type(out).__name__}; expected a dict, arrays by name of wrt")
-        names, out = (wrt,) if isinstance(wrt, str) else tuple(wrt), out or {}
+        out = out or {}
         arguments = ARGUMENTS[operation]
         entering = self.entering(operation)
         known = (*arguments[:1], "tangent", *arguments[1:], *(name for name in entering if self._varies(name)))

@@ -20,7 +20,7 @@ from . import status as words
 from .adjoints import Adjoints, differentiable
 from .arrays import Call, Values, parse_device, parse_dtype, recorded, shape_of
 from .derivatives import Derivatives
-from .errors import UnsupportedError
+from .errors import UnsupportedError, names_of
 from .frames import Frame, checked
 from .levels import Recursions
 from .loops import EMBEDDED, Loops
@@ -473,10 +473,7 @@ def _world_count(scene: Scene, worlds: Any) -> int:
 
 
 def _variable_names(variable: Any) -> tuple[str, ...]:
-    try:
-        names = (variable,) if isinstance(variable, str) else tuple(variable)
-    except TypeError:
-        raise TypeError(f"Dynamics: variable is {variable!r}; expected names such as ('body_mass',)") from None
+    names = names_of("Dynamics", "variable", variable, ("body_mass",))
     for name in names:
         if name not in VARIABLE:
             raise ValueError(f"Dynamics: variable names {name!r}; expected some of {', '.join(VARIABLE)}")

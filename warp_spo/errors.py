@@ -1,5 +1,6 @@
 """The errors a caller may want to tell apart; every other mistake is a plain ValueError or TypeError."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,13 @@ def refuse_masked(call: str, name: str, array: Any) -> None:
             f"{call}: {name} is a masked array, whose mask nothing here looks at; expected a plain NumPy array; pass "
             f"its .filled(number), or its .data to use what is under the mask"
         )
+
+
+def names_of(call: str, what: str, names: Any, such: tuple[str, ...]) -> tuple[str, ...]:
+    """One name, or an iterable of them, as a tuple; raise TypeError of anything else, showing ``such`` as one would."""
+    if not isinstance(names, Iterable):
+        raise TypeError(f"{call}: {what} is {names!r}; expected names, such as {such}")
+    return (names,) if isinstance(names, str) else tuple(names)
 
 
 class DirectedLoopError(ValueError):

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from .adjoints import ARGUMENTS, OPTIONAL
+from .errors import names_of
 from .scene import Scene
 
 
@@ -131,9 +132,9 @@ class Preparation:
 
     def _prepare_product(self, product: str, options: dict[str, Any]) -> None:
         operation, way = product[:-4], product[-3:]
-        wrt = self._names("wrt", options.pop("wrt", ()) if way == "vjp" else ())
+        wrt = names_of("Dynamics.prepare", "wrt", options.pop("wrt", ()) if way == "vjp" else (), ("q", "qd"))
         default = ("dq", "dqd", f"d{ARGUMENTS[operation][2]}") if way == "jvp" else ()
-        along = self._names("along", options.pop("along", default) if default else ())
+        along = names_of("Dynamics.prepare", "along", options.pop("along", default) if default else (), ("dq", "dqd"))
         for name in along:
             if name not in (*default, "dbody_f"):
                 expected = ", ".join((*default, "dbody_f"))
@@ -157,12 +158,6 @@ class Preparation:
         else:
             cotangents = results[: 2 if operation == "step" else 1]
             self.pulled_back(operation, given, more, results, cotangents, wrt or tuple(given))
-
-    @staticmethod
-    def _names(option: str, names: Any) -> tuple[str, ...]:
-        if not isinstance(names, str | list | tuple):
-            raise TypeError(f"Dynamics.prepare: {option} is {names!r}; expected names, such as ('q', 'qd')")
-        return (names,) if isinstance(names, str) else tuple(names)
 
     @staticmethod
     def _refuse_rest(operation: str, options: dict[str, Any]) -> None:

@@ -9,6 +9,8 @@ from typing import Any
 import torch
 import warp as wp
 
+from .errors import names_of
+
 _DTYPES: dict[Any, torch.dtype] = {
     wp.float32: torch.float32,
     wp.float64: torch.float64,
@@ -205,10 +207,8 @@ class Module(torch.nn.Module):
         super().__init__()
         if not hasattr(dyn, "differentiable_values"):
             raise TypeError(f"Module: dyn is of type {type(dyn).__name__}; expected a Dynamics")
-        if not isinstance(names, str | list | tuple | None):
-            raise TypeError(f"Module: names is {names!r}; expected names of values, such as ('body_mass',)")
         self.dyn = dyn
-        names = (names,) if isinstance(names, str) else dyn.differentiable_values if names is None else tuple(names)
+        names = names_of("Module", "names", dyn.differentiable_values if names is None else names, ("body_mass",))
         for name in names:
             if name not in dyn.differentiable_values:
                 raise ValueError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import newton
@@ -14,7 +14,7 @@ from newton import JointTargetMode, ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
 from ..dynamics import Dynamics
-from ..errors import UnsupportedError
+from ..errors import UnsupportedError, names_of
 from ..kernels import declare, exchange
 from ..parts import DOF_VALUES, FREE
 from ..scene import Scene
@@ -115,8 +115,7 @@ class SolverSPO(Plugs, SolverBase):
     ):
         if not hasattr(model, "particle_count"):
             raise TypeError(f"SolverSPO: model is of type {type(model).__name__}; expected a newton.Model")
-        if not isinstance(variable, str | Iterable):
-            raise TypeError(f"SolverSPO: variable is {variable!r}; expected names such as ('body_mass',)")
+        self._asked = names_of("SolverSPO", "variable", variable, ("body_mass",))
         super().__init__(model)
         if integrator not in INTEGRATORS:
             raise ValueError(f"SolverSPO: integrator is {integrator!r}; expected one of {', '.join(INTEGRATORS)}")
@@ -124,7 +123,6 @@ class SolverSPO(Plugs, SolverBase):
             raise UnsupportedError("SolverSPO", f"{model.particle_count} particles", "another solver for a model view")
         self.integrator = integrator
         self._options: dict[str, Any] = {"loops": loops, "granularity": granularity}
-        self._asked = (variable,) if isinstance(variable, str) else tuple(variable)
         self._build()
 
     def _build(self) -> None:

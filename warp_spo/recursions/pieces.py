@@ -54,12 +54,6 @@ class Piece:
         """The dofs that move its last link, from the root out."""
         return [dof for piece in reversed([self, *self.ancestors]) for dof in piece.dofs]
 
-    def reach(self, dof: int) -> int:
-        """How many dofs, from the root out, the link of one of its dofs needs to move."""
-        further = sum(piece.weight for piece in self.ancestors)
-        at = next(at for at, link in enumerate(self.links) if dof in link.dofs)
-        return further + sum(len(link.dofs) for link in self.links[: at + 1])
-
     def fork(self, other: Piece) -> Piece | None:
         """The last piece that carries both, or None."""
         mine = [self, *self.ancestors]
