@@ -443,14 +443,10 @@ class Adjoints:
         solved = results.pop("tau", None)
         if solved is None:
             solved = self.recursions.array("lambda of derivatives", *shape)
-        asked = qdd is None and bool(results)
-        if asked:
+        if qdd is None and results:
             qdd = self.recursions.array("qdd of derivatives", *shape)
-        if asked and self.programs.plan.few:
             self._launch("forward_dynamics_and_solve", qdd, {"solved": solved}, **state, **forces, cotangent=cotangent)
-        else:  # each with less code, of which an instruction cache holds more
-            if asked:
-                self._run("forward_dynamics", qdd, **state, **forces)
+        else:
             self._run("solve_mass_matrix", solved, q=given["q"], b=cotangent)
         if results:
             self._pull("forward_dynamics", tuple(results), [*results.values()], {**state, "qdd": qdd, "solved": solved})

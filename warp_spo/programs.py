@@ -44,7 +44,7 @@ TILES = ("inverse_dynamics_derivatives", "mass_matrix_derivative")
 """Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
 REGISTERS, PARTS = 65536, 4  # of a multiprocessor
 MOST_REGISTERS = 255  # of a thread
-BLOCKS = {"forward_dynamics_apart": (3, 168), "solve_mass_matrix": (4, 128)}
+BLOCKS = {"forward_dynamics_apart": (3, 168), "solve_mass_matrix": (4, 128), "forward_dynamics_vjp": (4, 128)}
 """Blocks of limbs for it, if they leave a thread so many registers, where there are many worlds."""
 PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
 FRAME_LISTS = 16  # different lists of frames that get a program of their own
