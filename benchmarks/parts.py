@@ -49,7 +49,7 @@ def on_gpu() -> list[Part]:
     """What the README shows; the other rows of ours; peers; the stress suite."""
     both, jobs = ("--dtype", "float32", "float64"), str(max(1, (os.cpu_count() or 2) // 2))
     parts = [
-        ours(f"headline.{robot}", rf"^{robot}\.{BASIC}\.", 130.0, *both, worlds=("1", "4096", "65536", "1048576"))
+        ours(f"headline.{robot}", rf"^{robot}\.{BASIC}\.", 180.0, *both, worlds=("1", "4096", "65536", "1048576"))
         for robot in ROBOTS
     ]
     parts += [ours(f"operations.{robot}", rf"^{robot}\.(?!{BASIC})", 90.0, *both) for robot in ROBOTS]
