@@ -668,6 +668,14 @@ BAD_SCENES = {
         ValueError, "Scene: a coupling's ratio is nan; expected finite numbers",
     ),
     "value": (lambda: scene().with_values(gravity="down"), ValueError, "Scene.with_values: gravity is 'down'"),
+    "text in an object array": (
+        lambda: scene().with_values(gravity=np.array(["0", "0", "1"], dtype=object)),
+        ValueError, "Scene.with_values: gravity is array(['0', '0', '1']",
+    ),
+    "gradient": (
+        lambda: scene().with_values(gravity=pytest.importorskip("torch").ones(3, requires_grad=True)),
+        ValueError, "Scene.with_values: gravity is tensor([1., 1., 1.], requires_grad=True); expected numbers",
+    ),
 }
 
 

@@ -499,6 +499,8 @@ def test_mistakes_are_explained(device):
     call = lambda **more: dyn.step(**{"q": a["q"], "qd": a["qd"], "tau": None, "dt": H, **more})  # noqa: E731
     with pytest.raises(TypeError, match=r"Dynamics.step: dt is 'soon'; expected a number of seconds"):
         call(dt="soon")
+    with pytest.raises(TypeError, match=r"Dynamics.step: dt is array\(\[0.002\]\); expected a number of seconds"):
+        call(dt=np.array([2e-3]))
     with pytest.raises(ValueError, match="integrator is 'euler'; expected one of semi_implicit"):
         call(integrator="euler")
     with pytest.raises(ValueError, match=r"Dynamics.step: qd is a NumPy array float64 \(2, 3\)"):

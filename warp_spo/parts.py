@@ -60,9 +60,15 @@ def checked_array(call: str, name: str, value: Any, shape: tuple[int, ...]) -> n
 
 
 def real(value: Any) -> np.ndarray:
-    """A copy in float64: what the caller does to his later changes nothing. TypeError of text and complex numbers."""
+    """A copy in float64: what the caller does to his later changes nothing.
+
+    TypeError of text, complex numbers and a torch tensor that requires grad: nothing is differentiated through a copy.
+    """
+    if getattr(value, "requires_grad", False):
+        raise TypeError
     array = np.array(value)
-    if array.dtype.kind not in "biufO":
+    texts = array.dtype == object and any(isinstance(entry, str | bytes) for entry in array.flat)
+    if array.dtype.kind not in "biufO" or texts:
         raise TypeError
     return array.astype(np.float64)
 

@@ -297,7 +297,7 @@ def _seconds(call: Call, dt: Any) -> float:
     if getattr(dt, "requires_grad", False):
         raise ValueError(f"{name}: dt requires grad; derivatives are not available through this call; pass float(dt)")
     try:
-        if isinstance(dt, str | bytes | bool | np.bool_ | complex):
+        if isinstance(dt, str | bytes | bool | np.bool_ | complex) or np.ndim(dt) > 0:
             raise TypeError
         seconds = float(dt)
     except (TypeError, ValueError):
