@@ -1,6 +1,6 @@
 """Does the plan choose well? Forward dynamics of ten random trees at each granularity, beside what the plan takes.
 
-    python -m benchmarks.plans [--device cuda:0] [--trees 0 1 ...] [--worlds 1 256 4096 65536]
+    python -m benchmarks.plans [--device cuda:0] [--trees 0 1 ...] [--worlds 1 256 4096 65536] [--compile]
 
 A line is one tree and world count: the time at each granularity in us, the choice, and its time over the best one's.
 All kernels are compiled first, side by side. The exit code is 1 if a choice takes more than ``ALLOWED`` of the best.
@@ -34,12 +34,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--device", help="Warp device, default: the current one")
     parser.add_argument("--trees", nargs="+", type=int, default=list(range(len(zoo.BRANCHED))))
     parser.add_argument("--worlds", nargs="+", type=int, default=WORLDS)
+    parser.add_argument("--compile", action="store_true", help="fill Warp's cache, time nothing")
     options = parser.parse_args(arguments)
     start = time.perf_counter()
     scenes = {which: zoo.branched(which) for which in options.trees}
     made = {which: prepared(scene, options.worlds, options.device) for which, scene in scenes.items()}
     load(made)
     print(f"traced and compiled in {time.perf_counter() - start:.0f} s", flush=True)
+    if options.compile:
+        return 0
     beyond = []
     for which, scene in scenes.items():
         for worlds in options.worlds:
@@ -61,12 +64,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def prepared(scene: spo.Scene, counts: list[int], device: str | None) -> dict[tuple[str, int], spo.Dynamics]:
-    """Traced, not compiled, by granularity and worlds. Programs depend on how rows are read, not on the worlds."""
+    """Traced, not compiled, by granularity and worlds; plans that differ in nothing else share their programs."""
     made, programs = {}, {}
     for name in ("tree", "segment"):
         for worlds in counts:
             made[name, worlds] = dyn = spo.Dynamics(scene, worlds, device, granularity=name)
-            key = name, dyn.plan.staged
+            key = name, dyn.plan.staged, dyn.plan.few, dyn.plan.apart
             if key in programs:
                 dyn.programs._programs = programs[key]
                 continue
