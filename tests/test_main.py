@@ -8,10 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import warp as wp
 
 from warp_spo import __main__ as job
-from warp_spo import report
+from warp_spo import report, trial
 from warp_spo.operations import OPERATIONS, TOLERANCE
 
 # Two bars on the ground whose tips are pinned together: a loop.
@@ -44,6 +46,25 @@ def test_reports_every_operation_in_both_precisions(tmp_path, capsys, device):
     (picture,) = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', text)
     assert "largest relative error" in base64.b64decode(picture).decode()
     assert "http" not in text.replace(picture, "")  # nothing to fetch
+
+
+def test_a_robot_that_cannot_move_passes(tmp_path, capsys, device):
+    robot = tmp_path / "block.urdf"
+    robot.write_text('<robot name="r"><link name="a"><inertial><mass value="1"/>'
+                     '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>')
+    assert job.main([str(robot), "--worlds", "2", "--device", str(device)]) == 0
+    assert "FAILED" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("summed", [2, 5, 6, 7])
+@pytest.mark.parametrize("entry", [0, 3, 5])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_single_entry_that_is_not_finite_is_found(monkeypatch, device, summed, entry, value):
+    monkeypatch.setattr(trial, "MOST_SUMMED", summed)  # sums of arrays with more entries are taken in parts
+    numbers = np.ones((3, 2))
+    assert trial.all_finite(wp.array(numbers, dtype=wp.float32, device=device))
+    numbers.flat[entry] = value
+    assert not trial.all_finite(wp.array(numbers, dtype=wp.float32, device=device))
 
 
 def test_a_wrong_result_fails_and_is_named(capsys, monkeypatch, device):

@@ -96,6 +96,8 @@ class Operation:
         """
         assert self.solves is not None, f"{self.name} solves no equation"
         A, b = self.solves(dense, *inputs)
+        if not len(A):
+            return 0.0
         x, b = result.astype(np.float64).reshape(len(A), -1), b.reshape(len(A), -1)
         size = np.linalg.norm(A, 2) * np.linalg.norm(x) + np.linalg.norm(b)
         return float(np.linalg.norm(A @ x - b) / (size if size > 0.0 else 1.0))

@@ -412,7 +412,7 @@ class Dense:
     @property
     def center_of_mass(self):
         """Centre of mass of all that moves, in the world [3], [m]."""
-        return self._moving @ self.com / self._moving.sum()
+        return self._moving @ self.com / (self._moving.sum() or 1.0)
 
     @property
     def com_jacobian(self):
