@@ -394,6 +394,8 @@ BAD_RESULTS = {
     "no wrt": (dict(wrt=()), ValueError, "wrt is (); expected one name or more, each once"),
     "twice": (dict(wrt=("q", "q")), ValueError, "wrt is ('q', 'q'); expected one name or more, each once"),
     "a number": (dict(wrt=3), TypeError, "wrt is 3; expected names"),
+    "no names": (dict(wrt=[["q"]]), TypeError, "wrt is [['q']]; expected names"),
+    "0-d": (dict(wrt=np.array("q")), TypeError, "wrt is array('q', dtype='<U1'); expected names"),
 }
 
 
@@ -523,13 +525,17 @@ def test_a_label_of_two_bodies_names_none(device):
 
 
 # -- construction and prepare ------------------------------------------------------------------------------------------
-BAD_ARGUMENTS = {
+BAD_ARGUMENTS: dict = {
     "granularity": [("leaf", ValueError), (1, ValueError), ([], ValueError)],
     "loops": [("open", ValueError), (None, ValueError), ([], ValueError)],
-    "variable": [(("mass",), ValueError), ("mass", ValueError), ((3,), ValueError), (3, TypeError), (None, TypeError)],
+    "variable": [(("mass",), ValueError), ("mass", ValueError), ((3,), TypeError), (3, TypeError), (None, TypeError),
+                 ([["gravity"]], TypeError), (np.array("gravity"), TypeError), (b"gravity", TypeError)],
     "dtype": [("float16", ValueError), (float, ValueError), (None, ValueError), (torch.float16, ValueError)],
-    "worlds": [(0, ValueError), (-1, ValueError), (2.5, TypeError), ("3", TypeError), (True, TypeError)],
-    "refine": [(-1, ValueError), (True, ValueError), ("1", ValueError)],
+    "worlds": [(0, ValueError), (-1, ValueError), (2.5, TypeError), ("3", TypeError), (True, TypeError),
+               (torch.tensor(True), TypeError), (torch.tensor([3]), TypeError), (np.array(3.0), TypeError),
+               (torch.zeros((), dtype=torch.int64, device="meta"), TypeError)],
+    "refine": [(-1, ValueError), (True, ValueError), ("1", ValueError), (1.0, ValueError),
+               (np.array(True), ValueError)],
     "device": [(name, ValueError) for name in ("gpu", [], "cuda:99", torch.device("meta"), 3)],
 }
 
@@ -611,6 +617,7 @@ BAD_PREPARE = {
     "status": (dict(operation="inverse_dynamics", status=True), "inverse_dynamics has no option status"),
     "columns": (dict(operation="solve_mass_matrix", columns="many"), "columns is 'many'"),
     "negative": (dict(operation="solve_mass_matrix", columns=-1), "columns is -1"),
+    "true columns": (dict(operation="solve_mass_matrix", columns=True), "columns is True"),
     "a list": (dict(operation=["step"]), "no operation ['step']; expected one of forward_dynamics"),
     "along": (dict(operation="forward_dynamics_jvp", along=("dx",)), "along names 'dx'", "some of dq, dqd"),
 }
