@@ -24,6 +24,7 @@ from .frames import Frame, checked
 from .levels import Recursions
 from .loops import EMBEDDED, Loops
 from .parameters import RIGID_VALUES, VARIABLE
+from .parts import real
 from .preparation import Preparation
 from .programs import Programs
 from .refinement import Refinement
@@ -120,9 +121,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
                     raise ValueError(f"Dynamics.set: unknown value {name!r}; expected one of {', '.join(VARIABLE)}")
                 if not hasattr(value, "shape"):
                     try:
-                        if value is None:
-                            raise TypeError
-                        value = np.asarray(value, dtype=np.float64)
+                        value = real(value)
                     except (TypeError, ValueError):
                         raise TypeError(f"Dynamics.set: {name} is {value!r}; expected an array of numbers") from None
                 shape = self.scene.values[name].shape[1:]
