@@ -11,6 +11,7 @@ import torch
 import warp as wp
 import zoo
 from laws import OPERATIONS, TOLERANCE
+from torch.autograd import forward_ad
 
 import warp_spo as spo
 from warp_spo import reference
@@ -273,6 +274,78 @@ def test_a_lazy_negative_view_is_refused(device):
     np.testing.assert_array_equal(
         numbers(dyn.gravity_force(negative.resolve_neg().contiguous())), numbers(dyn.gravity_force(q))
     )
+
+
+def test_a_lazy_zero_tensor_is_refused(device):
+    """It has numbers and no memory: read at its address, the interpreter would end."""
+    if device.is_cuda:
+        pytest.skip("lazy zeros are made on the CPU here")
+    dyn = dynamics(device)
+    q = given("torch", dyn)["q"]
+    zero = torch._efficientzerotensor(q.shape, dtype=q.dtype)
+    words = "holds no memory", "expected numbers in memory", ".clone()"
+    with explained(ValueError, "Dynamics.gravity_force: q", *words):
+        dyn.gravity_force(zero)
+    with explained(ValueError, "Dynamics.bias_force: qd", *words):
+        dyn.bias_force(q, torch._efficientzerotensor((WORLDS, dyn.scene.dof_count), dtype=q.dtype))
+    np.testing.assert_array_equal(numbers(dyn.gravity_force(zero.clone())), numbers(dyn.gravity_force(0.0 * q)))
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script")  # of torch itself, in forward mode
+def test_a_forward_mode_tangent_is_never_dropped(device):
+    """Nothing of a dual tensor says so: its requires_grad is False, and its memory holds the primal alone."""
+    dyn = spo.Dynamics(scene(), WORLDS, device=device, dtype="float64", variable=("body_mass",))
+    a = given("torch", dyn)
+    mass = made("torch", dyn.scene.values["body_mass"][0], dyn)
+    with forward_ad.dual_level():
+        dual = {name: forward_ad.make_dual(a[name], torch.ones_like(a[name])) for name in ("q", "qd", "tau")}
+        seconds = forward_ad.make_dual(torch.tensor(0.01), torch.tensor(1.0))
+        pose = forward_ad.make_dual(torch.tensor(POSE), torch.ones(7))
+        calls = {
+            "Dynamics.gravity_force: q": lambda: dyn.gravity_force(dual["q"]),
+            "Dynamics.forward_dynamics: tau": lambda: dyn.forward_dynamics(a["q"], a["qd"], dual["tau"]),
+            "Dynamics.mass_matrix_inverse: q": lambda: dyn.mass_matrix_inverse(dual["q"]),
+            "Dynamics.bias_force: qd": lambda: dyn.bias_force(a["q"].clone().requires_grad_(), dual["qd"]),
+            "Dynamics.bias_force: out": lambda: dyn.bias_force(a["q"], a["qd"], out=dual["tau"]),
+            "Dynamics.set: body_mass": lambda: dyn.set(body_mass=forward_ad.make_dual(mass, mass)),
+            "Dynamics.step: dt": lambda: dyn.step(a["q"], a["qd"], None, seconds),
+            "Dynamics.jacobian: a frame's pose": lambda: dyn.jacobian(a["q"], [(0, pose)]),
+        }
+        for name, call in calls.items():
+            with explained(ValueError, name, "has a forward-mode tangent", "backward", "_jvp", "unpack_dual"):
+                call()
+        primal = forward_ad.unpack_dual(dual["q"]).primal
+        np.testing.assert_array_equal(numbers(dyn.gravity_force(primal)), numbers(dyn.gravity_force(a["q"])))
+    np.testing.assert_array_equal(numbers(dyn.gravity_force(a["q"])), numbers(dynamics(device).gravity_force(a["q"])))
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script")  # of torch itself, in forward mode
+def test_transforms_of_torch_are_refused_by_name(device):
+    """They hand in wrappers without memory: of the arguments, or of the cotangents on the way back."""
+    dyn = dynamics(device)
+    a = given("torch", dyn)
+    q, one = a["q"], a["q"].clone().requires_grad_()
+    force, inverse = dyn.gravity_force, dyn.mass_matrix_inverse
+    result = force(one)
+    functional = torch.autograd.functional.jacobian
+    calls = {
+        "gravity_force: q is": [
+            lambda: torch.func.vmap(force)(torch.stack([q, q])),
+            lambda: torch.func.jvp(force, (q,), (q,)),
+            lambda: torch.func.jacfwd(force)(q),
+            lambda: torch.func.grad(lambda x: force(x).sum())(q),
+        ],
+        "mass_matrix_inverse: q is": [lambda: torch.func.vmap(inverse)(torch.stack([q, q]))],
+        "inverse_dynamics_vjp: cotangent is": [
+            lambda: functional(force, q, vectorize=True),
+            lambda: torch.autograd.grad(result, one, torch.stack([result, result]).detach(), is_grads_batched=True),
+        ],
+    }
+    for name, those in calls.items():
+        for call in those:
+            with explained(ValueError, f"Dynamics.{name}", "wrapped by a transform", "vectorize=False"):
+                call()
+    assert functional(force, q).shape == (*result.shape, *q.shape)
 
 
 BAD_SECONDS = [

@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from .arrays import check_plain
 from .errors import refuse_masked, whole
 from .parts import IDENTITY_POSE, real
 from .scene import Scene
@@ -50,6 +51,7 @@ def _checked(scene: Scene, call: str, frame: Frame) -> tuple[int, tuple[float, .
 
 def _origin(call: str, frame: Frame, pose: Any) -> tuple[float, ...]:
     refuse_masked(call, "a frame's pose", pose)
+    check_plain(call, "a frame's pose", pose)
     if getattr(pose, "requires_grad", False):
         raise ValueError(
             f"{call}: a frame's pose requires grad; derivatives are not available by it; pass the pose's detach()"

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from .adjoints import differentiable
-from .arrays import Call
+from .arrays import Call, check_plain
 from .errors import UnsupportedError, is_bool
 from .kernels import combination, loops
 from .levels import Recursions
@@ -300,6 +300,7 @@ def _seconds(call: Call, dt: Any) -> float:
     elif getattr(dt, "requires_grad", False):
         raise ValueError(f"{name}: dt requires grad; derivatives are not available through this call; pass float(dt)")
     else:
+        check_plain(name, "dt", dt)
         try:
             number = real(dt)
             if number.ndim or is_bool(dt):
