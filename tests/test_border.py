@@ -2,6 +2,7 @@
 
 import functools
 import re
+from fractions import Fraction
 
 import laws
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 import warp as wp
 import zoo
 from laws import OPERATIONS, TOLERANCE
+from torch.autograd import forward_ad
 
 import warp_spo as spo
 from warp_spo import reference
@@ -274,13 +276,95 @@ def test_a_lazy_negative_view_is_refused(device):
     )
 
 
+def test_a_lazy_zero_tensor_is_refused(device):
+    """It has numbers and no memory: read at its address, the interpreter would end."""
+    if device.is_cuda:
+        pytest.skip("lazy zeros are made on the CPU here")
+    dyn = dynamics(device)
+    q = given("torch", dyn)["q"]
+    zero = torch._efficientzerotensor(q.shape, dtype=q.dtype)
+    words = "holds no memory", "expected numbers in memory", ".clone()"
+    with explained(ValueError, "Dynamics.gravity_force: q", *words):
+        dyn.gravity_force(zero)
+    with explained(ValueError, "Dynamics.bias_force: qd", *words):
+        dyn.bias_force(q, torch._efficientzerotensor((WORLDS, dyn.scene.dof_count), dtype=q.dtype))
+    np.testing.assert_array_equal(numbers(dyn.gravity_force(zero.clone())), numbers(dyn.gravity_force(0.0 * q)))
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script")  # of torch itself, in forward mode
+def test_a_forward_mode_tangent_is_never_dropped(device):
+    """Nothing of a dual tensor says so: its requires_grad is False, and its memory holds the primal alone."""
+    dyn = spo.Dynamics(scene(), WORLDS, device=device, dtype="float64", variable=("body_mass",))
+    a = given("torch", dyn)
+    mass = made("torch", dyn.scene.values["body_mass"][0], dyn)
+    with forward_ad.dual_level():
+        dual = {name: forward_ad.make_dual(a[name], torch.ones_like(a[name])) for name in ("q", "qd", "tau")}
+        seconds = forward_ad.make_dual(torch.tensor(0.01), torch.tensor(1.0))
+        pose = forward_ad.make_dual(torch.tensor(POSE), torch.ones(7))
+        calls = {
+            "Dynamics.gravity_force: q": lambda: dyn.gravity_force(dual["q"]),
+            "Dynamics.forward_dynamics: tau": lambda: dyn.forward_dynamics(a["q"], a["qd"], dual["tau"]),
+            "Dynamics.mass_matrix_inverse: q": lambda: dyn.mass_matrix_inverse(dual["q"]),
+            "Dynamics.bias_force: qd": lambda: dyn.bias_force(a["q"].clone().requires_grad_(), dual["qd"]),
+            "Dynamics.bias_force: out": lambda: dyn.bias_force(a["q"], a["qd"], out=dual["tau"]),
+            "Dynamics.set: body_mass": lambda: dyn.set(body_mass=forward_ad.make_dual(mass, mass)),
+            "Dynamics.step: dt": lambda: dyn.step(a["q"], a["qd"], None, seconds),
+            "Dynamics.jacobian: a frame's pose": lambda: dyn.jacobian(a["q"], [(0, pose)]),
+        }
+        for name, call in calls.items():
+            with explained(ValueError, name, "has a forward-mode tangent", "backward", "_jvp", "unpack_dual"):
+                call()
+        primal = forward_ad.unpack_dual(dual["q"]).primal
+        np.testing.assert_array_equal(numbers(dyn.gravity_force(primal)), numbers(dyn.gravity_force(a["q"])))
+    np.testing.assert_array_equal(numbers(dyn.gravity_force(a["q"])), numbers(dynamics(device).gravity_force(a["q"])))
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script")  # of torch itself, in forward mode
+def test_transforms_of_torch_are_refused_by_name(device):
+    """They hand in wrappers without memory: of the arguments, or of the cotangents on the way back."""
+    dyn = dynamics(device)
+    a = given("torch", dyn)
+    q, one = a["q"], a["q"].clone().requires_grad_()
+    force, inverse = dyn.gravity_force, dyn.mass_matrix_inverse
+    result = force(one)
+    functional = torch.autograd.functional.jacobian
+    calls = {
+        "gravity_force: q is": [
+            lambda: torch.func.vmap(force)(torch.stack([q, q])),
+            lambda: torch.func.jvp(force, (q,), (q,)),
+            lambda: torch.func.jacfwd(force)(q),
+            lambda: torch.func.grad(lambda x: force(x).sum())(q),
+        ],
+        "mass_matrix_inverse: q is": [lambda: torch.func.vmap(inverse)(torch.stack([q, q]))],
+        "inverse_dynamics_vjp: cotangent is": [
+            lambda: functional(force, q, vectorize=True),
+            lambda: torch.autograd.grad(result, one, torch.stack([result, result]).detach(), is_grads_batched=True),
+        ],
+    }
+    for name, those in calls.items():
+        for call in those:
+            with explained(ValueError, f"Dynamics.{name}", "wrapped by a transform", "vectorize=False"):
+                call()
+    assert functional(force, q).shape == (*result.shape, *q.shape)
+
+
+BAD_SECONDS = [
+    None, "soon", "1e-3", b"1e-3", True, np.True_, np.array(True), torch.tensor(True), 1j, np.complex64(1e-3),
+    torch.tensor(1j), np.array("0.001"), np.array("0.001", object), 10**400, torch.zeros((), device="meta"), [0.25],
+    np.full(WORLDS, 0.25), torch.full((1,), 0.25), wp.zeros(1, device="cpu"),
+]  # fmt: skip
+
+
 def test_dt_is_one_number_and_is_never_detached(device):
     dyn = dynamics(device)
     a = laws.states(dyn.scene, WORLDS)
     wanted = dyn.integrate(a["q"], a["qd"], 0.25)
-    for dt in (np.float32(0.25), np.array(0.25), torch.tensor(0.25)):
+    for dt in (np.float32(0.25), np.float64(0.25), np.array(0.25), torch.tensor(0.25), Fraction(1, 4)):
         np.testing.assert_array_equal(dyn.integrate(a["q"], a["qd"], dt), wanted)
-    for dt in (None, "soon", np.full(WORLDS, 0.25), wp.zeros(1)):
+    wanted = dyn.integrate(a["q"], a["qd"], 1.0)
+    for dt in (1, np.int8(1), np.array(1, np.uint8), torch.tensor(1)):
+        np.testing.assert_array_equal(dyn.integrate(a["q"], a["qd"], dt), wanted)
+    for dt in BAD_SECONDS:
         with explained(TypeError, "Dynamics.integrate", "dt is", "expected a number of seconds"):
             dyn.integrate(a["q"], a["qd"], dt)
     with explained(ValueError, "Dynamics.integrate", "dt requires grad", "float(dt)"):
@@ -305,7 +389,7 @@ def test_dt_is_a_number_that_the_dtype_holds(operation, device):
     for dt in BAD_DT:
         with explained(ValueError, f"Dynamics.{operation}", f"dt is {dt} s", "float32", "finite"):
             getattr(dyn, operation)(*arguments, dt)
-    for dt in ("1e-3", True):
+    for dt in BAD_SECONDS:
         with explained(TypeError, f"Dynamics.{operation}", f"dt is {dt!r}", "expected a number of seconds"):
             getattr(dyn, operation)(*arguments, dt)
 
@@ -394,6 +478,8 @@ BAD_RESULTS = {
     "no wrt": (dict(wrt=()), ValueError, "wrt is (); expected one name or more, each once"),
     "twice": (dict(wrt=("q", "q")), ValueError, "wrt is ('q', 'q'); expected one name or more, each once"),
     "a number": (dict(wrt=3), TypeError, "wrt is 3; expected names"),
+    "no names": (dict(wrt=[["q"]]), TypeError, "wrt is [['q']]; expected names"),
+    "0-d": (dict(wrt=np.array("q")), TypeError, "wrt is array('q', dtype='<U1'); expected names"),
 }
 
 
@@ -469,7 +555,8 @@ def test_frames_by_label_index_and_pose_are_the_same(operation, device):
     dense = np.stack([getattr(reference.Dense(dyn.scene, row), operation)([1, (0, POSE)]) for row in q])
     assert laws.error(wanted, dense) <= TOLERANCE["float64"]
     pose = np.array(POSE, np.float32)
-    for frames in (["shin", ("thigh", POSE)], (np.int64(1), [0, list(POSE)]), [1, (0, wp.transform(*POSE))]):
+    for frames in (["shin", ("thigh", POSE)], (np.int64(1), [0, list(POSE)]), [1, (0, wp.transform(*POSE))],
+                   [1, (0, torch.tensor(POSE))], [1, (0, [torch.tensor(x) for x in POSE])]):  # fmt: skip
         assert laws.error(run(frames), wanted) <= 1e-7  # POSE in float32
     assert laws.error(run([1, (0, pose)]), wanted) <= 1e-7
     np.testing.assert_array_equal(run(range(2)), run([0, 1]))
@@ -502,6 +589,12 @@ BAD_FRAMES = {
     "long quaternion": ([(0, (0, 0, 0, 0, 0, 0, 2))], ValueError, "expected x, y, z and a unit quaternion"),
     "nan": ([(0, (np.nan, 0, 0, 0, 0, 0, 1))], ValueError, "expected x, y, z and a unit quaternion"),
     "text": ([(0, "here")], TypeError, "expected a body (index or label) or (body, pose in the body)"),
+    "texts": ([(0, ["0"] * 6 + ["1"])], TypeError, "expected a body (index or label) or (body, pose in the body)"),
+    "complex": ([(0, np.ones(7) * 1j)], TypeError, "expected a body (index or label) or (body, pose in the body)"),
+    "huge": ([(0, (10**400, 0, 0, 0, 0, 0, 1))], TypeError, "expected a body (index or label) or (body, pose"),
+    "one number": ([(0, 1.0)], TypeError, "expected a body (index or label) or (body, pose in the body)"),
+    "gradient": ([(0, torch.ones(7, requires_grad=True))], ValueError, "a frame's pose requires grad; derivatives"),
+    "a truth": ([torch.tensor(True)], TypeError, "a frame is tensor(True); expected a body (index or label)"),
 }
 
 
@@ -523,13 +616,17 @@ def test_a_label_of_two_bodies_names_none(device):
 
 
 # -- construction and prepare ------------------------------------------------------------------------------------------
-BAD_ARGUMENTS = {
+BAD_ARGUMENTS: dict = {
     "granularity": [("leaf", ValueError), (1, ValueError), ([], ValueError)],
     "loops": [("open", ValueError), (None, ValueError), ([], ValueError)],
-    "variable": [(("mass",), ValueError), ("mass", ValueError), ((3,), ValueError), (3, TypeError), (None, TypeError)],
+    "variable": [(("mass",), ValueError), ("mass", ValueError), ((3,), TypeError), (3, TypeError), (None, TypeError),
+                 ([["gravity"]], TypeError), (np.array("gravity"), TypeError), (b"gravity", TypeError)],
     "dtype": [("float16", ValueError), (float, ValueError), (None, ValueError), (torch.float16, ValueError)],
-    "worlds": [(0, ValueError), (-1, ValueError), (2.5, TypeError), ("3", TypeError), (True, TypeError)],
-    "refine": [(-1, ValueError), (True, ValueError), ("1", ValueError)],
+    "worlds": [(0, ValueError), (-1, ValueError), (2.5, TypeError), ("3", TypeError), (True, TypeError),
+               (torch.tensor(True), TypeError), (torch.tensor([3]), TypeError), (np.array(3.0), TypeError),
+               (torch.zeros((), dtype=torch.int64, device="meta"), TypeError)],
+    "refine": [(-1, ValueError), (True, ValueError), ("1", ValueError), (1.0, ValueError),
+               (np.array(True), ValueError)],
     "device": [(name, ValueError) for name in ("gpu", [], "cuda:99", torch.device("meta"), 3)],
 }
 
@@ -539,6 +636,35 @@ def test_bad_arguments_are_refused_in_words(name, value, error, device):
     arguments = {"worlds": WORLDS, "device": device} | {name: value}
     with explained(error, "Dynamics: ", name, "expected"):
         spo.Dynamics(scene(), **arguments)
+
+
+def test_whole_numbers_and_names_of_any_kind(device):
+    for worlds in (np.int8(WORLDS), np.array(WORLDS), torch.tensor(WORLDS)):
+        assert type(spo.Dynamics(scene(), worlds, device=device).worlds) is int
+    dyn = spo.Dynamics(scene(), WORLDS, device=device, dtype="float64", variable=np.array(["gravity"]))
+    assert dyn.variable == ("gravity",) and type(dyn.variable[0]) is str
+    dyn.prepare("solve_mass_matrix", columns=np.int64(2))
+    a = laws.states(dyn.scene, WORLDS)
+    found = dyn.inverse_dynamics_vjp(a["q"], a["qd"], a["qdd"], cotangent=a["qd"], wrt=np.array(["q", "tau"])[:1])
+    assert [type(name) for name in found] == [str]
+
+
+def test_set_takes_numbers_alone(device):
+    dyn = spo.Dynamics(scene(), WORLDS, device=device, dtype="float64", variable=("body_mass",))
+    mass = dyn.scene.values["body_mass"][0]
+    q = laws.states(dyn.scene, WORLDS)["q"]
+    light, heavy = dyn.gravity_force(q), None
+    for value in ((2.0 * mass).tolist(), [torch.tensor(2.0 * m) for m in mass], [Fraction(2.0 * m) for m in mass]):
+        dyn.set(body_mass=mass)
+        np.testing.assert_array_equal(dyn.gravity_force(q), light)
+        dyn.set(body_mass=value)
+        heavy = dyn.gravity_force(q) if heavy is None else heavy
+        np.testing.assert_array_equal(dyn.gravity_force(q), heavy)
+    bad = None, "heavy", ["1"] * len(mass), [None] * len(mass), [1j] * len(mass), [10**400] * len(mass), [[1.0], 2.0]
+    for value in (*bad, [torch.tensor(m, requires_grad=True) for m in mass], [torch.zeros((), device="meta")]):
+        with explained(TypeError, "Dynamics.set: body_mass is", "expected an array of numbers"):
+            dyn.set(body_mass=value)
+    np.testing.assert_array_equal(dyn.gravity_force(q), heavy)
 
 
 def test_an_unoffered_granularity_is_a_value_error_that_names_it(device):
@@ -611,6 +737,7 @@ BAD_PREPARE = {
     "status": (dict(operation="inverse_dynamics", status=True), "inverse_dynamics has no option status"),
     "columns": (dict(operation="solve_mass_matrix", columns="many"), "columns is 'many'"),
     "negative": (dict(operation="solve_mass_matrix", columns=-1), "columns is -1"),
+    "true columns": (dict(operation="solve_mass_matrix", columns=True), "columns is True"),
     "a list": (dict(operation=["step"]), "no operation ['step']; expected one of forward_dynamics"),
     "along": (dict(operation="forward_dynamics_jvp", along=("dx",)), "along names 'dx'", "some of dq, dqd"),
 }
@@ -667,6 +794,17 @@ BAD_SCENES = {
         lambda: spo.Scene(scene().bodies, scene().hinges, couplings=[spo.Coupling(0, 1, np.nan)]),
         ValueError, "Scene: a coupling's ratio is nan; expected finite numbers",
     ),
+    "coupling": (
+        lambda: spo.Scene(scene().bodies, scene().hinges, couplings=[spo.Coupling(0.0, 1)]),
+        TypeError, "Scene: a coupling names hinge 0.0; expected an integer",
+    ),
+    "huge": (lambda: spo.Body(10**400), ValueError, "Body: mass [kg] is 1000"),
+    "nothing there": (lambda: scene().with_values(gravity=[0, None, 0]), ValueError, "gravity is [0, None, 0]"),
+    "meta": (lambda: spo.Body(torch.ones((), device="meta")), ValueError, "Body: mass [kg] is tensor(..., device="),
+    "gradients": (
+        lambda: scene().with_values(gravity=[torch.ones((), requires_grad=True)] * 3),
+        ValueError, "Scene.with_values: gravity is [tensor(1., requires_grad=True), ",
+    ),
     "value": (lambda: scene().with_values(gravity="down"), ValueError, "Scene.with_values: gravity is 'down'"),
     "text in an object array": (
         lambda: scene().with_values(gravity=np.array(["0", "0", "1"], dtype=object)),
@@ -684,6 +822,17 @@ def test_bad_scenes_are_refused_in_words(case):
     build, error, words = BAD_SCENES[case]
     with explained(error, words):
         build()
+
+
+def test_tensors_are_numbers(recwarn):
+    """Without NumPy's warning of arrays that cannot be asked not to copy."""
+    body = spo.Body(torch.tensor(2.0), torch.tensor([1.0, 2.0, 3.0]), torch.eye(3))
+    np.testing.assert_array_equal(body.com, [1.0, 2.0, 3.0])
+    held = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    changed = scene().with_values(gravity=held)
+    held.zero_()
+    np.testing.assert_array_equal(changed.values["gravity"], [[0.0, 0.0, 1.0]])
+    assert body.mass == 2.0 and not recwarn.list
 
 
 def test_hinges_listed_child_first_and_forests(device):

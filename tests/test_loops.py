@@ -481,6 +481,7 @@ def test_project_closes(name, device):
         errors = [np.abs(dyn.closure_error(dyn.project(off, iterations=i))).max() for i in range(5)]
         assert errors[1] < 0.2 * errors[0] and errors[2] < 10.0 * errors[1] ** 2 + 1e-12 and errors[4] < 1e-12
         np.testing.assert_array_equal(dyn.project(off, iterations=0), off)
+        np.testing.assert_array_equal(dyn.project(off, iterations=np.int64(3)), dyn.project(off, iterations=3))
         q, qd = dyn.project(off, s.qd, iterations=5)
         for w in range(3):
             closed = Closed(scene, q[w])
@@ -666,8 +667,9 @@ def test_mistakes_are_explained(device):
         make("cut").closure_error(q)
     with pytest.raises(spo.UnsupportedError, match="hold=True"):
         make("multipliers").project(q, hold=True)
-    with pytest.raises(ValueError, match="iterations is -1"):
-        make().project(q, iterations=-1)
+    for iterations in (-1, True, 1.0, "1"):
+        with pytest.raises(ValueError, match=f"iterations is {iterations!r}; expected how many Newton steps"):
+            make().project(q, iterations=iterations)
     for out in ((), (None, None, None), (None, q.copy())):
         with pytest.raises(TypeError, match=r"(?s)project: out is \(.*; expected an array for q, there being no qd"):
             make().project(q, out=out)

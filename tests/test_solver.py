@@ -266,7 +266,8 @@ def test_observables_belong_to_their_solver(turned):
         solver.observables({SolverBase.ObservableKind.CONTACT_F}, contacts=model.contacts())
 
 
-@pytest.mark.parametrize("case", ["long", "double", "NumPy", "strides", "nothing", "state", "control", "model"])
+@pytest.mark.parametrize("case", ["long", "double", "NumPy", "strides", "nothing", "state", "control", "contacts",
+                                  "reset", "flags", "model"])  # fmt: skip
 def test_what_is_not_the_models_is_refused(turned, case):
     """Arrays are read where they are: of another size or type, that would be other memory, or other numbers."""
     model, solver = turned
@@ -278,6 +279,23 @@ def test_what_is_not_the_models_is_refused(turned, case):
         state, words, error = 3, "SolverSPO.step: state_in is of type int; expected a newton.State", TypeError
     elif case == "control":
         control, words, error = 3, "SolverSPO.step: control is of type int; expected a newton.Control", TypeError
+    elif case == "contacts":
+        with pytest.raises(TypeError, match=r"SolverSPO.step: contacts is of type int; expected newton.Contacts"):
+            solver.step(state, state, control, 3, H)
+        return
+    elif case == "reset":
+        with pytest.raises(TypeError, match=r"SolverSPO.reset: state is of type NoneType; expected a newton.State"):
+            solver.reset(None)
+        return
+    elif case == "flags":
+        for flags in ("x", 1.5, True):
+            with pytest.raises(TypeError, match=f"SolverSPO.reset: flags is {flags!r}; expected newton.StateFlags"):
+                solver.reset(state, flags=flags)
+        for flags in ("x", None):
+            words = f"SolverSPO.notify_model_changed: flags is {flags!r}; expected newton.ModelFlags"
+            with pytest.raises(TypeError, match=words):
+                solver.notify_model_changed(flags)
+        return
     elif case == "model":
         with pytest.raises(TypeError, match=r"SolverSPO: model is of type NoneType; expected a newton.Model"):
             SolverSPO(None)
@@ -402,6 +420,43 @@ def test_variable_values_are_taken_over_and_folded_ones_rebuild():
         solver.notify_model_changed(ModelFlags.JOINT_DOF_PROPERTIES)
     solver.check_model()
     assert np.abs(advance(solver, moving(model), 5).joint_qd.numpy() - heavy).max() > 1e-2
+
+
+def test_what_cannot_move_stands_still():
+    """Fixed joints alone: bodies stay where the joints put them, and what they receive through these is not offered."""
+    builder = newton.ModelBuilder()
+    over, joints = -1, []
+    for k in range(2):
+        link = builder.add_link(mass=1.0, inertia=wp.mat33(np.eye(3)), label=f"link{k}")
+        pose = wp.transform((1.0, 2.0, 3.0), wp.quat(0.6, 0.0, 0.0, 0.8))
+        joints.append(builder.add_joint_fixed(over, link, parent_xform=pose, label=f"joint{k}"))
+        over = link
+    builder.add_articulation(joints, label="post")
+    model = replicated(builder, 2)
+    solver, fresh = SolverSPO(model), model.state()
+    assert solver.supported_observables == {"joint_qdd", "status", SolverBase.ObservableKind.BODY_QDD}
+    newton.eval_fk(model, model.joint_q, model.joint_qd, fresh)
+    seen = solver.observables(solver.supported_observables)
+    for more in ({}, {"observables": seen}):
+        state = model.state()
+        for array in (state.body_q, state.body_qd, seen.body_qdd):
+            array.fill_(np.nan)
+        seen.status.fill_(-1)
+        after = advance(solver, state, 2, model.control(), **more)
+        same_poses(after.body_q.numpy(), fresh.body_q.numpy(), FLOAT32)
+        assert not after.body_qd.numpy().any()
+    assert not seen.body_qdd.numpy().any() and not seen.status.numpy().any()
+    state = model.state()
+    state.body_q.fill_(np.nan)
+    solver.reset(state, wp.array([True, False, False], dtype=wp.bool, device="cpu"))
+    same_poses(state.body_q.numpy()[:2], fresh.body_q.numpy()[:2], FLOAT32)
+    assert np.isnan(state.body_q.numpy()[2:]).all()
+    model.body_mass.fill_(2.0)
+    with pytest.raises(ValueError, match=r"model.body_mass is 2.0 .*BODY_INERTIAL"):
+        solver.check_model()
+    solver.notify_model_changed(ModelFlags.ALL)
+    solver.check_model()
+    same_poses(advance(solver, model.state()).body_q.numpy(), fresh.body_q.numpy(), FLOAT32)
 
 
 def test_gravity_of_each_world_is_variable():

@@ -277,6 +277,28 @@ def test_a_loop_joint_is_a_constraint_alone(more):
         SolverSPO(finalize(fourbar(more)), loops="embed")
 
 
+def test_a_refused_notice_leaves_the_solver_as_it_was():
+    """Friction makes the loop joint more than a constraint; the solver goes on without it."""
+    model = replicated(fourbar(), 2)
+    solver = SolverSPO(model, loops="embed")
+    before, state = dict(vars(solver)), start(model, solver)
+    wanted = advance(solver, start(model, solver), 3)
+    friction = model.joint_friction.numpy()
+    friction[3] = 1.0
+    model.joint_friction.assign(friction)
+    with (
+        pytest.raises(UnsupportedError, match="joint_friction of loop joint 'pin'"),
+        pytest.warns(UserWarning, match="joint_friction folded"),
+    ):
+        solver.notify_model_changed(ModelFlags.JOINT_DOF_FORCE_PROPERTIES)
+    assert all(vars(solver)[name] is value for name, value in before.items())
+    after = advance(solver, state, 3)
+    for name in ("joint_q", "joint_qd", "body_q", "body_qd"):
+        np.testing.assert_array_equal(getattr(after, name).numpy(), getattr(wanted, name).numpy())
+    with pytest.raises(ValueError, match="joint_friction"):
+        solver.check_model()
+
+
 def test_calls_that_mean_the_mass_matrix_of_a_tree(pinned):
     model, solver = pinned
     with pytest.raises(UnsupportedError, match=r"SolverSPO.solve_inverse.*loops='embed'"):

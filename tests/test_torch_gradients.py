@@ -11,7 +11,7 @@ import symbolic
 import torch
 import warp as wp
 import zoo
-from torch.autograd import gradcheck
+from torch.autograd import forward_ad, gradcheck
 
 import warp_spo as spo
 from warp_spo import torch as spo_torch
@@ -426,6 +426,20 @@ def test_bad_ops_and_modules_are_refused_in_words(tree, case):
     with pytest.raises(TypeError, match=words):
         make(tree[0])
     assert len(list(spo_torch.Module(tree[0], "body_mass").parameters())) == 1
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script")  # of torch itself, in forward mode
+def test_transforms_of_torch_are_refused_by_custom_ops_too(tree):
+    """Forward mode would give zeros: what torch makes of an op has no tangent."""
+    dyn, a = tree
+    op = spo_torch.custom_op(dyn, "gravity_force")
+    (q,) = on(dyn, a, "q", grad=False)
+    for call in (lambda: torch.func.jvp(op, (q,), (q,)), lambda: torch.func.grad(lambda x: op(x).sum())(q),
+                 lambda: torch.func.vmap(op)(torch.stack([q, q]))):  # fmt: skip
+        with pytest.raises(ValueError, match=r"custom_op\('gravity_force'\): q is wrapped by a transform of torch"):
+            call()
+    with forward_ad.dual_level(), pytest.raises(ValueError, match="q has a forward-mode tangent"):
+        op(forward_ad.make_dual(q, q))
 
 
 # -- planted bugs ------------------------------------------------------------------------------------------------------

@@ -104,6 +104,12 @@ def recorded(arguments: tuple, values: Values | None = None) -> bool:
     return torch.is_grad_enabled() and (bool(values and values.tensors) or any(map(torch.requires_grad, arguments)))
 
 
+def check_plain(call: str, name: str, value: Any) -> None:
+    """Raise ValueError of a torch tensor whose tangent, or transform, a copy of its numbers would lose."""
+    if "torch" in sys.modules and _torch().is_tensor(value):
+        _torch().pointer(call, name, value)
+
+
 def differentiated(*call: Any) -> Any:
     """See :func:`warp_spo.torch.differentiated`."""
     return _torch().differentiated(*call)
@@ -255,9 +261,15 @@ class Call:
                 self._refuse_grad(name, "is recorded by wp.Tape", "leave the tape's block")
             return array if array.dtype is dtype else view(array.ptr, came, dtype, self.device.alias)
         torch = _torch()
+        pointer = torch.pointer(self.name, name, array)
         self._check(name, array, kind, array.shape, shape, meaning, dtype, torch.has_dtype(array, dtype))
         if not torch.is_on(array, self.device) or not array.is_contiguous():
             self._refuse_place(name, array, kind, array.is_contiguous(), change)
+        if not pointer and array.numel():
+            raise ValueError(
+                f"{self.name}: {name} holds no memory; expected numbers in memory; of a lazy zero tensor pass "
+                f"{name}.clone()"
+            )
         if array.is_neg():  # the memory holds the numbers with the other sign
             raise ValueError(
                 f"{self.name}: {name} is a lazy negative view; expected plain memory; pass {name}.resolve_neg()"
@@ -268,7 +280,7 @@ class Call:
             self._enter_stream()
         if change:
             torch.mark_changed(array)
-        return view(array.data_ptr(), tuple(array.shape), dtype, self.device.alias)
+        return view(pointer, tuple(array.shape), dtype, self.device.alias)
 
     def _take_numpy(self, name, array, shape, meaning, dtype, change):
         kinds = {wp.float32: "biuf", wp.float64: "biuf", wp.bool: "b"}.get(dtype, "iu")

@@ -6,7 +6,6 @@ every further call only launches. Inside, a vector is [omega; v] in the node fra
 
 from __future__ import annotations
 
-import operator
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -20,11 +19,12 @@ from . import status as words
 from .adjoints import Adjoints, differentiable
 from .arrays import Call, Values, parse_device, parse_dtype, recorded, shape_of
 from .derivatives import Derivatives
-from .errors import UnsupportedError, names_of
+from .errors import UnsupportedError, names_of, whole
 from .frames import Frame, checked
 from .levels import Recursions
 from .loops import EMBEDDED, Loops
 from .parameters import RIGID_VALUES, VARIABLE
+from .parts import real
 from .preparation import Preparation
 from .programs import Programs
 from .refinement import Refinement
@@ -95,12 +95,13 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
         self.programs = Programs(self.recursions, self.plan)
         self.values = Values()
         self._close(loops, independent)
-        if not isinstance(refine, int | np.integer) or isinstance(refine, bool) or refine < 0:
+        count = whole(refine)
+        if count is None or count < 0:
             raise ValueError(f"Dynamics: refine is {refine!r}; expected how many steps, 0 or more")
-        if refine and self.closed:
-            raise UnsupportedError("Dynamics", f"refine={refine} with loops={loops!r}", "dtype='float64'")
-        self.refine = refine
-        self._refinement = Refinement(self, refine) if refine else None
+        if count and self.closed:
+            raise UnsupportedError("Dynamics", f"refine={count} with loops={loops!r}", "dtype='float64'")
+        self.refine = count
+        self._refinement = Refinement(self, count) if count else None
 
     # -- values ----------------------------------------------------------------------------------------------------
     def set(self, **values: Any) -> None:
@@ -120,9 +121,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
                     raise ValueError(f"Dynamics.set: unknown value {name!r}; expected one of {', '.join(VARIABLE)}")
                 if not hasattr(value, "shape"):
                     try:
-                        if value is None:
-                            raise TypeError
-                        value = np.asarray(value, dtype=np.float64)
+                        value = real(value)
                     except (TypeError, ValueError):
                         raise TypeError(f"Dynamics.set: {name} is {value!r}; expected an array of numbers") from None
                 shape = self.scene.values[name].shape[1:]
@@ -460,12 +459,9 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
 def _world_count(scene: Scene, worlds: Any) -> int:
     if worlds is None:
         return scene.worlds
-    try:
-        if isinstance(worlds, bool):
-            raise TypeError
-        count = operator.index(worlds)
-    except TypeError:
-        raise TypeError(f"Dynamics: worlds is {worlds!r}; expected an integer") from None
+    count = whole(worlds)
+    if count is None:
+        raise TypeError(f"Dynamics: worlds is {worlds!r}; expected an integer")
     if count < 1 or scene.worlds not in (1, count):
         expected = "one or more" if scene.worlds == 1 else f"{scene.worlds}, for which the scene holds values"
         raise ValueError(f"Dynamics: worlds is {count}; expected {expected}")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .errors import UnsupportedError
+from .errors import UnsupportedError, whole
 from .parts import SCREWS, UNLIMITED
 from .recursions.embedded import Embedded, Embedding
 from .recursions.links import Links
@@ -164,11 +164,11 @@ def _numbers(scene: Scene, asked: Sequence[int | str], call: str) -> set[int]:
     if not isinstance(asked, Sequence | np.ndarray) or isinstance(asked, str):
         raise TypeError(f"{call}: independent is {asked!r}; expected a list of dofs, indices or labels")
     for dof in asked:
-        number = labels.index(dof) if isinstance(dof, str) and dof in labels else dof
-        if not isinstance(number, int | np.integer) or isinstance(number, bool) or not 0 <= number < scene.dof_count:
+        number = labels.index(dof) if isinstance(dof, str) and dof in labels else whole(dof)
+        if number is None or not 0 <= number < scene.dof_count:
             raise ValueError(f"{call}: independent names {dof!r}; expected dofs, 0 to {scene.dof_count - 1}, or labels "
                              f"among {', '.join(labels)}")
-        found.add(int(number))
+        found.add(number)
     return found
 
 

@@ -1,6 +1,6 @@
 """The errors a caller may want to tell apart; every other mistake is a plain ValueError or TypeError."""
 
-from collections.abc import Iterable
+import operator
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,26 @@ def refuse_masked(call: str, name: str, array: Any) -> None:
 
 def names_of(call: str, what: str, names: Any, such: tuple[str, ...]) -> tuple[str, ...]:
     """One name, or an iterable of them, as a tuple; raise TypeError of anything else, showing ``such`` as one would."""
-    if not isinstance(names, Iterable):
+    try:
+        found: tuple = (names,) if isinstance(names, str) else tuple(names)
+    except TypeError:
+        found = (None,)
+    if not all(isinstance(name, str) for name in found):
         raise TypeError(f"{call}: {what} is {names!r}; expected names, such as {such}")
-    return (names,) if isinstance(names, str) else tuple(names)
+    return tuple(map(str, found))  # NumPy's are strings of a type of their own
+
+
+def is_bool(value: Any) -> bool:
+    """Whether a value is true or false, of Python, NumPy or torch; arrays of them too."""
+    return isinstance(value, bool) or str(getattr(value, "dtype", "")).endswith("bool")
+
+
+def whole(value: Any) -> int | None:
+    """A whole number, of Python, NumPy or torch, as an int; None of anything else. A bool is none."""
+    try:
+        return operator.index(value) if not is_bool(value) and not getattr(value, "ndim", 0) else None
+    except (TypeError, RuntimeError):  # RuntimeError: a tensor without memory
+        return None
 
 
 class DirectedLoopError(ValueError):

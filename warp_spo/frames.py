@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import difflib
 import math
-import operator
 from collections.abc import Sequence
 from typing import Any
 
-from .errors import refuse_masked
-from .parts import IDENTITY_POSE
+from .arrays import check_plain
+from .errors import refuse_masked, whole
+from .parts import IDENTITY_POSE, real
 from .scene import Scene
 
 Frame = Any  # a body (index, label, or what is behind a label's last slash), or (body, pose in the body)
@@ -41,18 +41,33 @@ def _checked(scene: Scene, call: str, frame: Frame) -> tuple[int, tuple[float, .
                 f"{call}: {len(found)} bodies have the label {body!r}; expected one; pass the body's index"
             )
         body = found[0]
+    index = whole(body)
+    if index is None:
+        raise _wrong(call, frame)
+    if not 0 <= index < len(labels):
+        raise ValueError(f"{call}: a frame's body is {index}; expected 0 to {len(labels) - 1}")
+    return index, IDENTITY_POSE[:3] if pose is IDENTITY_POSE else _origin(call, frame, pose)
+
+
+def _origin(call: str, frame: Frame, pose: Any) -> tuple[float, ...]:
     refuse_masked(call, "a frame's pose", pose)
+    check_plain(call, "a frame's pose", pose)
+    if getattr(pose, "requires_grad", False):
+        raise ValueError(
+            f"{call}: a frame's pose requires grad; derivatives are not available by it; pass the pose's detach()"
+        )
     try:
-        if isinstance(body, bool):
-            raise TypeError
-        body, pose = operator.index(body), tuple(float(number) for number in pose)
+        given = real(pose)
     except (TypeError, ValueError):
-        raise TypeError(
-            f"{call}: a frame is {frame!r}; expected a body (index or label) or (body, pose in the body)"
-        ) from None
-    if not 0 <= body < len(labels):
-        raise ValueError(f"{call}: a frame's body is {body}; expected 0 to {len(labels) - 1}")
-    unit = len(pose) == 7 and abs(math.hypot(*pose[3:]) - 1.0) < 1e-5  # float32 poses are unit to 1e-7
-    if not unit or not all(map(math.isfinite, pose)):
-        raise ValueError(f"{call}: a frame's pose is {pose}; expected x, y, z and a unit quaternion xyzw")
-    return body, pose[:3]
+        raise _wrong(call, frame) from None
+    if given.ndim != 1:
+        raise _wrong(call, frame)
+    numbers = tuple(given.tolist())
+    unit = len(numbers) == 7 and abs(math.hypot(*numbers[3:]) - 1.0) < 1e-5  # float32 poses are unit to 1e-7
+    if not unit or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{call}: a frame's pose is {numbers}; expected x, y, z and a unit quaternion xyzw")
+    return numbers[:3]
+
+
+def _wrong(call: str, frame: Frame) -> TypeError:
+    return TypeError(f"{call}: a frame is {frame!r}; expected a body (index or label) or (body, pose in the body)")

@@ -18,7 +18,7 @@ import warp as wp
 from .applications import Applications
 from .arrays import Call
 from .embedding import Closing, embedding, usual_rank
-from .errors import UnsupportedError
+from .errors import UnsupportedError, whole
 from .kernels import declare
 from .kernels import loops as kernels
 from .recursions.embedded import Embedding
@@ -148,7 +148,8 @@ class Loops(Applications):
             self._check_closed(call)
             if hold and self.embedding is None:
                 raise UnsupportedError(call.name, "hold=True with loops='multipliers'", "use loops='embed'")
-            if not isinstance(iterations, int) or isinstance(iterations, bool) or iterations < 0:
+            steps = whole(iterations)
+            if steps is None or steps < 0:
                 raise ValueError(f"{call.name}: iterations is {iterations!r}; expected how many Newton steps")
             both = out if isinstance(out, tuple | list) else (out, None)
             if len(both) != 2 or (qd is None and both[1] is not None):
@@ -157,7 +158,7 @@ class Loops(Applications):
             q, qd = self._read_state(call, q, qd)
             q_out = call.write(both[0], q.shape, "[world, coordinate]", name="out[0]")
             qd_out = None if qd is None else call.write(both[1], qd.shape, "[world, dof]", name="out[1]")
-            self._project(q, qd, hold, iterations, q_out, qd_out)
+            self._project(q, qd, hold, steps, q_out, qd_out)
         return call.result
 
     def _project(self, q: wp.array, qd: Any, hold: bool, iterations: int, q_out: wp.array, qd_out: Any) -> None:

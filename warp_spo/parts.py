@@ -62,15 +62,19 @@ def checked_array(call: str, name: str, value: Any, shape: tuple[int, ...]) -> n
 def real(value: Any) -> np.ndarray:
     """A copy in float64: what the caller does to his later changes nothing.
 
-    TypeError of text, complex numbers and a torch tensor that requires grad: nothing is differentiated through a copy.
+    TypeError of text, None, complex numbers, what float64 does not reach, and torch tensors that require grad, in lists
+    too: nothing is differentiated through a copy.
     """
-    if getattr(value, "requires_grad", False):
-        raise TypeError
-    array = np.array(value)
-    texts = array.dtype == object and any(isinstance(entry, str | bytes) for entry in array.flat)
-    if array.dtype.kind not in "biufO" or texts:
-        raise TypeError
-    return array.astype(np.float64)
+    try:
+        array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
+        for one in (value, *array.flat) if array.dtype == object else (value,):
+            if one is None or isinstance(one, str | bytes) or getattr(one, "requires_grad", False):
+                raise TypeError
+        if array.dtype.kind not in "biufO":
+            raise TypeError
+        return array.astype(np.float64)
+    except (OverflowError, RuntimeError):  # what torch raises of tensors that NumPy cannot see
+        raise TypeError from None
 
 
 def read_only(array: np.ndarray) -> np.ndarray:

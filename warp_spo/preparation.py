@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from .adjoints import ARGUMENTS, OPTIONAL
-from .errors import names_of
+from .errors import names_of, whole
 from .scene import Scene
 
 
@@ -121,10 +121,14 @@ class Preparation:
         if name == "x":
             return self._zeros(self.worlds, 6 * len(asked["frames"]))
         if name == "b":
-            columns = asked["columns"]
-            if columns is not None and (not isinstance(columns, int) or columns < 0):
-                raise ValueError(f"Dynamics.prepare: columns is {columns!r}; expected how many right-hand sides")
-            return self._zeros(self.worlds, self._minimal, *(() if columns is None else (columns,)))
+            if asked["columns"] is None:
+                return self._zeros(self.worlds, self._minimal)
+            columns = whole(asked["columns"])
+            if columns is None or columns < 0:
+                raise ValueError(
+                    f"Dynamics.prepare: columns is {asked['columns']!r}; expected how many right-hand sides"
+                )
+            return self._zeros(self.worlds, self._minimal, columns)
         return self._zeros(*self._shape_of(name))
 
     def _zeros(self, *shape: int) -> wp.array:

@@ -147,6 +147,8 @@ class Scene:
             for name in ("ratio", "offset"):
                 checked_array("Scene", f"a coupling's {name}", getattr(coupling, name), ())
             for index in (coupling.hinge, coupling.reference):
+                if not isinstance(index, int | np.integer):
+                    raise TypeError(f"Scene: a coupling names hinge {index!r}; expected an integer")
                 if not 0 <= index < len(self.hinges) or self.hinges[index].coord_count != 1:
                     raise ValueError(f"Scene: a coupling names hinge {index}; expected one of {len(self.hinges)} "
                                      f"hinges with one coordinate")

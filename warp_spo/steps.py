@@ -8,10 +8,11 @@ import numpy as np
 import warp as wp
 
 from .adjoints import differentiable
-from .arrays import Call
-from .errors import UnsupportedError
+from .arrays import Call, check_plain
+from .errors import UnsupportedError, is_bool
 from .kernels import combination, loops
 from .levels import Recursions
+from .parts import real
 from .recursions.closed_step import NEWTON_STEPS
 from .recursions.impedance import DEFAULT_BOUND
 from .scene import Scene
@@ -294,14 +295,19 @@ class Steps:
 
 def _seconds(call: Call, dt: Any) -> float:
     name = call.name
-    if getattr(dt, "requires_grad", False):
-        raise ValueError(f"{name}: dt requires grad; derivatives are not available through this call; pass float(dt)")
-    try:
-        if isinstance(dt, str | bytes | bool | np.bool_ | complex) or np.ndim(dt) > 0:
-            raise TypeError
+    if isinstance(dt, float):
         seconds = float(dt)
-    except (TypeError, ValueError):
-        raise TypeError(f"{name}: dt is {dt!r}; expected a number of seconds, the same in all worlds") from None
+    elif getattr(dt, "requires_grad", False):
+        raise ValueError(f"{name}: dt requires grad; derivatives are not available through this call; pass float(dt)")
+    else:
+        check_plain(name, "dt", dt)
+        try:
+            number = real(dt)
+            if number.ndim or is_bool(dt):
+                raise TypeError
+        except (TypeError, ValueError):
+            raise TypeError(f"{name}: dt is {dt!r}; expected a number of seconds, the same in all worlds") from None
+        seconds = float(number)
     least, most = SECONDS[call.dtype]
     if seconds != 0.0 and not least <= abs(seconds) <= most:
         raise ValueError(f"{name}: dt is {seconds} s; expected a number that {call.dtype.__name__} holds, finite")

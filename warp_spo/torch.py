@@ -8,6 +8,8 @@ from typing import Any
 
 import torch
 import warp as wp
+from torch._C import _functorch
+from torch.autograd import forward_ad
 
 from .errors import names_of
 
@@ -41,6 +43,30 @@ def is_on(tensor: torch.Tensor, device: wp.Device) -> bool:
 
 def is_dense(tensor: torch.Tensor) -> bool:
     return tensor.layout is torch.strided
+
+
+def pointer(call: str, name: str, tensor: torch.Tensor) -> int:
+    """Return where the tensor's numbers lie; 0 if nowhere.
+
+    Raises:
+        ValueError: a transform of torch, or a forward-mode tangent, would be lost with the memory alone.
+    """
+    try:
+        found = tensor.data_ptr()
+    except RuntimeError:  # sparse ones have no pointer either
+        if _functorch.is_functorch_wrapped_tensor(tensor) or _functorch.is_legacy_batchedtensor(tensor):
+            raise ValueError(
+                f"{call}: {name} is wrapped by a transform of torch (torch.func, jacobian(vectorize=True), "
+                f"is_grads_batched=True), which cannot look into this call; expected a plain tensor; worlds are the "
+                f"batch: use backward, or the _vjp and _jvp methods, or vectorize=False"
+            ) from None
+        return 0
+    if forward_ad._current_level >= 0 and forward_ad.unpack_dual(tensor).tangent is not None:
+        raise ValueError(
+            f"{call}: {name} has a forward-mode tangent; derivatives are not available through this call; use "
+            f"backward, or the _jvp methods, or pass torch.autograd.forward_ad.unpack_dual({name}).primal"
+        )
+    return found
 
 
 def empty(shape: tuple, dtype: type, device: wp.Device) -> torch.Tensor:
@@ -92,6 +118,7 @@ def differentiated(dyn: Any, operation: str, method: Any, arguments: dict[str, A
                 f"{call}: {other} requires grad and {name} is of type {type(x).__name__}; expected torch tensors only; "
                 f"pass torch.as_tensor({name}), or call inside torch.no_grad()"
             )
+        pointer(call, name, x)
     if arguments.get("integrator", "semi_implicit") != "semi_implicit" or arguments.get("qdd") is not None:
         raise ValueError(
             f"{call}: an input requires grad; expected integrator='semi_implicit' and no qdd=, of which gradients are "
@@ -346,6 +373,8 @@ def custom_op(dyn: Any, operation: str, **options: Any) -> Any:
         for n, x in given.items():
             if not is_tensor(x):
                 raise TypeError(f"custom_op({operation!r}): {n} is of type {type(x).__name__}; expected a torch tensor")
+            if forward_ad._current_level >= 0 or not torch.compiler.is_compiling():
+                pointer(f"custom_op({operation!r})", n, x)
         found = ahead(" ".join(given), list(given.values()))
         return tuple(found[:results]) if results > 1 else found[0]
 

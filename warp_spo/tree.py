@@ -7,20 +7,18 @@ An edge runs from a parent to a child. The inertial frame is not a node: a node 
 from __future__ import annotations
 
 import functools
-import operator
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
-from .errors import DirectedLoopError
+from .errors import DirectedLoopError, whole
 
 
 def _index(call: str, what: str, value: Any, low: int, high: int) -> int:
-    try:
-        index = operator.index(value)
-    except TypeError:
-        raise TypeError(f"{call}: {what} is {value!r}; expected an integer") from None
+    index = whole(value)
+    if index is None:
+        raise TypeError(f"{call}: {what} is {value!r}; expected an integer")
     if not low <= index < high:
         raise ValueError(f"{call}: {what} is {index}; expected {low} to {high - 1}")
     return index

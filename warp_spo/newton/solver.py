@@ -14,7 +14,7 @@ from newton import JointTargetMode, ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
 from ..dynamics import Dynamics
-from ..errors import UnsupportedError, names_of
+from ..errors import UnsupportedError, names_of, whole
 from ..kernels import declare, exchange
 from ..parts import DOF_VALUES, FREE
 from ..scene import Scene
@@ -201,9 +201,9 @@ class SolverSPO(Plugs, SolverBase):
 
     @property
     def supported_observables(self) -> frozenset[str]:
-        """All of them; but what a body receives through its joint is not known where loops are closed."""
-        lost = {SolverBase.ObservableKind.BODY_PARENT_F} if self.dynamics.closed else set()
-        return self.SUPPORTED_OBSERVABLES - lost
+        """All of them; but what bodies receive through joints is not known where loops are closed or nothing moves."""
+        unknown = self.dynamics.closed or not self.dynamics.scene.dof_count
+        return self.SUPPORTED_OBSERVABLES - ({SolverBase.ObservableKind.BODY_PARENT_F} if unknown else set())
 
     # -- steps -----------------------------------------------------------------------------------------------------
     def step(
@@ -228,8 +228,7 @@ class SolverSPO(Plugs, SolverBase):
         """
         self.validate_observables(observables)
         for name, state in (("state_in", state_in), ("state_out", state_out)):
-            if not hasattr(state, "joint_q"):
-                raise TypeError(f"SolverSPO.step: {name} is of type {type(state).__name__}; expected a newton.State")
+            _check_state("SolverSPO.step", name, state)
         if control is not None and not hasattr(control, "joint_f"):
             raise TypeError(f"SolverSPO.step: control is of type {type(control).__name__}; expected a newton.Control")
         self._refuse_contacts(contacts)
@@ -303,6 +302,10 @@ class SolverSPO(Plugs, SolverBase):
             self._wrenches.write(out, observables.body_parent_f)
 
     def _refuse_contacts(self, contacts: Any) -> None:
+        if contacts is not None and not hasattr(contacts, "rigid_contact_max"):
+            raise TypeError(
+                f"SolverSPO.step: contacts is of type {type(contacts).__name__}; expected newton.Contacts or None"
+            )
         if contacts is None or not (contacts.rigid_contact_max or contacts.soft_contact_max):
             return
         if self.device.is_capturing:
@@ -327,10 +330,11 @@ class SolverSPO(Plugs, SolverBase):
             flags: JOINT_Q, JOINT_QD, BODY_Q or BODY_QD (both), BODY_F; None is all of them, 0 none: the solver keeps
                 nothing from step to step.
         """
+        _check_state("SolverSPO.reset", "state", state)
+        flags = _flags("SolverSPO.reset", StateFlags, StateFlags.ALL if flags is None else flags)
         mask = self._normalize_reset_world_mask(world_mask)
         if mask is not None:
             mask = mask[self._mask_from :]
-        flags = int(StateFlags.ALL if flags is None else flags)
         if flags & StateFlags.JOINT_Q:
             wp.copy(self._q.buffer("first"), self._q.read(self.model.joint_q, "first"))
             self._q.write(self._q.buffer("first"), state.joint_q, mask)
@@ -365,7 +369,7 @@ class SolverSPO(Plugs, SolverBase):
         Raises:
             ValueError: inside a capture, a flag that names folded arrays alone.
         """
-        flags, names = int(flags), []
+        flags, names = _flags("SolverSPO.notify_model_changed", ModelFlags, flags), []
         for flag, those in FLAGS.items():
             if flags & int(flag):
                 names += [name for name in those if name in self._used and name not in names]
@@ -386,11 +390,20 @@ class SolverSPO(Plugs, SolverBase):
                     "graphs captured before are out of date; name it in variable= to change it without rebuilding",
                     stacklevel=2,
                 )
-                self._build()
+                self._rebuild()
                 return
         for name in variable:
             wp.copy(self._used[name], getattr(self.model, name))
         self._refresh(variable)
+
+    def _rebuild(self) -> None:
+        """Build anew, or stay as before where the model has become one that is refused."""
+        before = dict(self.__dict__)
+        try:
+            self._build()
+        except Exception:
+            self.__dict__.update(before)
+            raise
 
     def _refresh(self, names: Sequence[str]) -> None:
         for name in names:
@@ -424,6 +437,18 @@ class SolverSPO(Plugs, SolverBase):
             return ""
         at = tuple(differ[0].tolist())
         return f"is {held[at]} at {list(at)} where the solver uses {used[at]}"
+
+
+def _check_state(call: str, name: str, state: Any) -> None:
+    if not hasattr(state, "joint_q"):
+        raise TypeError(f"{call}: {name} is of type {type(state).__name__}; expected a newton.State")
+
+
+def _flags(call: str, kind: type, flags: Any) -> int:
+    bits = whole(flags)
+    if bits is None:
+        raise TypeError(f"{call}: flags is {flags!r}; expected newton.{kind.__name__}, or an integer of their bits")
+    return bits
 
 
 def _with_drives(scene: Scene, position: np.ndarray, driven: np.ndarray) -> Scene:
