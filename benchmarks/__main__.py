@@ -157,7 +157,9 @@ def compare(a: Path, b: Path) -> int:
     """Print the largest differences of two runs; 1 if one is beyond ``ALLOWED``."""
     found = evidence.compare(evidence.read(a), evidence.read(b))
     for difference, x, y in found[:SHOWN]:
-        print(f"{difference:6.1%}  {x['us']:10.4g} us  {y['us']:10.4g} us  {case_name(x)}")
+        name = case_name(x) if "dtype" in x else f"{x['group']}: {x['name']}.w{x['worlds']}"
+        whose = f", {x['peer']}" if x.get("peer") else ""
+        print(f"{difference:6.1%}  {x['us']:10.4g} us  {y['us']:10.4g} us  {name}{whose}")
     beyond = sum(difference > ALLOWED for difference, _, _ in found)
     print(f"{len(found)} cases of 20 us or more; {beyond} differ by more than {ALLOWED:.0%}")
     return 1 if beyond else 0

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
-IDENTITY = ("scene", "op", "worlds", "dtype", "granularity", "peer", "variant", "sweep")
-"""Keys that tell one measurement from another; a row may lack the last three and the granularity."""
+IDENTITY = ("scene", "op", "worlds", "dtype", "granularity", "peer", "variant", "sweep", "group", "name")
+"""Keys that tell one measurement from another; a row has some of them."""
 
 
 class Evidence(NamedTuple):
@@ -91,7 +91,7 @@ def _of_machine(runs: list[dict]) -> Evidence:
             kind = _kind(row)
             of_newest = newest.setdefault((kind, row.get("peer")), data["commit"]) == data["commit"]
             stressed = (row.get("case"), str(row.get("parameters")), row.get("precision"), row.get("granularity"))
-            key = stressed if kind == "stress" else (*identity(row), row.get("group"), row.get("name"))
+            key = stressed if kind == "stress" else identity(row)
             if of_newest and key not in seen:
                 seen.add(key)
                 rows[kind].append(row)

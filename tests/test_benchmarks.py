@@ -320,6 +320,12 @@ def test_two_runs_are_compared(tmp_path, capsys):
     files = [str(runner.save(run, tmp_path / f"{name}.json")) for name, run in (("a", first), ("b", second))]
     assert main(["--compare", *files]) == 1  # 16 and 48 us
     assert "ant.phi.float32.w64" in capsys.readouterr().out
+    for run, steps in ((first, (30.0, 60.0)), (second, (30.1, 90.0))):  # rows of capabilities have a name alone
+        of = [dict(group="steps", name=f"robot {k}", worlds=64, us=us) for k, us in enumerate(steps)]
+        runner.save(run | dict(rows=run["rows"] + of), tmp_path / ("a.json" if run is first else "b.json"))
+    assert main(["--compare", *files]) == 1
+    assert "50.0%          60 us          90 us  steps: robot 1.w64" in capsys.readouterr().out
+    runner.save(first, tmp_path / "a.json")
     second["rows"] = [row for row in second["rows"] if row["worlds"] > 64]
     runner.save(second, tmp_path / "b.json")
     assert main(["--compare", *files]) == 0
