@@ -11,12 +11,14 @@
 * loops: forward dynamics of a biped with closed ankles, embedded, beside the same robot with its loops cut.
 
 Calls are captured into a CUDA graph, several in a row, and replayed; on a CPU they are timed one by one. A line is the
-time of one call; what cannot run is skipped with its reason. Results are checked to be finite.
+time of one call; what cannot run is skipped with its reason. Derivatives and inverses are compared with their
+references, the other results checked to be finite.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import re
 import sys
 import time
@@ -28,7 +30,8 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.operations import Inputs
+from warp_spo.operations import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
+from warp_spo.trial import Subject, Trial, all_finite
 
 from . import robots, runner
 
@@ -36,6 +39,7 @@ DT = 2e-3  # [s]
 SETS = 4
 CALLS = 48  # in one graph, whose launch takes 8 us
 REPEATS = 15
+SAMPLE = 2  # worlds that are compared; the reference of G1's derivatives takes a second for one
 WARM_UP = 0.2  # [s]: a GPU that has waited for a model to be built takes this long to come to its clocks
 KE, KD = 200.0, 20.0  # drives [N m/rad, N m s/rad]
 
@@ -70,7 +74,7 @@ def _wall(run: Callable[[int], Any], index: int) -> float:
 
 
 # -- steps -------------------------------------------------------------------------------------------------------------
-def steps(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], float]]]:
+def steps(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], dict]]]:
     import newton
 
     from warp_spo.newton import SolverSPO
@@ -87,7 +91,7 @@ def steps(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], fl
 
     shared: list[Any] = []
 
-    def step(name: str, **options: Any) -> float:
+    def step(name: str, **options: Any) -> dict:
         if not shared:
             shared.append(model())
         its = shared[0]
@@ -105,7 +109,7 @@ def steps(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], fl
 
         us = timed(run, device)
         assert np.isfinite(now.joint_qd.numpy()).all(), f"{name}: not finite"
-        return us
+        return dict(us=us)
 
     yield "SolverSPO.step", lambda: step("SolverSPO")
     yield "SolverSteel.step", lambda: step("SolverSteel", enable_joint_limits=True)
@@ -115,90 +119,65 @@ def steps(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], fl
 
 
 # -- ours --------------------------------------------------------------------------------------------------------------
+def inputs(scene: spo.Scene, worlds: int) -> list[Inputs]:
+    return [Inputs(scene, worlds, seed) for seed in range(SETS)]
+
+
+def of_operations(*names: str) -> Callable[..., Iterator[tuple[str, Callable[[], dict]]]]:
+    """Operations on each of the robots, compared with their references."""
+    def cases(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], dict]]]:
+        for robot in robots.ROBOTS:
+            scene = robots.scene(robot)
+            subject = functools.cache(lambda scene=scene: Subject(spo.Dynamics(scene, worlds, device),
+                                                                  inputs(scene, worlds)))  # fmt: skip
+            for name in names:
+                yield f"{robot} {name}", lambda name=name, subject=subject: compared(subject(), name)
+
+    return cases
+
+
+def compared(subject: Subject, name: str) -> dict:
+    trial = Trial(subject, (OPERATIONS | APPLICATIONS)[name], SAMPLE)
+    error, tolerance = trial.check(), TOLERANCE["float32"]
+    assert error <= tolerance, f"error {error:.1e} beyond {tolerance:.0e}"
+    return dict(us=1e6 * trial.measure(REPEATS)[0].median, error=error)
+
+
 class Ours:
     """Dynamics of one scene with inputs on the device."""
 
     def __init__(self, scene: spo.Scene, worlds: int, device: wp.Device, **options: Any):
         self.dyn, self.scene, self.device = spo.Dynamics(scene, worlds, device, **options), scene, device
-        sets = [Inputs(scene, worlds, seed) for seed in range(SETS)]
         self.sets = [
-            {name: wp.array(each.array(name), dtype=wp.float32, device=device) for name in ("q", "qd", "tau", "b")}
-            for each in sets
+            {name: wp.array(each.array(name), dtype=wp.float32, device=device) for name in ("q", "qd", "tau")}
+            for each in inputs(scene, worlds)
         ]
 
-    def out(self, *shape: int) -> wp.array:
-        return wp.empty((self.dyn.worlds, *shape), dtype=wp.float32, device=self.device)
-
-    def time(self, call: Callable[..., Any], out: Any) -> float:
-        """Of ``call(dyn, set, out)`` [us]."""
+    def time(self, call: Callable[[spo.Dynamics, dict, wp.array], Any], *shape: int) -> dict:
+        """Of ``call(dyn, set, out)``, ``out`` a result [world, *shape]."""
+        out = wp.empty((self.dyn.worlds, *shape), dtype=wp.float32, device=self.device)
         us = timed(lambda index: call(self.dyn, self.sets[index], out), self.device)
-        for array in out.values() if isinstance(out, dict) else out if isinstance(out, tuple) else (out,):
-            assert np.isfinite(array.numpy()).all(), "not finite"
-        return us
+        assert all_finite(out), "not finite"
+        return dict(us=us)
 
 
-def forward(dyn: spo.Dynamics, x: dict, out: wp.array) -> None:
-    dyn.forward_dynamics(x["q"], x["qd"], x["tau"], out=out)
-
-
-def derivatives(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], float]]]:
-    for name in ("panda", "go2", "g1"):
-        scene = robots.scene(name)
-        n, kept = scene.dof_count, []
-
-        def ours(scene: spo.Scene = scene, kept: list = kept) -> Ours:
-            kept[:] = kept or [Ours(scene, worlds, device)]
-            return kept[0]
-
-        def dense(ours: Any = ours, n: int = n) -> float:
-            out = tuple(ours().out(n, n) for _ in range(3))
-            return ours().time(
-                lambda dyn, x, out: dyn.forward_dynamics_derivatives(x["q"], x["qd"], x["tau"], out=out), out
-            )
-
-        def product(ours: Any = ours, n: int = n, scene: spo.Scene = scene) -> float:
-            out = dict(q=ours().out(scene.coord_count), qd=ours().out(n), tau=ours().out(n))
-
-            def pull(dyn: spo.Dynamics, x: dict, out: dict) -> None:
-                dyn.forward_dynamics_vjp(x["q"], x["qd"], x["tau"], cotangent=x["b"], out=out)
-
-            return ours().time(pull, out)
-
-        yield f"{name} forward_dynamics", lambda ours=ours, n=n: ours().time(forward, ours().out(n))
-        yield f"{name} forward_dynamics_derivatives", dense
-        yield f"{name} forward_dynamics_vjp", product
-
-
-def inverse(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], float]]]:
-    for name in ("panda", "go2", "g1"):
-        scene = robots.scene(name)
-
-        def whole(scene: spo.Scene = scene) -> float:
-            ours = Ours(scene, worlds, device)
-            return ours.time(
-                lambda dyn, x, out: dyn.mass_matrix_inverse(x["q"], out=out), ours.out(*[scene.dof_count] * 2)
-            )
-
-        yield f"{name} mass_matrix_inverse", whole
-
-
-def operational(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], float]]]:
+def operational(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], dict]]]:
     scene = robots.scene("g1")
     feet = [label for label in scene.body_labels if label.endswith("ankle_roll_link")]
 
-    def ours() -> float:
-        one = Ours(scene, worlds, device)
-        return one.time(
-            lambda dyn, x, out: dyn.operational_inertia_inverse(x["q"], feet, out=out), one.out(12, 12)
-        )
+    def ours() -> dict:
+        def call(dyn: spo.Dynamics, x: dict, out: wp.array) -> None:
+            dyn.operational_inertia_inverse(x["q"], feet, out=out)
 
-    def mujoco() -> float:
+        return Ours(scene, worlds, device).time(call, 12, 12)
+
+    def mujoco() -> dict:
         from .peers.coordinates import States
         from .peers.lumped import lump
         from .peers.mujoco_gpu import MujocoWarp
 
         peer = MujocoWarp(lump(scene), device, "float32")
-        states = States(peer.coordinates, [Inputs(scene, worlds, seed) for seed in range(SETS)], "float32")
+        states = States(peer.coordinates, inputs(scene, worlds), "float32")
         peer.prepare("forward_dynamics", "", states, worlds)
         mjw, m, d, nv = peer.mjw, peer.model, peer.data, peer.host.nv
         owners = [at for at, link in enumerate(peer.robot.links) for _ in range(6 if link.kind == "free" else 1)]
@@ -226,28 +205,38 @@ def operational(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[
                 mjw.solve_m(m, d, x, column)
 
         with wp.ScopedDevice(device):
-            return timed(run, device)
+            return dict(us=timed(run, device))
 
     yield "g1 operational_inertia_inverse of two feet", ours
     yield "g1 mujoco_warp kinematics, com_pos, crb, factor_m, 2 jac, 12 solve_m", mujoco
 
 
-def loops(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], float]]]:
+def loops(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], dict]]]:
     from warp_spo.examples.biped import scene as biped
 
-    def ours(how: str) -> float:
+    def ours(how: str) -> dict:
         one = Ours(biped(), worlds, device, loops=how, granularity="tree")
         q = one.dyn.project(np.tile(one.scene.neutral_q, (worlds, 1))) if how == "embed" else one.sets[0]["q"]
         q = wp.array(q, dtype=wp.float32, device=device) if isinstance(q, np.ndarray) else q
         for each in one.sets:
             each["q"] = q
-        return one.time(forward, one.out(one.scene.dof_count))
+
+        def call(dyn: spo.Dynamics, x: dict, out: wp.array) -> None:
+            dyn.forward_dynamics(x["q"], x["qd"], x["tau"], out=out)
+
+        return one.time(call, one.scene.dof_count)
 
     yield "biped forward_dynamics, loops cut", lambda: ours("cut")
     yield "biped forward_dynamics, loops embedded", lambda: ours("embed")
 
 
-GROUPS = dict(steps=steps, derivatives=derivatives, inverse=inverse, operational=operational, loops=loops)
+GROUPS = dict(
+    steps=steps,
+    derivatives=of_operations("forward_dynamics", "forward_dynamics_derivatives", "forward_dynamics_vjp"),
+    inverse=of_operations("mass_matrix_inverse"),
+    operational=operational,
+    loops=loops,
+)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -257,7 +246,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--worlds", nargs="+", type=int, default=[4096, 65536])
     parser.add_argument("--json", type=Path, help="write the rows there")
     options = parser.parse_args(arguments)
-    device, rows, failed = wp.get_device(options.device), [], 0
+    rows: list[dict] = []
+    device, failed = wp.get_device(options.device), 0
+    run = runner.record(rows, options.device)
     for group, cases in GROUPS.items():
         for worlds in options.worlds:
             for name, measure in cases(worlds, device):
@@ -265,7 +256,7 @@ def main(arguments: list[str] | None = None) -> int:
                     continue
                 row: dict[str, Any] = dict(group=group, name=name, worlds=worlds)
                 try:
-                    row["us"] = measure()
+                    row |= measure()
                     text = f"{row['us']:.4g} us, {worlds / row['us']:.4g} 10^6/s"
                 except Exception as error:  # the others go on
                     row["skipped"] = f"{type(error).__name__}: {error}"
@@ -273,7 +264,7 @@ def main(arguments: list[str] | None = None) -> int:
                 print(f"{group} {name}, {worlds} worlds: {text}", flush=True)
                 rows.append(row)
                 if options.json:
-                    runner.save(runner.record(rows, options.device), options.json)
+                    runner.save(run, options.json)
     return 0 if failed < len(rows) else 1
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zoo
 
 import warp_spo as spo
 from warp_spo.operations import INPUTS, OPERATIONS, TOLERANCE, Inputs, rotations
@@ -19,6 +20,7 @@ from warp_spo.reference import Dense
 
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
 from benchmarks import (
+    capabilities,
     cases,
     everything,
     evidence,
@@ -330,6 +332,24 @@ def test_two_runs_are_compared(tmp_path, capsys):
     runner.save(second, tmp_path / "b.json")
     assert main(["--compare", *files]) == 0
     assert "2 cases of 20 us or more; 0 differ" in capsys.readouterr().out
+
+
+def test_capabilities_are_compared_with_references(tmp_path, capsys, device, monkeypatch):
+    monkeypatch.setattr(capabilities.robots, "ROBOTS", {"arm": None})
+    monkeypatch.setattr(capabilities.robots, "scene", lambda name: zoo.from_parents([-1, 0], ["revolute", "ball"], 3))
+    file, where = tmp_path / "capabilities.json", ["--worlds", "3", "--device", str(device)]
+    assert capabilities.main(["^(derivatives|inverse) ", *where, "--json", str(file)]) == 0
+    rows = json.loads(file.read_text())["rows"]
+    assert [row["name"] for row in rows] == [
+        f"arm {op}"
+        for op in ("forward_dynamics", "forward_dynamics_derivatives", "forward_dynamics_vjp", "mass_matrix_inverse")
+    ]
+    assert all(0.0 < row["error"] <= TOLERANCE["float32"] and row["us"] > 0.0 for row in rows)
+    right = OPERATIONS["mass_matrix_inverse"]
+    wrong = dataclasses.replace(right, reference=lambda dense, q: 1.1 * right.reference(dense, q))
+    monkeypatch.setattr(capabilities, "OPERATIONS", {right.name: wrong})
+    assert capabilities.main(["^inverse ", *where]) == 1
+    assert "mass_matrix_inverse, 3 worlds: skipped: AssertionError: error 9.1e-02" in capsys.readouterr().out
 
 
 def test_everything_goes_on_where_it_stopped(tmp_path, capsys, device, monkeypatch):
