@@ -6,7 +6,6 @@ the roots, ``A.T @ x`` from the roots to the tips, one launch a level.
 """
 
 import functools
-import operator
 from collections.abc import Sequence
 from itertools import accumulate
 
@@ -15,6 +14,7 @@ import warp as wp
 from .algebra import Identity, Operator, Product, Scaled, Sum, Transpose, add_scaled
 from .arrays import WARP
 from .blocks import Blocks, Stored, Table, choose_memory, matrix_size, memory, pack, place_offsets
+from .errors import whole
 from .tree import Digraph, Tree
 
 __all__ = ["BWA", "Blocks", "Identity", "Operator", "Product", "Resolvent", "Scaled", "Sum", "Transpose"]
@@ -111,15 +111,15 @@ class BWA(Operator):
 
     def power(self, exponent: int) -> Operator:
         """E^exponent: blocks are products of weights along the paths of that length (Lemma 1). 0 gives the identity."""
-        exponent = operator.index(exponent)
-        if exponent < 0:
+        count = whole(exponent)
+        if count is None or count < 0:
             raise ValueError(
-                f"BWA.power: exponent is {exponent}; expected 0 or more; E has no inverse, its resolvent has"
+                f"BWA.power: exponent is {exponent!r}; expected 0 or more, an integer; E has no inverse, its resolvent has"
             )
-        if exponent == 0:
+        if count == 0:
             return Identity(self.shape[0], self.device, self.dtype, self.kind)
         # E^(depth + 1) is zero already (Lemma 2)
-        return Product(*[self] * min(exponent, len(self.graph.levels)))
+        return Product(*[self] * min(count, len(self.graph.levels)))
 
 
 class Resolvent(Operator):
@@ -163,9 +163,10 @@ class Resolvent(Operator):
     def block(self, i: int, j: int):
         """Return A(i, j) [world, m_i, m_j], the weight between distant nodes (eq. 7), in the kind of the weights."""
         for name, node in (("i", i), ("j", j)):
-            if not 0 <= operator.index(node) < self.E.graph.node_count:
+            number = whole(node)
+            if number is None or not 0 <= number < self.E.graph.node_count:
                 raise ValueError(
-                    f"Resolvent.block: {name} is {node}; expected a node, 0 to {self.E.graph.node_count - 1}"
+                    f"Resolvent.block: {name} is {node!r}; expected a node, 0 to {self.E.graph.node_count - 1}"
                 )
         return self._columns("block", self.E.starts[j], self.E.dims[j], self.E.starts[i], self.E.dims[i])
 
@@ -200,9 +201,10 @@ def _node_dims(graph, labels, sizes, dims) -> tuple[int, ...]:
         if len(dims) != graph.node_count:
             raise ValueError(f"BWA: {len(dims)} dims; expected {graph.node_count}, one a node")
         for node, size in enumerate(dims):
-            if operator.index(size) < 1:
-                raise ValueError(f"BWA: dims[{node}] is {size}; expected 1 or more")
-            found[node] = operator.index(size), f"dims[{node}]"
+            number = whole(size)
+            if number is None or number < 1:
+                raise ValueError(f"BWA: dims[{node}] is {size!r}; expected 1 or more, an integer")
+            found[node] = number, f"dims[{node}]"
     for edge, label, size in zip(graph.edges, labels, sizes, strict=False):
         for node, length, place in zip(edge, size, ("rows", "columns"), strict=True):
             known, source = found.setdefault(node, (length, label))
