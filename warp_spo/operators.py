@@ -114,7 +114,8 @@ class BWA(Operator):
         count = whole(exponent)
         if count is None or count < 0:
             raise ValueError(
-                f"BWA.power: exponent is {exponent!r}; expected 0 or more, an integer; E has no inverse, its resolvent has"
+                f"BWA.power: exponent is {exponent!r}; expected 0 or more, an integer; E has no inverse, its resolvent "
+                "has"
             )
         if count == 0:
             return Identity(self.shape[0], self.device, self.dtype, self.kind)
