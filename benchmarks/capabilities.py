@@ -138,9 +138,11 @@ def of_operations(*names: str) -> Callable[..., Iterator[tuple[str, Callable[[],
 
 def compared(subject: Subject, name: str) -> dict:
     trial = Trial(subject, (OPERATIONS | APPLICATIONS)[name], SAMPLE)
-    error, tolerance = trial.check(), TOLERANCE["float32"]
+    checked = trial.check()
+    timing, left = trial.measure(REPEATS)
+    error, tolerance = float(np.max([checked, left])), TOLERANCE["float32"]
     assert error <= tolerance, f"error {error:.1e} beyond {tolerance:.0e}"
-    return dict(us=1e6 * trial.measure(REPEATS)[0].median, error=error)
+    return dict(us=1e6 * timing.median, error=error)
 
 
 class Ours:

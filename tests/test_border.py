@@ -278,11 +278,9 @@ def test_a_lazy_negative_view_is_refused(device):
 
 def test_a_lazy_zero_tensor_is_refused(device):
     """It has numbers and no memory: read at its address, the interpreter would end."""
-    if device.is_cuda:
-        pytest.skip("lazy zeros are made on the CPU here")
     dyn = dynamics(device)
     q = given("torch", dyn)["q"]
-    zero = torch._efficientzerotensor(q.shape, dtype=q.dtype)
+    zero = torch._efficientzerotensor(q.shape, dtype=q.dtype, device=q.device)
     words = "holds no memory", "expected numbers in memory", ".clone()"
     with explained(ValueError, "Dynamics.gravity_force: q", *words):
         dyn.gravity_force(zero)
