@@ -47,7 +47,7 @@ def newton(robot: str) -> list[Part]:
 
 def on_gpu() -> list[Part]:
     """What the README shows; the other rows of ours; peers; the stress suite."""
-    both, jobs = ("--dtype", "float32", "float64"), str(max(1, (os.cpu_count() or 2) // 2))
+    both, jobs = ("--dtype", "float32", "float64"), str(max(1, (os.cpu_count() or 2) * 3 // 4))
     parts = [
         ours(f"headline.{robot}", rf"^{robot}\.{BASIC}\.", 180.0, *both, worlds=("1", "4096", "65536", "1048576"))
         for robot in ROBOTS
@@ -69,14 +69,14 @@ def on_gpu() -> list[Part]:
     parts += [Part("capabilities", ["benchmarks.capabilities"], None, 240.0)]
     parts += [Part("stress.node", ["benchmarks.stress", "--granularity", "node"], None, 150.0)]
     for robot in ROBOTS:
-        parts += [peer("mujoco_warp", [robot], 40.0, WORLDS), peer("grid", [robot], 40.0, WORLDS)]
+        parts += [peer("mujoco_warp", [robot], 40.0, WORLDS), peer("grid", [robot], 60.0, WORLDS)]
         parts += newton(robot)[:3]
-        parts += [peer("resolvent", [robot], 40.0, ("1", "128", "4096")), peer("torch", [robot], 40.0, WORLDS)]
-    parts += [peer("frax", ["panda"], 30.0, WORLDS)]
-    parts += [peer("pinocchio", list(ROBOTS), 120.0, WORLDS)._replace(alone=True)]
+        parts += [peer("resolvent", [robot], 40.0, ("1", "128", "4096")), peer("torch", [robot], 80.0, WORLDS)]
+    parts += [peer("frax", ["panda"], 80.0, WORLDS)]
+    parts += [peer("pinocchio", list(ROBOTS), 150.0, WORLDS)._replace(alone=True)]
     parts += [Part("stress.long", ["benchmarks.stress", LONG, "--slow"], None, 150.0)]
     parts += [newton(robot)[3] for robot in ROBOTS]
-    parts += [Part("stress.plan", ["benchmarks.stress", "--check", "--jobs", jobs], None, 180.0)]
+    parts += [Part("stress.plan", ["benchmarks.stress", "--check", "--jobs", jobs], None, 240.0)]
     return parts
 
 

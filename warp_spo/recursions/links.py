@@ -176,6 +176,17 @@ class Links:
                 stack.append((link, False))
                 stack.extend((child, True) for child in reversed(link.children))
 
+    def thrown(self, link: Link) -> float | None:
+        """Mass that a free link on the inertial frame carries, itself included; None of others, and if it varies."""
+        if link.motion != FREE or link.parent is not None:
+            return None
+        mass, carried = 0.0, [link]
+        while carried:
+            other = carried.pop()
+            mass = mass + (0.0 if other.inertia is None else other.inertia.mass)
+            carried.extend(other.children)
+        return mass if is_constant(mass) else None
+
     # -- values ----------------------------------------------------------------------------------------------------
     def _symbols(self, name: str, all_vary: bool) -> np.ndarray:
         """One world's value: numbers, or objects where some are inputs."""

@@ -274,7 +274,11 @@ class Trace:
             for other in self.carried_on(link, letter, forces, Vector):
                 f = f + other
             n, f = Vector(f[:3]), Vector(f[3:])
-            tau = newton_euler.hinge_force(link, self.places[key], n, f, qdd)
+            mass = self.links.thrown(link)
+            if mass is None:
+                tau = newton_euler.hinge_force(link, self.places[key], n, f, qdd)
+            else:
+                tau = newton_euler.root_force(link, self.places[key], n, f, mass, alpha[key][1], base, qdd)
             stores += [Store("out", (dof,), value) for dof, value in zip(link.dofs, tau, strict=True)]
             if link.parent is not None:
                 n, f = self.places[key].pose.force_to_parent(n, f)
