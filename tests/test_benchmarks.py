@@ -334,6 +334,23 @@ def test_two_runs_are_compared(tmp_path, capsys):
     assert "2 cases of 20 us or more; 0 differ" in capsys.readouterr().out
 
 
+RUN = dict(rows=[], machine=dict(device="x"), date="2026", commit="c", versions={})
+
+
+@pytest.mark.parametrize("run", [
+    [], RUN | dict(rows=None), RUN | dict(rows=[dict(us=30.0)]), RUN | dict(rows=[3]), RUN | dict(versions=[]),
+    RUN | dict(date=3), RUN | dict(machine={}), RUN | dict(stress=[dict(verdict="ok")]),
+    RUN | dict(stress=3),
+], ids=str)  # fmt: skip
+def test_what_is_no_run_is_refused_by_name(tmp_path, capsys, run):
+    """A JSON file that no run wrote is named, whatever was to be made of it."""
+    file = tmp_path / "odd.json"
+    file.write_text(json.dumps(run))
+    for call in (["--compare", str(file), str(file)], ["--table", str(file)],
+                 ["--from", str(tmp_path), "--report", str(tmp_path)]):  # fmt: skip
+        assert main(call) == 2 and f"{str(file)!r} is not the JSON of a run" in capsys.readouterr().err
+
+
 def test_capabilities_are_compared_with_references(tmp_path, capsys, device, monkeypatch):
     monkeypatch.setattr(capabilities.robots, "ROBOTS", {"arm": None})
     monkeypatch.setattr(capabilities.robots, "scene", lambda name: zoo.from_parents([-1, 0], ["revolute", "ball"], 3))
