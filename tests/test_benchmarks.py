@@ -398,6 +398,35 @@ def test_everything_goes_on_where_it_stopped(tmp_path, capsys, device, monkeypat
     assert "S1.chain_rand n=4" in (tmp_path / reports.FILE).read_text()
 
 
+def test_a_part_whose_file_was_cut_off_is_measured_again(tmp_path, device, monkeypatch):
+    """What another part measured is kept, what is no run is left out or made anew."""
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    text = json.dumps(RUN | dict(rows=[dict(zip(evidence.MEASURED, "abcde", strict=True))]))
+    (tmp_path / "one_part.py").write_text(f"import sys\nopen(sys.argv[-1], 'w').write({text!r})\n")
+    part = everything.Part("one", ["one_part"])
+    monkeypatch.setattr(everything, "FOLDER", tmp_path / "parts")
+    monkeypatch.setenv(everything.PEERS_FOLDER, str(tmp_path))
+    out = tmp_path / "out.json"
+    everything.run([part], device, 60.0, 1, out)
+    (file,) = (tmp_path / "parts").glob("*/one.json")
+    file.write_text(text[:40])
+    assert everything.run([part], device, 60.0, 1, out)[1] == [] and file.read_text() == text
+    broken = file.with_name("broken.json")
+    broken.write_text(text[:40])
+    kept, left_out = everything.run([part, part._replace(name="broken")], device, 1.0, 1, out)
+    assert len(left_out) == 1 and len(evidence.read(kept)["rows"]) == 1
+
+
+@pytest.mark.parametrize("option, value", [("--jobs", "0"), ("--gpus", "-1"), ("--budget", "nan")])
+def test_everything_refuses_what_it_would_wait_for_in_vain(capsys, option, value):
+    assert main(["--everything", "headline.panda", option, value]) == 2
+    assert f"benchmarks: {option} is {value}; expected more than 0" in capsys.readouterr().err
+
+
+def test_everything_explains_a_filter_that_is_none(capsys):
+    assert main(["--everything", "("]) == 2 and "'(' is no regular expression" in capsys.readouterr().err
+
+
 def test_a_part_that_takes_too_long_is_stopped(tmp_path, capsys, monkeypatch):
     text = "import signal, time; signal.signal(signal.SIGINT, signal.SIG_IGN); time.sleep(60)"
     (tmp_path / "endless_part.py").write_text(text)
