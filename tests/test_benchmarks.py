@@ -423,6 +423,14 @@ def test_everything_refuses_what_it_would_wait_for_in_vain(capsys, option, value
     assert f"benchmarks: {option} is {value}; expected more than 0" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", ["--json", "--report"])
+def test_a_place_that_cannot_be_written_is_refused_before_measuring(tmp_path, capsys, option):
+    (tmp_path / "file").write_text("")
+    place = str(tmp_path / "file" / "below")
+    assert main(["cartpole.passive", "--check", "--worlds", "1", option, place]) == 2
+    assert f"benchmarks: {option} is '{place}" in capsys.readouterr().err
+
+
 def test_everything_explains_a_filter_that_is_none(capsys):
     assert main(["--everything", "("]) == 2 and "'(' is no regular expression" in capsys.readouterr().err
 
