@@ -78,6 +78,9 @@ def main(argv: list[str] | None = None) -> int:
             return 0
         if options.compare:
             return compare(*options.compare)
+        for option, out in (("--json", options.json), ("--report", options.report and options.report / report.FILE)):
+            if out:
+                runner.check_place(option, out)
         pyplot = pages.load_pyplot() if options.report or options.readme else None
         if options.everything:
             device = find_device(options.device)

@@ -7,7 +7,6 @@ budget leaves out is named, and the same command goes on from there.
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -17,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from . import runner
+from . import evidence, runner
 from .evidence import ROOT
 
 FOLDER = ROOT / "build" / "evidence"
@@ -87,7 +86,7 @@ class Lanes:
 
     def run(self, parts: Sequence[Part]) -> list[Part]:
         """Compile and measure; returns the parts that the budget left out or cut short."""
-        waiting = [part for part in parts if not (self.folder / f"{part.name}.done").exists()]
+        waiting = [part for part in parts if not self._is_done(part)]
         if len(waiting) < len(parts):
             self.say(f"{len(parts) - len(waiting)} parts are there already, in {self.folder}")
         queue, unfinished = [part for part in waiting if part.compile], []
@@ -109,6 +108,10 @@ class Lanes:
             for job in [*self.compiling.values(), *(each.job for each in self.measuring.values())]:
                 stop(job, 1.0)
         return unfinished + waiting
+
+    def _is_done(self, part: Part) -> bool:
+        file = self.folder / f"{part.name}.json"
+        return (self.folder / f"{part.name}.done").exists() and (is_run(file) or not file.exists())
 
     def _ready(self, waiting: list[Part], queued: bool) -> Part | None:
         """The first part whose kernels are compiled; what compiles its own comes when all others' are."""
@@ -136,7 +139,7 @@ class Lanes:
         stop(job, GRACE)
         del self.measuring[lane]
         file, log = self.folder / f"{part.name}.json", self.folder / f"{part.name}.log"
-        rows = len(json.loads(file.read_text())["rows"]) if file.exists() else 0
+        rows = len(evidence.read(file)["rows"]) if is_run(file) else 0
         how = "stopped, out of time" if code is None else "" if code == 0 else f"returned {code}"
         reasons = [line for line in log.read_text().splitlines() if line.startswith(("skipped", "benchmarks:"))]
         self.say("; ".join([f"{part.name}: {rows} rows in {time.monotonic() - begin:.0f} s", *filter(None, [how])]))
@@ -159,9 +162,18 @@ def stop(job: subprocess.Popen, grace: float) -> None:
             continue
 
 
+def is_run(file: Path) -> bool:
+    """Whether the file is there and holds a run; one that was cut off in writing does not."""
+    try:
+        evidence.read(file)
+    except ValueError:
+        return False
+    return True
+
+
 def merged(files: Sequence[Path]) -> dict:
     """The runs in files of one commit and machine as one run."""
-    runs = sorted((json.loads(file.read_text()) for file in files), key=lambda run: run["date"])
+    runs = sorted(map(evidence.read, files), key=lambda run: run["date"])
     whole: dict[str, Any] = dict(runs[-1], rows=[])
     for key in ("machine", "versions"):
         whole[key] = {name: value for run in runs for name, value in run[key].items()}
@@ -182,8 +194,11 @@ def run(
     """Run parts, write their rows as one run into the file or folder ``out``; returns the file, and parts left out.
 
     Raises:
-        ValueError: there was no time for a single row.
+        ValueError: there was no time for a single row; budget, jobs or gpus are not positive.
     """
+    for name, value in (("budget", budget), ("jobs", jobs), ("gpus", gpus)):
+        if value is not None and not value > 0:
+            raise ValueError(f"benchmarks: --{name} is {value:g}; expected more than 0")
     found = runner.machine(device)
     cuda = "device_memory_GiB" in found
     folder = FOLDER / f"{short(found)}-{runner.commit()[:12]}"
@@ -194,7 +209,7 @@ def run(
     most = sum(part.seconds for part in parts)
     lanes.say(f"{found['device']}: {len(parts)} parts, at most {most:.0f} s of measuring")
     left_out = lanes.run(parts)
-    files = [folder / f"{part.name}.json" for part in parts if (folder / f"{part.name}.json").exists()]
+    files = [file for part in parts if is_run(file := folder / f"{part.name}.json")]
     if not files:
         raise ValueError(f"benchmarks: nothing was measured in {budget:g} s; logs are in {folder}")
     whole = merged(files)

@@ -5,12 +5,21 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 IDENTITY = ("scene", "op", "worlds", "dtype", "granularity", "peer", "variant", "sweep", "group", "name")
 """Keys that tell one measurement from another; a row has some of them."""
+RUN = {"rows": list, "machine": dict, "date": str, "commit": str, "versions": dict}
+MEASURED = {"name", "scene", "op", "worlds", "dtype"}
+ROWS = {
+    "ours": MEASURED,
+    "peers": MEASURED,
+    "stress": {"case", "parameters", "verdict"},
+    "capabilities": {"group", "name", "worlds"},
+}
+"""What the file of a run holds, and every row of a kind."""
 
 
 class Evidence(NamedTuple):
@@ -50,12 +59,23 @@ def read(path: Path) -> dict:
     """
     try:
         data = json.loads(Path(path).read_text())
-        data["rows"], data["machine"]["device"], data["date"], data["commit"], data["versions"]
     except OSError as error:
         raise ValueError(f"benchmarks: cannot read {str(path)!r}: {error.strerror}; expected a run's JSON") from None
-    except (ValueError, KeyError, TypeError):
-        raise ValueError(f"benchmarks: {str(path)!r} is not the JSON of a run, as --json writes it") from None
+    except ValueError:
+        data = None
+    if not _is_run(data):
+        raise ValueError(f"benchmarks: {str(path)!r} is not the JSON of a run, as --json writes it")
     return data
+
+
+def _is_run(data: Any) -> bool:
+    """Whether all is there that tables, pictures and reports look up without asking."""
+    if not isinstance(data, dict) or not all(isinstance(data.get(key), kind) for key, kind in RUN.items()):
+        return False
+    stress = data.get("stress", [])
+    if "device" not in data["machine"] or not isinstance(stress, list):
+        return False
+    return all(isinstance(row, dict) and ROWS[_kind(row)] <= row.keys() for row in [*data["rows"], *stress])
 
 
 def files(paths: Iterable[Path]) -> list[Path]:

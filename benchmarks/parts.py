@@ -96,10 +96,13 @@ def choose(pattern: str, cuda: bool, device: str) -> list[Part]:
     """Parts whose name holds a match of the regular expression, on ``device``.
 
     Raises:
-        ValueError: none does.
+        ValueError: none does, or it is no regular expression.
     """
     everything = on_gpu() if cuda else on_cpu()
-    chosen = [part for part in everything if re.search(pattern, part.name)]
+    try:
+        chosen = [part for part in everything if re.search(pattern, part.name)]
+    except re.error as error:
+        raise ValueError(f"benchmarks: filter {pattern!r} is no regular expression: {error}") from None
     if not chosen:
         names = ", ".join(part.name for part in everything)
         raise ValueError(f"benchmarks: no part matches {pattern!r}; expected a regular expression of {names}")

@@ -9,6 +9,7 @@ import platform
 import re
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterable, Iterator
 from importlib import metadata
 from pathlib import Path
@@ -169,6 +170,23 @@ def record(rows: list[dict], device: Any = None, roof: roofline.Roof | None = No
         versions=versions(),
         rows=rows,
     )
+
+
+def check_place(option: str, out: Path) -> None:
+    """Make the folder of a file, or the folder ``out``, before anything is measured.
+
+    Raises:
+        ValueError: nothing can be written there.
+    """
+    folder = out if out.is_dir() or not out.suffix else out.parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ValueError(
+            f"benchmarks: {option} is {str(out)!r}: {error.strerror}; expected a place that can be written to"
+        ) from None
 
 
 def save(data: dict, out: Path) -> Path:

@@ -334,6 +334,23 @@ def test_two_runs_are_compared(tmp_path, capsys):
     assert "2 cases of 20 us or more; 0 differ" in capsys.readouterr().out
 
 
+RUN = dict(rows=[], machine=dict(device="x"), date="2026", commit="c", versions={})
+
+
+@pytest.mark.parametrize("run", [
+    [], RUN | dict(rows=None), RUN | dict(rows=[dict(us=30.0)]), RUN | dict(rows=[3]), RUN | dict(versions=[]),
+    RUN | dict(date=3), RUN | dict(machine={}), RUN | dict(stress=[dict(verdict="ok")]),
+    RUN | dict(stress=3),
+], ids=str)  # fmt: skip
+def test_what_is_no_run_is_refused_by_name(tmp_path, capsys, run):
+    """A JSON file that no run wrote is named, whatever was to be made of it."""
+    file = tmp_path / "odd.json"
+    file.write_text(json.dumps(run))
+    for call in (["--compare", str(file), str(file)], ["--table", str(file)],
+                 ["--from", str(tmp_path), "--report", str(tmp_path)]):  # fmt: skip
+        assert main(call) == 2 and f"{str(file)!r} is not the JSON of a run" in capsys.readouterr().err
+
+
 def test_capabilities_are_compared_with_references(tmp_path, capsys, device, monkeypatch):
     monkeypatch.setattr(capabilities.robots, "ROBOTS", {"arm": None})
     monkeypatch.setattr(capabilities.robots, "scene", lambda name: zoo.from_parents([-1, 0], ["revolute", "ball"], 3))
@@ -379,6 +396,43 @@ def test_everything_goes_on_where_it_stopped(tmp_path, capsys, device, monkeypat
     assert evidence.read(tmp_path / "run.json")["rows"] == run["rows"]
     assert main(["--from", str(tmp_path / "run.json"), "--report", str(tmp_path)]) == 0
     assert "S1.chain_rand n=4" in (tmp_path / reports.FILE).read_text()
+
+
+def test_a_part_whose_file_was_cut_off_is_measured_again(tmp_path, device, monkeypatch):
+    """What another part measured is kept, what is no run is left out or made anew."""
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    text = json.dumps(RUN | dict(rows=[dict(zip(evidence.MEASURED, "abcde", strict=True))]))
+    (tmp_path / "one_part.py").write_text(f"import sys\nopen(sys.argv[-1], 'w').write({text!r})\n")
+    part = everything.Part("one", ["one_part"])
+    monkeypatch.setattr(everything, "FOLDER", tmp_path / "parts")
+    monkeypatch.setenv(everything.PEERS_FOLDER, str(tmp_path))
+    out = tmp_path / "out.json"
+    everything.run([part], device, 60.0, 1, out)
+    (file,) = (tmp_path / "parts").glob("*/one.json")
+    file.write_text(text[:40])
+    assert everything.run([part], device, 60.0, 1, out)[1] == [] and file.read_text() == text
+    broken = file.with_name("broken.json")
+    broken.write_text(text[:40])
+    kept, left_out = everything.run([part, part._replace(name="broken")], device, 1.0, 1, out)
+    assert len(left_out) == 1 and len(evidence.read(kept)["rows"]) == 1
+
+
+@pytest.mark.parametrize("option, value", [("--jobs", "0"), ("--gpus", "-1"), ("--budget", "nan")])
+def test_everything_refuses_what_it_would_wait_for_in_vain(capsys, option, value):
+    assert main(["--everything", "headline.panda", option, value]) == 2
+    assert f"benchmarks: {option} is {value}; expected more than 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--json", "--report"])
+def test_a_place_that_cannot_be_written_is_refused_before_measuring(tmp_path, capsys, option):
+    (tmp_path / "file").write_text("")
+    place = str(tmp_path / "file" / "below")
+    assert main(["cartpole.passive", "--check", "--worlds", "1", option, place]) == 2
+    assert f"benchmarks: {option} is '{place}" in capsys.readouterr().err
+
+
+def test_everything_explains_a_filter_that_is_none(capsys):
+    assert main(["--everything", "("]) == 2 and "'(' is no regular expression" in capsys.readouterr().err
 
 
 def test_a_part_that_takes_too_long_is_stopped(tmp_path, capsys, monkeypatch):

@@ -92,7 +92,8 @@ def test_loops_are_cut_and_named(tmp_path, capsys, monkeypatch, device):
         (["no_such_robot"], "expected one of humanoid, ant, quadruped, cartpole"),
         (["no/such/file.urdf"], "no file 'no/such/file.urdf'"),
         ([__file__], "ends in '.py'"),
-        (["cartpole", "--worlds", "0"], "worlds is 0; expected one or more"),
+        (["cartpole", "--worlds", "0"], "worlds is 0; expected 1 to 2147483647"),
+        (["cartpole", "--worlds", "99999999999"], "worlds is 99999999999; expected 1 to 2147483647"),
         (["cartpole", "--device", "abacus"], "--device is 'abacus'; expected one of those here: cpu"),
     ],
 )

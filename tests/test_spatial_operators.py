@@ -489,3 +489,32 @@ def test_factorization_refuses_what_does_not_fit(device):
         spo.Factorization(E, H, spo.Blocks.diagonal([np.eye(3), np.eye(2)], device=device))
     with pytest.raises(ValueError, match="expected a Tree"):
         spo.Factorization(spo.BWA(spo.Digraph([(0, 1)]), [np.ones((2, 3))], device=device), H, M)
+
+
+@pytest.mark.parametrize("granularity", ["node", "tree"])
+def test_blocks_and_applications_hold_the_same_values(granularity, device):
+    """Without an update after ``set`` as with it: what an operator does to a vector is what its entries say."""
+    scene = zoo.chain(2)
+    dyn = spo.Dynamics(scene, 2, device, "float64", variable=("body_mass",), granularity=granularity)
+    q, v = (np.random.default_rng(seed).normal(size=(2, scene.dof_count)) for seed in (0, 1))
+    ops = dyn.operators(q)
+    mass = ops.H @ ops.phi @ ops.M @ ops.phi.T @ ops.H.T + ops.Delta
+    values = scene.values["body_mass"][0], scene.values["joint_armature"][0]
+
+    def agree():
+        dense = mass.dense()
+        np.testing.assert_allclose(mass @ v, np.einsum("wij,wj->wi", dense, v), rtol=1e-13)
+        return dense
+
+    agree()
+    dyn.set(body_mass=2.0 * values[0])
+    agree()
+    for factor in (3.0, 4.0):  # a rebuild, and a second one
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            dyn.set(joint_armature=factor * values[1])
+        agree()
+    ops.update(q)
+    after = scene.with_values(body_mass=2.0 * values[0][None], joint_armature=4.0 * values[1][None])
+    expected = [reference.Dense(after, state).mass_matrix for state in q]
+    np.testing.assert_allclose(agree(), expected, rtol=1e-11, atol=1e-12)

@@ -32,6 +32,7 @@ from .scene import Scene
 from .spatial_operators import SpatialOperators
 from .steps import Steps
 
+MOST_WORLDS = 2**31 - 1  # of an axis of a Warp array
 LOOPS = ("raise", "cut", "embed", "multipliers")
 
 
@@ -462,8 +463,8 @@ def _world_count(scene: Scene, worlds: Any) -> int:
     count = whole(worlds)
     if count is None:
         raise TypeError(f"Dynamics: worlds is {worlds!r}; expected an integer")
-    if count < 1 or scene.worlds not in (1, count):
-        expected = "one or more" if scene.worlds == 1 else f"{scene.worlds}, for which the scene holds values"
+    if not 1 <= count <= MOST_WORLDS or scene.worlds not in (1, count):
+        expected = f"1 to {MOST_WORLDS}" if scene.worlds == 1 else f"{scene.worlds}, for which the scene holds values"
         raise ValueError(f"Dynamics: worlds is {count}; expected {expected}")
     return count
 

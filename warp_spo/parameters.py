@@ -70,6 +70,7 @@ class Parameters:
         self._hinge_of: Any = wp.array(scene.hinge_of, dtype=int, device=device)
         self._derived: dict[str, Derived] = {}
         self._captured = False
+        self._stamp = 0
         self._sharers: list[Parameters] = []
         self._values: dict[str, wp.array] = {}
         for name, value in scene.values.items():
@@ -78,6 +79,11 @@ class Parameters:
                 shared, own = own, wp.empty((worlds, *value.shape[1:]), dtype=wp.float64, device=device)
                 wp.copy(own, spread(shared, 0, worlds))
             self._values[name] = own
+
+    @property
+    def stamp(self) -> int | None:
+        """Equal as long as no value has changed; None if a graph may change them unseen."""
+        return None if self._captured else self._stamp
 
     def derived(self, key: str, build: Callable[[], Derived]) -> list[wp.array]:
         """The arrays of that name; ``build()`` allocates them at the first request."""
@@ -174,6 +180,7 @@ class Parameters:
         """Take over the variable values of ``other``."""
         for name in self.variable:
             wp.copy(self._values[name], other._values[name])
+        self._stamp = other._stamp
         self.refresh(self.variable)
 
     def share(self, other: Parameters) -> None:
@@ -187,6 +194,7 @@ class Parameters:
         for sharer in self._sharers:
             sharer.refresh(names)
         self._captured |= bool(self.device.is_capturing)
+        self._stamp += 1
         for found in self._derived.values():
             if any(name in found.of for name in names):
                 found.fill()

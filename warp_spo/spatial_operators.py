@@ -25,7 +25,7 @@ class SpatialOperators(Letters):
 
     Whatever is composed of these operators, applied to one vector a world, is one kernel that starts from q, unless the
     granularity is "node"; the blocks are then filled when something else asks for them. A value that ``dyn.set``
-    changes is in force after the next :meth:`update`.
+    changes is in force at once, with "node" after the next :meth:`update`.
 
     Attributes:
         E_phi, phi: weights phi(p, k), eq. 15 to 17, with the rotation between node frames.
@@ -68,7 +68,8 @@ class SpatialOperators(Letters):
         self._kind: str | None = WARP
         self._fused = recursions.plan.of("expression") != "node" and dofs > 0
         self._q: Any = wp.empty((worlds, scene.coord_count), dtype=dtype, device=device) if self._fused else None
-        self._filled = self._captured = False
+        self._filled: int | None = None  # stamp of the values that the blocks were filled with
+        self._captured = False
 
     def update(self, q: Any) -> None:
         """Take the coordinates ``q`` [world, coordinate]; launches only."""
@@ -78,7 +79,7 @@ class SpatialOperators(Letters):
             self._kind = call.kind
             if self._fused:
                 wp.copy(self._q, q)
-                self._filled = False
+                self._filled = None
                 # A graph with this launch may be replayed at any time: the host no longer knows what is up to date.
                 self._captured = self._captured or run.device.is_capturing
             else:
@@ -89,9 +90,9 @@ class SpatialOperators(Letters):
             operator.kind = self._kind
 
     def fill(self) -> None:
-        capturing = self._recursions.device.is_capturing
-        if self._fused and (not self._filled or self._captured or capturing):
-            self._filled = not capturing
+        capturing, stamp = self._recursions.device.is_capturing, self._recursions.parameters.stamp
+        if self._fused and (stamp is None or self._filled != stamp or self._captured or capturing):
+            self._filled = None if capturing else stamp
             self._write_blocks(self._q)
 
     def _write_blocks(self, q: wp.array) -> None:
