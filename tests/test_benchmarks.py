@@ -418,8 +418,8 @@ def test_a_part_whose_file_was_cut_off_is_measured_again(tmp_path, device, monke
 
 
 @pytest.mark.parametrize("option, value", [("--jobs", "0"), ("--gpus", "-1"), ("--budget", "nan")])
-def test_everything_refuses_what_it_would_wait_for_in_vain(capsys, option, value):
-    assert main(["--everything", "headline.panda", option, value]) == 2
+def test_everything_refuses_what_it_would_wait_for_in_vain(tmp_path, capsys, option, value):
+    assert main(["--everything", "headline.panda", option, value, "--json", str(tmp_path)]) == 2
     assert f"benchmarks: {option} is {value}; expected more than 0" in capsys.readouterr().err
 
 

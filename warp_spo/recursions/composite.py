@@ -30,7 +30,7 @@ def entries(link: Link, places: dict[int, Placed], body: Rigid) -> dict[tuple[in
 def turning(link: Link, place: Placed, body: Rigid) -> dict[tuple[int, int], Value]:
     """Entries of a ball's or a free hinge's own dofs: ``body`` in the axes of its rates, where its mass is exact.
 
-    H R H* with R in the link's axes is the same but for rounding: a rotation in float32 is off by 1e-7 from its inverse.
+    H R H* with R in the link's axes is the same but for rounding: a float32 rotation is off by 1e-7 from its inverse.
     """
     if place.turned is None:
         return {}
