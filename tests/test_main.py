@@ -117,6 +117,13 @@ def test_missing_matplotlib_names_the_extra(tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "report").exists()
 
 
+def test_a_folder_that_cannot_be_made_is_named(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert job.main(["cartpole", "--worlds", "2", "--report", str(tmp_path / "file")]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and f"--report is '{tmp_path}" in err and "expected a folder" in err
+
+
 def test_runs_as_a_module():
     root = Path(job.__file__).parent.parent
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}

@@ -54,7 +54,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         pyplot: Any = report.load_pyplot() if options.report else None
         if options.report:
-            options.report.mkdir(parents=True, exist_ok=True)
+            _make_folder(options.report)
         scene = load(options.robot)
         device = find_device(options.device)
         worlds = options.worlds if options.worlds is not None else WORLDS[device.is_cuda]
@@ -154,6 +154,18 @@ def run(dyns: list[Dynamics]) -> Iterator[dict[str, Any]]:
                 granularity = subject.dyn.plan.of(operation.name)
                 row = dict(op=operation.name, granularity=granularity, dtype=dtype, worlds=worlds)
                 yield row | dict(error=error, seconds=timing.median)
+
+
+def _make_folder(path: Path) -> None:
+    """Before anything runs.
+
+    Raises:
+        ValueError: there is none, and none can be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"--report is {str(path)!r}: {error.strerror}; expected a folder, or a place for one") from None
 
 
 if __name__ == "__main__":
