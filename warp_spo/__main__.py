@@ -165,7 +165,7 @@ def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"--report is {str(path)!r}: {error.strerror}; expected a folder, or a place for one") from None
+        raise ValueError(f"--report is {str(path)!r}: {error.strerror}; expected a folder") from None
 
 
 if __name__ == "__main__":
