@@ -178,7 +178,7 @@ PINNED = {
     "quadruped": (4111, 1773, 1565, 2778, 4984, 1901),
     "humanoid": (8574, 2793, 4253, 6597, 13854, 4876),
 }
-"""Scene of the benchmarks -> operations of one world, in the order of ORDER; 7 of a free base's inverse dynamics are for accuracy."""
+"""Scene of the benchmarks -> operations of one world, in the order of ORDER; 7 with a free base are for accuracy."""
 STALE = 0.97  # of a pinned number: less has to be written down
 ORDER = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "solve_mass_matrix", "mass_matrix_inverse",
          "log_det_mass_matrix")  # fmt: skip
