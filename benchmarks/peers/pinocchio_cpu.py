@@ -68,7 +68,7 @@ class Pinocchio(Peer):
             if built:  # elsewhere
                 return os.environ.get("WARP_SPO_PINOCCHIO", "4.1.0")
             raise Absent(f"{error}; pip install warp_spo[oracles] cmeel-eigen") from None
-        if not (include / "eigen3").is_dir():
+        if not built and not (include / "eigen3").is_dir():
             raise Absent("no Eigen headers; pip install cmeel-eigen")
         return found
 
