@@ -236,7 +236,7 @@ def test_a_lazy_zero_tensor_is_refused(device):
     with explained(ValueError, "Dynamics.gravity_force: q", *words):
         dyn.gravity_force(zero)
     with explained(ValueError, "Dynamics.bias_force: qd", *words):
-        dyn.bias_force(q, torch._efficientzerotensor((WORLDS, dyn.scene.dof_count), dtype=q.dtype))
+        dyn.bias_force(q, torch._efficientzerotensor((WORLDS, dyn.scene.dof_count), dtype=q.dtype, device=q.device))
     np.testing.assert_array_equal(numbers(dyn.gravity_force(zero.clone())), numbers(dyn.gravity_force(0.0 * q)))
 
 
@@ -265,7 +265,8 @@ def test_a_forward_mode_tangent_is_never_dropped(device):
                 call()
         primal = forward_ad.unpack_dual(dual["q"]).primal
         np.testing.assert_array_equal(numbers(dyn.gravity_force(primal)), numbers(dyn.gravity_force(a["q"])))
-    np.testing.assert_array_equal(numbers(dyn.gravity_force(a["q"])), numbers(dynamics(device).gravity_force(a["q"])))
+    folded = numbers(dynamics(device).gravity_force(a["q"]))  # other code, which a GPU rounds in its own way
+    assert laws.error(numbers(dyn.gravity_force(a["q"])), folded) <= TOLERANCE["float64"]
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script")  # of torch itself, in forward mode
