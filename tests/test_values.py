@@ -12,6 +12,7 @@ import torch
 import warp as wp
 import zoo
 from allocations import no_warp_allocation
+from border import made, numbers
 from laws import OPERATIONS, TOLERANCE
 
 import warp_spo as spo
@@ -53,20 +54,6 @@ def drawn(name, worlds, seed=0):
     if name in ("body_com", "gravity"):
         return value + rng.uniform(-0.2, 0.2, value.shape)
     return value + rng.uniform(0.0, 1.0, value.shape)
-
-
-def made(kind, values, dyn):
-    dtype = dyn.dtype.__name__
-    if kind == "torch":
-        return torch.tensor(values, dtype=getattr(torch, dtype), device=wp.device_to_torch(dyn.device))
-    if kind == "warp":
-        return wp.array(values, dtype=dyn.dtype, device=dyn.device)
-    return np.array(values, dtype)
-
-
-def numbers(array):
-    array = array.cpu() if isinstance(array, torch.Tensor) else array
-    return np.asarray(array.numpy() if hasattr(array, "numpy") else array)
 
 
 def assert_equals(dyn, expected_scene, operations=OPERATIONS, tolerance=None):
