@@ -284,7 +284,7 @@ BAD_SCENES = {
         ValueError, "Scene.with_values: gravity is array(['0', '0', '1']",
     ),
     "gradient": (
-        lambda: scene().with_values(gravity=pytest.importorskip("torch").ones(3, requires_grad=True)),
+        lambda: scene().with_values(gravity=torch.ones(3, requires_grad=True)),
         ValueError, "Scene.with_values: gravity is tensor([1., 1., 1.], requires_grad=True); expected numbers",
     ),
 }
