@@ -125,6 +125,7 @@ def inputs(scene: spo.Scene, worlds: int) -> list[Inputs]:
 
 def of_operations(*names: str) -> Callable[..., Iterator[tuple[str, Callable[[], dict]]]]:
     """Operations on each of the robots, compared with their references."""
+
     def cases(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], dict]]]:
         for robot in robots.ROBOTS:
             scene = robots.scene(robot)
@@ -184,9 +185,7 @@ def operational(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[
         mjw, m, d, nv = peer.mjw, peer.model, peer.data, peer.host.nv
         owners = [at for at, link in enumerate(peer.robot.links) for _ in range(6 if link.kind == "free" else 1)]
         bodies = [
-            1 + owners[place]
-            for place, dof in enumerate(peer.robot.dofs)
-            if "ankle_roll" in scene.dof_labels[dof]
+            1 + owners[place] for place, dof in enumerate(peer.robot.dofs) if "ankle_roll" in scene.dof_labels[dof]
         ]
         assert len(bodies) == 2, f"{len(bodies)} feet"
         J = [[wp.zeros((worlds, 3, nv), dtype=wp.float32, device=device) for _ in range(2)] for _ in bodies]

@@ -57,8 +57,10 @@ def world_axes(links: list[Link], outward: list[int]) -> list[Link]:
 def subtracted(links: list[Link], outward: list[int]) -> list[Link]:
     """World axes, link origins, offsets subtracted from world positions."""
     R, x = _world_poses(links, outward)
-    return [_moved(link, R[k], x[k] * 0, x[k] - (x[link.parent] if link.parent >= 0 else 0 * x[k]))
-            for k, link in enumerate(links)]
+    return [
+        _moved(link, R[k], x[k] * 0, x[k] - (x[link.parent] if link.parent >= 0 else 0 * x[k]))
+        for k, link in enumerate(links)
+    ]
 
 
 def world_origin(links: list[Link], outward: list[int]) -> list[Link]:

@@ -112,8 +112,10 @@ def links(a: Arithmetic, scene: Any, q: np.ndarray) -> list[Link]:
     """Every node of ``scene`` at q [world, coordinate], in node frames (the child anchors of the hinges)."""
     c = ARITHMETIC[a.constants or a.name]
     worlds, q = len(q), a.number(q)
-    value = {name: c.number(scene.values[name]) for name in ("body_mass", "body_com", "body_inertia", "joint_armature",
-                                                              "joint_X_p", "joint_X_c")}
+    value = {
+        name: c.number(scene.values[name])
+        for name in ("body_mass", "body_com", "body_inertia", "joint_armature", "joint_X_p", "joint_X_c")
+    }
 
     def spread(x: np.ndarray) -> np.ndarray:
         return np.broadcast_to(a.number(x), (worlds, *x.shape[1:]))
@@ -134,8 +136,9 @@ def links(a: Arithmetic, scene: Any, q: np.ndarray) -> list[Link]:
         M = spread(block(J, mass * s, mass * transpose(s), mass * c.number(np.eye(3))))
         R, l, H = _hinge(a, hinge, q[:, at : at + hinge.coord_count], spread(com))
         R_t, l_t = spread(R_t), spread(l_t)
-        found.append(Link(p, dofs, R_t @ R, l_t + (R_t @ l[..., None])[..., 0], H, M,
-                          spread(value["joint_armature"])[:, dofs]))
+        found.append(
+            Link(p, dofs, R_t @ R, l_t + (R_t @ l[..., None])[..., 0], H, M, spread(value["joint_armature"])[:, dofs])
+        )
     return found
 
 
@@ -174,8 +177,9 @@ class Sweep:
         D_cond: largest condition number of a hinge's block H P H* + Delta [world], float64.
     """
 
-    def __init__(self, scene: Any, q: np.ndarray, arithmetic: str, change: Callable | None = None,
-                 symmetric: bool = True):
+    def __init__(
+        self, scene: Any, q: np.ndarray, arithmetic: str, change: Callable | None = None, symmetric: bool = True
+    ):
         self.arithmetic = a = ARITHMETIC[arithmetic]
         self.scene, self.worlds = scene, len(q)
         self.links = links(a, scene, q)

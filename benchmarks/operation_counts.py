@@ -142,8 +142,11 @@ def _weights(c: Count) -> int:
 def _update(c: Count) -> int:
     """The Riccati recursion with general 6 x 6 blocks, symmetry used: w P+ w*, U, D, G, P+, w - w G H."""
     blocks = c.children * (6 * 6 * 11 + 21 * 12)
-    return c.pose() + blocks + c.dofs * (66 + 12 + 6 + 42) + sum(
-        hinge.dof_count * (66 + 72) for hinge, parent in zip(c.hinges, c.parent, strict=True) if parent >= 0
+    return (
+        c.pose()
+        + blocks
+        + c.dofs * (66 + 12 + 6 + 42)
+        + sum(hinge.dof_count * (66 + 72) for hinge, parent in zip(c.hinges, c.parent, strict=True) if parent >= 0)
     )
 
 

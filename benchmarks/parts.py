@@ -18,6 +18,7 @@ LONG = "n1023$|n1024$|n4096$|million|4096_worlds"  # of the stress suite
 
 def ours(name: str, cases: str, seconds: float, *options: str, worlds: Sequence[str] = ()) -> Part:
     """A part of ``python -m benchmarks``."""
+
     def command(counts: Sequence[str]) -> list[str]:
         return ["benchmarks", cases, *options, *(["--worlds", *counts] if counts else [])]
 

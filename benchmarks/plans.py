@@ -57,8 +57,11 @@ def main(arguments: list[str] | None = None) -> int:
             beyond += [ratio] * (ratio > ALLOWED)
             shown = ", ".join(f"{name} {us:.4g}" for name, us in times.items())
             limbs = sum(not children for children in scene.tree.children)
-            print(f"tree {which}: {scene.dof_count} dof, depth {scene.tree.depth}, {limbs} leaves, w{worlds}: {shown}; "
-                  f"plan {chosen}, {ratio:.3f} of the best", flush=True)
+            print(
+                f"tree {which}: {scene.dof_count} dof, depth {scene.tree.depth}, {limbs} leaves, w{worlds}: {shown}; "
+                f"plan {chosen}, {ratio:.3f} of the best",
+                flush=True,
+            )
     print(f"{len(beyond)} of {len(scenes) * len(options.worlds)} choices take more than {ALLOWED} times the best")
     return 1 if beyond else 0
 

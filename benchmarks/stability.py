@@ -100,9 +100,7 @@ def start_rates(scene: spo.Scene, seed: int = 0) -> np.ndarray:
     return qd if scene.hinges[0].kind == "free" else 0.0 * qd
 
 
-def energies(
-    scene: spo.Scene, q: np.ndarray, qd: np.ndarray, limits: bool = True
-) -> tuple[np.ndarray, np.ndarray]:
+def energies(scene: spo.Scene, q: np.ndarray, qd: np.ndarray, limits: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """Kinetic energy, armature included, and that of gravity, springs and passed limits, at states [n, ...] [J].
 
     ``limits``: they are springs; SolverSteel has none unless asked.

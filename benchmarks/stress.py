@@ -21,8 +21,22 @@ from .stress_checks import CHECKS, LONG, READS_PIVOTS
 from .stress_measure import Subject, contrasts, row
 from .stress_scenes import Setting
 
-HEADS = ("case", "precision", "max error", "median", "law", "x law", "backward", "min D/tr P", "status", "ns/world",
-         "verdict", "law is", "from", "against")
+HEADS = (
+    "case",
+    "precision",
+    "max error",
+    "median",
+    "law",
+    "x law",
+    "backward",
+    "min D/tr P",
+    "status",
+    "ns/world",
+    "verdict",
+    "law is",
+    "from",
+    "against",
+)
 WIDTHS = (36, 18, 9, 8, 8, 7, 8, 10, 10, 8, 8, 22, 26, 8)
 
 
@@ -43,14 +57,19 @@ def rows(
             except ValueError:
                 raise
             except Exception as error:
-                yield dict(case=case.name, parameters=case.parameters, precision=precision, granularity=granularity,
-                           source=case.source, verdict="FAILS", why=f"{type(error).__name__}: {error}")
+                yield dict(
+                    case=case.name,
+                    parameters=case.parameters,
+                    precision=precision,
+                    granularity=granularity,
+                    source=case.source,
+                    verdict="FAILS",
+                    why=f"{type(error).__name__}: {error}",
+                )
         yield from contrasts(case)
 
 
-def check_rows(
-    pattern: str, device: Any = None, granularity: str | None = None, slow: bool = False
-) -> Iterator[dict]:
+def check_rows(pattern: str, device: Any = None, granularity: str | None = None, slow: bool = False) -> Iterator[dict]:
     """Yield a row for each check whose name holds a match, and precision; the long ones too with ``slow``."""
     for name, (check, source) in (CHECKS | (LONG if slow else {})).items():
         if not re.search(pattern, name) or (name in READS_PIVOTS and granularity not in (None, "node")):
@@ -65,8 +84,15 @@ def check_rows(
                 raise
             except Exception as error:  # such as a kernel that does not compile: the other checks go on
                 verdict, why = "FAILS", f"{type(error).__name__}: {error}"
-            yield dict(case=name, parameters={}, precision=dtype, granularity=granularity, source=source,
-                       verdict=verdict, why=why)
+            yield dict(
+                case=name,
+                parameters={},
+                precision=dtype,
+                granularity=granularity,
+                source=source,
+                verdict=verdict,
+                why=why,
+            )
 
 
 def side_by_side(
@@ -91,6 +117,7 @@ def _one(device: str, granularity: str | None, work: tuple[str, str]) -> list[di
 
 def line(found: dict) -> str:
     """One line of the printed table."""
+
     def number(key: str, form: str = ".1e") -> str:
         return "" if found.get(key) is None or found[key] != found[key] else f"{found[key]:{form}}"
 
@@ -98,9 +125,22 @@ def line(found: dict) -> str:
     status = ""
     if "status" in found:
         status = "0" if not found["flagged"] else f"{max(found['status'])} in {found['flagged']}"
-    cells = (name, found["precision"], number("max_error"), number("median_error"), number("law"),
-             number("ratio", ".2g"), number("backward_error"), number("pivot"), status, number("ns", ".3g"),
-             found["verdict"], found.get("formula", ""), found.get("source", ""), found.get("reference", ""))
+    cells = (
+        name,
+        found["precision"],
+        number("max_error"),
+        number("median_error"),
+        number("law"),
+        number("ratio", ".2g"),
+        number("backward_error"),
+        number("pivot"),
+        status,
+        number("ns", ".3g"),
+        found["verdict"],
+        found.get("formula", ""),
+        found.get("source", ""),
+        found.get("reference", ""),
+    )
     return "  ".join(f"{cell:<{width}}" for cell, width in zip(cells, WIDTHS, strict=True)).rstrip()
 
 

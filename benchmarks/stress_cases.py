@@ -127,52 +127,141 @@ CASES = [
     *every("S2.chain_coriolis", scenes.chain_coriolis, "S2, few eps", flat(5e-7), dict(n=(4, 16, 64))),
     *every("S3.chain_grav_torque", scenes.chain_gravity_torque, "S3", COND, dict(n=(16, 64, 256))),
     *every("S4.crb_chol", scenes.chain_gravity_torque, "S4", CHOLESKY, dict(n=(16, 64, 256)), quantity="dense"),
-    *every("S5.straight_D", scenes.straight, "S5", flat(4 * EPS32), dict(n=(6, 40, 256)), quantity="pivots",
-           metric="component"),
-    *every("S5.straight_logdet", scenes.straight, "S5", LENGTH, dict(n=(6, 40, 256)), quantity="log_det",
-           metric="absolute"),
+    *every(
+        "S5.straight_D",
+        scenes.straight,
+        "S5",
+        flat(4 * EPS32),
+        dict(n=(6, 40, 256)),
+        quantity="pivots",
+        metric="component",
+    ),
+    *every(
+        "S5.straight_logdet", scenes.straight, "S5", LENGTH, dict(n=(6, 40, 256)), quantity="log_det", metric="absolute"
+    ),
     *every("S7.random_coil", lambda n: scenes.chain_rand(n, 3.0), "S7", flat(5e-7), dict(n=(16, 64, 256))),
     *every("S8.binary_tree", scenes.binary_tree, "S8", flat(5e-7), dict(n=(255,)), slow=(1023,)),
     *every("S9.star", scenes.star, "S9", WIDE, dict(n=(64, 512)), quantity="root_pivot"),
     *every("S10.caterpillar", scenes.caterpillar, "S10", flat(5e-7), dict(n=(64,))),
-    *every("S11.heavy_tip", scenes.heavy_tip, "S11, 4.1", HEAVY, dict(r=(1e2, 1e4, 1e6, 1e8, 1e10, 1e12)),
-           contrast=("square root",)),
+    *every(
+        "S11.heavy_tip",
+        scenes.heavy_tip,
+        "S11, 4.1",
+        HEAVY,
+        dict(r=(1e2, 1e4, 1e6, 1e8, 1e10, 1e12)),
+        contrast=("square root",),
+    ),
     *every("S12.light_tip", scenes.heavy_tip, "S12", flat(5e-7), dict(r=(1e-2, 1e-4, 1e-6, 1e-8, 1e-12))),
-    *every("S13.massless_interior", functools.partial(scenes.light_link, 4), "S13", flat(5e-7),
-           dict(mu=(1.0, 1e-2, 1e-4, 1e-6, 1e-8, 1e-12, 0.0))),
+    *every(
+        "S13.massless_interior",
+        functools.partial(scenes.light_link, 4),
+        "S13",
+        flat(5e-7),
+        dict(mu=(1.0, 1e-2, 1e-4, 1e-6, 1e-8, 1e-12, 0.0)),
+    ),
     *every("S14.massless_distal", functools.partial(scenes.light_link, 7), "S14", flat(5e-7), dict(mu=(1e-12,))),
-    *(Case(f"S15.gimbal_{label}", dict(e=e, delta=delta), scenes.gimbal, source="S15", quantity=quantity,
-           contrast=("world axes",) if quantity == "root_pivot" else (), **flat(1e-6))
-      for label, quantity in (("D0", "root_pivot"), ("qdd", "qdd"))
-      for e in (1e-2, 1e-4, 1e-6, 1e-8) for delta in (1e-1, 1e-2, 1e-3, 0.0)),
-    *(Case("S15.gimbal_oblique", dict(e=e, delta=delta), OBLIQUE_GIMBAL,
-           source="S15, world axes", **TILTED)
-      for e in (1e-2, 1e-4, 1e-6) for delta in (1e-1, 1e-2, 1e-3)),
-    *every("S16.far_base", scenes.far_origin, "S16", flat(5e-7), dict(x=(0.0, 1.0, 1e2, 1e5)),
-           contrast=("world origin", "subtracted offsets")),
-    *every("S16.far_floating", functools.partial(scenes.far_origin, floating=True), "S16", flat(5e-7),
-           dict(x=(0.0, 1e2, 1e5))),
-    *(case for label, quantity in (("D", "pivots"), ("qdd", "qdd"))
-      for r in (1.0, 0.5, 0.3, 0.1)
-      for case in every(f"S18.scale_sep_{label}", scenes.scale_separation, "S18", flat(1e-6), dict(r=(r,)),
-                        quantity=quantity, metric="component", words=SUBNORMAL if r == 0.1 else {})),
+    *(
+        Case(
+            f"S15.gimbal_{label}",
+            dict(e=e, delta=delta),
+            scenes.gimbal,
+            source="S15",
+            quantity=quantity,
+            contrast=("world axes",) if quantity == "root_pivot" else (),
+            **flat(1e-6),
+        )
+        for label, quantity in (("D0", "root_pivot"), ("qdd", "qdd"))
+        for e in (1e-2, 1e-4, 1e-6, 1e-8)
+        for delta in (1e-1, 1e-2, 1e-3, 0.0)
+    ),
+    *(
+        Case("S15.gimbal_oblique", dict(e=e, delta=delta), OBLIQUE_GIMBAL, source="S15, world axes", **TILTED)
+        for e in (1e-2, 1e-4, 1e-6)
+        for delta in (1e-1, 1e-2, 1e-3)
+    ),
+    *every(
+        "S16.far_base",
+        scenes.far_origin,
+        "S16",
+        flat(5e-7),
+        dict(x=(0.0, 1.0, 1e2, 1e5)),
+        contrast=("world origin", "subtracted offsets"),
+    ),
+    *every(
+        "S16.far_floating",
+        functools.partial(scenes.far_origin, floating=True),
+        "S16",
+        flat(5e-7),
+        dict(x=(0.0, 1e2, 1e5)),
+    ),
+    *(
+        case
+        for label, quantity in (("D", "pivots"), ("qdd", "qdd"))
+        for r in (1.0, 0.5, 0.3, 0.1)
+        for case in every(
+            f"S18.scale_sep_{label}",
+            scenes.scale_separation,
+            "S18",
+            flat(1e-6),
+            dict(r=(r,)),
+            quantity=quantity,
+            metric="component",
+            words=SUBNORMAL if r == 0.1 else {},
+        )
+    ),
     *every("S20.stiff_delta", scenes.stiff_armature, "S20", flat(5e-7), dict(s=(0.0, 1.0, 1e3, 1e6, 1e9, 1e12))),
-    *every("S20.implicit_1e8", scenes.implicit_stiffness, "S20", flat(5e-7),
-           dict(dt=(1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1))),
-    *every("S26.ball", functools.partial(scenes.weak_ball, floating=False), "S26", BLOCK,
-           dict(weak=(1.0, 1e-2, 1e-4, 1e-5, 1e-6))),
-    *every("S26.free_ball", functools.partial(scenes.weak_ball, floating=True), "S26", BLOCK,
-           dict(weak=(1.0, 1e-2, 1e-4, 1e-5, 1e-6))),
-    *every("S26.three_angles", scenes.three_angles, "S15, oblique axes", OBLIQUE,
-           dict(delta=(1.0, 1e-1, 1e-2, 1e-3))),
-    *every("S30.sym_ablation", scenes.chain_gravity, "S30", flat(2e-7), dict(n=(16, 64, 256)),
-           contrast=("full 6 x 6 P", "body axes, NumPy"), precisions=("float32",)),
-    *(case for steps in (0, 1, 2)
-      for case in every(f"S33.refine_{steps}", scenes.chain_gravity_torque, "S33", refined(steps),
-                        dict(n=(16, 64, 256)), steps=steps, precisions=("float32",))),
-    *every("S34.long_logdet", scenes.chain_rand, "S34", LENGTH, dict(n=(64, 256)), slow=(1024,),
-           quantity="log_det", metric="absolute", precisions=("float32",),  # a sum in more digits than D has
-           contrast=("float32 sum",)),
+    *every(
+        "S20.implicit_1e8", scenes.implicit_stiffness, "S20", flat(5e-7), dict(dt=(1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1))
+    ),
+    *every(
+        "S26.ball",
+        functools.partial(scenes.weak_ball, floating=False),
+        "S26",
+        BLOCK,
+        dict(weak=(1.0, 1e-2, 1e-4, 1e-5, 1e-6)),
+    ),
+    *every(
+        "S26.free_ball",
+        functools.partial(scenes.weak_ball, floating=True),
+        "S26",
+        BLOCK,
+        dict(weak=(1.0, 1e-2, 1e-4, 1e-5, 1e-6)),
+    ),
+    *every("S26.three_angles", scenes.three_angles, "S15, oblique axes", OBLIQUE, dict(delta=(1.0, 1e-1, 1e-2, 1e-3))),
+    *every(
+        "S30.sym_ablation",
+        scenes.chain_gravity,
+        "S30",
+        flat(2e-7),
+        dict(n=(16, 64, 256)),
+        contrast=("full 6 x 6 P", "body axes, NumPy"),
+        precisions=("float32",),
+    ),
+    *(
+        case
+        for steps in (0, 1, 2)
+        for case in every(
+            f"S33.refine_{steps}",
+            scenes.chain_gravity_torque,
+            "S33",
+            refined(steps),
+            dict(n=(16, 64, 256)),
+            steps=steps,
+            precisions=("float32",),
+        )
+    ),
+    *every(
+        "S34.long_logdet",
+        scenes.chain_rand,
+        "S34",
+        LENGTH,
+        dict(n=(64, 256)),
+        slow=(1024,),
+        quantity="log_det",
+        metric="absolute",
+        precisions=("float32",),  # a sum in more digits than D has
+        contrast=("float32 sum",),
+    ),
 ]
 
 

@@ -136,8 +136,13 @@ def unit_powers_of_two(where: Setting) -> None:
     mass, length = 2.0**7, 2.0**-5
     v = p.scene.values
     X = v["joint_X_p"] * np.array([length] * 3 + [1.0] * 4)
-    other = p.scene.with_values(body_mass=v["body_mass"] * mass, body_com=v["body_com"] * length, joint_X_p=X,
-                                body_inertia=v["body_inertia"] * mass * length**2, gravity=v["gravity"] * length)
+    other = p.scene.with_values(
+        body_mass=v["body_mass"] * mass,
+        body_com=v["body_com"] * length,
+        joint_X_p=X,
+        body_inertia=v["body_inertia"] * mass * length**2,
+        gravity=v["gravity"] * length,
+    )
     names = ("body_mass", "body_com", "joint_X_p", "body_inertia", "gravity")
     here, there = (
         scene.with_values(**{name: np.repeat(scene.values[name][:1], p.worlds, axis=0) for name in names})
@@ -192,8 +197,11 @@ def lost_directions(where: Setting) -> None:
     """
     for p in [scenes.weak_ball(weak, False) for weak in (1e-8, 1e-9, 0.0)] + [scenes.three_angles(0.0)]:
         if where.dtype == "float64":  # its own smallest numbers
-            p = scenes.weak_ball(1e-18, False) if p.q.shape[1] == 4 else Problem(
-                p.scene, np.where(np.arange(3) == 1, np.pi / 2.0, p.q), p.tau)
+            p = (
+                scenes.weak_ball(1e-18, False)
+                if p.q.shape[1] == 4
+                else Problem(p.scene, np.where(np.arange(3) == 1, np.pi / 2.0, p.q), p.tau)
+            )
         qdd, status = run(p, where)
         lost = np.isnan(qdd).any(1)
         assert (status == 1).all(), f"status {status}, q {p.q[0]}, qdd {qdd[0]}"
@@ -347,8 +355,15 @@ def same_bits(where: Setting, worlds: int = 64) -> None:
     hinges = []
     for k in old:
         h = p.scene.hinges[k]
-        hinges.append(spo.Hinge("revolute", -1 if h.parent < 0 else int(new[h.parent]), int(new[k]), axis=h.axis,
-                                parent_pose=h.parent_pose))
+        hinges.append(
+            spo.Hinge(
+                "revolute",
+                -1 if h.parent < 0 else int(new[h.parent]),
+                int(new[k]),
+                axis=h.axis,
+                parent_pose=h.parent_pose,
+            )
+        )
     renumbered = problem(spo.Scene([p.scene.bodies[k] for k in old], hinges, gravity=NONE), q[:, old], tau[:, old])
     np.testing.assert_array_equal(run(renumbered, where)[0], first[:, old])
 

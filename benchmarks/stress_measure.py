@@ -44,8 +44,10 @@ class Subject:
         """q, qd and tau on the device."""
         if dtype not in self._inputs:
             p = self.problem
-            self._inputs[dtype] = tuple(None if x is None else wp.array(x, dtype=getattr(wp, dtype), device=self.device)
-                                        for x in (p.q, p.qd, p.tau))
+            self._inputs[dtype] = tuple(
+                None if x is None else wp.array(x, dtype=getattr(wp, dtype), device=self.device)
+                for x in (p.q, p.qd, p.tau)
+            )
         return self._inputs[dtype]
 
     @functools.cached_property
@@ -158,14 +160,25 @@ def row(case: Case, subject: Subject, precision: str, timed: bool = False) -> di
     judged = precision in case.precisions
     law = law_of(case, EPS[dtype])
     ratio = float((error / law).max()) if judged else float("nan")
-    found = dict(case=case.name, parameters=case.parameters, precision=precision, quantity=case.quantity,
-                 metric=case.metric, reference=sweep.arithmetic.name, max_error=float(error.max()),
-                 granularity=subject.granularity,
-                 median_error=float(np.median(error)), law=float(law[np.argmax(error / law)]) if judged else None,
-                 formula=case.formula, source=case.source, ratio=ratio,
-                 pivot=float((np.abs(sweep.D) / sweep.P_trace).astype(np.float64).min()),
-                 status=sorted({int(word) for word in status}), flagged=int((status != 0).sum()),
-                 misjudged=int((~case.expects(status, dtype, law)).sum()))
+    found = dict(
+        case=case.name,
+        parameters=case.parameters,
+        precision=precision,
+        quantity=case.quantity,
+        metric=case.metric,
+        reference=sweep.arithmetic.name,
+        max_error=float(error.max()),
+        granularity=subject.granularity,
+        median_error=float(np.median(error)),
+        law=float(law[np.argmax(error / law)]) if judged else None,
+        formula=case.formula,
+        source=case.source,
+        ratio=ratio,
+        pivot=float((np.abs(sweep.D) / sweep.P_trace).astype(np.float64).min()),
+        status=sorted({int(word) for word in status}),
+        flagged=int((status != 0).sum()),
+        misjudged=int((~case.expects(status, dtype, law)).sum()),
+    )
     found["verdict"] = "" if not judged else "ok" if ratio <= ALLOWED and not found["misjudged"] else "FAILS"
     if found["verdict"] == "FAILS" and case.name in CAUSES:
         found["why"] = CAUSES[case.name]
@@ -186,6 +199,15 @@ def contrasts(case: Case) -> list[dict]:
             log_det = np.add.accumulate(np.log(D), axis=1)[:, -1:]  # one after the other, in D's precision
         value = {"qdd": qdd, "pivots": D, "root_pivot": D[:, :1], "log_det": log_det}[case.quantity]
         error = distance(case, value)
-        found.append(dict(case=case.name, parameters=case.parameters, precision=name, quantity=case.quantity,
-                          max_error=float(error.max()), median_error=float(np.median(error)), verdict="contrast"))
+        found.append(
+            dict(
+                case=case.name,
+                parameters=case.parameters,
+                precision=name,
+                quantity=case.quantity,
+                max_error=float(error.max()),
+                median_error=float(np.median(error)),
+                verdict="contrast",
+            )
+        )
     return found

@@ -79,12 +79,26 @@ def at(x: float) -> tuple:
     return (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
-def tree(parents: Sequence[int], bodies: Sequence[spo.Body], offset: Sequence[float], depth: Sequence[int],
-         gravity: Any = NONE, **hinge: Any) -> spo.Scene:
+def tree(
+    parents: Sequence[int],
+    bodies: Sequence[spo.Body],
+    offset: Sequence[float],
+    depth: Sequence[int],
+    gravity: Any = NONE,
+    **hinge: Any,
+) -> spo.Scene:
     """Revolute hinges about z on even ``depth`` and y on odd, ``offset`` along the parent's x."""
-    hinges = [spo.Hinge("revolute", int(p), k, axis=(0, d % 2, 1 - d % 2), parent_pose=at(x),
-                        **{key: value[k] for key, value in hinge.items()})
-              for k, (p, x, d) in enumerate(zip(parents, offset, depth, strict=True))]
+    hinges = [
+        spo.Hinge(
+            "revolute",
+            int(p),
+            k,
+            axis=(0, d % 2, 1 - d % 2),
+            parent_pose=at(x),
+            **{key: value[k] for key, value in hinge.items()},
+        )
+        for k, (p, x, d) in enumerate(zip(parents, offset, depth, strict=True))
+    ]
     return spo.Scene(list(bodies), hinges, gravity=gravity)
 
 

@@ -62,8 +62,15 @@ def rates(evidence: Evidence) -> str:
         lines.get((row["scene"], row["op"]), {})[row["worlds"]] = row
     if not lines:
         return ""
-    heads = ["float32", "µs, 1 world", f"µs, {usual:,} worlds", f"10⁹/s, {most:,} worlds", "error",
-             f"fastest other, {usual:,} worlds", "its error"]
+    heads = [
+        "float32",
+        "µs, 1 world",
+        f"µs, {usual:,} worlds",
+        f"10⁹/s, {most:,} worlds",
+        "error",
+        f"fastest other, {usual:,} worlds",
+        "its error",
+    ]
     text = ["| " + " | ".join(heads) + " |", "|---|" + "---:|" * (len(heads) - 1)]
     for (scene, op), mine in lines.items():
         same = scene, op, usual, "float32"

@@ -45,8 +45,11 @@ def main(arguments: list[str] | None = None) -> int:
                 granularity = None if asked == "plan" else asked
                 row = measured(scene, worlds, options.device, granularity, inputs, VARIABLE)
                 worst = max(worst, row["error"])
-                print(f"{name}.w{worlds} variable {row['us']:.4g} us, {row['us'] / folded['us']:.3g} times as long, "
-                      f"{row['text']}, set {row['set_us']:.4g} us", flush=True)
+                print(
+                    f"{name}.w{worlds} variable {row['us']:.4g} us, {row['us'] / folded['us']:.3g} times as long, "
+                    f"{row['text']}, set {row['set_us']:.4g} us",
+                    flush=True,
+                )
     return 0 if worst <= TOLERANCE["float32"] else 1
 
 

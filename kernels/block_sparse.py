@@ -114,4 +114,5 @@ def unit(T):
 
     return block_unit
 
+
 KERNELS = (gather, sweep, scale, unit)

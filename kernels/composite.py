@@ -13,9 +13,7 @@ def composite(s) -> wp.Kernel:
     T = s.T
 
     @wp.kernel(module=f"warp_spo_composite_{T.__name__}", enable_backward=False)
-    def kernel(
-        topology: Topology, level: int, pose: wp.array3d[T], rigid: wp.array3d[T], composite_out: wp.array3d[T]
-    ):
+    def kernel(topology: Topology, level: int, pose: wp.array3d[T], rigid: wp.array3d[T], composite_out: wp.array3d[T]):
         i, world = wp.tid()
         node = topology.order[level + i]
         body = s.load_rigid(rigid, node, world)
@@ -64,5 +62,6 @@ def mass_matrix(s) -> wp.Kernel:
                 last = first + topology.dof_count[node] - 1
 
     return kernel
+
 
 KERNELS = (composite, mass_matrix)

@@ -130,4 +130,5 @@ def factorize(T) -> wp.Kernel:
 
     return kernel
 
+
 KERNELS = (factorize,)

@@ -75,4 +75,5 @@ def force(s) -> wp.Kernel:
 
     return kernel
 
+
 KERNELS = (body_force, force)

@@ -94,4 +94,5 @@ def widen(s) -> wp.Kernel:
 
     return kernel
 
+
 KERNELS = (derive, transpose, widen)

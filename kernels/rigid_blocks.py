@@ -59,4 +59,5 @@ def fill(s) -> wp.Kernel:
 
     return kernel
 
+
 KERNELS = (fill,)

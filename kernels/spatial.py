@@ -14,8 +14,10 @@ import warp as wp
 from .straight import C_TYPE, function
 
 POSE, MOTION, RIGID, ARTICULATED = 12, 6, 10, 21  # components of one of each
-ENTRY = "const long long part = a.strides[1]; {c}* at = ({c}*)((char*)a.data + i * (long long)a.strides[0]\n" \
+ENTRY = (
+    "const long long part = a.strides[1]; {c}* at = ({c}*)((char*)a.data + i * (long long)a.strides[0]\n"
     "    + world * (long long)a.strides[2]);\n"
+)
 COMPONENT = "*({c}*)((char*)at + {k} * part)"
 
 

@@ -338,14 +338,22 @@ def voted(a_pass: str, flags: int, warps: int, c: str) -> str:
     a warp may write the next ones while another still reads.
     """
     every = " + ".join(f"SENT(now + {warp})" for warp in range(warps))
-    return "\n".join([
-        "bool open = true;", f"{c} missed_row[1] = {{}};",
-        f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{", "missed_row[0] = 0;", a_pass,
-        f"const int now = {flags} + (turn & 1) * {warps};",
-        "SENT(now + warp) = missed_row[0];",
-        "const int going = __syncthreads_or(missed_row[0] > 0);",
-        f"missed_row[0] = {every};", "open = missed_row[0] > 0;", "if (!going) break;", "}",
-    ])
+    return "\n".join(
+        [
+            "bool open = true;",
+            f"{c} missed_row[1] = {{}};",
+            f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{",
+            "missed_row[0] = 0;",
+            a_pass,
+            f"const int now = {flags} + (turn & 1) * {warps};",
+            "SENT(now + warp) = missed_row[0];",
+            "const int going = __syncthreads_or(missed_row[0] > 0);",
+            f"missed_row[0] = {every};",
+            "open = missed_row[0] > 0;",
+            "if (!going) break;",
+            "}",
+        ]
+    )
 
 
 def once(a_pass: str, barrier: str, c: str) -> str:
@@ -355,11 +363,17 @@ def once(a_pass: str, barrier: str, c: str) -> str:
 
 def alone(a_pass: str, c: str) -> str:
     """As :func:`voted`, by one thread for a world of its own."""
-    return "\n".join([
-        "const bool open = true;", f"{c} missed_row[1] = {{}};",
-        f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{", "missed_row[0] = 0;", a_pass,
-        "if (!(missed_row[0] > 0)) break;", "}",
-    ])
+    return "\n".join(
+        [
+            "const bool open = true;",
+            f"{c} missed_row[1] = {{}};",
+            f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{",
+            "missed_row[0] = 0;",
+            a_pass,
+            "if (!(missed_row[0] > 0)) break;",
+            "}",
+        ]
+    )
 
 
 def function(name: str, native: str, arguments: dict[str, type], result: type | None = None) -> wp.Function:
@@ -396,8 +410,12 @@ def {key}(worlds: int, {declared}):
     file = f"<{key}>"
     linecache.cache[file] = len(source), None, source.splitlines(True), file  # where Warp looks for the source
     space = {f"array{axes}": wp.array(dtype=T, ndim=axes) for axes in range(1, 5)} | {
-        "array0": T, "table": wp.array(dtype=int, ndim=1), "mask": wp.array(dtype=wp.bool, ndim=2),
-        "wide": wp.array(dtype=wp.float64, ndim=2), "wp": wp, "__name__": key
+        "array0": T,
+        "table": wp.array(dtype=int, ndim=1),
+        "mask": wp.array(dtype=wp.bool, ndim=2),
+        "wide": wp.array(dtype=wp.float64, ndim=2),
+        "wp": wp,
+        "__name__": key,
     }
     exec(compile(source, file, "exec"), space)
     space["native"] = wp.func_native(native)(space["native"])

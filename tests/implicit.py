@@ -99,9 +99,7 @@ def closed_step(closed, independent, h, qd, tau, body_f=None, target_q=None, tar
         return column @ (M @ qdd - load - np.array([force(i, v) for i, v in enumerate(rate)]))
 
     for _ in range(30):  # of Newton: near the answer soon, as a rule; the sweeps say whether
-        f, ahead, behind = (
-            np.array([force(i, v + e) for i, v in enumerate(qd + h * qdd)]) for e in (0.0, NEAR, -NEAR)
-        )
+        f, ahead, behind = (np.array([force(i, v + e) for i, v in enumerate(qd + h * qdd)]) for e in (0.0, NEAR, -NEAR))
         slope = 0.5 * (ahead - behind) / NEAR
         qdd = qdd - X @ np.linalg.solve(X.T @ (M - h * np.diag(slope)) @ X, X.T @ (M @ qdd - load - f))
     for _ in range(sweeps):

@@ -144,20 +144,35 @@ def tilted(kind="revolute", seed=3, **more):
     count = 4 if kind == "fixed" else 3
     place = lambda *poses: pose7(np.linalg.multi_dot([np.eye(4), *map(homogeneous, poses)]))  # noqa: E731
     hinges = [
-        spo.Hinge("revolute", k - 1, k, parent_pose=place(frames[k - 1], at(lengths[k - 1])) if k else world,
-                  child_pose=frames[k], **turn, **more)
+        spo.Hinge(
+            "revolute",
+            k - 1,
+            k,
+            parent_pose=place(frames[k - 1], at(lengths[k - 1])) if k else world,
+            child_pose=frames[k],
+            **turn,
+            **more,
+        )
         for k in range(count)
     ]
     axis = turn if kind == "revolute" else {}
-    loop = spo.Loop(kind, -1, count - 1, parent_pose=place(world, at(1.0)),
-                    child_pose=place(frames[count - 1], at(lengths[count - 1] if count == 3 else 0.0)), **axis)
+    loop = spo.Loop(
+        kind,
+        -1,
+        count - 1,
+        parent_pose=place(world, at(1.0)),
+        child_pose=place(frames[count - 1], at(lengths[count - 1] if count == 3 else 0.0)),
+        **axis,
+    )
     return spo.Scene([zoo.random_body(rng) for _ in range(count)], hinges, loops=[loop])
 
 
 def parallelogram():
     """S24: opposite bars of 0.4 and of 1 m; flat at q = 0, where it may fold the other way."""
-    hinges = [spo.Hinge("revolute", k - 1, k, axis=(0, 1, 0), parent_pose=at((0.4, 1.0)[k - 1] if k else 0.0))
-              for k in range(3)]
+    hinges = [
+        spo.Hinge("revolute", k - 1, k, axis=(0, 1, 0), parent_pose=at((0.4, 1.0)[k - 1] if k else 0.0))
+        for k in range(3)
+    ]
     loop = spo.Loop("revolute", -1, 2, axis=(0, 1, 0), parent_pose=at(1.0), child_pose=at(0.4))
     return spo.Scene([bar(0.4), bar(1.0), bar(0.4)], hinges, loops=[loop])
 
@@ -211,8 +226,10 @@ def geared():
     return spo.Scene(open_scene.bodies, open_scene.hinges, couplings=[spo.Coupling(2, 1, 1.0, 0.0)])
 
 
-MECHANISMS = {name: importlib.import_module(f"warp_spo.examples.{name}").scene
-              for name in ("fourbar", "fivebar", "slider_crank", "stewart", "biped", "gripper")}
+MECHANISMS = {
+    name: importlib.import_module(f"warp_spo.examples.{name}").scene
+    for name in ("fourbar", "fivebar", "slider_crank", "stewart", "biped", "gripper")
+}
 MECHANISMS |= {
     "tilted": tilted,
     "tilted, a ball": functools.partial(tilted, "ball"),
@@ -265,8 +282,9 @@ def states(scene, worlds=3, seed=1, q=None):
     return States(q, qd, tau, qdd, rng.normal(size=(worlds, scene.body_count, 6)))
 
 
-def random_closed(n, seed, kinds, hinge_kinds=("revolute", "prismatic", "universal", "ball"), couplings=0, roots=1,
-                  root_kind="free"):
+def random_closed(
+    n, seed, kinds, hinge_kinds=("revolute", "prismatic", "universal", "ball"), couplings=0, roots=1, root_kind="free"
+):
     """A random tree of random numbering with loop joints between random bodies, which meet at a random configuration.
 
     Returns:
@@ -289,6 +307,7 @@ def random_closed(n, seed, kinds, hinge_kinds=("revolute", "prismatic", "univers
         ratio = rng.uniform(-2, 2)
         offset = q[open_scene.q_start[follower]] - ratio * q[open_scene.q_start[leader]]
         coupled.append(spo.Coupling(int(follower), int(leader), ratio, offset))
-    scene = spo.Scene(open_scene.bodies, open_scene.hinges, gravity=open_scene.values["gravity"][0], loops=loops,
-                      couplings=coupled)
+    scene = spo.Scene(
+        open_scene.bodies, open_scene.hinges, gravity=open_scene.values["gravity"][0], loops=loops, couplings=coupled
+    )
     return scene, q

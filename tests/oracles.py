@@ -54,8 +54,10 @@ class Oracle:
     def __init__(self, scene, world):
         self.scene, self.world = scene, world
         self.body_pose = self.value("joint_X_c")
-        self.com = [se3(self.body_pose[h]).inverse().act(self.value("body_com")[k])  # in node axes
-                    for k, h in enumerate(scene.hinge_of)]
+        self.com = [
+            se3(self.body_pose[h]).inverse().act(self.value("body_com")[k])  # in node axes
+            for k, h in enumerate(scene.hinge_of)
+        ]
         armature = self.value("joint_armature")
         turning = np.repeat([hinge.kind in TURNING for hinge in scene.hinges], [h.dof_count for h in scene.hinges])
         self.inner_armature = np.where(turning, 0.0, armature)  # the oracle knows it
@@ -220,8 +222,9 @@ class PinocchioModel(Oracle):
 
     def body_poses(self, q):
         pin.forwardKinematics(self.model, self.data, self.q_of(q))
-        return np.array([pin.SE3ToXYZQUAT(self.data.oMi[self.joint[k]] * self.in_joint[k])
-                         for k in range(self.scene.body_count)])
+        return np.array(
+            [pin.SE3ToXYZQUAT(self.data.oMi[self.joint[k]] * self.in_joint[k]) for k in range(self.scene.body_count)]
+        )
 
 
 class MujocoModel(Oracle):

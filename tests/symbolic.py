@@ -43,8 +43,10 @@ def advance(scene, arrays, h, dtype="float64", most=16, trace=Applications, **op
 
     def stored(some):
         values = evaluate([item.value for item in some], lambda name, at: known[name][(slice(None), *at)], dtype)
-        found = {name: known.get(name, np.zeros((worlds, scene.coord_count))).astype(dtype) for name in
-                 {item.array for item in some}}
+        found = {
+            name: known.get(name, np.zeros((worlds, scene.coord_count))).astype(dtype)
+            for name in {item.array for item in some}
+        }
         for item, value in zip(some, values, strict=True):
             found[item.array][:, item.index[0] if item.index else 0] = value
         return found

@@ -371,6 +371,7 @@ def test_capabilities_are_compared_with_references(tmp_path, capsys, device, mon
 
 def test_everything_goes_on_where_it_stopped(tmp_path, capsys, device, monkeypatch):
     """``--everything`` in small: ours, a sweep, a peer and the stress suite, part by part, and one page of it."""
+
     def few(pattern, cuda, where):
         own = ["--device", where]
         dtypes = ["--dtype", *PRECISIONS]

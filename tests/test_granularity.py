@@ -114,8 +114,9 @@ SCENES = {
     "isotropic armature": lambda: armature("ball", True),
     "anisotropic armature": lambda: armature("free", False),
     "no gravity": weightless,
-    "three roots": lambda: zoo.from_parents([-1, 0, -1, 2, -1, 2],
-                                            ["revolute", "ball", "free", "d6", "planar", "fixed"], 7),
+    "three roots": lambda: zoo.from_parents(
+        [-1, 0, -1, 2, -1, 2], ["revolute", "ball", "free", "d6", "planar", "fixed"], 7
+    ),
     "two arms": zoo.fork,
     "dancer": zoo.dancer,
     "several robots": zoo.forest,
@@ -252,8 +253,9 @@ def test_equals_reference_where_a_warp_is_not_full(granularity, worlds, device):
         equals_reference(dyn, operation, states(dyn), laws.TOLERANCE["float32"])
 
 
-@pytest.mark.parametrize("name, dtype", [("two arms", "float64"),
-                                         pytest.param("every kind", "float32", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name, dtype", [("two arms", "float64"), pytest.param("every kind", "float32", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("granularity", GRANULARITIES)
 def test_values_that_differ_between_worlds(granularity, name, dtype, device):
     """Masses, CoMs, inertias, anchors, armature and gravity."""

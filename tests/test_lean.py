@@ -111,8 +111,9 @@ def test_nothing_at_all():
         assert found.operations == 0 and found.rows == () and found.fields == ()
 
 
-@pytest.mark.parametrize("operation", ["forward_dynamics", "inverse_dynamics", "mass_matrix", "solve_mass_matrix",
-                                       "log_det_mass_matrix"])
+@pytest.mark.parametrize(
+    "operation", ["forward_dynamics", "inverse_dynamics", "mass_matrix", "solve_mass_matrix", "log_det_mass_matrix"]
+)
 def test_an_arm_whose_axes_are_aligned(operation):
     skewed = count(of_arm7(SKEWED), operation)
     aligned, planar = (count(of_arm7(np.eye(3)[axes]), operation) for axes in ([2, 1], [1]))

@@ -150,8 +150,9 @@ def test_lagrange_along_what_closures_allow():
     dq, dqd = slope(lambda k: ends[k][0]), slope(lambda k: ends[k][1])
 
     def reference(k):
-        return np.array([mechanisms.Closed(scene, q).forward_dynamics(qd, tau)
-                         for q, qd, tau in zip(*ends[k], s.tau, strict=True)])
+        return np.array(
+            [mechanisms.Closed(scene, q).forward_dynamics(qd, tau) for q, qd, tau in zip(*ends[k], s.tau, strict=True)]
+        )
 
     state = dict(q=s.q, qd=s.qd, tau=s.tau)
     qdd = run(scene, "embedded_forward_dynamics", state, {"out": (3,)}, how=how)["out"]
@@ -373,4 +374,3 @@ def test_a_size_has_a_slope_at_zero_too():
     (slope,) = reverse([absolute(x)], [x], [1.0])
     for value, side in ((2.0, 1.0), (-2.0, -1.0), (0.0, -1.0)):
         assert evaluate([slope], lambda *_, value=value: value)[0] == side
-

@@ -143,8 +143,9 @@ def test_jacobian_and_bias_are_derivatives_of_the_error(name):
         N = closed.null_space(closed.jacobian)
         assert np.abs(Y[w] @ N).max() <= 1e-11 and np.linalg.matrix_rank(Y[w], 1e-7) == scene.dof_count - N.shape[1]
         assert np.abs(error[w]).max() < 1e-8
-        ahead, behind = (closing.at(closed.dense.integrate(unit, t)[None])[0][0] for unit, t in (
-            (s.qd[w], 1e-4), (s.qd[w], -1e-4)))
+        ahead, behind = (
+            closing.at(closed.dense.integrate(unit, t)[None])[0][0] for unit, t in ((s.qd[w], 1e-4), (s.qd[w], -1e-4))
+        )
         trace = Multipliers(Links(scene), "float64", ("q", "qd"))
         trace.place_links(moves=True)
         values = [v for c in trace.constraints for v in c.acceleration(trace.places, trace.vector("qd"), lambda i: 0.0)]
@@ -161,12 +162,22 @@ def test_equals_pinocchio():
     oracle = oracles.PinocchioModel(scene)
     constraints = pin.StdVec_RigidConstraintModel()
     for loop in scene.loops:
-        frames = [oracle.in_joint[body] * oracles.se3(pose) for body, pose in (
-            (loop.parent, loop.parent_pose), (loop.child, loop.child_pose))]
+        frames = [
+            oracle.in_joint[body] * oracles.se3(pose)
+            for body, pose in ((loop.parent, loop.parent_pose), (loop.child, loop.child_pose))
+        ]
         joints = [oracle.joint[loop.parent], oracle.joint[loop.child]]
-        constraints.append(pin.RigidConstraintModel(
-            pin.ContactType.CONTACT_3D, oracle.model, joints[0], frames[0], joints[1], frames[1],
-            pin.ReferenceFrame.LOCAL))
+        constraints.append(
+            pin.RigidConstraintModel(
+                pin.ContactType.CONTACT_3D,
+                oracle.model,
+                joints[0],
+                frames[0],
+                joints[1],
+                frames[1],
+                pin.ReferenceFrame.LOCAL,
+            )
+        )
     datas = pin.StdVec_RigidConstraintData()
     for constraint in constraints:
         datas.append(constraint.createData())
@@ -302,8 +313,10 @@ def test_near_parallel_loops(apart, dtype):
     q = zoo.random_state(scene, 1, 4).q
     dense = Closed(scene, q[0]).dense
     inner = np.linalg.inv(dense.body_matrix[2]) @ dense.body_matrix[3]
-    loops = [spo.Loop("ball", 2, 3, parent_pose=pose7(inner @ homogeneous(np.array(at(x)))), child_pose=at(x))
-             for x in (0.3, 0.3 + apart)]
+    loops = [
+        spo.Loop("ball", 2, 3, parent_pose=pose7(inner @ homogeneous(np.array(at(x)))), child_pose=at(x))
+        for x in (0.3, 0.3 + apart)
+    ]
     scene = spo.Scene(scene.bodies, scene.hinges, loops=loops)
     how = Embedding(tuple(_spanning(Closing(scene).at(q)[1])[0]), ())  # five of six
     s = mechanisms.States(q, *np.random.default_rng(0).normal(size=(3, 1, scene.dof_count)), np.zeros((1, 4, 6)))
@@ -349,8 +362,10 @@ def test_a_locked_loop_stands_still():
 
 # -- as users call it --------------------------------------------------------------------------------------------------
 def both(scene, worlds, device, dtype="float64", **more):
-    return [spo.Dynamics(scene, worlds, device=device, dtype=dtype, loops=loops, **more) for loops in (
-        "embed", "multipliers")]
+    return [
+        spo.Dynamics(scene, worlds, device=device, dtype=dtype, loops=loops, **more)
+        for loops in ("embed", "multipliers")
+    ]
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
@@ -374,8 +389,9 @@ def test_kernels_do_what_traces_do(dtype, device):
         _, rank = lag.loop_multipliers(s.q, s.qd, s.tau, s.body_f)
         np.testing.assert_array_equal(rank, len(how.rows))
         Mass, free = embed.mass_matrix(s.q), embed.independent_dofs
-        np.testing.assert_allclose(embed.mass_matrix_inverse(s.q) @ Mass, np.tile(np.eye(len(free)), (3, 1, 1)),
-                                   atol=1e-9)
+        np.testing.assert_allclose(
+            embed.mass_matrix_inverse(s.q) @ Mass, np.tile(np.eye(len(free)), (3, 1, 1)), atol=1e-9
+        )
         bias = embed.bias_force(s.q, s.qd, s.body_f)
         tau = embed.inverse_dynamics(s.q, s.qd, s.qdd, s.body_f)
         np.testing.assert_allclose(tau, np.einsum("wij,wj->wi", Mass, s.qdd[:, free]) + bias, atol=1e-9)
@@ -414,8 +430,9 @@ def test_worlds_that_differ(device):
     names = ("body_mass", "body_com", "body_inertia", "gravity", "joint_armature")
     scene = scene.with_values(**{name: varied[name] for name in names})
     s = mechanisms.states(scene)
-    wanted = np.array([
-        Closed(scene, s.q[w], world=w).forward_dynamics(s.qd[w], s.tau[w], s.body_f[w]) for w in range(3)])
+    wanted = np.array(
+        [Closed(scene, s.q[w], world=w).forward_dynamics(s.qd[w], s.tau[w], s.body_f[w]) for w in range(3)]
+    )
     for dyn in both(scene, 3, device):
         on = laws.to_device(dyn, s._asdict())
         first = dyn.forward_dynamics(on["q"], on["qd"], on["tau"], on["body_f"])
@@ -432,8 +449,9 @@ def test_worlds_that_differ(device):
         np.testing.assert_array_equal(out.numpy(), first.numpy())
         spoiled = s.q.copy()
         spoiled[1] = np.nan
-        bad = dyn.forward_dynamics(wp.array(spoiled, dtype=wp.float64, device=device), on["qd"], on["tau"],
-                                   on["body_f"], status=status).numpy()
+        bad = dyn.forward_dynamics(
+            wp.array(spoiled, dtype=wp.float64, device=device), on["qd"], on["tau"], on["body_f"], status=status
+        ).numpy()
         np.testing.assert_array_equal(bad[[0, 2]], out.numpy()[[0, 2]])
         assert np.isnan(bad[1]).all()
         np.testing.assert_array_equal(status.numpy(), [0, 2, 0])
@@ -513,8 +531,9 @@ ROLLED = [("fourbar", 0.5), ("cassie_leg", 0.1)]
 ROLLED_LONG = ["fourbar", "fivebar", "slider_crank", "stewart", "biped", "gripper", "cassie_leg"]
 
 
-@pytest.mark.parametrize(("name", "seconds"), [
-    *ROLLED, *(pytest.param(name, 10.0, marks=pytest.mark.slow) for name in ROLLED_LONG)])
+@pytest.mark.parametrize(
+    ("name", "seconds"), [*ROLLED, *(pytest.param(name, 10.0, marks=pytest.mark.slow) for name in ROLLED_LONG)]
+)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_loops_stay_closed(name, seconds, dtype, device):
     scene = MECHANISMS[name]()
@@ -567,15 +586,27 @@ def test_a_four_bar_from_newton(device):
     newton = pytest.importorskip("newton")
     builder = newton.ModelBuilder()
     identity, lengths = wp.quat_identity(), (0.4, 0.9, 0.7)
-    bodies = [builder.add_link(xform=wp.transform_identity(), mass=1.0, com=wp.vec3(0.5 * length, 0.0, 0.0),
-                               inertia=wp.mat33(np.diag([0.01, 0.1, 0.1]))) for length in lengths]
+    bodies = [
+        builder.add_link(
+            xform=wp.transform_identity(),
+            mass=1.0,
+            com=wp.vec3(0.5 * length, 0.0, 0.0),
+            inertia=wp.mat33(np.diag([0.01, 0.1, 0.1])),
+        )
+        for length in lengths
+    ]
     joints = []
     for k, body in enumerate(bodies):
         place = wp.transform((lengths[k - 1] if k else 0.0, 0.0, 0.0), identity)
         joints.append(builder.add_joint_revolute(bodies[k - 1] if k else -1, body, parent_xform=place, axis=(0, 1, 0)))
     builder.add_articulation(joints)
-    builder.add_joint_revolute(-1, bodies[2], parent_xform=wp.transform((1.0, 0.0, 0.0), identity),
-                               child_xform=wp.transform((0.7, 0.0, 0.0), identity), axis=(0, 1, 0))
+    builder.add_joint_revolute(
+        -1,
+        bodies[2],
+        parent_xform=wp.transform((1.0, 0.0, 0.0), identity),
+        child_xform=wp.transform((0.7, 0.0, 0.0), identity),
+        axis=(0, 1, 0),
+    )
     scene = spo.from_newton(builder.finalize(device="cpu"))
     s = mechanisms.states(scene)
     one, two = (dyn.forward_dynamics(s.q, s.qd, s.tau, s.body_f) for dyn in both(scene, 3, device))
@@ -630,8 +661,10 @@ def test_variable_values_are_read(device):
     s = mechanisms.states(scene)
     names = ("body_mass", "joint_X_p")
     for loops in ("embed", "multipliers"):
-        folded, free = (spo.Dynamics(scene, 3, device=device, dtype="float64", loops=loops, variable=variable)
-                        for variable in ((), names))
+        folded, free = (
+            spo.Dynamics(scene, 3, device=device, dtype="float64", loops=loops, variable=variable)
+            for variable in ((), names)
+        )
         free.set(body_mass=2.0 * scene.values["body_mass"][0])
         free.set(**{name: scene.values[name][0] for name in names})
         for dyn in (folded, free):

@@ -50,8 +50,10 @@ def test_reports_every_operation_in_both_precisions(tmp_path, capsys, device):
 
 def test_a_robot_that_cannot_move_passes(tmp_path, capsys, device):
     robot = tmp_path / "block.urdf"
-    robot.write_text('<robot name="r"><link name="a"><inertial><mass value="1"/>'
-                     '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>')
+    robot.write_text(
+        '<robot name="r"><link name="a"><inertial><mass value="1"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'
+    )
     assert job.main([str(robot), "--worlds", "2", "--device", str(device)]) == 0
     assert "FAILED" not in capsys.readouterr().err
 

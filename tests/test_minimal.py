@@ -36,19 +36,39 @@ def where(scene):
 
 # name -> (arrays it takes after q, its shape for n independent dofs, the reference's value in one world)
 CLOSED = {
-    "operational_inertia_inverse": ((), lambda n: (18, 18), lambda c, s, free: c.operational_inertia_inverse(
-        frames_of(c.scene))),
-    "operational_inertia_inverse_product": (("x",), lambda n: (3, 6), lambda c, s, free: (
-        c.operational_inertia_inverse(frames_of(c.scene)) @ s["x"]).reshape(3, 6)),
+    "operational_inertia_inverse": (
+        (),
+        lambda n: (18, 18),
+        lambda c, s, free: c.operational_inertia_inverse(frames_of(c.scene)),
+    ),
+    "operational_inertia_inverse_product": (
+        ("x",),
+        lambda n: (3, 6),
+        lambda c, s, free: (c.operational_inertia_inverse(frames_of(c.scene)) @ s["x"]).reshape(3, 6),
+    ),
     "log_det_mass_matrix": ((), lambda n: (), lambda c, s, free: np.linalg.slogdet(c.mass_matrix(free))[1]),
     "jacobian": ((), lambda n: (3, 6, n), lambda c, s, free: c.dense.jacobian(frames_of(c.scene)) @ c.columns(free)),
-    "jacobian_bias": (("qd",), lambda n: (3, 6), lambda c, s, free: c.dense.jacobian_bias(
-        s["qd"], frames_of(c.scene)) + c.dense.jacobian(frames_of(c.scene)) @ demanded(c, s, free)),
+    "jacobian_bias": (
+        ("qd",),
+        lambda n: (3, 6),
+        lambda c, s, free: (
+            c.dense.jacobian_bias(s["qd"], frames_of(c.scene))
+            + c.dense.jacobian(frames_of(c.scene)) @ demanded(c, s, free)
+        ),
+    ),
     "com_jacobian": ((), lambda n: (3, n), lambda c, s, free: c.dense.com_jacobian @ c.columns(free)),
-    "centroidal_momentum_matrix": ((), lambda n: (6, n), lambda c, s, free: (
-        c.dense.centroidal_momentum_matrix @ c.columns(free))),
-    "centroidal_momentum_bias": (("qd",), lambda n: (6,), lambda c, s, free: c.dense.centroidal_momentum_bias(
-        s["qd"]) + c.dense.centroidal_momentum_matrix @ demanded(c, s, free)),
+    "centroidal_momentum_matrix": (
+        (),
+        lambda n: (6, n),
+        lambda c, s, free: c.dense.centroidal_momentum_matrix @ c.columns(free),
+    ),
+    "centroidal_momentum_bias": (
+        ("qd",),
+        lambda n: (6,),
+        lambda c, s, free: (
+            c.dense.centroidal_momentum_bias(s["qd"]) + c.dense.centroidal_momentum_matrix @ demanded(c, s, free)
+        ),
+    ),
 }
 
 
@@ -65,8 +85,9 @@ def traced_error(name, operation):
     scene, how, s, closed = mechanisms.case(name)
     takes, shape, reference = CLOSED[operation]
     options = {"frames": where(scene)} if "jacobian" in operation[:9] or "operational" in operation else {}
-    got = traced(scene, f"embedded_{operation}", arrays_of(s), ("q", *takes), {"out": shape(len(how.dofs))}, how=how,
-                 **options)["out"]
+    got = traced(
+        scene, f"embedded_{operation}", arrays_of(s), ("q", *takes), {"out": shape(len(how.dofs))}, how=how, **options
+    )["out"]
     states = [{key: array[w] for key, array in arrays_of(s).items()} for w in range(3)]
     return max(laws.error(got[w], np.asarray(reference(c, states[w], how.dofs))) for w, c in enumerate(closed))
 
@@ -81,8 +102,15 @@ def test_a_tight_loop_holds_the_frames_it_ties():
     """The tip of a welded four-bar stands still, whatever pushes: its rows vanish; the crank's do not."""
     scene, how, s, _ = mechanisms.case("tilted, a weld")
     tip = (scene.body_count - 1, scene.loops[0].child_pose[:3])
-    got = traced(scene, "embedded_operational_inertia_inverse", s._asdict(), ("q",), {"out": (12, 12)}, how=how,
-                 frames=((0, (0.3, 0.1, 0.2)), tip))["out"]
+    got = traced(
+        scene,
+        "embedded_operational_inertia_inverse",
+        s._asdict(),
+        ("q",),
+        {"out": (12, 12)},
+        how=how,
+        frames=((0, (0.3, 0.1, 0.2)), tip),
+    )["out"]
     assert np.abs(got[:, 6:]).max() <= 1e-10 * np.abs(got).max()
 
 
@@ -96,8 +124,15 @@ def test_dead_points_pass():
     worst = int(np.argmin(np.abs(X[:, 2])))
     assert np.abs(X[worst, 2]) < 1e-2
     s = mechanisms.states(scene, 1, q=q[[worst]])
-    got = traced(scene, "embedded_operational_inertia_inverse", s._asdict(), ("q",), {"out": (18, 18)}, how=how,
-                 frames=where(scene))["out"][0]
+    got = traced(
+        scene,
+        "embedded_operational_inertia_inverse",
+        s._asdict(),
+        ("q",),
+        {"out": (18, 18)},
+        how=how,
+        frames=where(scene),
+    )["out"][0]
     assert laws.error(got, Closed(scene, s.q[0]).operational_inertia_inverse(frames_of(scene))) <= DIFFERENCES
 
 
@@ -108,8 +143,15 @@ def hybrid_error(name, held):
     mask = np.zeros(scene.dof_count, dtype=bool)
     mask[np.array(how.dofs)[held]] = True
     shapes = {name: (scene.dof_count,) for name in ("out", "tau_out")}
-    got = traced(scene, "embedded_hybrid_dynamics", s._asdict(), ("q", "qd", "tau", "qdd", "body_f"), shapes, how=how,
-                 held=tuple(mask.tolist()))
+    got = traced(
+        scene,
+        "embedded_hybrid_dynamics",
+        s._asdict(),
+        ("q", "qd", "tau", "qdd", "body_f"),
+        shapes,
+        how=how,
+        held=tuple(mask.tolist()),
+    )
     errors = []
     for w, c in enumerate(closed):
         right = c.hybrid_dynamics(s.qd[w], s.tau[w], s.qdd[w], mask, how.dofs, s.body_f[w])
@@ -161,8 +203,9 @@ def test_kernels_do_what_traces_do(dtype, device):
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-@pytest.mark.parametrize(("name", "frames"), [
-    ("cassie_leg", [11]), pytest.param("biped", [3, 10], marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("name", "frames"), [("cassie_leg", [11]), pytest.param("biped", [3, 10], marks=pytest.mark.slow)]
+)
 def test_operational_inertia_of_feet_that_rods_drive(name, frames, dtype, device):
     """What a push on the foot meets, through the loops: with multipliers in float64; more than the open leg's."""
     scene, _, s, closed = mechanisms.case(name)
@@ -201,10 +244,23 @@ def test_a_planted_bug_in_the_columns_is_seen(monkeypatch):
     symbolic.plant(monkeypatch, minimal.Minimal, "embedded_solve_mass_matrix", "place[dof], *column)", first)
     scene, how, s, _ = mechanisms.case("fivebar")
     b = np.random.default_rng(0).normal(size=(3, len(how.dofs), 2))
-    both = traced(scene, "embedded_solve_mass_matrix", {**s._asdict(), "b": b}, ("q", "b"), {"out": b.shape[1:]},
-                  how=how, columns=2)["out"]
-    second = traced(scene, "embedded_solve_mass_matrix", {**s._asdict(), "b": b[:, :, 1]}, ("q", "b"),
-                    {"out": b.shape[1:2]}, how=how)["out"]
+    both = traced(
+        scene,
+        "embedded_solve_mass_matrix",
+        {**s._asdict(), "b": b},
+        ("q", "b"),
+        {"out": b.shape[1:]},
+        how=how,
+        columns=2,
+    )["out"]
+    second = traced(
+        scene,
+        "embedded_solve_mass_matrix",
+        {**s._asdict(), "b": b[:, :, 1]},
+        ("q", "b"),
+        {"out": b.shape[1:2]},
+        how=how,
+    )["out"]
     assert laws.error(both[:, :, 1], second) > 0.1
 
 
@@ -239,14 +295,39 @@ def test_what_speaks_of_independent_dofs_fits_what_speaks_of_all(device):
     np.testing.assert_allclose(np.einsum("b,wbi->wi", scene.values["body_mass"][0], moves), force[:, :3], atol=1e-8)
 
 
-OF_ALL_DOFS = {"forward_dynamics", "passive_force", "body_poses", "body_velocities", "body_states", "integrate",
-               "frame_accelerations", "body_accelerations", "closure_error", "project"}
+OF_ALL_DOFS = {
+    "forward_dynamics",
+    "passive_force",
+    "body_poses",
+    "body_velocities",
+    "body_states",
+    "integrate",
+    "frame_accelerations",
+    "body_accelerations",
+    "closure_error",
+    "project",
+}
 """What speaks of all dofs, or of bodies, whatever ties them."""
 OF_INVERSE = {"bias_force", "gravity_force", "bias_force_vjp", "gravity_force_vjp"}
-OF_MULTIPLIERS = {"inverse_dynamics", "mass_matrix", "mass_matrix_inverse", "solve_mass_matrix", "bias_force",
-                  "gravity_force", "log_det_mass_matrix", "log_det_mass_matrix_gradient", "mass_matrix_packed",
-                  "mass_matrix_inverse_packed", "jacobian", "jacobian_bias", "com_jacobian",
-                  "centroidal_momentum_matrix", "centroidal_momentum_bias", "quasi_velocities", "loop_multipliers"}
+OF_MULTIPLIERS = {
+    "inverse_dynamics",
+    "mass_matrix",
+    "mass_matrix_inverse",
+    "solve_mass_matrix",
+    "bias_force",
+    "gravity_force",
+    "log_det_mass_matrix",
+    "log_det_mass_matrix_gradient",
+    "mass_matrix_packed",
+    "mass_matrix_inverse_packed",
+    "jacobian",
+    "jacobian_bias",
+    "com_jacobian",
+    "centroidal_momentum_matrix",
+    "centroidal_momentum_bias",
+    "quasi_velocities",
+    "loop_multipliers",
+}
 """What multipliers are about is Mass qdd + bias_force = tau + Y* lambda of all dofs: these are its terms."""
 
 
@@ -255,8 +336,14 @@ def test_no_operation_forgets_the_loops(how, device):
     """Each is known here, embedded, of all dofs, or it raises and names a way out."""
     dyn = spo.Dynamics(MECHANISMS["gripper"](), 1, device=device, loops=how)
     of_tree = {f"{operation}_vjp" for operation in OF_TREE}
-    known = {"embed": {*loops.EMBEDDED, *OF_INVERSE, "operational_inertia", "forward_dynamics_derivatives"},
-             "multipliers": OF_MULTIPLIERS}[how] | OF_ALL_DOFS | of_tree
+    known = (
+        {
+            "embed": {*loops.EMBEDDED, *OF_INVERSE, "operational_inertia", "forward_dynamics_derivatives"},
+            "multipliers": OF_MULTIPLIERS,
+        }[how]
+        | OF_ALL_DOFS
+        | of_tree
+    )
     assert known <= {*TAKES, *PRODUCTS}
     for operation in {*TAKES, *PRODUCTS} - known - {"step"}:  # which has tests of its own
         with pytest.raises(spo.UnsupportedError, match=r"use|loops='cut'|loops='multipliers'|independent"):
@@ -277,8 +364,12 @@ def test_no_operation_forgets_the_loops(how, device):
 BUGS = [
     ("operational_inertia_inverse", "_through", "force = force + column * rate", "force = force - column * rate"),
     ("operational_inertia_inverse", "_through", "{id(link): force}", "{id(cluster.links[0]): force}"),
-    ("operational_inertia_inverse_product", "embedded_operational_inertia_inverse_product",
-     "pushed=self.pushed(frames)", "pushed={}"),
+    (
+        "operational_inertia_inverse_product",
+        "embedded_operational_inertia_inverse_product",
+        "pushed=self.pushed(frames)",
+        "pushed={}",
+    ),
     ("log_det_mass_matrix", "embedded_log_det_mass_matrix", ", allowed=allowed)", ")"),
     ("jacobian", "_of_independent", "if dof in row)", "if dof in row and dof == free)"),
     ("jacobian_bias", "minimal_demand", "how, how.dofs", "how"),
@@ -292,12 +383,15 @@ def test_a_planted_bug_is_seen(monkeypatch, operation, name, old, new):
     assert not traced_error("cassie_leg", operation) <= 1e-4
 
 
-@pytest.mark.parametrize(("old", "new"), [
-    ("if not held[dof]]", "]"),
-    ("tau(i)) for i, x", "0.0) for i, x"),
-    ("loads=True", "loads=False"),
-    ("[Cluster([link], link.parent, []) for link in alone if id(link) not in inside]", "[]"),
-])
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("if not held[dof]]", "]"),
+        ("tau(i)) for i, x", "0.0) for i, x"),
+        ("loads=True", "loads=False"),
+        ("[Cluster([link], link.parent, []) for link in alone if id(link) not in inside]", "[]"),
+    ],
+)
 def test_a_planted_bug_in_hybrid_dynamics_is_seen(monkeypatch, old, new):
     count = len(mechanisms.case("cassie_leg").how.dofs)
     symbolic.plant(monkeypatch, minimal.Minimal, "embedded_hybrid_dynamics", old, new)

@@ -31,10 +31,16 @@ SCENES = [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in 
 # name -> (arrays it takes after q, shape of the result, the reference's value for one world)
 OPERATIONS = {
     "jacobian_bias": (("qd",), lambda s: (2, 6), lambda d, a: d.jacobian_bias(a["qd"], laws.frames_of(d.scene))),
-    "frame_accelerations": (("qd", "qdd"), lambda s: (2, 6), lambda d, a: (
-        d.jacobian(laws.frames_of(d.scene)) @ a["qdd"] + d.jacobian_bias(a["qd"], laws.frames_of(d.scene)))),
-    "operational_inertia_inverse_product": (("x",), lambda s: (2, 6), lambda d, a: (
-        d.operational_inertia_inverse(laws.frames_of(d.scene)) @ a["x"]).reshape(2, 6)),
+    "frame_accelerations": (
+        ("qd", "qdd"),
+        lambda s: (2, 6),
+        lambda d, a: d.jacobian(laws.frames_of(d.scene)) @ a["qdd"] + d.jacobian_bias(a["qd"], laws.frames_of(d.scene)),
+    ),
+    "operational_inertia_inverse_product": (
+        ("x",),
+        lambda s: (2, 6),
+        lambda d, a: (d.operational_inertia_inverse(laws.frames_of(d.scene)) @ a["x"]).reshape(2, 6),
+    ),
     "com_jacobian": ((), lambda s: (3, s.dof_count), lambda d, a: d.com_jacobian),
     "centroidal_momentum_matrix": ((), lambda s: (6, s.dof_count), lambda d, a: d.centroidal_momentum_matrix),
     "centroidal_momentum_bias": (("qd",), lambda s: (6,), lambda d, a: d.centroidal_momentum_bias(a["qd"])),
@@ -151,8 +157,15 @@ def test_packed_matrices_are_the_full_ones(device):
     """A forest, one tree of which hangs on a body that stands still and carries two arms: what is left out is zero."""
     bodies = [spo.Body(1.0, (0.1, 0.2, 0.0), np.eye(3))] * 6
     parents, kinds = [-1, 0, 0, 1, -1, 4], ["fixed", "revolute", "prismatic", "universal", "ball", "revolute"]
-    hinges = [spo.Hinge(kind, parent, body, **({} if kind in ("fixed", "ball") else dict(axis=np.eye(3)[:2] if kind ==
-              "universal" else (0, 1, 0)))) for body, (parent, kind) in enumerate(zip(parents, kinds, strict=True))]
+    hinges = [
+        spo.Hinge(
+            kind,
+            parent,
+            body,
+            **({} if kind in ("fixed", "ball") else dict(axis=np.eye(3)[:2] if kind == "universal" else (0, 1, 0))),
+        )
+        for body, (parent, kind) in enumerate(zip(parents, kinds, strict=True))
+    ]
     scene = spo.Scene(bodies, hinges)
     dyn, q = spo.Dynamics(scene, 2, device=device, dtype="float64"), states(scene, 2)["q"]
     for packed, full, (rows, columns) in (

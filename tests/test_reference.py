@@ -25,8 +25,9 @@ STENCIL = 3e-4  # of unit time: 1e-3 loses a factor 100 where accelerations reac
 
 every_scene = pytest.mark.parametrize("name", zoo.SCENES)
 is_screws = {name: all(h.kind not in ("ball", "free") for h in make().hinges) for name, make in zoo.SCENES.items()}
-is_floating = [name for name, make in zoo.SCENES.items()
-               if any(h.kind == "free" for h in make().hinges if h.parent < 0)]
+is_floating = [
+    name for name, make in zoo.SCENES.items() if any(h.kind == "free" for h in make().hinges if h.parent < 0)
+]
 
 
 @functools.cache
@@ -159,10 +160,22 @@ def test_coordinates_are_newtons():
     pose = lambda: wp.transform(*np.split(zoo.random_pose(rng), [3]))  # noqa: E731
     body = lambda: builder.add_link(mass=1.0, com=rng.uniform(-0.2, 0.2, 3), inertia=wp.mat33(np.eye(3)))  # noqa: E731
     axes = lambda n: [newton.ModelBuilder.JointDofConfig(axis=wp.vec3(v)) for v in zoo.unit(rng, n, 3)]  # noqa: E731
-    square = lambda n: [newton.ModelBuilder.JointDofConfig(axis=wp.vec3(v))  # noqa: E731
-                        for v in np.linalg.qr(rng.normal(size=(3, 3)))[0][:n]]
-    add = [builder.add_joint_free, builder.add_joint_ball, builder.add_joint_revolute, builder.add_joint_free,
-           builder.add_joint_prismatic, builder.add_joint_d6, builder.add_joint_fixed, builder.add_joint_d6]
+    square = (
+        lambda n: [
+            newton.ModelBuilder.JointDofConfig(axis=wp.vec3(v))  # noqa: E731
+            for v in np.linalg.qr(rng.normal(size=(3, 3)))[0][:n]
+        ]
+    )
+    add = [
+        builder.add_joint_free,
+        builder.add_joint_ball,
+        builder.add_joint_revolute,
+        builder.add_joint_free,
+        builder.add_joint_prismatic,
+        builder.add_joint_d6,
+        builder.add_joint_fixed,
+        builder.add_joint_d6,
+    ]
     joints, parent = [], -1
     for joint in add:
         child, extra = body(), {}
@@ -192,8 +205,10 @@ def test_double_pendulum():
     close(d.mass_matrix, m * l**2 * np.array([[5 / 3 + c, 1 / 3 + c / 2], [1 / 3 + c / 2, 1 / 3]]), ORACLE)
     close(np.diag(d.D), m * l**2 * np.array([4 / 3 - 3 / 4 * c**2, 1 / 3]), ORACLE)
     h, c1, c12 = m * l**2 * s / 2, np.cos(q[0]), np.cos(q.sum())
-    bias = [-h * (2 * qd[0] * qd[1] + qd[1] ** 2) + m * g * l * (1.5 * c1 + 0.5 * c12),
-            h * qd[0] ** 2 + 0.5 * m * g * l * c12]
+    bias = [
+        -h * (2 * qd[0] * qd[1] + qd[1] ** 2) + m * g * l * (1.5 * c1 + 0.5 * c12),
+        h * qd[0] ** 2 + 0.5 * m * g * l * c12,
+    ]
     close(d.bias_force(), bias, ORACLE)
     close(d.bias_force(), [12.60392851, 0.3412855], 1e-7)
     close(np.diag(d.D), [0.751036537717704, 0.212333333333333], PUBLISHED)

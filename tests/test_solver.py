@@ -84,8 +84,14 @@ def turned():
     model = replicated(floating(np.random.default_rng(3)), 2)
     model.joint_limit_upper.fill_(1e10)
     model.joint_limit_lower.fill_(-1e10)
-    for name in ("joint_damping", "joint_stiffness", "joint_friction", "joint_armature", "joint_target_ke",
-                 "joint_target_kd"):
+    for name in (
+        "joint_damping",
+        "joint_stiffness",
+        "joint_friction",
+        "joint_armature",
+        "joint_target_ke",
+        "joint_target_kd",
+    ):
         getattr(model, name).zero_()
     model.joint_target_mode.zero_()
     model.joint_velocity_limit.fill_(1e6)
@@ -247,8 +253,12 @@ def test_observables(turned):
         R = rotation(pose[k])
         mass, inertia = model.body_mass.numpy()[k], R @ model.body_inertia.numpy()[k] @ R.T
         w = velocity[k, 3:]
-        need = np.concatenate([mass * (acceleration[k, :3] - model.gravity.numpy()[0]),
-                               inertia @ acceleration[k, 3:] + np.cross(w, inertia @ w)])
+        need = np.concatenate(
+            [
+                mass * (acceleration[k, :3] - model.gravity.numpy()[0]),
+                inertia @ acceleration[k, 3:] + np.cross(w, inertia @ w),
+            ]
+        )
         got = reaction[k] + forces[k]
         if k % 3 < 2:  # a chain of three
             child = reaction[k + 1]

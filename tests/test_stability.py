@@ -74,7 +74,9 @@ def numbered(cell):
 def test_an_arm_is_as_far_from_a_fine_step_as_mujoco_is():
     """Ours is MuJoCo's scheme, so its error at 2 ms is MuJoCo's, of order 1; a step of order 2 is within a percent."""
     scene = zoo.from_parents([-1, 0, 1], ["revolute"] * 3, 8).with_values(
-        joint_damping=np.full(3, 0.05), joint_limit_upper=np.full(3, 0.1), joint_stiffness=np.zeros(3),
+        joint_damping=np.full(3, 0.05),
+        joint_limit_upper=np.full(3, 0.1),
+        joint_stiffness=np.zeros(3),
         joint_armature=np.zeros(3),
     )
     errors = stability.mujoco_errors(scene, np.array([0.3, -0.2, 0.5]), np.array([1.0, -1.0, 0.5]))

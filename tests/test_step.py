@@ -237,8 +237,11 @@ def test_a_free_hinge_without_laws_keeps_its_short_way():
     scene = zoo.single_body("free").with_values(
         joint_armature=np.zeros(6), joint_damping=np.zeros(6), joint_stiffness=np.zeros(6)
     )
-    count = lambda scene: len(symbolic.ordered(  # noqa: E731
-        item.value for item in symbolic.Applications(symbolic.Links(scene), "float64", ("q", "qd")).step()))
+    count = lambda scene: len(
+        symbolic.ordered(  # noqa: E731
+            item.value for item in symbolic.Applications(symbolic.Links(scene), "float64", ("q", "qd")).step()
+        )
+    )
     assert count(scene) * 2 < count(scene.with_values(joint_damping=np.arange(6.0)))
 
 
@@ -346,15 +349,22 @@ def test_float32_settles_on_the_same_pieces(device):
     """
     scene = zoo.SCENES["chain7"]()
     n, count = scene.dof_count, 2048
-    scene = scene.with_values(joint_velocity_limit=np.full(n, 4.0), joint_effort_limit=np.full(n, 30.0),
-                              joint_target_ke=np.full(n, 200.0), joint_target_kd=np.full(n, 20.0),
-                              joint_limit_lower=np.full(n, -2.0), joint_limit_upper=np.full(n, 2.0))
+    scene = scene.with_values(
+        joint_velocity_limit=np.full(n, 4.0),
+        joint_effort_limit=np.full(n, 30.0),
+        joint_target_ke=np.full(n, 200.0),
+        joint_target_kd=np.full(n, 20.0),
+        joint_limit_lower=np.full(n, -2.0),
+        joint_limit_upper=np.full(n, 2.0),
+    )
     a, found = laws.states(scene, count, dtype="float32"), {}
     for dtype in ("float64", "float32"):
         dyn = spo.Dynamics(scene, count, device=device, dtype=dtype)
         status = wp.full(count, -1, dtype=wp.int32, device=device)
-        given = [wp.array(factor * a[name], dtype=dyn.dtype, device=device)
-                 for name, factor in (("q", 1.0), ("qd", 3.0), ("tau", 20.0))]
+        given = [
+            wp.array(factor * a[name], dtype=dyn.dtype, device=device)
+            for name, factor in (("q", 1.0), ("qd", 3.0), ("tau", 20.0))
+        ]
         found[dtype] = dyn.step(*given, H, status=status)[1].numpy(), status.numpy()
     settled = (found["float64"][1] == 0) & (found["float32"][1] == 0)
     assert settled.mean() > 0.99

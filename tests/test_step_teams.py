@@ -172,7 +172,7 @@ def test_a_world_that_does_not_settle_says_so(monkeypatch):
 
 
 # -- planted bugs ------------------------------------------------------------------------------------------------------
-WAIT = '''\'asm volatile("bar.sync 0;" ::: "memory");\', '''
+WAIT = """\'asm volatile("bar.sync 0;" ::: "memory");\', """
 BUGS = {
     "a warp that stops early": (
         straight, "voted", '"const int going = __syncthreads_or(missed_row[0] > 0);"',
@@ -187,6 +187,8 @@ BUGS = {
     "a word unheard": (Step, "_words", "select(less(worst, word), word, worst)", "word"),
 }  # fmt: skip
 NEEDS = {"flags in one place": "roots", "a limb that is not asked": "hand"}
+
+
 def seen(monkeypatch, name):
     """Whether the machine, or a result, shows that something is wrong."""
     text, a, (q, qd, _) = texts_of(monkeypatch, name, status=True)

@@ -34,9 +34,15 @@ def served(reads_pivots):
     return [name for name in GRANULARITIES if name == "node" or not reads_pivots]
 
 
-@pytest.mark.parametrize("case, precision, granularity", [
-    marked(case, case.id, precision, granularity, case.slow)
-    for case in CASES for precision in case.precisions for granularity in served(case.reads_pivots)])
+@pytest.mark.parametrize(
+    "case, precision, granularity",
+    [
+        marked(case, case.id, precision, granularity, case.slow)
+        for case in CASES
+        for precision in case.precisions
+        for granularity in served(case.reads_pivots)
+    ],
+)
 def test_error_obeys_its_law(case, precision, granularity, device):
     skip_unless_served(case.problem.scene, granularity)
     row = stress_measure.row(case, stress_measure.Subject(case.problem, device, granularity), precision)
@@ -44,9 +50,15 @@ def test_error_obeys_its_law(case, precision, granularity, device):
     assert row["ratio"] <= ALLOWED, f"error {row['max_error']:.1e}, law {row['law']:.1e} ({row['source']})"
 
 
-@pytest.mark.parametrize("name, dtype, granularity", [
-    marked(name, name, dtype, granularity) for name in stress_checks.CHECKS for dtype in ("float32", "float64")
-    for granularity in served(name in stress_checks.READS_PIVOTS)])
+@pytest.mark.parametrize(
+    "name, dtype, granularity",
+    [
+        marked(name, name, dtype, granularity)
+        for name in stress_checks.CHECKS
+        for dtype in ("float32", "float64")
+        for granularity in served(name in stress_checks.READS_PIVOTS)
+    ],
+)
 def test_check(name, dtype, granularity, device):
     skip_unless_served(stress_checks.floating_chain(1).scene, granularity)
     stress_checks.CHECKS[name][0](Setting(device, dtype, granularity))
@@ -144,8 +156,9 @@ def test_sweep_is_the_dense_reference(name):
         assert np.abs(got[world] - wanted).max() <= 1e-10 * np.abs(wanted).max()
 
 
-@pytest.mark.parametrize("name", [
-    "S3.chain_grav_torque.n16", "S11.heavy_tip.r1e+10", "S15.gimbal_qdd.e1e-08.delta0.001"])
+@pytest.mark.parametrize(
+    "name", ["S3.chain_grav_torque.n16", "S11.heavy_tip.r1e+10", "S15.gimbal_qdd.e1e-08.delta0.001"]
+)
 def test_extended_precision_is_good_enough(name):
     """Against 50 digits, its error is a hundredth of what float64 leaves."""
     case = next(case for case in CASES if case.id == name)
@@ -158,9 +171,11 @@ def test_extended_precision_is_good_enough(name):
 
 def test_forms_that_the_library_does_not_offer_are_worse(device):
     """Contrast, in float32: a full 6 x 6 P, world axes at a gimbal, the world's origin far away."""
-    for name, form, factor in (("S30.sym_ablation.n64", "full 6 x 6 P", 100.0),
-                               ("S15.gimbal_D0.e1e-08.delta0.001", "world axes", 1e5),
-                               ("S16.far_base.x100", "world origin", 100.0)):
+    for name, form, factor in (
+        ("S30.sym_ablation.n64", "full 6 x 6 P", 100.0),
+        ("S15.gimbal_D0.e1e-08.delta0.001", "world axes", 1e5),
+        ("S16.far_base.x100", "world origin", 100.0),
+    ):
         (case,) = (case for case in CASES if case.id == name)
         ours = stress_measure.row(case, stress_measure.Subject(case.problem, device), "float32")
         theirs = {row["precision"]: row for row in stress_measure.contrasts(case)}[form]

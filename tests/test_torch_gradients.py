@@ -445,8 +445,11 @@ def test_transforms_of_torch_are_refused_by_custom_ops_too(tree):
 # -- planted bugs ------------------------------------------------------------------------------------------------------
 BUGS = {
     "the slope of the forces": ("step_vjp", "h * total(law.piece", "0.0 * total(law.piece"),
-    "what the new velocity moves": ("step_vjp", "dict(zip(dofs, back, strict=False))",
-                                    "{dof: pushed[1](dof) for dof in dofs}"),
+    "what the new velocity moves": (
+        "step_vjp",
+        "dict(zip(dofs, back, strict=False))",
+        "{dof: pushed[1](dof) for dof in dofs}",
+    ),
     "the sign of lambda": ("forward_dynamics_vjp", "lambda dof: -solved(dof)", "lambda dof: solved(dof)"),
     "the turn of a quaternion": ("tangent", "cross(u, g_u)", "cross(g_u, u)"),
     "the arm of a free hinge": ("tangent", "turn - cross(", "turn + cross("),

@@ -216,9 +216,16 @@ def test_literals_are_read_back_as_they_were(dtype):
 
 
 @pytest.mark.parametrize("dtype", TYPES)
-@pytest.mark.parametrize("operation, given", [("forward_dynamics", ("q", "qd", "tau", "body_f")),
-                                              ("inverse_dynamics", ("q", "qd", "qdd")), ("mass_matrix", ("q",)),
-                                              ("mass_matrix_inverse", ("q",)), ("log_det_mass_matrix", ("q",))])
+@pytest.mark.parametrize(
+    "operation, given",
+    [
+        ("forward_dynamics", ("q", "qd", "tau", "body_f")),
+        ("inverse_dynamics", ("q", "qd", "qdd")),
+        ("mass_matrix", ("q",)),
+        ("mass_matrix_inverse", ("q",)),
+        ("log_det_mass_matrix", ("q",)),
+    ],
+)
 def test_the_trace_in_numpy_is_the_kernel(operation, given, dtype, device):
     """The same trace by NumPy in float64: they share the graph and nothing after it."""
     scene = zoo.forest()
@@ -275,8 +282,9 @@ def test_sine_and_cosine(dtype, coordinate, device):
     assert np.isnan(lost).all()
 
 
-@pytest.mark.parametrize("c, old, new", [("float", "(quadrant + 1) & 2", "quadrant & 2"),
-                                         ("float", "-3.13916473e-7f", "-3.13916e-7f")])
+@pytest.mark.parametrize(
+    "c, old, new", [("float", "(quadrant + 1) & 2", "quadrant & 2"), ("float", "-3.13916473e-7f", "-3.13916e-7f")]
+)
 def test_a_wrong_sine_is_seen(c, old, new, device, monkeypatch):
     assert straight.NATIVE[c].count(old) == 1
     monkeypatch.setitem(straight.NATIVE, c, straight.NATIVE[c].replace(old, new))

@@ -85,8 +85,9 @@ def run(text, arrays, backwards=False, further=None, over=None):
     frame, over = text.frame, over or {}
     worlds = len(next(array for name, array in arrays.items() if name not in (*frame.fields, *frame.numbers)))
     rows = {f"{row.name}_row": Shared(row.name, arrays[row.name].reshape(worlds, -1).T) for row in frame.rows}
-    rows |= {f"{row.name}_row": rows[f"{over[row.name]}_row"] if row.name in over else Shared(row.name)
-             for row in frame.more}
+    rows |= {
+        f"{row.name}_row": rows[f"{over[row.name]}_row"] if row.name in over else Shared(row.name) for row in frame.more
+    }
     result = rows[f"{frame.result.row}_row"] if frame.result.way == IN_PLACE else Shared("result")
     result, sent = rows[f"{over['out']}_row"] if "out" in over else result, Shared("sent")
     fields = {name: arrays[name] for name in frame.fields}
@@ -136,7 +137,7 @@ FUNCTIONS = {
 FORMS = [
     (r"^const int going = __syncthreads_or\((.*)\);$", r"going = yield bool((\1).any())"),
     (r"^(?:const )?bool (\w+) = true;$", r"\1 = worlds == worlds"),
-        (r"^if \(open\) (\w+_row\[\d+\]) = (.*);$", r"\1 = where(open, \2, \1)"),
+    (r"^if \(open\) (\w+_row\[\d+\]) = (.*);$", r"\1 = where(open, \2, \1)"),
     (r"^if \(!going\) break;$", "if not going: break"),
     (r"^const int going = (.*);$", r"going = (\1).any()"),
     (r"^(?:const )?(?:float|double) (\w+)\[(\d+)\] = \{\};$", r"\1 = [0.0 * worlds] * \2"),

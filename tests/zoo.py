@@ -60,9 +60,13 @@ def random_hinge(rng, kind, parent, child, axes=None, plain=False):
         arguments["angular"] = np.linalg.qr(rng.normal(size=(3, 3)))[0][: axes[1]]
     if not plain:
         dof = Hinge(kind, parent, child, **arguments).dof_count
-        arguments |= dict(parent_pose=random_pose(rng), child_pose=random_pose(rng, 0.2),
-                          armature=rng.uniform(0.01, 0.2, dof), damping=rng.uniform(0.0, 1.0, dof),
-                          stiffness=rng.uniform(0.0, 5.0, dof))
+        arguments |= dict(
+            parent_pose=random_pose(rng),
+            child_pose=random_pose(rng, 0.2),
+            armature=rng.uniform(0.01, 0.2, dof),
+            damping=rng.uniform(0.0, 1.0, dof),
+            stiffness=rng.uniform(0.0, 5.0, dof),
+        )
     return Hinge(kind, parent, child, **arguments)
 
 
@@ -77,8 +81,10 @@ def from_parents(parents, kinds, seed, hinge_order=None, d6_axes=()):
     rng = np.random.default_rng(seed)
     axes = list(d6_axes)
     bodies = [random_body(rng) for _ in parents]
-    hinges = [random_hinge(rng, kind, int(parent), k, axes=axes.pop() if kind == "d6" and axes else None)
-              for k, (parent, kind) in enumerate(zip(parents, kinds, strict=True))]
+    hinges = [
+        random_hinge(rng, kind, int(parent), k, axes=axes.pop() if kind == "d6" and axes else None)
+        for k, (parent, kind) in enumerate(zip(parents, kinds, strict=True))
+    ]
     order = range(len(hinges)) if hinge_order is None else hinge_order
     return Scene(bodies, [hinges[i] for i in order], gravity=rng.uniform(-9.81, 9.81, 3))
 
@@ -138,8 +144,10 @@ def every_d6(seed=5):
 def plain(n=6, seed=6):
     """A revolute tree whose anchors are the body frames: structural zeros everywhere, no armature."""
     rng = np.random.default_rng(seed)
-    hinges = [Hinge("revolute", (k - 1) // 2, k, axis=np.eye(3)[k % 3],
-                    parent_pose=(0.3 * (k > 0), 0, 0, 0, 0, 0, 1)) for k in range(n)]
+    hinges = [
+        Hinge("revolute", (k - 1) // 2, k, axis=np.eye(3)[k % 3], parent_pose=(0.3 * (k > 0), 0, 0, 0, 0, 0, 1))
+        for k in range(n)
+    ]
     return Scene([random_body(rng) for _ in range(n)], hinges)
 
 
@@ -152,8 +160,9 @@ def rod(mass, length, thin=True):
 
 def planar_chain(n, mass=1.0, length=1.0, gravity=(0.0, -9.81, 0.0)):
     """n equal thin rods in the xy plane, hinges about z; straight along x at q = 0."""
-    hinges = [Hinge("revolute", k - 1, k, axis=(0, 0, 1), parent_pose=(length * (k > 0), 0, 0, 0, 0, 0, 1))
-              for k in range(n)]
+    hinges = [
+        Hinge("revolute", k - 1, k, axis=(0, 0, 1), parent_pose=(length * (k > 0), 0, 0, 0, 0, 0, 1)) for k in range(n)
+    ]
     return Scene([rod(mass, length) for _ in range(n)], hinges, gravity=gravity)
 
 
@@ -175,8 +184,9 @@ def rod_chain(n):
     Returns:
         scene; q [n] uniform in (-0.6, 0.6) of seed 2; tau [n] normal of seed 3.
     """
-    hinges = [Hinge("revolute", k - 1, k, axis=(0, k % 2, 1 - k % 2), parent_pose=(k > 0, 0, 0, 0, 0, 0, 1))
-              for k in range(n)]
+    hinges = [
+        Hinge("revolute", k - 1, k, axis=(0, k % 2, 1 - k % 2), parent_pose=(k > 0, 0, 0, 0, 0, 0, 1)) for k in range(n)
+    ]
     scene = Scene([rod(1.0, 1.0, thin=False) for _ in range(n)], hinges)
     return scene, np.random.default_rng(2).uniform(-0.6, 0.6, n), np.random.default_rng(3).normal(size=n)
 
@@ -208,11 +218,16 @@ def permuted(scene, seed=0):
             moved["pitch"] = edge.pitch
         return kind(**(fields | moved))
 
-    coupled = [Coupling(int(new_hinge[c.hinge]), int(new_hinge[c.reference]), c.ratio, c.offset)
-               for c in scene.couplings]
-    new = Scene([scene.bodies[k] for k in body], [renumbered(scene.hinges[h], Hinge) for h in hinge],
-                gravity=scene.values["gravity"][0], loops=[renumbered(loop, Loop) for loop in scene.loops],
-                couplings=coupled)
+    coupled = [
+        Coupling(int(new_hinge[c.hinge]), int(new_hinge[c.reference]), c.ratio, c.offset) for c in scene.couplings
+    ]
+    new = Scene(
+        [scene.bodies[k] for k in body],
+        [renumbered(scene.hinges[h], Hinge) for h in hinge],
+        gravity=scene.values["gravity"][0],
+        loops=[renumbered(loop, Loop) for loop in scene.loops],
+        couplings=coupled,
+    )
     entries = lambda start: np.concatenate([np.arange(start[h], start[h + 1]) for h in hinge]).astype(int)  # noqa: E731
     q, qd = entries(scene.q_start), entries(scene.qd_start)
     values = {}
@@ -281,8 +296,9 @@ def random_state(scene, worlds=1, seed=0):
     return State(q, *rng.normal(size=(2, worlds, scene.dof_count)))
 
 
-SCENES = {f"one_{kind}": functools.partial(single_body, kind, seed=10 + i) for i, kind in enumerate(KINDS)
-          if kind != "fixed"}
+SCENES = {
+    f"one_{kind}": functools.partial(single_body, kind, seed=10 + i) for i, kind in enumerate(KINDS) if kind != "fixed"
+}
 SCENES |= {
     "one_fixed_then_revolute": functools.partial(from_parents, [-1, 0, 1], ["fixed", "revolute", "fixed"], 9),
     "chain7": functools.partial(chain, 7),

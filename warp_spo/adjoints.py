@@ -291,7 +291,11 @@ class Adjoints:
         return _by_name(names, call.result)
 
     def _step_pulled_back(
-        self, given: dict[str, Any], options: dict[str, Any], results: Sequence[Any], cotangents: Sequence[Any],
+        self,
+        given: dict[str, Any],
+        options: dict[str, Any],
+        results: Sequence[Any],
+        cotangents: Sequence[Any],
         wrt: Sequence[str],
     ) -> dict[str, Any]:
         """Of a step; ``results`` are the new state and the accelerations."""

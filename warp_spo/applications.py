@@ -148,9 +148,7 @@ class Applications:
             self._launch("jacobian_bias", out, q=q, qd=qd, frames=where)
         return call.result
 
-    def frame_accelerations(
-        self, q: Any, qd: Any, qdd: Any, frames: Sequence[Frame], out: Any = None
-    ) -> Any:
+    def frame_accelerations(self, q: Any, qd: Any, qdd: Any, frames: Sequence[Frame], out: Any = None) -> Any:
         """J qdd + J' qd: how the frames accelerate, in one outward sweep; with forward_dynamics, task-space dynamics.
 
         Acceleration of each frame's origin [m/s^2], then angular acceleration [rad/s^2], inertial axes. Gravity is not

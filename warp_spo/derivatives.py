@@ -138,9 +138,7 @@ class Derivatives:
         q, qd = self._read_state(call, q, qd)
         third, body_f = self._read_rate(call, name, third), self._read_body_f(call, body_f)
         shape = (self.worlds, *self._square)
-        outs = tuple(
-            call.write(array, shape, "[world, dof, dof]", name=f"out[{i}]") for i, array in enumerate(out)
-        )
+        outs = tuple(call.write(array, shape, "[world, dof, dof]", name=f"out[{i}]") for i, array in enumerate(out))
         return {"q": q, "qd": qd, name: third, "body_f": body_f}, outs
 
     def _row_by_row(self, given: dict[str, Any], outs: Sequence[wp.array]) -> None:

@@ -91,8 +91,8 @@ def drawn(scene: Scene, count: int, seed: int = 0) -> np.ndarray:
     for hinge, coordinate, dof in zip(scene.hinges, scene.q_start, scene.qd_start, strict=False):
         if hinge.motion != SCREWS:
             turn = rng.normal(size=(count, 4))
-            q[:, coordinate + hinge.coord_count - 4 : coordinate + hinge.coord_count] = (
-                turn / np.linalg.norm(turn, axis=1, keepdims=True)
+            q[:, coordinate + hinge.coord_count - 4 : coordinate + hinge.coord_count] = turn / np.linalg.norm(
+                turn, axis=1, keepdims=True
             )
             continue
         for i in range(hinge.dof_count):
@@ -131,12 +131,17 @@ def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str 
         if len(cluster.dofs) > MOST_DOFS:
             names = list(dict.fromkeys(link.label for link in cluster.links))
             tied = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
-            raise UnsupportedError(call, f"embedding {len(cluster.dofs)} dof that move together ({tied}; "
-                                         f"up to {MOST_DOFS} are)", "use loops='multipliers'")
+            raise UnsupportedError(
+                call,
+                f"embedding {len(cluster.dofs)} dof that move together ({tied}; up to {MOST_DOFS} are)",
+                "use loops='multipliers'",
+            )
     q = closing.closed(drawn(scene, SAMPLES))
     if len(q) == 0:
-        raise ValueError(f"{call}: no configuration was found that closes {scene.ties}; expected anchors that can "
-                         f"meet; loops='cut' leaves them open")
+        raise ValueError(
+            f"{call}: no configuration was found that closes {scene.ties}; expected anchors that can "
+            f"meet; loops='cut' leaves them open"
+        )
     Y = closing.at(q)[1]
     rows: list[int] = []
     free = set(range(scene.dof_count))
@@ -150,8 +155,10 @@ def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str 
             independent = [i for i, dof in enumerate(dofs.tolist()) if dof in wanted]
             if len(independent) != X.shape[2] or not (_hold(X, independent) > RANK).any():
                 labels = [scene.dof_labels[dof] for dof in dofs]
-                raise ValueError(f"{call}: independent names {[labels[i] for i in independent]} of the dofs that move "
-                                 f"together, {labels}; expected {X.shape[2]} that move all of them")
+                raise ValueError(
+                    f"{call}: independent names {[labels[i] for i in independent]} of the dofs that move "
+                    f"together, {labels}; expected {X.shape[2]} that move all of them"
+                )
         free -= set(dofs.tolist()) - set(dofs[independent].tolist())
     if wanted is not None and free != wanted:
         missing = [scene.dof_labels[dof] for dof in sorted(free - wanted)]
@@ -166,8 +173,10 @@ def _numbers(scene: Scene, asked: Sequence[int | str], call: str) -> set[int]:
     for dof in asked:
         number = labels.index(dof) if isinstance(dof, str) and dof in labels else whole(dof)
         if number is None or not 0 <= number < scene.dof_count:
-            raise ValueError(f"{call}: independent names {dof!r}; expected dofs, 0 to {scene.dof_count - 1}, or labels "
-                             f"among {', '.join(labels)}")
+            raise ValueError(
+                f"{call}: independent names {dof!r}; expected dofs, 0 to {scene.dof_count - 1}, or labels "
+                f"among {', '.join(labels)}"
+            )
         found.add(number)
     return found
 

@@ -203,8 +203,9 @@ class Loops(Applications):
         """
         with self._call("loop_multipliers") as call:
             if not self.closed or self.loops != "multipliers":
-                raise UnsupportedError(call.name, f"loops={self.loops!r} without multipliers",
-                                       "build Dynamics with loops='multipliers'")
+                raise UnsupportedError(
+                    call.name, f"loops={self.loops!r} without multipliers", "build Dynamics with loops='multipliers'"
+                )
             if not isinstance(out, tuple | list) or len(out) != 2:
                 raise TypeError(f"{call.name}: out is {out!r}; expected a pair of arrays or None, (multipliers, rank)")
             q, qd = self._read_state(call, q, qd)
@@ -226,8 +227,11 @@ class Loops(Applications):
     def _solution(self) -> tuple[wp.array, wp.array, wp.array]:
         """multipliers [world, row], rank [world], resolved [world, 1]."""
         run = self.recursions
-        return run.array("loop multipliers", self.worlds, self.closure_rows), self._rank, run.array(
-            "loop resolved", self.worlds, 1)
+        return (
+            run.array("loop multipliers", self.worlds, self.closure_rows),
+            self._rank,
+            run.array("loop resolved", self.worlds, 1),
+        )
 
     @functools.cached_property
     def _rank(self) -> wp.array:
@@ -288,19 +292,28 @@ class Loops(Applications):
         if self.embedding is None:
             return
         if held is None:
-            raise UnsupportedError(call.name, "a mask on the device, or one for each world, with loops='embed'",
-                                   "pass a list or a NumPy array [dof]")
+            raise UnsupportedError(
+                call.name,
+                "a mask on the device, or one for each world, with loops='embed'",
+                "pass a list or a NumPy array [dof]",
+            )
         labels = self.scene.dof_labels
         wrong = [labels[dof] for dof, on in enumerate(held) if on and dof not in self.embedding.dofs]
         if wrong:
-            raise UnsupportedError(call.name, f"prescribing {', '.join(wrong)}, which the loops make follow other dofs",
-                                   "name them in Dynamics(independent=...)")
+            raise UnsupportedError(
+                call.name,
+                f"prescribing {', '.join(wrong)}, which the loops make follow other dofs",
+                "name them in Dynamics(independent=...)",
+            )
 
     def _check_closed(self, call: Call) -> None:
         if not self.closed:
             what = f"loops={self.loops!r}" if self.scene.loops or self.scene.couplings else "a scene without loops"
-            raise UnsupportedError(call.name, what, "build Dynamics with loops='embed' or 'multipliers' of a scene "
-                                                    "that has loops or couplings")
+            raise UnsupportedError(
+                call.name,
+                what,
+                "build Dynamics with loops='embed' or 'multipliers' of a scene that has loops or couplings",
+            )
 
     def _check_operation(self, name: str) -> None:
         if self.closed and name in OF_TREES[self.loops]:

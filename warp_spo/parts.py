@@ -346,8 +346,18 @@ class Loop:
     screws: tuple = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        hinge = Hinge(self.kind, self.parent, self.child, self.axis, self.linear, self.angular, self.pitch,
-                      parent_pose=self.parent_pose, child_pose=self.child_pose, label=self.label)
+        hinge = Hinge(
+            self.kind,
+            self.parent,
+            self.child,
+            self.axis,
+            self.linear,
+            self.angular,
+            self.pitch,
+            parent_pose=self.parent_pose,
+            child_pose=self.child_pose,
+            label=self.label,
+        )
         for name in ("kind", "screws", "parent_pose", "child_pose"):
             object.__setattr__(self, name, getattr(hinge, name))
 

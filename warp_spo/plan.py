@@ -217,9 +217,7 @@ def _depth(scene: Scene) -> int:
     return max(depth.values())
 
 
-def _chosen(
-    dofs: int, limbs: int, alike: bool, worlds: int, cuda: bool, dtype: str, varies: bool
-) -> tuple[str, str]:
+def _chosen(dofs: int, limbs: int, alike: bool, worlds: int, cuda: bool, dtype: str, varies: bool) -> tuple[str, str]:
     if dofs == 0:
         return "node", "nothing moves"
     if dofs > MOST_DOFS:

@@ -254,8 +254,10 @@ class Programs:
             ends = [item for item in news if item.array == "out"]
             news = [item for item in news if item.array != "out"] + by_slot(ends)
             branches = later.branch(news), [later.branch(by_slot(turn)) for turn in rounds]
-            team.add(Work(piece, *regions, checking.region(checks), *branches),
-                     sum(each.operations for each in {emitter, checking, later}))
+            team.add(
+                Work(piece, *regions, checking.region(checks), *branches),
+                sum(each.operations for each in {emitter, checking, later}),
+            )
         cuda = team.cuda()  # fills the tables
         registers = _registers(pieces.warps)
         if operation in BLOCKS and dtype == "float32" and not self.plan.few:
@@ -273,8 +275,16 @@ class Programs:
             return item
         return item._replace(index=(staging.flat(item.index, shapes[item.array][1:]),))
 
-    def _finished(self, operation: str, frame: Frame, cuda: str, cpu: str, tables: dict, operations: int,
-                  registers: int | None = None) -> Program:
+    def _finished(
+        self,
+        operation: str,
+        frame: Frame,
+        cuda: str,
+        cpu: str,
+        tables: dict,
+        operations: int,
+        registers: int | None = None,
+    ) -> Program:
         native = straight.assemble(frame, cuda, cpu, self.run.dtype)
         rows, fields = (*(row.name for row in frame.rows), *frame.numbers), tuple(frame.fields)
         arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 0) for name in frame.numbers]
@@ -291,12 +301,19 @@ class Programs:
         arrays += [(name, array.ndim) for name, array in held.items()]
         arrays += [("out", result.array.ndim if entry is None else 3)] + [(row.name, row.ndim) for row in frame.more]
         kernel = straight.kernel(operation, native, arrays, self.run.dtype, registers)
-        return Program(kernel, rows, fields, tuple(held.values()), frame.warps, frame.block, operations, result.slots,
-                       entry)
+        return Program(
+            kernel, rows, fields, tuple(held.values()), frame.warps, frame.block, operations, result.slots, entry
+        )
 
     def _frame(
-        self, operation: str, stores: list[Store], everything: list[Store], shapes: dict, more: tuple,
-        sent: int = 0, warps: int = 1,
+        self,
+        operation: str,
+        stores: list[Store],
+        everything: list[Store],
+        shapes: dict,
+        more: tuple,
+        sent: int = 0,
+        warps: int = 1,
     ) -> Frame:
         ways = self.plan.stages(operation, warps), self.plan.gathers(operation, warps, 1 + len(more))
         return staging.frame(stores, everything, shapes, more, sent, warps, self.run.dtype, *ways, self.relays)

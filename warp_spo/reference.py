@@ -297,8 +297,11 @@ class Dense:
     def _node_jacobian(self):
         """Of every node frame's origin, world axes: velocity, then angular velocity [node, 6, dof]."""
         columns = [self._motion(unit, np.zeros(self.dof_count)) for unit in np.eye(self.dof_count)]
-        return np.stack([np.concatenate([V, W], axis=1) for W, V, _, _ in columns], axis=-1) if columns else np.zeros(
-            (self.body_count, 6, 0))
+        return (
+            np.stack([np.concatenate([V, W], axis=1) for W, V, _, _ in columns], axis=-1)
+            if columns
+            else np.zeros((self.body_count, 6, 0))
+        )
 
     def _jacobian_at(self, body, point):
         J = self._node_jacobian[body].copy()

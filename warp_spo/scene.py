@@ -76,8 +76,14 @@ class Scene:
         DirectedLoopError: hinges whose parents form a directed loop.
     """
 
-    def __init__(self, bodies: Sequence[Body], hinges: Sequence[Hinge], gravity: Any = (0.0, 0.0, -9.81),
-                 loops: Sequence[Loop] = (), couplings: Sequence[Coupling] = ()):
+    def __init__(
+        self,
+        bodies: Sequence[Body],
+        hinges: Sequence[Hinge],
+        gravity: Any = (0.0, 0.0, -9.81),
+        loops: Sequence[Loop] = (),
+        couplings: Sequence[Coupling] = (),
+    ):
         self.bodies, self.hinges = _parts("bodies", bodies, Body), _parts("hinges", hinges, Hinge)
         self.loops, self.couplings = _parts("loops", loops, Loop), _parts("couplings", couplings, Coupling)
         self._check_indices()
@@ -132,15 +138,21 @@ class Scene:
             if not all(isinstance(body, int | np.integer) for body in (hinge.parent, hinge.child)):
                 raise TypeError(f"Scene: {name} joins body {hinge.parent!r} to body {hinge.child!r}; expected integers")
             if not (-1 <= hinge.parent < count and 0 <= hinge.child < count) or hinge.parent == hinge.child:
-                raise ValueError(f"Scene: {name} joins body {hinge.parent} to body {hinge.child}; expected two of "
-                                 f"{count} bodies, -1 being the inertial frame as parent")
+                raise ValueError(
+                    f"Scene: {name} joins body {hinge.parent} to body {hinge.child}; expected two of "
+                    f"{count} bodies, -1 being the inertial frame as parent"
+                )
             if isinstance(hinge, Hinge) and carried.setdefault(hinge.child, name) != name:
-                raise ValueError(f"Scene: body {hinge.child} is the child of {carried[hinge.child]} and of {name}; "
-                                 f"expected one hinge a body: make one of them a Loop")
+                raise ValueError(
+                    f"Scene: body {hinge.child} is the child of {carried[hinge.child]} and of {name}; "
+                    f"expected one hinge a body: make one of them a Loop"
+                )
         if len(carried) < count:
             lost = next(body for body in range(count) if body not in carried)
-            raise ValueError(f"Scene: body {lost} {self.bodies[lost].label!r} is the child of no hinge; expected one "
-                             f"hinge a body: add Hinge('free', -1, {lost}) to let it float")
+            raise ValueError(
+                f"Scene: body {lost} {self.bodies[lost].label!r} is the child of no hinge; expected one "
+                f"hinge a body: add Hinge('free', -1, {lost}) to let it float"
+            )
         for coupling in self.couplings:
             if coupling.hinge == coupling.reference:
                 raise ValueError(f"Scene: a coupling ties hinge {coupling.hinge} to itself; expected two hinges")
@@ -150,8 +162,10 @@ class Scene:
                 if not isinstance(index, int | np.integer):
                     raise TypeError(f"Scene: a coupling names hinge {index!r}; expected an integer")
                 if not 0 <= index < len(self.hinges) or self.hinges[index].coord_count != 1:
-                    raise ValueError(f"Scene: a coupling names hinge {index}; expected one of {len(self.hinges)} "
-                                     f"hinges with one coordinate")
+                    raise ValueError(
+                        f"Scene: a coupling names hinge {index}; expected one of {len(self.hinges)} "
+                        f"hinges with one coordinate"
+                    )
 
     # -- sizes and names -------------------------------------------------------------------------------------------
     @property
@@ -193,8 +207,11 @@ class Scene:
 
     @property
     def dof_labels(self) -> list[str]:
-        return [label if hinge.dof_count == 1 else f"{label}:{i}"
-                for label, hinge in zip(self.joint_labels, self.hinges, strict=True) for i in range(hinge.dof_count)]
+        return [
+            label if hinge.dof_count == 1 else f"{label}:{i}"
+            for label, hinge in zip(self.joint_labels, self.hinges, strict=True)
+            for i in range(hinge.dof_count)
+        ]
 
     @property
     def ties(self) -> str:
@@ -246,8 +263,10 @@ class Scene:
         if array.shape == shape:
             array = array[None]
         if array.shape[1:] != shape or array.ndim != len(shape) + 1 or array.shape[0] == 0:
-            raise ValueError(f"{call}: {name} has shape {np.shape(value)}; expected {shape} or (worlds, "
-                             f"{', '.join(map(str, shape))})")
+            raise ValueError(
+                f"{call}: {name} has shape {np.shape(value)}; expected {shape} or (worlds, "
+                f"{', '.join(map(str, shape))})"
+            )
         if not np.isfinite(array).all():
             raise ValueError(f"{call}: {name} holds NaN or infinity; expected finite numbers")
         if name in ("joint_X_p", "joint_X_c"):
@@ -258,5 +277,7 @@ class Scene:
         return read_only(array)
 
     def __repr__(self) -> str:
-        return (f"Scene({self.body_count} bodies, {self.dof_count} dof, depth {self.tree.depth}, "
-                f"{len(self.loops)} loops, {self.worlds} world(s))")
+        return (
+            f"Scene({self.body_count} bodies, {self.dof_count} dof, depth {self.tree.depth}, "
+            f"{len(self.loops)} loops, {self.worlds} world(s))"
+        )

@@ -84,8 +84,11 @@ def read_before(stores: list[Store], everything: list[Store], row: str) -> bool:
             graphs.setdefault(id(item.value.graph), []).append(item.value)
     for symbols in graphs.values():
         read = {s.args[1]: s.number for s in ordered(symbols) if s.op == "input" and s.args[0] == row}
-        done = {item.index[0]: item.value.number if not is_constant(item.value) else -1 for item in stores
-                if is_constant(item.value) or item.value.graph is symbols[0].graph}
+        done = {
+            item.index[0]: item.value.number if not is_constant(item.value) else -1
+            for item in stores
+            if is_constant(item.value) or item.value.graph is symbols[0].graph
+        }
         if any(number > done.get(entry, number) for entry, number in read.items()):
             return False
     return True

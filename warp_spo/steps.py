@@ -235,8 +235,9 @@ class Steps:
         self._combine(2.0, qd_at, -1.0, qd, qd_next)
         self._finish(q_next, qd_next, q_out, qd_out)
 
-    def _rk4(self, call: Call, q: Any, qd: Any, q_out: Any, qd_out: Any, dt: float, tau: Any, body_f: Any,
-             **targets: Any) -> None:
+    def _rk4(
+        self, call: Call, q: Any, qd: Any, q_out: Any, qd_out: Any, dt: float, tau: Any, body_f: Any, **targets: Any
+    ) -> None:
         """Classical Runge-Kutta in the coordinates, quaternions included, which are normalised at the end."""
         values = self.scene.values
         if values["joint_friction"].any() or (abs(values["joint_velocity_limit"]) < DEFAULT_BOUND).any():

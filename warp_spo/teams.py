@@ -142,8 +142,11 @@ class Team:
         names = ["", *(f"i{at}_" for at in range(len(ranks) - 1))]
         kept = {name: max(work.piece.weight for work in rank.values()) for name, rank in zip(names, ranks, strict=True)}
         text = [self.passes.declared(kept, self.c)]
-        text += [straight.once(a_pass, BARRIER, self.c) if self.passes.flags is None else
-                 straight.voted(a_pass, self.passes.flags, self.pieces.warps, self.c)]
+        text += [
+            straight.once(a_pass, BARRIER, self.c)
+            if self.passes.flags is None
+            else straight.voted(a_pass, self.passes.flags, self.pieces.warps, self.c)
+        ]
         for last in (False, True):
             found = []
             for at, (name, rank) in enumerate(zip(names, ranks, strict=True)):
@@ -206,8 +209,13 @@ class Team:
             inside = [head, body]
             if several:
                 starts = itertools.accumulate(counts.values(), initial=0)
-                inside = [f"const int {name}first = {_chosen(warps, starts)};", "#pragma unroll 1",
-                          f"for (int turn = 0; turn < {_chosen(warps, counts.values())}; ++turn) {{", *inside, "}"]
+                inside = [
+                    f"const int {name}first = {_chosen(warps, starts)};",
+                    "#pragma unroll 1",
+                    f"for (int turn = 0; turn < {_chosen(warps, counts.values())}; ++turn) {{",
+                    *inside,
+                    "}",
+                ]
             text.append("\n".join([f"{condition}{{", *inside, "}"]))
         return "\n".join(text)
 

@@ -50,7 +50,7 @@ def _find_loop(edges: Sequence[tuple[int, int]], among: set[int]) -> list[int]:
     while node not in seen:
         seen.append(node)
         node = parent_of[node]
-    return seen[seen.index(node):][::-1]
+    return seen[seen.index(node) :][::-1]
 
 
 class Digraph:

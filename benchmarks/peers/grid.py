@@ -87,7 +87,6 @@ class Grid(Peer):
                     yield row
 
 
-
 def build(out: Path, name: str, robot: Robot, arch: str) -> None:
     """Write ``grid_NAME`` into the folder ``out``.
 

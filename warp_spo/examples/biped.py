@@ -43,8 +43,10 @@ def main(seconds=0.2, dt=1e-3):
     q, qd = dyn.project(q + 0.1 * rng.normal(size=q.shape), qd, iterations=8)
     tau = rng.normal(size=qd.shape)
     one, two = dyn.forward_dynamics(q, qd, tau), lag.forward_dynamics(q, qd, tau)
-    print(f"{dyn.scene.dof_count} dofs, {len(dyn.independent_dofs)} independent; embedding and multipliers differ by "
-          f"{np.abs(one - two).max() / np.abs(one).max():.1e}")
+    print(
+        f"{dyn.scene.dof_count} dofs, {len(dyn.independent_dofs)} independent; embedding and multipliers differ by "
+        f"{np.abs(one - two).max() / np.abs(one).max():.1e}"
+    )
     for _ in range(round(seconds / dt)):
         q, qd = dyn.step(q, qd, None, dt)
     print(f"after {seconds} s of free fall the rods are open by {np.abs(dyn.closure_error(q)).max():.1e} m")

@@ -29,8 +29,10 @@ def main(samples=20_000, seed=0):
     innovation = T - (ops.H @ ops.psi @ ops.K) @ T
     Mass, D = dyn.mass_matrix(q)[0], np.array(ops.D.dense())[0]
     errors = [np.abs(np.cov(x.T) - wanted).max() / np.abs(wanted).max() for x, wanted in ((T, Mass), (innovation, D))]
-    print(f"{samples} samples: the covariance of T is Mass up to {errors[0]:.1e}, that of the innovations is D up to "
-          f"{errors[1]:.1e}; chance leaves {samples**-0.5:.0e}")
+    print(
+        f"{samples} samples: the covariance of T is Mass up to {errors[0]:.1e}, that of the innovations is D up to "
+        f"{errors[1]:.1e}; chance leaves {samples**-0.5:.0e}"
+    )
     return errors
 
 

@@ -49,8 +49,10 @@ def main(seconds=2.0, dt=2e-3, seed=0, picture=None):
         drawn.append(np.linalg.norm(error, axis=1))
         path.append(np.stack([center + circle[0] - error, q[:, :3]]))
     late = np.max(drawn[len(drawn) // 2 :])
-    print(f"the hand is within {1e3 * late:.1f} mm of its circle; the base has moved by up to "
-          f"{1e3 * np.linalg.norm(q[:, :3], axis=1).max():.0f} mm")
+    print(
+        f"the hand is within {1e3 * late:.1f} mm of its circle; the base has moved by up to "
+        f"{1e3 * np.linalg.norm(q[:, :3], axis=1).max():.0f} mm"
+    )
     if picture:
         with drawing(picture, "paths of hand and base, y and z [m]", "the hand's distance from its circle [m]") as axes:
             axes[0].plot(*np.moveaxis(np.array(path)[:, :, 0, 1:], -1, 0))

@@ -53,8 +53,10 @@ def main(steps=1000, noise=1.0, iterations=6, seed=0, picture=None):
         change = torch.linalg.lstsq(torch.cat(rows), -missed.detach().T.reshape(-1, 1)).solution
         guesses.append(guesses[-1] + change[:, 0])
     found, right = guesses[-1].numpy(), np.array(MASSES + DAMPING)
-    print(f"{steps} steps: masses {found[:3].round(3)} kg, damping {found[3:].round(3)} N m s, off by "
-          f"{np.abs(found - right).max():.1e}")
+    print(
+        f"{steps} steps: masses {found[:3].round(3)} kg, damping {found[3:].round(3)} N m s, off by "
+        f"{np.abs(found - right).max():.1e}"
+    )
     if picture:
         with drawing(picture, "masses [kg]", "damping [N m s]") as axes:
             for each, lines, dashed in zip(axes, np.hsplit(np.array(guesses), 2), np.split(right, 2), strict=True):

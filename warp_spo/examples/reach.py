@@ -50,8 +50,10 @@ def main(worlds=8, iterations=30, seed=0, picture=None):
         loss.backward()
         optimizer.step()
         losses.append(loss.item())
-    print(f"{iterations} gradients through {STEPS} steps of {worlds} arms: the loss falls from {losses[0]:.3g} to "
-          f"{losses[-1]:.3g}, hands are {1e2 * off.detach().sqrt().mean():.1f} cm off")
+    print(
+        f"{iterations} gradients through {STEPS} steps of {worlds} arms: the loss falls from {losses[0]:.3g} to "
+        f"{losses[-1]:.3g}, hands are {1e2 * off.detach().sqrt().mean():.1f} cm off"
+    )
     if picture:
         paths = torch.stack([hand(dyn.body_poses(q)) for q in path]) - targets
         with drawing(picture, "loss", "the hands' distance from their targets [m]") as (left, right):

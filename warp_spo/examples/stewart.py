@@ -28,8 +28,18 @@ def scene(stiffness=2000.0):
         upright = (*-np.array(tilt[:3]), tilt[3])
         bodies += [bar(0.5, 0.5, axis=2), bar(0.5, 0.5, axis=2)]
         hinges.append(spo.Hinge("universal", -1, 2 * i, axis=((1, 0, 0), (0, 1, 0)), parent_pose=at(*foot, tilt)))
-        hinges.append(spo.Hinge("prismatic", 2 * i, 2 * i + 1, axis=(0, 0, 1), parent_pose=at(z=length - 0.5),
-                                stiffness=stiffness, damping=50.0, label=f"leg {i}"))
+        hinges.append(
+            spo.Hinge(
+                "prismatic",
+                2 * i,
+                2 * i + 1,
+                axis=(0, 0, 1),
+                parent_pose=at(z=length - 0.5),
+                stiffness=stiffness,
+                damping=50.0,
+                label=f"leg {i}",
+            )
+        )
         if i > 0:
             loops.append(spo.Loop("ball", 2 * i + 1, 12, parent_pose=at(z=0.5), child_pose=at(*top)))
         else:
@@ -46,8 +56,10 @@ def main(seconds=0.5, dt=1e-3):
     for _ in range(round(seconds / dt)):
         q, qd = dyn.step(q, qd, None, dt)
     x, y, z = dyn.body_poses(q)[0, 12, :3]
-    print(f"after {seconds} s the platform is at {x:.4f}, {y:.4f}, {z:.4f} m; balls open by "
-          f"{np.abs(dyn.closure_error(q)).max():.1e} m")
+    print(
+        f"after {seconds} s the platform is at {x:.4f}, {y:.4f}, {z:.4f} m; balls open by "
+        f"{np.abs(dyn.closure_error(q)).max():.1e} m"
+    )
 
 
 if __name__ == "__main__":

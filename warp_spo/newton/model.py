@@ -31,6 +31,7 @@ ROUNDING = 1e-3  # relative: a quaternion or axis nearer than this to unit lengt
 ASYMMETRY = 1e-6  # relative: R I R^T in float32 leaves a few 1e-7
 OBLIQUE = 1e-3  # cosine: D6 axes nearer than this to a right angle are orthogonal up to a file's digits
 
+
 def from_newton(model: newton.Model) -> Scene:
     """The scene of a finalized model.
 

@@ -430,8 +430,10 @@ class SolverSPO(Plugs, SolverBase):
     def _difference(self, name: str) -> str:
         """What the solver uses and the model holds, where they first differ; empty if they do not."""
         used, held = self._used[name].numpy(), getattr(self.model, name).numpy()
-        differ = np.argwhere((used != held) & ~(np.isnan(used) & np.isnan(held))) if used.dtype.kind == "f" else (
-            np.argwhere(used != held)
+        differ = (
+            np.argwhere((used != held) & ~(np.isnan(used) & np.isnan(held)))
+            if used.dtype.kind == "f"
+            else (np.argwhere(used != held))
         )
         if not len(differ):
             return ""

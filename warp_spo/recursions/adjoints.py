@@ -111,8 +111,15 @@ class Adjoints(Derivatives):
         back = reverse(results, [*after.values(), *ends], seeds)
         found = dict(zip((x.args for x in ends), back[len(dofs) :], strict=True))
         rates = dict(zip(dofs, back, strict=False))
-        impedance = Impedance(self.links, h, self.vector("q"), qd, None,
-                              self.vector("target_q") if "target_q" in self.given else None, self.vector("target_qd"))
+        impedance = Impedance(
+            self.links,
+            h,
+            self.vector("q"),
+            qd,
+            None,
+            self.vector("target_q") if "target_q" in self.given else None,
+            self.vector("target_qd"),
+        )
         forces: dict[int, Value] = {}
         stiff: dict[int, Value] = {}
 

@@ -226,8 +226,11 @@ def _directions(loop: Loop) -> tuple[list[Vector], list[Vector], list[tuple[Vect
     turns = [np.array(axis) for axis, angular, _ in loop.screws if angular]
     slides = [np.array(axis) for axis, angular, _ in loop.screws if not angular]
     if loop.kind == "helical":
-        raise UnsupportedError(call, "a helical joint that closes a loop",
-                               "make it a hinge of the tree and close the loop at another joint")
+        raise UnsupportedError(
+            call,
+            "a helical joint that closes a loop",
+            "make it a hinge of the tree and close the loop at another joint",
+        )
     if loop.kind in ("ball", "free"):
         turns = list(np.eye(3))
     if loop.kind == "free":

@@ -185,9 +185,7 @@ def factor(
         carried[key] = NO_INERTIA if link.parent is None else places[key].pose.articulated_to_parent(P)
         if link.parent is None or id(link.parent) not in inside:
             handed = handed + carried[key]
-    MX = [
-        {row: total(M.get((row, dof), 0.0) * x for dof, x in column.items()) for row in cluster.dofs} for column in X
-    ]
+    MX = [{row: total(M.get((row, dof), 0.0) * x for dof, x in column.items()) for row in cluster.dofs} for column in X]
     U = [Vector(total(F[dof][c] * x for dof, x in column.items()) for c in range(6)) for column in X]
     D = [[total(x * MX[j][dof] for dof, x in X[i].items()) for j in range(i + 1)] for i in range(len(X))]
     root = {dof: sqrt(M[dof, dof]) for dof in cluster.dofs}
@@ -256,9 +254,7 @@ def hinge_forces(
     return tau, handed
 
 
-def expanded(
-    cluster: Cluster, done: Factor, rates: list[Value], k: Columns, above: tuple[Vector, Vector]
-) -> Columns:
+def expanded(cluster: Cluster, done: Factor, rates: list[Value], k: Columns, above: tuple[Vector, Vector]) -> Columns:
     """qdd by dof, for rates = D^-1 eps and the acceleration ``above`` of the parent."""
     alpha = (*above[0], *above[1])
     y = [a - b for a, b in zip(rates, done.solve([dot(column, alpha) for column in done.U]), strict=True)]

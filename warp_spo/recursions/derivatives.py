@@ -172,5 +172,3 @@ class Derivatives(Applications):
 
 def _power(velocity: tuple[Vector, Vector], momentum: tuple[Vector, Vector]) -> Value:
     return dot(velocity[0], momentum[0]) + dot(velocity[1], momentum[1])
-
-

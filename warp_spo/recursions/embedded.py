@@ -179,9 +179,7 @@ class Embedded(Applications):
         key = id(cluster)
         swept.demanded[key] = k
         self.at_cluster(cluster, "D")
-        swept.clusters[key] = done = aggregates.factor(
-            cluster, space, self.places, own, self.epsilon, self.stiffened
-        )
+        swept.clusters[key] = done = aggregates.factor(cluster, space, self.places, own, self.epsilon, self.stiffened)
         self.at_cluster(cluster, "z")
         t, force = aggregates.hinge_forces(
             cluster, self.places, self.motions, own, z, lambda dof: k.get(dof, 0.0), self.stiffened

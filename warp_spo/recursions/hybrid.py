@@ -100,5 +100,3 @@ def expanded(
         tau.append(select(held, along + pivot.D * qdd[-1] + head, b))
         alpha = alpha + pivot.column * qdd[-1]
     return qdd, tau, (Vector(alpha[:3]), Vector(alpha[3:]))
-
-

@@ -227,8 +227,11 @@ class Impedance:
                 continue
             if link.motion in TURNING:
                 label = self.scene.dof_labels[dof]
-                raise UnsupportedError("Dynamics.step", f"a limit on {label!r}, a dof of a ball or free hinge,",
-                                       f"leave {name} at {-inward * UNLIMITED:.0e} there")
+                raise UnsupportedError(
+                    "Dynamics.step",
+                    f"a limit on {label!r}, a dof of a ball or free hinge,",
+                    f"leave {name} at {-inward * UNLIMITED:.0e} there",
+                )
             depth = inward * (bound - self.q(link.coordinate + i))  # how far outside; positive there
             k, d = self.value("joint_limit_ke", dof), self.value("joint_limit_kd", dof)
             d = select(less(0.0, depth), d, 0.0)

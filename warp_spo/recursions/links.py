@@ -207,16 +207,23 @@ class Links:
             R, p = R_a.T @ R, R_a.T @ (p - p_a)
         R_c, p_c = poses["joint_X_c"][scene.hinge_of[node]]
         com = _numbers(R_c.T @ (self._values["body_com"][node] - p_c))
-        return Node((_folded(R), Vector(p.tolist())), (_folded(R_c), Vector(p_c.tolist())), Vector(com.tolist()),
-                    self._rigid(node, R_c, com))
+        return Node(
+            (_folded(R), Vector(p.tolist())),
+            (_folded(R_c), Vector(p_c.tolist())),
+            Vector(com.tolist()),
+            self._rigid(node, R_c, com),
+        )
 
     def _rigid(self, node: int, R: np.ndarray, c: np.ndarray) -> Rigid:
         """Inertia of the body about the origin of its node frame, for its CoM ``c`` in it."""
         mass = self._values["body_mass"][node : node + 1]
         inertia = R.T @ self._values["body_inertia"][node] @ R + (np.eye(3) * (c @ c) - np.outer(c, c)) * mass
         J = (0.5 * (inertia + inertia.T)).tolist()
-        return Rigid(mass.tolist()[0], Vector((c * mass).tolist()),
-                     symmetric(J[0][0], J[1][1], J[2][2], J[0][1], J[0][2], J[1][2]))
+        return Rigid(
+            mass.tolist()[0],
+            Vector((c * mass).tolist()),
+            symmetric(J[0][0], J[1][1], J[2][2], J[0][1], J[0][2], J[1][2]),
+        )
 
     def seat(self, body: int, pose: np.ndarray) -> Seat:
         """Where a frame of a body, or with -1 of the inertial frame, sits."""
@@ -259,8 +266,9 @@ class Links:
                 motion = SLIDE if angular == 0.0 else TURN if linear == 0.0 else HELIX
                 pitch = linear / angular if motion is HELIX else 0.0
                 armature = (armatures[dof + i],)
-                link = self._append(link, motion, matrix @ align, offset, pitch, (dof + i,), coordinate + i, armature,
-                                    node, label)
+                link = self._append(
+                    link, motion, matrix @ align, offset, pitch, (dof + i,), coordinate + i, armature, node, label
+                )
                 matrix, offset = align.T, ZERO
             rest = Seat(link, matrix, offset)
         else:
@@ -306,8 +314,19 @@ class Links:
             if _price(kept) + _price(after) < _price(own) + _price(before):
                 link.grouped, parent.grouped = kept, after
 
-    def _append(self, parent: Link | None, motion: Any, matrix: Matrix, offset: Vector, pitch: float,
-                dofs: tuple, coordinate: int, armature: tuple, node: int, label: str) -> Link:
+    def _append(
+        self,
+        parent: Link | None,
+        motion: Any,
+        matrix: Matrix,
+        offset: Vector,
+        pitch: float,
+        dofs: tuple,
+        coordinate: int,
+        armature: tuple,
+        node: int,
+        label: str,
+    ) -> Link:
         link = Link(parent, motion, _still(matrix), offset, pitch, dofs, coordinate, armature, node, label)
         self.links.append(link)
         if parent is not None:
@@ -411,4 +430,3 @@ def _aligned(axis: np.ndarray) -> Matrix:
         x = x - z * (x @ z)
         x /= np.linalg.norm(x)
     return Matrix.of(np.stack([x, np.cross(z, x), z], axis=1).tolist())
-

@@ -129,19 +129,22 @@ class Minimal(Embedded):
         """out [independent dof, independent dof] = (X* Mass X)^-1"""
         swept = self.sweep(how, lambda dof: 0.0, moves=False, loads=False)
         carrier = {dof: link for link in self.links.links for dof in link.dofs}
-        return self._products(swept, {
-            i: self._inward(swept, carrier[dof], NO_FORCE, {dof: 1.0}) for i, dof in enumerate(how.dofs)
-        })
+        return self._products(
+            swept, {i: self._inward(swept, carrier[dof], NO_FORCE, {dof: 1.0}) for i, dof in enumerate(how.dofs)}
+        )
 
     def embedded_operational_inertia_inverse(self, frames: tuple, how: Embedding) -> list[Store]:
         """out [6 frames, 6 frames] = J X (X* Mass X)^-1 X* J*"""
         for link in self.links.links:
             self.place_axes(link)
         swept = self.sweep(how, lambda dof: 0.0, moves=False, loads=False)
-        return self._products(swept, {
-            row: {} if link is None else self._inward(swept, link, wrench, {})
-            for row, (link, wrench) in enumerate(self.unit_wrenches(frames))
-        })
+        return self._products(
+            swept,
+            {
+                row: {} if link is None else self._inward(swept, link, wrench, {})
+                for row, (link, wrench) in enumerate(self.unit_wrenches(frames))
+            },
+        )
 
     def embedded_operational_inertia_inverse_product(self, frames: tuple, how: Embedding) -> list[Store]:
         """out [frame, 6] = J X (X* Mass X)^-1 X* J* x: wrenches inward, the accelerations that they make outward"""

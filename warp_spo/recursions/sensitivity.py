@@ -137,7 +137,12 @@ def _lever(arm: Vector, f: Vector) -> Matrix:
 
 
 def of_coordinates(
-    link: Link, place: Placed, motion: Motion, parent: Motion, above: tuple[Vector, Vector], own: tuple[Vector, Vector],
+    link: Link,
+    place: Placed,
+    motion: Motion,
+    parent: Motion,
+    above: tuple[Vector, Vector],
+    own: tuple[Vector, Vector],
     rates: object,
 ) -> list[Sensitivity]:
     """Per unit displacement along each dof of a link.
@@ -172,9 +177,7 @@ def of_rates(link: Link, place: Placed, motion: Motion, parent: Motion) -> list[
     """Per unit of each rate of a link."""
     spin_c = place.pose.to_child(parent.spin)
     both = spin_c + motion.spin
-    return [
-        Sensitivity(ZERO, ZERO, w, cross(both, w), cross(spin_c, v) * 2.0) for w, v in columns(link, place)
-    ]
+    return [Sensitivity(ZERO, ZERO, w, cross(both, w), cross(spin_c, v) * 2.0) for w, v in columns(link, place)]
 
 
 def columns(link: Link, place: Placed) -> list[tuple[Vector, Vector]]:

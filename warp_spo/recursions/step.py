@@ -263,8 +263,15 @@ def _finite(values: list[Value]) -> Value:
 
 def hinge_force(trace: Trace) -> list[Store]:
     """out = the forces of all laws as they are at q, qd."""
-    impedance = Impedance(trace.links, 0.0, trace.vector("q"), trace.vector("qd"), None,
-                          trace.vector("target_q") if "target_q" in trace.given else None, trace.vector("target_qd"))
+    impedance = Impedance(
+        trace.links,
+        0.0,
+        trace.vector("q"),
+        trace.vector("qd"),
+        None,
+        trace.vector("target_q") if "target_q" in trace.given else None,
+        trace.vector("target_qd"),
+    )
     stores = []
     for link in trace.links.links:
         trace.at(link, "f")

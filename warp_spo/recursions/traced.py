@@ -20,7 +20,6 @@ from .pieces import Piece
 EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}
 
 
-
 class Trace:
     """One evaluation of a scene, or of one piece of it: what is shared between the operations on it.
 
@@ -456,7 +455,8 @@ class Trace:
 def pivots(done: dict[int, articulated.Factor]) -> tuple[dict[int, list[Value]], Value]:
     """D by link, and NaN where a pivot is lost that nobody would notice."""
     return {key: [pivot.D for pivot in factor.pivots] for key, factor in done.items()}, total(
-        factor.nothing for factor in done.values())
+        factor.nothing for factor in done.values()
+    )
 
 
 def _mirrored(i: int, j: int, value: Value) -> list[tuple[tuple[int, int], Value]]:

@@ -14,8 +14,19 @@ from .graph import Scalar, Value, is_constant, ordered
 
 C_TYPE = {"float32": "float", "float64": "double"}
 BINARY = {"add": "+", "sub": "-", "mul": "*", "quotient": "/"}
-COST = {"add": 1, "sub": 1, "mul": 1, "neg": 0, "cut": 0, "absolute": 0, "guarded": 1, "select": 1, "less": 1,
-        "lost": 1, "input": 0}
+COST = {
+    "add": 1,
+    "sub": 1,
+    "mul": 1,
+    "neg": 0,
+    "cut": 0,
+    "absolute": 0,
+    "guarded": 1,
+    "select": 1,
+    "less": 1,
+    "lost": 1,
+    "input": 0,
+}
 COST_ELSE = 8  # about what a sine, a root or a reciprocal takes in additions
 
 
