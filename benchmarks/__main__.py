@@ -11,8 +11,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_spo import report as pages
 from warp_spo.__main__ import find_device
+from warp_spo.trials import report as pages
 
 from . import cases as data
 from . import everything, evidence, parts, pictures, report, roofline, runner, table

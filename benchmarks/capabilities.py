@@ -30,8 +30,8 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.operations import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
-from warp_spo.trial import Subject, Trial, all_finite
+from warp_spo.trials.operations import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
+from warp_spo.trials.trial import Subject, Trial, all_finite
 
 from . import robots, runner
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.operations import OPERATIONS
+from warp_spo.trials.operations import OPERATIONS
 
 from . import robots
 from .precisions import PRECISIONS

@@ -26,10 +26,10 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
-from warp_spo import dynamics, programs
+from warp_spo.dynamics import dynamics
+from warp_spo.dynamics.preparation import PRODUCTS, TAKES
 from warp_spo.examples import biped, fivebar, fourbar, slider_crank, stewart
 from warp_spo.kernels import straight
-from warp_spo.preparation import PRODUCTS, TAKES
 
 from . import robots, shapes
 

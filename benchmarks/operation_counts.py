@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import warp_spo as spo
-from warp_spo.operations import two_frames
-from warp_spo.parts import FREE, SCREWS
+from warp_spo.scene.parts import FREE, SCREWS
+from warp_spo.trials.operations import two_frames
 
 ADD, DOT, CROSS, ROTATE, MATMUL = 3, 5, 9, 15, 45  # of 3-vectors; matrix by vector; matrix by matrix
 SYMMETRIC = 30  # R (S R^T) of a symmetric matrix, of which 6 numbers are wanted, after S R^T

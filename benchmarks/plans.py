@@ -16,8 +16,8 @@ import warp as wp
 
 import warp_spo as spo
 from warp_spo.kernels.straight import WARP
-from warp_spo.operations import OPERATIONS, Inputs
-from warp_spo.trial import Subject, Trial
+from warp_spo.trials.operations import OPERATIONS, Inputs
+from warp_spo.trials.trial import Subject, Trial
 
 sys.path.append(str(Path(__file__).parent.parent / "tests"))  # the trees are those of the tests
 import zoo

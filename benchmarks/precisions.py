@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 import warp_spo as spo
-from warp_spo.operations import OPERATIONS, TOLERANCE, Inputs, Operation
-from warp_spo.trial import Subject
+from warp_spo.trials.operations import OPERATIONS, TOLERANCE, Inputs, Operation
+from warp_spo.trials.trial import Subject
 
 HEADLINE = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "solve_mass_matrix")
 REFINED = ("forward_dynamics", "solve_mass_matrix")

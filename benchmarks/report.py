@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from warp_spo import report as pages
+from warp_spo.trials import report as pages
 
 from . import pictures
 from .evidence import Evidence

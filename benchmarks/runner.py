@@ -19,9 +19,9 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.operations import Inputs
 from warp_spo.reference import Dense
-from warp_spo.trial import Trial
+from warp_spo.trials.operations import Inputs
+from warp_spo.trials.trial import Trial
 
 from . import roofline
 from .cases import FACTORIES, case_name
@@ -46,7 +46,7 @@ def run(
     Rows have ``error``, ``error_median`` and ``error_p99`` (relative, over ``sample`` worlds of each set of inputs, and
     over the timed run; NaN if any is), ``backward_error`` (the largest, where the result solves an
     equation), ``reference`` ("dense", or "float64" for recursions), ``compile_s`` (first call, see
-    :class:`warp_spo.trial.Trial`), ``launches``, on CUDA ``registers`` and ``local_bytes`` (the largest of a kernel's
+    ``Trial``), ``launches``, on CUDA ``registers`` and ``local_bytes`` (the largest of a kernel's
     threads), ``granularity``, ``chosen`` (by the plan, not asked for), sizes of the scene and, unless ``check``:
 
     * ``us`` (median of one evaluation of all worlds; CUDA: in a graph of many), ``p10_us``, ``p90_us``, ``spread``

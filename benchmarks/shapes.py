@@ -66,7 +66,7 @@ SHAPES = {
 class Recursive:
     """Stands in for the dense reference: the float64 recursions at node granularity, on the CPU.
 
-    ``Recursive(scene)`` is a ``reference`` of :class:`warp_spo.operations.Inputs`.
+    ``Recursive(scene)`` is a ``reference`` of :class:`warp_spo.trials.operations.Inputs`.
     """
 
     def __init__(self, scene: spo.Scene):

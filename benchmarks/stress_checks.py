@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.parameters import VARIABLE
+from warp_spo.execution.parameters import VARIABLE
 
 from . import stress_scenes as scenes
 from .exact import Sweep

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from warp_spo.operations import OPERATIONS
+from warp_spo.trials.operations import OPERATIONS
 
 from .cases import SCENES
 from .evidence import RESULTS, ROOT, Evidence, usual_worlds

@@ -14,8 +14,8 @@ from typing import Any
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.operations import OPERATIONS, TOLERANCE, Inputs
-from warp_spo.trial import Subject, Trial
+from warp_spo.trials.operations import OPERATIONS, TOLERANCE, Inputs
+from warp_spo.trials.trial import Subject, Trial
 
 from .cases import SCENES
 from .resources import recorded, resources

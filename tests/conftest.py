@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_spo import plan
+from warp_spo.execution import plan
 
 wp.config.log_level = wp.LOG_WARNING
 

@@ -4,7 +4,7 @@ import pytest
 
 import warp_spo as spo
 from warp_spo.errors import UnsupportedError
-from warp_spo.plan import MOST_DOFS
+from warp_spo.execution.plan import MOST_DOFS
 
 GRANULARITIES = ("node", "tree", "segment")
 """A granularity that Dynamics accepts belongs here: the stress suite then runs on it."""

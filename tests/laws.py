@@ -8,7 +8,7 @@ import warp as wp
 import zoo
 
 from warp_spo import reference
-from warp_spo.parts import SCREWS
+from warp_spo.scene.parts import SCREWS
 
 FRAMES = [0, (-1, (0.1, -0.2, 0.3, 0.0, 0.6, 0.0, 0.8))]  # -1: the scene's last body
 STEP = 0.05

@@ -13,9 +13,9 @@ import numpy as np
 import zoo
 
 import warp_spo as spo
-from warp_spo.embedding import Closing, drawn, embedding
+from warp_spo.dynamics.embedding import Closing, drawn, embedding
 from warp_spo.examples.parts import at, bar
-from warp_spo.recursions.embedded import Embedding
+from warp_spo.recursions.loops.embedded import Embedding
 from warp_spo.reference import Dense, homogeneous, pose7, rotation_vector
 
 FIRST = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}  # weights of a first derivative, odd

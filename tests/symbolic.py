@@ -8,8 +8,8 @@ import numpy as np
 from warp_spo.recursions.applications import Applications
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.step import LOOPED, MISSED
-from warp_spo.trace.evaluate import evaluate
-from warp_spo.trace.graph import ordered as ordered
+from warp_spo.trace.evaluation import evaluate
+from warp_spo.trace.scalars import ordered as ordered
 
 
 def run(scene, operation, arrays, given, shapes, dtype="float64", trace=Applications, **options):

@@ -12,11 +12,11 @@ import zoo
 from test_granularity import hand
 
 import warp_spo as spo
-from warp_spo import plan
+from warp_spo.execution import plan
 from warp_spo.kernels import straight
-from warp_spo.recursions import power
-from warp_spo.recursions.adjoints import Adjoints
-from warp_spo.recursions.power import Carried, Power
+from warp_spo.recursions.derivatives import power
+from warp_spo.recursions.derivatives.adjoints import Adjoints
+from warp_spo.recursions.derivatives.power import Carried, Power
 from warp_spo.reference import Dense
 
 WORLDS = 3

@@ -15,8 +15,8 @@ import pytest
 import zoo
 
 import warp_spo as spo
-from warp_spo.operations import INPUTS, OPERATIONS, TOLERANCE, Inputs, rotations
 from warp_spo.reference import Dense
+from warp_spo.trials.operations import INPUTS, OPERATIONS, TOLERANCE, Inputs, rotations
 
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
 from benchmarks import (

@@ -14,7 +14,7 @@ from laws import OPERATIONS, TOLERANCE
 from torch.autograd import forward_ad
 
 import warp_spo as spo
-from warp_spo.adjoints import ARGUMENTS
+from warp_spo.dynamics.adjoints import ARGUMENTS
 
 KINDS = ["torch", "warp", "numpy"]
 INPUTS = [

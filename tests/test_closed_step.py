@@ -12,11 +12,12 @@ from mechanisms import MECHANISMS
 from test_step import FORCES, furnished
 
 import warp_spo as spo
-from warp_spo.embedding import Closing
+from warp_spo.dynamics.embedding import Closing
 from warp_spo.errors import UnsupportedError
 from warp_spo.examples.parts import at, bar, energy
-from warp_spo.recursions import closed_step, clusters, impedance, step
-from warp_spo.recursions.multipliers import Multipliers
+from warp_spo.recursions import impedance, step
+from warp_spo.recursions.loops import closed_step, clusters
+from warp_spo.recursions.loops.multipliers import Multipliers
 
 H = 2e-3
 SHORTEST = 1e-7  # of the way back onto the closures: ours is the shortest seen from where the step ends, O(h^4)

@@ -7,9 +7,9 @@ from robots import ROBOTS
 
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.traced import Trace
-from warp_spo.trace import graph as g
-from warp_spo.trace.derivative import forward, partial, reverse
-from warp_spo.trace.evaluate import FUNCTIONS, evaluate
+from warp_spo.trace import scalars as g
+from warp_spo.trace.differentiation import forward, partial, reverse
+from warp_spo.trace.evaluation import FUNCTIONS, evaluate
 
 SCENES = {
     "floating": lambda: zoo.from_parents([-1, 0, 1, 0], ["free", "revolute", "prismatic", "ball"], 31),

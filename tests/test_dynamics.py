@@ -283,7 +283,7 @@ def test_a_scene_that_cannot_move(dtype, device):
 
 def test_columns_that_do_not_fit_go_in_turns(device, monkeypatch):
     dyn = spo.Dynamics(scene_of("tree10"), 3, device=device, dtype="float64")
-    monkeypatch.setattr("warp_spo.plan.COLUMN_BYTES", 2 * dyn.scene.body_count * 6 * 3 * 8)  # two at a time
+    monkeypatch.setattr("warp_spo.execution.plan.COLUMN_BYTES", 2 * dyn.scene.body_count * 6 * 3 * 8)  # two at a time
     arrays = laws.states(dyn.scene, 3)
     for operation in ("solve_mass_matrix", "mass_matrix_inverse", "operational_inertia_inverse"):
         laws.equals_reference(dyn, operation, arrays, TOLERANCE["float64"])

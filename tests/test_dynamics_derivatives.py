@@ -15,9 +15,9 @@ from allocations import no_warp_allocation
 from robots import ROBOTS
 
 import warp_spo as spo
-from warp_spo.plan import MOST_DOFS
-from warp_spo.recursions import sensitivity
-from warp_spo.recursions.derivatives import Derivatives
+from warp_spo.execution.plan import MOST_DOFS
+from warp_spo.recursions.derivatives import sensitivity
+from warp_spo.recursions.derivatives.inverse_dynamics import Derivatives
 from warp_spo.reference import Dense
 
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo

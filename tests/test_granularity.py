@@ -13,7 +13,7 @@ import zoo
 from robots import ROBOTS
 
 import warp_spo as spo
-from warp_spo import plan
+from warp_spo.execution import plan
 from warp_spo.kernels import straight
 
 GRANULARITIES = ("tree", "segment")

@@ -13,7 +13,7 @@ import warp_spo.kernels
 PACKAGE = pathlib.Path(warp_spo.__file__).parent
 KERNELS = pathlib.Path(warp_spo.kernels.__path__[0])
 HOST = sorted(path for path in PACKAGE.rglob("*.py") if "kernels" not in path.parts)
-SYMBOLIC = sorted(path for folder in ("trace", "recursions") for path in (PACKAGE / folder).glob("*.py"))
+SYMBOLIC = sorted(path for folder in ("trace", "recursions") for path in (PACKAGE / folder).rglob("*.py"))
 DEVICE = sorted(KERNELS.glob("*.py"))
 
 

@@ -10,7 +10,7 @@ import warp as wp
 import zoo
 
 import warp_spo as spo
-from warp_spo.parameters import VARIABLE
+from warp_spo.execution.parameters import VARIABLE
 from warp_spo.recursions.links import LINK_VALUES
 
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo

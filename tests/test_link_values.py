@@ -8,7 +8,7 @@ import zoo
 import warp_spo as spo
 from warp_spo import reference
 from warp_spo.recursions.links import Links
-from warp_spo.trace.graph import ordered
+from warp_spo.trace.scalars import ordered
 
 INERTIAS = ("body_mass", "body_com", "body_inertia")
 WORLDS = 3

@@ -11,14 +11,15 @@ from test_closed_step import smooth
 from test_step import furnished
 
 import warp_spo as spo
-from warp_spo.embedding import Closing
+from warp_spo.dynamics.embedding import Closing
 from warp_spo.errors import UnsupportedError
-from warp_spo.programs import Traces
-from warp_spo.recursions import adjoints, embedded_adjoints, power
-from warp_spo.recursions.nullspace import NullSpace
-from warp_spo.trace.derivative import reverse
-from warp_spo.trace.evaluate import evaluate
-from warp_spo.trace.graph import Graph, absolute
+from warp_spo.execution.programs import Traces
+from warp_spo.recursions.derivatives import adjoints, power
+from warp_spo.recursions.loops import embedded_adjoints
+from warp_spo.recursions.loops.nullspace import NullSpace
+from warp_spo.trace.differentiation import reverse
+from warp_spo.trace.evaluation import evaluate
+from warp_spo.trace.scalars import Graph, absolute
 
 SCENES = ["fourbar", "tilted", "ancestors", "far_loop"]  # planar, redundant rows, couplings, a free hinge and a ball
 H = 5e-3

@@ -17,15 +17,15 @@ import zoo
 from mechanisms import MECHANISMS, Closed
 
 import warp_spo as spo
-from warp_spo.embedding import Closing, _spanning, drawn, embedding
+from warp_spo.dynamics.embedding import Closing, _spanning, drawn, embedding
 from warp_spo.examples.parts import at, bar, energy
-from warp_spo.programs import Traces
-from warp_spo.recursions import closures, clusters, embedded, nullspace
-from warp_spo.recursions.embedded import Embedding
+from warp_spo.execution.programs import Traces
 from warp_spo.recursions.links import Links
-from warp_spo.recursions.multipliers import Multipliers
+from warp_spo.recursions.loops import closures, clusters, embedded, nullspace
+from warp_spo.recursions.loops.embedded import Embedding
+from warp_spo.recursions.loops.multipliers import Multipliers
 from warp_spo.reference import homogeneous, pose7
-from warp_spo.trace.evaluate import evaluate
+from warp_spo.trace.evaluation import evaluate
 
 DIFFERENCES = 1e-9  # what differences of order 8 leave of second derivatives; conditioning of the draws
 AGREE = 1e-10  # embedding and multipliers, float64, away from change points

@@ -13,8 +13,8 @@ import pytest
 import warp as wp
 
 from warp_spo import __main__ as job
-from warp_spo import report, trial
-from warp_spo.operations import OPERATIONS, TOLERANCE
+from warp_spo.trials import report, trial
+from warp_spo.trials.operations import OPERATIONS, TOLERANCE
 
 # Two bars on the ground whose tips are pinned together: a loop.
 LOOP = """<mujoco><default><geom size=".03"/></default><worldbody>

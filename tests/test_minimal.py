@@ -12,11 +12,11 @@ from mechanisms import MECHANISMS, Closed
 from test_loops import traced
 
 import warp_spo as spo
-from warp_spo import loops
-from warp_spo.adjoints import OF_TREE
-from warp_spo.embedding import Closing, embedding
-from warp_spo.preparation import PRODUCTS, TAKES
-from warp_spo.recursions import minimal
+from warp_spo.dynamics import loops
+from warp_spo.dynamics.adjoints import OF_TREE
+from warp_spo.dynamics.embedding import Closing, embedding
+from warp_spo.dynamics.preparation import PRODUCTS, TAKES
+from warp_spo.recursions.loops import minimal
 
 DIFFERENCES = 1e-9  # what differences of order 8 leave of second derivatives; conditioning of the draws
 TOLERANCE = {"float64": 10.0 * DIFFERENCES, "float32": 3e-5}

@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_spo.errors import DirectedLoopError, UnsupportedError
 from warp_spo.newton import SHIPPED, from_newton, load, shipped
-from warp_spo.parts import DOF_VALUES, FREE, SCREWS
+from warp_spo.scene.parts import DOF_VALUES, FREE, SCREWS
 
 wp.config.log_level = wp.LOG_WARNING
 FLOAT32_FK = 2e-5  # Newton's poses and twists are float32; measured 3e-6 on the humanoid

@@ -13,11 +13,11 @@ from allocations import no_warp_allocation
 
 import warp_spo as spo
 from warp_spo.examples import estimation
-from warp_spo.operations import APPLICATIONS, Inputs
 from warp_spo.recursions import applications, determinant, newton_euler
 from warp_spo.recursions.applications import Applications
 from warp_spo.reference import Dense
-from warp_spo.trial import Subject, Trial
+from warp_spo.trials.operations import APPLICATIONS, Inputs
+from warp_spo.trials.trial import Subject, Trial
 
 WORLDS = 3
 TOLERANCE = {
@@ -376,7 +376,7 @@ def test_singular_operational_inertia_is_nan(dtype, device):
 def test_a_planted_bug_in_the_inverse_is_seen(monkeypatch, tmp_path, device):
     from mutants import mutant
 
-    from warp_spo import applications
+    from warp_spo.dynamics import applications
 
     old = "weight -= A[world, k, i] * out[world, i, j]"
     monkeypatch.setattr(applications, "cholesky", mutant(tmp_path, "cholesky", old, old.replace("-=", "+=")))

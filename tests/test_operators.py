@@ -10,8 +10,8 @@ import warp as wp
 from allocations import no_warp_allocation
 
 from warp_spo.errors import DirectedLoopError
-from warp_spo.operators import BWA, Blocks, Identity
-from warp_spo.tree import Digraph, Tree
+from warp_spo.graph.operators import BWA, Blocks, Identity
+from warp_spo.scene.tree import Digraph, Tree
 
 WORLDS = 3
 TOLERANCE = {

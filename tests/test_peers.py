@@ -11,7 +11,7 @@ import pytest
 import zoo
 
 import warp_spo as spo
-from warp_spo.operations import TOLERANCE, Inputs
+from warp_spo.trials.operations import TOLERANCE, Inputs
 
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
 from benchmarks import cases, peers, robots

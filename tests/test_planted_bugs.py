@@ -10,10 +10,13 @@ from laws import TOLERANCE
 from mutants import mutant
 
 import warp_spo as spo
-from warp_spo import blocks, levels, node_steps, teams
+from warp_spo.execution import node_steps, teams
+from warp_spo.execution import sweeps as levels
+from warp_spo.graph import blocks
 from warp_spo.kernels import straight
 from warp_spo.recursions import articulated, inverse, links, messages, newton_euler, pieces, traced
-from warp_spo.trace import graph, spatial
+from warp_spo.trace import scalars as graph
+from warp_spo.trace import spatial
 
 WORLDS = 3
 

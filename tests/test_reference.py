@@ -10,9 +10,9 @@ import warp as wp
 import zoo
 
 from warp_spo.newton import from_newton, load, shipped
-from warp_spo.parts import Body, Hinge
 from warp_spo.reference import Dense, homogeneous, quaternion, rotation, rotation_about, rotation_vector, skew
-from warp_spo.scene import Scene
+from warp_spo.scene.parts import Body, Hinge
+from warp_spo.scene.scene import Scene
 
 # Relative to the largest entry of the expected array unless said otherwise.
 ORACLE = 1e-11  # float64 against float64, forward dynamics loses cond(M) eps; measured 4e-13, cond up to 5e3
@@ -160,12 +160,11 @@ def test_coordinates_are_newtons():
     pose = lambda: wp.transform(*np.split(zoo.random_pose(rng), [3]))  # noqa: E731
     body = lambda: builder.add_link(mass=1.0, com=rng.uniform(-0.2, 0.2, 3), inertia=wp.mat33(np.eye(3)))  # noqa: E731
     axes = lambda n: [newton.ModelBuilder.JointDofConfig(axis=wp.vec3(v)) for v in zoo.unit(rng, n, 3)]  # noqa: E731
-    square = (
-        lambda n: [
-            newton.ModelBuilder.JointDofConfig(axis=wp.vec3(v))  # noqa: E731
-            for v in np.linalg.qr(rng.normal(size=(3, 3)))[0][:n]
-        ]
-    )
+
+    def square(n):
+        basis = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        return [newton.ModelBuilder.JointDofConfig(axis=wp.vec3(v)) for v in basis[:n]]
+
     add = [
         builder.add_joint_free,
         builder.add_joint_ball,

@@ -14,12 +14,12 @@ from robots import ROBOTS
 
 import warp_spo as spo
 from warp_spo import reference
+from warp_spo.execution.staging import read_before
 from warp_spo.recursions.applications import Applications
 from warp_spo.recursions.links import Links
-from warp_spo.staging import read_before
-from warp_spo.trace.emit import Store
-from warp_spo.trace.evaluate import evaluate
-from warp_spo.trace.graph import Graph
+from warp_spo.trace.emission import Store
+from warp_spo.trace.evaluation import evaluate
+from warp_spo.trace.scalars import Graph
 
 IDENTITY = {
     "float64": 1e-11,  # products of a dozen operators, relative to the largest entry; cond(M) of the worst robot is 1e5

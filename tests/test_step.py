@@ -15,9 +15,9 @@ from allocations import no_warp_allocation
 import warp_spo as spo
 from warp_spo.errors import UnsupportedError
 from warp_spo.kernels import straight
-from warp_spo.parts import SCREWS
 from warp_spo.recursions import impedance, integration, joint_space, step
 from warp_spo.reference import Dense, rotation
+from warp_spo.scene.parts import SCREWS
 
 H = 2e-3
 TOLERANCE = {
@@ -237,11 +237,11 @@ def test_a_free_hinge_without_laws_keeps_its_short_way():
     scene = zoo.single_body("free").with_values(
         joint_armature=np.zeros(6), joint_damping=np.zeros(6), joint_stiffness=np.zeros(6)
     )
-    count = lambda scene: len(
-        symbolic.ordered(  # noqa: E731
-            item.value for item in symbolic.Applications(symbolic.Links(scene), "float64", ("q", "qd")).step()
-        )
-    )
+
+    def count(scene):
+        stores = symbolic.Applications(symbolic.Links(scene), "float64", ("q", "qd")).step()
+        return len(symbolic.ordered(item.value for item in stores))
+
     assert count(scene) * 2 < count(scene.with_values(joint_damping=np.arange(6.0)))
 
 

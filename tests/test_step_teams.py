@@ -14,7 +14,7 @@ from test_granularity import MANY, hand
 from test_step import FORCES, TOLERANCE, H, furnished, states
 
 import warp_spo as spo
-from warp_spo import plan, teams
+from warp_spo.execution import plan, teams
 from warp_spo.kernels import straight
 from warp_spo.recursions.step import SHORT, Step, by_pieces
 

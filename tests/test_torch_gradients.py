@@ -15,9 +15,9 @@ from torch.autograd import forward_ad, gradcheck
 
 import warp_spo as spo
 from warp_spo import torch as spo_torch
-from warp_spo.plan import MOST_DOFS
-from warp_spo.recursions.adjoints import Adjoints
-from warp_spo.staging import read_before
+from warp_spo.execution.plan import MOST_DOFS
+from warp_spo.execution.staging import read_before
+from warp_spo.recursions.derivatives.adjoints import Adjoints
 
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
 

@@ -13,14 +13,14 @@ import zoo
 from robots import ROBOTS
 
 import warp_spo as spo
-from warp_spo import plan, teams
+from warp_spo.execution import plan, teams
 from warp_spo.kernels import straight
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.pieces import Pieces
 from warp_spo.recursions.traced import Trace
-from warp_spo.trace import graph as g
-from warp_spo.trace.emit import Emitter, Store, literal, literals
-from warp_spo.trace.evaluate import evaluate
+from warp_spo.trace import scalars as g
+from warp_spo.trace.emission import Emitter, Store, literal, literals
+from warp_spo.trace.evaluation import evaluate
 from warp_spo.trace.spatial import Articulated, Matrix, Pose, Rigid, Vector, cross, skew, symmetric
 
 TYPES = {"float32": wp.float32, "float64": wp.float64}

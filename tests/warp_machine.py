@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from warp_spo.execution.programs import Programs
+from warp_spo.execution.teams import BARRIER
 from warp_spo.kernels.straight import IN_PLACE, SPREAD, TILED, Frame
-from warp_spo.programs import Programs
-from warp_spo.teams import BARRIER
 
 NOBODY = (-1, -1)
 

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warp_spo.parts import KINDS, Body, Coupling, Hinge, Loop
-from warp_spo.scene import Scene
+from warp_spo.scene.parts import KINDS, Body, Coupling, Hinge, Loop
+from warp_spo.scene.scene import Scene
 
 INNER_KINDS = ("fixed", "revolute", "prismatic", "helical", "universal", "cylindrical", "ball", "planar", "free", "d6")
 SCREW_KINDS = ("revolute", "prismatic", "universal", "cylindrical", "d6")

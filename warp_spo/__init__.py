@@ -6,13 +6,13 @@ The graph layer: :class:`Tree`, :class:`Digraph`, :class:`BWA` and its resolvent
 
 from typing import TYPE_CHECKING, Any
 
-from .dynamics import Dynamics
+from .dynamics.dynamics import Dynamics
 from .errors import DirectedLoopError, UnsupportedError
-from .factorization import Factorization
-from .operators import BWA, Blocks, Identity, Operator
-from .parts import Body, Coupling, Hinge, Loop
-from .scene import Scene
-from .tree import Digraph, Tree
+from .graph.factorization import Factorization
+from .graph.operators import BWA, Blocks, Identity, Operator
+from .scene.parts import Body, Coupling, Hinge, Loop
+from .scene.scene import Scene
+from .scene.tree import Digraph, Tree
 
 if TYPE_CHECKING:
     from .newton import from_newton, load

@@ -17,11 +17,11 @@ from typing import Any, NoReturn
 
 import warp as wp
 
-from . import report
-from .dynamics import Dynamics
-from .operations import OPERATIONS, TOLERANCE, Inputs
-from .scene import Scene
-from .trial import SAMPLE, Subject, Trial
+from .dynamics.dynamics import Dynamics
+from .scene.scene import Scene
+from .trials import report
+from .trials.operations import OPERATIONS, TOLERANCE, Inputs
+from .trials.trial import SAMPLE, Subject, Trial
 
 WORLDS = {False: 1024, True: 4096}  # on a CPU, on a GPU
 WARM_UP, BUDGET = 0.05, 0.3  # [s] for each operation: all of them in well under a minute
@@ -139,7 +139,7 @@ def load(robot: str) -> Scene:
 def run(dyns: list[Dynamics]) -> Iterator[dict[str, Any]]:
     """Yield a row for each operation and Dynamics (of one scene and world count), the precisions next to each other.
 
-    Rows have op, granularity, dtype, worlds, error (see :meth:`warp_spo.operations.Operation.error`) and seconds, the
+    Rows have op, granularity, dtype, worlds, error (see ``Operation.error``) and seconds, the
     median run time of one evaluation of all worlds.
     """
     scene, worlds, cuda = dyns[0].scene, dyns[0].worlds, dyns[0].device.is_cuda

@@ -11,7 +11,7 @@ from pathlib import Path
 import warp as wp
 
 from warp_spo.__main__ import find_device
-from warp_spo.operations import Inputs
+from warp_spo.trials.operations import Inputs
 
 from .. import runner
 from ..cases import SCENES

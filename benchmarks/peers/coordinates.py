@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_spo.operations import OPERATIONS, Inputs
 from warp_spo.reference import Dense
+from warp_spo.trials.operations import OPERATIONS, Inputs
 
 from .lumped import Robot, rotation, skew
 
@@ -108,7 +108,7 @@ def _apply(T: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 class States:
-    """Sets of random states, those of :class:`warp_spo.operations.Inputs`, in a peer's coordinates and precision.
+    """Sets of random states, those of ``Inputs`` in warp_spo.trials, in a peer's coordinates and precision.
 
     Args:
         coordinates: the peer's.

@@ -22,7 +22,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from warp_spo.operations import Inputs
+from warp_spo.trials.operations import Inputs
 
 from . import exchange
 from .coordinates import States

@@ -11,7 +11,9 @@ import newton
 import numpy as np
 
 from ..errors import UnsupportedError
-from ..robot_files import (
+from ..scene.scene import Scene
+from .model import from_newton, host, names_of
+from .robot_files import (
     MISREAD,
     mjcf_gravity,
     mjcf_misread,
@@ -21,8 +23,6 @@ from ..robot_files import (
     robot_format,
     urdf_source,
 )
-from ..scene import Scene
-from .model import from_newton, host, names_of
 
 REPAIR = 1e-5  # relative: an inertia that finalize moved by more was repaired, not rounded
 

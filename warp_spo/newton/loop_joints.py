@@ -7,8 +7,8 @@ import numpy as np
 from newton import JointTargetMode
 
 from ..errors import UnsupportedError
-from ..parts import UNLIMITED
 from ..recursions.impedance import DEFAULT_BOUND
+from ..scene.parts import UNLIMITED
 
 
 def check_loop_joints(model: newton.Model, joints: np.ndarray) -> None:

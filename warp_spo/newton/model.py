@@ -15,8 +15,8 @@ import numpy as np
 from newton import JointType
 
 from ..errors import DirectedLoopError, UnsupportedError
-from ..parts import DOF_VALUES, UNLIMITED, Body, Coupling, Hinge, Loop
-from ..scene import Scene
+from ..scene.parts import DOF_VALUES, UNLIMITED, Body, Coupling, Hinge, Loop
+from ..scene.scene import Scene
 
 KINDS = {
     JointType.FIXED: "fixed",

@@ -11,9 +11,9 @@ import warp as wp
 from newton import ModelFlags
 from newton.solvers.experimental.coupled import CouplingInterface
 
-from ..dynamics import Dynamics
+from ..dynamics.dynamics import Dynamics
 from ..errors import UnsupportedError
-from ..frames import Frame
+from ..scene.frames import Frame
 from .layout import Layout
 from .model import host
 

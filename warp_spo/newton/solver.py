@@ -13,12 +13,12 @@ import warp as wp
 from newton import JointTargetMode, ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
-from ..dynamics import Dynamics
+from ..dynamics.dynamics import Dynamics
+from ..dynamics.steps import INTEGRATORS
 from ..errors import UnsupportedError, names_of, whole
 from ..kernels import declare, exchange
-from ..parts import DOF_VALUES, FREE
-from ..scene import Scene
-from ..steps import INTEGRATORS
+from ..scene.parts import DOF_VALUES, FREE
+from ..scene.scene import Scene
 from .layout import Layout
 from .loop_joints import check_loop_joints
 from .model import Worlds, from_newton, host

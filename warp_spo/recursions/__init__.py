@@ -1,1 +1,1 @@
-"""The recursions as steps over abstract scalars, one file a recursion; a step is written once and traced."""
+"""The recursions of multibody dynamics, written once on symbolic scalars."""

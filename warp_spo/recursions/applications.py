@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from ..trace.emit import Store
-from ..trace.graph import Value, reciprocal, sqrt
+from ..trace.emission import Store
+from ..trace.scalars import Value, reciprocal, sqrt
 from ..trace.spatial import ZERO, Articulated, Rigid, Vector, cross, dot
-from . import articulated, closed_step, composite, determinant, hybrid, motion, newton_euler, reactions, step
+from . import articulated, composite, determinant, hybrid, motion, newton_euler, reactions, step
 from .hybrid import Given
 from .links import Link
+from .loops import closed_step
 from .motion import STILL
 from .operators import Operators
 from .traced import Trace

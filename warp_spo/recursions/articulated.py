@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..trace.graph import Value, absolute, guarded, is_constant, quotient, reciprocal
+from ..trace.scalars import Value, absolute, guarded, is_constant, quotient, reciprocal
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Rigid, Vector, cross, dot, magnitude, symmetric, total
 from .links import BALL, FREE, SLIDE, TURN, Link, Placed
 from .motion import NONE, Motion, carried, in_hinge, in_link

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..trace.graph import Value
+from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Pose, Rigid, Vector
 from .articulated import columns
 from .links import NOTHING as NOTHING

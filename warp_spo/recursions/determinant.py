@@ -7,7 +7,7 @@ A. Jain, "Compensating mass matrix potential for constrained molecular dynamics"
 
 from __future__ import annotations
 
-from ..trace.graph import Value
+from ..trace.scalars import Value
 from ..trace.spatial import ZERO, Articulated, Matrix, Pose, Vector, dot
 from .articulated import NO_INERTIA, Factor
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from ..trace.graph import Value, is_constant, select
+from ..trace.scalars import Value, is_constant, select
 from ..trace.spatial import Articulated, Pose, Vector, dot, total
 from . import articulated
 from .articulated import LEAST, NO_INERTIA, Factor, Pivot

@@ -18,9 +18,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import UnsupportedError
-from ..parts import UNLIMITED
-from ..scene import Scene
-from ..trace.graph import Value, absolute, is_constant, less, reciprocal, select
+from ..scene.parts import UNLIMITED
+from ..scene.scene import Scene
+from ..trace.scalars import Value, absolute, is_constant, less, reciprocal, select
 from ..trace.spatial import Vector, total
 from .integration import rotation_vector
 from .links import BALL, FREE, Link, Links
@@ -266,7 +266,7 @@ def is_number(x: Value, number: float) -> bool:
 
 def neutral_inertias(scene: Scene) -> np.ndarray:
     """1 / diagonal of Mass^-1 at the neutral configuration, of world 0 [dof]; of Mass, where it has no inverse."""
-    from ..trace.evaluate import evaluate
+    from ..trace.evaluation import evaluate
     from .traced import Trace
 
     one = scene.with_values(**{name: array[:1] for name, array in scene.values.items()})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from ..trace.graph import Value, arctangent, cos, less, reciprocal, select, sin, sqrt
+from ..trace.scalars import Value, arctangent, cos, less, reciprocal, select, sin, sqrt
 from ..trace.spatial import Vector, cross, dot
 from .kinematics import Quaternion, multiplied
 from .links import BALL, FREE, Link, quaternion_rotation

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..trace.emit import Store
-from ..trace.graph import Value
+from ..trace.emission import Store
+from ..trace.scalars import Value
 from ..trace.spatial import ZERO, Vector, dot, total
 from . import articulated
 from .links import Link

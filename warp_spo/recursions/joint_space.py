@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from ..trace.graph import Value, guarded, reciprocal
+from ..trace.scalars import Value, guarded, reciprocal
 
 if TYPE_CHECKING:
     from .traced import Trace

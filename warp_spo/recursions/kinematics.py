@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..trace.graph import cos, reciprocal, sin, sqrt
+from ..trace.scalars import cos, reciprocal, sin, sqrt
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, total
 from .links import BALL, FREE, HELIX, SLIDE, TURN, Link, Placed
 

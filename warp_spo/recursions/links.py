@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..parts import BALL as BALL
-from ..parts import FREE, SCREWS
-from ..scene import Scene
-from ..trace.graph import Graph, Scalar, Value, cos, is_constant, reciprocal, reduced, sin
+from ..scene.parts import BALL as BALL
+from ..scene.parts import FREE, SCREWS
+from ..scene.scene import Scene
+from ..trace.scalars import Graph, Scalar, Value, cos, is_constant, reciprocal, reduced, sin
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
 
 TURN, SLIDE, HELIX = "turn", "slide", "helix"
@@ -111,7 +111,7 @@ class Links:
         gravity: Vector.
         turns_vary: some joint's anchor is turned by what is no constant.
         tables: the scalars that an :meth:`opened` copy reads, by name, in order.
-        reverses: what takes gradients by the tables back to the values, see :mod:`warp_spo.link_values`.
+        reverses: what takes gradients by the tables back to the values, see :mod:`warp_spo.execution.link_values`.
     """
 
     def __init__(self, scene: Scene, variable: tuple[str, ...] = ()):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from ..trace.graph import Value
+from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Vector, cross, symmetric
 from .links import BALL, HELIX, SLIDE, TURN, Link, Placed
 

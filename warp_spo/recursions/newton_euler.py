@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..trace.graph import Value
+from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, Matrix, Rigid, Vector, cross, skew
 from .links import FREE, Link, Placed
 from .motion import Motion, carried, in_hinge, in_link

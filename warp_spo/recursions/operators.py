@@ -14,8 +14,8 @@ import itertools
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from ..trace.emit import Store
-from ..trace.graph import Value
+from ..trace.emission import Store
+from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Pose, Vector, cross, dot
 from . import articulated
 from .links import FREE, Link, Placed, placed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..trace.emit import Store
+from ..trace.emission import Store
 from ..trace.spatial import IDENTITY, Pose, Vector, cross
 from . import newton_euler
 from .motion import STILL

@@ -15,9 +15,9 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from ..scene import Scene
-from ..trace.emit import Store
-from ..trace.graph import Value, less, reciprocal, select
+from ..scene.scene import Scene
+from ..trace.emission import Store
+from ..trace.scalars import Value, less, reciprocal, select
 from ..trace.spatial import total
 from .impedance import Impedance, Law, added, is_number
 from .integration import coordinate_rates, moved

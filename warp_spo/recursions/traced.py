@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
-from ..trace.emit import Store
-from ..trace.graph import Value, is_constant, sum_of_logarithms
+from ..trace.emission import Store
+from ..trace.scalars import Value, is_constant, sum_of_logarithms
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Rigid, Vector, cross, total
 from . import articulated, composite, kinematics, messages, motion, newton_euler
 from .inverse import Inverse

@@ -1,1 +1,1 @@
-"""Tracing: step functions run once on symbolic scalars, and what remains of a scene becomes straight-line code."""
+"""Symbolic scalars: tracing with constant folding, derivatives, and C++ emission."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from .graph import Value, absolute, is_constant
+from .scalars import Value, absolute, is_constant
 
 
 def total(values: Iterable[Value]) -> Value:

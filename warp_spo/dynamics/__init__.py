@@ -1,0 +1,5 @@
+"""What users call: :class:`Dynamics`."""
+
+from .dynamics import Dynamics
+
+__all__ = ["Dynamics"]

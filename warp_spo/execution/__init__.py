@@ -1,0 +1,1 @@
+"""How recursions run on a device: the plan, generated kernels, launches a level, and the values that kernels read."""

@@ -1,0 +1,85 @@
+"""What links are made of where it varies: one kernel of a scene computes it in float64, and rounds once, at the store.
+
+It runs when a value is set, not when an operation is called.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from ..kernels import straight
+from ..recursions.links import Links
+from ..trace.differentiation import reverse
+from ..trace.emission import Emitter, Store, literals
+from ..trace.scalars import ordered
+from .parameters import Derived, Parameters, spread
+
+
+def table(parameters: Parameters, links: Links, name: str) -> wp.array:
+    """The scalars ``links.tables[name]`` as [entry, world], with stride 0 where all worlds share them."""
+
+    def build() -> Derived:
+        values = list(links.tables[name])
+        sources = list(dict.fromkeys(scalar.args[0] for scalar in ordered(values) if scalar.op == "input"))
+        T, device, worlds = parameters.dtype, parameters.device, parameters.rows(sources)
+        own = wp.empty((len(values), worlds), dtype=T, device=device)
+        inputs = [worlds, *(parameters.entries(source, worlds) for source in sources)]
+        kernel = _kernel(name, values, sources, T)
+        fill = lambda: wp.launch(kernel, worlds, inputs, [own], device=device)  # noqa: E731
+        return Derived([spread(own, 1, parameters.worlds)], sources, fill)
+
+    return parameters.derived(name, build)[0]
+
+
+def _kernel(name: str, values: list, sources: list[str], T: type) -> wp.Kernel:
+    """A thread a world: Newton's values [entry, world] in, the table [entry, world] out."""
+    emitter = Emitter(
+        "float64",
+        lambda array, entry: f"FIELD({array}, {entry})",
+        lambda array, entry, value: f"out.data[({entry}) * (long long)worlds + world] = ({straight.C_TYPE[T]}){value};",
+        lambda array, index: index[0],
+        late=sources,
+    )
+    listing = emitter.region([Store("out", (entry,), value) for entry, value in enumerate(values)])
+    native = straight.per_world(sources, literals(listing, "float64"))
+    arrays = [(source, 2) for source in sources] + [("out", 2)]
+    return straight.kernel(f"links_{name}", native, arrays, T, wide=tuple(sources))
+
+
+def pull_back(parameters: Parameters, links: Links, cotangent: wp.array, gradients: dict[str, wp.array]) -> None:
+    """``gradients[name]`` [world, entry] by Newton's values, of those by the table "value" ``cotangent``.
+
+    In float64, rounded once.
+    """
+    kernel, sources = _reverse(parameters, links, tuple(gradients))
+    inputs = [parameters.worlds, *(parameters.entries(source, parameters.worlds) for source in sources), cotangent]
+    wp.launch(kernel, parameters.worlds, inputs, list(gradients.values()), device=parameters.device)
+
+
+def _reverse(parameters: Parameters, links: Links, names: tuple[str, ...]) -> tuple[wp.Kernel, list[str]]:
+    """The kernel of a list of names, kept with the links whose graph it belongs to."""
+    key = names, parameters.dtype
+    if key not in links.reverses:
+        values = list(links.tables["value"])
+        inputs = [scalar for scalar in ordered(values) if scalar.op == "input"]
+        seeds = [links.graph.input("cotangent", slot) for slot in range(len(values))]
+        found = dict(zip((x.args for x in inputs), reverse(values, inputs, seeds), strict=True))
+        sizes = {name: links.scene.values[name][0].size for name in names}
+        stores = [Store(name, (i,), found.get((name, i), 0.0)) for name in names for i in range(sizes[name])]
+        read = ordered([item.value for item in stores])
+        sources = list(dict.fromkeys(x.args[0] for x in read if x.op == "input" and x.args[0] != "cotangent"))
+        links.reverses[key] = _reverse_kernel(stores, sources, len(values), sizes, parameters.dtype), sources
+    return links.reverses[key]
+
+
+def _reverse_kernel(stores: list[Store], sources: list[str], size: int, sizes: dict[str, int], T: type) -> wp.Kernel:
+    def load(array: str, entry: str) -> str:
+        return f"FIELD({array}, {entry})" if array in sources else f"{array}.data[world * {size} + {entry}]"
+
+    def store(array: str, entry: str, value: str) -> str:
+        return f"{array}_bar.data[world * {sizes[array]} + {entry}] = ({straight.C_TYPE[T]})({value});"
+
+    emitter = Emitter("float64", load, store, lambda array, index: index[0], late=(*sources, "cotangent"))
+    native = straight.per_world(sources, literals(emitter.region(stores), "float64"))
+    arrays = [(source, 2) for source in sources] + [("cotangent", 2)] + [(f"{name}_bar", 2) for name in sizes]
+    return straight.kernel("links_reverse", native, arrays, T, wide=tuple(sources))

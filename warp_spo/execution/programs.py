@@ -1,0 +1,373 @@
+"""Programs: an operation of one scene as one kernel, traced, emitted, compiled at its first use and launched.
+
+At tree granularity a thread works on one world, in program order. At segment granularity a warp works on one serial
+chain of 32 worlds, a block on 32 worlds; limbs of equal structure run one text, in which what differs is read from a
+table.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from ..kernels import straight
+from ..kernels.spreading import WARP
+from ..kernels.straight import DIRECT, INTEGERS, RELAYED, SPREAD, TILED, Frame, Result
+from ..recursions import messages
+from ..recursions.links import TABLES, Links
+from ..recursions.loops.embedded_adjoints import EmbeddedAdjoints
+from ..recursions.loops.multipliers import Multipliers
+from ..recursions.messages import INWARD, OUTWARD, SENDS
+from ..recursions.operators import meet, written
+from ..recursions.pieces import Pieces
+from ..recursions.step import GAIN, GUESS, LOOPED, MISSED, by_pieces
+from ..trace.emission import PREFIX, Angles, Emitter, Store, literals
+from . import link_values, staging
+from .plan import MOST_WARPS, SHARED, TREE_ONLY, Plan
+from .staging import FIELDS
+from .sweeps import Recursions
+from .teams import Passes, Team, Work
+
+TRACED = (
+    *SENDS,
+    "log_det_mass_matrix",
+    "body_poses",
+    "body_velocities",
+    "body_states",
+    "jacobian",
+    "operational_inertia_inverse",
+    "expression",
+    *TREE_ONLY,
+)
+TILES = ("inverse_dynamics_derivatives", "mass_matrix_derivative")
+"""Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
+REGISTERS, PARTS = 65536, 4  # of a multiprocessor
+MOST_REGISTERS = 255  # of a thread
+BLOCKS = {"forward_dynamics_apart": (3, 168), "solve_mass_matrix": (4, 128), "forward_dynamics_vjp": (4, 128)}
+"""Blocks of limbs for it, if they leave a thread so many registers, where there are many worlds."""
+PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
+FRAME_LISTS = 16  # different lists of frames that get a program of their own
+EXPRESSIONS = 64  # different expressions of operators that do
+
+
+class Traces(EmbeddedAdjoints, Multipliers):
+    """Every operation that is traced."""
+
+
+class Program(NamedTuple):
+    """One kernel.
+
+    Attributes:
+        rows: names of the callers' arrays, and then numbers, that it reads. fields: of FIELDS.
+        tables: arrays of its own.
+        operations: floating-point operations of one world.
+        slots: values of one world in the tiles that it writes; entry: where each entry of the result is among them, -1
+            being zero. See :mod:`.kernels.tiles`.
+    """
+
+    kernel: wp.Kernel
+    rows: tuple[str, ...]
+    fields: tuple[str, ...]
+    tables: tuple[wp.array, ...]
+    warps: int
+    block: int
+    operations: int
+    slots: int = 0
+    entry: Any = None
+
+
+class Programs:
+    """The programs of one scene.
+
+    Args:
+        run: its sweeps, whose parameters the programs read.
+        plan: which granularity each operation has.
+
+    Attributes:
+        relays: what is too long for shared memory waits in the rows of the result.
+    """
+
+    def __init__(self, run: Recursions, plan: Plan):
+        self.run, self.plan = run, plan
+        self.relays = run.device.is_cuda
+        self._programs: dict[Any, Program | None] = {}
+        self._links: Links | None = None
+
+    def forget(self) -> None:
+        """Drop all programs: values that they folded have changed."""
+        self._programs.clear()
+        self._links = None
+
+    def find(
+        self,
+        operation: str,
+        shapes: dict[str, tuple[int, ...]],
+        out: tuple[int, ...],
+        more: dict[str, tuple[int, ...]] | None = None,
+        **options: Any,
+    ) -> Any:
+        """The :class:`Program` for an operation on arrays of these shapes, or None if it has none.
+
+        Args:
+            shapes: of the arrays that are given, [world, ...].
+            out: shape of the result, [world, ...]. more: of further results, by name.
+            options: of the operation.
+        """
+        if self.plan.of(operation) == "node" or operation not in TRACED:
+            return None
+        if operation == "solve_mass_matrix" and len(out) > 2:
+            return None
+        key = operation, (*shapes, *(more or ())), out[1:], *options.values()
+        if key not in self._programs:
+            lists = sum(1 for other in self._programs if other[0] == operation)
+            most = EXPRESSIONS if operation == "expression" else FRAME_LISTS
+            if options and lists >= most and operation not in (*TREE_ONLY, *SHARED):
+                return None
+            self._programs[key] = self._build(operation, shapes, out, more or {}, options)
+        return self._programs[key]
+
+    def launch(self, program: Program, arrays: dict[str, Any], out: wp.array, *more: wp.array) -> None:
+        rows = [arrays[name] for name in program.rows]
+        fields = [self.field(name) for name in program.fields]
+        inputs, worlds, block = [*rows, *fields, *program.tables], self.run.worlds, program.block
+        of_block = block // program.warps
+        threads = -(-worlds // of_block) * block if self.run.device.is_cuda else worlds
+        wp.launch(program.kernel, threads, [worlds, *inputs], [out, *more], device=self.run.device, block_dim=block)
+
+    def field(self, name: str) -> wp.array:
+        """One of FIELDS."""
+        if name not in TABLES:
+            return self.run.parameters.field(name)
+        return link_values.table(self.run.parameters, self.links, name)
+
+    @property
+    def operation_counts(self) -> dict[str, int]:
+        """Floating-point operations of one world, by operation."""
+        return {_called(key): program.operations for key, program in self._programs.items() if program is not None}
+
+    def described(self) -> list[str]:
+        """A line for each kernel: its granularity, its operations in one world, and on CUDA what it takes."""
+        lines = []
+        for key, program in self._programs.items():
+            if program is None:
+                continue
+            granularity = f"segment, {program.warps} warps" if program.warps > 1 else "tree"
+            line = f"{_called(key)}  {granularity}, {program.operations} operations a world"
+            if self.run.device.is_cuda:
+                found = wp.get_cuda_kernel_properties(program.kernel, self.run.device, program.block)
+                line += f", {found['register_count']} registers, {found['local_memory_size']} bytes of stack a thread"
+            lines.append(line)
+        return lines
+
+    # -- building --------------------------------------------------------------------------------------------------
+    @property
+    def links(self) -> Links:
+        if self._links is None:
+            self._links = Links(self.run.scene, self.run.parameters.variable)
+        return self._links
+
+    def _build(self, operation: str, shapes: dict, out_shape: tuple, more: dict, options: dict) -> Program | None:
+        links = self.links.opened()
+        if (operation in ("body_poses", "body_states") and links.turns_vary) or not links.links:
+            return None
+        if operation == "expression" and not meet(options["expression"]):
+            return None
+        shapes = {**shapes, "out": out_shape}
+        shared = self.plan.of(operation) == "segment" and messages.shared(operation, shapes, options.get("wrt", ()))
+        if operation == "step":
+            shared = shared and by_pieces(self.run.scene, shapes, options.get("how"))
+        if operation == "forward_dynamics" and self.plan.apart and "qd" in shapes:
+            operation = "forward_dynamics_apart"
+        if shared:
+            pieces = Pieces(links)
+            several = 1 < pieces.warps <= MOST_WARPS
+            both = {**shapes, **more}
+            program = self._segment_program(operation, both, pieces, tuple(more), options) if several else None
+            if program is not None:
+                return program
+        return self._tree_program(operation, links, {**shapes, **more}, tuple(more), options)
+
+    def _tree_program(self, operation: str, links: Links, shapes: dict, more: tuple, options: dict) -> Program:
+        trace = Traces(links, self.run.dtype.__name__, tuple(shapes))
+        stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
+        apart = [item for item in stores if item.array in more]  # each straight to memory
+        outs = [item for item in stores if item.array == "out"]
+        frame = self._frame(operation, outs, stores, shapes, more)
+        if operation in TILES:
+            result = Result(TILED, frame.result.array, slots=staging.solid(stores))
+            frame = frame._replace(staged=self.plan.staged, result=result)
+        once = operation == "step" or any(item.array in LOOPED for item in stores)  # may write over what it reads
+        frame = frame._replace(again=not once and not frame.staged and frame.result.way in (DIRECT, TILED, RELAYED))
+        placed, table = staging.placed(outs, frame.result)
+        placed += apart
+        emitter, looped = self._emitter(shapes, frame), [item for item in stores if item.array in LOOPED]
+        regions = [emitter.region([], trace.ahead), emitter.branch(looped)] if looped else []
+        *before, body = (literals(each, self.run.dtype.__name__) for each in [*regions, emitter.region(placed)])
+        if looped:
+            ahead, a_pass = before
+            body = straight.looped(ahead, a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
+        block = PAIR * WARP if self.plan.few and not frame.scalars else WARP
+        frame = frame._replace(again=frame.again and "farthest" in body, block=block)
+        tables = {} if table is None else {"place": table}
+        return self._finished(operation, frame, body, body, tables, emitter.operations)
+
+    def _segment_program(
+        self, operation: str, shapes: dict, pieces: Pieces, more: tuple, options: dict
+    ) -> Program | None:
+        dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(operation, pieces)
+        slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
+        everything: list[Store] = []
+        traced: list[list[Store]] = []
+        apart: list[tuple[list[Store], list[Store], list[list[Store]]]] = []
+        for index in range(len(pieces.pieces)):
+            links = self.links.opened()  # its own: pieces of equal structure then give equal text
+            trace = Traces(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
+            traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)(**options)])
+            rounds = [[self._flattened(item, shapes) for item in turn] for turn in trace.rounds]
+            news = [self._flattened(item, shapes) for item in trace.news]
+            apart.append((trace.checks, news, rounds))
+            everything += traced[-1] + trace.checks + news + [item for turn in rounds for item in turn]
+        bends = any(item.array == MISSED for item in everything)
+        passes = Passes((GUESS, GAIN), sent if bends else None) if operation == "step" else None
+        sent += 2 * pieces.warps if bends else 0
+        whole = [item for item in everything if item.array == "out"]
+        frame = self._frame(operation, whole, everything, shapes, more, sent, pieces.warps)
+        if frame.result.way == DIRECT and frame.result.array.entries > staging.LONG_ROW:
+            return None  # no room for the result in shared memory, which matters more
+        if not frame.fits(self.run.dtype):
+            return None  # nor for what limbs tell each other
+        team = Team(pieces, dtype, passes)
+        outs = [[item for item in stores if item.array == "out"] for stores in traced]
+        placed, table = staging.placed(whole, frame.result)
+        outs[0] += placed[len(whole) :] if table is None else []  # zeros
+        by_slot = lambda found: found if table is None else staging.by_slot(found, table)  # noqa: E731
+        for piece, stores, items, (checks, news, rounds) in zip(pieces.pieces, traced, outs, apart, strict=True):
+            emitter, checking = self._emitter(shapes, frame), self._emitter(shapes, frame)
+            later = self._emitter(shapes, frame) if passes else emitter
+            inward = [item for item in stores if item.array == INWARD]
+            outward = [item for item in stores if item.array == OUTWARD]
+            last = outward if set(SENDS[operation]) & set(messages.OUTWARD_LETTERS) else inward
+            last += by_slot(items)
+            last += [item for item in stores if item.array in (*more, GAIN)]
+            regions = emitter.region(inward), emitter.region(outward)
+            ends = [item for item in news if item.array == "out"]
+            news = [item for item in news if item.array != "out"] + by_slot(ends)
+            branches = later.branch(news), [later.branch(by_slot(turn)) for turn in rounds]
+            team.add(
+                Work(piece, *regions, checking.region(checks), *branches),
+                sum(each.operations for each in {emitter, checking, later}),
+            )
+        cuda = team.cuda()  # fills the tables
+        registers = _registers(pieces.warps)
+        if operation in BLOCKS and dtype == "float32" and not self.plan.few:
+            blocks, enough = BLOCKS[operation]
+            fewer = _registers(blocks * pieces.warps)
+            registers = fewer if fewer >= enough else registers
+        lists = {"place": table, "table": team.table, "shifts": team.shifts}
+        tables = {name: values for name, values in lists.items() if values}
+        cap = registers if registers < MOST_REGISTERS else None
+        return self._finished(operation, frame, cuda, team.cpu(), tables, team.operations, cap)
+
+    @staticmethod
+    def _flattened(item: Store, shapes: dict) -> Store:
+        if item.array in (INWARD, OUTWARD, *LOOPED):
+            return item
+        return item._replace(index=(staging.flat(item.index, shapes[item.array][1:]),))
+
+    def _finished(
+        self,
+        operation: str,
+        frame: Frame,
+        cuda: str,
+        cpu: str,
+        tables: dict,
+        operations: int,
+        registers: int | None = None,
+    ) -> Program:
+        native = straight.assemble(frame, cuda, cpu, self.run.dtype)
+        rows, fields = (*(row.name for row in frame.rows), *frame.numbers), tuple(frame.fields)
+        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 0) for name in frame.numbers]
+        arrays += [(name, 2) for name in fields]
+        result, entry = frame.result, None
+        if result.way in SPREAD:
+            tables = tables | {"place": result.spread.table(tables["place"], self.run.dtype)}
+        held: dict[str, wp.array] = {
+            name: wp.array(values, dtype=int if name in INTEGERS else self.run.dtype, device=self.run.device)
+            for name, values in tables.items()
+        }
+        if result.way == TILED:
+            entry = held.pop("place")
+        arrays += [(name, array.ndim) for name, array in held.items()]
+        arrays += [("out", result.array.ndim if entry is None else 3)] + [(row.name, row.ndim) for row in frame.more]
+        kernel = straight.kernel(operation, native, arrays, self.run.dtype, registers)
+        return Program(
+            kernel, rows, fields, tuple(held.values()), frame.warps, frame.block, operations, result.slots, entry
+        )
+
+    def _frame(
+        self,
+        operation: str,
+        stores: list[Store],
+        everything: list[Store],
+        shapes: dict,
+        more: tuple,
+        sent: int = 0,
+        warps: int = 1,
+    ) -> Frame:
+        ways = self.plan.stages(operation, warps), self.plan.gathers(operation, warps, 1 + len(more))
+        return staging.frame(stores, everything, shapes, more, sent, warps, self.run.dtype, *ways, self.relays)
+
+    def _emitter(self, shapes: dict, frame: Frame) -> Emitter:
+        result = frame.result
+        angles = Angles.IN_PLACE if frame.staged else Angles.AGAIN if frame.again else Angles.FIRST
+        guard = "if (mine) " if result.way == DIRECT else ""
+
+        def load(array: str, entry: str) -> str:
+            if array in (INWARD, OUTWARD):
+                return f"SENT({entry})"
+            if array in LOOPED and frame.warps > 1:
+                return f"{'' if array == MISSED else PREFIX}{array}_row[{entry}]"
+            if array in FIELDS:
+                return f"FIELD({array}, {entry})"
+            return f"{array}_row[{entry}]"
+
+        def store(array: str, entry: str, value: str) -> str:
+            if array in (INWARD, OUTWARD):
+                return f"SENT({entry}) = {value};"
+            if array == "out" and result.way == RELAYED:
+                return f"RELAY({entry}) = {value};"
+            if array == MISSED and frame.warps > 1:
+                return f"missed_row[0] += {value};"
+            if array in LOOPED and frame.warps > 1:
+                return f"{'if (open) ' if array == GUESS else ''}{load(array, entry)} = {value};"
+            if array == "out" and result.way == TILED:
+                return f"if (mine) result_row[({entry}) * {straight.TILE}] = {value};"
+            if array == "out":
+                return f"{guard}result_row[{entry}] = {value};"
+            return f"if (mine) {array}_row[{entry}] = {value};"
+
+        places = {
+            name: {entry: place for place, entry in enumerate(entries)}
+            for name, entries in zip(frame.fields, frame.held, strict=False)
+        }
+
+        def flat(array: str, index: tuple) -> int:
+            if array in places:
+                return places[array][index[0]]
+            return index[0] if len(index) == 1 else staging.flat(index, shapes[array][1:])
+
+        return Emitter(self.run.dtype.__name__, load, store, flat, angles, FIELDS)
+
+
+def _registers(warps: int) -> int:
+    """Of a thread, if a multiprocessor is to hold so many warps: its parts share them, each with its own registers."""
+    return REGISTERS // PARTS // (WARP * -(-warps // PARTS)) // 8 * 8
+
+
+def _called(key: tuple) -> str:
+    """What the user calls the operation of a program."""
+    if key[0] == "expression":
+        return written(key[-1])
+    without_qdd = {("q",): "gravity_force", ("q", "qd"): "bias_force", ("q", "qd", "body_f"): "bias_force"}
+    return without_qdd.get(key[1], key[0]) if key[0] == "inverse_dynamics" else key[0]

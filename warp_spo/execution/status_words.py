@@ -1,0 +1,39 @@
+"""The word of each world that says whether its forward dynamics can be trusted; see ``Dynamics.forward_dynamics``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from ..kernels import declare
+from ..kernels import status as kernels
+from ..kernels.spatial import ARTICULATED
+from .sweeps import Recursions
+
+
+def write(
+    run: Recursions, q: wp.array, qd: Any, tau: Any, body_f: Any, qdd: wp.array, status: wp.array, factored: bool
+) -> None:
+    """Fill ``status`` [world] for forward dynamics that has just run: one sweep inward, and a launch over the worlds.
+
+    Reads pose, axis, articulated, gain and pivot. Sweeps have left them in the workspace (``factored``); for a
+    recursion that keeps them elsewhere the factorisation is swept now. What that loses bounds what the other form
+    loses, whose hinges lie along axes.
+    """
+    declare(kernels, run.steps)
+    if not factored:
+        run.hinges(q)
+        run.factor()
+    p, dofs = run.parameters, run.scene.dof_count
+    armature, pose, axis = p.field("joint_armature"), run.array("pose"), run.array("axis")
+    rounding = run.array("rounding", run.scene.body_count, ARTICULATED, run.worlds)
+    lost = run.array("lost", dofs, run.worlds)
+    factors = [run.array(name) for name in ("articulated", "gain", "pivot")]
+    inputs = [p.tree, pose, axis, p.rigid, armature, *factors]
+    kernel = kernels.digits(run.steps)
+    for first, count in run.plan.inward:
+        arguments = [run.topology, first, *inputs]
+        wp.launch(kernel, (count, run.worlds), arguments, [rounding, lost], device=run.device)
+    values = [p.tree, p.com, p.rigid, armature, p.gravity]
+    run.launch_nodes(kernels.word, run.worlds, [q, qd, tau, body_f, *values, lost, qdd], [status])

@@ -1,0 +1,244 @@
+"""The sweeps of a scene at node granularity, a launch a level, one method for each.
+
+A method launches its kernels and leaves the results in the workspace, [node or dof, component, world]; later methods
+read what earlier ones left. The workspace is allocated at first use and kept.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels import articulated, composite, declare, kinematics, newton_euler, parameters, rigid_blocks, tiles
+from ..kernels.spatial import ARTICULATED, MOTION, POSE, RIGID
+from ..kernels.topology import Topology
+from ..scene.scene import Scene
+from .node_steps import steps
+from .parameters import Parameters
+from .plan import Plan
+
+
+class Recursions:
+    """Launches of one scene's recursions.
+
+    Attributes:
+        topology: the tree's tables on the device.
+        parameters: the scene's values on the device.
+        steps: what kernels at node granularity do at a node.
+    """
+
+    def __init__(self, scene: Scene, plan: Plan, device: wp.Device, dtype: type, variable: tuple[str, ...]):
+        self.scene, self.plan, self.device, self.dtype = scene, plan, device, dtype
+        self.steps = steps(dtype)
+        declare(tiles, dtype)
+        for file in (parameters, kinematics, newton_euler, articulated, composite, rigid_blocks):
+            declare(file, self.steps)
+        self.worlds = plan.worlds
+        self.topology = _topology(scene, device)
+        screw = np.column_stack([scene.dof_axis, scene.dof_angular, scene.dof_linear])
+        self._screw: Any = wp.array(screw, dtype=dtype, device=device)
+        self.parameters = Parameters(scene, self.topology, self.worlds, device, dtype, variable)
+        self._workspace: dict[Any, wp.array] = {}
+        self._frames: dict[tuple, tuple[wp.array, wp.array]] = {}
+
+    def replace_values(self, scene: Scene) -> None:
+        """Take the values of ``scene``, the same topology; variable values stay as they were set."""
+        before, variable = self.parameters, self.parameters.variable
+        self.scene = scene
+        self.parameters = Parameters(scene, self.topology, self.worlds, self.device, self.dtype, variable)
+        self.parameters.adopt_variable(before)
+
+    # -- launching -------------------------------------------------------------------------------------------------
+    @property
+    def nodes(self) -> tuple[int, int]:
+        """Launch dimensions of a kernel with one thread for each (node, world)."""
+        return self.scene.body_count, self.worlds
+
+    @property
+    def workspace_bytes(self) -> int:
+        """Device memory that the calls so far have taken."""
+        return sum(array.capacity for array in self._workspace.values())
+
+    def array(self, name: Any, *shape: int) -> wp.array:
+        """The workspace array of that name; the first use gives its shape."""
+        if name not in self._workspace:
+            assert shape, f"workspace array {name!r} is read before it is written"
+            self._workspace[name] = wp.empty(shape, dtype=self.dtype, device=self.device)
+        return self._workspace[name]
+
+    def _per_node(self, name: Any, components: int) -> wp.array:
+        return self.array(name, self.scene.body_count, components, self.worlds)
+
+    def launch(self, factory: Callable, dim: Any, inputs: list, outputs: list) -> None:
+        wp.launch(factory(self.dtype), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    def launch_nodes(self, factory: Callable, dim: Any, inputs: list, outputs: list) -> None:
+        """Launch a kernel that takes the steps."""
+        wp.launch(factory(self.steps), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    def _sweep(self, factory: Callable, levels: Sequence[tuple[int, int]], inputs: list, outputs: list) -> None:
+        """One launch a level, one thread for each (node, world)."""
+        kernel = factory(self.steps)
+        for first, count in levels:
+            arguments = [self.topology, first, *inputs]
+            wp.launch(kernel, (count, self.worlds), arguments, outputs, device=self.device)
+
+    def _sweep_columns(
+        self, factory: Callable, levels: Sequence, columns: tuple[int, int], inputs: list, outputs: list
+    ) -> None:
+        """One launch a level, one thread for each (node, column, world); ``columns`` = (first, count)."""
+        kernel = factory(self.steps)
+        for first, count in levels:
+            arguments = [self.topology, first, columns[0], *inputs]
+            wp.launch(kernel, (count, columns[1], self.worlds), arguments, outputs, device=self.device)
+
+    # -- kinematics ------------------------------------------------------------------------------------------------
+    def hinges(self, q: wp.array, qd: wp.array | None = None) -> None:
+        """Pose and H* of every node; with qd also H* qd and dH*/dt qd."""
+        outputs = [
+            self._per_node("pose", POSE),
+            self.array("axis", self.scene.dof_count, MOTION, self.worlds),
+            None if qd is None else self._per_node("velocity", MOTION),
+            None if qd is None else self._per_node("bias", MOTION),
+        ]
+        inputs = [self.topology, self._screw, self.parameters.tree, self.parameters.com, q, qd]
+        self.launch_nodes(kinematics.hinge, self.nodes, inputs, outputs)
+
+    def velocities(self) -> wp.array:
+        """V = phi* H* qd, after hinges with qd."""
+        velocity = self.array("velocity")
+        inputs = [self.array("pose"), self.array("axis"), self.array("bias"), None, None]
+        self._sweep(kinematics.motion, self.plan.outward, inputs, [velocity, None])
+        return velocity
+
+    def accelerations(self, qdd: wp.array | None, moves: bool, gravity: bool) -> tuple[wp.array, wp.array | None]:
+        """alpha = phi* (H* qdd + a), with or without gravity, and V if it ``moves``: after hinges with qd."""
+        velocity, bias = (self.array("velocity"), self.array("bias")) if moves else (None, None)
+        acceleration = self._per_node("acceleration", MOTION)
+        base = self.parameters.gravity if gravity else None
+        inputs = [self.array("pose"), self.array("axis"), bias, base, qdd]
+        self._sweep(kinematics.motion, self.plan.outward, inputs, [velocity, acceleration])
+        return acceleration, velocity
+
+    def world_poses(self) -> wp.array:
+        """Pose of every node frame in the inertial frame."""
+        world_pose = self._per_node("world_pose", POSE)
+        self._sweep(kinematics.poses, self.plan.outward, [self.array("pose")], [world_pose])
+        return world_pose
+
+    def frames(self, frames: tuple) -> tuple[wp.array, wp.array]:
+        """Bodies [frame] and origins in the body frame [frame, 3] on the device; the same arrays for equal frames."""
+        if frames not in self._frames:
+            bodies: Any = wp.array([body for body, _ in frames], dtype=int, device=self.device)
+            origins: Any = wp.array(np.array([origin for _, origin in frames]), dtype=self.dtype, device=self.device)
+            self._frames[frames] = (bodies, origins)
+        return self._frames[frames]
+
+    def jacobian(self, frame_nodes: wp.array, frame_offsets: wp.array, out: wp.array) -> None:
+        """Jacobians of frames, [world, frame, 6, dof]."""
+        where = [frame_nodes, frame_offsets, self.parameters.anchor]
+        inputs = [self.topology, *where, self.array("pose"), self.world_poses(), self.array("axis")]
+        self.launch_nodes(kinematics.jacobian, (len(frame_nodes), self.worlds), inputs, [out])
+
+    # -- Newton-Euler ----------------------------------------------------------------------------------------------
+    def body_forces(self, acceleration: Any, velocity: Any, body_f: Any) -> wp.array:
+        """M alpha + crf(V) M V less the external wrench, of every node by itself; None is zero."""
+        force = self._per_node("force", MOTION)
+        world_pose = None if body_f is None else self.world_poses()
+        inputs = [self.parameters.rigid, self.parameters.com, acceleration, velocity, body_f, world_pose]
+        self.launch_nodes(newton_euler.body_force, self.nodes, inputs, [force])
+        return force
+
+    def hinge_forces(self, qdd: wp.array | None, force: wp.array, out: wp.array) -> None:
+        """out = H phi force + Delta qdd."""
+        inputs = [self.array("pose"), self.array("axis"), self.parameters.field("joint_armature"), qdd]
+        self._sweep(newton_euler.force, self.plan.inward, inputs, [force, out])
+
+    # -- mass matrix -----------------------------------------------------------------------------------------------
+    def mass_matrix(self, out: wp.array) -> None:
+        """Mass by composite bodies, [world, dof, dof]."""
+        pose, axis, bodies = self.array("pose"), self.array("axis"), self._per_node("composite", RIGID)
+        self._sweep(composite.composite, self.plan.inward, [pose, self.parameters.rigid], [bodies])
+        out.zero_()
+        inputs = [self.topology, pose, axis, self.parameters.field("joint_armature"), bodies]
+        self.launch_nodes(composite.mass_matrix, (self.scene.dof_count, self.worlds), inputs, [out])
+
+    def factor(self) -> wp.array:
+        """Mass = [I + H phi K] D [I + H phi K]*; returns the pivots of D [dof, world]."""
+        dofs = self.scene.dof_count
+        inputs = [
+            self.array("pose"),
+            self.array("axis"),
+            self.parameters.rigid,
+            self.parameters.field("joint_armature"),
+        ]
+        outputs = [
+            self._per_node("articulated", ARTICULATED),
+            self.array("gain", dofs, MOTION, self.worlds),
+            self.array("pivot", dofs, self.worlds),
+        ]
+        self._sweep(articulated.factor, self.plan.inward, inputs, outputs)
+        return outputs[2]
+
+    def solve(self, b: wp.array | None, out: wp.array, force: wp.array | None = None, gravity: bool = False) -> None:
+        """out = Mass^-1 (b - H phi force), less what gravity takes; after :meth:`factor`.
+
+        b and out are [world, dof] or [world, dof, column]; None is zero.
+        """
+        shape = (*out.shape[:2], math.prod(out.shape[2:]))
+        out, b = out.reshape(shape), None if b is None else b.reshape(shape)
+        base = self.parameters.gravity if gravity else None
+        for columns, work in self._chunks(shape[2]):
+            self._reduce(columns, force, b, False, work, out)
+            self._sweep_columns(articulated.expand, self.plan.outward, columns, [*self._factors, base], [work, out])
+
+    def sandwich(self, b: wp.array | None, columns: int, out: wp.array) -> None:
+        """out = b* Mass^-1 b [world, column, column] for b [world, dof, column], None = unit matrix; after factor."""
+        half = self.array(("half", columns), self.worlds, self.scene.dof_count, columns)
+        for chunk, work in self._chunks(columns):
+            self._reduce(chunk, None, b, b is None, work, half)
+        self.launch_nodes(articulated.weighted_product, out.shape, [half, self.array("pivot")], [out])
+
+    @property
+    def _factors(self) -> list[wp.array]:
+        return [self.array(name) for name in ("pose", "axis", "gain", "pivot")]
+
+    def _reduce(self, columns: tuple, force: Any, b: Any, identity: bool, work: wp.array, out: wp.array) -> None:
+        """out = D^-1 [I - H psi K] (b - H phi force)."""
+        inputs = [*self._factors, force, b, identity]
+        self._sweep_columns(articulated.reduce, self.plan.inward, columns, inputs, [work, out])
+
+    def _chunks(self, columns: int) -> list[tuple[tuple[int, int], wp.array]]:
+        """(first, count) of the right-hand sides that go together, each with the workspace that it needs."""
+        scalar = wp.types.type_size_in_bytes(self.dtype)
+        size = self.plan.column_chunk(columns, self.scene.body_count * MOTION * self.worlds * scalar)
+        work = self.array(("columns", size), self.scene.body_count, MOTION, size * self.worlds)
+        return [((first, min(size, columns - first)), work) for first in range(0, columns, size)]
+
+
+def _topology(scene: Scene, device: wp.Device) -> Topology:
+    tree, hinge_of = scene.tree, scene.hinge_of
+    hinges = [scene.hinges[h] for h in hinge_of]
+    dof_node = np.zeros(scene.dof_count, dtype=np.int32)
+    for node, hinge in enumerate(hinges):
+        first = scene.qd_start[hinge_of[node]]
+        dof_node[first : first + hinge.dof_count] = node
+    tables = {
+        "order": [node for level in tree.levels for node in level],
+        "parent": tree.parent,
+        "child_start": np.cumsum([0] + [len(children) for children in tree.children]),
+        "children": [child for children in tree.children for child in children],
+        "motion": [hinge.motion for hinge in hinges],
+        "q_start": scene.q_start[hinge_of],
+        "qd_start": scene.qd_start[hinge_of],
+        "dof_count": [hinge.dof_count for hinge in hinges],
+        "dof_node": dof_node,
+    }
+    topology = Topology()
+    for name, table in tables.items():
+        setattr(topology, name, wp.array(np.asarray(table, dtype=np.int32), dtype=int, device=device))
+    return topology

@@ -1,0 +1,301 @@
+"""Teams: the statements of a scene's pieces put together, a warp for each leaf piece, barriers between the stages."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from ..kernels import straight
+from ..recursions.pieces import Piece, Pieces
+from ..trace.emission import C_TYPE, Listing, filled, literal, literals
+
+BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
+CACHED = 8192  # operations of a world whose code an instruction cache holds
+
+
+class Work(NamedTuple):
+    """What one piece has to do: going in, coming out, checking a pass, telling others, and, in rounds, what those said.
+
+    Of work in passes, the last two come when all passes are done.
+    """
+
+    piece: Piece
+    inward: Listing
+    outward: Listing
+    check: Listing
+    news: Listing
+    rounds: list[Listing]
+
+    @property
+    def text(self) -> tuple[str, str, str]:
+        return self.inward.text, self.outward.text, self.check.text
+
+
+class Passes(NamedTuple):
+    """Passes in which a team goes round all its work, until every warp's guesses were right.
+
+    Attributes:
+        kept: names of what a piece keeps from pass to pass, by dof of its own: arrays of a thread whose indices are
+            constants, so that they live in registers.
+        flags: where in the memory that warps share the flags begin; None: there is nothing to guess, one pass will do.
+    """
+
+    kept: tuple[str, ...]
+    flags: int | None
+
+    def declared(self, entries: dict[str, int], c: str) -> str:
+        """What pieces keep, by the prefix of their names: so many entries each."""
+        sizes = entries.items()
+        return "\n".join(f"{c} {prefix}{name}_row[{count}] = {{}};" for prefix, count in sizes for name in self.kept)
+
+
+class Team:
+    """The work of all pieces of a scene.
+
+    Args:
+        pieces, dtype: of the scene.
+        passes: the work is done in passes, see :class:`Passes`.
+
+    Attributes:
+        table: constants in which equal pieces differ. shifts: likewise, distances of the entries that they read and
+            write. Both as the kernel's arrays hold them.
+        operations: floating-point operations of one world.
+    """
+
+    def __init__(self, pieces: Pieces, dtype: str, passes: Passes | None = None):
+        self.pieces, self.dtype, self.c, self.passes = pieces, dtype, C_TYPE[dtype], passes
+        self.table: list[float] = []
+        self.shifts: list[int] = []
+        self.operations = 0
+        self._work: dict[int, Work] = {}
+
+    def add(self, work: Work, operations: int) -> None:
+        """Take on the work of a piece, whose ``rounds`` may use all that others sent."""
+        self._work[work.piece.index] = work
+        self.operations += operations
+
+    @property
+    def _last(self) -> int:
+        """The last stage in which there is something to do."""
+        stages = [0]
+        for piece, inward, outward, _, _, rounds in self._work.values():
+            stages += [piece.inward] if inward.text else []
+            stages += [piece.outward] if outward.text else []
+            if rounds and not self.passes:
+                stages.append(self.pieces.stages - 1)  # pieces further in meet in the last one
+        return max(stages)
+
+    def cpu(self) -> str:
+        """Everything in order, by one thread."""
+        text: list[str] = []
+        later: list[str] = []
+        for stage in range(self._last + 1):
+            for piece in reversed(self.pieces.pieces):
+                if piece.inward == stage:
+                    text.append(literals(self._work[piece.index].inward, self.dtype, f"p{piece.index}_"))
+            for piece in self.pieces.pieces:
+                if piece.outward == stage:
+                    text.append(literals(self._work[piece.index].outward, self.dtype, f"p{piece.index}_"))
+                    if self._work[piece.index].check.text:
+                        text.append(self._branch(piece, self._work[piece.index].check))
+                    (later if self.passes else text).append(self._branch(piece, self._work[piece.index].news))
+        for work in self._work.values():
+            later += [self._branch(work.piece, listing) for listing in work.rounds]
+        if self.passes:
+            kept = {f"p{piece.index}_": piece.weight for piece in self.pieces.pieces}
+            text = [self.passes.declared(kept, self.c), straight.alone("\n".join(text), self.c)]
+        return "\n".join(text + later)
+
+    def _branch(self, piece: Piece, listing: Listing) -> str:
+        return "\n".join(["{", literals(listing, self.dtype, f"p{piece.index}_"), "}"])
+
+    def cuda(self) -> str:
+        """A branch for each kind of leaf piece, which its warps enter together."""
+        kinds: dict[tuple, list[Work]] = {}
+        for work in self._work.values():
+            if not work.piece.children:
+                kinds.setdefault(work.text, []).append(work)
+        text: list[str] = []
+        for alike in kinds.values():
+            text.append(f"{'else ' if text else ''}if ({_any_of([work.piece.warp for work in alike])}) {{")
+            inward, outward = self._shared(alike)
+            text += [inward, self._inner([work.piece.warp for work in alike]), outward]
+            if not self.passes and any(work.rounds for works in kinds.values() for work in works):
+                text += [self._apart(alike, [[work.news] for work in alike], "n_"), BARRIER, self._rounds(alike)]
+            text.append("}")
+        return self._in_passes("\n".join(text)) if self.passes else "\n".join(text)
+
+    def _in_passes(self, a_pass: str) -> str:
+        """``a_pass`` until all agree, then every piece's news, and what the first makes of them."""
+        assert self.passes is not None
+        leaves = [work for work in self._work.values() if not work.piece.children]
+        inner = [work for work in self._work.values() if work.piece.children]
+        ranks: list[dict[int, Work]] = [{leaf.piece.warp: leaf for leaf in leaves}]  # by warp: one of its pieces
+        for work in inner:
+            warp = work.piece.warp
+            free = next((rank for rank in ranks if warp not in rank), None)
+            if free is None:
+                ranks.append(free := {})
+            free[warp] = work
+        names = ["", *(f"i{at}_" for at in range(len(ranks) - 1))]
+        kept = {name: max(work.piece.weight for work in rank.values()) for name, rank in zip(names, ranks, strict=True)}
+        text = [self.passes.declared(kept, self.c)]
+        text += [
+            straight.once(a_pass, BARRIER, self.c)
+            if self.passes.flags is None
+            else straight.voted(a_pass, self.passes.flags, self.pieces.warps, self.c)
+        ]
+        for last in (False, True):
+            found = []
+            for at, (name, rank) in enumerate(zip(names, ranks, strict=True)):
+                said = [rank.get(leaf.piece.warp) for leaf in leaves]
+                its = [[] if one is None else one.rounds if last else [one.news] for one in said]
+                found.append(self._apart(leaves, its, f"c{at}_", name))
+            if last and any(found):
+                text.append(BARRIER)
+            text += found
+        return "\n".join(text)
+
+    def _inner(self, warps: list[int]) -> str:
+        """The stages between the leaves' way in and their way out, with the pieces that some of ``warps`` take on."""
+        owners: dict[tuple, list[list[Work]]] = {}
+        for warp in warps:
+            mine = [work for work in self._work.values() if work.piece.children and work.piece.warp == warp]
+            if mine:
+                owners.setdefault(tuple((w.text, w.piece.inward, w.piece.outward) for w in mine), []).append(mine)
+        text: list[str] = []
+        for chains in owners.values():
+            text.append(f"{'else ' if text else ''}if ({_any_of([chain[0].piece.warp for chain in chains])}) {{")
+            shared = [self._shared(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
+            for stage in range(1, self._last + 1):
+                text.append(BARRIER)
+                order = list(zip(chains[0], shared, strict=True))
+                text += [inward for work, (inward, _) in reversed(order) if work.piece.inward == stage]
+                for at, (alike, (_, outward)) in enumerate(zip(zip(*chains, strict=True), shared, strict=True)):
+                    if alike[0].piece.outward == stage:
+                        text.append(outward)
+                        if not self.passes:
+                            text.append(self._apart(alike, [[work.news] for work in alike], f"i{at}_n_", f"i{at}_"))
+            if not self.passes:
+                text += [self._rounds(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
+            text.append("}")
+        idle = [BARRIER] * self._last
+        if text and len(warps) > sum(map(len, owners.values())):
+            text += ["else {", *idle, "}"]
+        return "\n".join(text or idle)
+
+    def _rounds(self, alike: Sequence[Work], prefix: str = "") -> str:
+        """What pieces of equal structure make of what the others said."""
+        return self._apart(alike, [work.rounds for work in alike], f"{prefix}x_", prefix)
+
+    def _apart(self, alike: Sequence[Work], turns: list[list[Listing]], tables: str, prefix: str = "") -> str:
+        """What pieces of equal structure do each for themselves, in turns: those that do the same share its text."""
+        kinds: dict[str, list[tuple[int, Listing]]] = {}
+        for work, listings in zip(alike, turns, strict=True):
+            for at, listing in enumerate(listings):
+                if listing.text:
+                    kind = listing.text if self._loops else f"{at} {listing.text}"
+                    kinds.setdefault(kind, []).append((work.piece.warp, listing))
+        text: list[str] = []
+        for at, some in enumerate(kinds.values()):
+            counts = Counter(warp for warp, _ in some)
+            warps, name = list(counts), f"{tables}{at}_"
+            several = max(counts.values()) > 1
+            who = f"{name}first + turn" if several else _chosen(warps, range(len(warps)))
+            head, (body,) = self._filled([[listing for _, listing in some]], prefix, name, who)
+            condition = "" if len(warps) == len(alike) else f"if ({_any_of(warps)}) "
+            inside = [head, body]
+            if several:
+                starts = itertools.accumulate(counts.values(), initial=0)
+                inside = [
+                    f"const int {name}first = {_chosen(warps, starts)};",
+                    "#pragma unroll 1",
+                    f"for (int turn = 0; turn < {_chosen(warps, counts.values())}; ++turn) {{",
+                    *inside,
+                    "}",
+                ]
+            text.append("\n".join([f"{condition}{{", *inside, "}"]))
+        return "\n".join(text)
+
+    @property
+    def _loops(self) -> bool:
+        """Turns are loops, slower than statements in a row that an instruction cache holds."""
+        return self.operations > CACHED
+
+    def _shared(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str]:
+        """One text, in and out, for pieces of equal structure."""
+        regions = [[work.inward for work in alike], [work.outward for work in alike], [work.check for work in alike]]
+        who = _chosen([work.piece.warp for work in alike], range(len(alike)))
+        head, (inward, outward, check) = self._filled(regions, prefix, prefix, who)
+        outward = "\n".join([outward, "{", check, "}"]) if check else outward
+        return f"{head}\n{inward}" if head else inward, outward
+
+    def _filled(self, regions: list[list[Listing]], prefix: str, tables: str, who: str) -> tuple[str, list[str]]:
+        """The text of each region, for any of those whose listings it has; what differs comes from the tables.
+
+        Args:
+            prefix: of the names of values. tables: of the names of what is read from the tables.
+            who: C++ for which of the listings it is.
+
+        Returns:
+            What comes first, and the regions.
+        """
+        constants, shifts = _Columns(), _Columns()
+
+        def constant(values: tuple[float, ...]) -> str:
+            texts = {literal(value, self.dtype) for value in values}
+            return texts.pop() if len(texts) == 1 else f"__ldg({tables}numbers + {constants.of(values)})"
+
+        def entry(found: tuple[tuple[str, int], ...]) -> str:
+            first = found[0][1]
+            distances = tuple(at - first for _, at in found)
+            return f"{first} + {tables}shift[{shifts.of(distances)}]" if any(distances) else str(first)
+
+        texts = []
+        for listings in regions:
+            names = [", ".join(dict.fromkeys(label)) for label in zip(*(x.labels for x in listings), strict=True)]
+            numbers = [constant(values) for values in zip(*(x.constants for x in listings), strict=True)]
+            entries = [entry(found) for found in zip(*(x.indices for x in listings), strict=True)]
+            texts.append(filled(listings[0], numbers, entries, names, prefix))
+        head = []
+        if constants.columns or shifts.columns:
+            head.append(f"const int {tables}who = {who};")
+        if constants.columns:
+            first, count = len(self.table), len(constants.columns)
+            head.append(f"const {self.c}* {tables}numbers = table.data + {first} + {tables}who * {count};")
+            self.table += [value for row in zip(*constants.columns, strict=True) for value in row]
+        if shifts.columns:
+            first, count = len(self.shifts), len(shifts.columns)
+            head.append(f"int {tables}shift[{count}];")
+            read = "__ldg(shifts.data + {} + {}who * {})"
+            head += [f"{tables}shift[{k}] = {read.format(first + k, tables, count)};" for k in range(count)]
+            self.shifts += [value for row in zip(*shifts.columns, strict=True) for value in row]
+        return "\n".join(head), texts
+
+
+class _Columns:
+    """Distinct tuples, one value for each member, in the order in which they were met."""
+
+    def __init__(self) -> None:
+        self.columns: list[tuple] = []
+        self._known: dict[tuple, int] = {}
+
+    def of(self, values: tuple) -> int:
+        if values not in self._known:
+            self._known[values] = len(self.columns)
+            self.columns.append(values)
+        return self._known[values]
+
+
+def _any_of(warps: list[int]) -> str:
+    return " || ".join(f"warp == {warp}" for warp in warps)
+
+
+def _chosen(warps: Sequence[int], numbers: Iterable[int]) -> str:
+    """C++ for the number of this warp, one of ``warps``."""
+    *others, last = zip(warps, numbers, strict=False)
+    if all(number == last[1] for _, number in others):
+        return str(last[1])
+    return f"({' : '.join([*(f'warp == {warp} ? {number}' for warp, number in others), str(last[1])])})"

@@ -1,0 +1,351 @@
+"""The lazy algebra of operators: sums, products, multiples and transposes are written down, then applied.
+
+An operator maps ``x`` [world, columns] to [world, rows], each world by itself. ``H @ phi @ M @ phi.T @ H.T`` computes
+nothing; ``that @ x`` applies the factors from the right, each by its own kernels, and no matrix is formed. Where all
+letters belong to one :class:`Letters`, it may apply the whole in one kernel instead.
+"""
+
+import abc
+import functools
+import itertools
+import numbers
+from typing import Any
+
+import warp as wp
+
+from ..arrays import Call, kind_of, new, parse_device, parse_dtype, view
+from ..kernels import block_sparse, declare
+
+
+class Workspace:
+    """The temporaries of one operator for one number of worlds and columns; made at first use, then kept."""
+
+    def __init__(self, call: Call, worlds: int, columns: int):
+        self._sizes = worlds, columns
+        self._memory = call.kind, call.dtype, call.device
+        self._arrays: dict[tuple, tuple] = {}
+
+    def take(self, owner: "Operator", rows: int, use: object = 0) -> wp.array:
+        """Return the temporary [world, row, column] that ``owner`` may use while it is being applied."""
+        # One operator may appear several times in an expression, but never inside itself: its temporaries are free
+        # again when its _apply returns, and no input or output of it can be one of them.
+        key = id(owner), rows, use
+        if key not in self._arrays:
+            worlds, columns = self._sizes
+            kind, dtype, device = self._memory
+            self._arrays[key] = new(kind, (worlds, rows, columns), dtype, device)
+        return self._arrays[key][1]
+
+
+class Letters(abc.ABC):
+    """Whoever owns the numbers of operators that bear letters, and may know of faster ways to apply expressions."""
+
+    @abc.abstractmethod
+    def fill(self) -> None:
+        """Launch what brings the blocks of all letters up to date, where it is not done yet."""
+
+    @abc.abstractmethod
+    def run(self, expression: Any, x: wp.array, out: wp.array) -> bool:
+        """Launch ``out = expression x`` [world, row] as one kernel, or return False; see Operator.expression."""
+
+
+class Operator(abc.ABC):
+    """A linear map of vectors, one matrix a world (or one for all).
+
+    A kind of operator says what it does in ``_apply`` and ``_apply_transposed``; everything else is here. Nothing is
+    overridden; to change an operator, wrap it.
+
+    Attributes:
+        shape: (rows, columns).
+        worlds: number of worlds; 1 = the same matrix in every world, for any number of worlds.
+        device, dtype: where and in what it computes; arrays it meets must agree.
+        kind: kind of array that :meth:`dense` returns; None = NumPy.
+        letter: (:class:`Letters`, name), for operators that belong to one.
+        form, operands: what a composed operator is made of.
+    """
+
+    letter: "tuple[Letters, str] | None" = None
+    form: tuple = ()
+    operands: "tuple[Operator, ...]" = ()
+    __array_ufunc__ = None  # NumPy hands array @ op and array + op to the operator
+
+    def __init__(self, shape: tuple[int, int], worlds: int, device: wp.Device, dtype: type, kind: str | None):
+        self.shape = shape
+        self.worlds = worlds
+        self.device = device
+        self.dtype = dtype
+        self.kind = kind
+        self._workspaces: dict[tuple, Workspace] = {}
+        declare(block_sparse, dtype)
+
+    @functools.cached_property
+    def expression(self) -> Any:
+        """The operator in letters, as nested tuples (form, operands); None where there is a part that bears none."""
+        if self.letter is not None:
+            return self.letter[1]
+        parts = [operand.expression for operand in self.operands]
+        return None if not self.form or None in parts else (*self.form, *parts)
+
+    @functools.cached_property
+    def letters(self) -> "tuple[Letters, ...]":
+        """Who owns the letters of the operator."""
+        own = () if self.letter is None else (self.letter[0],)
+        return tuple(dict.fromkeys([*own, *(owner for operand in self.operands for owner in operand.letters)]))
+
+    def _fused(self, x: wp.array, out: wp.array) -> bool:
+        """Launch ``out = op x`` [world, row] as one kernel, if there is one."""
+        return len(self.letters) == 1 and self.expression is not None and self.letters[0].run(self.expression, x, out)
+
+    def _fill(self) -> None:
+        for owner in self.letters:
+            owner.fill()
+
+    @abc.abstractmethod
+    def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
+        """Launch ``out = alpha op x``, or ``out += alpha op x``. x, out: [world, row, column], apart."""
+
+    @abc.abstractmethod
+    def _apply_transposed(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
+        """As :meth:`_apply`, of the transpose."""
+
+    def apply(self, x, out=None):
+        """Return ``op @ x``.
+
+        Args:
+            x: [world, columns of op] or [world, columns of op, any]; torch, Warp or NumPy.
+            out: array for the result [world, rows of op (, any)], of the kind of x, apart from x.
+
+        With ``out`` and without NumPy this launches and does nothing else after the first call for a number of worlds
+        and columns. One operator may be applied on one stream at a time, because its temporaries are its own.
+
+        Raises:
+            ValueError, TypeError: as :class:`warp_spo.arrays.Call`.
+        """
+        name = f"{type(self).__name__}.apply"
+        kind_of(x, name, "x")
+        many = len(x.shape) == 3
+        with Call(name, self.device, self.dtype) as call:
+            worlds = self.worlds if self.worlds > 1 else -1
+            shape = (worlds, self.shape[1], -1) if many else (worlds, self.shape[1])
+            x = call.read("x", x, shape, "[world, column of the operator, any]" if many else "[world, column]")
+            worlds = x.shape[0]
+            columns = x.shape[2] if many else 1
+            shape = (worlds, self.shape[0], columns) if many else (worlds, self.shape[0])
+            y = call.write(out, shape, "[world, row of the operator, any]" if many else "[world, row]")
+            if y.size and (many or not self._fused(x, y)):
+                self._fill()
+                key = call.kind, worlds, columns
+                if key not in self._workspaces:
+                    self._workspaces[key] = Workspace(call, worlds, columns)
+                self._apply(_with_columns(x), _with_columns(y), 1.0, False, self._workspaces[key])
+        return call.result
+
+    def dense(self):
+        """Return the matrix [world, row, column]; world = 1 if it is the same in all. For looking and for testing."""
+        return self._columns("dense", 0, self.shape[1], 0, self.shape[0])
+
+    def _columns(self, name, first, count, first_row, rows):
+        """Rows ``first_row`` ... of the columns ``first`` ... of the matrix, in the operator's kind."""
+        with Call(f"{type(self).__name__}.{name}", self.device, self.dtype, kind=self.kind) as call:
+            y = call.write(None, (self.worlds, rows, count))
+            if y.size:
+                space = Workspace(call, self.worlds, count)
+                x, whole = space.take(self, self.shape[1], "x"), y
+                if rows != self.shape[0]:
+                    whole = space.take(self, self.shape[0], "y")
+                self._fill()
+                wp.launch(block_sparse.unit(self.dtype), x.shape, [first], [x], device=self.device)
+                self._apply(x, whole, 1.0, False, space)
+                if whole is not y:
+                    wp.copy(y, whole[:, first_row : first_row + rows])
+        return call.result
+
+    @functools.cached_property
+    def T(self) -> "Operator":
+        """The transpose."""
+        return Transpose(self)
+
+    def __matmul__(self, other):
+        return Product(self, other) if isinstance(other, Operator) else self.apply(other)
+
+    def __rmatmul__(self, array):
+        kind_of(array, "array @ operator", "array")
+        if len(array.shape) != 2:
+            raise ValueError(
+                f"array @ operator: array has shape {tuple(array.shape)}; expected [world, row of the operator]; for "
+                f"several columns write operator.T @ array with [world, row, column]"
+            )
+        return self.T.apply(array)
+
+    def __add__(self, other):
+        return Sum(self, other) if isinstance(other, Operator) else self._refuse("+", other)
+
+    def __sub__(self, other):
+        return Sum(self, Scaled(-1.0, other)) if isinstance(other, Operator) else self._refuse("-", other)
+
+    def __radd__(self, other):
+        return self._refuse("+", other)
+
+    def __rsub__(self, other):
+        return self._refuse("-", other)
+
+    def __neg__(self):
+        return Scaled(-1.0, self)
+
+    def __mul__(self, number):
+        return Scaled(number, self) if isinstance(number, numbers.Real) else self._refuse("*", number)
+
+    __rmul__ = __mul__
+
+    def _refuse(self, sign, other):
+        expected = "a number" if sign == "*" else "an operator"
+        raise TypeError(
+            f"{type(self).__name__} {sign} {type(other).__name__}: expected {expected}; use dense() for matrices of "
+            f"numbers, or @ to apply the operator"
+        )
+
+    def __repr__(self):
+        worlds = "any worlds" if self.worlds == 1 else f"{self.worlds} worlds"
+        return (
+            f"{type(self).__name__}({self.shape[0]} x {self.shape[1]}, {worlds}, {self.dtype.__name__}, {self.device})"
+        )
+
+
+class Identity(Operator):
+    """``I x = x``.
+
+    Args:
+        size: number of rows and columns.
+        device: as everywhere; the CPU unless given.
+        dtype: "float32" or "float64".
+    """
+
+    def __init__(self, size: int, device="cpu", dtype="float64", kind: str | None = None):
+        super().__init__((size, size), 1, parse_device(device), parse_dtype(dtype, "Identity"), kind)
+        self.form = ("identity",)
+
+    def _apply(self, x, out, alpha, accumulate, space):
+        add_scaled(x, out, alpha, accumulate)
+
+    _apply_transposed = _apply
+
+
+class Scaled(Operator):
+    """``(a B) x = a (B x)``; costs nothing, the factor goes into the kernels of B."""
+
+    def __init__(self, factor: float, operand: Operator):
+        super().__init__(operand.shape, operand.worlds, operand.device, operand.dtype, operand.kind)
+        self.factor = float(factor)
+        self.operand = operand
+        self.form, self.operands = ("scaled", self.factor), (operand,)
+
+    def _apply(self, x, out, alpha, accumulate, space):
+        self.operand._apply(x, out, alpha * self.factor, accumulate, space)
+
+    def _apply_transposed(self, x, out, alpha, accumulate, space):
+        self.operand._apply_transposed(x, out, alpha * self.factor, accumulate, space)
+
+
+class Transpose(Operator):
+    """``B.T``."""
+
+    def __init__(self, operand: Operator):
+        super().__init__(operand.shape[::-1], operand.worlds, operand.device, operand.dtype, operand.kind)
+        self.operand = operand
+        self.form, self.operands = ("transpose",), (operand,)
+        self.__dict__["T"] = operand
+
+    def _apply(self, x, out, alpha, accumulate, space):
+        self.operand._apply_transposed(x, out, alpha, accumulate, space)
+
+    def _apply_transposed(self, x, out, alpha, accumulate, space):
+        self.operand._apply(x, out, alpha, accumulate, space)
+
+
+class Sum(Operator):
+    """``(B + C) x = B x + C x``, added from left to right."""
+
+    def __init__(self, *terms: Operator):
+        self.terms = _flatten(Sum, terms, "terms")
+        for term in self.terms:
+            if term.shape != self.terms[0].shape:
+                raise ValueError(
+                    f"sum of operators: {self.terms[0]!r} and {term!r} differ in shape; expected equal shapes; check "
+                    f"which of them is missing a .T"
+                )
+        super().__init__(self.terms[0].shape, *_common("sum", self.terms))
+        self.form, self.operands = ("sum",), self.terms
+
+    def _apply(self, x, out, alpha, accumulate, space):
+        for index, term in enumerate(self.terms):
+            term._apply(x, out, alpha, accumulate or index > 0, space)
+
+    def _apply_transposed(self, x, out, alpha, accumulate, space):
+        for index, term in enumerate(self.terms):
+            term._apply_transposed(x, out, alpha, accumulate or index > 0, space)
+
+
+class Product(Operator):
+    """``(B C) x = B (C x)``."""
+
+    def __init__(self, *factors: Operator):
+        self.factors = _flatten(Product, factors, "factors")
+        for left, right in itertools.pairwise(self.factors):
+            if left.shape[1] != right.shape[0]:
+                raise ValueError(
+                    f"product of operators: {left!r} @ {right!r}; expected as many columns on the left as rows on the "
+                    f"right; check which of them is missing a .T"
+                )
+        super().__init__((self.factors[0].shape[0], self.factors[-1].shape[1]), *_common("product", self.factors))
+        self.form, self.operands = ("product",), self.factors
+
+    def _apply(self, x, out, alpha, accumulate, space):
+        for stage, factor in enumerate(self.factors[:0:-1]):
+            between = space.take(self, factor.shape[0], stage % 2)
+            factor._apply(x, between, 1.0, False, space)
+            x = between
+        self.factors[0]._apply(x, out, alpha, accumulate, space)
+
+    def _apply_transposed(self, x, out, alpha, accumulate, space):
+        for stage, factor in enumerate(self.factors[:-1]):
+            between = space.take(self, factor.shape[1], stage % 2)
+            factor._apply_transposed(x, between, 1.0, False, space)
+            x = between
+        self.factors[-1]._apply_transposed(x, out, alpha, accumulate, space)
+
+
+def add_scaled(x: wp.array, out: wp.array, alpha: float, accumulate: bool) -> None:
+    """Launch ``out = alpha x``, or ``out += alpha x``; [world, row, column]."""
+    wp.launch(block_sparse.scale(x.dtype), x.shape, [alpha, accumulate, x], [out], device=x.device)
+
+
+def _with_columns(array: wp.array) -> wp.array:
+    """[world, row] as [world, row, 1]."""
+    if array.ndim == 3:
+        return array
+    return view(array.ptr or 0, (*array.shape, 1), array.dtype, str(array.device))
+
+
+def _flatten(kind: type, operands, name: str) -> tuple:
+    return tuple(
+        part for operand in operands for part in (getattr(operand, name) if type(operand) is kind else (operand,))
+    )
+
+
+def _common(what: str, operands) -> tuple:
+    """Worlds, device, dtype and kind of a composition; ValueError that names two operands that do not fit."""
+    first = operands[0]
+    worlds = 1
+    for operand in operands:
+        if operand.device != first.device or operand.dtype is not first.dtype:
+            raise ValueError(
+                f"{what} of operators: {first!r} and {operand!r} differ in device or dtype; expected the same; build "
+                f"them with the same device= and dtype="
+            )
+        if operand.worlds > 1 and worlds > 1 and operand.worlds != worlds:
+            raise ValueError(
+                f"{what} of operators: one has {worlds} worlds, {operand!r} another number; expected the same, or "
+                f"weights that all worlds share"
+            )
+        worlds = max(worlds, operand.worlds)
+    return worlds, first.device, first.dtype, next((o.kind for o in operands if o.kind is not None), None)

@@ -1,0 +1,220 @@
+"""The paper's graph layer: the block-weighted adjacency E of a graph and its resolvent A = (I - E)^-1.
+
+``E = sum e_p w(p, k) e_k*`` over the edges, parent p, child k (Jain, eq. 4); ``A = I + E + E^2 + ...`` (eq. 9), a sum
+that ends, because without directed loops E is nilpotent (Lemma 2). A is never formed: ``A @ x`` sweeps from the tips to
+the roots, ``A.T @ x`` from the roots to the tips, one launch a level.
+"""
+
+import functools
+from collections.abc import Sequence
+from itertools import accumulate
+
+import warp as wp
+
+from ..arrays import WARP
+from ..errors import whole
+from ..scene.tree import Digraph, Tree
+from .algebra import Identity, Operator, Product, Scaled, Sum, Transpose, add_scaled
+from .blocks import Blocks, Stored, Table, choose_memory, matrix_size, memory, pack, place_offsets
+
+__all__ = ["BWA", "Blocks", "Identity", "Operator", "Product", "Resolvent", "Scaled", "Sum", "Transpose"]
+
+
+class BWA(Operator):
+    """Block-weighted adjacency E: ``(E x)(p) = sum of w(p, k) x(k)`` over the children k of p (eq. 4).
+
+    Vectors are [world, N], N = sum(dims), node after node.
+
+    Args:
+        graph: a Tree, with one weight a node, None for the roots; or a Digraph, with one weight an edge.
+        weights: weight k maps the child's vector to the parent's: [world, m_parent, m_child] or [m_parent, m_child];
+            torch, Warp or NumPy. They are copied. Weights without a world axis are shared by all worlds.
+        dims: size m of each node; may be left out where the weights tell it.
+        device, dtype: those of the weights unless given; NumPy: the CPU.
+
+    Attributes:
+        graph, dims: as given.
+        starts: where each node begins in a vector; one more entry for the end.
+        offsets: first scalar of each edge's block in ``weights``, in the order of ``graph.edges``.
+
+    Raises:
+        ValueError, TypeError: a weight that is missing, or that does not fit its nodes.
+    """
+
+    def __init__(
+        self, graph: Tree | Digraph, weights: Sequence, dims: Sequence[int] | None = None, device=None, dtype=None
+    ):
+        labels, given = _edge_weights(graph, weights)
+        device, dtype, kind = choose_memory("BWA", given, device, dtype)
+        sizes = [matrix_size("BWA", label, weight) for label, weight in zip(labels, given, strict=True)]
+        dims = _node_dims(graph, labels, sizes, dims)
+        packed = pack("BWA", labels, given, sizes, device, dtype)
+        self._set(graph, dims, packed, None, kind)
+
+    @classmethod
+    def packed(
+        cls,
+        graph: Tree | Digraph,
+        dims: Sequence[int],
+        weights: wp.array | Stored,
+        offsets: Sequence[int] | None = None,
+        kind: str | None = WARP,
+    ) -> "BWA":
+        """Return E over weights that lie on the device already and may be rewritten there.
+
+        Args:
+            graph, dims: as above; dims is needed.
+            weights: [world or 1, scalar], any strides; kept, not copied.
+            offsets: first scalar of each edge's block, in the order of ``graph.edges``; one after the other unless
+                given.
+            kind: kind of array that :meth:`dense` returns.
+        """
+        _edge_weights(graph, None)
+        self = cls.__new__(cls)
+        self._set(graph, _node_dims(graph, [], [], dims), weights, offsets, kind)
+        return self
+
+    def _set(self, graph, dims, weights, offsets, kind):
+        sizes = [(dims[parent], dims[child]) for parent, child in graph.edges]
+        self.graph = graph
+        self.dims = dims
+        self.starts = (0, *accumulate(dims))
+        self.offsets = place_offsets("BWA", sizes, weights, offsets)
+        self.stored = weights
+        super().__init__((self.starts[-1], self.starts[-1]), weights.shape[0], weights.device, weights.dtype, kind)
+        blocks = [
+            (self.starts[parent], self.starts[child], *size, offset)
+            for (parent, child), size, offset in zip(graph.edges, sizes, self.offsets, strict=True)
+        ]
+        outward = [[row for node in level for row in self._rows(node)] for level in graph.levels]
+        self._up = Table(outward[::-1], blocks, False, weights.device)
+        self._down = Table(outward, blocks, True, weights.device)
+
+    @property
+    def weights(self) -> wp.array:
+        """[world or 1, scalar], the blocks row-major, up to date."""
+        self._fill()
+        return memory(self.stored)
+
+    def _rows(self, node):
+        return range(self.starts[node], self.starts[node + 1])
+
+    def _apply(self, x, out, alpha, accumulate, space):
+        self._up.gather(memory(self.stored), x, out, alpha, accumulate)
+
+    def _apply_transposed(self, x, out, alpha, accumulate, space):
+        self._down.gather(memory(self.stored), x, out, alpha, accumulate)
+
+    def resolvent(self) -> "Resolvent":
+        """A = (I - E)^-1."""
+        return Resolvent(self)
+
+    def power(self, exponent: int) -> Operator:
+        """E^exponent: blocks are products of weights along the paths of that length (Lemma 1). 0 gives the identity."""
+        count = whole(exponent)
+        if count is None or count < 0:
+            raise ValueError(
+                f"BWA.power: exponent is {exponent!r}; expected 0 or more, an integer; E has no inverse, its resolvent "
+                "has"
+            )
+        if count == 0:
+            return Identity(self.shape[0], self.device, self.dtype, self.kind)
+        # E^(depth + 1) is zero already (Lemma 2)
+        return Product(*[self] * min(count, len(self.graph.levels)))
+
+
+class Resolvent(Operator):
+    """A = (I - E)^-1 by sweeps; ``A(i, j)`` is the sum over all paths from i to j of the products of weights.
+
+    Up, for A: ``y(k) = x(k) + sum of w(k, j) y(j)`` over the children j. Down, for A.T: ``y(k) = x(k) + sum of
+    w(p, k)* y(p)`` over the parents p. O(nodes), one launch a level.
+
+    Attributes:
+        E: the adjacency it belongs to (eq. 10).
+    """
+
+    def __init__(self, E: BWA):
+        super().__init__(E.shape, E.worlds, E.device, E.dtype, E.kind)
+        self.E = E
+        self.form, self.operands = ("resolvent",), (E,)
+
+    def _apply(self, x, out, alpha, accumulate, space):
+        self._sweep(self.E._up, x, out, alpha, accumulate, space)
+
+    def _apply_transposed(self, x, out, alpha, accumulate, space):
+        self._sweep(self.E._down, x, out, alpha, accumulate, space)
+
+    def _sweep(self, table, x, out, alpha, accumulate, space):
+        # The sweep reads what it has written, so it cannot run on top of other terms of a sum.
+        y = space.take(self, self.shape[0]) if accumulate else out
+        table.sweep(memory(self.E.stored), x, y, alpha)
+        if accumulate:
+            add_scaled(y, out, 1.0, True)
+
+    @functools.cached_property
+    def strict(self) -> Operator:
+        """A - I = E A = A E (eq. 13), without the cancellation of the difference."""
+        return Product(self.E, self)
+
+    @functools.cached_property
+    def inverse(self) -> Operator:
+        """I - E; no sweep."""
+        return Sum(Identity(self.shape[0], self.device, self.dtype), Scaled(-1.0, self.E))
+
+    def block(self, i: int, j: int):
+        """Return A(i, j) [world, m_i, m_j], the weight between distant nodes (eq. 7), in the kind of the weights."""
+        for name, node in (("i", i), ("j", j)):
+            number = whole(node)
+            if number is None or not 0 <= number < self.E.graph.node_count:
+                raise ValueError(
+                    f"Resolvent.block: {name} is {node!r}; expected a node, 0 to {self.E.graph.node_count - 1}"
+                )
+        return self._columns("block", self.E.starts[j], self.E.dims[j], self.E.starts[i], self.E.dims[i])
+
+
+def _edge_weights(graph, weights) -> tuple[list[str], list]:
+    """The names and weights of the edges, in the order of ``graph.edges``."""
+    if not isinstance(graph, Tree | Digraph):
+        raise TypeError(f"BWA: graph is of type {type(graph).__name__}; expected a Tree or a Digraph")
+    if weights is None:
+        return [], []
+    count, what = (graph.node_count, "node") if isinstance(graph, Tree) else (len(graph.edges), "edge")
+    if len(weights) != count:
+        raise ValueError(
+            f"BWA: {len(weights)} weights; expected {count}, one a {what}" + (" (None for roots)" * (what == "node"))
+        )
+    children = [child for _, child in graph.edges] if what == "node" else range(count)
+    weighted = set(children)
+    for index, weight in enumerate(weights):
+        if weight is None and index in weighted:
+            raise ValueError(
+                f"BWA: weights[{index}] is None; expected [world, m_parent, m_child]; only roots have none"
+            )
+        if weight is not None and index not in weighted:
+            raise ValueError(f"BWA: weights[{index}] is given, but node {index} is a root; expected None")
+    return [f"weights[{index}]" for index in children], [weights[index] for index in children]
+
+
+def _node_dims(graph, labels, sizes, dims) -> tuple[int, ...]:
+    """The size of every node, from ``dims`` or from the sizes of the weights."""
+    found = {}
+    if dims is not None:
+        if len(dims) != graph.node_count:
+            raise ValueError(f"BWA: {len(dims)} dims; expected {graph.node_count}, one a node")
+        for node, size in enumerate(dims):
+            number = whole(size)
+            if number is None or number < 1:
+                raise ValueError(f"BWA: dims[{node}] is {size!r}; expected 1 or more, an integer")
+            found[node] = number, f"dims[{node}]"
+    for edge, label, size in zip(graph.edges, labels, sizes, strict=False):
+        for node, length, place in zip(edge, size, ("rows", "columns"), strict=True):
+            known, source = found.setdefault(node, (length, label))
+            if length != known or length < 1:
+                raise ValueError(
+                    f"BWA: {label} has {length} {place}, which is the size of node {node}; expected {max(known, 1)} by "
+                    f"{source}; a weight is [world, m_parent, m_child]"
+                )
+    missing = [node for node in range(graph.node_count) if node not in found]
+    if missing:
+        raise ValueError(f"BWA: no weight tells the size of nodes {missing}; expected dims=, the size of every node")
+    return tuple(found[node][0] for node in range(graph.node_count))

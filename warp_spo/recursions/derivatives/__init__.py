@@ -1,0 +1,1 @@
+"""Derivatives of the recursions: dense Jacobians, and products with them."""

@@ -1,0 +1,186 @@
+"""Backwards through inverse dynamics: how lambda . tau(q, qd, qdd) changes with its arguments.
+
+lambda . tau = sum over the links of mu . f + sum over the dofs of lambda Delta qdd, with mu the velocities (omega; v)
+that the rates lambda give and f the force that gives a link its acceleration, less the external one. How a link moves
+follows from how its parent does, so one sweep outward makes the sum, and one inward says link by link how it changes
+with the motion of each; with mu it changes as the force that the link transmits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, NamedTuple
+
+from ...trace.differentiation import reverse
+from ...trace.emission import Store
+from ...trace.scalars import Value, cut, is_constant, ordered
+from ...trace.spatial import ZERO, Matrix, Rigid, Vector, cross, dot, skew
+from ..links import Link, Placed
+from ..motion import in_link, whirl
+
+if TYPE_CHECKING:
+    from ..traced import Trace
+
+Entry = Callable[[int], Value]
+Ways = dict[tuple, Value]
+"""How the sum changes, by what an input of the trace is called."""
+
+
+class Moving(NamedTuple):
+    """How a link moves, in its axes.
+
+    Attributes:
+        spin: omega. w, v: acceleration, classical. mu_w, mu_v: the velocities mu.
+    """
+
+    spin: Vector
+    w: Vector
+    v: Vector
+    mu_w: Vector
+    mu_v: Vector
+
+
+class Seen(NamedTuple):
+    """What a link shows of itself to its bodies and to its children, each scalar cut.
+
+    Attributes:
+        axes: in the inertial frame, if forces are given there. turning: follows from how it moves.
+    """
+
+    moving: Moving
+    axes: Matrix
+    turning: Matrix
+
+    @classmethod
+    def of(cls, moving: Moving, axes: Iterable[Vector]) -> Seen:
+        apart = Moving(*_cut(moving))
+        return cls(apart, Matrix(axes), Matrix(_cut(turning_of(apart))))
+
+    @property
+    def all(self) -> list[Value]:
+        return _flat([*self.moving, *self.axes, *self.turning])
+
+
+class Carried(NamedTuple):
+    """Vectors that a link takes from its parent, in its own axes: its motion but for its own rates, and the axes.
+
+    Attributes:
+        raw: as they were made. apart: the same, cut.
+    """
+
+    raw: list[Vector]
+    apart: list[Vector]
+
+    @classmethod
+    def of(cls, place: Placed, parent: Seen, axes: Matrix) -> Carried:
+        pose, (spin, w, v, mu_w, mu_v) = place.pose, parent.moving
+        mu = pose.motion_to_child(mu_w, mu_v)
+        raw = [pose.to_child(spin), pose.to_child(w), pose.to_child(v + parent.turning @ pose.l), *mu, *axes]
+        return cls(raw, _cut(raw))
+
+
+class Power:
+    """The sum for one trace, of a whole scene or of a piece, and how it changes.
+
+    Args:
+        multiplier, qdd: lambda and the accelerations, by dof: inputs, or what other recursions make.
+
+    Attributes:
+        ways: how it changes with entries of "q", "qd", "qdd", "body_f" and of the scene's values, each by the name and
+            the index of that input. stores: what other pieces need of it. forces: tau, by dof.
+    """
+
+    def __init__(self, trace: Trace, multiplier: Entry, qdd: Entry):
+        self.trace, self.ways, self.stores = trace, Ways(), list[Store]()
+        self.forces: dict[int, Value] = {}
+        self.multiplier, self.qdd = lambda dof: cut(multiplier(dof)), lambda dof: cut(qdd(dof))
+        base = Moving(ZERO, *trace.base, ZERO, ZERO)
+        seen: dict[int | None, Seen] = {None: Seen(base, Matrix(), turning_of(base))}
+        carried: dict[int, Carried] = {}
+        moved: dict[int, Moving] = {}
+        bars: dict[int, list[Value]] = {}
+        for link, outward in trace.traversal():
+            key, over = id(link), None if link.parent is None else id(link.parent)
+            if outward:
+                trace.place(link)
+                trace.at(link, "m")
+                carried[key] = Carried.of(trace.places[key], seen[over], trace.axes.get(key, Matrix()))
+                moved[key] = self._moved(link, carried[key].apart)
+                seen[key] = Seen.of(moved[key], carried[key].apart[5:])
+                trace.axes[key] = seen[key].axes
+                continue
+            trace.at(link, "g")
+            others = trace.carried_on(link, "B", bars, list)
+            bars[key] = self._handed(link, seen[key], moved[key], carried[key], seen[over], others)
+            self.stores += trace.handed_on("B", link, bars[key])
+
+    def _moved(self, link: Link, carried: list[Vector]) -> Moving:
+        """With what the link's own rates add."""
+        place, (spin, w, v, mu_w, mu_v, *_) = self.trace.places[id(link)], carried
+        rates = self.trace.vector("qd"), self.qdd, self.multiplier
+        (w_d, v_d), (w_dd, v_dd), (w_l, v_l) = (in_link(link, place, rate) for rate in rates)
+        return Moving(
+            spin + w_d, w + cross(spin, w_d) + w_dd, v + 2.0 * cross(spin, v_d) + v_dd, mu_w + w_l, mu_v + v_l
+        )
+
+    def _handed(
+        self, link: Link, mine: Seen, moved: Moving, carried: Carried, parent: Seen, others: list[list[Value]]
+    ) -> list[Value]:
+        """How the sum changes with what the link's parent shows of itself; ``others``: so say the link's children."""
+        bars = self._back([_power(link.grouped, self.trace.external(link), mine)], [1.0], mine.all)
+        for other in others:
+            bars = [a + b for a, b in zip(bars, other, strict=True)]
+        own = len(mine.all) - 9
+        turning = self._back(_flat(turning_of(mine.moving)), bars[own:], mine.all[:own])
+        bars = [a + b for a, b in zip(bars[:own], turning, strict=True)]
+
+        before, dofs = _flat(carried.apart[:5]), link.dofs
+        rates, weights = [self.qdd(dof) for dof in dofs], [self.multiplier(dof) for dof in dofs]
+        forces = [a * x for a, x in zip(link.armature, rates, strict=True)]
+        ends = [*before, *rates, *weights]
+        bars, axes = self._back([*_flat(moved), *forces], [*bars[:15], *weights], ends), bars[15:]
+        for dof, bar in zip(dofs, bars[15:], strict=False):
+            self._add(("qdd", dof), bar)
+        self.forces |= {dof: bar + f for dof, bar, f in zip(dofs, bars[15 + len(dofs) :], forces, strict=True)}
+        bars = [*bars[:15], *axes]
+
+        turn = self.trace.places[id(link)].pose.turn or ()
+        for at, x in enumerate(carried.apart if turn else ()):  # each turns backwards, about the link's z axis
+            self._add(("q", link.coordinate), x[1] * bars[3 * at] - x[0] * bars[3 * at + 1])
+        ends = [] if link.parent is None else parent.all
+        return self._back(_flat(carried.raw), bars, [*ends, *turn])[: len(ends)]
+
+    def _back(self, outputs: list[Value], bars: list[Value], ends: list[Value]) -> list[Value]:
+        """How the sum changes with ``ends``, each scalar of them counted once; what reaches inputs goes to ``ways``."""
+        stops = list({x.key: x for x in ends if not is_constant(x)}.values())
+        leaves = [x for x in ordered(outputs, stops) if x.op == "input"]
+        found = reverse(outputs, [*stops, *leaves], bars)
+        for x, way in zip(leaves, found[len(stops) :], strict=True):
+            self._add(x.args, way)
+        left = dict(zip((x.key for x in stops), found, strict=False))
+        return [0.0 if is_constant(x) else left.pop(x.key, 0.0) for x in ends]
+
+    def _add(self, entry: tuple, way: Value) -> None:
+        self.ways[entry] = self.ways.get(entry, 0.0) + way
+
+
+def turning_of(moving: Moving) -> Matrix:
+    """omega'~ + omega~ omega~: acceleration of a point per unit of its arm."""
+    return skew(moving.w) + whirl(moving.spin)
+
+
+def _power(inertia: Rigid | None, external: Vector, seen: Seen) -> Value:
+    """mu . f of the bodies of a link, with ``external`` (n; f) at its origin."""
+    (spin, w, v, mu_w, mu_v), n, f = seen.moving, -Vector(external[:3]), -Vector(external[3:])
+    if inertia is not None:
+        n = n + inertia.inertia @ w + cross(inertia.moment, v) + cross(spin, inertia.inertia @ spin)
+        f = f + inertia.mass * v + seen.turning @ inertia.moment
+    return dot(mu_w, n) + dot(mu_v, f)
+
+
+def _cut(rows: Iterable[Vector]) -> list[Vector]:
+    return [Vector(map(cut, row)) for row in rows]
+
+
+def _flat(rows: Iterable[Vector]) -> list[Value]:
+    return [x for row in rows for x in row]

@@ -1,0 +1,188 @@
+"""What moving one coordinate does to the forces of all that its link carries: steps of the analytic derivatives.
+
+Seen from the link, the bodies that it carries stay as they are, and the rest of the world moves: with the displacement
+(theta; d) of the link, what is fixed in the parent turns by -theta. So the carried bodies get, as one rigid body, a
+further angular velocity and acceleration, and their forces change by sums over them that the tree gathers inward. As
+everywhere, accelerations are classical and velocities relative: no velocity of an origin enters. The sums are the body
+Coriolis matrix of S. Singh, R. Russo, P. Wensing 2022 without the part that such velocities cancel.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from ...trace.scalars import Value
+from ...trace.spatial import ZERO, Matrix, Rigid, Vector, cross, dot, skew, symmetric
+from ..links import BALL, FREE, Link, Placed
+from ..motion import NONE, Motion, carried, in_link, whirl
+
+
+class Sensitivity(NamedTuple):
+    """How all that a link carries moves otherwise, in the link's axes, per unit of a coordinate or a rate.
+
+    Attributes:
+        turn, shift: theta and d, zero for a rate.
+        spin: change of every omega.
+        w: change of omega' + omega~ of the change, the same for all that is carried.
+        v: change of the acceleration of the link's origin.
+    """
+
+    turn: Vector
+    shift: Vector
+    spin: Vector
+    w: Vector
+    v: Vector
+
+
+class Carried(NamedTuple):
+    """Sums over all that a link carries: rho from its origin, u the velocity relative to it, in its axes.
+
+    Attributes:
+        body: the composite inertia.
+        flow, momentum: sum of m u rho*, of m u.
+        load, pull: external force f and torque t: sum of (rho . f) - f rho* - t~, of f.
+    """
+
+    body: Rigid
+    flow: Matrix
+    momentum: Vector
+    load: Matrix
+    pull: Vector
+
+    def __add__(self, other: tuple) -> Carried:
+        return Carried(*(a + b for a, b in zip(self, other, strict=True)))
+
+    @property
+    def coriolis(self) -> Matrix:
+        """2 (tr(flow) - flow): moment per unit of the spin that is added."""
+        Y = self.flow
+        trace = Y[0][0] + Y[1][1] + Y[2][2]
+        return Matrix.of([[2.0 * ((trace if i == j else 0.0) - Y[i][j]) for j in range(3)] for i in range(3)])
+
+    def force(self, s: Sensitivity) -> tuple[Vector, Vector]:
+        """Change of (n; f), seen from the link."""
+        n, f = self.body.apply(s.w, s.v)
+        n = n + self.coriolis @ s.spin + self.load @ s.turn
+        return n, f + cross(s.spin, self.momentum) * 2.0 + cross(s.turn, self.pull)
+
+    def row(self, w: Vector, v: Vector) -> Row:
+        """The force on a column (w; v) of H*, for whatever moves the link otherwise."""
+        n, f = self.body.apply(w, v)
+        spin = self.coriolis.T @ w + cross(self.momentum, v) * 2.0
+        return Row(n, f, spin, self.load.T @ w + cross(self.pull, v))
+
+
+class Row(NamedTuple):
+    """A force as a function of how a link moves otherwise: the adjoint of :class:`Sensitivity`."""
+
+    w: Vector
+    v: Vector
+    spin: Vector
+    turn: Vector
+
+    def at(self, s: Sensitivity) -> Value:
+        return dot(self.w, s.w) + dot(self.v, s.v) + dot(self.spin, s.spin) + dot(self.turn, s.turn)
+
+    def to_parent(self, place: Placed, drift: Vector) -> Row:
+        """The same for how the parent moves otherwise; ``drift``: see :func:`drift`."""
+        pose = place.pose
+        w, v = pose.force_to_parent(self.w, self.v)
+        return Row(w, v, pose.to_parent(self.spin) + cross(drift, v) * 2.0, pose.to_parent(self.turn))
+
+
+EMPTY = Carried(Rigid(0.0, ZERO, NONE), NONE, ZERO, NONE, ZERO)
+
+
+def drift(link: Link, place: Placed, parent: Motion | None, qd: object) -> Vector:
+    """Velocity of the link's origin relative to its parent's, in the parent's axes."""
+    if qd is None:
+        return ZERO
+    own = place.pose.to_parent(in_link(link, place, qd)[1])
+    return own if parent is None else own + cross(parent.spin, place.pose.l)
+
+
+def of_body(inertia: Rigid | None, motion: Motion) -> Carried:
+    """A body that turns about its link's origin: u = omega x rho."""
+    if inertia is None:
+        return EMPTY
+    J = inertia.inertia
+    half = 0.5 * (J[0][0] + J[1][1] + J[2][2])
+    second = symmetric(half - J[0][0], half - J[1][1], half - J[2][2], -J[0][1], -J[0][2], -J[1][2])  # sum m rho rho*
+    return Carried(inertia, skew(motion.spin) @ second, cross(motion.spin, inertia.moment), NONE, ZERO)
+
+
+def under_load(moment_arm: Vector, force: Vector, torque: Vector) -> Carried:
+    """A wrench on a body."""
+    return EMPTY._replace(load=_lever(moment_arm, force) - skew(torque), pull=force)
+
+
+def to_parent(place: Placed, drifting: Vector, own: Carried) -> Carried:
+    """What a link carries, about its parent's origin and in its axes."""
+    pose, l = place.pose, place.pose.l
+    body = pose.rigid_to_parent(own.body)
+    momentum = pose.to_parent(own.momentum)
+    pull = pose.to_parent(own.pull)
+    flow = pose.turned(own.flow) + _outer(momentum, l) + _outer(drifting, body.moment)
+    return Carried(body, flow, momentum + drifting * own.body.mass, pose.turned(own.load) + _lever(l, pull), pull)
+
+
+def _outer(a: Vector, b: Vector) -> Matrix:
+    return Matrix.of([[x * y for y in b] for x in a])
+
+
+def _lever(arm: Vector, f: Vector) -> Matrix:
+    """(arm . f) - f arm*"""
+    product = dot(arm, f)
+    return Matrix.of([[(product if i == j else 0.0) - f[i] * arm[j] for j in range(3)] for i in range(3)])
+
+
+def of_coordinates(
+    link: Link,
+    place: Placed,
+    motion: Motion,
+    parent: Motion,
+    above: tuple[Vector, Vector],
+    own: tuple[Vector, Vector],
+    rates: object,
+) -> list[Sensitivity]:
+    """Per unit displacement along each dof of a link.
+
+    A screw's own velocity is constant in the link; that of a ball or free hinge is constant in its parent.
+
+    Args:
+        motion, own: of the link: velocities; acceleration (w; v). parent, above: of its parent.
+        rates: qd by dof, or None.
+    """
+    pose = place.pose
+    w_c = pose.to_child(above[0])
+    spin_c = pose.to_child(parent.spin)
+    whole = link.motion in (BALL, FREE)
+    if whole:
+        spin, (w, v) = motion.spin, own
+        slide = ZERO
+    else:
+        spin, (w, v) = spin_c, carried(place, motion, above)
+        slide = ZERO if rates is None else in_link(link, place, rates)[1] * 2.0
+    turning = skew(w) + (motion.whirl if whole else whirl(spin))
+    shifting = skew(w_c) + whirl(spin_c)
+    found = []
+    for theta, d in columns(link, place):
+        change = cross(spin, theta)
+        v_d = cross(v, theta) + shifting @ d + cross(change, slide)
+        found.append(Sensitivity(theta, d, change, turning @ theta, v_d))
+    return found
+
+
+def of_rates(link: Link, place: Placed, motion: Motion, parent: Motion) -> list[Sensitivity]:
+    """Per unit of each rate of a link."""
+    spin_c = place.pose.to_child(parent.spin)
+    both = spin_c + motion.spin
+    return [Sensitivity(ZERO, ZERO, w, cross(both, w), cross(spin_c, v) * 2.0) for w, v in columns(link, place)]
+
+
+def columns(link: Link, place: Placed) -> list[tuple[Vector, Vector]]:
+    """(w; v) of H* for each dof."""
+    return [
+        in_link(link, place, lambda other, dof=dof: 1.0 if other == dof else 0.0)  # type: ignore[misc]
+        for dof in link.dofs
+    ]

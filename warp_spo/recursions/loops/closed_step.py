@@ -1,0 +1,122 @@
+"""Time steps of scenes whose loops are closed: implicit in all hinges, and put back onto the closures.
+
+Embedded: what the laws of a hinge leave of themselves is armature and force, inside a cluster as elsewhere, so that
+D = X* (Mass + h R) X holds the share of every dof that a loop ties. The state after the step leaves the closures by
+O(h^2) of what turns. Newton's steps take it back along the shortest way, position first, then velocity, all with one
+factorisation of Y, where the step ended: the first leaves O(h^4), the second O(h^6).
+
+By multipliers: Mass + h R is the open tree's, (Y (Mass + h R)^-1 Y*) lambda = -(Y qdd(0) + Y' qd) a system between two
+launches. Passes would have to span them all, so that laws that bend are refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from ...errors import UnsupportedError
+from ...trace.emission import Store
+from ...trace.scalars import Value, less
+from ...trace.spatial import total
+from ..integration import moved
+from ..links import Link, placed
+from ..step import Step
+from . import clusters
+from .closures import Ratio, opened
+from .clusters import Cluster, Columns
+
+NEWTON_STEPS = 2  # of position and of velocity, where a loop joint is; couplings are linear and take one
+RESOLVED = 4.0  # roundings: a margin that is no larger may be rounding alone
+
+
+class ClosedStep(Step):
+    """The step as a trace, loops embedded.
+
+    Args:
+        trace: an :class:`.embedded.Embedded`. how: its rows that count, an :class:`.embedded.Embedding`.
+    """
+
+    trace: Any
+
+    def __init__(self, trace: Any, how: Any):
+        super().__init__(trace)
+        self.how = how
+        self.margins: list[Value] = []
+        self.after: tuple[Columns, Columns] = {}, {}  # q', qd'
+
+    def _accelerations(self, tau: Callable[[int], Value]) -> Columns:
+        swept = self.trace.sweep(self.how, tau, moves=True, loads=True)
+        self.margins += swept.margins
+        return self.trace.outward_accelerations(swept, self.trace.base)
+
+    def put_back(self, stores: list[Store]) -> list[Store]:
+        """The stores with q' and qd' on the closures."""
+        q, qd = ({s.index[0]: s.value for s in stores if s.array == array} for array in ("q_out", "out"))
+        for cluster in self.trace.clusters:
+            self.trace.at_cluster(cluster, "c")
+            self._close(cluster, q, qd)
+        self.after = q, qd
+        closed = {"q_out": q, "out": qd}
+        return [s._replace(value=closed[s.array][s.index[0]]) if s.array in closed else s for s in stores]
+
+    def _close(self, cluster: Cluster, q: Columns, qd: Columns) -> None:
+        count = 1 if all(isinstance(tie, Ratio) for _, tie in cluster.constraints) else NEWTON_STEPS
+        place = lambda: {id(link): placed(link, q.__getitem__) for link in cluster.links}  # noqa: E731
+        places = place()
+        tied = clusters.tied(cluster, places, self.how.rows, self.trace.epsilon)
+        self.margins += tied.space.margins
+        for _ in range(count):
+            step = tied.space.particular([-g for g in tied.errors(places, q.__getitem__)])
+            for link in cluster.links:
+                new = moved(link, q.__getitem__, lambda dof: step.get(dof, 0.0), 1.0)  # noqa: B023
+                q |= {link.coordinate + c: value for c, value in enumerate(new)}
+            places = place()
+        rows = [row for _, tie in cluster.constraints for row in tie.jacobian(places)]
+        for _ in range(count):
+            rates = [total(x * qd[dof] for dof, x in rows[i].items()) for i in tied.numbers]
+            step = tied.space.particular([-rate for rate in rates])
+            qd |= {dof: qd[dof] + change for dof, change in step.items()}
+
+    def _weightless(self, link: Link) -> bool:
+        """What a loop ties may carry what is on its other side."""
+        return id(link) not in self.trace.cluster_of and super()._weightless(link)
+
+    def _unresolved(self) -> Value:
+        least = RESOLVED * self.trace.epsilon
+        return total(1.0 - less(least, margin) for margin in self.margins)
+
+    def _open(self) -> Value:
+        q, qd = self.after
+        places = {id(link): placed(link, q.__getitem__) for cluster in self.trace.clusters for link in cluster.links}
+        return opened(self.trace.constraints, places, q.__getitem__, qd.__getitem__)
+
+
+class MultiplierStep(Step):
+    """The step of the open tree as a trace, under the array "multipliers", of a :class:`.multipliers.Multipliers`."""
+
+    trace: Any
+
+    def system(self) -> list[Store]:
+        """out, right, size: what the multipliers solve."""
+        self.trace.stiffened = self._stiffened
+        tau = self.trace.vector("tau")
+        return self.trace.loop_system(lambda dof: tau(dof) + self.forces[dof])
+
+    def _stiffened(self, link: Link) -> Link:
+        stiff = super()._stiffened(link)
+        for dof in link.dofs:
+            if any(law.bends for law in self.laws[dof]):
+                label = self.trace.links.scene.dof_labels[dof]
+                what = f"a limit, friction or a bound on {label!r} with loops='multipliers'"
+                raise UnsupportedError("Dynamics.step", what, "use loops='embed'")
+        return stiff
+
+    def _accelerations(self, tau: Callable[[int], Value]) -> Columns:
+        trace = self.trace
+        trace.place_links(moves=True)
+        loads = trace._combined(trace.vector("multipliers"))
+        done, rates, _ = trace.reduce(lambda dof: tau(dof) + loads.get(dof, 0.0), moves=True, loads=True)
+        return {item.index[0]: item.value for item in trace.expand(done, rates, trace.base)}
+
+    def _unresolved(self) -> Value:
+        return 1.0 - less(self.trace.epsilon**0.5, self.trace.graph.input("resolved", 0))

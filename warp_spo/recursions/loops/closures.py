@@ -1,0 +1,290 @@
+"""Closures: what a loop joint or a coupling demands of the tree, by rows: g(q) = 0, Y qd = 0, Y qdd + Y' qd = 0.
+
+A loop joint is seen from the lowest link that carries both of its anchors, held still: positions are then no larger
+than the loop, and what the robot does as a whole does not matter. A row is a direction of the relative twist of the
+anchors, (omega; v) at the child anchor, that the joint does not allow. All vectors are in the axes of that lowest link.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...errors import UnsupportedError
+from ...scene.parts import Coupling, Loop, in_plane
+from ...trace.scalars import Value, less, reciprocal
+from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, dot, total
+from .. import articulated
+from ..links import Link, Links, Placed, Seat
+from ..motion import in_link
+
+PARALLEL = 1e-6  # sine of the angle between two axes of a loop joint, below which they are one
+OPEN = 1e-5  # [rad], or distance over arm, beyond which a closure is open: float32 rounds a few turns by less
+SLOW = 1e-4  # [rad/s, m/s]: of slower rates no share is asked, those of a truss are rounding alone
+
+
+class State(NamedTuple):
+    """Where a link is and how it moves: axes, origin; omega, v of the origin; their rates."""
+
+    axes: Matrix
+    origin: Vector
+    spin: Vector
+    velocity: Vector
+    spin_rate: Vector
+    acceleration: Vector
+
+
+REST = State(IDENTITY, ZERO, ZERO, ZERO, ZERO, ZERO)
+
+
+class Row(NamedTuple):
+    """A direction (w; v) of the relative twist at the child anchor, and how fast w turns; v turns with the parent."""
+
+    w: Vector
+    v: Vector
+    w_rate: Vector
+
+
+@dataclasses.dataclass
+class Ratio:
+    """A coupling: qd[follower] = ratio qd[leader].
+
+    Attributes:
+        follower, leader: links. path: the links between them and their lowest common ancestor; the ancestor too, if it
+            is one of the two.
+    """
+
+    follower: Link
+    leader: Link
+    ratio: float
+    offset: float
+    path: list[Link]
+
+    rows = 1
+
+    def error(self, places: Any, q: Callable[[int], Value]) -> list[Value]:
+        return [q(self.follower.coordinate) - self.ratio * q(self.leader.coordinate) - self.offset]
+
+    def jacobian(self, places: Any) -> list[dict[int, Value]]:
+        return [{self.follower.dofs[0]: 1.0, self.leader.dofs[0]: -self.ratio}]
+
+    def sizes(self, places: Any) -> list[Value]:
+        return [1.0 + self.ratio * self.ratio]
+
+    def acceleration(self, places: Any, qd: Any, qdd: Callable[[int], Value]) -> list[Value]:
+        return [qdd(self.follower.dofs[0]) - self.ratio * qdd(self.leader.dofs[0])]
+
+
+class Closure:
+    """A loop joint.
+
+    Args:
+        links: of the scene.
+        loop: the joint.
+
+    Raises:
+        UnsupportedError: a joint whose directions depend on how often it was turned round (helical), or whose axes are
+            parallel.
+    """
+
+    def __init__(self, links: Links, loop: Loop):
+        self.inner, self.outer = links.seat(loop.parent, loop.parent_pose), links.seat(loop.child, loop.child_pose)
+        inner, outer = _ancestors(self.inner.link), _ancestors(self.outer.link)
+        while inner and outer and inner[0] is outer[0]:
+            del inner[0], outer[0]
+        self.inner_path, self.outer_path = inner, outer
+        self.path = inner + outer
+        self.slides, self.held, self.crossed = _directions(loop)
+        self.rows = len(self.slides) + len(self.held) + len(self.crossed)
+
+    # -- positions -------------------------------------------------------------------------------------------------
+    def error(self, places: dict[int, Placed], q: Any) -> list[Value]:
+        """g: distances [m], and angles [rad] as twice the tangent of their half: no turn but none has g = 0."""
+        inner, outer = self._anchors(places)
+        back = inner.axes.T
+        r = back @ (outer.origin - inner.origin)
+        R = back @ outer.axes
+        values = [dot(e, r) for e in self.slides]
+        if len(self.held) == 3:
+            scale = 2.0 * reciprocal(1.0 + R[0][0] + R[1][1] + R[2][2])
+            turn = Vector((R[2][1] - R[1][2], R[0][2] - R[2][0], R[1][0] - R[0][1]))
+            values += [dot(e, turn) * scale for e in self.held]
+        elif self.held:
+            axis = cross(*self.held)
+            scale = 2.0 * reciprocal(1.0 + dot(axis, R @ axis))
+            values += [dot(e, cross(axis, R @ axis)) * scale for e in self.held]
+        values += [dot(first, R @ second) - dot(first, second) for first, second in self.crossed]
+        return values
+
+    # -- rates -----------------------------------------------------------------------------------------------------
+    def jacobian(self, places: dict[int, Placed]) -> list[dict[int, Value]]:
+        """Y, each row by dof."""
+        inner, outer = self._anchors(places)
+        found: list[dict[int, Value]] = [{} for _ in range(self.rows)]
+        rows = self._rows(inner, outer)
+        for dof, w, v in self._columns(places, outer):
+            for entries, row in zip(found, rows, strict=True):
+                entries[dof] = dot(row.w, w) + dot(row.v, v)
+        return found
+
+    def sizes(self, places: dict[int, Placed]) -> list[Value]:
+        """Sum of squares of the twists that each row of Y is a projection of."""
+        _, outer = self._anchors(places)
+        turning, sliding = 0.0, 0.0
+        for _, w, v in self._columns(places, outer):
+            turning, sliding = turning + dot(w, w), sliding + dot(v, v)
+        return [sliding] * len(self.slides) + [turning] * (self.rows - len(self.slides))
+
+    def _columns(self, places: dict[int, Placed], outer: State) -> Iterator[tuple[int, Vector, Vector]]:
+        """(dof, w, v): the relative twist at the child anchor per unit rate of each dof."""
+        for path, sign in ((self.inner_path, -1.0), (self.outer_path, 1.0)):
+            for link, state in zip(path, self._states(path, places), strict=True):
+                arm = outer.origin - state.origin
+                for dof, H in zip(link.dofs, articulated.columns(link, places[id(link)]), strict=True):
+                    w, v = state.axes @ Vector(H[:3]), state.axes @ Vector(H[3:])
+                    yield dof, w * sign, (v + cross(w, arm)) * sign
+
+    def acceleration(self, places: dict[int, Placed], qd: Any, qdd: Callable[[int], Value]) -> list[Value]:
+        """Y qdd + Y' qd; ``qd`` None is zero."""
+        inner, outer = self._anchors(places, qd, qdd)
+        w, v = outer.spin - inner.spin, outer.velocity - inner.velocity
+        arm = outer.origin - inner.origin  # of the point of the parent that is at the child anchor
+        v = v - cross(inner.spin, arm)
+        a = outer.acceleration - inner.acceleration - cross(inner.spin_rate, arm)
+        a = a - cross(inner.spin, cross(inner.spin, arm) + 2.0 * v)
+        rate = outer.spin_rate - inner.spin_rate
+        rows = self._rows(inner, outer)
+        return [dot(row.w, rate) + dot(row.w_rate, w) + dot(row.v, a) for row in rows]
+
+    def _rows(self, inner: State, outer: State) -> list[Row]:
+        rows = [Row(ZERO, inner.axes @ e, ZERO) for e in self.slides]
+        for e in self.held:
+            w = inner.axes @ e
+            rows.append(Row(w, ZERO, cross(inner.spin, w)))
+        for first, second in self.crossed:
+            a, b = inner.axes @ first, outer.axes @ second
+            rate = cross(cross(outer.spin, b), a) + cross(b, cross(inner.spin, a))
+            rows.append(Row(cross(b, a), ZERO, rate))
+        return rows
+
+    def _anchors(self, places: dict[int, Placed], qd: Any = None, qdd: Any = None) -> tuple[State, State]:
+        inner, outer = (
+            _carried(self._states(path, places, qd, qdd)[-1] if path else REST, anchor)
+            for path, anchor in ((self.inner_path, self.inner), (self.outer_path, self.outer))
+        )
+        return inner, outer
+
+    def _states(self, path: list[Link], places: dict[int, Placed], qd: Any = None, qdd: Any = None) -> list[State]:
+        """How the links of a path are and move, seen from the common link."""
+        found, state = [], REST
+        for link in path:
+            state = _moved(link, places[id(link)], state, qd, qdd)
+            found.append(state)
+        return found
+
+
+def _moved(link: Link, place: Placed, over: State, qd: Any, qdd: Any) -> State:
+    pose = place.pose
+    axes, d = over.axes @ pose.rotation, over.axes @ pose.l
+    spin, velocity, rate, acceleration = over.spin, over.velocity, over.spin_rate, over.acceleration
+    acceleration = acceleration + cross(rate, d) + cross(spin, cross(spin, d))
+    velocity = velocity + cross(spin, d)
+    if qd is not None:
+        w, v = (axes @ part for part in in_link(link, place, qd))
+        rate = rate + cross(spin, w)
+        acceleration = acceleration + 2.0 * cross(spin, v)
+        spin, velocity = spin + w, velocity + v
+    if qdd is not None:
+        w, v = (axes @ part for part in in_link(link, place, qdd))
+        rate, acceleration = rate + w, acceleration + v
+    return State(axes, over.origin + d, spin, velocity, rate, acceleration)
+
+
+def _carried(link: State, anchor: Seat) -> State:
+    s = link.axes @ anchor.offset
+    velocity = link.velocity + cross(link.spin, s)
+    acceleration = link.acceleration + cross(link.spin_rate, s) + cross(link.spin, cross(link.spin, s))
+    return State(link.axes @ anchor.matrix, link.origin + s, link.spin, velocity, link.spin_rate, acceleration)
+
+
+def _ancestors(link: Link | None) -> list[Link]:
+    """A link and its ancestors, outward."""
+    found: list[Link] = []
+    while link is not None:
+        found.insert(0, link)
+        link = link.parent
+    return found
+
+
+def _directions(loop: Loop) -> tuple[list[Vector], list[Vector], list[tuple[Vector, Vector]]]:
+    """What a joint does not allow, in its parent anchor's axes: directions of translation; axes of turning; pairs of
+    axes, one in either anchor, whose angle stays."""
+    call = f"Loop({loop.label!r})" if loop.label else f"Loop({loop.kind!r})"
+    turns = [np.array(axis) for axis, angular, _ in loop.screws if angular]
+    slides = [np.array(axis) for axis, angular, _ in loop.screws if not angular]
+    if loop.kind == "helical":
+        raise UnsupportedError(
+            call,
+            "a helical joint that closes a loop",
+            "make it a hinge of the tree and close the loop at another joint",
+        )
+    if loop.kind in ("ball", "free"):
+        turns = list(np.eye(3))
+    if loop.kind == "free":
+        slides = list(np.eye(3))
+    for axes in (slides, turns):
+        near = len(axes) == 2 and np.linalg.norm(np.cross(axes[0], axes[1])) < PARALLEL
+        far = len(axes) == 3 and abs(np.linalg.det(axes)) < PARALLEL
+        if near or far:
+            raise UnsupportedError(call, "a loop joint with axes that are not independent", "leave out one of them")
+    if len(turns) == 3 and max(abs(turns[0] @ turns[1]), abs(turns[1] @ turns[2])) > PARALLEL:
+        raise UnsupportedError(call, "a loop joint with three oblique axes of turning", "use a ball")
+    free = {0: list(np.eye(3)), 3: []}
+    across = free.get(len(slides)) or ([] if len(slides) == 3 else _complement(slides))
+    held = free.get(len(turns)) or (list(in_plane(turns[0])) if len(turns) == 1 else [])
+    pairs = [(Vector(turns[0].tolist()), Vector(turns[1].tolist()))] if len(turns) == 2 else []
+    return [Vector(e.tolist()) for e in across], [Vector(e.tolist()) for e in held], pairs
+
+
+def _complement(axes: list[np.ndarray]) -> list[np.ndarray]:
+    if len(axes) == 1:
+        return list(in_plane(axes[0]))
+    normal = np.cross(axes[0], axes[1])
+    return [normal / np.linalg.norm(normal)]
+
+
+def closures(links: Links) -> list[Closure | Ratio]:
+    """All that a scene demands: loop joints, then couplings."""
+    scene = links.scene
+    by_dof = {link.dofs[0]: link for link in links.links}
+    found: list[Closure | Ratio] = [Closure(links, loop) for loop in scene.loops]
+    for coupling in scene.couplings:
+        follower, leader = (by_dof[int(scene.qd_start[h])] for h in (coupling.hinge, coupling.reference))
+        found.append(_ratio(follower, leader, coupling))
+    return found
+
+
+def opened(
+    constraints: list[Closure | Ratio], places: dict[int, Placed], q: Callable[[int], Value], qd: Callable[[int], Value]
+) -> Value:
+    """How many rows are open by more than OPEN, in g, or in Y qd as a share of the rates; measured by their sizes."""
+    found = []
+    for constraint in constraints:
+        dofs = [dof for link in constraint.path for dof in link.dofs]
+        speed = SLOW**2 + total(qd(dof) * qd(dof) for dof in dofs)
+        rows = zip(constraint.error(places, q), constraint.jacobian(places), constraint.sizes(places), strict=True)
+        for error, row, size in rows:
+            rate = total(x * qd(dof) for dof, x in row.items())
+            found += [less(OPEN**2 * size, error * error), less(OPEN**2 * size * speed, rate * rate)]
+    return total(found)
+
+
+def _ratio(follower: Link, leader: Link, coupling: Coupling) -> Ratio:
+    a, b = _ancestors(follower), _ancestors(leader)
+    while len(a) > 1 and len(b) > 1 and a[0] is b[0]:
+        del a[0], b[0]
+    path = a + [link for link in b if all(link is not other for other in a)]
+    return Ratio(follower, leader, float(coupling.ratio), float(coupling.offset), path)

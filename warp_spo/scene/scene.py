@@ -1,0 +1,283 @@
+"""Scenes: a multibody system as plain float64 values, checked once and never repaired.
+
+A scene is one world's topology and the values that may differ between worlds. Node k of the paper is body k here, its
+frame is the child anchor of the hinge that carries it, and the columns of H.T come in the order of ``qd``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from ..errors import refuse_masked
+from .parts import (
+    DOF_VALUES,
+    FREE,
+    SCREWS,
+    Body,
+    Coupling,
+    Hinge,
+    Loop,
+    checked_array,
+    checked_inertia,
+    checked_unit,
+    read_only,
+    real,
+)
+from .tree import Tree
+
+NOT_NEGATIVE = ("body_mass", "joint_friction", "joint_effort_limit", "joint_velocity_limit")
+
+
+def _refuse_negative(call: str, name: str, array: np.ndarray) -> None:
+    if name in NOT_NEGATIVE and array.size and array.min() < 0.0:
+        raise ValueError(f"{call}: {name} holds {array.min()}; expected zero or more")
+
+
+def _parts(name: str, given: Any, kind: type) -> tuple:
+    parts = tuple(given) if isinstance(given, Iterable) else (given,)
+    if not isinstance(given, Iterable) or not all(isinstance(part, kind) for part in parts):
+        came = ", ".join(sorted({type(part).__name__ for part in parts}))
+        raise TypeError(f"Scene: {name} holds {came}; expected a list of {kind.__name__}")
+    return parts
+
+
+class Scene:
+    """A multibody system: a forest of bodies, and the values that kernels read.
+
+    Values are checked and never repaired. Masses and principal moments may be zero, of any ratio, and break the
+    triangle inequality (see :class:`Body`); below zero they are refused.
+
+    Args:
+        bodies: body k is node k.
+        hinges: one for each body, in the order of ``q``; any order, any numbering of the bodies.
+        gravity: acceleration of a falling body [m/s^2], inertial axes, shape (3,).
+        loops: hinges beyond the tree; :class:`Dynamics` asks what to do with them.
+        couplings: mimics.
+
+    Attributes:
+        bodies, hinges, loops, couplings: as given; :meth:`with_values` changes ``values`` alone.
+        tree: the :class:`Tree` over the bodies.
+        hinge_of: index of the hinge that carries each body [body].
+        q_start, qd_start: first entry of q and qd of each hinge, and the total at the end [hinge + 1].
+        values: float64 arrays by Newton's names, [1 or worlds, ...]: body_mass [kg], body_com [m], body_inertia
+            [kg m^2], joint_X_p, joint_X_c (poses [hinge, 7]), gravity [m/s^2], joint_rest_q [coordinate], and per dof
+            joint_armature, joint_damping, joint_friction, joint_stiffness, joint_target_ke, joint_target_kd,
+            joint_limit_lower, joint_limit_upper, joint_limit_ke, joint_limit_kd, joint_effort_limit,
+            joint_velocity_limit.
+        dof_axis [dof, 3], dof_angular [dof], dof_linear [dof]: the screws, in the parent anchor frame.
+        q_index, dof_index: entries [worlds, n] of the source model's flat joint_q and joint_qd.
+
+    Raises:
+        ValueError: indices that make no forest, or values that no scene has.
+        DirectedLoopError: hinges whose parents form a directed loop.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[Body],
+        hinges: Sequence[Hinge],
+        gravity: Any = (0.0, 0.0, -9.81),
+        loops: Sequence[Loop] = (),
+        couplings: Sequence[Coupling] = (),
+    ):
+        self.bodies, self.hinges = _parts("bodies", bodies, Body), _parts("hinges", hinges, Hinge)
+        self.loops, self.couplings = _parts("loops", loops, Loop), _parts("couplings", couplings, Coupling)
+        self._check_indices()
+        self.hinge_of = np.empty(len(self.bodies), dtype=np.int32)
+        for index, hinge in enumerate(self.hinges):
+            self.hinge_of[hinge.child] = index
+        self.tree = Tree([self.hinges[h].parent for h in self.hinge_of])
+        self.q_start = np.cumsum([0] + [hinge.coord_count for hinge in self.hinges])
+        self.qd_start = np.cumsum([0] + [hinge.dof_count for hinge in self.hinges])
+
+        values: dict[str, np.ndarray] = {
+            "body_mass": np.array([[body.mass for body in self.bodies]]),
+            "body_com": np.array([[body.com for body in self.bodies]]),
+            "body_inertia": np.array([[body.inertia for body in self.bodies]]),
+            "joint_X_p": np.array([[hinge.parent_pose for hinge in self.hinges]]),
+            "joint_X_c": np.array([[hinge.child_pose for hinge in self.hinges]]),
+            "joint_rest_q": np.concatenate([hinge.rest for hinge in self.hinges])[None],
+            "gravity": checked_array("Scene", "gravity [m/s^2]", gravity, (3,))[None],
+        }
+        for name in DOF_VALUES:
+            field = name.removeprefix("joint_")
+            values[name] = np.concatenate([getattr(hinge, field) for hinge in self.hinges])[None]
+            _refuse_negative("Scene", name, values[name])
+        for array in values.values():
+            read_only(array)
+        self.values = MappingProxyType(values)
+
+        screws = [self._screws_of(hinge) for hinge in self.hinges]
+        self.dof_axis = np.concatenate([axis for axis, _, _ in screws]).reshape(-1, 3)
+        self.dof_angular = np.concatenate([angular for _, angular, _ in screws])
+        self.dof_linear = np.concatenate([linear for _, _, linear in screws])
+        self.q_index = np.arange(self.coord_count)[None]
+        self.dof_index = np.arange(self.dof_count)[None]
+
+    @staticmethod
+    def _screws_of(hinge: Hinge) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        if hinge.motion == SCREWS:
+            axes, angular, linear = (np.array([screw[i] for screw in hinge.screws]) for i in range(3))
+            return axes.reshape(-1, 3), angular, linear
+        axes = np.tile(np.eye(3), (hinge.dof_count // 3, 1))  # free: CoM velocity, then angular velocity
+        angular = np.repeat([0.0, 1.0] if hinge.motion == FREE else [1.0], 3)
+        return axes, angular, 1.0 - angular
+
+    def _check_indices(self) -> None:
+        count = len(self.bodies)
+        if count == 0:
+            raise ValueError("Scene: no bodies; expected one or more")
+        carried: dict[int, str] = {}
+        edges: list[Any] = [*self.hinges, *self.loops]
+        for index, hinge in enumerate(edges):
+            name = f"hinge {index} {hinge.label!r}" if index < len(self.hinges) else f"loop {hinge.label!r}"
+            if not all(isinstance(body, int | np.integer) for body in (hinge.parent, hinge.child)):
+                raise TypeError(f"Scene: {name} joins body {hinge.parent!r} to body {hinge.child!r}; expected integers")
+            if not (-1 <= hinge.parent < count and 0 <= hinge.child < count) or hinge.parent == hinge.child:
+                raise ValueError(
+                    f"Scene: {name} joins body {hinge.parent} to body {hinge.child}; expected two of "
+                    f"{count} bodies, -1 being the inertial frame as parent"
+                )
+            if isinstance(hinge, Hinge) and carried.setdefault(hinge.child, name) != name:
+                raise ValueError(
+                    f"Scene: body {hinge.child} is the child of {carried[hinge.child]} and of {name}; "
+                    f"expected one hinge a body: make one of them a Loop"
+                )
+        if len(carried) < count:
+            lost = next(body for body in range(count) if body not in carried)
+            raise ValueError(
+                f"Scene: body {lost} {self.bodies[lost].label!r} is the child of no hinge; expected one "
+                f"hinge a body: add Hinge('free', -1, {lost}) to let it float"
+            )
+        for coupling in self.couplings:
+            if coupling.hinge == coupling.reference:
+                raise ValueError(f"Scene: a coupling ties hinge {coupling.hinge} to itself; expected two hinges")
+            for name in ("ratio", "offset"):
+                checked_array("Scene", f"a coupling's {name}", getattr(coupling, name), ())
+            for index in (coupling.hinge, coupling.reference):
+                if not isinstance(index, int | np.integer):
+                    raise TypeError(f"Scene: a coupling names hinge {index!r}; expected an integer")
+                if not 0 <= index < len(self.hinges) or self.hinges[index].coord_count != 1:
+                    raise ValueError(
+                        f"Scene: a coupling names hinge {index}; expected one of {len(self.hinges)} "
+                        f"hinges with one coordinate"
+                    )
+
+    # -- sizes and names -------------------------------------------------------------------------------------------
+    @property
+    def worlds(self) -> int:
+        """Worlds of the source model, or whose values the scene holds; a scene of one world serves any number."""
+        return max(array.shape[0] for array in (self.q_index, *self.values.values()))
+
+    @property
+    def body_count(self) -> int:
+        return len(self.bodies)
+
+    @property
+    def coord_count(self) -> int:
+        """Length of one world's q."""
+        return int(self.q_start[-1])
+
+    @property
+    def dof_count(self) -> int:
+        """Length of one world's qd."""
+        return int(self.qd_start[-1])
+
+    @property
+    def node_sizes(self) -> tuple[int, ...]:
+        """The paper's m_k: 6 for a rigid body."""
+        return (6,) * self.body_count
+
+    @property
+    def hinge_sizes(self) -> tuple[int, ...]:
+        """The paper's r_k, by node: degrees of freedom of the hinge that carries it."""
+        return tuple(self.hinges[h].dof_count for h in self.hinge_of)
+
+    @property
+    def body_labels(self) -> list[str]:
+        return [body.label or f"body_{k}" for k, body in enumerate(self.bodies)]
+
+    @property
+    def joint_labels(self) -> list[str]:
+        return [hinge.label or f"joint_{k}" for k, hinge in enumerate(self.hinges)]
+
+    @property
+    def dof_labels(self) -> list[str]:
+        return [
+            label if hinge.dof_count == 1 else f"{label}:{i}"
+            for label, hinge in zip(self.joint_labels, self.hinges, strict=True)
+            for i in range(hinge.dof_count)
+        ]
+
+    @property
+    def ties(self) -> str:
+        """What holds beyond the tree, in words: loop joints and couplings; empty if there is nothing."""
+        loops = [loop.label or f"body {loop.parent} to body {loop.child}" for loop in self.loops]
+        labels = self.joint_labels
+        couplings = [f"{labels[c.hinge]} follows {labels[c.reference]}" for c in self.couplings]
+        kinds = ("loop joint(s)", loops), ("coupling(s)", couplings)
+        return " and ".join(f"{len(names)} {kind}: {', '.join(names)}" for kind, names in kinds if names)
+
+    @property
+    def neutral_q(self) -> np.ndarray:
+        """Coordinates at which every hinge's anchors coincide [coordinate]: zeros and identity quaternions."""
+        q = np.zeros(self.coord_count)
+        for hinge, start in zip(self.hinges, self.q_start, strict=False):
+            if hinge.motion != SCREWS:
+                q[start + hinge.coord_count - 1] = 1.0
+        return q
+
+    def with_values(self, **values: Any) -> Scene:
+        """A copy with some of ``values`` replaced, [...] for all worlds or [worlds, ...] for each.
+
+        Raises:
+            ValueError: an unknown name, a wrong shape, numbers that are not finite, or unequal world counts.
+        """
+        scene = object.__new__(Scene)
+        scene.__dict__.update(self.__dict__)
+        checked = {name: self.check_value("Scene.with_values", name, value) for name, value in values.items()}
+        scene.values = MappingProxyType({**self.values, **checked})
+        counts = {array.shape[0] for array in (scene.q_index, *scene.values.values())} - {1}
+        if len(counts) > 1:
+            raise ValueError(f"Scene.with_values: values for {sorted(counts)} worlds; expected one world count")
+        worlds = scene.worlds
+        if scene.q_index.shape[0] != worlds:
+            scene.q_index = np.arange(worlds * self.coord_count).reshape(worlds, -1)
+            scene.dof_index = np.arange(worlds * self.dof_count).reshape(worlds, -1)
+        return scene
+
+    def check_value(self, call: str, name: str, value: Any) -> np.ndarray:
+        """``value`` as a float64 array [1 or worlds, ...], if it is one that ``values[name]`` can be."""
+        if name not in self.values:
+            raise ValueError(f"{call}: unknown value {name!r}; expected one of {', '.join(sorted(self.values))}")
+        shape = self.values[name].shape[1:]
+        refuse_masked(call, name, value)
+        try:
+            array = real(value)
+        except (TypeError, ValueError):
+            raise ValueError(f"{call}: {name} is {value!r}; expected numbers of shape {shape}") from None
+        if array.shape == shape:
+            array = array[None]
+        if array.shape[1:] != shape or array.ndim != len(shape) + 1 or array.shape[0] == 0:
+            raise ValueError(
+                f"{call}: {name} has shape {np.shape(value)}; expected {shape} or (worlds, "
+                f"{', '.join(map(str, shape))})"
+            )
+        if not np.isfinite(array).all():
+            raise ValueError(f"{call}: {name} holds NaN or infinity; expected finite numbers")
+        if name in ("joint_X_p", "joint_X_c"):
+            array[..., 3:] = checked_unit(call, f"the quaternions of {name}", array[..., 3:])
+        if name == "body_inertia":
+            array = checked_inertia(call, array)
+        _refuse_negative(call, name, array)
+        return read_only(array)
+
+    def __repr__(self) -> str:
+        return (
+            f"Scene({self.body_count} bodies, {self.dof_count} dof, depth {self.tree.depth}, "
+            f"{len(self.loops)} loops, {self.worlds} world(s))"
+        )

@@ -1,0 +1,43 @@
+"""A trace evaluated by NumPy, in any precision: what the emitted code must agree with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from .scalars import Value, is_constant, ordered
+
+FUNCTIONS: dict[str, Callable] = {
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "neg": lambda a: -a,
+    "cut": lambda a: a,
+    "sin": np.sin,
+    "cos": np.cos,
+    "sqrt": np.sqrt,
+    "quotient": lambda a, b: a / b,
+    "reciprocal": lambda a: 1.0 / a,
+    "reduced": lambda a: a,
+    "absolute": np.abs,
+    "lost": lambda a: a - a,
+    "guarded": lambda a, least: np.where(a > least, a, np.nan),
+    "less": lambda a, b: np.where(a < b, 1.0, 0.0),
+    "arctangent": np.arctan2,
+    "select": lambda mask, a, b: np.where(mask != 0.0, a, b),
+    "sum_of_logarithms": lambda *terms: sum(np.log(term.astype(np.float64)) for term in terms),
+}
+
+
+def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype: Any = np.float64) -> list[np.ndarray]:
+    """The outputs, for ``load(array, index)`` a number or an array over worlds."""
+    outputs, values = list(outputs), {}
+    for scalar in ordered(outputs):
+        if scalar.op == "input":
+            values[scalar.key] = np.asarray(load(scalar.args[0], scalar.args[1:]), dtype=dtype)
+        else:
+            args = [np.asarray(a, dtype=dtype) if is_constant(a) else values[a.key] for a in scalar.args]
+            values[scalar.key] = np.asarray(FUNCTIONS[scalar.op](*args), dtype=dtype)
+    return [np.asarray(o, dtype=dtype) if is_constant(o) else values[o.key] for o in outputs]
