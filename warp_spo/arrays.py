@@ -3,17 +3,27 @@
 The caller's arrays are torch tensors, Warp arrays or NumPy arrays, ``[world, ...]`` and C-contiguous. torch and Warp
 arrays are used where they are: they must have the object's dtype and device, nothing is copied silently. NumPy arrays
 are cast and copied. The kind of the first array is the kind of the result.
+
+:data:`ArrayT` says so to editors and type checkers: ``def f(self, q: ArrayT, out: ArrayT | None = None) -> ArrayT``
+returns a ``torch.Tensor`` for a ``torch.Tensor`` (or a ``torch.nn.Parameter``), a ``wp.array`` for a ``wp.array``, and
+a ``np.ndarray`` for a ``np.ndarray``. An argument that may be of another kind than the result is an :data:`AnyArray`.
+Neither imports torch at run time.
 """
 
 import functools
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar, Union
 
 import numpy as np
 import warp as wp
 
 from .errors import refuse_masked
 
+if TYPE_CHECKING:
+    import torch
+
+ArrayT = TypeVar("ArrayT", "torch.Tensor", "wp.array[Any, Any]", "np.ndarray[Any, Any]")
+AnyArray = Union["torch.Tensor", "wp.array[Any, Any]", "np.ndarray[Any, Any]"]
 NUMPY, WARP, TORCH = "NumPy", "Warp", "torch"
 _DTYPES = {"float32": wp.float32, "float64": wp.float64}
 
