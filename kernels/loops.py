@@ -4,10 +4,9 @@ import functools
 
 import warp as wp
 
-from .status import FINE, NOT_FINITE, NOT_POSITIVE
+from .status import NOT_FINITE, OK, PIVOT
 
-LOOPS, OPEN = 6, 7  # words: the closures lose rank, or half of the digits, here; they are open
-NOT_SETTLED = 5  # of a step; OPEN is worse
+NOT_SETTLED, LOOPS, OPEN = 5, 6, 7  # as warp_spo.Status, which kernels cannot import; a test compares
 EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
 SWEEPS = 10  # of Jacobi's rotations: quadratic convergence; 6 to 8 do for 36 rows
 NOISE = 32.0  # times rows and eps: eigenvalues below this share of the largest are zero
@@ -142,9 +141,9 @@ def least_norm(T) -> wp.Kernel:
 
 @functools.cache
 def word(T) -> wp.Kernel:
-    """The worst of what is true of a world: NOT_FINITE, LOOPS, NOT_POSITIVE.
+    """The worst of what is true of a world: NOT_FINITE, LOOPS, PIVOT.
 
-    LOOPS where a margin [world, n] is below ``least``, or NaN; NOT_POSITIVE where the result is NaN for another reason.
+    LOOPS where a margin [world, n] is below ``least``, or NaN; PIVOT where the result is NaN for another reason.
     """
 
     @wp.kernel(module=f"warp_spo_loops_{T.__name__}", enable_backward=False)
@@ -174,13 +173,13 @@ def word(T) -> wp.Kernel:
                     given = given and wp.isfinite(body_f[world, body, c])
         for i in range(margin.shape[1]):
             resolved = resolved and margin[world, i] > least
-        found = int(FINE)
+        found = int(OK)
         if not given:
             found = int(NOT_FINITE)
         elif not resolved:
             found = int(LOOPS)
         elif not finite:
-            found = int(NOT_POSITIVE)
+            found = int(PIVOT)
         status_out[world] = found
 
     return kernel
@@ -197,7 +196,7 @@ def opened(T) -> wp.Kernel:
     ):
         world = wp.tid()
         found = status_out[world]
-        if rows[world, 0] > T(0.0) and (found == FINE or found == NOT_SETTLED):
+        if rows[world, 0] > T(0.0) and (found == OK or found == NOT_SETTLED):
             status_out[world] = OPEN
 
     return kernel

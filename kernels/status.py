@@ -15,7 +15,7 @@ import warp as wp
 from .kinematics import SCREWS
 from .topology import Topology
 
-FINE, NOT_POSITIVE, NOT_FINITE, DIGITS_LOST, OUT_OF_RANGE = range(5)  # the words
+OK, PIVOT, NOT_FINITE, DIGITS, RANGE = range(5)  # as warp_spo.Status, which kernels cannot import; a test compares
 EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
 NORMAL = {wp.float32: (2.0**-126, 2.0**127), wp.float64: (2.0**-1022, 2.0**1023)}  # smallest and large numbers
 
@@ -24,7 +24,7 @@ NORMAL = {wp.float32: (2.0**-126, 2.0**127), wp.float64: (2.0**-1022, 2.0**1023)
 def digits(s) -> wp.Kernel:
     """Inward, one level, after ``factor``: lost = (H S H* + |H| |P| |H*| + |Delta|) / D, the error of D in eps.
 
-    In place of the number: -NOT_POSITIVE where D is NaN for want of a positive pivot, -OUT_OF_RANGE where D or what it
+    In place of the number: -PIVOT where D is NaN for want of a positive pivot, -RANGE where D or what it
     is made of leaves the normal range of T, NaN where D is NaN because of another node.
 
     L has the squares of ``d = diag(P)^1/2`` for its entries, since |P(i, j)| <= d(i) d(j): what is small stays small
@@ -125,9 +125,9 @@ def digits(s) -> wp.Kernel:
             lost = (error + delta + wp.where(along, T(0.0), size)) / D
             whole = size + delta
             if whole > largest or (whole > T(0.0) and whole < smallest) or (D > T(0.0) and D < smallest):
-                lost = T(-float(OUT_OF_RANGE))
+                lost = T(-float(RANGE))
             elif wp.isnan(D) and not wp.isnan(whole):
-                lost = T(-float(NOT_POSITIVE))
+                lost = T(-float(PIVOT))
             lost_out[dof, world] = lost
 
             n_D, f_D = n / D, f / D
@@ -163,11 +163,11 @@ def digits(s) -> wp.Kernel:
 
 @functools.cache
 def word(s) -> wp.Kernel:
-    """The worst of what is true of a world, one thread for each: NOT_FINITE, NOT_POSITIVE, OUT_OF_RANGE, DIGITS_LOST.
+    """The worst of what is true of a world, one thread for each: NOT_FINITE, PIVOT, RANGE, DIGITS.
 
-    DIGITS_LOST: D may have lost half of the digits of T, lost > 2 eps^-1/2: measured errors are .02 to .8 of ``lost``.
-    NOT_POSITIVE as the sweeps see it; and where a result is not finite and D may be rounding alone, since another form
-    of the recursion refuses other pivots. OUT_OF_RANGE also where the result overflows, or all of it is subnormal.
+    DIGITS: D may have lost half of the digits of T, lost > 2 eps^-1/2: measured errors are .02 to .8 of ``lost``.
+    PIVOT as the sweeps see it; and where a result is not finite and D may be rounding alone, since another form
+    of the recursion refuses other pivots. RANGE also where the result overflows, or all of it is subnormal.
     """
     T = s.T
     most = T(2.0 * EPSILON[T] ** -0.5)
@@ -217,21 +217,21 @@ def word(s) -> wp.Kernel:
                 given = given and wp.isfinite(qd[world, dof])
             if tau:
                 given = given and wp.isfinite(tau[world, dof])
-            positive = positive and lost[dof, world] != T(-float(NOT_POSITIVE))
+            positive = positive and lost[dof, world] != T(-float(PIVOT))
             hopeless = hopeless or lost[dof, world] > none
-            in_range = in_range and lost[dof, world] != T(-float(OUT_OF_RANGE))
+            in_range = in_range and lost[dof, world] != T(-float(RANGE))
             resolved = resolved and not lost[dof, world] > most
             overflow = overflow or not wp.isfinite(qdd[world, dof])
             largest = wp.max(largest, wp.abs(qdd[world, dof]))
-        found = int(FINE)
+        found = int(OK)
         if not given:
             found = int(NOT_FINITE)
         elif not positive or (overflow and hopeless):
-            found = int(NOT_POSITIVE)
+            found = int(PIVOT)
         elif overflow or not in_range or (largest > T(0.0) and largest < tiny):
-            found = int(OUT_OF_RANGE)
+            found = int(RANGE)
         elif not resolved:
-            found = int(DIGITS_LOST)
+            found = int(DIGITS)
         status_out[world] = found
 
     return kernel

@@ -13,9 +13,14 @@ from .graph.operators import BWA, Blocks, Identity, Operator
 from .scene.parts import Body, Coupling, Hinge, Loop
 from .scene.scene import Scene
 from .scene.tree import Digraph, Tree
+from .status import Status
 
 if TYPE_CHECKING:
+    from . import newton as newton
+    from . import torch as torch
     from .newton import from_newton, load
+
+    __version__: str
 
 __all__ = [
     "BWA",
@@ -31,20 +36,29 @@ __all__ = [
     "Loop",
     "Operator",
     "Scene",
+    "Status",
     "Tree",
     "UnsupportedError",
+    "__version__",
     "from_newton",
     "load",
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name in ("load", "from_newton"):  # these import newton
-        from . import newton
+if not TYPE_CHECKING:  # or every misspelled name would pass a type checker
 
-        return getattr(newton, name)
-    if name in ("torch", "newton"):
+    def __getattr__(name: str) -> Any:
         import importlib
 
-        return importlib.import_module(f".{name}", __name__)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        if name in ("load", "from_newton"):  # these import newton
+            return getattr(importlib.import_module(".newton", __name__), name)
+        if name in ("torch", "newton"):
+            return importlib.import_module(f".{name}", __name__)
+        if name == "__version__":
+            from importlib.metadata import PackageNotFoundError, version
+
+            try:
+                return version(__name__)
+            except PackageNotFoundError:
+                return "0+checkout"  # of a checkout that was never installed
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

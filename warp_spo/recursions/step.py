@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from ..scene.scene import Scene
+from ..status import Status
 from ..trace.emission import Store
 from ..trace.scalars import Value, less, reciprocal, select
 from ..trace.spatial import total
@@ -32,7 +33,6 @@ LOOPED = (GUESS, GAIN, MISSED)
 WIDE = {BALL: 4, FREE: 7}  # coordinates of a hinge with a quaternion
 SHORT = 10  # dofs up to which passes solve a system that is formed once
 FAINT = 1e-12  # share of its laws' resistances that holds a weightless dof in a pass in which none of them does
-NOT_POSITIVE, NOT_FINITE, NOT_SETTLED, CHANGE_POINT, OPEN = 1, 2, 5, 6, 7  # status words; two as warp_spo.status
 
 
 class Step:
@@ -210,22 +210,22 @@ class Step:
     def _word(self, results: list[Value], looped: bool) -> Value:
         """The worst that is true of the world."""
         settled = less(self.trace.graph.input(MISSED, 0), 0.5) if looped else 1.0
-        word = select(self._open(), OPEN, select(settled, 0.0, NOT_SETTLED))
-        word = select(_finite(results), word, NOT_POSITIVE)
-        return select(_finite(self._inputs()), select(self._unresolved(), CHANGE_POINT, word), NOT_FINITE)
+        word = select(self._open(), Status.OPEN, select(settled, 0.0, Status.NOT_SETTLED))
+        word = select(_finite(results), word, Status.PIVOT)
+        return select(_finite(self._inputs()), select(self._unresolved(), Status.LOOPS, word), Status.NOT_FINITE)
 
     def _words(self, own: Piece, results: list[Value]) -> list[Store]:
         """What a piece says to the first one, which makes one word of what all say: the larger, the worse."""
         trace, graph = self.trace, self.trace.graph
         graph.step = "status|s"
-        finite = select(_finite(self._inputs()), select(_finite(results), 0.0, NOT_POSITIVE), NOT_FINITE)
+        finite = select(_finite(self._inputs()), select(_finite(results), 0.0, Status.PIVOT), Status.NOT_FINITE)
         if own.index == 0:
             worst: Value = 0.0
             for piece in Pieces(trace.links).pieces:
                 (word,) = trace.receive("S", piece)
                 worst = select(less(worst, word), word, worst)
             settled = less(graph.input(MISSED, 0), 0.5)
-            trace.rounds = [[Store("status", (), select(worst, worst, select(settled, 0.0, NOT_SETTLED)))]]
+            trace.rounds = [[Store("status", (), select(worst, worst, select(settled, 0.0, Status.NOT_SETTLED)))]]
         return trace.post("S", own, [finite])
 
     def _inputs(self) -> list[Value]:

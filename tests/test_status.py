@@ -1,0 +1,65 @@
+"""spo.Status: a number means the same in every file; each has advice; the more severe of two states is reported."""
+
+import importlib
+import pkgutil
+
+import numpy as np
+import pytest
+import zoo
+
+import warp_spo as spo
+from warp_spo import kernels
+
+NUMBERS = dict(
+    OK=0, PIVOT=1, NOT_FINITE=2, DIGITS=3, RANGE=4, NOT_SETTLED=5, LOOPS=6, OPEN=7, CONTACT=8, SLOTS=9, UNSUPPORTED=10
+)  # fmt: skip
+
+
+def test_numbers_are_what_users_have_stored():
+    assert {state.name: state.value for state in spo.Status} == NUMBERS
+
+
+def test_kernels_hold_the_same_numbers():
+    """Kernels import nothing from the package above them, so they repeat the numbers that they write."""
+    found = []
+    for module in pkgutil.iter_modules(kernels.__path__):
+        module = importlib.import_module(f"{kernels.__name__}.{module.name}")
+        for state in spo.Status:
+            if hasattr(module, state.name):
+                found.append((module.__name__, state.name))
+                assert getattr(module, state.name) == state, (
+                    f"{module.__name__}.{state.name} is not Status.{state.name}"
+                )
+    assert {name for _, name in found} >= {
+        "OK",
+        "PIVOT",
+        "NOT_FINITE",
+        "DIGITS",
+        "RANGE",
+        "NOT_SETTLED",
+        "LOOPS",
+        "OPEN",
+    }
+
+
+def test_every_state_has_advice_and_a_severity_of_its_own():
+    assert all(len(state.advice) > 20 and state.advice.endswith(".") for state in spo.Status)
+    assert sorted(state.severity for state in spo.Status) == list(range(len(spo.Status)))
+    order = sorted(spo.Status, key=lambda state: -state.severity)
+    assert ", ".join(state.name for state in order) in " ".join(spo.Status.__doc__.split())
+
+
+@pytest.mark.parametrize("granularity", ["node", "tree"])
+def test_the_most_severe_state_is_reported(granularity):
+    """World 0 has neither inertia nor armature, world 1 has a NaN as well, world 2 is as the scene says."""
+    values = {"body_mass": 2, "body_inertia": 4, "joint_armature": 2}  # and how many axes each has
+    dyn = spo.Dynamics(zoo.fork(), 3, "cpu", variable=tuple(values), granularity=granularity)
+    for name, axes in values.items():
+        value = np.tile(dyn.scene.values[name][:1], (3,) + (1,) * (axes - 1))
+        value[:2] = 0.0
+        dyn.set(**{name: value})
+    q, status = np.tile(dyn.scene.neutral_q, (3, 1)), np.full(3, -1, np.int32)
+    tau = np.ones((3, dyn.scene.dof_count))
+    tau[1, 0] = np.nan
+    dyn.forward_dynamics(q, None, tau, status=status)
+    assert [spo.Status(number) for number in status] == [spo.Status.PIVOT, spo.Status.NOT_FINITE, spo.Status.OK]

@@ -1,0 +1,93 @@
+"""Why a world's result cannot be computed or trusted: one number a world, which ``status=`` arguments receive."""
+
+import enum
+
+
+class Status(enum.IntEnum):
+    """The number that a call with ``status=`` writes for each world: the most severe state that holds in that world.
+
+    ::
+
+        status = np.zeros(dyn.worlds, np.int32)
+        qdd = dyn.forward_dynamics(q, qd, tau, status=status)
+        for number in np.unique(status):
+            print(spo.Status(number).name, (status == number).sum(), spo.Status(number).advice)
+
+    The numbers never change. They are not ordered by severity. From the most severe to the least severe the order is
+    NOT_FINITE, LOOPS, PIVOT, RANGE, UNSUPPORTED, SLOTS, OPEN, CONTACT, NOT_SETTLED, DIGITS, OK; see :attr:`severity`.
+    NOT_FINITE and PIVOT come with results that are NaN, or not to be trusted; RANGE and LOOPS do where numbers leave
+    the range of the dtype or the rank is lost. With all others the result is finite, and off by what the name says.
+    """
+
+    OK = 0
+    """The result can be trusted."""
+    PIVOT = 1
+    """The mass matrix is not positive definite to working precision: a pivot of its factorisation is not positive."""
+    NOT_FINITE = 2
+    """An input, or a value of the scene, is NaN or infinite in this dtype."""
+    DIGITS = 3
+    """The result may keep fewer than half of the dtype's digits, by an estimate from above."""
+    RANGE = 4
+    """A pivot, a product that forms it, or the result is too small or too large for the dtype's normal numbers."""
+    NOT_SETTLED = 5
+    """The last pass of a step ended with a limit or a friction law on another branch than the pass had assumed."""
+    LOOPS = 6
+    """The closures of the loops lose rank, or half of the dtype's digits: the mechanism is at a change point."""
+    OPEN = 7
+    """The closures of the loops do not hold after the step, in position or in velocity."""
+    CONTACT = 8
+    """The last pass of a step ended with a contact force outside of its law by more than the tolerance."""
+    SLOTS = 9
+    """More contacts were found than the scene has slots for; the surplus contacts were left out."""
+    UNSUPPORTED = 10
+    """Some contacts are of a kind that the solver cannot take; they were left out."""
+
+    @property
+    def advice(self) -> str:
+        """What to do about it, in one or two sentences."""
+        return _ADVICE[self]
+
+    @property
+    def severity(self) -> int:
+        """0 for OK; of two states that hold in one world, ``status=`` receives the one with the greater severity."""
+        return _BY_SEVERITY.index(self)
+
+
+_BY_SEVERITY = (
+    Status.OK,
+    Status.DIGITS,
+    Status.NOT_SETTLED,
+    Status.CONTACT,
+    Status.OPEN,
+    Status.SLOTS,
+    Status.UNSUPPORTED,
+    Status.RANGE,
+    Status.PIVOT,
+    Status.LOOPS,
+    Status.NOT_FINITE,
+)
+
+_ADVICE = {
+    Status.OK: "Nothing needs to be done.",
+    Status.PIVOT: (
+        "Give the joint armature or its body inertia: a massless leaf, three hinges at a gimbal lock and a point mass "
+        "on a ball joint have no positive pivot. Use one ball joint in place of three hinges."
+    ),
+    Status.NOT_FINITE: (
+        "Look for the NaN or the infinity in this world's q, qd, tau, body_f and in the values passed to Dynamics.set; "
+        "reset the world."
+    ),
+    Status.DIGITS: (
+        "Use float64 for such worlds, give light links armature, and lay joint axes along the axes of their anchors."
+    ),
+    Status.RANGE: "Change the units of mass or length, or use float64.",
+    Status.NOT_SETTLED: "Use a shorter dt. The step stands, with a force that a shorter dt would correct.",
+    Status.LOOPS: "Use float64, or keep the mechanism away from configurations in which it can branch or lock.",
+    Status.OPEN: (
+        "Use a shorter dt, start from Dynamics.project, use float64 where angles span many turns or places lie 100 m "
+        "from the origin."
+    ),
+    Status.CONTACT: "Use a shorter dt or more passes, or lower the contact's stiffness.",
+    Status.SLOTS: "Build the scene with more contact slots.",
+    Status.UNSUPPORTED: "Take contacts of this kind out of the model, or give them shapes that the solver supports.",
+}
