@@ -1,4 +1,6 @@
 import os
+import sys
+from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # many small matrices: threads only wait for each other
 
@@ -9,6 +11,7 @@ import warp as wp
 from warp_spo.execution import plan
 
 wp.config.log_level = wp.LOG_WARNING
+sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
 
 
 def pytest_addoption(parser):

@@ -9,7 +9,7 @@ import symbolic
 import warp as wp
 import warp_machine
 import zoo
-from test_granularity import hand
+from granularity_scenes import hand
 
 import warp_spo as spo
 from warp_spo.execution import plan

@@ -9,7 +9,7 @@ import pytest
 import symbolic
 import warp as wp
 from mechanisms import MECHANISMS
-from test_step import FORCES, furnished
+from step_scenes import FORCES, furnished, smooth
 
 import warp_spo as spo
 from warp_spo.dynamics.embedding import Closing
@@ -21,7 +21,6 @@ from warp_spo.recursions.loops.multipliers import Multipliers
 
 H = 2e-3
 SHORTEST = 1e-7  # of the way back onto the closures: ours is the shortest seen from where the step ends, O(h^4)
-SMOOTH = ("damping", "stiffness", "target_ke", "target_kd", "armature")
 ROUNDING = {"float64": 1e-12, "float32": 1e-6}  # of closures [m, rad]; angles of up to 10 rad
 
 
@@ -30,12 +29,6 @@ def given(scene, s):
     rng = np.random.default_rng(7)
     targets = dict(target_q=s.q[::-1].copy(), target_qd=rng.normal(size=s.qd.shape))
     return dict(q=s.q, qd=s.qd, tau=s.tau, body_f=s.body_f) | targets
-
-
-def smooth(scene, seed=0):
-    """Everything that does not bend, on every dof."""
-    rng, n = np.random.default_rng(seed), scene.dof_count
-    return scene.with_values(**{f"joint_{name}": rng.uniform(0.5, 20.0, n) for name in SMOOTH})
 
 
 def wanted(scene, how, s, a):

@@ -1,8 +1,6 @@
 """Analytic derivatives of the dynamics against Pinocchio's, and against central differences of the dense reference."""
 
 import functools
-import sys
-from pathlib import Path
 
 import laws
 import numpy as np
@@ -15,13 +13,11 @@ from allocations import no_warp_allocation
 from robots import ROBOTS
 
 import warp_spo as spo
+from benchmarks import cases
 from warp_spo.execution.plan import MOST_DOFS
 from warp_spo.recursions.derivatives import sensitivity
 from warp_spo.recursions.derivatives.inverse_dynamics import Derivatives
 from warp_spo.reference import Dense
-
-sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
-from benchmarks import cases
 
 STEP = 1e-5
 DIFFERENCES = 1e-6  # relative: eps / h + h^2; the issue's bound, measured 4e-9

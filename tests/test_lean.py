@@ -1,8 +1,5 @@
 """A scene pays for what it has: operations, arrays and kernel arguments of its programs, counted."""
 
-import sys
-from pathlib import Path
-
 import laws
 import numpy as np
 import pytest
@@ -10,11 +7,9 @@ import warp as wp
 import zoo
 
 import warp_spo as spo
+from benchmarks import cases
 from warp_spo.execution.parameters import VARIABLE
 from warp_spo.recursions.links import LINK_VALUES
-
-sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
-from benchmarks import cases
 
 GIVEN = {"forward_dynamics": ("qd", "tau"), "inverse_dynamics": ("qd", "qdd"), "solve_mass_matrix": ("b",),
          "mass_matrix": (), "mass_matrix_inverse": (), "log_det_mass_matrix": ()}  # fmt: skip

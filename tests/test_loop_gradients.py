@@ -7,8 +7,7 @@ import pytest
 import symbolic
 import warp as wp
 from mechanisms import FIRST, MECHANISMS
-from test_closed_step import smooth
-from test_step import furnished
+from step_scenes import furnished, smooth
 
 import warp_spo as spo
 from warp_spo.dynamics.embedding import Closing

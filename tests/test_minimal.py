@@ -1,4 +1,4 @@
-"""Operations in the independent dofs of closed loops, against Lagrange's equations; which there are."""
+"""Operations in the independent dofs of closed loops, against Lagrange's equations."""
 
 import laws
 import mechanisms
@@ -8,14 +8,12 @@ import symbolic
 import warp as wp
 import zoo
 from allocations import no_warp_allocation
+from closed_loops import traced
 from mechanisms import MECHANISMS, Closed
-from test_loops import traced
 
 import warp_spo as spo
 from warp_spo.dynamics import loops
-from warp_spo.dynamics.adjoints import OF_TREE
 from warp_spo.dynamics.embedding import Closing, embedding
-from warp_spo.dynamics.preparation import PRODUCTS, TAKES
 from warp_spo.recursions.loops import minimal
 
 DIFFERENCES = 1e-9  # what differences of order 8 leave of second derivatives; conditioning of the draws
@@ -136,7 +134,6 @@ def test_dead_points_pass():
     assert laws.error(got, Closed(scene, s.q[0]).operational_inertia_inverse(frames_of(scene))) <= DIFFERENCES
 
 
-# -- prescribed motion -------------------------------------------------------------------------------------------------
 def hybrid_error(name, held):
     """``held``: which of the independent dofs."""
     scene, how, s, closed = mechanisms.case(name)
@@ -169,7 +166,6 @@ def test_hybrid_dynamics(name):
         assert hybrid_error(name, np.array(held, dtype=int)) <= TOLERANCE["float64"], held
 
 
-# -- as users call it --------------------------------------------------------------------------------------------------
 def run(dyn, operation, on, **more):
     frames = [frames_of(dyn.scene)] if "jacobian" in operation[:9] or "operational" in operation else []
     return getattr(dyn, operation)(on["q"], *[on[name] for name in CLOSED[operation][0]], *frames, **more)
@@ -295,72 +291,6 @@ def test_what_speaks_of_independent_dofs_fits_what_speaks_of_all(device):
     np.testing.assert_allclose(np.einsum("b,wbi->wi", scene.values["body_mass"][0], moves), force[:, :3], atol=1e-8)
 
 
-OF_ALL_DOFS = {
-    "forward_dynamics",
-    "passive_force",
-    "body_poses",
-    "body_velocities",
-    "body_states",
-    "integrate",
-    "frame_accelerations",
-    "body_accelerations",
-    "closure_error",
-    "project",
-}
-"""What speaks of all dofs, or of bodies, whatever ties them."""
-OF_INVERSE = {"bias_force", "gravity_force", "bias_force_vjp", "gravity_force_vjp"}
-OF_MULTIPLIERS = {
-    "inverse_dynamics",
-    "mass_matrix",
-    "mass_matrix_inverse",
-    "solve_mass_matrix",
-    "bias_force",
-    "gravity_force",
-    "log_det_mass_matrix",
-    "log_det_mass_matrix_gradient",
-    "mass_matrix_packed",
-    "mass_matrix_inverse_packed",
-    "jacobian",
-    "jacobian_bias",
-    "com_jacobian",
-    "centroidal_momentum_matrix",
-    "centroidal_momentum_bias",
-    "quasi_velocities",
-    "loop_multipliers",
-}
-"""What multipliers are about is Mass qdd + bias_force = tau + Y* lambda of all dofs: these are its terms."""
-
-
-@pytest.mark.parametrize("how", ["embed", "multipliers"])
-def test_no_operation_forgets_the_loops(how, device):
-    """Each is known here, embedded, of all dofs, or it raises and names a way out."""
-    dyn = spo.Dynamics(MECHANISMS["gripper"](), 1, device=device, loops=how)
-    of_tree = {f"{operation}_vjp" for operation in OF_TREE}
-    known = (
-        {
-            "embed": {*loops.EMBEDDED, *OF_INVERSE, "operational_inertia", "forward_dynamics_derivatives"},
-            "multipliers": OF_MULTIPLIERS,
-        }[how]
-        | OF_ALL_DOFS
-        | of_tree
-    )
-    assert known <= {*TAKES, *PRODUCTS}
-    for operation in {*TAKES, *PRODUCTS} - known - {"step"}:  # which has tests of its own
-        with pytest.raises(spo.UnsupportedError, match=r"use|loops='cut'|loops='multipliers'|independent"):
-            dyn.prepare(operation)
-    q = np.zeros((1, dyn.scene.coord_count))
-    if how == "embed":
-        for pattern in ("mass_matrix_pattern", "mass_matrix_inverse_pattern"):
-            with pytest.raises(spo.UnsupportedError, match="use mass_matrix"):
-                getattr(dyn, pattern)
-        with pytest.raises(spo.UnsupportedError, match="operators"):
-            dyn.operators(q)
-    else:
-        with pytest.raises(spo.UnsupportedError, match=r"operational_inertia: .*use loops='embed'"):
-            dyn.operational_inertia(q, [0])
-
-
-# -- bugs --------------------------------------------------------------------------------------------------------------
 BUGS = [
     ("operational_inertia_inverse", "_through", "force = force + column * rate", "force = force - column * rate"),
     ("operational_inertia_inverse", "_through", "{id(link): force}", "{id(cluster.links[0]): force}"),

@@ -11,13 +11,11 @@ import pytest
 import zoo
 
 import warp_spo as spo
-from warp_spo.trials.operations import TOLERANCE, Inputs
-
-sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
 from benchmarks import cases, peers, robots
 from benchmarks.peers import coordinates, exchange, lumped
 from benchmarks.peers.__main__ import main
 from benchmarks.peers.peer import Absent
+from warp_spo.trials.operations import TOLERANCE, Inputs
 
 WORLDS = 3
 FLOAT64_MAP = 1e-12  # of a state of size one, mapped there and back

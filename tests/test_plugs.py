@@ -8,8 +8,8 @@ import pytest
 import warp as wp
 from newton.actuators import JointSpaceResponse
 from newton.controllers import ControllerOperationalSpaceModelFree
-from test_newton import arm
-from test_solver import floating, moving, replicated
+from newton_models import arm
+from solver_models import floating, moving, replicated
 
 from warp_spo.newton import SolverSPO
 from warp_spo.newton.isaaclab import adapter

@@ -7,8 +7,8 @@ import warp as wp
 from allocations import no_warp_allocation
 from newton import JointTargetMode, ModelFlags, StateFlags
 from newton.solvers import SolverBase
-from test_newton import arm, finalize
-from test_solver import advance, replicated
+from newton_models import arm, finalize
+from solver_models import advance, replicated
 
 import warp_spo as spo
 from warp_spo.errors import UnsupportedError

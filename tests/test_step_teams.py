@@ -10,8 +10,8 @@ import symbolic
 import warp as wp
 import warp_machine
 import zoo
-from test_granularity import MANY, hand
-from test_step import FORCES, TOLERANCE, H, furnished, states
+from granularity_scenes import MANY, hand
+from step_scenes import FORCES, TOLERANCE, H, furnished, states
 
 import warp_spo as spo
 from warp_spo.execution import plan, teams

@@ -1,23 +1,17 @@
 """The stress suite: every case within 10 times its law, what cannot be computed flagged, bits kept."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import warp as wp
-
-import warp_spo as spo
-from warp_spo.kernels import status as status_kernels
-
-sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
 from granularities import GRANULARITIES, SLOW, skip_unless_served
 
+import warp_spo as spo
 from benchmarks import stress, stress_checks, stress_measure, stress_scenes
 from benchmarks.exact import Sweep
 from benchmarks.stress_cases import ALLOWED, CASES, CAUSES, choose
 from benchmarks.stress_scenes import Setting
 from warp_spo import reference
+from warp_spo.kernels import status as status_kernels
 
 KNOWN = {(case.id, dtype): CAUSES[case.name] for case in CASES if case.name in CAUSES for dtype in case.precisions}
 """(case, precision) -> why it fails. One case; three are allowed."""

@@ -1,0 +1,169 @@
+"""The code that traces emit equals their evaluation in NumPy; sine and cosine are right to the last places."""
+
+import math
+
+import laws
+import numpy as np
+import pytest
+import warp as wp
+import zoo
+
+import warp_spo as spo
+from warp_spo.kernels import straight
+from warp_spo.recursions.links import Links
+from warp_spo.recursions.traced import Trace
+from warp_spo.trace import scalars as g
+from warp_spo.trace.emission import Emitter, Store, literal, literals
+from warp_spo.trace.evaluation import evaluate
+
+TYPES = {"float32": wp.float32, "float64": wp.float64}
+
+
+def compiled(values, rows, dtype, device):
+    """``values`` of inputs ("x", i) for rows [world, i], by a kernel."""
+    T, count = TYPES[dtype], len(values)
+    out = straight.Row("out", 2, count)
+    frame = straight.Frame(
+        rows=[straight.Row("x", 2, rows.shape[1])], staged=False, fields=[],
+        result=straight.Result(straight.DIRECT, out), sent=0, warps=1, block=32)  # fmt: skip
+    emitter = Emitter(dtype, lambda array, entry: f"{array}_row[{entry}]",
+                      lambda array, entry, value: f"if (mine) result_row[{entry}] = {value};",
+                      lambda array, index: index[0])  # fmt: skip
+    text = literals(emitter.region([Store("out", (i,), value) for i, value in enumerate(values)]), dtype)
+    kernel = straight.kernel("trace", straight.assemble(frame, text, text, T), [("x", 2), ("out", 2)], T)
+    x = wp.array(rows, dtype=T, device=device)
+    result = wp.full((len(rows), count), float("nan"), dtype=T, device=device)
+    threads = -(-len(rows) // 32) * 32 if device.is_cuda else len(rows)
+    wp.launch(kernel, threads, [len(rows), x], [result], device=device, block_dim=32)
+    return result.numpy()
+
+
+@pytest.mark.parametrize("dtype, tolerance", [("float32", 1e-6), ("float64", 1e-15)])
+def test_every_operation_as_code(dtype, tolerance, device):
+    """The code of each operation of the graph against NumPy's, NaN and infinity among the constants."""
+    graph = g.Graph()
+    x, y, z = (graph.input("x", i) for i in range(3))
+    values = [x + y, x - y, x * y, -x, g.sin(x), g.cos(x * y), g.sqrt(x), g.reciprocal(y), g.absolute(-x - y),
+              g.sin(g.reduced(z)), g.guarded(x, y), g.guarded(y, x), graph.make("lost", x), g.select(z, x, y),
+              g.select(graph.make("lost", x), x, y), g.sum_of_logarithms([x, y]), x + math.nan, y * math.inf,
+              -math.inf * y, math.pi * x, 1e-30 * x, x + 1e10, 0.1, math.nan, -math.inf, x, x]  # fmt: skip
+    rows = np.random.default_rng(3).uniform(0.5, 2.0, (33, 3)).astype(dtype).astype(np.float64)
+    wanted = np.array(evaluate(values, lambda _, index: rows[:, index[0]]), dtype=object)
+    got = compiled(values, rows, dtype, device)
+    for at, want in enumerate(wanted):
+        want = np.broadcast_to(np.asarray(want, np.float64), 33)
+        np.testing.assert_allclose(got[:, at], want, rtol=4 * tolerance, atol=tolerance, err_msg=str(values[at]))
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+def test_literals_are_read_back_as_they_were(dtype):
+    rng = np.random.default_rng(4)
+    numbers = [*rng.normal(size=100), *(10.0 ** rng.uniform(-30, 30, 100)), 0.0, 1.0, -1.0, 1 / 3, 2**-126]
+    for number in numbers:
+        text = literal(float(number), dtype)
+        assert text.endswith("f") == (dtype == "float32") and ("." in text or "e" in text)
+        assert np.dtype(dtype).type(text.rstrip("f")) == np.dtype(dtype).type(number)
+    assert [literal(x, dtype) for x in (math.nan, math.inf, -math.inf)] == ["nan", "infinity", "-infinity"]
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+@pytest.mark.parametrize(
+    "operation, given",
+    [
+        ("forward_dynamics", ("q", "qd", "tau", "body_f")),
+        ("inverse_dynamics", ("q", "qd", "qdd")),
+        ("mass_matrix", ("q",)),
+        ("mass_matrix_inverse", ("q",)),
+        ("log_det_mass_matrix", ("q",)),
+    ],
+)
+def test_the_trace_in_numpy_is_the_kernel(operation, given, dtype, device):
+    """The same trace by NumPy in float64: they share the graph and nothing after it."""
+    scene = zoo.forest()
+    arrays = laws.states(scene, 3, dtype=dtype)
+    stores = getattr(Trace(Links(scene), dtype, given), operation)()
+    dyn = spo.Dynamics(scene, 3, device=device, dtype=dtype, granularity="tree")
+    got = laws.numpy_call(dyn, operation, {key: value for key, value in arrays.items() if key in given})
+    wanted = np.zeros(got.shape)
+    load = lambda array, index: arrays[array][(slice(None), *index)]  # noqa: E731
+    for item, value in zip(stores, evaluate([item.value for item in stores], load), strict=True):
+        wanted[(slice(None), *item.index)] = value
+    assert laws.error(got, wanted) <= laws.TOLERANCE[dtype]
+
+
+LAST_PLACES = 2.0
+RANGES = [1e-30, 1e-3, 0.5, 1.6, 3.2, 10.0, 1e3, 9e4]
+REACH = {"float32": 1e5, "float64": 1e8}  # below, the zeros of sine and cosine are met to the last place too
+FAR = {"float32": [1e6, 1e7], "float64": [1e6, 9e7, 1e9, 1e10]}
+
+
+def last_places(got, wanted, dtype):
+    """|got - wanted| in units of the last place of wanted, which is of more precision."""
+    unit = np.spacing(np.abs(wanted).astype(dtype)).astype(np.longdouble)
+    return np.abs(got.astype(np.longdouble) - wanted) / unit
+
+
+def angles(reach, dtype):
+    rng = np.random.default_rng(5)
+    near = np.arange(-3000, 3000) * (np.pi / 2) if reach > 10 else np.array([0.0])  # where one of them nearly vanishes
+    x = np.concatenate([rng.uniform(-reach, reach, 20000), near[np.abs(near) <= reach], [0.0, reach, -reach]])
+    return np.concatenate([x, np.nextafter(x.astype(dtype), np.dtype(dtype).type(9))]).astype(dtype)
+
+
+@pytest.mark.parametrize("coordinate", [True, False], ids=["coordinate", "computed"])
+@pytest.mark.parametrize("dtype", TYPES)
+def test_sine_and_cosine(dtype, coordinate, device):
+    """To two units in the last place, near the zeros too, for coordinates and for angles that were computed."""
+    graph = g.Graph()
+    x = graph.input("x", 0)
+    angle = x if coordinate else x * graph.input("x", 1)
+    for reach in (*RANGES, *FAR[dtype]):
+        rows = np.stack([a := angles(reach, dtype), np.ones_like(a)], axis=1)
+        got = compiled([g.sin(angle), g.cos(angle)], rows, dtype, device)
+        exact = rows[:, 0].astype(np.longdouble)
+        for column, wanted in enumerate((np.sin(exact), np.cos(exact))):
+            if reach < REACH[dtype]:
+                worst = last_places(got[:, column], wanted, dtype)
+            else:  # turns come off first, and the angle that is left is rounded
+                worst = np.abs(got[:, column] - wanted) / np.finfo(dtype).eps
+            name = ("sin", "cos")[column]
+            assert worst.max() <= LAST_PLACES, f"{name}({rows[worst.argmax(), 0]!r}): {worst.max()}"
+    lost = compiled([g.sin(angle), g.cos(angle)], np.array([[np.nan, 1], [np.inf, 1], [-np.inf, 1]]), dtype, device)
+    assert np.isnan(lost).all()
+
+
+@pytest.mark.parametrize(
+    "c, old, new", [("float", "(quadrant + 1) & 2", "quadrant & 2"), ("float", "-3.13916473e-7f", "-3.13916e-7f")]
+)
+def test_a_wrong_sine_is_seen(c, old, new, device, monkeypatch):
+    assert straight.NATIVE[c].count(old) == 1
+    monkeypatch.setitem(straight.NATIVE, c, straight.NATIVE[c].replace(old, new))
+    with pytest.raises(AssertionError):
+        test_sine_and_cosine("float32", True, device)
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+def test_turns_taken_off(dtype, device):
+    """|x - reduced| is a number of full turns, and what is left is at most half of one."""
+    mpmath = pytest.importorskip("mpmath")
+    x = np.random.default_rng(6).uniform(-1e6, 1e6, 500).astype(dtype)
+    got = compiled([g.reduced(g.Graph().input("x", 0))], x[:, None], dtype, device)[:, 0]
+    assert np.abs(got).max() <= np.pi * (1 + 1e-6)
+    with mpmath.workdps(40):
+        for a, r in zip(x.tolist(), got.tolist(), strict=True):
+            turns = (mpmath.mpf(a) - r) / (2 * mpmath.pi)
+            assert abs(turns - mpmath.nint(turns)) <= np.finfo(dtype).eps
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+def test_reciprocal_and_root(dtype, device):
+    graph = g.Graph()
+    x = graph.input("x", 0)
+    rng = np.random.default_rng(7)
+    rows = (10.0 ** rng.uniform(-30, 30, (20000, 1))).astype(dtype)
+    rows = np.concatenate([rows, -rows])
+    got = compiled([g.reciprocal(x), g.sqrt(x * (1.0 / 3.0))], rows, dtype, device)
+    assert last_places(got[:, 0], 1 / rows[:, 0].astype(np.longdouble), dtype).max() <= LAST_PLACES
+    third = rows[:20000, 0] * np.dtype(dtype).type(1.0 / 3.0)
+    assert last_places(got[:20000, 1], np.sqrt(third.astype(np.longdouble)), dtype).max() <= LAST_PLACES
+    assert np.isnan(got[20000:, 1]).all()
