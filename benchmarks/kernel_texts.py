@@ -29,7 +29,7 @@ import warp_spo as spo
 from warp_spo.dynamics import dynamics
 from warp_spo.dynamics.preparation import PRODUCTS, TAKES
 from warp_spo.examples import biped, fivebar, fourbar, slider_crank, stewart
-from warp_spo.kernels import straight
+from warp_spo.kernels import native
 
 from . import robots, shapes
 
@@ -103,7 +103,7 @@ def recording(recorder: Recorder) -> Iterator[None]:
     empty = wp.empty
     with (
         mock.patch.object(dynamics.plans, "choose", as_for_cuda),
-        mock.patch.object(straight, "kernel", record),
+        mock.patch.object(native, "kernel", record),
         mock.patch.object(wp, "launch", lambda *args, **more: None),
         mock.patch.object(wp, "zeros", lambda shape, **more: empty(shape, **more)),
     ):

@@ -15,7 +15,7 @@ from pathlib import Path
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.kernels.straight import WARP
+from warp_spo.kernels.slots import WARP_SIZE
 from warp_spo.trials.operations import OPERATIONS, Inputs
 from warp_spo.trials.trial import Subject, Trial
 
@@ -91,7 +91,7 @@ def load(made: dict) -> None:
             device = dyn.device
             for program in dyn.programs._programs.values():
                 kernel = program.kernel
-                blocks.setdefault(program.block if device.is_cuda else WARP, {})[kernel.key] = kernel.module
+                blocks.setdefault(program.block if device.is_cuda else WARP_SIZE, {})[kernel.key] = kernel.module
     for block, modules in blocks.items():
         wp.force_load(device, list(modules.values()), block_dim=block, max_workers=os.cpu_count())
 

@@ -11,7 +11,8 @@ import types
 
 import warp as wp
 
-from .straight import C_TYPE, function
+from . import native
+from .elementary import C_TYPE
 
 POSE, MOTION, RIGID, ARTICULATED = 12, 6, 10, 21  # components of one of each
 ENTRY = (
@@ -104,5 +105,5 @@ def _memory(n: int, T):
     loads = "".join(f"v[{k}] = {place};\n" for k, place in enumerate(places))
     stores = "".join(f"{place} = v[{k}];\n" for k, place in enumerate(places))
     where = {"a": array, "i": int, "world": int}
-    load = function(f"load_{n}_{T.__name__}", f"{entry}wp::vec_t<{n}, {c}> v;\n{loads}return v;", where, vector)
-    return load, function(f"store_{n}_{T.__name__}", entry + stores, where | {"v": vector})
+    load = native.function(f"load_{n}_{T.__name__}", f"{entry}wp::vec_t<{n}, {c}> v;\n{loads}return v;", where, vector)
+    return load, native.function(f"store_{n}_{T.__name__}", entry + stores, where | {"v": vector})

@@ -1,7 +1,7 @@
-"""Matrices that traced kernels leave as tiles, [tile, slot, world of the tile]: spread over rows, and multiplied.
+"""Matrices that generated kernels write as tiles, [tile, slot, world of the tile]: unpacked into rows, or multiplied.
 
-Entry e of a world's matrix is value ``place[e]`` among its slots, or zero where that is negative. A thread works on one
-entry in all worlds of a tile: it reads what lies side by side, and neighbours write side by side.
+Entry e of a world's matrix is the value in slot ``place[e]``, or zero where ``place[e]`` is negative. A thread works on
+one entry in all worlds of a tile: it reads contiguous memory, and neighbouring threads write neighbouring entries.
 """
 
 import functools
@@ -14,7 +14,7 @@ TYPES = """\
 struct alignas(16) Part { %(c)s x[16 / sizeof(%(c)s)]; };  // read at once
 struct Tile { Part part[%(tile)d * sizeof(%(c)s) / 16]; };
 """
-SPREAD = """\
+UNPACK = """\
 Tile v = {};
 if (slot >= 0) v = ((const Tile*)a.data)[(long long)tile * a.shape[1] + slot];
 const int first = tile * %(tile)d, count = out.shape[0] - first < %(tile)d ? out.shape[0] - first : %(tile)d;
@@ -49,16 +49,17 @@ for (int u = 0; u < count; ++u) {
 """
 
 
-def _code(text: str, T) -> str:
+def _code(text: str, T: type) -> str:
+    """Return the native code of ``text`` for scalars of type ``T``."""
     wide = f"#define WIDE (16 / (int)sizeof({C_TYPE[T]}))\n"
     return wide + (TYPES + text) % {"c": C_TYPE[T], "tile": TILE} + "#undef WIDE\n"
 
 
 @functools.cache
-def spread(T) -> wp.Kernel:
-    """out[world, e] = the value at ``place[first + e]``; one thread for each (tile, e)."""
+def unpack(T: type) -> wp.Kernel:
+    """Set ``out[world, e]`` to the value in slot ``place[first + e]``; one thread for each (tile, e)."""
 
-    @wp.func_native(_code(SPREAD, T))
+    @wp.func_native(_code(UNPACK, T))
     def write(tile: int, e: int, slot: int, a: wp.array3d[T], out: wp.array2d[T]): ...
 
     @wp.kernel(module=f"warp_spo_tiles_{T.__name__}", enable_backward=False)
@@ -70,8 +71,11 @@ def spread(T) -> wp.Kernel:
 
 
 @functools.cache
-def product(T) -> wp.Kernel:
-    """q_out, qd_out = -A B for two blocks of B in tiles, [dof, dof] each; one thread for each (tile, row, column)."""
+def negative_product(T: type) -> wp.Kernel:
+    """Compute q_out, qd_out = -A B for two blocks of B in tiles, [dof, dof] each.
+
+    One thread for each (tile, row, column).
+    """
 
     @wp.func_native(_code(MULTIPLY, T))
     def multiply(
@@ -99,4 +103,4 @@ def product(T) -> wp.Kernel:
     return kernel
 
 
-KERNELS = (spread, product)
+KERNELS = (unpack, negative_product)

@@ -137,7 +137,7 @@ def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
     solved = np.array([np.linalg.solve(reference[w].mass_matrix, a["cotangent"][w]) for w in range(WORLDS)])
     state, find, further = {"q": wide, "qd": rate}, dyn.programs.find, {}
     program = find("forward_dynamics_and_solve", state | {"tau": rate, "cotangent": rate}, rate, {"solved": rate})
-    assert program.warps > 1 and texts[-1].frame.staged == texts[-1].frame.gathered == staged
+    assert program.warps > 1 and texts[-1].frame.staged == texts[-1].frame.further_staged == staged
     for backwards in (False, True):
         assert laws.error(warp_machine.run(texts[-1], a, backwards, further), qdd) <= TOLERANCE["float64"]
         assert laws.error(further.pop("solved"), solved) <= TOLERANCE["float64"]

@@ -13,7 +13,7 @@ from operators_of_robots import IDENTITY, SCENES, close, fused, inverse_mass, sc
 
 import warp_spo as spo
 from warp_spo import reference
-from warp_spo.execution.staging import read_before
+from warp_spo.execution.staging import is_read_before_written
 from warp_spo.trace.emission import Store
 from warp_spo.trace.scalars import Graph
 
@@ -108,7 +108,7 @@ def test_long_rows_go_through_shared_memory(expression, device, monkeypatch):
 def test_no_result_is_written_over_what_is_still_to_be_read():
     graph = Graph()
     x = [graph.input("x", i) for i in range(2)]
-    before = lambda *stores: read_before(list(stores), list(stores), "x")  # noqa: E731
+    before = lambda *stores: is_read_before_written(list(stores), list(stores), "x")  # noqa: E731
     assert before(Store("out", (0,), x[0] + x[1]), Store("out", (1,), 2.0 * x[1]))
     assert not before(Store("out", (0,), 0.0), Store("out", (1,), x[0] * x[1]))
     early = 3.0 * graph.input("x", 5)

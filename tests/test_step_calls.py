@@ -13,7 +13,7 @@ from step_scenes import FORCES, H, furnished, slider, states
 
 import warp_spo as spo
 from warp_spo.errors import UnsupportedError
-from warp_spo.kernels import straight
+from warp_spo.kernels import native, straight
 from warp_spo.reference import Dense, rotation
 
 
@@ -41,8 +41,8 @@ def test_in_place_and_without_allocation(device):
 
 def test_a_step_in_place_reads_its_state_once(device, monkeypatch):
     """No second try for far angles after the state has been written over: they are looked at first."""
-    texts, kernel = [], straight.kernel
-    monkeypatch.setattr(straight, "kernel", lambda name, text, *more: texts.append(text) or kernel(name, text, *more))
+    texts, kernel = [], native.kernel
+    monkeypatch.setattr(native, "kernel", lambda name, text, *more: texts.append(text) or kernel(name, text, *more))
     scene = zoo.chain(3)
     scene = scene.with_values(joint_stiffness=np.zeros(3))
     dyn = spo.Dynamics(scene, 2, device=device, dtype="float64")

@@ -175,14 +175,15 @@ def test_a_world_that_does_not_settle_says_so(monkeypatch):
 WAIT = """\'asm volatile("bar.sync 0;" ::: "memory");\', """
 BUGS = {
     "a warp that stops early": (
-        straight, "voted", '"const int going = __syncthreads_or(missed_row[0] > 0);"',
+        straight, "repeat_team_passes", '"const int going = __syncthreads_or(missed_row[0] > 0);"',
         WAIT + '"const int going = missed_row[0] > 0;"'),
-    "nobody asks for another pass": (straight, "voted", "_or(missed_row[0] > 0)", "_or(missed_row[0] < 0)"),
-    "flags in one place": (straight, "voted", "(turn & 1)", "(turn & 0)"),
+    "nobody asks for another pass": (
+        straight, "repeat_team_passes", "_or(missed_row[0] > 0)", "_or(missed_row[0] < 0)"),
+    "flags in one place": (straight, "repeat_team_passes", "(turn & 1)", "(turn & 0)"),
     "no barrier in the vote": (
-        straight, "voted", "going = __syncthreads_or(missed_row[0] > 0)", "going = missed_row[0] > -1"),
+        straight, "repeat_team_passes", "going = __syncthreads_or(missed_row[0] > 0)", "going = missed_row[0] > -1"),
     "a guess that stays": (Step, "_looped", "after = gain\n", "after = 0.0 * gain\n"),
-    "a limb that is not asked": (straight, "voted", "for warp in range(warps)", "for warp in range(1)"),
+    "a limb that is not asked": (straight, "repeat_team_passes", "for warp in range(warps)", "for warp in range(1)"),
     "a word before it is said": (teams.Team, "_in_passes", "if last and any(found)", "if False"),
     "a word unheard": (Step, "_words", "select(less(worst, word), word, worst)", "word"),
 }  # fmt: skip

@@ -12,7 +12,7 @@ from torch.autograd import forward_ad
 import warp_spo as spo
 from warp_spo import torch as spo_torch
 from warp_spo.execution.plan import MOST_DOFS
-from warp_spo.execution.staging import read_before
+from warp_spo.execution.staging import is_read_before_written
 from warp_spo.recursions.derivatives.adjoints import Adjoints
 
 
@@ -135,7 +135,7 @@ def test_a_result_is_not_written_over_what_is_read_later():
     trace = Adjoints(dyn.programs.links.opened(), "float32", tuple(shapes))
     stores = trace.forward_dynamics_vjp(("tau", "q"))
     first = [item for item in stores if item.array == "out"]
-    free = {name: read_before(first, stores, name) for name in ("cotangent", "qd", "qdd")}
+    free = {name: is_read_before_written(first, stores, name) for name in ("cotangent", "qd", "qdd")}
     del first, stores  # which pytest would write out
     assert free == {"cotangent": True, "qd": False, "qdd": False}
 

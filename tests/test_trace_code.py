@@ -9,7 +9,7 @@ import warp as wp
 import zoo
 
 import warp_spo as spo
-from warp_spo.kernels import straight
+from warp_spo.kernels import native, straight
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.traced import Trace
 from warp_spo.trace import scalars as g
@@ -23,14 +23,14 @@ def compiled(values, rows, dtype, device):
     """``values`` of inputs ("x", i) for rows [world, i], by a kernel."""
     T, count = TYPES[dtype], len(values)
     out = straight.Row("out", 2, count)
-    frame = straight.Frame(
+    frame = straight.KernelLayout(
         rows=[straight.Row("x", 2, rows.shape[1])], staged=False, fields=[],
-        result=straight.Result(straight.DIRECT, out), sent=0, warps=1, block=32)  # fmt: skip
+        result=straight.Result(straight.DIRECT, out), messages=0, warps=1, block=32)  # fmt: skip
     emitter = Emitter(dtype, lambda array, entry: f"{array}_row[{entry}]",
                       lambda array, entry, value: f"if (mine) result_row[{entry}] = {value};",
                       lambda array, index: index[0])  # fmt: skip
     text = literals(emitter.region([Store("out", (i,), value) for i, value in enumerate(values)]), dtype)
-    kernel = straight.kernel("trace", straight.assemble(frame, text, text, T), [("x", 2), ("out", 2)], T)
+    kernel = native.kernel("trace", straight.assemble(frame, text, text, T), [("x", 2), ("out", 2)], T)
     x = wp.array(rows, dtype=T, device=device)
     result = wp.full((len(rows), count), float("nan"), dtype=T, device=device)
     threads = -(-len(rows) // 32) * 32 if device.is_cuda else len(rows)

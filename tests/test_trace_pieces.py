@@ -133,7 +133,7 @@ def test_results_that_leave_through_shared_memory(monkeypatch):
 
     for wrt, ways in ((("q", "qd", "tau"), (straight.STAGED, 2)), (("q", "qd"), (straight.DIRECT, 0))):
         found = frame(lambda dyn, wrt=wrt: dyn.forward_dynamics_vjp(q, qd, tau, cotangent=tau, wrt=wrt))
-        assert (found.result.way, len(found.leaving)) == ways and not found.staged
+        assert (found.result.way, len(found.staged_further)) == ways and not found.staged
     assert frame(lambda dyn: dyn.inverse_dynamics(q, qd, tau)).result.way == straight.DIRECT
     assert frame(lambda dyn: dyn.inverse_dynamics(q, qd, tau), few=0).result.way == straight.STAGED
 

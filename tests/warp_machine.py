@@ -12,7 +12,7 @@ import numpy as np
 
 from warp_spo.execution.programs import Programs
 from warp_spo.execution.teams import BARRIER
-from warp_spo.kernels.straight import IN_PLACE, SPREAD, TILED, Frame
+from warp_spo.kernels.straight import BY_TABLE, IN_PLACE, TILED, KernelLayout
 
 NOBODY = (-1, -1)
 
@@ -25,7 +25,7 @@ class Text(NamedTuple):
     """What surrounds and what is in one kernel."""
 
     operation: str
-    frame: Frame
+    frame: KernelLayout
     cuda: str
     cpu: str
     tables: dict
@@ -86,7 +86,8 @@ def run(text, arrays, backwards=False, further=None, over=None):
     worlds = len(next(array for name, array in arrays.items() if name not in (*frame.fields, *frame.numbers)))
     rows = {f"{row.name}_row": Shared(row.name, arrays[row.name].reshape(worlds, -1).T) for row in frame.rows}
     rows |= {
-        f"{row.name}_row": rows[f"{over[row.name]}_row"] if row.name in over else Shared(row.name) for row in frame.more
+        f"{row.name}_row": rows[f"{over[row.name]}_row"] if row.name in over else Shared(row.name)
+        for row in frame.further
     }
     result = rows[f"{frame.result.row}_row"] if frame.result.way == IN_PLACE else Shared("result")
     result, sent = rows[f"{over['out']}_row"] if "out" in over else result, Shared("sent")
@@ -112,12 +113,12 @@ def run(text, arrays, backwards=False, further=None, over=None):
             raise Race(f"warps {sorted(stopped)} of {sorted(going)} end after {stretch} barriers, the others do not")
         going = {} if stopped else going
         stretch += 1
-    for row in frame.more:
+    for row in frame.further:
         further[row.name] = np.full((worlds, row.entries), np.nan)
         for entry, value in rows[f"{row.name}_row"].values.items():
             further[row.name][:, entry] = value
     whole = np.zeros((frame.result.array.entries, worlds))
-    places = text.tables["place"] if frame.result.way in (*SPREAD, TILED) else range(len(whole))
+    places = text.tables["place"] if frame.result.way in (*BY_TABLE, TILED) else range(len(whole))
     for entry, slot in enumerate(places):
         whole[entry] = 0.0 if slot < 0 else result.values.get(slot, np.nan)
     return whole.T

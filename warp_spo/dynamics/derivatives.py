@@ -102,7 +102,7 @@ class Derivatives:
                 program, rates = self._tiled("inverse_dynamics_derivatives", (3, *self._square), **arrays)
                 self._run("mass_matrix_inverse", inverse, q=arrays["q"])
                 inputs = [inverse, rates, program.entry.reshape((3, n, n))]
-                self.recursions.launch(tiles.product, (len(rates), n, n), inputs, [by_q, by_qd])
+                self.recursions.launch(tiles.negative_product, (len(rates), n, n), inputs, [by_q, by_qd])
         return ForwardDynamicsDerivatives(*call.result)
 
     def mass_matrix_derivative(self, q: Any, out: Any = None) -> Any:
@@ -172,7 +172,7 @@ class Derivatives:
             return
         rows = out.reshape((self.worlds, out.size // self.worlds))
         inputs = [found, program.entry, block * rows.shape[1]]
-        self.recursions.launch(tiles.spread, (len(found), rows.shape[1]), inputs, [rows])
+        self.recursions.launch(tiles.unpack, (len(found), rows.shape[1]), inputs, [rows])
 
     _call: Any
     _read_state: Any

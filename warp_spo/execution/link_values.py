@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ..kernels import straight
+from ..kernels import native, straight
 from ..recursions.links import Links
 from ..trace.differentiation import reverse
 from ..trace.emission import Emitter, Store, literals
@@ -41,9 +41,9 @@ def _kernel(name: str, values: list, sources: list[str], T: type) -> wp.Kernel:
         late=sources,
     )
     listing = emitter.region([Store("out", (entry,), value) for entry, value in enumerate(values)])
-    native = straight.per_world(sources, literals(listing, "float64"))
+    text = straight.assemble_per_world(sources, literals(listing, "float64"))
     arrays = [(source, 2) for source in sources] + [("out", 2)]
-    return straight.kernel(f"links_{name}", native, arrays, T, wide=tuple(sources))
+    return native.kernel(f"links_{name}", text, arrays, T, wide=tuple(sources))
 
 
 def pull_back(parameters: Parameters, links: Links, cotangent: wp.array, gradients: dict[str, wp.array]) -> None:
@@ -80,6 +80,6 @@ def _reverse_kernel(stores: list[Store], sources: list[str], size: int, sizes: d
         return f"{array}_bar.data[world * {sizes[array]} + {entry}] = ({straight.C_TYPE[T]})({value});"
 
     emitter = Emitter("float64", load, store, lambda array, index: index[0], late=(*sources, "cotangent"))
-    native = straight.per_world(sources, literals(emitter.region(stores), "float64"))
+    text = straight.assemble_per_world(sources, literals(emitter.region(stores), "float64"))
     arrays = [(source, 2) for source in sources] + [("cotangent", 2)] + [(f"{name}_bar", 2) for name in sizes]
-    return straight.kernel("links_reverse", native, arrays, T, wide=tuple(sources))
+    return native.kernel("links_reverse", text, arrays, T, wide=tuple(sources))

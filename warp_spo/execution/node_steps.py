@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from ..kernels import straight
-from ..kernels.elementary import NATIVE
+from ..kernels import native
+from ..kernels.elementary import C_TYPE, NATIVE
 from ..kernels.spatial import spatial
 from ..recursions import articulated, kinematics, links, motion, newton_euler
 from ..recursions.articulated import Pivot
@@ -147,7 +147,7 @@ def steps(T: type) -> Steps:
 
 
 def _emitted(name: str, traced: Callable, kinds: dict[str, Kind], T: type) -> wp.Function:
-    graph, dtype, c = Graph(), T.__name__, straight.C_TYPE[T]
+    graph, dtype, c = Graph(), T.__name__, C_TYPE[T]
     read = {x: kind.read(Vector(graph.input(x, i) for i in range(kind.size))) for x, kind in kinds.items()}
     found = traced(*read.values())
     values = _packed(found)
@@ -164,9 +164,9 @@ def _emitted(name: str, traced: Callable, kinds: dict[str, Kind], T: type) -> wp
         lambda array, index: index[0],
     )
     statements = literals(emitter.region([Store("result", (i,), value) for i, value in enumerate(values)]), dtype)
-    native = f"{FUSED}{NATIVE[c]}{shape} result;\n{statements}\nreturn result;"
+    text = f"{FUSED}{NATIVE[c]}{shape} result;\n{statements}\nreturn result;"
     types = {x: T if kind is NUMBER else wp.types.vector(kind.size, T) for x, kind in kinds.items()}
-    return straight.function(f"{name}_{dtype}", native, types, result)
+    return native.function(f"{name}_{dtype}", text, types, result)
 
 
 def _packed(found: Any) -> list[Value]:

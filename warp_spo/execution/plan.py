@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from ..kernels.spreading import WARP
+from ..kernels.slots import WARP_SIZE
 from ..recursions.links import Links
 from ..recursions.pieces import Pieces
 from ..scene.parts import FREE
@@ -167,7 +167,7 @@ class Plan:
         ``warps`` share 32 worlds.
         """
         if warps > 1:
-            return self.worlds > WARP if self.dofs > LONG_ROWS else operation in GATHERED
+            return self.worlds > WARP_SIZE if self.dofs > LONG_ROWS else operation in GATHERED
         return results > FEW_RESULTS or (not self.few and (self.varies or operation in SHORT))
 
     def column_chunk(self, columns: int, bytes_per_column: int) -> int:

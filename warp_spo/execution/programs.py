@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from ..kernels import straight
-from ..kernels.spreading import WARP
-from ..kernels.straight import DIRECT, INTEGERS, RELAYED, SPREAD, TILED, Frame, Result
+from ..kernels import native, straight
+from ..kernels.native import INTEGERS
+from ..kernels.slots import WARP_SIZE
+from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout, Result
 from ..recursions import messages
 from ..recursions.links import TABLES, Links
 from ..recursions.loops.embedded_adjoints import EmbeddedAdjoints
@@ -193,24 +194,26 @@ class Programs:
         stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         outs = [item for item in stores if item.array == "out"]
-        frame = self._frame(operation, outs, stores, shapes, more)
+        layout = self._layout(operation, outs, stores, shapes, more)
         if operation in TILES:
-            result = Result(TILED, frame.result.array, slots=staging.solid(stores))
-            frame = frame._replace(staged=self.plan.staged, result=result)
+            result = Result(TILED, layout.result.array, slots=staging.count_slots(stores))
+            layout = layout._replace(staged=self.plan.staged, result=result)
         once = operation == "step" or any(item.array in LOOPED for item in stores)  # may write over what it reads
-        frame = frame._replace(again=not once and not frame.staged and frame.result.way in (DIRECT, TILED, RELAYED))
-        placed, table = staging.placed(outs, frame.result)
+        layout = layout._replace(
+            retries=not once and not layout.staged and layout.result.way in (DIRECT, TILED, RELAYED)
+        )
+        placed, table = staging.arrange_stores(outs, layout.result)
         placed += apart
-        emitter, looped = self._emitter(shapes, frame), [item for item in stores if item.array in LOOPED]
+        emitter, looped = self._emitter(shapes, layout), [item for item in stores if item.array in LOOPED]
         regions = [emitter.region([], trace.ahead), emitter.branch(looped)] if looped else []
         *before, body = (literals(each, self.run.dtype.__name__) for each in [*regions, emitter.region(placed)])
         if looped:
             ahead, a_pass = before
-            body = straight.looped(ahead, a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
-        block = PAIR * WARP if self.plan.few and not frame.scalars else WARP
-        frame = frame._replace(again=frame.again and "farthest" in body, block=block)
+            body = straight.repeat_passes(ahead, a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
+        block = PAIR * WARP_SIZE if self.plan.few and not layout.shared_scalars else WARP_SIZE
+        layout = layout._replace(retries=layout.retries and "farthest" in body, block=block)
         tables = {} if table is None else {"place": table}
-        return self._finished(operation, frame, body, body, tables, emitter.operations)
+        return self._finished(operation, layout, body, body, tables, emitter.operations)
 
     def _segment_program(
         self, operation: str, shapes: dict, pieces: Pieces, more: tuple, options: dict
@@ -232,19 +235,19 @@ class Programs:
         passes = Passes((GUESS, GAIN), sent if bends else None) if operation == "step" else None
         sent += 2 * pieces.warps if bends else 0
         whole = [item for item in everything if item.array == "out"]
-        frame = self._frame(operation, whole, everything, shapes, more, sent, pieces.warps)
-        if frame.result.way == DIRECT and frame.result.array.entries > staging.LONG_ROW:
+        layout = self._layout(operation, whole, everything, shapes, more, sent, pieces.warps)
+        if layout.result.way == DIRECT and layout.result.array.entries > staging.LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
-        if not frame.fits(self.run.dtype):
+        if not layout.fits(self.run.dtype):
             return None  # nor for what limbs tell each other
         team = Team(pieces, dtype, passes)
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
-        placed, table = staging.placed(whole, frame.result)
+        placed, table = staging.arrange_stores(whole, layout.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
-        by_slot = lambda found: found if table is None else staging.by_slot(found, table)  # noqa: E731
+        by_slot = lambda found: found if table is None else staging.stores_by_slot(found, table)  # noqa: E731
         for piece, stores, items, (checks, news, rounds) in zip(pieces.pieces, traced, outs, apart, strict=True):
-            emitter, checking = self._emitter(shapes, frame), self._emitter(shapes, frame)
-            later = self._emitter(shapes, frame) if passes else emitter
+            emitter, checking = self._emitter(shapes, layout), self._emitter(shapes, layout)
+            later = self._emitter(shapes, layout) if passes else emitter
             inward = [item for item in stores if item.array == INWARD]
             outward = [item for item in stores if item.array == OUTWARD]
             last = outward if set(SENDS[operation]) & set(messages.OUTWARD_LETTERS) else inward
@@ -267,31 +270,31 @@ class Programs:
         lists = {"place": table, "table": team.table, "shifts": team.shifts}
         tables = {name: values for name, values in lists.items() if values}
         cap = registers if registers < MOST_REGISTERS else None
-        return self._finished(operation, frame, cuda, team.cpu(), tables, team.operations, cap)
+        return self._finished(operation, layout, cuda, team.cpu(), tables, team.operations, cap)
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
         if item.array in (INWARD, OUTWARD, *LOOPED):
             return item
-        return item._replace(index=(staging.flat(item.index, shapes[item.array][1:]),))
+        return item._replace(index=(staging.flat_index(item.index, shapes[item.array][1:]),))
 
     def _finished(
         self,
         operation: str,
-        frame: Frame,
+        layout: KernelLayout,
         cuda: str,
         cpu: str,
         tables: dict,
         operations: int,
         registers: int | None = None,
     ) -> Program:
-        native = straight.assemble(frame, cuda, cpu, self.run.dtype)
-        rows, fields = (*(row.name for row in frame.rows), *frame.numbers), tuple(frame.fields)
-        arrays = [(row.name, row.ndim) for row in frame.rows] + [(name, 0) for name in frame.numbers]
+        text = straight.assemble(layout, cuda, cpu, self.run.dtype)
+        rows, fields = (*(row.name for row in layout.rows), *layout.numbers), tuple(layout.fields)
+        arrays = [(row.name, row.ndim) for row in layout.rows] + [(name, 0) for name in layout.numbers]
         arrays += [(name, 2) for name in fields]
-        result, entry = frame.result, None
-        if result.way in SPREAD:
-            tables = tables | {"place": result.spread.table(tables["place"], self.run.dtype)}
+        result, entry = layout.result, None
+        if result.way in BY_TABLE:
+            tables = tables | {"place": result.slot_layout.table(tables["place"], self.run.dtype)}
         held: dict[str, wp.array] = {
             name: wp.array(values, dtype=int if name in INTEGERS else self.run.dtype, device=self.run.device)
             for name, values in tables.items()
@@ -299,13 +302,15 @@ class Programs:
         if result.way == TILED:
             entry = held.pop("place")
         arrays += [(name, array.ndim) for name, array in held.items()]
-        arrays += [("out", result.array.ndim if entry is None else 3)] + [(row.name, row.ndim) for row in frame.more]
-        kernel = straight.kernel(operation, native, arrays, self.run.dtype, registers)
+        arrays += [("out", result.array.ndim if entry is None else 3)] + [
+            (row.name, row.ndim) for row in layout.further
+        ]
+        kernel = native.kernel(operation, text, arrays, self.run.dtype, registers)
         return Program(
-            kernel, rows, fields, tuple(held.values()), frame.warps, frame.block, operations, result.slots, entry
+            kernel, rows, fields, tuple(held.values()), layout.warps, layout.block, operations, result.slots, entry
         )
 
-    def _frame(
+    def _layout(
         self,
         operation: str,
         stores: list[Store],
@@ -314,19 +319,19 @@ class Programs:
         more: tuple,
         sent: int = 0,
         warps: int = 1,
-    ) -> Frame:
+    ) -> KernelLayout:
         ways = self.plan.stages(operation, warps), self.plan.gathers(operation, warps, 1 + len(more))
-        return staging.frame(stores, everything, shapes, more, sent, warps, self.run.dtype, *ways, self.relays)
+        return staging.choose_layout(stores, everything, shapes, more, sent, warps, self.run.dtype, *ways, self.relays)
 
-    def _emitter(self, shapes: dict, frame: Frame) -> Emitter:
-        result = frame.result
-        angles = Angles.IN_PLACE if frame.staged else Angles.AGAIN if frame.again else Angles.FIRST
+    def _emitter(self, shapes: dict, layout: KernelLayout) -> Emitter:
+        result = layout.result
+        angles = Angles.IN_PLACE if layout.staged else Angles.AGAIN if layout.retries else Angles.FIRST
         guard = "if (mine) " if result.way == DIRECT else ""
 
         def load(array: str, entry: str) -> str:
             if array in (INWARD, OUTWARD):
                 return f"SENT({entry})"
-            if array in LOOPED and frame.warps > 1:
+            if array in LOOPED and layout.warps > 1:
                 return f"{'' if array == MISSED else PREFIX}{array}_row[{entry}]"
             if array in FIELDS:
                 return f"FIELD({array}, {entry})"
@@ -337,9 +342,9 @@ class Programs:
                 return f"SENT({entry}) = {value};"
             if array == "out" and result.way == RELAYED:
                 return f"RELAY({entry}) = {value};"
-            if array == MISSED and frame.warps > 1:
+            if array == MISSED and layout.warps > 1:
                 return f"missed_row[0] += {value};"
-            if array in LOOPED and frame.warps > 1:
+            if array in LOOPED and layout.warps > 1:
                 return f"{'if (open) ' if array == GUESS else ''}{load(array, entry)} = {value};"
             if array == "out" and result.way == TILED:
                 return f"if (mine) result_row[({entry}) * {straight.TILE}] = {value};"
@@ -349,20 +354,20 @@ class Programs:
 
         places = {
             name: {entry: place for place, entry in enumerate(entries)}
-            for name, entries in zip(frame.fields, frame.held, strict=False)
+            for name, entries in zip(layout.fields, layout.cached, strict=False)
         }
 
         def flat(array: str, index: tuple) -> int:
             if array in places:
                 return places[array][index[0]]
-            return index[0] if len(index) == 1 else staging.flat(index, shapes[array][1:])
+            return index[0] if len(index) == 1 else staging.flat_index(index, shapes[array][1:])
 
         return Emitter(self.run.dtype.__name__, load, store, flat, angles, FIELDS)
 
 
 def _registers(warps: int) -> int:
     """Of a thread, if a multiprocessor is to hold so many warps: its parts share them, each with its own registers."""
-    return REGISTERS // PARTS // (WARP * -(-warps // PARTS)) // 8 * 8
+    return REGISTERS // PARTS // (WARP_SIZE * -(-warps // PARTS)) // 8 * 8
 
 
 def _called(key: tuple) -> str:

@@ -1,4 +1,7 @@
-"""Staging: how rows come in and results leave a kernel, through shared memory or past it, by what has room there."""
+"""Staging: the choice how a generated kernel reads rows and writes results, through shared memory or directly.
+
+The choice depends on which of them have room in shared memory.
+"""
 
 from __future__ import annotations
 
@@ -6,50 +9,66 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..kernels.spreading import WARP
-from ..kernels.straight import DIRECT, IN_PLACE, MAPPED, RELAYED, SPREAD, STAGED, TILED, Frame, Result, Row
+from ..kernels.slots import WARP_SIZE
+from ..kernels.straight import (
+    BY_TABLE,
+    DIRECT,
+    IN_PLACE,
+    MAPPED,
+    RELAYED,
+    STAGED,
+    TILED,
+    KernelLayout,
+    Result,
+    Row,
+)
 from ..recursions.links import TABLES
 from ..scene.parts import DOF_VALUES
 from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant, ordered
 
 FIELDS = (*TABLES, *DOF_VALUES, "joint_rest_q")
-"""Values of the scene as kernels read them, [entry, world]: what links are made of, and Newton's own."""
-SHORT_ROW = 36  # entries of a result that a thread writes by itself
-LONG_ROW = 64  # entries from which what is zero or there twice is left out of shared memory
+"""Names of the values of the scene that kernels read as [entry, world]: tables of the links, and Newton's values."""
+SHORT_ROW = 36  # largest number of entries of a result that each thread writes directly
+LONG_ROW = 64  # largest number of entries of a result whose zeros and repeated values take room in shared memory
 
 
-def frame(
+def choose_layout(
     stores: list[Store],
     everything: list[Store],
-    shapes: Mapping[str, tuple],
-    more: Sequence[str],
-    sent: int,
+    shapes: Mapping[str, tuple[int, ...]],
+    further: Sequence[str],
+    messages: int,
     warps: int,
     T: type,
     staged: bool,
     gathered: bool,
     relays: bool,
-) -> Frame:
-    """What surrounds the kernel whose result flat ``stores`` make, out of ``everything`` that it stores.
+) -> KernelLayout:
+    """Return the first layout in the order of preference that fits into shared memory.
 
     Args:
-        shapes: of what is given and of the results, by name. more: names of further results.
-        sent: values that limbs tell each other. warps: that share 32 worlds.
-        T: the scalar. staged: rows come in through shared memory, if they have room there. gathered: short results
-            leave through it though they are not.
-        relays: a result that has none waits in its own rows.
+        stores: the stores that make the result, with flat indices.
+        everything: all stores of the kernel.
+        shapes: the shapes of the arguments and of the results, [world, ...], by name.
+        further: the names of further results.
+        messages: the number of scalars that the warps of a team send each other.
+        warps: the number of warps that work on 32 worlds.
+        T: the scalar type.
+        staged: rows are read through shared memory if it has room for them.
+        gathered: short results are written through shared memory even if rows are not read through it.
+        relays: a result without room in shared memory may wait in its own rows, see :mod:`warp_spo.kernels.slots`.
     """
-    used = _reads(everything)
+    used = _read_entries(everything)
     rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used and shape]
     numbers = tuple(name for name, shape in shapes.items() if name in used and not shape)
     out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
     dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
     over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
-    over = [name for name in over if read_before(stores, everything, name)]
-    slots = solid(stores)
+    over = [name for name in over if is_read_before_written(stores, everything, name)]
+    slots = count_slots(stores)
     fields = {name: tuple(sorted(used[name])) for name in FIELDS if name in used}
-    held = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
+    cached = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
     ways = [(False, Result(DIRECT, out))]
     staged = staged or any(row.name in ("x", "body_f") and row.entries > SHORT_ROW for row in rows)
     if dense and (staged or gathered or out.entries > SHORT_ROW):
@@ -59,26 +78,47 @@ def frame(
     if out.entries > LONG_ROW and not (dense and staged and over == ["x"]):
         mapped = Result(MAPPED, out, slots=slots)
         ways = [(staged, mapped), (False, mapped), *ways]
-        if relays and _apart(rows, out):
+        if relays and _may_write_early(rows, out):
             ways.insert(-1, (False, Result(RELAYED, out, slots=slots)))
-    further = tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in more)
-    frames = [
-        Frame(rows, staged, list(fields), result, sent, warps, WARP * warps, further, together, False, entries, numbers)
+    other_results = tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in further)
+    layouts = [
+        KernelLayout(
+            rows=rows,
+            staged=staged,
+            fields=list(fields),
+            result=result,
+            messages=messages,
+            warps=warps,
+            block=WARP_SIZE * warps,
+            further=other_results,
+            further_staged=together,
+            cached=entries,
+            numbers=numbers,
+        )
         for staged, result in ways
-        for together in ((True, False) if further and result.way in (IN_PLACE, STAGED) else (False,))
-        for entries in held[::-1]
+        for together in ((True, False) if other_results and result.way in (IN_PLACE, STAGED) else (False,))
+        for entries in cached[::-1]
     ]
-    return next((one for one in frames if one.fits(T)), frames[-1])
+    return next((layout for layout in layouts if layout.fits(T)), layouts[-1])
 
 
-def _apart(rows: list[Row], out: Row) -> bool:
-    """No row is the result's array, so that it can be written before all is read."""
+def _may_write_early(rows: list[Row], out: Row) -> bool:
+    """Return whether the kernel may write the result before it has read everything.
+
+    It may not where an argument can be the array of the result, which has the same number of entries then.
+    """
     return all(row.entries != out.entries for row in rows)
 
 
-def read_before(stores: list[Store], everything: list[Store], row: str) -> bool:
-    """Every entry of ``row`` that is read at all is read before the same entry of the result is written over it."""
-    graphs: dict[int, list[Value]] = {}  # of pieces, which write their own entries when all others have read
+def is_read_before_written(stores: list[Store], everything: list[Store], row: str) -> bool:
+    """Return whether every entry of ``row`` is read before the same entry of the result is written over it.
+
+    Args:
+        stores: the stores that make the result.
+        everything: all stores of the kernel.
+        row: the name of the array.
+    """
+    graphs: dict[int, list[Value]] = {}  # one for each piece: pieces write their own entries after all have read
     for item in everything:
         if not is_constant(item.value):
             graphs.setdefault(id(item.value.graph), []).append(item.value)
@@ -94,47 +134,54 @@ def read_before(stores: list[Store], everything: list[Store], row: str) -> bool:
     return True
 
 
-def placed(stores: list[Store], result: Result) -> tuple[list[Store], list[int] | None]:
-    """Flat stores as the result wants them, and the slot of each entry, -1 being zero, where values are numbered."""
+def arrange_stores(stores: list[Store], result: Result) -> tuple[list[Store], list[int] | None]:
+    """Return the stores of the result in the form that its way of leaving requires, and the slot of each entry.
+
+    Results with slots get one store for each distinct value; an entry's slot is -1 where its value is zero. All other
+    results get a store of zero for each entry that ``stores`` leave out, and None in place of the slots.
+    """
     out = result.array
-    if result.way in (*SPREAD, TILED):
+    if result.way in (*BY_TABLE, TILED):
         slots: dict[Any, int] = {}
         table = [-1] * out.entries
         for item in stores:
             if not _is_zero(item.value):
-                table[item.index[0]] = slots.setdefault(_name(item.value), len(slots))
-        return by_slot(stores, table), table
+                table[item.index[0]] = slots.setdefault(_identity(item.value), len(slots))
+        return stores_by_slot(stores, table), table
     done = {item.index for item in stores}
     return stores + [Store("out", (i,), 0.0) for i in range(out.entries) if (i,) not in done], None
 
 
-def by_slot(stores: list[Store], table: list[int]) -> list[Store]:
+def stores_by_slot(stores: list[Store], table: list[int]) -> list[Store]:
+    """Return one store for each slot; ``table`` gives the slot of each entry, -1 for the value zero."""
     values = {table[item.index[0]]: item.value for item in stores if table[item.index[0]] >= 0}
     return [Store("out", (slot,), value) for slot, value in sorted(values.items())]
 
 
-def solid(stores: list[Store]) -> int:
-    """Different values that are not the constant zero."""
-    return len({_name(item.value) for item in stores if not _is_zero(item.value)})
+def count_slots(stores: list[Store]) -> int:
+    """Return the number of distinct values, the constant zero not counted."""
+    return len({_identity(item.value) for item in stores if not _is_zero(item.value)})
 
 
 def _is_zero(value: Value) -> bool:
     return is_constant(value) and value == 0.0
 
 
-def _name(value: Value) -> Any:
+def _identity(value: Value) -> Any:
+    """Return a key that is equal for equal values."""
     return value if is_constant(value) else (id(value.graph), value.key)
 
 
-def flat(index: tuple, shape: tuple) -> int:
+def flat_index(index: tuple[int, ...], shape: tuple[int, ...]) -> int:
+    """Return the row-major position of ``index`` in an array of this shape."""
     at = 0
     for i, size in zip(index, shape, strict=True):
         at = at * size + i
     return at
 
 
-def _reads(stores: list[Store]) -> dict[str, set[int]]:
-    """Names of the arrays that are read, and which first indices."""
+def _read_entries(stores: list[Store]) -> dict[str, set[int]]:
+    """Return the first indices that are read of each array, by the array's name."""
     graphs: dict[int, list[Value]] = {}
     for item in stores:
         if not is_constant(item.value):

@@ -105,7 +105,7 @@ class Team:
             later += [self._branch(work.piece, listing) for listing in work.rounds]
         if self.passes:
             kept = {f"p{piece.index}_": piece.weight for piece in self.pieces.pieces}
-            text = [self.passes.declared(kept, self.c), straight.alone("\n".join(text), self.c)]
+            text = [self.passes.declared(kept, self.c), straight.repeat_thread_passes("\n".join(text), self.c)]
         return "\n".join(text + later)
 
     def _branch(self, piece: Piece, listing: Listing) -> str:
@@ -143,9 +143,9 @@ class Team:
         kept = {name: max(work.piece.weight for work in rank.values()) for name, rank in zip(names, ranks, strict=True)}
         text = [self.passes.declared(kept, self.c)]
         text += [
-            straight.once(a_pass, BARRIER, self.c)
+            straight.run_one_pass(a_pass, BARRIER, self.c)
             if self.passes.flags is None
-            else straight.voted(a_pass, self.passes.flags, self.pieces.warps, self.c)
+            else straight.repeat_team_passes(a_pass, self.passes.flags, self.pieces.warps, self.c)
         ]
         for last in (False, True):
             found = []
