@@ -86,8 +86,8 @@ class SpatialOperators(Letters):
                 self._write_blocks(q)
         for operator in (self.E_phi, self.phi, self.H, self.M, self.Delta, self.P, self.D, self.D_inverse, self.G):
             operator.kind = self._kind
-        for operator in (self.K, self.E_psi, self.psi):
-            operator.kind = self._kind
+        for derived in (self.K, self.E_psi, self.psi):
+            derived.kind = self._kind
 
     def fill(self) -> None:
         capturing, stamp = self._recursions.device.is_capturing, self._recursions.parameters.stamp

@@ -9,11 +9,11 @@ import abc
 import functools
 import itertools
 import numbers
-from typing import Any
+from typing import Any, NoReturn, overload
 
 import warp as wp
 
-from ..arrays import Call, kind_of, new, parse_device, parse_dtype, view
+from ..arrays import ArrayT, Call, kind_of, new, parse_device, parse_dtype, view
 from ..kernels import block_sparse, declare
 
 
@@ -108,7 +108,7 @@ class Operator(abc.ABC):
     def _apply_transposed(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         """As :meth:`_apply`, of the transpose."""
 
-    def apply(self, x, out=None):
+    def apply(self, x: ArrayT, out: ArrayT | None = None) -> ArrayT:
         """Return ``op @ x``.
 
         Args:
@@ -127,20 +127,20 @@ class Operator(abc.ABC):
         with Call(name, self.device, self.dtype) as call:
             worlds = self.worlds if self.worlds > 1 else -1
             shape = (worlds, self.shape[1], -1) if many else (worlds, self.shape[1])
-            x = call.read("x", x, shape, "[world, column of the operator, any]" if many else "[world, column]")
-            worlds = x.shape[0]
-            columns = x.shape[2] if many else 1
+            read = call.read("x", x, shape, "[world, column of the operator, any]" if many else "[world, column]")
+            worlds = read.shape[0]
+            columns = read.shape[2] if many else 1
             shape = (worlds, self.shape[0], columns) if many else (worlds, self.shape[0])
             y = call.write(out, shape, "[world, row of the operator, any]" if many else "[world, row]")
-            if y.size and (many or not self._fused(x, y)):
+            if y.size and (many or not self._fused(read, y)):
                 self._fill()
                 key = call.kind, worlds, columns
                 if key not in self._workspaces:
                     self._workspaces[key] = Workspace(call, worlds, columns)
-                self._apply(_with_columns(x), _with_columns(y), 1.0, False, self._workspaces[key])
+                self._apply(_with_columns(read), _with_columns(y), 1.0, False, self._workspaces[key])
         return call.result
 
-    def dense(self):
+    def dense(self) -> Any:
         """Return the matrix [world, row, column]; world = 1 if it is the same in all. For looking and for testing."""
         return self._columns("dense", 0, self.shape[1], 0, self.shape[0])
 
@@ -165,10 +165,14 @@ class Operator(abc.ABC):
         """The transpose."""
         return Transpose(self)
 
-    def __matmul__(self, other):
+    @overload
+    def __matmul__(self, other: "Operator") -> "Operator": ...
+    @overload
+    def __matmul__(self, other: ArrayT) -> ArrayT: ...
+    def __matmul__(self, other: Any) -> Any:
         return Product(self, other) if isinstance(other, Operator) else self.apply(other)
 
-    def __rmatmul__(self, array):
+    def __rmatmul__(self, array: ArrayT) -> ArrayT:
         kind_of(array, "array @ operator", "array")
         if len(array.shape) != 2:
             raise ValueError(
@@ -177,34 +181,34 @@ class Operator(abc.ABC):
             )
         return self.T.apply(array)
 
-    def __add__(self, other):
+    def __add__(self, other: "Operator") -> "Operator":
         return Sum(self, other) if isinstance(other, Operator) else self._refuse("+", other)
 
-    def __sub__(self, other):
+    def __sub__(self, other: "Operator") -> "Operator":
         return Sum(self, Scaled(-1.0, other)) if isinstance(other, Operator) else self._refuse("-", other)
 
-    def __radd__(self, other):
-        return self._refuse("+", other)
+    def __radd__(self, other: object) -> NoReturn:
+        self._refuse("+", other)
 
-    def __rsub__(self, other):
-        return self._refuse("-", other)
+    def __rsub__(self, other: object) -> NoReturn:
+        self._refuse("-", other)
 
-    def __neg__(self):
+    def __neg__(self) -> "Operator":
         return Scaled(-1.0, self)
 
-    def __mul__(self, number):
+    def __mul__(self, number: float) -> "Operator":
         return Scaled(number, self) if isinstance(number, numbers.Real) else self._refuse("*", number)
 
     __rmul__ = __mul__
 
-    def _refuse(self, sign, other):
+    def _refuse(self, sign: str, other: object) -> NoReturn:
         expected = "a number" if sign == "*" else "an operator"
         raise TypeError(
             f"{type(self).__name__} {sign} {type(other).__name__}: expected {expected}; use dense() for matrices of "
             f"numbers, or @ to apply the operator"
         )
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         worlds = "any worlds" if self.worlds == 1 else f"{self.worlds} worlds"
         return (
             f"{type(self).__name__}({self.shape[0]} x {self.shape[1]}, {worlds}, {self.dtype.__name__}, {self.device})"
