@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from warp_spo.__main__ import find_device
-from warp_spo.trials import report as pages
+from warp_spo.trials import drawing
 
 from . import cases as data
 from . import everything, evidence, parts, pictures, report, roofline, runner, table
@@ -81,7 +81,7 @@ def main(argv: list[str] | None = None) -> int:
         for option, out in (("--json", options.json), ("--report", options.report and options.report / report.FILE)):
             if out:
                 runner.check_place(option, out)
-        pyplot = pages.load_pyplot() if options.report or options.readme else None
+        pyplot = drawing.load_pyplot() if options.report or options.readme else None
         if options.everything:
             device = find_device(options.device)
             chosen = parts.choose(options.filter, device.is_cuda, str(device))
@@ -152,7 +152,7 @@ def write_readme(pyplot: Any, source: Path) -> None:
     for name, figure in zip(table.PICTURES, (pictures.headline, pictures.scaling), strict=True):
         drawn = figure(pyplot, found[0])
         if drawn is not None:
-            (table.RESULTS / name).write_text(pages.svg(drawn))
+            (table.RESULTS / name).write_text(drawing.svg(drawn))
             pyplot.close(drawn)
 
 

@@ -1,45 +1,47 @@
-"""Pictures of the rows: error against run time, and run time against size. Colour: who; marker: in which precision."""
+"""Pictures of the rows: error against run time, and run time against size. Colour: which library; marker: precision."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
-from .evidence import Evidence, usual_worlds
-from .table import HEADLINE
+import numpy as np
 
-OURS = {"node": "tab:blue", "segment": "tab:orange", "tree": "tab:green"}
-PEERS = (
-    *("tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive", "tab:cyan", "black", "gold", "navy", "salmon"),
-    *("mediumpurple", "sandybrown", "darkred", "teal", "magenta", "lightskyblue"),
-)
-MARKERS = {"float32": "o", "refined": "D", "randomised": "^", "float64": "s"}
-NAMES = {"refined": "float32, refined", "randomised": "float32, variable inertias"}
-SHOWN = (*HEADLINE[:3], "psi")  # in the headline: what all peers have, and an operator
-ROBOTS = ("panda", "go2", "g1"), ("arm7", "quadruped", "humanoid")  # of the headline: those that peers have, or ours
+from warp_spo.trials import drawing
+from warp_spo.trials.drawing import Point
+
+from .evidence import Evidence, usual_worlds
+
+MAIN = "forward_dynamics"  # the operation of the README's picture
+ROBOTS = ("panda", "go2", "g1"), ("arm7", "quadruped", "humanoid")  # of that picture: those that peers have, or ours
+TITLES = {"panda": "Panda arm", "go2": "Go2 quadruped", "g1": "G1 humanoid", "arm7": "Arm", "humanoid": "Humanoid"}
+ON_CPU = ("Pinocchio", "MuJoCo C")  # libraries that have no GPU code
+GUIDE = "time in proportion to size"
 PANELS = {
-    "worlds": ("worlds", "worlds"),
-    "chain": ("dof", "dofs of a chain"),
-    "tree": ("dof", "dofs of a random tree"),
-    "deep": ("depth", "levels of a tree of 256 bodies"),
-    "branching": ("branching", "children of a node, 256 bodies"),
+    "worlds": ("worlds", "number of worlds", "Robots"),
+    "chain": ("dof", "dofs of the chain", "Chain"),
+    "tree": ("dof", "dofs of the tree", "Random tree"),
+    "deep": ("depth", "levels of the tree", "Depth of a tree of 256 bodies"),
+    "branching": ("branching", "children of each node", "Branching of a tree of 256 bodies"),
 }
-"""Sweep -> what grows, and how the axis calls it."""
+"""Sweep -> key of what grows, the axis' label, the panel's title."""
 
 
 def who(row: dict) -> str:
-    """A peer's name and variant, or our granularity."""
+    """Return a peer's name and variant, or our granularity."""
     return f"{row['peer']} {row.get('variant', '')}".strip() if row.get("peer") else row["granularity"]
 
 
-def colors(everything: Sequence[dict]) -> dict[str, str]:
-    """Colour of each of ours and of every peer, the same in all pictures of these rows."""
-    peers = sorted({who(row) for row in everything if row.get("peer")})
-    return OURS | {name: PEERS[i % len(PEERS)] for i, name in enumerate(peers)}
+def point_name(row: dict) -> str:
+    """Return the name that stands at a row's point: library and variant without versions, or our granularity."""
+    if not row.get("peer"):
+        return row["granularity"]
+    variant = row.get("variant") or ("dense resolvent" if "resolvent" in row["peer"] else "")
+    return f"{drawing.library(row['peer'])} {variant.removeprefix('Solver')}".strip()
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Indices of the points (run time, error) that no other beats in one without losing in the other, fastest first."""
+    """Return the indices of the points (run time, error) that no other point beats in both, fastest first."""
     front, best = [], float("inf")
     for i in sorted(range(len(points)), key=lambda i: points[i]):
         if points[i][1] < best:
@@ -48,150 +50,249 @@ def pareto(points: Sequence[tuple[float, float]]) -> list[int]:
     return front
 
 
-def error_time(pyplot: Any, evidence: Evidence, operation: str, worlds: int) -> Any:
-    """Error against run time of one operation, a panel a robot; None where nothing was timed."""
-    rows = [row for row in _curves(evidence) if row["op"] == operation and row["worlds"] == worlds]
-    panels = [[row for row in rows if row["scene"] == scene] for scene in dict.fromkeys(row["scene"] for row in rows)]
-    if not panels:
-        return None
-    wide = min(4, len(panels))
-    tall = -(-len(panels) // wide)
-    figure, grid = pyplot.subplots(tall, wide, figsize=(3.3 * wide, 2.7 * tall), layout="constrained", squeeze=False)
-    for axes, mine in zip(grid.flat, panels, strict=False):
-        _panel(axes, mine, colors(evidence.peers), f"{mine[0]['scene']}, {worlds} worlds")
-    for axes in list(grid.flat)[len(panels) :]:
-        axes.axis("off")
-    _legend(figure, rows, colors(evidence.peers))
-    return figure
-
-
+# -- error against run time --------------------------------------------------------------------------------------------
+@drawing.style()
 def headline(pyplot: Any, evidence: Evidence) -> Any:
-    """Error against run time of the operations that all peers have, and of psi, on three robots."""
-    rows = _curves(evidence)
+    """Draw error against run time of forward dynamics on three robots: ours, and the fastest variant of each library.
+
+    Returns:
+        The figure; None without rows.
+    """
+    rows = [row for row in _timed(evidence) if row["op"] == MAIN and row["dtype"] in ("float32", "float64")]
     scenes = {row["scene"] for row in rows}
     robots = next((names for names in ROBOTS if scenes >= set(names)), sorted(scenes)[:3])
-    operations = [op for op in SHOWN if any(row["op"] == op for row in rows)]
-    worlds = usual_worlds(rows)
-    rows = [r for r in rows if r["scene"] in robots and r["op"] in operations and r["worlds"] == worlds]
+    rows = [row for row in rows if row["scene"] in robots and row["error"] > 0.0]
+    worlds = usual_worlds([row for row in rows if not row.get("peer")] or rows)
+    rows = _fastest([row for row in rows if row["worlds"] == worlds])
     if not rows:
         return None
-    size = dict(figsize=(3.3 * len(robots), 2.6 * len(operations)), layout="constrained", squeeze=False)
-    figure, grid = pyplot.subplots(len(operations), len(robots), **size)
-    for operation, line in zip(operations, grid, strict=True):
-        for robot, axes in zip(robots, line, strict=True):
-            mine = [row for row in rows if row["op"] == operation and row["scene"] == robot]
-            _panel(axes, mine, colors(evidence.peers), f"{robot}: {operation}")
-    _legend(figure, rows, colors(evidence.peers))
-    figure.suptitle(f"{evidence.machine['device']}, {worlds} worlds", fontsize=9)
+    figure, grid = pyplot.subplots(1, len(robots), figsize=(10.4, 4.9), layout="constrained", squeeze=False)
+    for axes, robot in zip(grid[0], robots, strict=True):
+        mine = [row for row in rows if row["scene"] == robot]
+        drawing.log_axis(axes.xaxis, [row["us"] for row in rows], drawing.time_text)
+        drawing.log_axis(axes.yaxis, [row["error"] for row in rows], drawing.power_text, most=5)
+        axes.set(title=_title(mine[0]), xlabel=f"run time of all {worlds:,} robots")
+        axes.label_outer()
+    grid[0][0].set_ylabel("largest relative error")
+    device = evidence.machine["device"]
+    drawing.title(figure, f"Forward dynamics of {worlds:,} robots at once, {device}: lower left is better")
+    _legend(figure, rows)
+    drawing.finish_layout(figure)
+    for axes, robot in zip(grid[0], robots, strict=True):
+        mine = [row for row in rows if row["scene"] == robot]
+        _speedup(axes, mine)
+        _points(axes, mine, [_library_name(row) for row in mine])
     return figure
 
 
-def scaling(pyplot: Any, evidence: Evidence) -> Any:
-    """Run time against what grows, a panel a sweep; None where nothing was swept."""
-    panels = [name for name in PANELS if any(row.get("sweep") == name and "us" in row for row in evidence.rows)]
-    if not panels:
+@drawing.style()
+def error_time(pyplot: Any, evidence: Evidence, operation: str, worlds: int) -> Any:
+    """Draw error against run time of one operation, a panel a robot: ours, every peer and variant, the Pareto front.
+
+    An error of zero is drawn at the bottom. One that is NaN is left out, and the panel says how many are.
+
+    Returns:
+        The figure; None where nothing was timed.
+    """
+    rows = [row for row in _timed(evidence) if row["op"] == operation and row["worlds"] == worlds]
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    if not scenes:
         return None
-    size = dict(figsize=(3.3 * min(3, len(panels)), 2.8 * -(-len(panels) // 3)), layout="constrained", squeeze=False)
-    figure, grid = pyplot.subplots(-(-len(panels) // 3), min(3, len(panels)), **size)
-    for axes, name in zip(grid.flat, panels, strict=False):
-        mine = [row for row in evidence.rows if row.get("sweep") == name and "us" in row]
-        lines = dict.fromkeys((row["op"], row["scene"] if name == "worlds" else "") for row in mine)
-        for op, scene in lines:
-            points = sorted(
-                (_size(row, name), row["us"]) for row in mine if row["op"] == op and scene in ("", row["scene"])
-            )
-            style = "-" if op == "forward_dynamics" else "--"
-            color = None if name == "worlds" else "tab:blue"
-            label = f"{scene} {op}".strip()
-            axes.plot(*zip(*points, strict=True), style, color=color, marker=".", linewidth=1.0, label=label)
-        worlds = "" if name == "worlds" else f" ({mine[0]['worlds']} worlds)"
-        axes.set(xscale="log", yscale="log", xlabel=f"{PANELS[name][1]}{worlds}", ylabel="run time of all worlds [µs]")
-        axes.set_xscale("log", base=2)
-        axes.xaxis.label.set_size(8)
-        axes.yaxis.label.set_size(8)
-        _grid(axes)
-        _plain_ticks(axes.yaxis, [row["us"] for row in mine])
-        axes.legend(fontsize=6)
-    for axes in list(grid.flat)[len(panels) :]:
+    wide = min(2, len(scenes))
+    tall = -(-len(scenes) // wide)
+    size = (max(5.4 * wide, 7.0), 3.9 * tall + 1.0)
+    figure, grid = pyplot.subplots(tall, wide, figsize=size, layout="constrained", squeeze=False)
+    panels = []
+    for axes, scene in zip(grid.flat, scenes, strict=False):
+        mine = _newest([row for row in rows if row["scene"] == scene])
+        shown = [row for row in mine if row["error"] == row["error"]]
+        bottom = min([row["error"] for row in shown if row["error"] > 0.0], default=1e-16) / 3.0
+        panels.append((axes, [row | dict(error=max(row["error"], bottom)) for row in shown]))
+        drawing.log_axis(axes.xaxis, [row["us"] for row in mine], drawing.time_text)
+        drawing.log_axis(axes.yaxis, [max(row["error"], bottom) for row in shown] or [bottom], drawing.power_text)
+        axes.set(title=_title(mine[0]), xlabel="run time of all worlds", ylabel="largest relative error")
+        if len(shown) < len(mine):
+            note = f"{len(mine) - len(shown)} without a result"
+            axes.set_title(note, loc="right", fontsize=9, fontweight="normal", color=drawing.FAINT)
+    for axes in list(grid.flat)[len(scenes) :]:
         axes.axis("off")
-    figure.suptitle(f"{evidence.machine['device']}, float32", fontsize=9)
+    drawing.title(
+        figure, f"{operation}, {worlds:,} world{'s' * (worlds > 1)}, {evidence.machine['device']}: lower left is better"
+    )
+    _legend(figure, rows, pareto_front=True)
+    drawing.finish_layout(figure)
+    for axes, mine in panels:
+        front = [(mine[i]["us"], mine[i]["error"]) for i in pareto([(row["us"], row["error"]) for row in mine])]
+        if front:
+            axes.step(*zip(*front, strict=True), where="post", color=drawing.FAINT, linewidth=0.8, zorder=1)
+        _points(axes, mine, [point_name(row) for row in mine])
     return figure
 
 
 def world_counts(evidence: Evidence) -> list[int]:
-    """At which error is drawn against run time: ours, or the peers' where there is none of ours."""
-    ours = {row["worlds"] for row in _curves(evidence) if not row.get("peer")}
+    """Return the world counts at which error is drawn against run time: ours, or else the peers'."""
+    ours = {row["worlds"] for row in _timed(evidence) if not row.get("peer")}
     return sorted(ours or {row["worlds"] for row in evidence.peers if "us" in row})
 
 
-def _curves(evidence: Evidence) -> list[dict]:
+def _title(row: dict) -> str:
+    return f"{TITLES.get(row['scene'], row['scene'])}, {row['dof']} dof"
+
+
+def _timed(evidence: Evidence) -> list[dict]:
     return [row for row in [*evidence.rows, *evidence.peers] if not row.get("sweep") and "us" in row and "error" in row]
+
+
+def _newest(rows: Sequence[dict]) -> list[dict]:
+    """Return our rows first, and of two rows with the same name and precision the one that the plan chose."""
+    best: dict[tuple, dict] = {}
+    for row in sorted(rows, key=lambda row: (bool(row.get("peer")), not row.get("chosen", True))):
+        best.setdefault((who(row), row["dtype"]), row)
+    return list(best.values())
+
+
+def _fastest(rows: Sequence[dict]) -> list[dict]:
+    """Return our rows first, then the fastest row of each robot, library and precision."""
+    best: dict[tuple, dict] = {}
+    for row in sorted(rows, key=lambda row: (bool(row.get("peer")), not row.get("chosen", True), row["us"])):
+        best.setdefault((row["scene"], _library_name(row), row["dtype"]), row)
+    return list(best.values())
+
+
+def _library_name(row: dict) -> str:
+    """Return the library; of Newton its solver too, for there are two."""
+    if not row.get("peer"):
+        return "warp_spo"
+    solver = next((name for name in ("Featherstone", "Steel") if name in row.get("variant", "")), "")
+    cpu = " (CPU)" if drawing.library(row["peer"]) in ON_CPU else ""
+    return f"{drawing.library(row['peer'])} {solver}".strip() + cpu
+
+
+def _points(axes: Any, rows: Sequence[dict], names: Sequence[str]) -> None:
+    """Draw a marker a row, ours larger and in front, and its name."""
+    points = []
+    for row, name in zip(rows, names, strict=True):
+        ours, color = not row.get("peer"), drawing.color(row.get("peer"))
+        size, marker = (8.5 if ours else 5.5), drawing.MARKERS.get(row["dtype"], "v")
+        axes.plot(row["us"], row["error"], marker, color=color, markersize=size, linestyle="",
+                  markeredgecolor="white", markeredgewidth=0.6, zorder=4 if ours else 3)  # fmt: skip
+        points.append(Point(row["us"], row["error"], name, color, bold=ours))
+    drawing.label_points(axes, points)
+
+
+def _speedup(axes: Any, rows: Sequence[dict]) -> None:
+    """Draw an arrow from ours to the fastest peer in float32, and how many times as long the peer takes."""
+    ours = next((row for row in rows if not row.get("peer") and row["dtype"] == "float32"), None)
+    peers = [row for row in rows if row.get("peer") and row["dtype"] == "float32"]
+    if not ours or not peers:
+        return
+    other = min(peers, key=lambda row: row["us"])
+    y = ours["error"] * 1e-2
+    ends = dict(arrowprops=dict(arrowstyle="<->", color=drawing.OURS, linewidth=1.4, shrinkA=0, shrinkB=0))
+    axes.annotate("", (ours["us"], y), (other["us"], y), in_layout=False, **ends)
+    text = f"{other['us'] / ours['us']:.0f} × faster than {_library_name(other)}"
+    axes.annotate(text, (ours["us"], y), xytext=(0, -5), textcoords="offset points", ha="left", va="top",
+                  color=drawing.OURS, fontweight="bold", fontsize=10.5, in_layout=False)  # fmt: skip
+
+
+def _legend(figure: Any, rows: Sequence[dict], pareto_front: bool = False) -> None:
+    """Put a legend below the panels: a colour a library, a marker a precision."""
+    from matplotlib.lines import Line2D
+
+    peers = {drawing.library(row["peer"]): row["peer"] for row in rows if row.get("peer")}
+    ours = "warp_spo, named by granularity" if pareto_front else "warp_spo"
+    names = {ours: None} if any(not row.get("peer") for row in rows) else {}
+    handles = []
+    for name, peer in [*names.items(), *sorted(peers.items(), key=lambda each: each[0].lower())]:
+        size = 5.5 if peer else 8.5
+        label = peer.removeprefix("dense resolvent in ") if peer else name
+        handles.append(
+            Line2D([], [], marker="o", linestyle="", color=drawing.color(peer), markersize=size, label=label)
+        )
+    found = {row["dtype"] for row in rows}
+    for dtype in [*drawing.MARKERS, *sorted(found - drawing.MARKERS.keys())]:
+        if dtype in found:
+            label, marker = drawing.PRECISIONS.get(dtype, dtype), drawing.MARKERS.get(dtype, "v")
+            handles.append(Line2D([], [], marker=marker, linestyle="", color=drawing.FAINT, label=label))
+    if pareto_front:
+        handles.append(Line2D([], [], color=drawing.FAINT, linewidth=0.8, label="Pareto front"))
+    drawing.legend_below(figure, handles)
+
+
+# -- run time against size ---------------------------------------------------------------------------------------------
+@drawing.style()
+def scaling(pyplot: Any, evidence: Evidence) -> Any:
+    """Draw our run time against what grows, a panel a sweep.
+
+    Returns:
+        The figure; None where nothing was swept.
+    """
+    from matplotlib.lines import Line2D
+
+    swept = [row for row in evidence.rows if row.get("sweep") in PANELS and "us" in row]
+    panels = [name for name in PANELS if any(row["sweep"] == name for row in swept)]
+    if not panels:
+        return None
+    wide = min(3, len(panels))
+    tall = -(-len(panels) // wide)
+    size = (max(3.5 * wide, 6.5), 3.2 * tall + 0.9)
+    figure, grid = pyplot.subplots(tall, wide, figsize=size, layout="constrained", squeeze=False)
+    names = []
+    for axes, name in zip(grid.flat, panels, strict=False):
+        names.append((axes, _sweep(axes, name, [row for row in swept if row["sweep"] == name])))
+    drawing.title(figure, f"Run time against size in float32, {evidence.machine['device']}: lower is better")
+    handles = [Line2D([], [], color=drawing.OURS, linestyle=_dashes(op), marker=".", linewidth=1.6, label=op)
+               for op in dict.fromkeys(row["op"] for row in swept)]  # fmt: skip
+    handles.append(Line2D([], [], color=drawing.FAINT, linestyle=":", linewidth=1.0, label=GUIDE))
+    free = list(grid.flat)[len(panels) :]
+    for axes in free:
+        axes.axis("off")
+    if free:
+        free[0].legend(handles=handles, loc="center left")
+    else:
+        drawing.legend_below(figure, handles)
+    drawing.finish_layout(figure)
+    for axes, points in names:
+        drawing.label_points(axes, points, also=[place for line in axes.lines for place in _along(line)])
+    return figure
+
+
+def _sweep(axes: Any, name: str, rows: Sequence[dict]) -> list[Point]:
+    """Draw the lines of one sweep; return a name for the line of each scene, where there are several."""
+    _, label, title = PANELS[name]
+    scenes = list(dict.fromkeys(row["scene"] for row in rows)) if name == "worlds" else [""]
+    ends = []
+    for scene, color in zip(scenes, (drawing.OURS, drawing.OURS_DARK), strict=False):
+        for op in dict.fromkeys(row["op"] for row in rows):
+            mine = [row for row in rows if row["op"] == op and scene in ("", row["scene"])]
+            points = sorted((_size(row, name), row["us"]) for row in mine)
+            axes.plot(*zip(*points, strict=True), _dashes(op), marker=".", linewidth=1.6, color=color, label=op)
+            if scene and op == MAIN:
+                ends.append(Point(*points[min(2, len(points) - 1)], _title(mine[0]), color))
+    sizes, times = [_size(row, name) for row in rows], [row["us"] for row in rows]
+    drawing.log_axis(axes.xaxis, sizes, drawing.count_text, most=4)
+    drawing.log_axis(axes.yaxis, times, drawing.time_text, most=4)
+    if name != "branching":
+        top = max(row["us"] for row in rows if _size(row, name) == max(sizes))
+        low = min(sizes) / max(sizes)
+        axes.plot([low * max(sizes), max(sizes)], [low * top, top], ":", color=drawing.FAINT, linewidth=1.0, zorder=1)
+    axes.set(title=title, ylabel="run time of all worlds")
+    axes.set_xlabel(label if name == "worlds" else f"{label}, {rows[0]['worlds']:,} worlds")
+    return ends
+
+
+def _along(line: Any) -> list[tuple[float, float]]:
+    """Return places on a line of a logarithmic panel, between its points too."""
+    x, y = np.log(line.get_xydata()).T
+    place = np.linspace(0.0, len(x) - 1.0, 8 * len(x))
+    return [(float(a), float(b)) for a, b in np.exp([np.interp(place, np.arange(len(x)), each) for each in (x, y)]).T]
+
+
+def _dashes(operation: str) -> str:
+    return "-" if operation == MAIN else "--"
 
 
 def _size(row: dict, sweep: str) -> int:
     if sweep == "branching":
         return int(row["scene"].rpartition("_")[2])
     return row["depth"] + 1 if sweep == "deep" else row[PANELS[sweep][0]]
-
-
-def _panel(axes: Any, rows: Sequence[dict], color: dict[str, str], title: str) -> None:
-    """Error against run time, both logarithmic; ringed and joined: the Pareto front.
-
-    An error of zero is drawn at the bottom; one that is NaN is left out, and the panel says how many are.
-    """
-    shown = [row for row in rows if row["error"] == row["error"]]
-    bottom = min([row["error"] for row in shown if row["error"] > 0.0], default=1e-16) / 3.0
-    points = [(row["us"], max(row["error"], bottom)) for row in shown]
-    for row, point in zip(shown, points, strict=True):
-        marker = MARKERS.get(row["dtype"], "v")
-        axes.plot(*point, marker, color=color.get(who(row), "black"), markersize=5, alpha=0.85, linestyle="")
-    front = [points[i] for i in pareto(points)]
-    if front:
-        x, y = zip(*front, strict=True)
-        axes.step(x, y, where="post", color="black", linewidth=0.6, alpha=0.6)
-        axes.plot(x, y, "o", markersize=9, markerfacecolor="none", markeredgecolor="black", markeredgewidth=0.6)
-    if len(shown) < len(rows):
-        note = f"{len(rows) - len(shown)} without a result"
-        axes.text(0.02, 0.02, note, transform=axes.transAxes, fontsize=7, color="tab:red")
-    if not rows:
-        axes.axis("off")
-        return
-    axes.set(xscale="log", yscale="log")
-    axes.set_xlabel("run time of all worlds [µs]", fontsize=7)
-    axes.set_ylabel("largest relative error", fontsize=7)
-    axes.set_title(title, fontsize=8)
-    _grid(axes)
-    _plain_ticks(axes.xaxis, [row["us"] for row in rows])
-    _plain_ticks(axes.yaxis, [point[1] for point in points] or [bottom])
-
-
-def _grid(axes: Any) -> None:
-    """Lines at the labelled ticks, no others: pictures stay small."""
-    axes.minorticks_off()
-    axes.tick_params(labelsize=7)
-    axes.grid(True, which="major", alpha=0.3)
-
-
-def _plain_ticks(axis: Any, values: Sequence[float]) -> None:
-    """Labels such as 20 and 1e-07: 1, 2 and 5 of every decade where there are few decades."""
-    from matplotlib.ticker import FuncFormatter, LogLocator
-
-    few = max(values) < 100.0 * min(values)
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=6))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-
-
-def _legend(figure: Any, rows: Sequence[dict], color: dict[str, str]) -> None:
-    from matplotlib.lines import Line2D
-
-    people = dict.fromkeys([*(n for n in OURS if any(who(r) == n for r in rows)), *sorted({who(r) for r in rows})])
-    handles = [Line2D([], [], marker="o", linestyle="", color=color.get(name, "black"), label=name) for name in people]
-    for dtype in dict.fromkeys([*MARKERS, *(row["dtype"] for row in rows)]):
-        if any(row["dtype"] == dtype for row in rows):
-            marker = MARKERS.get(dtype, "v")
-            label = NAMES.get(dtype, dtype)
-            handles.append(Line2D([], [], marker=marker, linestyle="", color="gray", label=label))
-    ring = dict(markersize=9, markerfacecolor="none", markeredgecolor="black", color="black", linewidth=0.6)
-    handles.append(Line2D([], [], marker="o", label="Pareto front", **ring))
-    columns = min(len(handles), int(figure.get_figwidth() / 1.3))
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=7)

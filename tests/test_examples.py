@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from rendering import assert_is_whole
 
 from warp_spo.examples import floating_arm, identify, reach
 
@@ -16,20 +17,22 @@ def test_is_short(module):
 
 def test_a_floating_arm_draws_its_circle(tmp_path):
     assert floating_arm.main(seconds=1.0, picture=tmp_path / "arm.svg") <= 1e-3  # [m]; 3e-4 here, of order dt
-    assert "the hand" in (tmp_path / "arm.svg").read_text()
+    svg = (tmp_path / "arm.svg").read_text()
+    assert_is_whole(svg)
+    assert "hand in 4 worlds" in svg and "distance from the circle [mm]" in svg
 
 
 def test_masses_and_damping_are_found_again(tmp_path):
     """Without noise to rounding; with it as well as the record says: the first mass turns about the vertical only."""
     assert identify.main(steps=200, noise=0.0) <= 1e-10  # [kg, N m s]; 5e-14 here
-    assert identify.main(steps=1000, noise=0.1, picture=tmp_path / "found.png") <= 0.03  # 0.008 here
-    assert (tmp_path / "found.png").stat().st_size > 10_000
+    assert identify.main(steps=1000, noise=0.1, picture=tmp_path / "found.svg") <= 0.03  # 0.008 here
+    assert_is_whole((tmp_path / "found.svg").read_text())
 
 
 def test_gradients_through_500_steps_bring_hands_to_targets(tmp_path):
     losses = reach.main(worlds=2, iterations=6, picture=tmp_path / "reach.png")
     assert losses[-1] < 0.4 * losses[0] and min(losses) == losses[-1]  # 0.23 here
-    assert (tmp_path / "reach.png").stat().st_size > 10_000
+    assert (tmp_path / "reach.png").stat().st_size > 10_000  # pictures need not be SVG
 
 
 def test_pictures_are_asked_for_by_name():

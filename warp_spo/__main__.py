@@ -19,7 +19,7 @@ import warp as wp
 
 from .dynamics.dynamics import Dynamics
 from .scene.scene import Scene
-from .trials import report
+from .trials import drawing, report
 from .trials.operations import OPERATIONS, TOLERANCE, Inputs
 from .trials.trial import SAMPLE, Subject, Trial
 
@@ -52,7 +52,7 @@ def main(argv: list[str] | None = None) -> int:
     options = parser().parse_args(argv)
     wp.config.log_level = wp.LOG_WARNING  # before newton is imported
     try:
-        pyplot: Any = report.load_pyplot() if options.report else None
+        pyplot: Any = drawing.load_pyplot() if options.report else None
         if options.report:
             _make_folder(options.report)
         scene = load(options.robot)

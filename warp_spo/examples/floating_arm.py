@@ -7,7 +7,8 @@ arm's hinges. The torques that give the hand the acceleration a it needs are one
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, bar, command, drawing
+from warp_spo.examples.parts import at, band, bar, command, drawing
+from warp_spo.trials.drawing import FAINT, OURS, log_axis
 
 RADIUS, PERIOD = 0.1, 2.0  # of the circle [m, s]
 STIFF, DAMP = 400.0, 40.0  # of the hand's error [1/s^2, 1/s]
@@ -54,11 +55,14 @@ def main(seconds=2.0, dt=2e-3, seed=0, picture=None):
         f"{1e3 * np.linalg.norm(q[:, :3], axis=1).max():.0f} mm"
     )
     if picture:
-        with drawing(picture, "paths of hand and base, y and z [m]", "the hand's distance from its circle [m]") as axes:
-            axes[0].plot(*np.moveaxis(np.array(path)[:, :, 0, 1:], -1, 0))
-            axes[0].set_aspect("equal")
-            axes[1].semilogy(dt * np.arange(len(drawn)), drawn)
-            axes[1].set_xlabel("time [s]")
+        with drawing(picture, "Paths, seen along x", "Error of the hand: lower is better") as axes:
+            for k, (name, color) in enumerate((("hand", OURS), ("base", FAINT))):
+                lines = axes[0].plot(*np.moveaxis(np.array(path)[:, k, :, 1:], -1, 0), color=color, linewidth=1.2)
+                lines[0].set_label(f"{name} in {WORLDS} worlds")
+            axes[0].set(aspect="equal", xlabel="y [m]", ylabel="z [m]")
+            band(axes[1], dt * np.arange(len(drawn)), 1e3 * np.array(drawn), OURS, "hand")
+            log_axis(axes[1].yaxis, 1e3 * np.ravel(drawn[5:]), "{:g}".format)
+            axes[1].set(xlabel="time [s]", ylabel="distance from the circle [mm]")
     return late
 
 

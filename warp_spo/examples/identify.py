@@ -9,6 +9,7 @@ import torch
 
 import warp_spo as spo
 from warp_spo.examples.parts import at, bar, command, drawing
+from warp_spo.trials.drawing import FAINT, OURS, OURS_DARK
 
 MASSES, DAMPING = [2.0, 1.5, 0.7], [0.5, 0.3, 0.1]  # what is to be found [kg, N m s]
 DT, WINDOW = 2e-3, 20  # [s, steps]
@@ -51,6 +52,7 @@ def main(steps=1000, noise=1.0, iterations=6, seed=0, picture=None):
         rows = [torch.cat(torch.autograd.grad(column.sum(), (masses, damping), retain_graph=True), 1)
                 for column in missed.unbind(1)]  # fmt: skip
         change = torch.linalg.lstsq(torch.cat(rows), -missed.detach().T.reshape(-1, 1)).solution
+        deviation = torch.linalg.inv(torch.cat(rows).T @ torch.cat(rows)).diagonal().sqrt()
         guesses.append(guesses[-1] + change[:, 0])
     found, right = guesses[-1].numpy(), np.array(MASSES + DAMPING)
     print(
@@ -58,11 +60,17 @@ def main(steps=1000, noise=1.0, iterations=6, seed=0, picture=None):
         f"{np.abs(found - right).max():.1e}"
     )
     if picture:
-        with drawing(picture, "masses [kg]", "damping [N m s]") as axes:
-            for each, lines, dashed in zip(axes, np.hsplit(np.array(guesses), 2), np.split(right, 2), strict=True):
-                each.plot(lines, ".-")
-                each.hlines(dashed, 0, iterations, "0.7", "dashed")
-                each.set_xlabel("iteration")
+        with drawing(picture, "Masses of the bars", "Damping of the hinges") as axes:
+            for k, (value, spread, wanted) in enumerate(zip(np.transpose(guesses), deviation, right, strict=True)):
+                each, color = axes[k // 3], (OURS, OURS_DARK, FAINT)[k % 3]
+                each.plot(value, ".-", color=color)
+                name = f"{('bar', 'hinge')[k // 3]} {k % 3 + 1} ± 2 standard errors"
+                each.errorbar(iterations, value[-1], 2.0 * spread, fmt=".", color=color, capsize=4.0, label=name)
+                each.axhline(
+                    wanted, color=color, linestyle="--", linewidth=0.8, label="true value" if k % 3 == 2 else None
+                )
+            for each, name in zip(axes, ("mass [kg]", "damping [N m s/rad]"), strict=True):
+                each.set(xlabel="iteration", ylabel=name)
     return np.abs(found - right).max()
 
 

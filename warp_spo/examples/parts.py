@@ -49,12 +49,30 @@ def command(main):
 
 @contextlib.contextmanager
 def drawing(file, *titles):
-    """Axes side by side, one under each title, saved to a file at the end."""
+    """Yield axes side by side, one under each title, in the project's style; save them to a file at the end.
+
+    A panel whose lines have labels gets a legend below it.
+    """
     from matplotlib.figure import Figure
 
-    figure = Figure((5.0 * len(titles), 4.0), layout="constrained")
-    axes = figure.subplots(1, len(titles), squeeze=False)[0]
-    for each, title in zip(axes, titles, strict=True):
-        each.set_title(title)
-    yield axes
-    figure.savefig(file)
+    from warp_spo.trials.drawing import style
+
+    with style():
+        figure = Figure((5.2 * len(titles), 4.6), layout="constrained")
+        axes = figure.subplots(1, len(titles), squeeze=False)[0]
+        for each, title in zip(axes, titles, strict=True):
+            each.set_title(title)
+            each.grid(True)
+        yield axes
+        for each in axes:
+            if each.get_legend_handles_labels()[0]:
+                each.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2)
+        figure.get_layout_engine().set(w_pad=0.1, h_pad=0.08)
+        figure.savefig(file)
+
+
+def band(axes, x, values, color, label):
+    """Draw the median of ``values`` [x, world] as a line, and the range of all worlds as a band around it."""
+    axes.plot(x, np.median(values, axis=1), color=color, label=f"{label}, median")
+    axes.fill_between(x, np.min(values, axis=1), np.max(values, axis=1), color=color, alpha=0.2, linewidth=0,
+                      label=f"{label}, all {values.shape[1]} worlds")  # fmt: skip

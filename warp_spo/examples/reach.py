@@ -9,7 +9,8 @@ import torch
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, bar, command, drawing
+from warp_spo.examples.parts import at, band, bar, command, drawing
+from warp_spo.trials.drawing import OURS, log_axis
 
 DT, STEPS, KNOTS = 2e-3, 500, 11  # [s]
 START = [0.0, 0.5, 0.0, 1.2, 0.0, 0.6, 0.0]  # [rad]
@@ -56,11 +57,12 @@ def main(worlds=8, iterations=30, seed=0, picture=None):
     )
     if picture:
         paths = torch.stack([hand(dyn.body_poses(q)) for q in path]) - targets
-        with drawing(picture, "loss", "the hands' distance from their targets [m]") as (left, right):
-            left.semilogy(losses)
-            left.set_xlabel("iteration")
-            right.plot(DT * np.arange(STEPS), paths.norm(dim=-1).cpu())
-            right.set_xlabel("time [s]")
+        with drawing(picture, "Learning: lower is better", "The last rollout: lower is better") as (left, right):
+            left.plot(losses, ".-", color=OURS, label=f"mean loss of {worlds} worlds")
+            log_axis(left.yaxis, losses, "{:g}".format)
+            left.set(xlabel="iteration", ylabel="loss")
+            band(right, DT * np.arange(1, STEPS + 1), paths.norm(dim=-1).cpu().numpy(), OURS, "hand")
+            right.set(xlabel="time [s]", ylabel="distance from the target [m]", ylim=(0.0, None))
     return losses
 
 

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import base64
 import html
-import io
-import re
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from . import drawing
+from .drawing import Point
+
 HEADS = ("operation", "granularity", "precision", "error", "time", "evaluations/s")
 BAR = 30  # characters
-COLORS = {"float32": "tab:orange", "float64": "tab:blue"}
 
 
 class Progress:
@@ -119,61 +119,47 @@ def folded(summary: str, part: str) -> str:
     return f"<details><summary>{html.escape(summary)}</summary>\n{part}\n</details>"
 
 
-def svg(figure: Any) -> str:
-    """A figure as SVG text: labels as text in the reader's font, no date, so that equal rows give equal files."""
-    import matplotlib
-
-    out = io.StringIO()
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "warp_spo"}):
-        figure.savefig(out, format="svg", metadata={"Date": None})
-    text = re.sub(r"font-family: [^;]*", "font-family: sans-serif", out.getvalue())  # a line of names for each label
-    return re.sub(r"\n\s+", "\n", text)
-
-
 def embedded(figure: Any) -> str:
     """A figure inside the page."""
-    return f'<img src="data:image/svg+xml;base64,{base64.b64encode(svg(figure).encode()).decode()}">'
+    return f'<img src="data:image/svg+xml;base64,{base64.b64encode(drawing.svg(figure).encode()).decode()}">'
 
 
-def load_pyplot() -> Any:
-    """matplotlib.pyplot, drawing to files.
-
-    Raises:
-        ImportError: matplotlib is missing; names the extra that installs it.
-    """
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise ImportError(
-            f"--report draws with matplotlib, which is missing ({error}); pip install warp_spo[plots]"
-        ) from (None)
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    return pyplot
-
-
+@drawing.style()
 def picture(pyplot: Any, title: str, rows: Sequence[dict], tolerance: dict[str, float]) -> Any:
-    """A figure of error against run time, both logarithmic, a numbered point a row.
+    """Draw error against run time, both logarithmic, a panel a precision, a point with its name an operation.
 
-    An error of exactly zero is drawn at the bottom; one that is NaN is left out, and the legend says how many are.
+    An error of exactly zero is drawn at the bottom; one that is NaN is left out, and the panel's title says how many
+    are. A point beyond its tolerance is black.
     """
-    figure, axes = pyplot.subplots(figsize=(9.0, 6.0), layout="constrained")
-    number = {name: i + 1 for i, name in enumerate(dict.fromkeys(row["op"] for row in rows))}
-    shown = [row for row in rows if row["error"] == row["error"]]
-    bottom = min([row["error"] for row in shown if row["error"] > 0.0], default=1e-16) / 3.0
-    for dtype in dict.fromkeys(row["dtype"] for row in rows):
-        mine = [row for row in shown if row["dtype"] == dtype]
-        lost = sum(row["dtype"] == dtype for row in rows) - len(mine)
-        x, y = [1e6 * row["seconds"] for row in mine], [max(row["error"], bottom) for row in mine]
-        axes.scatter(x, y, s=18, color=COLORS[dtype], label=dtype + (f" ({lost} without a result)" if lost else ""))
-        for row, *place in zip(mine, x, y, strict=True):
-            axes.annotate(str(number[row["op"]]), place, xytext=(3, 3), textcoords="offset points", fontsize=8)
-        axes.axhline(tolerance[dtype], color=COLORS[dtype], linestyle=":", linewidth=1.0)
-    for name, i in number.items():
-        axes.plot([], [], " ", label=f"{i}  {name}")
-    axes.set(xscale="log", yscale="log", xlabel="run time of all worlds [us]", ylabel="largest relative error")
-    axes.set_title(title, fontsize=9)
-    axes.grid(True, which="major", alpha=0.3)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", title="dotted: tolerance", fontsize=8)
+    from matplotlib.lines import Line2D
+
+    dtypes = list(dict.fromkeys(row["dtype"] for row in rows))
+    size = (10.4, 4.2 * len(dtypes) + 0.8)
+    figure, grid = pyplot.subplots(len(dtypes), 1, figsize=size, sharex=True, layout="constrained", squeeze=False)
+    panels = []
+    for axes, dtype in zip(grid[:, 0], dtypes, strict=True):
+        mine = [row for row in rows if row["dtype"] == dtype]
+        shown = [row for row in mine if row["error"] == row["error"]]
+        bottom = min([row["error"] for row in shown if row["error"] > 0.0], default=1e-16) / 3.0
+        errors = [max(row["error"], bottom) for row in shown]
+        drawing.log_axis(axes.xaxis, [1e6 * row["seconds"] for row in rows], drawing.time_text)
+        drawing.log_axis(axes.yaxis, errors or [bottom], drawing.power_text)
+        lost = f", {len(mine) - len(shown)} without a result" if len(shown) < len(mine) else ""
+        axes.set_title(f"{dtype}, tolerance {drawing.power_text(tolerance[dtype])}{lost}")
+        axes.set_ylabel("largest relative error")
+        points = [Point(1e6 * row["seconds"], error, row["op"], drawing.OURS if error <= tolerance[dtype] else
+                  drawing.INK) for row, error in zip(shown, errors, strict=True)]  # fmt: skip
+        panels.append((axes, drawing.MARKERS[dtype], points))
+    grid[-1, 0].set_xlabel("run time of all worlds")
+    drawing.title(figure, f"{title}: lower left is better")
+    handles = [Line2D([], [], marker=marker, linestyle="", color=drawing.OURS, label=f"warp_spo, {dtype}")
+               for (_, marker, _), dtype in zip(panels, dtypes, strict=True)]  # fmt: skip
+    if any(point.color == drawing.INK for _, _, points in panels for point in points):
+        handles.append(Line2D([], [], marker="o", linestyle="", color=drawing.INK, label="beyond the tolerance"))
+    drawing.legend_below(figure, handles)
+    drawing.finish_layout(figure)
+    for axes, marker, points in panels:
+        for x, y, _, color, _ in points:
+            axes.plot(x, y, marker, color=color, markersize=6.0, markeredgecolor="white", markeredgewidth=0.6, zorder=4)
+        drawing.label_points(axes, [point._replace(color=drawing.INK) for point in points])
     return figure
