@@ -24,14 +24,14 @@ def least_norm(T) -> wp.Kernel:
     eps = T(EPSILON[T])
 
     @wp.func
-    def turn(A: wp.array3d[T], world: int, i: int, j: int, k: int, l: int, c: T, s: T):
+    def rotate_entries(A: wp.array3d[T], world: int, i: int, j: int, k: int, l: int, c: T, s: T):
         """Rotate the entries (i, j) and (k, l)."""
         a, b = T(A[world, i, j]), T(A[world, k, l])
         A[world, i, j] = c * a - s * b
         A[world, k, l] = s * a + c * b
 
     @wp.func
-    def solved(A: wp.array3d[T], L: wp.array3d[T], x: wp.array2d[T], world: int, least: T):
+    def solve_positive(A: wp.array3d[T], L: wp.array3d[T], x: wp.array2d[T], world: int, least: T):
         """Smallest pivot of A = L L* over ``least``; where it is above one also x = A^-1 x."""
         n = A.shape[1]
         smallest = T(2.0)
@@ -85,7 +85,7 @@ def least_norm(T) -> wp.Kernel:
                 A[world, i, j] = A[world, i, j] * scale_out[world, i] * scale_out[world, j]
             bound += A[world, i, i]
             out[world, i] = -scale_out[world, i] * right[world, i]
-        if healthy and solved(A, V_out, out, world, T(n) * wp.sqrt(eps) * bound) > T(1.0):
+        if healthy and solve_positive(A, V_out, out, world, T(n) * wp.sqrt(eps) * bound) > T(1.0):
             for i in range(n):
                 out[world, i] = out[world, i] * scale_out[world, i]
             rank_out[world] = n
@@ -106,10 +106,10 @@ def least_norm(T) -> wp.Kernel:
                         c = T(1.0) / wp.sqrt(t * t + T(1.0))
                         sine = t * c
                         for k in range(n):
-                            turn(A, world, k, p, k, q, c, sine)
+                            rotate_entries(A, world, k, p, k, q, c, sine)
                         for k in range(n):
-                            turn(A, world, p, k, q, k, c, sine)
-                            turn(V_out, world, k, p, k, q, c, sine)
+                            rotate_entries(A, world, p, k, q, k, c, sine)
+                            rotate_entries(V_out, world, k, p, k, q, c, sine)
                         A[world, p, q] = T(0.0)
                         A[world, q, p] = T(0.0)
         largest = T(0.0)
@@ -140,7 +140,7 @@ def least_norm(T) -> wp.Kernel:
 
 
 @functools.cache
-def word(T) -> wp.Kernel:
+def status_word(T) -> wp.Kernel:
     """The worst of what is true of a world: NOT_FINITE, LOOPS, PIVOT.
 
     LOOPS where a margin [world, n] is below ``least``, or NaN; PIVOT where the result is NaN for another reason.
@@ -186,8 +186,8 @@ def word(T) -> wp.Kernel:
 
 
 @functools.cache
-def opened(T) -> wp.Kernel:
-    """The word OPEN for worlds in which closures are open, and nothing worse is true."""
+def mark_open(T) -> wp.Kernel:
+    """Set the word OPEN for worlds in which closures are open, and nothing worse is true."""
 
     @wp.kernel(module=f"warp_spo_loops_{T.__name__}", enable_backward=False)
     def kernel(
@@ -202,4 +202,4 @@ def opened(T) -> wp.Kernel:
     return kernel
 
 
-KERNELS = (least_norm, word, opened)
+KERNELS = (least_norm, status_word, mark_open)

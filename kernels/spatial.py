@@ -3,7 +3,7 @@
 A quantity of a node is a vector: a pose (R by rows, l), a motion or force, a rigid inertia (mass, first moment, inertia
 about the frame's origin: xx, yy, zz, xy, xz, yz), an articulated inertia (the upper triangle of P by rows). Arrays
 inside the library are ``[node or dof, component, world]``, worlds neighbouring, so that the threads of a warp read
-neighbouring addresses. What is done with them comes from the traces, see :mod:`warp_spo.node_steps`.
+neighbouring addresses. What is done with them comes from the traces, see :mod:`warp_spo.node_functions`.
 """
 
 import functools

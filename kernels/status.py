@@ -1,7 +1,8 @@
-"""Whether forward dynamics of a world can be trusted: what rounding left of D, and one word a world. Jain's eq. 1.
+"""Whether forward dynamics of a world can be trusted: the digits that rounding leaves in D, and one word a world.
 
-Only launched when a caller asks for the word. The estimate carries S(k), positive semidefinite, with
--eps S <= dP <= eps S for the error dP that rounding leaves in P(k). It obeys the recursion of P with psi for phi,
+These kernels are launched only when a caller asks for the status (Jain, eq. 1). The estimate carries S(k), positive
+semidefinite, with -eps S <= dP <= eps S for the error dP that rounding leaves in P(k). It obeys the recursion of P with
+psi for phi,
 
     S(k) = sum over children phi [(I - G H) S (I - G H)* + L] phi* + L
 
@@ -21,7 +22,7 @@ NORMAL = {wp.float32: (2.0**-126, 2.0**127), wp.float64: (2.0**-1022, 2.0**1023)
 
 
 @functools.cache
-def digits(s) -> wp.Kernel:
+def lost_digits(s) -> wp.Kernel:
     """Inward, one level, after ``factor``: lost = (H S H* + |H| |P| |H*| + |Delta|) / D, the error of D in eps.
 
     In place of the number: -PIVOT where D is NaN for want of a positive pivot, -RANGE where D or what it
@@ -162,7 +163,7 @@ def digits(s) -> wp.Kernel:
 
 
 @functools.cache
-def word(s) -> wp.Kernel:
+def status_word(s) -> wp.Kernel:
     """The worst of what is true of a world, one thread for each: NOT_FINITE, PIVOT, RANGE, DIGITS.
 
     DIGITS: D may have lost half of the digits of T, lost > 2 eps^-1/2: measured errors are .02 to .8 of ``lost``.
@@ -237,4 +238,4 @@ def word(s) -> wp.Kernel:
     return kernel
 
 
-KERNELS = (digits, word)
+KERNELS = (lost_digits, status_word)

@@ -10,7 +10,7 @@ from laws import TOLERANCE
 from mutants import mutant
 
 import warp_spo as spo
-from warp_spo.execution import node_steps, teams
+from warp_spo.execution import node_functions, teams
 from warp_spo.execution import sweeps as levels
 from warp_spo.graph import blocks
 from warp_spo.kernels import straight
@@ -85,7 +85,7 @@ def test_a_wrong_gyroscopic_sign(monkeypatch, device):
     dyn, arrays = dynamics(device, "screw_tree")
     laws.bias_force_is_christoffel(dyn, arrays, 1e-6)
     symbolic.plant(monkeypatch, newton_euler, "body_force", "+ cross(motion.spin", "- cross(motion.spin")
-    monkeypatch.setattr(levels, "steps", node_steps.Steps)
+    monkeypatch.setattr(levels, "node_functions", node_functions.NodeFunctions)
     dyn, arrays = dynamics(device, "screw_tree")
     laws.forward_undoes_inverse_dynamics(dyn, arrays, TOLERANCE["float64"])  # blind, as theory says
     with pytest.raises(AssertionError):

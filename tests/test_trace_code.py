@@ -13,7 +13,7 @@ from warp_spo.kernels import native, straight
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.traced import Trace
 from warp_spo.trace import scalars as g
-from warp_spo.trace.emission import Emitter, Store, literal, literals
+from warp_spo.trace.emission import Emitter, Store, literal, render
 from warp_spo.trace.evaluation import evaluate
 
 TYPES = {"float32": wp.float32, "float64": wp.float64}
@@ -29,7 +29,7 @@ def compiled(values, rows, dtype, device):
     emitter = Emitter(dtype, lambda array, entry: f"{array}_row[{entry}]",
                       lambda array, entry, value: f"if (mine) result_row[{entry}] = {value};",
                       lambda array, index: index[0])  # fmt: skip
-    text = literals(emitter.region([Store("out", (i,), value) for i, value in enumerate(values)]), dtype)
+    text = render(emitter.region([Store("out", (i,), value) for i, value in enumerate(values)]), dtype)
     kernel = native.kernel("trace", straight.assemble(frame, text, text, T), [("x", 2), ("out", 2)], T)
     x = wp.array(rows, dtype=T, device=device)
     result = wp.full((len(rows), count), float("nan"), dtype=T, device=device)

@@ -15,7 +15,7 @@ def refuse_masked(call: str, name: str, array: Any) -> None:
         )
 
 
-def names_of(call: str, what: str, names: Any, such: tuple[str, ...]) -> tuple[str, ...]:
+def as_names(call: str, what: str, names: Any, such: tuple[str, ...]) -> tuple[str, ...]:
     """One name, or an iterable of them, as a tuple; raise TypeError of anything else, showing ``such`` as one would."""
     try:
         found: tuple = (names,) if isinstance(names, str) else tuple(names)
@@ -31,7 +31,7 @@ def is_bool(value: Any) -> bool:
     return isinstance(value, bool) or str(getattr(value, "dtype", "")).endswith("bool")
 
 
-def whole(value: Any) -> int | None:
+def as_integer(value: Any) -> int | None:
     """A whole number, of Python, NumPy or torch, as an int; None of anything else. A bool is none."""
     try:
         return operator.index(value) if not is_bool(value) and not getattr(value, "ndim", 0) else None

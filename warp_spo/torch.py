@@ -11,7 +11,7 @@ import warp as wp
 from torch._C import _functorch
 from torch.autograd import forward_ad
 
-from .errors import names_of
+from .errors import as_names
 
 _DTYPES: dict[Any, torch.dtype] = {
     wp.float32: torch.float32,
@@ -235,7 +235,7 @@ class Module(torch.nn.Module):
         if not hasattr(dyn, "differentiable_values"):
             raise TypeError(f"Module: dyn is of type {type(dyn).__name__}; expected a Dynamics")
         self.dyn = dyn
-        names = names_of("Module", "names", dyn.differentiable_values if names is None else names, ("body_mass",))
+        names = as_names("Module", "names", dyn.differentiable_values if names is None else names, ("body_mass",))
         for name in names:
             if name not in dyn.differentiable_values:
                 raise ValueError(

@@ -16,13 +16,13 @@ from typing import Any, ClassVar
 import warp as wp
 
 from ..arrays import Call, Values, differentiated, recorded
-from ..errors import UnsupportedError, names_of
+from ..errors import UnsupportedError, as_names
 from ..execution import link_values
 from ..execution.plan import MOST_DOFS
 from ..execution.programs import Programs
-from ..execution.sweeps import Recursions
+from ..execution.sweeps import Sweeps
 from ..recursions.links import LINK_VALUES
-from ..scene.frames import checked
+from ..scene.frames import check_frames
 from ..scene.scene import Scene
 
 ARGUMENTS = {
@@ -77,7 +77,7 @@ class Adjoints:
     device: wp.Device
     dtype: type
     variable: tuple[str, ...]
-    recursions: Recursions
+    recursions: Sweeps
     programs: Programs
     values: Values
     closed: bool
@@ -285,7 +285,7 @@ class Adjoints:
             if operation == "solve_mass_matrix":
                 arrays["qdd"] = call.read("result", result, shape)
             if operation == "jacobian":
-                arrays["frames"] = checked(self.scene, call.name, options["frames"])
+                arrays["frames"] = check_frames(self.scene, call.name, options["frames"])
             names, outs = self._gradients(call, operation, {}, wrt, None)
             self._pull(operation, names, outs, arrays)
         return _by_name(names, call.result)
@@ -378,7 +378,7 @@ class Adjoints:
     ) -> tuple[tuple[str, ...], list[wp.array]]:
         """The checked names, and an array for each."""
         self._check_size(call, operation)
-        names = names_of(call.name, "wrt", wrt, ARGUMENTS[operation][:2])
+        names = as_names(call.name, "wrt", wrt, ARGUMENTS[operation][:2])
         if not isinstance(out, Mapping | None):
             raise TypeError(f"{call.name}: out is of type {type(out).__name__}; expected a dict, arrays by name of wrt")
         out = out or {}

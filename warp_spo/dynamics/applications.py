@@ -15,11 +15,11 @@ import warp as wp
 
 from ..arrays import Call, shape_of
 from ..errors import refuse_masked
-from ..execution.parameters import spread
+from ..execution.parameters import broadcast_worlds
 from ..execution.programs import Programs
-from ..execution.sweeps import Recursions
+from ..execution.sweeps import Sweeps
 from ..kernels import cholesky
-from ..scene.frames import Frame, checked
+from ..scene.frames import Frame, check_frames
 from ..scene.scene import Scene
 
 
@@ -30,7 +30,7 @@ class Applications:
     worlds: int
     device: wp.Device
     dtype: type
-    recursions: Recursions
+    recursions: Sweeps
     programs: Programs
     _minimal: int  # independent dofs
 
@@ -102,7 +102,7 @@ class Applications:
             return call.read("prescribed", mask, (self.worlds, dofs), "[world, dof] or [dof]", dtype=wp.bool), None
         shared = call.read("prescribed", mask, (dofs,), "[world, dof] or [dof]", dtype=wp.bool)
         if shared.size:
-            wp.copy(self._mask, spread(shared.reshape((1, dofs)), 0, self.worlds))
+            wp.copy(self._mask, broadcast_worlds(shared.reshape((1, dofs)), 0, self.worlds))
         return self._mask, None
 
     @functools.cached_property
@@ -122,7 +122,7 @@ class Applications:
         """
         with self._call("operational_inertia") as call:
             q, _ = self._read_state(call, q, None)
-            where = checked(self.scene, call.name, frames)
+            where = check_frames(self.scene, call.name, frames)
             rows = 6 * len(where)
             out = call.write(out, (self.worlds, rows, rows), "[world, 6 frames, 6 frames]")
             mobility = self.recursions.array(("operational_inertia_inverse", rows), self.worlds, rows, rows)
@@ -143,7 +143,7 @@ class Applications:
         """
         with self._call("jacobian_bias") as call:
             q, qd = self._read_state(call, q, qd, optional=False)
-            where = checked(self.scene, call.name, frames)
+            where = check_frames(self.scene, call.name, frames)
             out = call.write(out, (self.worlds, len(where), 6), "[world, frame, 6]")
             self._launch("jacobian_bias", out, q=q, qd=qd, frames=where)
         return call.result
@@ -160,7 +160,7 @@ class Applications:
         with self._call("frame_accelerations") as call:
             q, qd = self._read_state(call, q, qd)
             qdd = self._read_rate(call, "qdd", qdd)
-            where = checked(self.scene, call.name, frames)
+            where = check_frames(self.scene, call.name, frames)
             out = call.write(out, (self.worlds, len(where), 6), "[world, frame, 6]")
             self._launch("frame_accelerations", out, q=q, qd=qd, qdd=qdd, frames=where)
         return call.result
@@ -180,7 +180,7 @@ class Applications:
         """
         with self._call("operational_inertia_inverse_product") as call:
             q, _ = self._read_state(call, q, None)
-            where = checked(self.scene, call.name, frames)
+            where = check_frames(self.scene, call.name, frames)
             x = call.read("x", x, (self.worlds, 6 * len(where)), "[world, 6 frames]")
             out = call.write(out, (self.worlds, len(where), 6), "[world, frame, 6]")
             self._launch("operational_inertia_inverse_product", out, q=q, x=x, frames=where)

@@ -14,7 +14,7 @@ import warp as wp
 
 from ..arrays import Call
 from ..execution.programs import Program, Programs
-from ..execution.sweeps import Recursions
+from ..execution.sweeps import Sweeps
 from ..kernels import tiles
 from ..kernels.straight import TILE
 from ..scene.scene import Scene
@@ -43,7 +43,7 @@ class Derivatives:
     worlds: int
     device: wp.Device
     dtype: type
-    recursions: Recursions
+    recursions: Sweeps
     programs: Programs
 
     def inverse_dynamics_derivatives(

@@ -14,14 +14,14 @@ import numpy as np
 import warp as wp
 
 from ..arrays import Call, Values, parse_device, parse_dtype, recorded, shape_of
-from ..errors import UnsupportedError, names_of, whole
+from ..errors import UnsupportedError, as_integer, as_names
 from ..execution import node_operations as nodes
 from ..execution import plan as plans
 from ..execution import status_words as words
 from ..execution.parameters import RIGID_VALUES, VARIABLE
 from ..execution.programs import Programs
-from ..execution.sweeps import Recursions
-from ..scene.frames import Frame, checked
+from ..execution.sweeps import Sweeps
+from ..scene.frames import Frame, check_frames
 from ..scene.parts import real
 from ..scene.scene import Scene
 from .adjoints import Adjoints, differentiable
@@ -92,11 +92,11 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
         varies = any(name in self.variable or scene.values[name].shape[0] > 1 for name in RIGID_VALUES)
         self.plan = plans.choose(scene, self.worlds, self.device.is_cuda, self.dtype.__name__, granularity, varies)
         self.granularity = self.plan.granularity
-        self.recursions = Recursions(scene, self.plan, self.device, self.dtype, self.variable)
+        self.recursions = Sweeps(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)
         self.values = Values()
         self._close(loops, independent)
-        count = whole(refine)
+        count = as_integer(refine)
         if count is None or count < 0:
             raise ValueError(f"Dynamics: refine is {refine!r}; expected how many steps, 0 or more")
         if count and self.closed:
@@ -360,7 +360,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
         """
         with self._call("jacobian") as call:
             q, _ = self._read_state(call, q, None)
-            where = checked(self.scene, call.name, frames)
+            where = check_frames(self.scene, call.name, frames)
             out = call.write(out, (self.worlds, len(where), 6, self._minimal), "[world, frame, 6, dof]")
             self._run("jacobian", out, q=q, frames=where)
         return call.result
@@ -369,7 +369,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
         """J Mass^-1 J* for the frames of :meth:`jacobian` [world, 6 frames, 6 frames]; loops that are embedded hold."""
         with self._call("operational_inertia_inverse") as call:
             q, _ = self._read_state(call, q, None)
-            where = checked(self.scene, call.name, frames)
+            where = check_frames(self.scene, call.name, frames)
             rows = 6 * len(where)
             out = call.write(out, (self.worlds, rows, rows), "[world, 6 frames, 6 frames]")
             self._run("operational_inertia_inverse", out, q=q, frames=where)
@@ -460,7 +460,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
 def _world_count(scene: Scene, worlds: Any) -> int:
     if worlds is None:
         return scene.worlds
-    count = whole(worlds)
+    count = as_integer(worlds)
     if count is None:
         raise TypeError(f"Dynamics: worlds is {worlds!r}; expected an integer")
     if not 1 <= count <= MOST_WORLDS or scene.worlds not in (1, count):
@@ -470,7 +470,7 @@ def _world_count(scene: Scene, worlds: Any) -> int:
 
 
 def _variable_names(variable: Any) -> tuple[str, ...]:
-    names = names_of("Dynamics", "variable", variable, ("body_mass",))
+    names = as_names("Dynamics", "variable", variable, ("body_mass",))
     for name in names:
         if name not in VARIABLE:
             raise ValueError(f"Dynamics: variable names {name!r}; expected some of {', '.join(VARIABLE)}")

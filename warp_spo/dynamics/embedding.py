@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import UnsupportedError, whole
+from ..errors import UnsupportedError, as_integer
 from ..recursions.links import Links
 from ..recursions.loops.embedded import Embedded, Embedding
 from ..scene.parts import SCREWS, UNLIMITED
@@ -171,7 +171,7 @@ def _numbers(scene: Scene, asked: Sequence[int | str], call: str) -> set[int]:
     if not isinstance(asked, Sequence | np.ndarray) or isinstance(asked, str):
         raise TypeError(f"{call}: independent is {asked!r}; expected a list of dofs, indices or labels")
     for dof in asked:
-        number = labels.index(dof) if isinstance(dof, str) and dof in labels else whole(dof)
+        number = labels.index(dof) if isinstance(dof, str) and dof in labels else as_integer(dof)
         if number is None or not 0 <= number < scene.dof_count:
             raise ValueError(
                 f"{call}: independent names {dof!r}; expected dofs, 0 to {scene.dof_count - 1}, or labels "

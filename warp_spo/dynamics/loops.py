@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from ..arrays import Call
-from ..errors import UnsupportedError, whole
+from ..errors import UnsupportedError, as_integer
 from ..kernels import declare
 from ..kernels import loops as kernels
 from ..recursions.loops.embedded import Embedding
@@ -148,7 +148,7 @@ class Loops(Applications):
             self._check_closed(call)
             if hold and self.embedding is None:
                 raise UnsupportedError(call.name, "hold=True with loops='multipliers'", "use loops='embed'")
-            steps = whole(iterations)
+            steps = as_integer(iterations)
             if steps is None or steps < 0:
                 raise ValueError(f"{call.name}: iterations is {iterations!r}; expected how many Newton steps")
             both = out if isinstance(out, tuple | list) else (out, None)
@@ -266,7 +266,7 @@ class Loops(Applications):
             least = 4.0 * kernels.EPSILON[self.dtype]
         if status is not None:
             inputs = [q, qd, tau, body_f, out, margin, self.dtype(least)]
-            self.recursions.launch(kernels.word, self.worlds, inputs, [status])
+            self.recursions.launch(kernels.status_word, self.worlds, inputs, [status])
 
     def _launch(self, operation: str, out: wp.array, more: dict[str, wp.array] | None = None, **given: Any) -> None:
         if self.embedding is not None and operation in EMBEDDED:

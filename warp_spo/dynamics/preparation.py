@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from ..errors import names_of, whole
+from ..errors import as_integer, as_names
 from ..scene.scene import Scene
 from .adjoints import ARGUMENTS, OPTIONAL
 
@@ -123,7 +123,7 @@ class Preparation:
         if name == "b":
             if asked["columns"] is None:
                 return self._zeros(self.worlds, self._minimal)
-            columns = whole(asked["columns"])
+            columns = as_integer(asked["columns"])
             if columns is None or columns < 0:
                 raise ValueError(
                     f"Dynamics.prepare: columns is {asked['columns']!r}; expected how many right-hand sides"
@@ -136,9 +136,9 @@ class Preparation:
 
     def _prepare_product(self, product: str, options: dict[str, Any]) -> None:
         operation, way = product[:-4], product[-3:]
-        wrt = names_of("Dynamics.prepare", "wrt", options.pop("wrt", ()) if way == "vjp" else (), ("q", "qd"))
+        wrt = as_names("Dynamics.prepare", "wrt", options.pop("wrt", ()) if way == "vjp" else (), ("q", "qd"))
         default = ("dq", "dqd", f"d{ARGUMENTS[operation][2]}") if way == "jvp" else ()
-        along = names_of("Dynamics.prepare", "along", options.pop("along", default) if default else (), ("dq", "dqd"))
+        along = as_names("Dynamics.prepare", "along", options.pop("along", default) if default else (), ("dq", "dqd"))
         for name in along:
             if name not in (*default, "dbody_f"):
                 expected = ", ".join((*default, "dbody_f"))

@@ -9,15 +9,15 @@ import warp as wp
 
 from ..arrays import WARP, Call
 from ..execution.programs import Programs
-from ..execution.sweeps import Recursions
-from ..graph.algebra import Letters
-from ..graph.blocks import Blocks, Stored, memory
+from ..execution.sweeps import Sweeps
+from ..graph.algebra import LetterOwner
+from ..graph.blocks import Blocks, DeferredWeights, weights_array
 from ..graph.factorization import Factorization
 from ..graph.operators import BWA
 from ..kernels import kinematics, rigid_blocks
 
 
-class SpatialOperators(Letters):
+class SpatialOperators(LetterOwner):
     """phi, psi and their kin for all worlds; made by ``dyn.operators(q)``.
 
     Vectors over nodes are [world, sum of node sizes], body after body, each [omega; v] or [n; f] in the node frame (the
@@ -34,7 +34,7 @@ class SpatialOperators(Letters):
         P, D, D_inverse, G, K, E_psi, psi: see :class:`Factorization`.
     """
 
-    def __init__(self, recursions: Recursions, programs: Programs):
+    def __init__(self, recursions: Sweeps, programs: Programs):
         self._recursions, self._programs = recursions, programs
         scene, worlds, device, dtype = recursions.scene, recursions.worlds, recursions.device, recursions.dtype
         tree, nodes = scene.tree, range(scene.body_count)
@@ -42,10 +42,10 @@ class SpatialOperators(Letters):
         start = [0, *accumulate(m)]
         row = [int(scene.qd_start[h]) for h in scene.hinge_of]
 
-        def store(scalars: int) -> Stored:
-            return Stored(worlds, scalars, dtype, device)
+        def store(scalars: int) -> DeferredWeights:
+            return DeferredWeights(worlds, scalars, dtype, device)
 
-        def packed(sizes: list[int]) -> tuple[Stored, list[int]]:
+        def packed(sizes: list[int]) -> tuple[DeferredWeights, list[int]]:
             offsets = list(accumulate(sizes, initial=0))
             return store(offsets[-1]), offsets[:-1]
 
@@ -90,7 +90,7 @@ class SpatialOperators(Letters):
             derived.kind = self._kind
 
     def fill(self) -> None:
-        capturing, stamp = self._recursions.device.is_capturing, self._recursions.parameters.stamp
+        capturing, stamp = self._recursions.device.is_capturing, self._recursions.parameters.version
         if self._fused and (stamp is None or self._filled != stamp or self._captured or capturing):
             self._filled = None if capturing else stamp
             self._write_blocks(self._q)
@@ -102,7 +102,7 @@ class SpatialOperators(Letters):
         run.hinges(q)
         armature = run.parameters.field("joint_armature")
         inputs = [run.topology, f.tables, run.array("pose"), run.array("axis"), run.parameters.rigid, armature]
-        outputs = [memory(operator.stored) for operator in (self.E_phi, self.H, self.M, self.Delta)]
+        outputs = [weights_array(operator.stored) for operator in (self.E_phi, self.H, self.M, self.Delta)]
         run.launch_nodes(rigid_blocks.fill, run.nodes, inputs, outputs)
         f.update()
         run.launch_nodes(kinematics.body_poses, run.nodes, [run.world_poses(), None], [self._frames])

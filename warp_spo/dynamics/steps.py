@@ -9,7 +9,7 @@ import warp as wp
 
 from ..arrays import Call, check_plain
 from ..errors import UnsupportedError, is_bool
-from ..execution.sweeps import Recursions
+from ..execution.sweeps import Sweeps
 from ..kernels import combination, loops
 from ..recursions.impedance import DEFAULT_BOUND
 from ..recursions.loops.closed_step import NEWTON_STEPS
@@ -33,7 +33,7 @@ class Steps:
     worlds: int
     device: wp.Device
     dtype: type
-    recursions: Recursions
+    recursions: Sweeps
 
     @differentiable
     def step(
@@ -222,7 +222,7 @@ class Steps:
         if "status" in asked:
             left = self.recursions.array("closures open", self.worlds, 1)
             self._launch("closures_open", left, q=q_out, qd=qd_out)
-            self.recursions.launch(loops.opened, self.worlds, [left], [asked["status"]])
+            self.recursions.launch(loops.mark_open, self.worlds, [left], [asked["status"]])
 
     def _midpoint(self, call: Call, q: Any, qd: Any, q_out: Any, qd_out: Any, dt: float, **forces: Any) -> None:
         """The midpoint is a half step whose sweep and laws are taken at the midpoint itself."""

@@ -10,9 +10,9 @@ import warp as wp
 from ..kernels import native, straight
 from ..recursions.links import Links
 from ..trace.differentiation import reverse
-from ..trace.emission import Emitter, Store, literals
+from ..trace.emission import Emitter, Store, render
 from ..trace.scalars import ordered
-from .parameters import Derived, Parameters, spread
+from .parameters import Derived, Parameters, broadcast_worlds
 
 
 def table(parameters: Parameters, links: Links, name: str) -> wp.array:
@@ -26,7 +26,7 @@ def table(parameters: Parameters, links: Links, name: str) -> wp.array:
         inputs = [worlds, *(parameters.entries(source, worlds) for source in sources)]
         kernel = _kernel(name, values, sources, T)
         fill = lambda: wp.launch(kernel, worlds, inputs, [own], device=device)  # noqa: E731
-        return Derived([spread(own, 1, parameters.worlds)], sources, fill)
+        return Derived([broadcast_worlds(own, 1, parameters.worlds)], sources, fill)
 
     return parameters.derived(name, build)[0]
 
@@ -41,7 +41,7 @@ def _kernel(name: str, values: list, sources: list[str], T: type) -> wp.Kernel:
         late=sources,
     )
     listing = emitter.region([Store("out", (entry,), value) for entry, value in enumerate(values)])
-    text = straight.assemble_per_world(sources, literals(listing, "float64"))
+    text = straight.assemble_per_world(sources, render(listing, "float64"))
     arrays = [(source, 2) for source in sources] + [("out", 2)]
     return native.kernel(f"links_{name}", text, arrays, T, wide=tuple(sources))
 
@@ -80,6 +80,6 @@ def _reverse_kernel(stores: list[Store], sources: list[str], size: int, sizes: d
         return f"{array}_bar.data[world * {sizes[array]} + {entry}] = ({straight.C_TYPE[T]})({value});"
 
     emitter = Emitter("float64", load, store, lambda array, index: index[0], late=(*sources, "cotangent"))
-    text = straight.assemble_per_world(sources, literals(emitter.region(stores), "float64"))
+    text = straight.assemble_per_world(sources, render(emitter.region(stores), "float64"))
     arrays = [(source, 2) for source in sources] + [("cotangent", 2)] + [(f"{name}_bar", 2) for name in sizes]
     return native.kernel("links_reverse", text, arrays, T, wide=tuple(sources))

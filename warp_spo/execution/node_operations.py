@@ -1,6 +1,6 @@
 """The operations at node granularity: each a row of sweeps, a launch a level; they serve every scene.
 
-``run`` is the scene's :class:`Recursions`; arrays are Warp's, [world, ...], absent ones None.
+``run`` is the scene's :class:`Sweeps`; arrays are Warp's, [world, ...], absent ones None.
 """
 
 from __future__ import annotations
@@ -10,12 +10,10 @@ from typing import Any
 import warp as wp
 
 from ..kernels import articulated, kinematics
-from .sweeps import Recursions
+from .sweeps import Sweeps
 
 
-def forward_dynamics(
-    run: Recursions, out: wp.array, q: Any, qd: Any = None, tau: Any = None, body_f: Any = None
-) -> None:
+def forward_dynamics(run: Sweeps, out: wp.array, q: Any, qd: Any = None, tau: Any = None, body_f: Any = None) -> None:
     run.hinges(q, qd)
     force = None
     if qd is not None or body_f is not None:
@@ -27,52 +25,52 @@ def forward_dynamics(
 
 
 def inverse_dynamics(
-    run: Recursions, out: wp.array, q: Any, qd: Any = None, qdd: Any = None, body_f: Any = None, gravity: bool = True
+    run: Sweeps, out: wp.array, q: Any, qd: Any = None, qdd: Any = None, body_f: Any = None, gravity: bool = True
 ) -> None:
     run.hinges(q, qd)
     force = run.body_forces(*run.accelerations(qdd, qd is not None, gravity), body_f)
     run.hinge_forces(qdd, force, out)
 
 
-def mass_matrix(run: Recursions, out: wp.array, q: wp.array) -> None:
+def mass_matrix(run: Sweeps, out: wp.array, q: wp.array) -> None:
     run.hinges(q)
     run.mass_matrix(out)
 
 
-def mass_matrix_inverse(run: Recursions, out: wp.array, q: wp.array) -> None:
+def mass_matrix_inverse(run: Sweeps, out: wp.array, q: wp.array) -> None:
     run.hinges(q)
     run.factor()
     run.sandwich(None, run.scene.dof_count, out)
 
 
-def solve_mass_matrix(run: Recursions, out: wp.array, q: wp.array, b: wp.array) -> None:
+def solve_mass_matrix(run: Sweeps, out: wp.array, q: wp.array, b: wp.array) -> None:
     run.hinges(q)
     run.factor()
     run.solve(b, out)
 
 
-def log_det_mass_matrix(run: Recursions, out: wp.array, q: wp.array) -> None:
+def log_det_mass_matrix(run: Sweeps, out: wp.array, q: wp.array) -> None:
     run.hinges(q)
     run.launch_nodes(articulated.log_determinant, run.worlds, [run.factor()], [out])
 
 
-def body_poses(run: Recursions, out: wp.array, q: wp.array) -> None:
+def body_poses(run: Sweeps, out: wp.array, q: wp.array) -> None:
     run.hinges(q)
     run.launch_nodes(kinematics.body_poses, run.nodes, [run.world_poses(), run.parameters.anchor], [out])
 
 
-def body_velocities(run: Recursions, out: wp.array, q: wp.array, qd: wp.array) -> None:
+def body_velocities(run: Sweeps, out: wp.array, q: wp.array, qd: wp.array) -> None:
     run.hinges(q, qd)
     inputs = [run.world_poses(), run.parameters.com, run.velocities()]
     run.launch_nodes(kinematics.body_velocities, run.nodes, inputs, [out])
 
 
-def jacobian(run: Recursions, out: wp.array, q: wp.array, frames: tuple) -> None:
+def jacobian(run: Sweeps, out: wp.array, q: wp.array, frames: tuple) -> None:
     run.hinges(q)
     run.jacobian(*run.frames(frames), out)
 
 
-def operational_inertia_inverse(run: Recursions, out: wp.array, q: wp.array, frames: tuple) -> None:
+def operational_inertia_inverse(run: Sweeps, out: wp.array, q: wp.array, frames: tuple) -> None:
     rows, dofs = 6 * len(frames), run.scene.dof_count
     run.hinges(q)
     J = run.array(("jacobian", len(frames)), run.worlds, len(frames), 6, dofs)

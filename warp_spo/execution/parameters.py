@@ -16,7 +16,7 @@ from ..kernels import parameters as kernels
 from ..kernels.spatial import POSE, RIGID
 from ..kernels.topology import Topology
 from ..scene.scene import Scene
-from .node_steps import steps
+from .node_functions import node_functions
 
 VARIABLE = (
     "body_mass",
@@ -35,7 +35,7 @@ VARIABLE = (
 RIGID_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c")
 
 
-def spread(array: wp.array, axis: int, worlds: int) -> wp.array:
+def broadcast_worlds(array: wp.array, axis: int, worlds: int) -> wp.array:
     """``array`` with its world axis, of length 1 or ``worlds``, seen as ``worlds`` long; no copy."""
     if array.shape[axis] == worlds:
         return array
@@ -70,20 +70,20 @@ class Parameters:
         self._hinge_of: Any = wp.array(scene.hinge_of, dtype=int, device=device)
         self._derived: dict[str, Derived] = {}
         self._captured = False
-        self._stamp = 0
+        self._version = 0
         self._sharers: list[Parameters] = []
         self._values: dict[str, wp.array] = {}
         for name, value in scene.values.items():
             own: Any = wp.array(value, dtype=wp.float64, device=device)
             if name in variable:
                 shared, own = own, wp.empty((worlds, *value.shape[1:]), dtype=wp.float64, device=device)
-                wp.copy(own, spread(shared, 0, worlds))
+                wp.copy(own, broadcast_worlds(shared, 0, worlds))
             self._values[name] = own
 
     @property
-    def stamp(self) -> int | None:
+    def version(self) -> int | None:
         """Equal as long as no value has changed; None if a graph may change them unseen."""
-        return None if self._captured else self._stamp
+        return None if self._captured else self._version
 
     def derived(self, key: str, build: Callable[[], Derived]) -> list[wp.array]:
         """The arrays of that name; ``build()`` allocates them at the first request."""
@@ -103,21 +103,21 @@ class Parameters:
         """Newton's numbers as [entry, world], float64; no copy."""
         value = self._values[name]
         flat = value.reshape((value.shape[0], math.prod(value.shape[1:])))
-        return spread(flat.transpose(), 1, worlds)
+        return broadcast_worlds(flat.transpose(), 1, worlds)
 
     def _bodies(self) -> list:
         """tree, anchor, com, rigid: see :mod:`warp_spo.kernels.parameters`, [node, component, world]."""
 
         def build() -> Derived:
             scene, worlds = self.scene, self.rows(RIGID_VALUES)
-            values = [spread(self._values[name], 0, worlds) for name in RIGID_VALUES]
+            values = [broadcast_worlds(self._values[name], 0, worlds) for name in RIGID_VALUES]
             own: list = [
                 wp.empty((scene.body_count, components, worlds), dtype=self.dtype, device=self.device)
                 for components in (POSE, POSE, 3, RIGID)
             ]
             inputs, dim = [self._topology, self._hinge_of, *values], (scene.body_count, worlds)
-            fill = lambda: wp.launch(kernels.derive(steps(self.dtype)), dim, inputs, own, device=self.device)  # noqa: E731
-            return Derived([spread(array, 2, self.worlds) for array in own], RIGID_VALUES, fill)
+            fill = lambda: wp.launch(kernels.derive(node_functions(self.dtype)), dim, inputs, own, device=self.device)  # noqa: E731
+            return Derived([broadcast_worlds(array, 2, self.worlds) for array in own], RIGID_VALUES, fill)
 
         return self.derived("bodies", build)
 
@@ -143,9 +143,9 @@ class Parameters:
         def build() -> Derived:
             value = self._values[name]
             own: Any = wp.empty(value.shape[::-1], dtype=self.dtype, device=self.device)
-            kernel = kernels.transpose(steps(self.dtype))
+            kernel = kernels.transpose(node_functions(self.dtype))
             fill = lambda: wp.launch(kernel, own.shape, [value], [own], device=self.device)  # noqa: E731
-            return Derived([spread(own, 1, self.worlds)], (name,), fill)
+            return Derived([broadcast_worlds(own, 1, self.worlds)], (name,), fill)
 
         return self.derived(name, build)[0]
 
@@ -167,9 +167,9 @@ class Parameters:
         if value.ndim == own.ndim:
             flat = value.reshape((self.worlds, size))
         else:
-            flat = spread(value.reshape((1, size)), 0, self.worlds)
+            flat = broadcast_worlds(value.reshape((1, size)), 0, self.worlds)
         wp.launch(
-            kernels.widen(steps(self.dtype)),
+            kernels.widen(node_functions(self.dtype)),
             dim=(self.worlds, size),
             inputs=[flat],
             outputs=[own.reshape((self.worlds, size))],
@@ -180,7 +180,7 @@ class Parameters:
         """Take over the variable values of ``other``."""
         for name in self.variable:
             wp.copy(self._values[name], other._values[name])
-        self._stamp = other._stamp
+        self._version = other._version
         self.refresh(self.variable)
 
     def share(self, other: Parameters) -> None:
@@ -194,7 +194,7 @@ class Parameters:
         for sharer in self._sharers:
             sharer.refresh(names)
         self._captured |= bool(self.device.is_capturing)
-        self._stamp += 1
+        self._version += 1
         for found in self._derived.values():
             if any(name in found.of for name in names):
                 found.fill()

@@ -23,11 +23,11 @@ from ..recursions.messages import INWARD, OUTWARD, SENDS
 from ..recursions.operators import meet, written
 from ..recursions.pieces import Pieces
 from ..recursions.step import GAIN, GUESS, LOOPED, MISSED, by_pieces
-from ..trace.emission import PREFIX, Angles, Emitter, Store, literals
+from ..trace.emission import PREFIX, Emitter, RangeReduction, Store, render
 from . import link_values, staging
 from .plan import MOST_WARPS, SHARED, TREE_ONLY, Plan
 from .staging import FIELDS
-from .sweeps import Recursions
+from .sweeps import Sweeps
 from .teams import Passes, Team, Work
 
 TRACED = (
@@ -89,7 +89,7 @@ class Programs:
         relays: what is too long for shared memory waits in the rows of the result.
     """
 
-    def __init__(self, run: Recursions, plan: Plan):
+    def __init__(self, run: Sweeps, plan: Plan):
         self.run, self.plan = run, plan
         self.relays = run.device.is_cuda
         self._programs: dict[Any, Program | None] = {}
@@ -206,7 +206,7 @@ class Programs:
         placed += apart
         emitter, looped = self._emitter(shapes, layout), [item for item in stores if item.array in LOOPED]
         regions = [emitter.region([], trace.ahead), emitter.branch(looped)] if looped else []
-        *before, body = (literals(each, self.run.dtype.__name__) for each in [*regions, emitter.region(placed)])
+        *before, body = (render(each, self.run.dtype.__name__) for each in [*regions, emitter.region(placed)])
         if looped:
             ahead, a_pass = before
             body = straight.repeat_passes(ahead, a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
@@ -325,7 +325,8 @@ class Programs:
 
     def _emitter(self, shapes: dict, layout: KernelLayout) -> Emitter:
         result = layout.result
-        angles = Angles.IN_PLACE if layout.staged else Angles.AGAIN if layout.retries else Angles.FIRST
+        angles = RangeReduction.AGAIN if layout.retries else RangeReduction.FIRST
+        angles = RangeReduction.IN_PLACE if layout.staged else angles
         guard = "if (mine) " if result.way == DIRECT else ""
 
         def load(array: str, entry: str) -> str:

@@ -9,11 +9,11 @@ import warp as wp
 from ..kernels import declare
 from ..kernels import status as kernels
 from ..kernels.spatial import ARTICULATED
-from .sweeps import Recursions
+from .sweeps import Sweeps
 
 
 def write(
-    run: Recursions, q: wp.array, qd: Any, tau: Any, body_f: Any, qdd: wp.array, status: wp.array, factored: bool
+    run: Sweeps, q: wp.array, qd: Any, tau: Any, body_f: Any, qdd: wp.array, status: wp.array, factored: bool
 ) -> None:
     """Fill ``status`` [world] for forward dynamics that has just run: one sweep inward, and a launch over the worlds.
 
@@ -21,7 +21,7 @@ def write(
     recursion that keeps them elsewhere the factorisation is swept now. What that loses bounds what the other form
     loses, whose hinges lie along axes.
     """
-    declare(kernels, run.steps)
+    declare(kernels, run.functions)
     if not factored:
         run.hinges(q)
         run.factor()
@@ -31,9 +31,9 @@ def write(
     lost = run.array("lost", dofs, run.worlds)
     factors = [run.array(name) for name in ("articulated", "gain", "pivot")]
     inputs = [p.tree, pose, axis, p.rigid, armature, *factors]
-    kernel = kernels.digits(run.steps)
+    kernel = kernels.lost_digits(run.functions)
     for first, count in run.plan.inward:
         arguments = [run.topology, first, *inputs]
         wp.launch(kernel, (count, run.worlds), arguments, [rounding, lost], device=run.device)
     values = [p.tree, p.com, p.rigid, armature, p.gravity]
-    run.launch_nodes(kernels.word, run.worlds, [q, qd, tau, body_f, *values, lost, qdd], [status])
+    run.launch_nodes(kernels.status_word, run.worlds, [q, qd, tau, body_f, *values, lost, qdd], [status])

@@ -17,26 +17,26 @@ from ..kernels import articulated, composite, declare, kinematics, newton_euler,
 from ..kernels.spatial import ARTICULATED, MOTION, POSE, RIGID
 from ..kernels.topology import Topology
 from ..scene.scene import Scene
-from .node_steps import steps
+from .node_functions import node_functions
 from .parameters import Parameters
 from .plan import Plan
 
 
-class Recursions:
+class Sweeps:
     """Launches of one scene's recursions.
 
     Attributes:
         topology: the tree's tables on the device.
         parameters: the scene's values on the device.
-        steps: what kernels at node granularity do at a node.
+        functions: the functions that kernels at node granularity call at a node.
     """
 
     def __init__(self, scene: Scene, plan: Plan, device: wp.Device, dtype: type, variable: tuple[str, ...]):
         self.scene, self.plan, self.device, self.dtype = scene, plan, device, dtype
-        self.steps = steps(dtype)
+        self.functions = node_functions(dtype)
         declare(tiles, dtype)
         for file in (parameters, kinematics, newton_euler, articulated, composite, rigid_blocks):
-            declare(file, self.steps)
+            declare(file, self.functions)
         self.worlds = plan.worlds
         self.topology = _topology(scene, device)
         screw = np.column_stack([scene.dof_axis, scene.dof_angular, scene.dof_linear])
@@ -77,12 +77,12 @@ class Recursions:
         wp.launch(factory(self.dtype), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def launch_nodes(self, factory: Callable, dim: Any, inputs: list, outputs: list) -> None:
-        """Launch a kernel that takes the steps."""
-        wp.launch(factory(self.steps), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+        """Launch a kernel whose factory takes the node functions."""
+        wp.launch(factory(self.functions), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def _sweep(self, factory: Callable, levels: Sequence[tuple[int, int]], inputs: list, outputs: list) -> None:
         """One launch a level, one thread for each (node, world)."""
-        kernel = factory(self.steps)
+        kernel = factory(self.functions)
         for first, count in levels:
             arguments = [self.topology, first, *inputs]
             wp.launch(kernel, (count, self.worlds), arguments, outputs, device=self.device)
@@ -91,7 +91,7 @@ class Recursions:
         self, factory: Callable, levels: Sequence, columns: tuple[int, int], inputs: list, outputs: list
     ) -> None:
         """One launch a level, one thread for each (node, column, world); ``columns`` = (first, count)."""
-        kernel = factory(self.steps)
+        kernel = factory(self.functions)
         for first, count in levels:
             arguments = [self.topology, first, columns[0], *inputs]
             wp.launch(kernel, (count, columns[1], self.worlds), arguments, outputs, device=self.device)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from ..kernels import straight
 from ..recursions.pieces import Piece, Pieces
-from ..trace.emission import C_TYPE, Listing, filled, literal, literals
+from ..trace.emission import C_TYPE, Listing, fill_in, literal, render
 
 BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
 CACHED = 8192  # operations of a world whose code an instruction cache holds
@@ -94,10 +94,10 @@ class Team:
         for stage in range(self._last + 1):
             for piece in reversed(self.pieces.pieces):
                 if piece.inward == stage:
-                    text.append(literals(self._work[piece.index].inward, self.dtype, f"p{piece.index}_"))
+                    text.append(render(self._work[piece.index].inward, self.dtype, f"p{piece.index}_"))
             for piece in self.pieces.pieces:
                 if piece.outward == stage:
-                    text.append(literals(self._work[piece.index].outward, self.dtype, f"p{piece.index}_"))
+                    text.append(render(self._work[piece.index].outward, self.dtype, f"p{piece.index}_"))
                     if self._work[piece.index].check.text:
                         text.append(self._branch(piece, self._work[piece.index].check))
                     (later if self.passes else text).append(self._branch(piece, self._work[piece.index].news))
@@ -109,7 +109,7 @@ class Team:
         return "\n".join(text + later)
 
     def _branch(self, piece: Piece, listing: Listing) -> str:
-        return "\n".join(["{", literals(listing, self.dtype, f"p{piece.index}_"), "}"])
+        return "\n".join(["{", render(listing, self.dtype, f"p{piece.index}_"), "}"])
 
     def cuda(self) -> str:
         """A branch for each kind of leaf piece, which its warps enter together."""
@@ -258,7 +258,7 @@ class Team:
             names = [", ".join(dict.fromkeys(label)) for label in zip(*(x.labels for x in listings), strict=True)]
             numbers = [constant(values) for values in zip(*(x.constants for x in listings), strict=True)]
             entries = [entry(found) for found in zip(*(x.indices for x in listings), strict=True)]
-            texts.append(filled(listings[0], numbers, entries, names, prefix))
+            texts.append(fill_in(listings[0], numbers, entries, names, prefix))
         head = []
         if constants.columns or shifts.columns:
             head.append(f"const int {tables}who = {who};")

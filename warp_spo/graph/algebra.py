@@ -2,7 +2,7 @@
 
 An operator maps ``x`` [world, columns] to [world, rows], each world by itself. ``H @ phi @ M @ phi.T @ H.T`` computes
 nothing; ``that @ x`` applies the factors from the right, each by its own kernels, and no matrix is formed. Where all
-letters belong to one :class:`Letters`, it may apply the whole in one kernel instead.
+letters belong to one :class:`LetterOwner`, it may apply the whole in one kernel instead.
 """
 
 import abc
@@ -37,7 +37,7 @@ class Workspace:
         return self._arrays[key][1]
 
 
-class Letters(abc.ABC):
+class LetterOwner(abc.ABC):
     """Whoever owns the numbers of operators that bear letters, and may know of faster ways to apply expressions."""
 
     @abc.abstractmethod
@@ -60,11 +60,11 @@ class Operator(abc.ABC):
         worlds: number of worlds; 1 = the same matrix in every world, for any number of worlds.
         device, dtype: where and in what it computes; arrays it meets must agree.
         kind: kind of array that :meth:`dense` returns; None = NumPy.
-        letter: (:class:`Letters`, name), for operators that belong to one.
+        letter: (:class:`LetterOwner`, name), for operators that belong to one.
         form, operands: what a composed operator is made of.
     """
 
-    letter: "tuple[Letters, str] | None" = None
+    letter: "tuple[LetterOwner, str] | None" = None
     form: tuple = ()
     operands: "tuple[Operator, ...]" = ()
     __array_ufunc__ = None  # NumPy hands array @ op and array + op to the operator
@@ -87,7 +87,7 @@ class Operator(abc.ABC):
         return None if not self.form or None in parts else (*self.form, *parts)
 
     @functools.cached_property
-    def letters(self) -> "tuple[Letters, ...]":
+    def letters(self) -> "tuple[LetterOwner, ...]":
         """Who owns the letters of the operator."""
         own = () if self.letter is None else (self.letter[0],)
         return tuple(dict.fromkeys([*own, *(owner for operand in self.operands for owner in operand.letters)]))

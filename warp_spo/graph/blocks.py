@@ -17,8 +17,8 @@ from ..kernels import block_sparse
 from .algebra import Operator
 
 
-class Stored:
-    """Room for the blocks of an operator [world, scalar], taken when it is first asked for; see :func:`storage`."""
+class DeferredWeights:
+    """Room for the blocks of an operator [world, scalar], taken when it is first asked for; see :func:`new_weights`."""
 
     ndim = 2
 
@@ -27,12 +27,12 @@ class Stored:
 
     @functools.cached_property
     def array(self) -> wp.array:
-        return storage(*self.shape, self.dtype, self.device)
+        return new_weights(*self.shape, self.dtype, self.device)
 
 
-def memory(weights: Any) -> wp.array:
-    """The array of weights that may be :class:`Stored`."""
-    return weights.array if isinstance(weights, Stored) else weights
+def weights_array(weights: Any) -> wp.array:
+    """The array of weights that may be :class:`DeferredWeights`."""
+    return weights.array if isinstance(weights, DeferredWeights) else weights
 
 
 class Table:
@@ -97,7 +97,7 @@ class Blocks(Operator):
         shape: (rows, columns).
         places: (row start, column start, rows, columns) of each block. Blocks that overlap add.
         weights: [world or 1, scalar], a Warp array on the device; the blocks lie in it row-major. Any strides. It is
-            kept, not copied: what is written into it later is what the operator applies. Or :class:`Stored`.
+            kept, not copied: what is written into it later is what the operator applies. Or :class:`DeferredWeights`.
         offsets: first scalar of each block in ``weights``; one after the other unless given.
         kind: kind of array that :meth:`dense` returns.
 
@@ -142,16 +142,16 @@ class Blocks(Operator):
     def weights(self) -> wp.array:
         """[world or 1, scalar], up to date."""
         self._fill()
-        return memory(self.stored)
+        return weights_array(self.stored)
 
     def _apply(self, x, out, alpha, accumulate, space):
-        self._forward.gather(memory(self.stored), x, out, alpha, accumulate)
+        self._forward.gather(weights_array(self.stored), x, out, alpha, accumulate)
 
     def _apply_transposed(self, x, out, alpha, accumulate, space):
-        self._transposed.gather(memory(self.stored), x, out, alpha, accumulate)
+        self._transposed.gather(weights_array(self.stored), x, out, alpha, accumulate)
 
 
-def storage(worlds: int, scalars: int, dtype: type, device: wp.Device) -> wp.array:
+def new_weights(worlds: int, scalars: int, dtype: type, device: wp.Device) -> wp.array:
     """Zeros [world, scalar] for the blocks of an operator, one scalar or more; worlds are neighbours in memory.
 
     Kernels have one thread a world side by side, whether they write the blocks or apply them.
@@ -203,7 +203,7 @@ def pack(
         )
     worlds = counts.pop() if counts else 1
     total = sum(rows * columns for rows, columns in sizes)
-    weights = storage(worlds, total, dtype, device)
+    weights = new_weights(worlds, total, dtype, device)
     scalar = wp.types.type_size_in_bytes(dtype)
     with Call(call, device, dtype) as border:
         offset = 0
@@ -231,7 +231,11 @@ def pack(
 
 def place_offsets(call: str, sizes: Sequence, weights: wp.array, offsets: Sequence[int] | None) -> tuple[int, ...]:
     """Return the first scalar of each block in ``weights``, checked."""
-    if not isinstance(weights, wp.array | Stored) or weights.ndim != 2 or weights.dtype not in (wp.float32, wp.float64):
+    if (
+        not isinstance(weights, wp.array | DeferredWeights)
+        or weights.ndim != 2
+        or weights.dtype not in (wp.float32, wp.float64)
+    ):
         raise ValueError(
             f"{call}: weights is {getattr(weights, 'shape', type(weights).__name__)}; expected a Warp array "
             f"[world or 1, scalar] of float32 or float64"

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..execution.parameters import spread
+from ..execution.parameters import broadcast_worlds
 from ..kernels import factorization as kernels
 from ..scene.tree import Tree
-from .blocks import Blocks, memory, storage
+from .blocks import Blocks, new_weights, weights_array
 from .operators import BWA
 
 
@@ -67,11 +67,11 @@ class Factorization:
         self.worlds = max(operator.worlds for operator in (E_phi, H, M, *([Delta] if Delta else [])))
         self.device, self.dtype = E_phi.device, E_phi.dtype
 
-        packed = store or (lambda scalars: storage(self.worlds, scalars, self.dtype, self.device))
+        packed = store or (lambda scalars: new_weights(self.worlds, scalars, self.dtype, self.device))
 
         N, dofs, kind = E_phi.shape[0], H.shape[0], E_phi.kind
         if Delta is None:
-            zero = storage(1, pivot_offsets[-1], self.dtype, self.device)
+            zero = new_weights(1, pivot_offsets[-1], self.dtype, self.device)
             Delta = Blocks((dofs, dofs), pivot_places, zero, pivot_offsets[:-1], kind)
         _check_places("Delta", Delta, pivot_places)
         self.E_phi, self.H, self.M, self.Delta = E_phi, H, M, Delta
@@ -102,8 +102,11 @@ class Factorization:
 
     def update(self) -> None:
         """Compute P, D, G and E_psi anew; launches only."""
-        inputs = [spread(memory(op.stored), 0, self.worlds) for op in (self.E_phi, self.H, self.M, self.Delta)]
-        outputs = [memory(op.stored) for op in (self.P, self.D, self.D_inverse, self.G, self.E_psi)]
+        inputs = [
+            broadcast_worlds(weights_array(op.stored), 0, self.worlds)
+            for op in (self.E_phi, self.H, self.M, self.Delta)
+        ]
+        outputs = [weights_array(op.stored) for op in (self.P, self.D, self.D_inverse, self.G, self.E_psi)]
         first = self.E_phi.graph.node_count
         for level in reversed(self.E_phi.graph.levels):
             first -= len(level)
@@ -111,7 +114,7 @@ class Factorization:
                 kernels.factorize(self.dtype),
                 dim=(len(level), self.worlds),
                 inputs=[self.tables, first, *inputs],
-                outputs=[*outputs, *map(memory, self._scratch)],
+                outputs=[*outputs, *map(weights_array, self._scratch)],
                 device=self.device,
             )
 

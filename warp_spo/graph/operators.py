@@ -12,10 +12,10 @@ from itertools import accumulate
 import warp as wp
 
 from ..arrays import WARP
-from ..errors import whole
+from ..errors import as_integer
 from ..scene.tree import Digraph, Tree
 from .algebra import Identity, Operator, Product, Scaled, Sum, Transpose, add_scaled
-from .blocks import Blocks, Stored, Table, choose_memory, matrix_size, memory, pack, place_offsets
+from .blocks import Blocks, DeferredWeights, Table, choose_memory, matrix_size, pack, place_offsets, weights_array
 
 __all__ = ["BWA", "Blocks", "Identity", "Operator", "Product", "Resolvent", "Scaled", "Sum", "Transpose"]
 
@@ -56,7 +56,7 @@ class BWA(Operator):
         cls,
         graph: Tree | Digraph,
         dims: Sequence[int],
-        weights: wp.array | Stored,
+        weights: wp.array | DeferredWeights,
         offsets: Sequence[int] | None = None,
         kind: str | None = WARP,
     ) -> "BWA":
@@ -94,16 +94,16 @@ class BWA(Operator):
     def weights(self) -> wp.array:
         """[world or 1, scalar], the blocks row-major, up to date."""
         self._fill()
-        return memory(self.stored)
+        return weights_array(self.stored)
 
     def _rows(self, node):
         return range(self.starts[node], self.starts[node + 1])
 
     def _apply(self, x, out, alpha, accumulate, space):
-        self._up.gather(memory(self.stored), x, out, alpha, accumulate)
+        self._up.gather(weights_array(self.stored), x, out, alpha, accumulate)
 
     def _apply_transposed(self, x, out, alpha, accumulate, space):
-        self._down.gather(memory(self.stored), x, out, alpha, accumulate)
+        self._down.gather(weights_array(self.stored), x, out, alpha, accumulate)
 
     def resolvent(self) -> "Resolvent":
         """A = (I - E)^-1."""
@@ -111,7 +111,7 @@ class BWA(Operator):
 
     def power(self, exponent: int) -> Operator:
         """E^exponent: blocks are products of weights along the paths of that length (Lemma 1). 0 gives the identity."""
-        count = whole(exponent)
+        count = as_integer(exponent)
         if count is None or count < 0:
             raise ValueError(
                 f"BWA.power: exponent is {exponent!r}; expected 0 or more, an integer; E has no inverse, its resolvent "
@@ -147,7 +147,7 @@ class Resolvent(Operator):
     def _sweep(self, table, x, out, alpha, accumulate, space):
         # The sweep reads what it has written, so it cannot run on top of other terms of a sum.
         y = space.take(self, self.shape[0]) if accumulate else out
-        table.sweep(memory(self.E.stored), x, y, alpha)
+        table.sweep(weights_array(self.E.stored), x, y, alpha)
         if accumulate:
             add_scaled(y, out, 1.0, True)
 
@@ -164,7 +164,7 @@ class Resolvent(Operator):
     def block(self, i: int, j: int):
         """Return A(i, j) [world, m_i, m_j], the weight between distant nodes (eq. 7), in the kind of the weights."""
         for name, node in (("i", i), ("j", j)):
-            number = whole(node)
+            number = as_integer(node)
             if number is None or not 0 <= number < self.E.graph.node_count:
                 raise ValueError(
                     f"Resolvent.block: {name} is {node!r}; expected a node, 0 to {self.E.graph.node_count - 1}"
@@ -202,7 +202,7 @@ def _node_dims(graph, labels, sizes, dims) -> tuple[int, ...]:
         if len(dims) != graph.node_count:
             raise ValueError(f"BWA: {len(dims)} dims; expected {graph.node_count}, one a node")
         for node, size in enumerate(dims):
-            number = whole(size)
+            number = as_integer(size)
             if number is None or number < 1:
                 raise ValueError(f"BWA: dims[{node}] is {size!r}; expected 1 or more, an integer")
             found[node] = number, f"dims[{node}]"

@@ -15,7 +15,7 @@ from newton.solvers import SolverBase
 
 from ..dynamics.dynamics import Dynamics
 from ..dynamics.steps import INTEGRATORS
-from ..errors import UnsupportedError, names_of, whole
+from ..errors import UnsupportedError, as_integer, as_names
 from ..kernels import declare, exchange
 from ..scene.parts import DOF_VALUES, FREE
 from ..scene.scene import Scene
@@ -115,7 +115,7 @@ class SolverSPO(Plugs, SolverBase):
     ):
         if not hasattr(model, "particle_count"):
             raise TypeError(f"SolverSPO: model is of type {type(model).__name__}; expected a newton.Model")
-        self._asked = names_of("SolverSPO", "variable", variable, ("body_mass",))
+        self._asked = as_names("SolverSPO", "variable", variable, ("body_mass",))
         super().__init__(model)
         if integrator not in INTEGRATORS:
             raise ValueError(f"SolverSPO: integrator is {integrator!r}; expected one of {', '.join(INTEGRATORS)}")
@@ -447,7 +447,7 @@ def _check_state(call: str, name: str, state: Any) -> None:
 
 
 def _flags(call: str, kind: type, flags: Any) -> int:
-    bits = whole(flags)
+    bits = as_integer(flags)
     if bits is None:
         raise TypeError(f"{call}: flags is {flags!r}; expected newton.{kind.__name__}, or an integer of their bits")
     return bits

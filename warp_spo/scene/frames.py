@@ -1,4 +1,4 @@
-"""Frames on bodies: what :meth:`Dynamics.jacobian` and its kin take, checked."""
+"""Frames on bodies: what :meth:`Dynamics.jacobian` and its kin take, check_frames."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..arrays import check_plain
-from ..errors import refuse_masked, whole
+from ..errors import as_integer, refuse_masked
 from .parts import IDENTITY_POSE, real
 from .scene import Scene
 
 Frame = Any  # a body (index, label, or what is behind a label's last slash), or (body, pose in the body)
 
 
-def checked(scene: Scene, call: str, frames: Sequence[Frame]) -> tuple[tuple[int, tuple[float, ...]], ...]:
+def check_frames(scene: Scene, call: str, frames: Sequence[Frame]) -> tuple[tuple[int, tuple[float, ...]], ...]:
     """Body and origin in the body frame of every frame.
 
     Raises:
@@ -23,10 +23,10 @@ def checked(scene: Scene, call: str, frames: Sequence[Frame]) -> tuple[tuple[int
     """
     if isinstance(frames, str) or not isinstance(frames, Sequence) or len(frames) == 0:
         raise ValueError(f"{call}: frames is {frames!r}; expected a list of bodies or of (body, pose in the body)")
-    return tuple(_checked(scene, call, frame) for frame in frames)
+    return tuple(_check_frame(scene, call, frame) for frame in frames)
 
 
-def _checked(scene: Scene, call: str, frame: Frame) -> tuple[int, tuple[float, ...]]:
+def _check_frame(scene: Scene, call: str, frame: Frame) -> tuple[int, tuple[float, ...]]:
     body, pose = frame if isinstance(frame, tuple | list) and len(frame) == 2 else (frame, IDENTITY_POSE)
     labels = scene.body_labels
     if isinstance(body, str):
@@ -41,7 +41,7 @@ def _checked(scene: Scene, call: str, frame: Frame) -> tuple[int, tuple[float, .
                 f"{call}: {len(found)} bodies have the label {body!r}; expected one; pass the body's index"
             )
         body = found[0]
-    index = whole(body)
+    index = as_integer(body)
     if index is None:
         raise _wrong(call, frame)
     if not 0 <= index < len(labels):

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import DirectedLoopError, whole
+from ..errors import DirectedLoopError, as_integer
 
 
 def _index(call: str, what: str, value: Any, low: int, high: int) -> int:
-    index = whole(value)
+    index = as_integer(value)
     if index is None:
         raise TypeError(f"{call}: {what} is {value!r}; expected an integer")
     if not low <= index < high:

@@ -62,7 +62,7 @@ class Listing(NamedTuple):
     labels: list[str]
 
 
-class Angles(enum.Enum):
+class RangeReduction(enum.Enum):
     """Where turns are taken off: in the rows, in shared memory; before the work; or, if need be, in a second try."""
 
     IN_PLACE, FIRST, AGAIN = range(3)
@@ -89,7 +89,7 @@ class Emitter:
         load: Callable[[str, str], str],
         store: Callable[[str, str, str], str],
         flat: Callable[[str, tuple], int],
-        angles: Angles = Angles.FIRST,
+        angles: RangeReduction = RangeReduction.FIRST,
         late: Iterable[str] = (),
     ):
         self.dtype, self._load, self._store, self._flat = dtype, load, store, flat
@@ -159,16 +159,16 @@ class Emitter:
         places, lines = [], []
         for scalar in angles.values():
             place = self._load(scalar.args[0], self._entry(scalar.args[0], scalar.args[1:]))
-            if self._angles is not Angles.IN_PLACE:
+            if self._angles is not RangeReduction.IN_PLACE:
                 name = self._name(scalar, "x")
                 lines.append(f"{T} {name} = {place};")
                 place = name
             places.append(place)
         reduced = [*(f"    {place} = on::reduced({place});" for place in places), "}"]
-        farthest = "farthest" if self._angles is Angles.AGAIN else f"{PREFIX}farthest"
+        farthest = "farthest" if self._angles is RangeReduction.AGAIN else f"{PREFIX}farthest"
         largest = [f"{T} {farthest} = 0;"]
         largest += [f"{farthest} = max({farthest}, on::absolute({place}));" for place in places]
-        if self._angles is Angles.AGAIN:
+        if self._angles is RangeReduction.AGAIN:
             guard = [*largest, "if (again) {", *reduced]
         else:
             guard = [*largest, f"if ({farthest} > on::reach()) {{", *reduced]
@@ -233,13 +233,13 @@ class Emitter:
         return [f"const {T} {name} = on::{op}({', '.join(texts)});"]
 
 
-def filled(listing: Listing, constants: list[str], indices: list[str], labels: list[str], prefix: str = "") -> str:
-    """The statements of a listing with what it leaves open filled in."""
+def fill_in(listing: Listing, constants: list[str], indices: list[str], labels: list[str], prefix: str = "") -> str:
+    """The statements of a listing with what it leaves open fill_in in."""
     given = {CONSTANT: constants, INDEX: indices, LABEL: labels}
     return OPEN.sub(lambda found: given[found[1]][int(found[2])], listing.text).replace(PREFIX, prefix)
 
 
-def literals(listing: Listing, dtype: str, prefix: str = "") -> str:
+def render(listing: Listing, dtype: str, prefix: str = "") -> str:
     """The statements of a listing as they are for itself."""
     constants = [literal(x, dtype) for x in listing.constants]
-    return filled(listing, constants, [str(entry) for _, entry in listing.indices], listing.labels, prefix)
+    return fill_in(listing, constants, [str(entry) for _, entry in listing.indices], listing.labels, prefix)

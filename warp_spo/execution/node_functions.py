@@ -20,7 +20,7 @@ from ..recursions.articulated import Pivot
 from ..recursions.links import Placed
 from ..recursions.motion import STILL, Motion
 from ..recursions.traced import EPSILON
-from ..trace.emission import Emitter, Store, literals
+from ..trace.emission import Emitter, Store, render
 from ..trace.scalars import Graph, Value, reciprocal
 from ..trace.spatial import Articulated, Matrix, Pose, Rigid, Vector, magnitude
 
@@ -125,7 +125,7 @@ STEPS: dict[str, tuple[Callable, dict[str, Kind]]] = {
 """What is traced, and its arguments, by name. What it returns is packed one after the other; a Matrix is one."""
 
 
-class Steps:
+class NodeFunctions:
     """Warp functions by name, and the types that they take.
 
     Attributes:
@@ -135,15 +135,15 @@ class Steps:
 
     def __init__(self, T: type):
         self.T, self.least = T, articulated.LEAST * EPSILON[T.__name__]
-        self.wide: Steps = self if T is wp.float64 else steps(wp.float64)
+        self.wide: NodeFunctions = self if T is wp.float64 else node_functions(wp.float64)
         vars(self).update(vars(spatial(T)))
         vars(self).update({name: _emitted(name, traced, kinds, T) for name, (traced, kinds) in STEPS.items()})
 
 
 @functools.cache
-def steps(T: type) -> Steps:
-    """Types, loads, stores and steps for scalars of type ``T`` (wp.float32 or wp.float64)."""
-    return Steps(T)
+def node_functions(T: type) -> NodeFunctions:
+    """Types, loads, stores and node functions for scalars of type ``T`` (wp.float32 or wp.float64)."""
+    return NodeFunctions(T)
 
 
 def _emitted(name: str, traced: Callable, kinds: dict[str, Kind], T: type) -> wp.Function:
@@ -163,7 +163,7 @@ def _emitted(name: str, traced: Callable, kinds: dict[str, Kind], T: type) -> wp
         lambda array, entry, value: f"{entries}[{entry}] = {value};",
         lambda array, index: index[0],
     )
-    statements = literals(emitter.region([Store("result", (i,), value) for i, value in enumerate(values)]), dtype)
+    statements = render(emitter.region([Store("result", (i,), value) for i, value in enumerate(values)]), dtype)
     text = f"{FUSED}{NATIVE[c]}{shape} result;\n{statements}\nreturn result;"
     types = {x: T if kind is NUMBER else wp.types.vector(kind.size, T) for x, kind in kinds.items()}
     return native.function(f"{name}_{dtype}", text, types, result)
