@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import symbolic
 from mechanisms import MECHANISMS, Closed
 
 import warp_spo as spo
 from warp_spo.dynamics.embedding import Closing
-from warp_spo.execution.programs import Traces
 from warp_spo.recursions.links import Links
+from warp_spo.recursions.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
 
 DIFFERENCES = 1e-9  # what differences of order 8 leave of second derivatives; conditioning of the draws
@@ -18,8 +19,8 @@ LOADED = ("q", "qd", "tau", "body_f")
 
 def traced(scene, operation, arrays, given, shapes, dtype="float64", **options):
     """Results by name, as symbolic.run, of a scene with closed loops."""
-    trace = Traces(Links(scene), dtype, tuple(given))
-    stores = [item for item in getattr(trace, operation)(**options) if item.array in shapes]
+    trace = Trace(Links(scene), dtype, tuple(given))
+    stores = [item for item in symbolic.function(operation)(trace, **options) if item.array in shapes]
     values = evaluate([item.value for item in stores], lambda name, index: arrays[name][(slice(None), *index)], dtype)
     worlds = len(arrays["q"])
     results = {name: np.zeros((worlds, *shape)) for name, shape in shapes.items()}  # kernels write zeros too
@@ -29,9 +30,9 @@ def traced(scene, operation, arrays, given, shapes, dtype="float64", **options):
 
 
 def by_embedding(scene, how, s, given=LOADED, dtype="float64"):
-    return traced(scene, "embedded_forward_dynamics", s._asdict(), given, {"out": (scene.dof_count,)}, dtype, how=how)[
-        "out"
-    ]
+    return traced(
+        scene, "embedded_forward_dynamics", s._asdict(), given, {"out": (scene.dof_count,)}, dtype, embedding=how
+    )["out"]
 
 
 def by_multipliers(scene, s, given=LOADED):

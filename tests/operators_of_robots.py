@@ -8,8 +8,9 @@ import zoo
 from robots import ROBOTS
 
 import warp_spo as spo
-from warp_spo.recursions.applications import Applications
+from warp_spo.recursions import operators as recursion
 from warp_spo.recursions.links import Links
+from warp_spo.recursions.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
 
 IDENTITY = {
@@ -62,7 +63,7 @@ def fused(name, worlds, device, dtype="float64", seed=0, granularity="tree", **o
 def traced(scene, operator, x, q):
     """``operator x`` as the trace has it, evaluated by NumPy: [world, row]."""
     arrays = {"q": q, "x": x}
-    stores = Applications(Links(scene), "float64", ("q", "x")).expression(operator.expression)
+    stores = recursion.expression(Trace(Links(scene), "float64", ("q", "x")), operator.expression)
     found = evaluate([item.value for item in stores], lambda name, index: arrays[name][:, index[0]])
     result = np.full((len(q), operator.shape[0]), np.nan)
     for item, value in zip(stores, found, strict=True):

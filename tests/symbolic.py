@@ -1,25 +1,65 @@
 """Traces evaluated by NumPy: what an operation's kernel computes, without compiling it; and bugs planted in them."""
 
 import inspect
+import sys
 import textwrap
 
 import numpy as np
 
-from warp_spo.recursions.applications import Applications
+import warp_spo
+from warp_spo.recursions import (
+    composite,
+    coordinates,
+    determinant,
+    forward_dynamics,
+    hinge_forces,
+    hybrid,
+    inverse,
+    kinematics,
+    momentum,
+    newton_euler,
+    operational,
+    operators,
+    quasi_velocities,
+    reactions,
+    step,
+)
+from warp_spo.recursions.derivatives import adjoints, inverse_dynamics
 from warp_spo.recursions.links import Links
+from warp_spo.recursions.loops import closed_step, embedded, embedded_adjoints, minimal, multipliers, projection
 from warp_spo.recursions.step import LOOPED, MISSED
+from warp_spo.recursions.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
 from warp_spo.trace.scalars import ordered as ordered
 
+TREE = (forward_dynamics, newton_euler, composite, inverse, determinant, kinematics, operational, momentum, hybrid,
+        quasi_velocities, reactions, step, hinge_forces, coordinates, operators, inverse_dynamics, adjoints, projection,
+        multipliers)  # fmt: skip
+EMBEDDED = (minimal, embedded, embedded_adjoints)
 
-def run(scene, operation, arrays, given, shapes, dtype="float64", trace=Applications, **options):
+
+def defined(file):
+    """Functions that a module defines, by name."""
+    return {name: f for name, f in vars(file).items() if getattr(f, "__module__", "") == file.__name__}
+
+
+def function(operation):
+    """The trace function of an operation; "embedded_..." is the one of embedded loops."""
+    found = {}
+    for file in TREE:
+        found |= defined(file)
+    for file in EMBEDDED:
+        found |= {f"embedded_{name}": f for name, f in defined(file).items()}
+    return found[operation]
+
+
+def run(scene, operation, arrays, given, shapes, dtype="float64", **options):
     """Results by name, [world, ...] of ``shapes``, NaN where nothing is stored.
 
     Args:
         arrays: inputs [world, ...] by name. given: those of them that the operation gets.
-        trace: the class that has the operation.
     """
-    stores = getattr(trace(Links(scene), dtype, tuple(given)), operation)(**options)
+    stores = function(operation)(Trace(Links(scene), dtype, tuple(given)), **options)
     values = evaluate([item.value for item in stores], lambda name, at: arrays[name][(slice(None), *at)], dtype)
     results = {name: np.full((len(arrays["q"]), *shape), np.nan) for name, shape in shapes.items()}
     for item, value in zip(stores, values, strict=True):
@@ -28,15 +68,17 @@ def run(scene, operation, arrays, given, shapes, dtype="float64", trace=Applicat
     return results
 
 
-def advance(scene, arrays, h, dtype="float64", most=16, trace=Applications, **options):
+def advance(scene, arrays, h, dtype="float64", most=16, **options):
     """One step: q', qd' [world, ...] and in how many passes each world's pieces held, ``most`` + 1 if they never did.
 
     Args:
         arrays: q, qd and what else the step gets, [world, ...] by name.
-        trace: the class that has the step.
     """
-    trace = trace(Links(scene), dtype, tuple(arrays))
-    stores = trace.step(**options)
+    trace = Trace(Links(scene), dtype, tuple(arrays))
+    if "multipliers" in arrays:
+        stores = closed_step.step_with_multipliers(trace, **options)
+    else:
+        stores = closed_step.step(trace, **options) if "embedding" in options else step.step(trace, **options)
     worlds = len(arrays["q"])
     known = arrays | {"dt": np.full((worlds, 1), h)}
     known |= {name: np.zeros((worlds, scene.dof_count)) for name in LOOPED}
@@ -69,4 +111,9 @@ def plant(monkeypatch, owner, name, old, new):
     assert source.count(old) == 1, f"{name} holds {source.count(old)} times: {old}"
     space = dict(original.__globals__)
     exec("from __future__ import annotations\n" + source.replace(old, new), space)
-    monkeypatch.setattr(owner, name, space[name])
+    holders = [owner]
+    if inspect.ismodule(owner):  # and every module that imports the function by name
+        modules = [module for key, module in sys.modules.items() if key.startswith(warp_spo.__name__)]
+        holders = [module for module in modules if getattr(module, name, None) is original]
+    for holder in holders:
+        monkeypatch.setattr(holder, name, space[name])

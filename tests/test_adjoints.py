@@ -15,7 +15,6 @@ import warp_spo as spo
 from warp_spo.execution import plan
 from warp_spo.kernels import straight
 from warp_spo.recursions.derivatives import power
-from warp_spo.recursions.derivatives.adjoints import Adjoints
 from warp_spo.recursions.derivatives.power import Carried, Power
 from warp_spo.reference import Dense
 
@@ -57,7 +56,7 @@ def mul(J, y):
 def dense(scene, a, given=("q", "qd", "qdd")):
     """d tau / d q along tangent coordinates, d tau / d qd, Mass: [3, world, dof, dof]."""
     shape = {"out": (3, scene.dof_count, scene.dof_count)}
-    J = symbolic.run(scene, "inverse_dynamics_derivatives", a, given, shape, trace=Adjoints)["out"]
+    J = symbolic.run(scene, "inverse_dynamics_derivatives", a, given, shape)["out"]
     return np.nan_to_num(J).swapaxes(0, 1)  # what is not stored is zero
 
 
@@ -172,7 +171,7 @@ def test_a_planted_bug_is_seen(bug, monkeypatch):
     a["cotangent"] = np.ascontiguousarray(a["b"][:, :, 0])
     state, wrt = ("q", "qd", "qdd"), ("tangent", "qd", "qdd")
     shapes = {"out": (n,), "qd_bar": (n,), "qdd_bar": (n,)}
-    got = symbolic.run(scene, "inverse_dynamics_vjp", a, (*state, "cotangent"), shapes, trace=Adjoints, wrt=wrt)
+    got = symbolic.run(scene, "inverse_dynamics_vjp", a, (*state, "cotangent"), shapes, wrt=wrt)
     pairs = zip(got.values(), dense(scene, a), strict=True)
     worst = max(laws.error(value, mul(J, a["cotangent"])) for value, J in pairs)
     assert worst <= TOLERANCE["float64"] if bug == "none" else worst > 1e-3

@@ -17,7 +17,6 @@ from warp_spo.errors import UnsupportedError
 from warp_spo.examples.parts import at, bar, energy
 from warp_spo.recursions import impedance, step
 from warp_spo.recursions.loops import closed_step, clusters
-from warp_spo.recursions.loops.multipliers import Multipliers
 
 H = 2e-3
 SHORTEST = 1e-7  # of the way back onto the closures: ours is the shortest seen from where the step ends, O(h^4)
@@ -40,7 +39,7 @@ def wanted(scene, how, s, a):
 
 def missed(scene, how, a, right, **more):
     """Largest error of velocities, as a share of the largest, and of coordinates."""
-    q, qd, _ = symbolic.advance(scene, a, H, trace=Multipliers, how=how, **more)
+    q, qd, _ = symbolic.advance(scene, a, H, embedding=how, **more)
     rates = max(np.abs(qd[w] - x[1]).max() / np.abs(x[1]).max() for w, x in enumerate(right))
     return rates, max(np.abs(q[w] - x[0]).max() for w, x in enumerate(right))
 
@@ -201,7 +200,7 @@ def test_in_place_the_same_bits_without_allocation(device):
         dyn.step(on["q"], on["qd"], dt=H, **more, out=(on["q"], on["qd"]))
     for array, name in zip(out, ("q", "qd"), strict=True):
         np.testing.assert_array_equal(array.numpy(), on[name].numpy())
-    q, qd, _ = symbolic.advance(scene, a, H, "float32", trace=Multipliers, how=dyn.embedding)
+    q, qd, _ = symbolic.advance(scene, a, H, "float32", embedding=dyn.embedding)
     np.testing.assert_allclose(out[0].numpy(), q, atol=1e-5)
     np.testing.assert_allclose(out[1].numpy(), qd, atol=1e-3)
 

@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+import symbolic
 import zoo
 from robots import ROBOTS
 
+from warp_spo.recursions.composite import mass_matrix
 from warp_spo.recursions.links import Links
-from warp_spo.recursions.traced import Trace
+from warp_spo.recursions.tracing import Trace
 from warp_spo.trace import scalars as g
 from warp_spo.trace.differentiation import forward, partial, reverse
 from warp_spo.trace.evaluation import FUNCTIONS, evaluate
@@ -23,7 +25,9 @@ FINITE_DIFFERENCE = 1e-6  # eps / h + h^2
 
 def traced(name, operation):
     links = Links(SCENES[name]())
-    stores = sorted(getattr(Trace(links, "float64", ARRAYS[operation]), operation)(), key=lambda item: item.index)
+    stores = sorted(
+        symbolic.function(operation)(Trace(links, "float64", ARRAYS[operation])), key=lambda item: item.index
+    )
     outputs = [item.value for item in stores]
     inputs = [x for x in g.ordered(outputs) if x.op == "input"]
     rng = np.random.default_rng(0)
@@ -87,7 +91,7 @@ def test_inverse_dynamics_gives_the_mass_matrix():
     scene = SCENES["floating"]()
     q = {x.args: value for x, value in zip(inputs, point, strict=True)}
     wanted = np.zeros((scene.dof_count, scene.dof_count))
-    stores = Trace(Links(scene), "float64", ("q",)).mass_matrix()
+    stores = mass_matrix(Trace(Links(scene), "float64", ("q",)))
     for item, value in zip(stores, evaluate([s.value for s in stores], lambda a, i: q[(a, *i)]), strict=True):
         wanted[item.index] = value
     columns = [at(forward(outputs, qdd, unit), inputs, point) for unit in np.eye(len(qdd)).tolist()]

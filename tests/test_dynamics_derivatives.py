@@ -15,8 +15,8 @@ from robots import ROBOTS
 import warp_spo as spo
 from benchmarks import cases
 from warp_spo.execution.plan import MOST_DOFS
+from warp_spo.recursions.derivatives import inverse_dynamics as dense
 from warp_spo.recursions.derivatives import sensitivity
-from warp_spo.recursions.derivatives.inverse_dynamics import Derivatives
 from warp_spo.reference import Dense
 
 STEP = 1e-5
@@ -39,7 +39,7 @@ def without_outer_armature(scene):
 
 
 def traced(scene, operation, a, given, shape):
-    got = symbolic.run(scene, operation, a, given, {"out": shape}, trace=Derivatives)["out"]
+    got = symbolic.run(scene, operation, a, given, {"out": shape})["out"]
     return np.nan_to_num(got)  # what is not stored is zero
 
 
@@ -124,9 +124,7 @@ def test_zeros_are_where_the_tree_has_no_path():
     """Two dofs meet only if one's body carries the other's; a floating base's position and velocity change nothing."""
     scene = scene_of("fork").with_values(gravity=np.zeros(3))
     n, a = scene.dof_count, laws.states(scene, 1)
-    trace = symbolic.run(
-        scene, "inverse_dynamics_derivatives", a, ("q", "qd", "qdd"), {"out": (3, n, n)}, trace=Derivatives
-    )["out"][0]
+    trace = symbolic.run(scene, "inverse_dynamics_derivatives", a, ("q", "qd", "qdd"), {"out": (3, n, n)})["out"][0]
     mass = Dense(scene, a["q"][0]).mass_matrix
     for block in trace:
         np.testing.assert_array_equal(np.isnan(block), mass == 0.0)
@@ -273,8 +271,7 @@ def test_far_from_the_origin_and_fast():
     far["qd"][:, rate : rate + 3] = 1024.0
     given, shapes = ("q", "qd", "qdd"), {"out": (3, n, n)}
     results = [
-        symbolic.run(scene, "inverse_dynamics_derivatives", x, given, shapes, "float32", trace=Derivatives)["out"]
-        for x in (a, far)
+        symbolic.run(scene, "inverse_dynamics_derivatives", x, given, shapes, "float32")["out"] for x in (a, far)
     ]
     np.testing.assert_array_equal(*results)
 
@@ -330,8 +327,8 @@ BUGS = {
     "drift of the origins": (sensitivity.Row, "to_parent", " + cross(drift, v) * 2.0", ""),
     "moments of a load": (sensitivity, "to_parent", " + _lever(l, pull)", ""),
     "a row's pull": (sensitivity.Carried, "row", " + cross(self.pull, v)", ""),
-    "the force elsewhere": (Derivatives, "_entries", " + cross(s.shift, force[1])", ""),
-    "the force turned": (Derivatives, "_entries", "n + cross(s.turn, force[0])", "n"),
+    "the force elsewhere": (dense, "_entries", " + cross(s.shift, force[1])", ""),
+    "the force turned": (dense, "_entries", "n + cross(s.turn, force[0])", "n"),
 }
 
 

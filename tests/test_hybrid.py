@@ -41,7 +41,7 @@ def traced_error(scene, a, held=None):
     arrays = a | {"prescribed": a["mask"].astype(float)}
     given = GIVEN if held is not None else (*GIVEN, "prescribed")
     shapes = {"out": (dofs,), "tau_out": (dofs,)}
-    got = symbolic.run(scene, "hybrid_dynamics", arrays, given, shapes, held=None if held is None else tuple(held))
+    got = symbolic.run(scene, "hybrid_dynamics", arrays, given, shapes, mask=None if held is None else tuple(held))
     mask = a["mask"] if held is None else np.tile(np.array(held, dtype=bool), (WORLDS, 1))
     return max(map(laws.error, got.values(), wanted(scene, a, mask)))
 
@@ -180,7 +180,7 @@ def test_a_prescribed_hinge_needs_no_inertia():
     right = dense.hybrid_dynamics(a["qd"][0], a["tau"][0], a["qdd"][0], a["prescribed"][0] > 0)
     np.testing.assert_allclose([got["out"][0], got["tau_out"][0]], right, atol=1e-14)
     assert np.isnan(got["out"][1]).all()
-    folded = symbolic.run(scene, "hybrid_dynamics", a, tuple(a)[:4], {"out": (2,), "tau_out": (2,)}, held=(False, True))
+    folded = symbolic.run(scene, "hybrid_dynamics", a, tuple(a)[:4], {"out": (2,), "tau_out": (2,)}, mask=(False, True))
     np.testing.assert_allclose(folded["out"], np.tile(right[0], (2, 1)), atol=1e-14)
 
 

@@ -12,7 +12,6 @@ from step_scenes import furnished, smooth
 import warp_spo as spo
 from warp_spo.dynamics.embedding import Closing
 from warp_spo.errors import UnsupportedError
-from warp_spo.execution.programs import Traces
 from warp_spo.recursions.derivatives import adjoints, power
 from warp_spo.recursions.loops import embedded_adjoints
 from warp_spo.recursions.loops.nullspace import NullSpace
@@ -39,7 +38,7 @@ def arrays_of(name, seed=0):
 
 
 def run(scene, operation, arrays, shapes, **options):
-    return symbolic.run(scene, operation, arrays, tuple(arrays), shapes, trace=Traces, **options)
+    return symbolic.run(scene, operation, arrays, tuple(arrays), shapes, **options)
 
 
 def product(scene, operation, arrays, wrt, **options):
@@ -77,13 +76,13 @@ def forward_dynamics_error(name, given=("q", "qd", "tau", "body_f")):
     state, n = {key: a[key] for key in given}, (scene.dof_count,)
 
     def qdd(arrays):
-        return run(scene, "embedded_forward_dynamics", arrays, {"out": n}, how=how)["out"]
+        return run(scene, "embedded_forward_dynamics", arrays, {"out": n}, embedding=how)["out"]
 
     def power_of(arrays):
         return (qdd(arrays) * np.tile(a["y"], (len(arrays["q"]) // len(a["y"]), 1))).sum(1)
 
     known = {**state, "qdd": qdd(state), "cotangent": a["y"]}
-    found = product(scene, "embedded_forward_dynamics_vjp", known, given, how=how)
+    found = product(scene, "embedded_forward_dynamics_vjp", known, given, embedding=how)
     return max(largest(found[key], difference(power_of, state, key)) for key in given)
 
 
@@ -98,9 +97,9 @@ def test_what_is_not_given_is_zero(given):
 
 
 BUGS = [
-    (embedded_adjoints.EmbeddedAdjoints, "ways", "self.rates, rates", "None, rates"),
-    (embedded_adjoints.EmbeddedAdjoints, "ways", "- tau(dof)", ""),
-    (embedded_adjoints.EmbeddedAdjoints, "ways", "[*mu, *(-x for x in nu)]", "[*mu, *nu]"),
+    (embedded_adjoints.ClosedEquations, "gradient", "velocities(trace), rates", "None, rates"),
+    (embedded_adjoints.ClosedEquations, "gradient", "- tau(dof)", ""),
+    (embedded_adjoints.ClosedEquations, "gradient", "[*mu, *(-x for x in nu)]", "[*mu, *nu]"),
     (NullSpace, "multipliers", "reversed(self._steps)", "self._steps"),
     (power.Power, "_handed", "dof: bar + f for", "dof: bar for"),
 ]
@@ -126,9 +125,11 @@ def test_both_ways_agree(name):
         if operation == "inverse_dynamics":
             del state["tau"]
         along = {f"{key}_dot": rng.normal(size=a["qd" if key == "q" else key].shape) for key in given}
-        pushed = run(scene, f"embedded_{operation}_jvp", {**state, **along}, {"out": a[y].shape[1:]}, how=how)["out"]
+        pushed = run(scene, f"embedded_{operation}_jvp", {**state, **along}, {"out": a[y].shape[1:]}, embedding=how)[
+            "out"
+        ]
         wrt = ("tangent", "qd", third, "body_f")
-        back = product(scene, f"embedded_{operation}_vjp", {**state, "cotangent": a[y]}, wrt, how=how)
+        back = product(scene, f"embedded_{operation}_vjp", {**state, "cotangent": a[y]}, wrt, embedding=how)
         one = (a[y] * pushed).sum(1)
         parts = [(back[key] * x).reshape(len(one), -1) for key, x in zip(wrt, along.values(), strict=True)]
         size = sum(np.abs(part).sum(1) for part in parts)
@@ -155,9 +156,9 @@ def test_lagrange_along_what_closures_allow():
         )
 
     state = dict(q=s.q, qd=s.qd, tau=s.tau)
-    qdd = run(scene, "embedded_forward_dynamics", state, {"out": (3,)}, how=how)["out"]
+    qdd = run(scene, "embedded_forward_dynamics", state, {"out": (3,)}, embedding=how)["out"]
     along = dict(q_dot=dq, qd_dot=dqd, qdd=qdd)
-    got = run(scene, "embedded_forward_dynamics_jvp", state | along, {"out": (3,)}, how=how)["out"]
+    got = run(scene, "embedded_forward_dynamics_jvp", state | along, {"out": (3,)}, embedding=how)["out"]
     assert largest(got, slope(reference)) <= 1e-6  # the reference's own differences
 
 
@@ -168,13 +169,15 @@ def test_inverse_dynamics_is_the_difference(name):
     a, m = arrays_of(name), (len(how.dofs),)
 
     def power_of(arrays):
-        tau = run(scene, "embedded_inverse_dynamics", arrays, {"out": m}, how=how)["out"]
+        tau = run(scene, "embedded_inverse_dynamics", arrays, {"out": m}, embedding=how)["out"]
         return (tau * np.tile(a["minimal"], (len(tau) // len(a["minimal"]), 1))).sum(1)
 
     for given in (("q", "qd", "qdd", "body_f"), ("q", "qd"), ("q",)):
         state = {key: a[key] for key in given}
 
-        found = product(scene, "embedded_inverse_dynamics_vjp", {**state, "cotangent": a["minimal"]}, given, how=how)
+        found = product(
+            scene, "embedded_inverse_dynamics_vjp", {**state, "cotangent": a["minimal"]}, given, embedding=how
+        )
         for key in given:
             assert largest(found[key], difference(power_of, state, key)) <= TOLERANCE, (given, key)
 
@@ -229,9 +232,14 @@ def test_a_step_is_the_difference(name, device):
 
 
 STEP_BUGS = [
-    (embedded_adjoints.EmbeddedAdjoints, "put_back", "if self.how is None else", "if self.how else"),
-    (adjoints.Adjoints, "step_vjp", "- stiff[dof] * solved[dof]", ""),
-    (adjoints.Adjoints, "step_vjp", "tau(dof) + forces[dof]", "tau(dof)"),
+    (
+        embedded_adjoints.ClosedEquations,
+        "put_back",
+        "ClosedStep(self.trace, self.loops.embedding).put_back(stores)",
+        "stores",
+    ),
+    (adjoints, "step_vjp", "- stiff[dof] * solved[dof]", ""),
+    (adjoints, "step_vjp", "tau(dof) + forces[dof]", "tau(dof)"),
 ]
 
 

@@ -21,7 +21,8 @@ from mechanisms import MECHANISMS, Closed
 from warp_spo.dynamics.embedding import Closing, embedding
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.loops import closures, clusters, embedded, nullspace
-from warp_spo.recursions.loops.multipliers import Multipliers
+from warp_spo.recursions.loops.projection import place_links
+from warp_spo.recursions.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
 
 
@@ -42,7 +43,7 @@ def test_minimal_coordinates_equal_lagrange(name):
     arrays = {**s._asdict(), "b": b}
 
     def run(operation, given, shape):
-        return traced(scene, f"embedded_{operation}", arrays, given, {"out": shape}, how=how)["out"]
+        return traced(scene, f"embedded_{operation}", arrays, given, {"out": shape}, embedding=how)["out"]
 
     Mass = run("mass_matrix", ("q",), (size, size))
     inverse = run("mass_matrix_inverse", ("q",), (size, size))
@@ -100,9 +101,13 @@ def test_jacobian_and_bias_are_derivatives_of_the_error(name):
         ahead, behind = (
             closing.at(closed.dense.integrate(unit, t)[None])[0][0] for unit, t in ((s.qd[w], 1e-4), (s.qd[w], -1e-4))
         )
-        trace = Multipliers(Links(scene), "float64", ("q", "qd"))
-        trace.place_links(moves=True)
-        values = [v for c in trace.constraints for v in c.acceleration(trace.places, trace.vector("qd"), lambda i: 0.0)]
+        trace = Trace(Links(scene), "float64", ("q", "qd"))
+        place_links(trace, moves=True)
+        values = [
+            v
+            for c in closures.closures(trace.links)
+            for v in c.acceleration(trace.places, trace.vector("qd"), lambda i: 0.0)
+        ]
         bias = evaluate(values, lambda name, index: getattr(s, name)[w : w + 1, index[0]])  # noqa: B023
         np.testing.assert_allclose([np.ravel(b)[0] for b in bias], (ahead + behind - 2 * error[w]) / 1e-8, atol=1e-5)
 
@@ -153,7 +158,7 @@ BUGS = [
     (closures.Closure, "acceleration", "+ 2.0 * v)", ")"),
     (closures, "_moved", "2.0 * cross(spin, v)", "cross(spin, v)"),
     (nullspace.Reflection, "apply", "self.scale * total", "1.01 * self.scale * total"),
-    (embedded.Embedded, "_eliminate", "force = force + column * rate", "force = force - column * rate"),
+    (embedded.ClosedLoops, "_eliminate", "force = force + column * rate", "force = force - column * rate"),
 ]
 
 

@@ -13,8 +13,15 @@ from allocations import no_warp_allocation
 
 import warp_spo as spo
 from warp_spo.examples import estimation
-from warp_spo.recursions import applications, determinant, newton_euler
-from warp_spo.recursions.applications import Applications
+from warp_spo.recursions import (
+    articulated_sweeps,
+    determinant,
+    kinematics,
+    momentum,
+    newton_euler,
+    operational,
+    quasi_velocities,
+)
 from warp_spo.reference import Dense
 from warp_spo.trials.operations import APPLICATIONS, Inputs
 from warp_spo.trials.trial import Subject, Trial
@@ -229,16 +236,16 @@ def test_equals_pinocchio(name):
 
 # -- planted bugs ------------------------------------------------------------------------------------------------------
 BUGS = {
-    "jacobian_bias": (Applications, "_at_frames", "+ self.motions[id(link)].whirl @ arm", ""),
-    "frame_accelerations": (Applications, "_at_frames", "cross(w, arm)", "cross(arm, w)"),
-    "operational_inertia_inverse_product": (Applications, "pushed", "cross(arm, f)", "cross(f, arm)"),
-    "com_jacobian": (Applications, "center", "mass = mass + body.mass", "mass = body.mass"),
-    "centroidal_momentum_matrix": (Applications, "center", " + origins[id(link)] * body.mass", ""),
+    "jacobian_bias": (kinematics, "accelerations_of_frames", "+ trace.motions[id(link)].whirl @ arm", ""),
+    "frame_accelerations": (kinematics, "accelerations_of_frames", "cross(w, arm)", "cross(arm, w)"),
+    "operational_inertia_inverse_product": (operational, "wrenches_on_links", "cross(arm, f)", "cross(f, arm)"),
+    "com_jacobian": (momentum, "center_of_mass", "mass = mass + body.mass", "mass = body.mass"),
+    "centroidal_momentum_matrix": (momentum, "center_of_mass", " + origins[id(link)] * body.mass", ""),
     "centroidal_momentum_bias": (newton_euler, "body_force", "cross(motion.spin, in", "-cross(motion.spin, in"),
-    "quasi_velocities": (Applications, "quasi_velocities", "V = V + pivot", "V = pivot"),
+    "quasi_velocities": (quasi_velocities, "quasi_velocities", "V = V + pivot", "V = pivot"),
     "log_det_mass_matrix_gradient": (determinant, "upsilon", "dot(g, y) + pivot.inverse", "dot(g, y)"),
-    "mass_matrix_packed": (applications, "_packed", ">= item.index[1]", "<= item.index[1]"),
-    "mass_matrix_inverse_packed": (applications, "_packed", "sorted(entries)", "entries"),
+    "mass_matrix_packed": (articulated_sweeps, "pack", ">= item.index[1]", "<= item.index[1]"),
+    "mass_matrix_inverse_packed": (articulated_sweeps, "pack", "sorted(entries)", "entries"),
 }
 
 

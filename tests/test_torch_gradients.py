@@ -25,7 +25,7 @@ from gradients import (
 
 import warp_spo as spo
 from warp_spo import torch as spo_torch
-from warp_spo.recursions.derivatives.adjoints import Adjoints
+from warp_spo.recursions.derivatives import adjoints, tangents
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def test_products_are_those_of_the_dense_derivatives(name):
     a["cotangent"] = np.random.default_rng(1).normal(size=(1, n))
     rates = {"q_dot": a["b"][..., 0], "qd_dot": a["b"][..., 1], "tau_dot": a["b"][..., 2]}
     state = ("q", "qd", "qdd", "body_f")
-    run = functools.partial(symbolic.run, scene, trace=Adjoints)
+    run = functools.partial(symbolic.run, scene)
     J = np.nan_to_num(run("inverse_dynamics_derivatives", a, state, {"out": (3, n, n)})["out"])[0]
     shapes = {"out": (n,), "qd_bar": (n,), "tau_bar": (n,)}
     got = run("forward_dynamics_vjp", a, (*state, "cotangent"), shapes, wrt=("tangent", "qd", "tau"))
@@ -118,8 +118,8 @@ BUGS = {
         "{dof: pushed[1](dof) for dof in dofs}",
     ),
     "the sign of lambda": ("forward_dynamics_vjp", "lambda dof: -solved(dof)", "lambda dof: solved(dof)"),
-    "the turn of a quaternion": ("tangent", "cross(u, g_u)", "cross(g_u, u)"),
-    "the arm of a free hinge": ("tangent", "turn - cross(", "turn + cross("),
+    "the turn of a quaternion": ("tangent_gradient", "cross(u, g_u)", "cross(g_u, u)"),
+    "the arm of a free hinge": ("tangent_gradient", "turn - cross(", "turn + cross("),
 }
 
 
@@ -127,7 +127,7 @@ BUGS = {
 def test_a_planted_bug_is_seen(bug, monkeypatch):
     """By the derivative along one direction."""
     name, old, new = BUGS[bug]
-    symbolic.plant(monkeypatch, Adjoints, name, old, new)
+    symbolic.plant(monkeypatch, tangents if name == "tangent_gradient" else adjoints, name, old, new)
     if name == "step_vjp":
         scene = furnished(zoo.from_parents([-1, 0], ["revolute", "ball"], 8))
         dyn = spo.Dynamics(scene, 1, device="cpu", dtype="float64", granularity="tree")

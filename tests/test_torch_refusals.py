@@ -13,7 +13,8 @@ import warp_spo as spo
 from warp_spo import torch as spo_torch
 from warp_spo.execution.plan import MOST_DOFS
 from warp_spo.execution.staging import is_read_before_written
-from warp_spo.recursions.derivatives.adjoints import Adjoints
+from warp_spo.recursions.derivatives.adjoints import forward_dynamics_vjp
+from warp_spo.recursions.tracing import Trace
 
 
 @pytest.fixture(scope="module")
@@ -132,8 +133,8 @@ def test_a_result_is_not_written_over_what_is_read_later():
     rate = (1, scene.dof_count)
     dyn = spo.Dynamics(scene, 1, device="cpu", granularity="tree")
     shapes = {"q": (1, scene.coord_count), "qd": rate, "qdd": rate, "cotangent": rate, "out": rate}
-    trace = Adjoints(dyn.programs.links.opened(), "float32", tuple(shapes))
-    stores = trace.forward_dynamics_vjp(("tau", "q"))
+    trace = Trace(dyn.programs.links.opened(), "float32", tuple(shapes))
+    stores = forward_dynamics_vjp(trace, ("tau", "q"))
     first = [item for item in stores if item.array == "out"]
     free = {name: is_read_before_written(first, stores, name) for name in ("cotangent", "qd", "qdd")}
     del first, stores  # which pytest would write out

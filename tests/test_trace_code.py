@@ -5,13 +5,14 @@ import math
 import laws
 import numpy as np
 import pytest
+import symbolic
 import warp as wp
 import zoo
 
 import warp_spo as spo
 from warp_spo.kernels import native, straight
 from warp_spo.recursions.links import Links
-from warp_spo.recursions.traced import Trace
+from warp_spo.recursions.tracing import Trace
 from warp_spo.trace import scalars as g
 from warp_spo.trace.emission import Emitter, Store, literal, render
 from warp_spo.trace.evaluation import evaluate
@@ -81,7 +82,7 @@ def test_the_trace_in_numpy_is_the_kernel(operation, given, dtype, device):
     """The same trace by NumPy in float64: they share the graph and nothing after it."""
     scene = zoo.forest()
     arrays = laws.states(scene, 3, dtype=dtype)
-    stores = getattr(Trace(Links(scene), dtype, given), operation)()
+    stores = symbolic.function(operation)(Trace(Links(scene), dtype, given))
     dyn = spo.Dynamics(scene, 3, device=device, dtype=dtype, granularity="tree")
     got = laws.numpy_call(dyn, operation, {key: value for key, value in arrays.items() if key in given})
     wanted = np.zeros(got.shape)

@@ -13,7 +13,11 @@ import numpy as np
 
 from ..errors import UnsupportedError, as_integer
 from ..recursions.links import Links
-from ..recursions.loops.embedded import Embedded, Embedding
+from ..recursions.loops.closures import closures
+from ..recursions.loops.clusters import clusters
+from ..recursions.loops.embedded import Embedding
+from ..recursions.loops.projection import closure_error, closure_jacobian, move
+from ..recursions.tracing import Trace
 from ..scene.parts import SCREWS, UNLIMITED
 from ..scene.scene import Scene
 from ..trace.evaluation import evaluate
@@ -32,21 +36,23 @@ class Closing:
     """The closures of a scene in one world, evaluated by NumPy at many configurations.
 
     Attributes:
-        trace: whose clusters and constraints are those of the scene.
+        clusters: the sets of links that loops and couplings tie.
         size: rows of all closures.
     """
 
     def __init__(self, scene: Scene):
         one = {name: array[0] for name, array in scene.values.items() if array.shape[0] > 1}
         self.scene = scene.with_values(**one) if one else scene
-        self.trace = Embedded(Links(self.scene), "float64", ("q", "step"))
-        self.size = sum(constraint.rows for constraint in self.trace.constraints)
-        self._error, self._jacobian = self.trace.closure_error(), self.trace.closure_jacobian()
-        step = self.trace.vector("step")
+        trace = Trace(Links(self.scene), "float64", ("q", "step"))
+        constraints = closures(trace.links)
+        self.clusters = clusters(trace.links, constraints)
+        self.size = sum(constraint.rows for constraint in constraints)
+        self._error, self._jacobian = closure_error(trace), closure_jacobian(trace)
+        step = trace.vector("step")
         self._moved = [
             (link.coordinate + i, value)
-            for link in self.trace.links.links
-            for i, value in enumerate(self.trace.moved(link, [step(dof) for dof in link.dofs]))
+            for link in trace.links.links
+            for i, value in enumerate(move(trace, link, [step(dof) for dof in link.dofs]))
         ]
 
     def at(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -111,7 +117,7 @@ def usual_rank(scene: Scene) -> int:
     if len(q) == 0 or closing.size == 0:
         return 0
     Y, rank = closing.at(q)[1], 0
-    for cluster in closing.trace.clusters:
+    for cluster in closing.clusters:
         singular = np.linalg.svd(Y[:, cluster.rows][:, :, cluster.dofs], compute_uv=False)
         rank += int((singular > RANK * singular[:, :1]).sum(axis=1).max())
     return rank
@@ -126,7 +132,7 @@ def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str 
     """
     wanted = None if asked is None else _numbers(scene, asked, call)
     closing = Closing(scene)
-    clusters = closing.trace.clusters
+    clusters = closing.clusters
     for cluster in clusters:
         if len(cluster.dofs) > MOST_DOFS:
             names = list(dict.fromkeys(link.label for link in cluster.links))

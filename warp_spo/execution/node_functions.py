@@ -19,7 +19,7 @@ from ..recursions import articulated, kinematics, links, motion, newton_euler
 from ..recursions.articulated import Pivot
 from ..recursions.links import Placed
 from ..recursions.motion import STILL, Motion
-from ..recursions.traced import EPSILON
+from ..recursions.tracing import EPSILON
 from ..trace.emission import Emitter, Store, render
 from ..trace.scalars import Graph, Value, reciprocal
 from ..trace.spatial import Articulated, Matrix, Pose, Rigid, Vector, magnitude

@@ -15,14 +15,32 @@ from ..kernels import native, straight
 from ..kernels.native import INTEGERS
 from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout, Result
-from ..recursions import messages
+from ..recursions import (
+    composite,
+    coordinates,
+    determinant,
+    forward_dynamics,
+    hinge_forces,
+    hybrid,
+    inverse,
+    kinematics,
+    messages,
+    momentum,
+    newton_euler,
+    operational,
+    operators,
+    quasi_velocities,
+    reactions,
+    step,
+)
+from ..recursions.derivatives import adjoints, inverse_dynamics
 from ..recursions.links import TABLES, Links
-from ..recursions.loops.embedded_adjoints import EmbeddedAdjoints
-from ..recursions.loops.multipliers import Multipliers
+from ..recursions.loops import closed_step, embedded, embedded_adjoints, minimal, multipliers, projection
 from ..recursions.messages import INWARD, OUTWARD, SENDS
 from ..recursions.operators import meet, written
 from ..recursions.pieces import Pieces
 from ..recursions.step import GAIN, GUESS, LOOPED, MISSED, by_pieces
+from ..recursions.tracing import Trace
 from ..trace.emission import PREFIX, Emitter, RangeReduction, Store, render
 from . import link_values, staging
 from .plan import MOST_WARPS, SHARED, TREE_ONLY, Plan
@@ -52,8 +70,38 @@ FRAME_LISTS = 16  # different lists of frames that get a program of their own
 EXPRESSIONS = 64  # different expressions of operators that do
 
 
-class Traces(EmbeddedAdjoints, Multipliers):
-    """Every operation that is traced."""
+def _functions() -> dict[str, Any]:
+    """The trace function of each operation, by name."""
+    tree = (
+        forward_dynamics, newton_euler, composite, inverse, determinant, kinematics, operational, momentum,
+        quasi_velocities, hybrid, reactions, step, hinge_forces, coordinates, operators, inverse_dynamics, adjoints,
+        projection, multipliers,
+    )  # fmt: skip
+    found = {
+        name: f for file in tree for name, f in vars(file).items() if getattr(f, "__module__", "") == file.__name__
+    }
+    found["forward_dynamics_apart"] = found.pop("forward_dynamics_bias_first")
+    found["step_system"] = closed_step.step_system
+    for file in (minimal, embedded, embedded_adjoints):
+        found |= {
+            f"embedded_{name}": f for name, f in vars(file).items() if getattr(f, "__module__", "") == file.__name__
+        }
+    return found
+
+
+FUNCTIONS = _functions()
+
+
+def run_trace(trace: Trace, operation: str, how: Any = None, held: Any = None, **options: Any) -> list[Store]:
+    """Call the trace function of an operation."""
+    if operation == "step":
+        if "multipliers" in trace.inputs:
+            return closed_step.step_with_multipliers(trace, **options)
+        return step.step(trace, **options) if how is None else closed_step.step(trace, how, **options)
+    options |= {} if how is None else {"embedding": how}
+    if held is not None:
+        options["mask" if "hybrid" in operation else "fixed"] = held
+    return FUNCTIONS[operation](trace, **options)
 
 
 class Program(NamedTuple):
@@ -190,8 +238,8 @@ class Programs:
         return self._tree_program(operation, links, {**shapes, **more}, tuple(more), options)
 
     def _tree_program(self, operation: str, links: Links, shapes: dict, more: tuple, options: dict) -> Program:
-        trace = Traces(links, self.run.dtype.__name__, tuple(shapes))
-        stores = [self._flattened(item, shapes) for item in getattr(trace, operation)(**options)]
+        trace = Trace(links, self.run.dtype.__name__, tuple(shapes))
+        stores = [self._flattened(item, shapes) for item in run_trace(trace, operation, **options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         outs = [item for item in stores if item.array == "out"]
         layout = self._layout(operation, outs, stores, shapes, more)
@@ -225,8 +273,8 @@ class Programs:
         apart: list[tuple[list[Store], list[Store], list[list[Store]]]] = []
         for index in range(len(pieces.pieces)):
             links = self.links.opened()  # its own: pieces of equal structure then give equal text
-            trace = Traces(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
-            traced.append([self._flattened(item, shapes) for item in getattr(trace, operation)(**options)])
+            trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
+            traced.append([self._flattened(item, shapes) for item in run_trace(trace, operation, **options)])
             rounds = [[self._flattened(item, shapes) for item in turn] for turn in trace.rounds]
             news = [self._flattened(item, shapes) for item in trace.news]
             apart.append((trace.checks, news, rounds))

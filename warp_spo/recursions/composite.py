@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Pose, Rigid, Vector
 from .articulated import columns
+from .articulated_sweeps import mirror, pack
 from .links import NOTHING as NOTHING
 from .links import Link, Placed
 from .motion import in_hinge
+
+if TYPE_CHECKING:
+    from .tracing import Trace
 
 
 def entries(link: Link, places: dict[int, Placed], body: Rigid) -> dict[tuple[int, int], Value]:
@@ -40,3 +47,30 @@ def own_entries(link: Link, place: Placed, body: Rigid) -> dict[tuple[int, int],
             if row <= column:
                 found[row, column] = force + armature if row == column else force
     return found
+
+
+def mass_matrix(trace: Trace) -> list[Store]:
+    """out = Mass, both triangles"""
+    carried: dict[int, Rigid] = {}
+    found: dict[tuple[int, int], Value] = {}
+    stores: list[Store] = []
+    for link, outward in trace.traversal():
+        if outward:
+            trace.place(link)
+            continue
+        key = id(link)
+        trace.label(link, "R")
+        body = link.grouped or NOTHING
+        for other in trace.from_children(link, "R", carried, Rigid.unpacked):
+            body = body + other
+        if link.parent is not None:
+            carried[key] = trace.places[key].pose.rigid_to_parent(body)
+            stores += trace.send_to_parent("R", link, carried[key].packed)
+        trace.label(link, "F")
+        found |= entries(link, trace.places, body)
+    return stores + mirror(found)
+
+
+def mass_matrix_packed(trace: Trace) -> list[Store]:
+    """out = the entries of Mass that the tree allows, lower triangle, row after row"""
+    return pack(mass_matrix(trace))

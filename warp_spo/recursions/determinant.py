@@ -7,9 +7,17 @@ A. Jain, "Compensating mass matrix potential for constrained molecular dynamics"
 
 from __future__ import annotations
 
-from ..trace.scalars import Value
+from typing import TYPE_CHECKING
+
+from ..trace.emission import Store
+from ..trace.scalars import Value, sum_of_logarithms
 from ..trace.spatial import ZERO, Articulated, Matrix, Pose, Vector, dot
+from . import motion
 from .articulated import NO_INERTIA, Factor
+from .articulated_sweeps import factor_tree
+
+if TYPE_CHECKING:
+    from .tracing import Trace
 
 
 def to_child(pose: Pose, S: Articulated) -> Articulated:
@@ -53,3 +61,39 @@ def generators(S: Articulated, P: Articulated) -> tuple[Vector, Vector]:
 def _axial(A: Matrix) -> Vector:
     """The vector a with tr(w~ A) = w . a."""
     return Vector((A[1][2] - A[2][1], A[2][0] - A[0][2], A[0][1] - A[1][0]))
+
+
+def log_det_mass_matrix(trace: Trace) -> list[Store]:
+    done = factor_tree(trace)
+    return [Store("out", (), sum_of_logarithms(p.D for f in done.values() for p in f.pivots))]
+
+
+def log_det_mass_matrix_gradient(trace: Trace, scale: float = 1.0) -> list[Store]:
+    """out = d log det Mass / dq, dual to qd"""
+    done = factor_tree(trace)
+    carried: dict[int, Articulated] = {}
+    stores = []
+    for link in trace.links.links:
+        trace.label(link, "u")
+        key, factor = id(link), done[id(link)]
+        place = trace.places[key]
+        S = NO_INERTIA
+        if link.parent is not None:
+            S = to_child(place.pose, carried[id(link.parent)])
+        carried[key] = upsilon(factor, S)
+        w, v = generators(S, factor.P)
+        if factor.whole:
+            w, v = ZERO, ZERO
+        elif len(link.dofs) > 1 and not factor.turned:  # turning the link turns H: move P under it instead
+            P = NO_INERTIA if link.inertia is None else link.inertia.articulated
+            for child in link.children:
+                P = P + done[id(child)].in_parent
+            w, _ = generators(carried[key], P)
+        values = motion.in_hinge(link, place, w, v)
+        stores += [Store("out", (dof,), 2.0 * scale * x) for dof, x in zip(link.dofs, values, strict=True)]
+    return stores
+
+
+def fixman_torque(trace: Trace) -> list[Store]:
+    """out = -1/2 d log det Mass / dq"""
+    return log_det_mass_matrix_gradient(trace, -0.5)

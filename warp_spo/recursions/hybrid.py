@@ -7,14 +7,18 @@ the constants 0 and 1 fold into the code; a symbol selects between both, whateve
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
+from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant, select
 from ..trace.spatial import Articulated, Pose, Vector, dot, total
 from . import articulated
 from .articulated import LEAST, NO_INERTIA, Factor, Pivot
 from .links import SLIDE, TURN, Link, Placed
 from .motion import Motion, carried
+
+if TYPE_CHECKING:
+    from .tracing import Trace
 
 
 class Given(NamedTuple):
@@ -100,3 +104,57 @@ def expanded(
         tau.append(select(held, along + pivot.D * qdd[-1] + head, b))
         alpha = alpha + pivot.column * qdd[-1]
     return qdd, tau, (Vector(alpha[:3]), Vector(alpha[3:]))
+
+
+def hybrid_dynamics(trace: Trace, mask: tuple[bool, ...] | None = None) -> list[Store]:
+    """out = qdd, tau_out = tau: dofs under the mask follow qdd, the others tau.
+
+    Args:
+        mask: constant mask by dof; None: the array "prescribed" is the mask.
+    """
+    prescribed = trace.vector("prescribed") if mask is None else lambda dof: float(mask[dof])
+    tau, qdd, moves = trace.vector("tau"), trace.vector("qdd"), "qd" in trace.inputs
+    given: dict[int, Given] = {}
+    done: dict[int, articulated.Factor] = {}
+    rates: dict[int, list[Value]] = {}
+    heads: dict[int, list[Value]] = {}
+    inner: dict[int, Articulated] = {}
+    forces: dict[int, Vector] = {}
+    for link, outward in trace.traversal():
+        key = id(link)
+        if outward:
+            trace.place(link, moves)
+            continue
+        trace.label(link, "P")
+        place, move = trace.places[key], trace.motions[key]
+        carried = [inner[id(child)] for child in link.children]
+        through = [(trace.places[id(child)].pose, done[id(child)].P) for child in link.children]
+        given[key] = known = Given(*([entry(dof) for dof in link.dofs] for entry in (prescribed, tau, qdd)))
+        if known.free:
+            done[key] = articulated.factor(link, place, carried, through, trace.epsilon)
+        else:
+            done[key] = factor(link, place, known.mask, carried, through, trace.epsilon)
+        inner[key] = done[key].in_parent
+        trace.label(link, "z")
+        z = articulated.gyroscopic(link.inertia, move) - trace.external_wrench(link)
+        for child in link.children:
+            z = z + forces[id(child)]
+        if known.free:
+            rates[key], forces[key] = articulated.reduced(link, place, done[key], move, z, known.tau)
+        else:
+            rates[key], heads[key], forces[key] = reduced(link, place, done[key], move, z, known)
+    alpha: dict[int, tuple[Vector, Vector]] = {}
+    stores: list[Store] = []
+    for link in trace.links.links:
+        trace.label(link, "a")
+        key = id(link)
+        above = trace.base_acceleration if link.parent is None else alpha[id(link.parent)]
+        known, place, move = given[key], trace.places[key], trace.motions[key]
+        if known.free:
+            forward, alpha[key] = articulated.expanded(link, place, done[key], rates[key], move, above)
+            inverse = known.tau
+        else:
+            forward, inverse, alpha[key] = expanded(link, place, done[key], rates[key], heads[key], move, above, known)
+        for dof, a, force in zip(link.dofs, forward, inverse, strict=True):
+            stores += [Store("out", (dof,), a), Store("tau_out", (dof,), force)]
+    return stores

@@ -20,10 +20,13 @@ import numpy as np
 from ..errors import UnsupportedError
 from ..scene.parts import UNLIMITED
 from ..scene.scene import Scene
+from ..trace.evaluation import evaluate
 from ..trace.scalars import Value, absolute, is_constant, less, reciprocal, select
 from ..trace.spatial import Vector, total
+from .composite import mass_matrix
 from .integration import rotation_vector
 from .links import BALL, FREE, Link, Links
+from .tracing import Trace
 
 CREEP = 1e-4  # rate [rad/s, m/s] below which dry friction sticks: there it is a damper, which this rate saturates
 TURNING = (BALL, FREE)  # motions with a quaternion
@@ -266,11 +269,8 @@ def is_number(x: Value, number: float) -> bool:
 
 def neutral_inertias(scene: Scene) -> np.ndarray:
     """1 / diagonal of Mass^-1 at the neutral configuration, of world 0 [dof]; of Mass, where it has no inverse."""
-    from ..trace.evaluation import evaluate
-    from .traced import Trace
-
     one = scene.with_values(**{name: array[:1] for name, array in scene.values.items()})
-    entries = Trace(Links(one), "float64", ("q",)).mass_matrix()
+    entries = mass_matrix(Trace(Links(one), "float64", ("q",)))
     mass = np.zeros((scene.dof_count, scene.dof_count))
     values = evaluate([item.value for item in entries], lambda array, index: scene.neutral_q[index[0]])
     for item, value in zip(entries, values, strict=True):

@@ -7,21 +7,25 @@ for each of them, N, and its columns of Y are complete. Two columns meet in the 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import ZERO, Vector, dot, total
 from . import articulated
+from .articulated_sweeps import factor, mirror, pack
 from .links import Link
 from .motion import STILL
 from .pieces import Piece, Pieces
+
+if TYPE_CHECKING:
+    from .tracing import Trace
 
 NO_FORCE = Vector((*ZERO, *ZERO))
 
 
 class Inverse:
-    """The entries of Mass^-1 that the pieces of a :class:`.traced.Trace` work out.
+    """The entries of Mass^-1 that the pieces of a :class:`.tracing.Trace` work out.
 
     Columns of Y are lists over the pivots from the root out to the end of a piece; it has one pivot for each dof.
 
@@ -31,11 +35,11 @@ class Inverse:
         stores: what is sent. news: likewise, to the pieces that meet this one.
     """
 
-    def __init__(self, trace: Any):
+    def __init__(self, trace: Trace):
         self.trace, self.pieces = trace, Pieces(trace.links).pieces
         self.entries: dict[tuple[int, int], Value] = {}
         self.rounds: list[dict[tuple[int, int], Value]] = []
-        self.done, self.stores = trace.factors()
+        self.done, self.stores = factor(trace)
         self.news: list[Store] = []
         self._rates: dict[int, list[Value]] = {}  # the part of Y_j in j's own piece
         self._forces: dict[int, Vector] = {}  # F_j
@@ -77,7 +81,7 @@ class Inverse:
             self._columns[j] = [dot(row, self._forces[j]) for row in N] + self._rates[j]
         if any(other.looks_at(piece) for other in self.pieces):
             heads = (self._columns[j][: len(N)] for j in piece.dofs)
-            self.news += trace.post("Y", piece, [x for head in heads for x in head])
+            self.news += trace.send("Y", piece, [x for head in heads for x in head])
         weighted = {j: [d * y for d, y in zip(D, self._columns[j], strict=False)] for j in piece.dofs}
         for at, j in enumerate(piece.dofs):
             trace.graph.step = f"column {j}|m"
@@ -85,16 +89,16 @@ class Inverse:
                 self.entries[i, j] = _meeting(weighted[i], self._columns[j])
         if not piece.children:
             return
-        trace.at(piece.links[-1], "n")
+        trace.label(piece.links[-1], "n")
         still = [0.0] * len(piece.links[-1].dofs)
         columns = []
         for c in range(6):
             rates, force = self._inward(piece.links, Vector(float(i == c) for i in range(6)), still)
             columns.append([dot(row, force) for row in N] + rates)
-        self.stores += trace.post("N", piece, [x for row in zip(*columns, strict=True) for x in row])
-        self.stores += trace.post("D", piece, D[len(N) :])
+        self.stores += trace.send("N", piece, [x for row in zip(*columns, strict=True) for x in row])
+        self.stores += trace.send("D", piece, D[len(N) :])
         rest = {j: [0.0] * (len(D) - len(self._columns[j])) for j in piece.dofs}
-        self.stores += trace.post("V", piece, [x for j in piece.dofs for x in self._columns[j] + rest[j]])
+        self.stores += trace.send("V", piece, [x for j in piece.dofs for x in self._columns[j] + rest[j]])
 
     def _meet(self, piece: Piece, other: Piece) -> None:
         """The entries of two branches, or of one and what carries it: columns meet in the pivots that both have."""
@@ -117,3 +121,17 @@ def _meeting(first: list[Value], second: list[Value]) -> Value:
 
 def _sixes(values: list[Value]) -> list[list[Value]]:
     return [values[i : i + 6] for i in range(0, len(values), 6)]
+
+
+def mass_matrix_inverse(trace: Trace) -> list[Store]:
+    """out = Mass^-1, both triangles"""
+    inverse = Inverse(trace)
+    rounds = [mirror(entries) for entries in inverse.rounds]
+    if trace.piece is not None:
+        trace.rounds, trace.news, rounds = rounds, inverse.news, []
+    return inverse.stores + mirror(inverse.entries) + [item for stores in rounds for item in stores]
+
+
+def mass_matrix_inverse_packed(trace: Trace) -> list[Store]:
+    """out = the entries of Mass^-1 within one tree, lower triangle, row after row"""
+    return pack(mass_matrix_inverse(trace))

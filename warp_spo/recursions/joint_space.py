@@ -11,9 +11,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ..trace.scalars import Value, guarded, reciprocal
+from .composite import mass_matrix
+from .newton_euler import inverse_dynamics
 
 if TYPE_CHECKING:
-    from .traced import Trace
+    from .tracing import Trace
 
 Entries = dict[tuple[int, int], Value]  # (row, column), row <= column
 
@@ -28,9 +30,9 @@ class JointSpace:
     def __init__(self, trace: Trace):
         self.trace, self.dofs = trace, range(trace.links.scene.dof_count)
         self.mass: Entries = {
-            (item.index[0], item.index[1]): item.value for item in trace.mass_matrix() if item.index[0] <= item.index[1]
+            (item.index[0], item.index[1]): item.value for item in mass_matrix(trace) if item.index[0] <= item.index[1]
         }
-        self.bias = {item.index[0]: item.value for item in trace.inverse_dynamics(qdd=lambda dof: 0.0)}
+        self.bias = {item.index[0]: item.value for item in inverse_dynamics(trace, qdd=lambda dof: 0.0)}
 
     def solve(self, delta: Callable[[int], Value], b: Callable[[int], Value]) -> list[Value]:
         """(Mass + diag(delta))^-1 (b - bias), by dof; NaN where a pivot is not positive beyond rounding."""

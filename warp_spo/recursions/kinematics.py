@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..trace.scalars import cos, reciprocal, sin, sqrt
+from ..trace.emission import Store
+from ..trace.scalars import Value, cos, reciprocal, sin, sqrt
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, total
-from .links import BALL, FREE, HELIX, SLIDE, TURN, Link, Placed
+from .links import BALL, FREE, HELIX, SLIDE, TURN, Link, Placed, placed
+from .motion import in_link
+from .newton_euler import accelerated
+
+if TYPE_CHECKING:
+    from .tracing import Trace
 
 Quaternion = Vector  # x, y, z, w
 
@@ -85,3 +92,142 @@ def columns(link: Link, parent_axes: Matrix, axes: Matrix, arm: Vector) -> list[
     arm = axes @ arm
     turns = [(axis, cross(axis, arm)) for axis in hinge.T]
     return turns if link.motion == BALL else [*((ZERO, axis) for axis in hinge.T), *turns]
+
+
+def zero(dof: int) -> Value:
+    """Return 0: no dof accelerates."""
+    return 0.0
+
+
+def place_axes(trace: Trace, link: Link) -> None:
+    """Place a link and find its axes in the inertial frame."""
+    trace.place(link)
+    trace.label(link, "R")
+    parent = IDENTITY if link.parent is None else trace.axes[id(link.parent)]
+    trace.axes[id(link)] = parent @ trace.places[id(link)].pose.rotation
+
+
+def frame_on_link(trace: Trace, body: int, origin: tuple) -> tuple[Link | None, Vector]:
+    """The link that carries a frame of a body, and the frame's origin in the link's frame."""
+    seat = trace.links.seats[body]
+    R, p = trace.links.nodes[body].anchor
+    return seat.link, seat.offset + seat.matrix @ (R.T @ (Vector(origin) - p))
+
+
+def jacobian(trace: Trace, frames: tuple) -> list[Store]:
+    """out [frame, 6, dof]: velocity of each frame's origin, then angular velocity, inertial axes, per unit qd."""
+    for each in trace.links.links:
+        place_axes(trace, each)
+    stores = []
+    for index, (body, origin) in enumerate(frames):
+        link, arm = frame_on_link(trace, body, origin)
+        while link is not None:
+            trace.label(link, f"j{index}_")
+            parent = IDENTITY if link.parent is None else trace.axes[id(link.parent)]
+            for dof, (w, v) in zip(link.dofs, columns(link, parent, trace.axes[id(link)], arm), strict=True):
+                stores += [Store("out", (index, c, dof), value) for c, value in enumerate((*v, *w))]
+            pose = trace.places[id(link)].pose
+            arm, link = pose.point_to_parent(arm), link.parent
+    return stores
+
+
+def body_poses(trace: Trace) -> list[Store]:
+    """out [body, 7] = position, quaternion xyzw"""
+    q = trace.vector("q")
+    at: dict[int | None, Vector] = {None: ZERO}
+    turns: dict[int | None, Vector] = {None: Vector((0.0, 0.0, 0.0, 1.0))}
+    for link in trace.links.links:
+        trace.label(link, "p")
+        over = None if link.parent is None else id(link.parent)
+        trace.places[id(link)] = place = placed(link, q)
+        at[id(link)] = at[over] + turned(turns[over], place.pose.l)
+        turns[id(link)] = multiplied(turns[over], relative_quaternion(link, q))
+    stores = []
+    for body, seat in trace.links.seats.items():
+        R, p = trace.links.nodes[body].anchor
+        key = None if seat.link is None else id(seat.link)
+        axes = seat.matrix @ R.T
+        position = at[key] + turned(turns[key], seat.offset - axes @ p)
+        pose = (*position, *multiplied(turns[key], constant_quaternion(axes)))
+        stores += [Store("out", (body, c), value) for c, value in enumerate(pose)]
+    return stores
+
+
+def body_velocities(trace: Trace) -> list[Store]:
+    """out [body, 6] = velocity of the CoM, angular velocity, in inertial axes"""
+    velocities: dict[int | None, tuple[Vector, Vector]] = {None: (ZERO, ZERO)}
+    for link in trace.links.links:
+        place_axes(trace, link)
+        trace.label(link, "v")
+        place, over = trace.places[id(link)], None if link.parent is None else id(link.parent)
+        hinge = in_link(link, place, trace.vector("qd"))
+        velocities[id(link)] = carried_velocity(place, velocities[over], hinge)
+    stores = []
+    for body, seat in trace.links.seats.items():
+        key = None if seat.link is None else id(seat.link)
+        w, v = velocities[key]
+        R = IDENTITY if key is None else trace.axes[key]
+        com = seat.offset + seat.matrix @ trace.links.nodes[body].com
+        values = (*velocity(R, w, v, com), *(R @ w))
+        stores += [Store("out", (body, c), value) for c, value in enumerate(values)]
+    return stores
+
+
+def body_states(trace: Trace) -> list[Store]:
+    """out = body_poses, velocities_out = body_velocities"""
+    return body_poses(trace) + [item._replace(array="velocities_out") for item in body_velocities(trace)]
+
+
+def place_all(trace: Trace, moves: bool = False) -> dict[int, Vector]:
+    """Place every link and find its axes; its origin in inertial axes, from the origin of the first root's link."""
+    origins: dict[int, Vector] = {}
+    for link in trace.links.links:
+        trace.place(link, moves)
+        trace.label(link, "R")
+        key, pose = id(link), trace.places[id(link)].pose
+        if link.parent is None:
+            trace.axes[key] = pose.rotation
+            first = trace.places[id(trace.links.links[0])].pose.l
+            origins[key] = pose.l - first if origins else ZERO  # what is far away cancels once
+        else:
+            over = id(link.parent)
+            trace.axes[key] = trace.axes[over] @ pose.rotation
+            origins[key] = origins[over] + trace.axes[over] @ pose.l
+    return origins
+
+
+def link_accelerations(trace: Trace, qdd: Callable[[int], Value]) -> dict[int, tuple[Vector, Vector]]:
+    """Accelerations of the links without gravity: phi* (H* qdd + a)."""
+    alpha: dict[int, tuple[Vector, Vector]] = {}
+    for link in trace.links.links:
+        trace.label(link, "a")
+        above = (ZERO, ZERO) if link.parent is None else alpha[id(link.parent)]
+        place, move = trace.places[id(link)], trace.motions[id(link)]
+        alpha[id(link)] = accelerated(link, place, move, above, qdd)
+    return alpha
+
+
+def jacobian_bias(trace: Trace, frames: tuple) -> list[Store]:
+    """out [frame, 6] = J' qd: acceleration of each frame's origin, angular acceleration, inertial axes, qdd = 0."""
+    place_all(trace, moves=True)
+    return accelerations_of_frames(trace, frames, link_accelerations(trace, zero))
+
+
+def frame_accelerations(trace: Trace, frames: tuple) -> list[Store]:
+    """out [frame, 6] = J qdd + J' qd"""
+    place_all(trace, moves="qd" in trace.inputs)
+    return accelerations_of_frames(trace, frames, link_accelerations(trace, trace.vector("qdd")))
+
+
+def accelerations_of_frames(trace: Trace, frames: tuple, alpha: dict[int, tuple[Vector, Vector]]) -> list[Store]:
+    """out [frame, 6]: how frames accelerate whose links do as ``alpha`` says, inertial axes."""
+    stores = []
+    for index, (body, origin) in enumerate(frames):
+        link, arm = frame_on_link(trace, body, origin)
+        values = (*ZERO, *ZERO)
+        if link is not None:
+            trace.label(link, f"j{index}_")
+            (w, v), R = alpha[id(link)], trace.axes[id(link)]
+            values = (*(R @ (v + cross(w, arm) + trace.motions[id(link)].whirl @ arm)), *(R @ w))
+        stores += [Store("out", (index, c), value) for c, value in enumerate(values)]
+    return stores

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
+from ..trace.emission import Store
 from ..trace.scalars import Value
-from ..trace.spatial import IDENTITY, Matrix, Rigid, Vector, cross, skew
+from ..trace.spatial import IDENTITY, ZERO, Matrix, Rigid, Vector, cross, skew
 from .links import FREE, Link, Placed
 from .motion import Motion, carried, in_hinge, in_link
+
+if TYPE_CHECKING:
+    from .tracing import Trace
 
 
 def accelerated(
@@ -59,3 +64,40 @@ def root_force(
     """
     forces = hinge_force(link, place, n, f - v * mass, qdd)
     return [*(Vector(forces[:3]) + at_root(link, base, qdd)[1] * mass), *forces[3:]]
+
+
+def inverse_dynamics(
+    trace: Trace, gravity: bool = True, qdd: Callable[[int], Value] | None = None, letter: str = "z"
+) -> list[Store]:
+    """out = Mass qdd + bias_force, for ``qdd`` or the array of that name"""
+    base = trace.base_acceleration if gravity else (ZERO, ZERO)
+    qdd, moves = qdd or trace.vector("qdd"), "qd" in trace.inputs
+    alpha: dict[int, tuple[Vector, Vector]] = {}
+    forces: dict[int, Vector] = {}
+    stores = []
+    for link, outward in trace.traversal():
+        key = id(link)
+        if outward:
+            trace.place(link, moves)
+            trace.label(link, "a")
+            above = base if link.parent is None else alpha[id(link.parent)]
+            alpha[key] = accelerated(link, trace.places[key], trace.motions[key], above, qdd)
+            continue
+        trace.label(link, "f")
+        f = -trace.external_wrench(link)
+        if link.grouped is not None:
+            f = f + body_force(link.grouped, trace.motions[key], *alpha[key])
+        for other in trace.from_children(link, letter, forces, Vector):
+            f = f + other
+        n, f = Vector(f[:3]), Vector(f[3:])
+        mass = trace.links.thrown(link)
+        if mass is None:
+            tau = hinge_force(link, trace.places[key], n, f, qdd)
+        else:
+            tau = root_force(link, trace.places[key], n, f, mass, alpha[key][1], base, qdd)
+        stores += [Store("out", (dof,), value) for dof, value in zip(link.dofs, tau, strict=True)]
+        if link.parent is not None:
+            n, f = trace.places[key].pose.force_to_parent(n, f)
+            forces[key] = Vector((*n, *f))
+            stores += trace.send_to_parent(letter, link, forces[key])
+    return stores

@@ -22,7 +22,7 @@ from .links import FREE, Link, Placed, placed
 from .motion import in_hinge, in_link
 
 if TYPE_CHECKING:
-    from .traced import Trace
+    from .tracing import Trace
 
 Expression = Any
 Field = Callable[[int], Any]  # node -> Vector of its entries
@@ -498,3 +498,8 @@ def _parts(v: Vector) -> tuple[Vector, Vector]:
 
 def _joined(parts: tuple[Vector, Vector]) -> Vector:
     return Vector((*parts[0], *parts[1]))
+
+
+def expression(trace: Trace, expression: Expression) -> list[Store]:
+    """out = an operator, or what is composed of several, times the array x."""
+    return Operators(trace).stores(expression)

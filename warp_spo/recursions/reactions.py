@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ..trace.emission import Store
 from ..trace.spatial import IDENTITY, Pose, Vector, cross
 from . import newton_euler
+from .kinematics import place_all
 from .motion import STILL
 
+if TYPE_CHECKING:
+    from .tracing import Trace
 
-def body_accelerations(trace: Any) -> list[Store]:
+
+def body_accelerations(trace: Trace) -> list[Store]:
     """out [body, 6] = acceleration of the CoM, angular acceleration"""
     _, alpha = _moving(trace)
     stores = []
@@ -18,7 +22,7 @@ def body_accelerations(trace: Any) -> list[Store]:
         if seat.link is None:
             continue
         key = id(seat.link)
-        trace.at(seat.link, "a")
+        trace.label(seat.link, "a")
         (w, v), move, R = alpha[key], trace.motions[key], trace.axes[key]
         com = seat.offset + seat.matrix @ trace.links.nodes[body].com
         linear = R @ (v + cross(w, com) + move.whirl @ com) + trace.links.gravity
@@ -26,7 +30,7 @@ def body_accelerations(trace: Any) -> list[Store]:
     return stores
 
 
-def body_reactions(trace: Any) -> list[Store]:
+def body_reactions(trace: Trace) -> list[Store]:
     """out [body, 6] = force, moment about the CoM, that a body's hinge puts on it
 
     A body takes for itself what moves it, and hands on what its children need; forces meet at CoMs.
@@ -39,10 +43,10 @@ def body_reactions(trace: Any) -> list[Store]:
     for body in reversed(list(seats)):  # parents come first there
         seat = seats[body]
         move, R, origin = STILL, IDENTITY, still
-        w, v = trace.base
+        w, v = trace.base_acceleration
         if seat.link is not None:
             key = id(seat.link)
-            trace.at(seat.link, "f")
+            trace.label(seat.link, "f")
             (w, v), move, R, origin = alpha[key], trace.motions[key], trace.axes[key], origins[key]
         com = seat.offset + seat.matrix @ trace.links.nodes[body].com
         place = Pose(None, seat.matrix, seat.offset)
@@ -50,7 +54,7 @@ def body_reactions(trace: Any) -> list[Store]:
         n, f = Vector(moment[:3]), Vector(moment[3:])
         n, f = R @ (n - cross(com, f)), R @ f
         places[body] = at = origin + R @ com
-        if "body_f" in trace.given:
+        if "body_f" in trace.inputs:
             f = f - Vector(trace.graph.input("body_f", body, c) for c in range(3))
             n = n - Vector(trace.graph.input("body_f", body, c) for c in range(3, 6))
         for child in tree.children[body]:
@@ -61,14 +65,14 @@ def body_reactions(trace: Any) -> list[Store]:
     return stores
 
 
-def _moving(trace: Any) -> tuple[dict[int, Vector], dict[int, tuple[Vector, Vector]]]:
+def _moving(trace: Trace) -> tuple[dict[int, Vector], dict[int, tuple[Vector, Vector]]]:
     """Origins and accelerations of all links, gravity in them as the other way round."""
-    origins = trace.place_all(moves=True)
+    origins = place_all(trace, moves=True)
     qdd = trace.vector("qdd")
     alpha: dict[int, tuple[Vector, Vector]] = {}
     for link in trace.links.links:
-        trace.at(link, "a")
-        above = trace.base if link.parent is None else alpha[id(link.parent)]
+        trace.label(link, "a")
+        above = trace.base_acceleration if link.parent is None else alpha[id(link.parent)]
         place, move = trace.places[id(link)], trace.motions[id(link)]
         alpha[id(link)] = newton_euler.accelerated(link, place, move, above, qdd)
     return origins, alpha

@@ -20,12 +20,13 @@ from ..status import Status
 from ..trace.emission import Store
 from ..trace.scalars import Value, less, reciprocal, select
 from ..trace.spatial import total
+from .articulated_sweeps import expand, reduce
 from .impedance import Impedance, Law, added, is_number
-from .integration import coordinate_rates, moved
+from .integration import moved
 from .joint_space import JointSpace
 from .links import BALL, FREE, Link
 from .pieces import Piece, Pieces
-from .traced import Trace
+from .tracing import Trace
 
 GUESS, GAIN, MISSED = "guess", "gain", "missed"
 """Variables of a loop over passes, zero at first: by dof of a piece, the guess of u, and u; whether one missed."""
@@ -43,8 +44,8 @@ class Step:
     """
 
     def __init__(self, trace: Trace):
-        self.trace, self.links = trace, trace.outward
-        vector, given = trace.vector, trace.given
+        self.trace, self.links = trace, trace.own_links
+        vector, given = trace.vector, trace.inputs
         self.h = trace.graph.input("dt", 0)
         apart = "q_from" in given
         self.q, self.qd = (vector("q_from"), vector("qd_from")) if apart else (vector("q"), vector("qd"))
@@ -79,7 +80,7 @@ class Step:
         rates_after = {dof: self.qd(dof) + gain for dof, gain in gains.items()}
         stores: list[Store] = []
         for link in self.links:
-            trace.at(link, "q")
+            trace.label(link, "q")
             stores += [Store("out", (dof,), rates_after[dof]) for dof in link.dofs]
             coordinates = moved(link, self.q, rates_after.__getitem__, self.h)
             stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
@@ -99,8 +100,8 @@ class Step:
         """qdd by dof for ``tau``, the pieces that hold at the guess in Mass."""
         if self._short:
             return self._in_joint_space(tau)
-        done, rates, sent = self.trace.reduce(tau, moves=True, loads=True)
-        stores = sent + self.trace.expand(done, rates, self.trace.base)
+        done, rates, sent = reduce(self.trace, tau, moves=True, loads=True)
+        stores = sent + expand(self.trace, done, rates, self.trace.base_acceleration)
         self.messages = [item for item in stores if item.array != "out"]
         return {item.index[0]: item.value for item in stores if item.array == "out"}
 
@@ -117,7 +118,7 @@ class Step:
         pieces: dict[int, Law] = {}
         self.trace.ahead = [*system.mass.values(), *system.bias.values()]
         for link in self.links:
-            self.trace.at(link, "r")
+            self.trace.label(link, "r")
             pieces.update(zip(link.dofs, self._pieces(link), strict=True))
         return dict(enumerate(system.solve(lambda dof: self.h * pieces[dof].resistance, tau)))
 
@@ -184,7 +185,7 @@ class Step:
             return []
         stores, missed, found = [], [], []
         for link in self.links:
-            self.trace.at(link, "u")
+            self.trace.label(link, "u")
             for dof in link.dofs:
                 gain, laws, at = gains[dof], self.laws[dof], self._kept.get(dof, dof)
                 found.append(Store(GAIN, (at,), gain))
@@ -226,7 +227,7 @@ class Step:
                 worst = select(less(worst, word), word, worst)
             settled = less(graph.input(MISSED, 0), 0.5)
             trace.rounds = [[Store("status", (), select(worst, worst, select(settled, 0.0, Status.NOT_SETTLED)))]]
-        return trace.post("S", own, [finite])
+        return trace.send("S", own, [finite])
 
     def _inputs(self) -> list[Value]:
         """What the links are given; the first piece has the bodies that do not move, too."""
@@ -236,7 +237,7 @@ class Step:
         coordinates = sorted(first + c for first, count in wide for c in range(count))
         own = {*map(id, self.links)} | (set() if trace.piece and trace.piece.index else {id(None)})
         bodies = sorted(body for body, seat in trace.links.seats.items() if id(seat.link) in own)
-        for name in trace.given:
+        for name in trace.inputs:
             if name in ("q", "target_q", "q_from"):
                 inputs += map(trace.vector(name), coordinates)
             if name in ("qd", "tau", "target_qd", "qd_from"):
@@ -261,49 +262,6 @@ def _finite(values: list[Value]) -> Value:
     return less(-1.0, total(v.graph.make("lost", v) for v in values if not isinstance(v, float)))
 
 
-def hinge_force(trace: Trace) -> list[Store]:
-    """out = the forces of all laws as they are at q, qd."""
-    impedance = Impedance(
-        trace.links,
-        0.0,
-        trace.vector("q"),
-        trace.vector("qd"),
-        None,
-        trace.vector("target_q") if "target_q" in trace.given else None,
-        trace.vector("target_qd"),
-    )
-    stores = []
-    for link in trace.links.links:
-        trace.at(link, "f")
-        for dof, laws in zip(link.dofs, impedance.laws(link), strict=True):
-            stores.append(Store("out", (dof,), total(law.at(0.0) for law in laws)))
-    return stores
-
-
-def passive_force(trace: Trace) -> list[Store]:
-    """out = -damping qd - stiffness (q - rest)"""
-    impedance = Impedance(trace.links, 0.0, trace.vector("q"), trace.vector("qd"))
-    stores = []
-    for link in trace.links.links:
-        trace.at(link, "f")
-        stores += [Store("out", (dof,), law.force) for dof, law in zip(link.dofs, impedance.passive(link), strict=True)]
-    return stores
-
-
-def integrate(trace: Trace) -> list[Store]:
-    """out = q moved along qd for dt"""
-    q, qd, h = trace.vector("q"), trace.vector("qd"), trace.graph.input("dt", 0)
-    return _coordinates(trace, lambda link: moved(link, q, qd, h))
-
-
-def rates(trace: Trace) -> list[Store]:
-    """out = dq/dt"""
-    return _coordinates(trace, lambda link: coordinate_rates(link, trace.vector("q"), trace.vector("qd")))
-
-
-def _coordinates(trace: Trace, of: Callable[[Link], list[Value]]) -> list[Store]:
-    stores = []
-    for link in trace.links.links:
-        trace.at(link, "q")
-        stores += [Store("out", (link.coordinate + c,), value) for c, value in enumerate(of(link))]
-    return stores
+def step(trace: Trace, qdd: bool = False, status: bool = False) -> list[Store]:
+    """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world."""
+    return Step(trace).stores(qdd, status)

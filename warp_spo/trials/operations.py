@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ..recursions.derivatives.adjoints import Adjoints
+from ..recursions.derivatives.adjoints import inverse_dynamics_jvp
 from ..recursions.links import Links
+from ..recursions.tracing import Trace
 from ..reference import Dense
 from ..scene.parts import SCREWS
 from ..scene.scene import Scene
@@ -301,7 +302,7 @@ def _inverse_derivatives(dense: Dense, qd: np.ndarray, qdd: np.ndarray) -> tuple
                                if value.shape[0] > 1})  # fmt: skip
     arrays = {"q": dense.q, "qd": qd, "qdd": qdd}
     directions = {"q_dot": np.eye(2 * n, n), "qd_dot": np.eye(2 * n, n, -n)}  # [direction, dof]
-    stores = Adjoints(Links(one), "float64", (*arrays, *directions)).inverse_dynamics_jvp()
+    stores = inverse_dynamics_jvp(Trace(Links(one), "float64", (*arrays, *directions)))
     values = evaluate(
         [item.value for item in stores],
         lambda name, at: directions[name][:, at[0]] if name in directions else float(arrays[name][at[0]]),

@@ -7,168 +7,172 @@ by q and by qd, H*(i) as a row of the composite inertia, and what it makes of an
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from ...trace.emission import Store
 from ...trace.scalars import Value
 from ...trace.spatial import ZERO, Rigid, Vector, cross, dot
 from .. import composite, motion, newton_euler
-from ..applications import Applications
 from ..links import BALL, FREE, Link
 from ..motion import STILL, Motion
 from . import sensitivity
 from .sensitivity import Carried, Sensitivity
 
+if TYPE_CHECKING:
+    from ..tracing import Trace
+
 Q, QD, QDD = range(3)  # blocks of the result
 
 
-class Derivatives(Applications):
-    """The operations of :class:`Applications`, and derivatives."""
+def inverse_dynamics_derivatives(trace: Trace) -> list[Store]:
+    """out [3, dof, dof] = d tau / d q along the tangent coordinates, d tau / d qd, Mass"""
+    qdd, moves = trace.vector("qdd"), "qd" in trace.inputs
+    rates = trace.vector("qd") if moves else None
+    alpha: dict[int, tuple[Vector, Vector]] = {}
+    own: dict[int, tuple[list[Sensitivity], list[Sensitivity]]] = {}
+    carried: dict[int, Carried] = {}
+    forces: dict[int, tuple[Vector, Vector]] = {}
+    drifts: dict[int, Vector] = {}
+    stores: list[Store] = []
+    for link, outward in trace.traversal():
+        key, over = id(link), link.parent
+        parent: Motion = STILL if over is None else trace.motions[id(over)]
+        if outward:
+            trace.place(link, moves)
+            place = trace.places[key]
+            trace.label(link, "a")
+            above = trace.base_acceleration if over is None else alpha[id(over)]
+            alpha[key] = newton_euler.accelerated(link, place, trace.motions[key], above, qdd)
+            trace.label(link, "s")
+            drifts[key] = sensitivity.drift(link, place, None if over is None else parent, rates)
+            own[key] = (
+                sensitivity.of_coordinates(link, place, trace.motions[key], parent, above, alpha[key], rates),
+                sensitivity.of_rates(link, place, trace.motions[key], parent),
+            )
+            continue
+        place = trace.places[key]
+        trace.label(link, "c")
+        all_in = sensitivity.of_body(link.inertia, trace.motions[key])
+        n, f = ZERO, ZERO
+        if link.inertia is not None:
+            force = newton_euler.body_force(link.inertia, trace.motions[key], *alpha[key])
+            n, f = Vector(force[:3]), Vector(force[3:])
+        for arm, pull, torque in _wrenches(trace, link):
+            all_in = all_in + sensitivity.under_load(arm, pull, torque)
+            n, f = n - torque - cross(arm, pull), f - pull
+        for child in link.children:
+            all_in = all_in + carried[id(child)]
+            n, f = n + forces[id(child)][0], f + forces[id(child)][1]
+        if over is not None:
+            carried[key] = sensitivity.to_parent(place, drifts[key], all_in)
+            forces[key] = place.pose.force_to_parent(n, f)
+        stores += _entries(trace, link, all_in, (n, f), own, drifts)
+    return stores
 
-    def inverse_dynamics_derivatives(self) -> list[Store]:
-        """out [3, dof, dof] = d tau / d q along the tangent coordinates, d tau / d qd, Mass"""
-        qdd, moves = self.vector("qdd"), "qd" in self.given
-        rates = self.vector("qd") if moves else None
-        alpha: dict[int, tuple[Vector, Vector]] = {}
-        own: dict[int, tuple[list[Sensitivity], list[Sensitivity]]] = {}
-        carried: dict[int, Carried] = {}
-        forces: dict[int, tuple[Vector, Vector]] = {}
-        drifts: dict[int, Vector] = {}
-        stores: list[Store] = []
-        for link, outward in self.traversal():
-            key, over = id(link), link.parent
-            parent: Motion = STILL if over is None else self.motions[id(over)]
-            if outward:
-                self.place(link, moves)
-                place = self.places[key]
-                self.at(link, "a")
-                above = self.base if over is None else alpha[id(over)]
-                alpha[key] = newton_euler.accelerated(link, place, self.motions[key], above, qdd)
-                self.at(link, "s")
-                drifts[key] = sensitivity.drift(link, place, None if over is None else parent, rates)
-                own[key] = (
-                    sensitivity.of_coordinates(link, place, self.motions[key], parent, above, alpha[key], rates),
-                    sensitivity.of_rates(link, place, self.motions[key], parent),
-                )
-                continue
-            place = self.places[key]
-            self.at(link, "c")
-            all_in = sensitivity.of_body(link.inertia, self.motions[key])
-            n, f = ZERO, ZERO
-            if link.inertia is not None:
-                force = newton_euler.body_force(link.inertia, self.motions[key], *alpha[key])
-                n, f = Vector(force[:3]), Vector(force[3:])
-            for arm, pull, torque in self.wrenches(link):
-                all_in = all_in + sensitivity.under_load(arm, pull, torque)
-                n, f = n - torque - cross(arm, pull), f - pull
-            for child in link.children:
-                all_in = all_in + carried[id(child)]
-                n, f = n + forces[id(child)][0], f + forces[id(child)][1]
-            if over is not None:
-                carried[key] = sensitivity.to_parent(place, drifts[key], all_in)
-                forces[key] = place.pose.force_to_parent(n, f)
-            stores += self._entries(link, all_in, (n, f), own, drifts)
-        return stores
 
-    def wrenches(self, link: Link) -> list[tuple[Vector, Vector, Vector]]:
-        """(arm, force, torque) of the external wrenches on the bodies of a link, in its frame."""
-        found = []
-        if "body_f" in self.given:
-            back = self.axes[id(link)].T
-            for body in self.bodies.get(id(link), ()):
-                seat = self.links.seats[body]
-                entries = [self.graph.input("body_f", body, c) for c in range(6)]
-                com = seat.offset + seat.matrix @ self.links.nodes[body].com
-                found.append((com, back @ Vector(entries[:3]), back @ Vector(entries[3:])))
-        return found
+def _wrenches(trace: Trace, link: Link) -> list[tuple[Vector, Vector, Vector]]:
+    """(arm, force, torque) of the external wrenches on the bodies of a link, in its frame."""
+    found = []
+    if "body_f" in trace.inputs:
+        back = trace.axes[id(link)].T
+        for body in trace.bodies.get(id(link), ()):
+            seat = trace.links.seats[body]
+            entries = [trace.graph.input("body_f", body, c) for c in range(6)]
+            com = seat.offset + seat.matrix @ trace.links.nodes[body].com
+            found.append((com, back @ Vector(entries[:3]), back @ Vector(entries[3:])))
+    return found
 
-    def _entries(
-        self, link: Link, all_in: Carried, force: tuple[Vector, Vector], own: dict, drifts: dict[int, Vector]
-    ) -> list[Store]:
-        """Entries of the three blocks in which a dof of the link meets one of its hinge or nearer to the root."""
-        place, stores = self.places[id(link)], []
-        by_q, by_qd = own[id(link)]
-        for at, (dof, s, s_d, (w, v)) in enumerate(
-            zip(link.dofs, by_q, by_qd, sensitivity.columns(link, place), strict=True)
-        ):
-            self.at(link, f"d{at}_")
-            row = all_in.row(w, v)
-            n, f = all_in.force(s)
-            change = n + cross(s.turn, force[0]), f + cross(s.turn, force[1])
-            blocks = [(Q, *change), (QD, *all_in.force(s_d)), (QDD, row.w, row.v)]
+
+def _entries(
+    trace: Trace, link: Link, all_in: Carried, force: tuple[Vector, Vector], own: dict, drifts: dict[int, Vector]
+) -> list[Store]:
+    """Entries of the three blocks in which a dof of the link meets one of its hinge or nearer to the root."""
+    place, stores = trace.places[id(link)], []
+    by_q, by_qd = own[id(link)]
+    for at, (dof, s, s_d, (w, v)) in enumerate(
+        zip(link.dofs, by_q, by_qd, sensitivity.columns(link, place), strict=True)
+    ):
+        trace.label(link, f"d{at}_")
+        row = all_in.row(w, v)
+        n, f = all_in.force(s)
+        change = n + cross(s.turn, force[0]), f + cross(s.turn, force[1])
+        blocks = [(Q, *change), (QD, *all_in.force(s_d)), (QDD, row.w, row.v)]
+        for block, n, f in blocks:
+            for i, value in zip(link.dofs, motion.in_hinge(link, place, n, f), strict=True):
+                extra = link.armature[at] if block == QDD and i == dof else 0.0
+                stores.append(Store("out", (block, i, dof), value + extra))
+        blocks[0] = Q, change[0] + cross(s.shift, force[1]), change[1]  # the parent feels the force elsewhere
+        over = link
+        while over.parent is not None:
+            pose = trace.places[id(over)].pose
+            row = row.to_parent(trace.places[id(over)], drifts[id(over)])
+            blocks = [*((block, *pose.force_to_parent(n, f)) for block, n, f in blocks[:2]), (QDD, row.w, row.v)]
+            over = over.parent
             for block, n, f in blocks:
-                for i, value in zip(link.dofs, motion.in_hinge(link, place, n, f), strict=True):
-                    extra = link.armature[at] if block == QDD and i == dof else 0.0
-                    stores.append(Store("out", (block, i, dof), value + extra))
-            blocks[0] = Q, change[0] + cross(s.shift, force[1]), change[1]  # the parent feels the force elsewhere
-            over = link
-            while over.parent is not None:
-                pose = self.places[id(over)].pose
-                row = row.to_parent(self.places[id(over)], drifts[id(over)])
-                blocks = [*((block, *pose.force_to_parent(n, f)) for block, n, f in blocks[:2]), (QDD, row.w, row.v)]
-                over = over.parent
-                for block, n, f in blocks:
-                    for i, value in zip(over.dofs, motion.in_hinge(over, self.places[id(over)], n, f), strict=True):
-                        stores.append(Store("out", (block, i, dof), value))
-                        if block == QDD:
-                            stores.append(Store("out", (block, dof, i), value))
-                for block, sensitivities in ((Q, own[id(over)][0]), (QD, own[id(over)][1])):
-                    for j, other in zip(over.dofs, sensitivities, strict=True):
-                        stores.append(Store("out", (block, dof, j), row.at(other)))
-        return stores
+                for i, value in zip(over.dofs, motion.in_hinge(over, trace.places[id(over)], n, f), strict=True):
+                    stores.append(Store("out", (block, i, dof), value))
+                    if block == QDD:
+                        stores.append(Store("out", (block, dof, i), value))
+            for block, sensitivities in ((Q, own[id(over)][0]), (QD, own[id(over)][1])):
+                for j, other in zip(over.dofs, sensitivities, strict=True):
+                    stores.append(Store("out", (block, dof, j), row.at(other)))
+    return stores
 
-    def mass_matrix_derivative(self) -> list[Store]:
-        """out [dof, dof, dof] = d Mass / d q along the tangent coordinates, the last index the coordinate.
 
-        Moving link k turns all that it carries against what is above it. So Mass changes where columns from above, as
-        the link sees them, meet its composite inertia, or the momenta that dofs below it hand on.
-        """
-        heads: dict[int, dict[int, tuple[Vector, Vector]]] = {}  # H* of the dofs above a link and of its own
-        tails: dict[int, dict[int, tuple[Vector, Vector]]] = {}  # R H* of the dofs below it
-        bodies: dict[int, Rigid] = {}
-        stores: list[Store] = []
-        for link, outward in self.traversal():
-            key = id(link)
-            if outward:
-                self.place(link)
-                self.at(link, "h")
-                pose = self.places[key].pose
-                above = {} if link.parent is None else heads[id(link.parent)]
-                heads[key] = {dof: pose.motion_to_child(w, v) for dof, (w, v) in above.items()}
-                heads[key] |= zip(link.dofs, sensitivity.columns(link, self.places[key]), strict=True)
-                continue
-            self.at(link, "t")
-            body, below = link.inertia or composite.NOTHING, dict[int, tuple[Vector, Vector]]()
-            for child in link.children:
-                pose = self.places[id(child)].pose
-                body = body + pose.rigid_to_parent(bodies[id(child)])
-                below |= {dof: pose.force_to_parent(n, f) for dof, (n, f) in tails[id(child)].items()}
-            bodies[key] = body
-            momenta = {dof: body.apply(w, v) for dof, (w, v) in heads[key].items()}
-            tails[key] = below | {dof: momenta[dof] for dof in link.dofs}
-            for dof in link.dofs:
-                self.at(link, f"m{dof}_")
-                changes = self._seen(link, heads[key], heads[key][dof])
-                met = {**below, **momenta}
-                for i, change in changes.items():
-                    for j, momentum in met.items():
-                        value = _power(change, momentum)
-                        if j in changes:
-                            if j < i:
-                                continue
-                            value = value + _power(changes[j], momenta[i])
-                        stores += [Store("out", (*at, dof), value) for at in {(i, j), (j, i)}]
-        return stores
+def mass_matrix_derivative(trace: Trace) -> list[Store]:
+    """out [dof, dof, dof] = d Mass / d q along the tangent coordinates, the last index the coordinate.
 
-    @staticmethod
-    def _seen(link: Link, heads: dict, moved: tuple[Vector, Vector]) -> dict[int, tuple[Vector, Vector]]:
-        """How columns H* change as the link sees them when it moves by one of its own."""
-        theta, d = moved
-        found = {}
-        for i, (w, v) in heads.items():
-            if i not in link.dofs:
-                found[i] = cross(w, theta), cross(w, d) + cross(v, theta)
-            elif link.motion in (BALL, FREE):  # they stay with the parent, and a free hinge's meet at the CoM
-                found[i] = cross(w, theta), cross(v, theta)
-        return found
+    Moving link k turns all that it carries against what is above it. So Mass changes where columns from above, as
+    the link sees them, meet its composite inertia, or the momenta that dofs below it hand on.
+    """
+    heads: dict[int, dict[int, tuple[Vector, Vector]]] = {}  # H* of the dofs above a link and of its own
+    tails: dict[int, dict[int, tuple[Vector, Vector]]] = {}  # R H* of the dofs below it
+    bodies: dict[int, Rigid] = {}
+    stores: list[Store] = []
+    for link, outward in trace.traversal():
+        key = id(link)
+        if outward:
+            trace.place(link)
+            trace.label(link, "h")
+            pose = trace.places[key].pose
+            above = {} if link.parent is None else heads[id(link.parent)]
+            heads[key] = {dof: pose.motion_to_child(w, v) for dof, (w, v) in above.items()}
+            heads[key] |= zip(link.dofs, sensitivity.columns(link, trace.places[key]), strict=True)
+            continue
+        trace.label(link, "t")
+        body, below = link.inertia or composite.NOTHING, dict[int, tuple[Vector, Vector]]()
+        for child in link.children:
+            pose = trace.places[id(child)].pose
+            body = body + pose.rigid_to_parent(bodies[id(child)])
+            below |= {dof: pose.force_to_parent(n, f) for dof, (n, f) in tails[id(child)].items()}
+        bodies[key] = body
+        momenta = {dof: body.apply(w, v) for dof, (w, v) in heads[key].items()}
+        tails[key] = below | {dof: momenta[dof] for dof in link.dofs}
+        for dof in link.dofs:
+            trace.label(link, f"m{dof}_")
+            changes = _column_changes(link, heads[key], heads[key][dof])
+            met = {**below, **momenta}
+            for i, change in changes.items():
+                for j, momentum in met.items():
+                    value = _power(change, momentum)
+                    if j in changes:
+                        if j < i:
+                            continue
+                        value = value + _power(changes[j], momenta[i])
+                    stores += [Store("out", (*at, dof), value) for at in {(i, j), (j, i)}]
+    return stores
+
+
+def _column_changes(link: Link, heads: dict, moved: tuple[Vector, Vector]) -> dict[int, tuple[Vector, Vector]]:
+    """How columns H* change as the link sees them when it moves by one of its own."""
+    theta, d = moved
+    found = {}
+    for i, (w, v) in heads.items():
+        if i not in link.dofs:
+            found[i] = cross(w, theta), cross(w, d) + cross(v, theta)
+        elif link.motion in (BALL, FREE):  # they stay with the parent, and a free hinge's meet at the CoM
+            found[i] = cross(w, theta), cross(v, theta)
+    return found
 
 
 def _power(velocity: tuple[Vector, Vector], momentum: tuple[Vector, Vector]) -> Value:

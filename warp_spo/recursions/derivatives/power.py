@@ -19,7 +19,7 @@ from ..links import Link, Placed
 from ..motion import in_link, whirl
 
 if TYPE_CHECKING:
-    from ..traced import Trace
+    from ..tracing import Trace
 
 Entry = Callable[[int], Value]
 Ways = dict[tuple, Value]
@@ -84,18 +84,20 @@ class Power:
 
     Args:
         multiplier, qdd: lambda and the accelerations, by dof: inputs, or what other recursions make.
+        base: acceleration of the inertial frame; gravity unless given.
 
     Attributes:
         ways: how it changes with entries of "q", "qd", "qdd", "body_f" and of the scene's values, each by the name and
             the index of that input. stores: what other pieces need of it. forces: tau, by dof.
     """
 
-    def __init__(self, trace: Trace, multiplier: Entry, qdd: Entry):
+    def __init__(self, trace: Trace, multiplier: Entry, qdd: Entry, base: tuple[Vector, Vector] | None = None):
         self.trace, self.ways, self.stores = trace, Ways(), list[Store]()
         self.forces: dict[int, Value] = {}
         self.multiplier, self.qdd = lambda dof: cut(multiplier(dof)), lambda dof: cut(qdd(dof))
-        base = Moving(ZERO, *trace.base, ZERO, ZERO)
-        seen: dict[int | None, Seen] = {None: Seen(base, Matrix(), turning_of(base))}
+        w, v = trace.base_acceleration if base is None else base
+        inertial = Moving(ZERO, w, v, ZERO, ZERO)
+        seen: dict[int | None, Seen] = {None: Seen(inertial, Matrix(), turning_of(inertial))}
         carried: dict[int, Carried] = {}
         moved: dict[int, Moving] = {}
         bars: dict[int, list[Value]] = {}
@@ -103,16 +105,16 @@ class Power:
             key, over = id(link), None if link.parent is None else id(link.parent)
             if outward:
                 trace.place(link)
-                trace.at(link, "m")
+                trace.label(link, "m")
                 carried[key] = Carried.of(trace.places[key], seen[over], trace.axes.get(key, Matrix()))
                 moved[key] = self._moved(link, carried[key].apart)
                 seen[key] = Seen.of(moved[key], carried[key].apart[5:])
                 trace.axes[key] = seen[key].axes
                 continue
-            trace.at(link, "g")
-            others = trace.carried_on(link, "B", bars, list)
+            trace.label(link, "g")
+            others = trace.from_children(link, "B", bars, list)
             bars[key] = self._handed(link, seen[key], moved[key], carried[key], seen[over], others)
-            self.stores += trace.handed_on("B", link, bars[key])
+            self.stores += trace.send_to_parent("B", link, bars[key])
 
     def _moved(self, link: Link, carried: list[Vector]) -> Moving:
         """With what the link's own rates add."""
@@ -127,7 +129,7 @@ class Power:
         self, link: Link, mine: Seen, moved: Moving, carried: Carried, parent: Seen, others: list[list[Value]]
     ) -> list[Value]:
         """How the sum changes with what the link's parent shows of itself; ``others``: so say the link's children."""
-        bars = self._back([_power(link.grouped, self.trace.external(link), mine)], [1.0], mine.all)
+        bars = self._back([_power(link.grouped, self.trace.external_wrench(link), mine)], [1.0], mine.all)
         for other in others:
             bars = [a + b for a, b in zip(bars, other, strict=True)]
         own = len(mine.all) - 9

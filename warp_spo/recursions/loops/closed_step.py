@@ -12,18 +12,25 @@ launches. Passes would have to span them all, so that laws that bend are refused
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ...errors import UnsupportedError
 from ...trace.emission import Store
 from ...trace.scalars import Value, less
 from ...trace.spatial import total
+from ..articulated_sweeps import expand, reduce
 from ..integration import moved
 from ..links import Link, placed
 from ..step import Step
 from . import clusters
 from .closures import Ratio, opened
 from .clusters import Cluster, Columns
+from .embedded import ClosedLoops, Embedding
+from .multipliers import combine_rows, loop_system
+from .projection import place_links
+
+if TYPE_CHECKING:
+    from ..tracing import Trace
 
 NEWTON_STEPS = 2  # of position and of velocity, where a loop joint is; couplings are linear and take one
 RESOLVED = 4.0  # roundings: a margin that is no larger may be rounding alone
@@ -33,27 +40,25 @@ class ClosedStep(Step):
     """The step as a trace, loops embedded.
 
     Args:
-        trace: an :class:`.embedded.Embedded`. how: its rows that count, an :class:`.embedded.Embedding`.
+        trace: the evaluation. embedding: the rows that count and the independent dofs.
     """
 
-    trace: Any
-
-    def __init__(self, trace: Any, how: Any):
+    def __init__(self, trace: Trace, embedding: Embedding):
         super().__init__(trace)
-        self.how = how
+        self.loops = ClosedLoops(trace, embedding)
         self.margins: list[Value] = []
         self.after: tuple[Columns, Columns] = {}, {}  # q', qd'
 
     def _accelerations(self, tau: Callable[[int], Value]) -> Columns:
-        swept = self.trace.sweep(self.how, tau, moves=True, loads=True)
+        swept = self.loops.sweep(tau, moves=True, loads=True)
         self.margins += swept.margins
-        return self.trace.outward_accelerations(swept, self.trace.base)
+        return self.loops.outward_accelerations(swept, self.trace.base_acceleration)
 
     def put_back(self, stores: list[Store]) -> list[Store]:
         """The stores with q' and qd' on the closures."""
         q, qd = ({s.index[0]: s.value for s in stores if s.array == array} for array in ("q_out", "out"))
-        for cluster in self.trace.clusters:
-            self.trace.at_cluster(cluster, "c")
+        for cluster in self.loops.clusters:
+            self.loops.label(cluster, "c")
             self._close(cluster, q, qd)
         self.after = q, qd
         closed = {"q_out": q, "out": qd}
@@ -63,7 +68,7 @@ class ClosedStep(Step):
         count = 1 if all(isinstance(tie, Ratio) for _, tie in cluster.constraints) else NEWTON_STEPS
         place = lambda: {id(link): placed(link, q.__getitem__) for link in cluster.links}  # noqa: E731
         places = place()
-        tied = clusters.tied(cluster, places, self.how.rows, self.trace.epsilon)
+        tied = clusters.tied(cluster, places, self.loops.embedding.rows, self.trace.epsilon)
         self.margins += tied.space.margins
         for _ in range(count):
             step = tied.space.particular([-g for g in tied.errors(places, q.__getitem__)])
@@ -79,7 +84,7 @@ class ClosedStep(Step):
 
     def _weightless(self, link: Link) -> bool:
         """What a loop ties may carry what is on its other side."""
-        return id(link) not in self.trace.cluster_of and super()._weightless(link)
+        return id(link) not in self.loops.cluster_of and super()._weightless(link)
 
     def _unresolved(self) -> Value:
         least = RESOLVED * self.trace.epsilon
@@ -87,20 +92,18 @@ class ClosedStep(Step):
 
     def _open(self) -> Value:
         q, qd = self.after
-        places = {id(link): placed(link, q.__getitem__) for cluster in self.trace.clusters for link in cluster.links}
-        return opened(self.trace.constraints, places, q.__getitem__, qd.__getitem__)
+        places = {id(link): placed(link, q.__getitem__) for cluster in self.loops.clusters for link in cluster.links}
+        return opened(self.loops.constraints, places, q.__getitem__, qd.__getitem__)
 
 
 class MultiplierStep(Step):
-    """The step of the open tree as a trace, under the array "multipliers", of a :class:`.multipliers.Multipliers`."""
-
-    trace: Any
+    """The step of the open tree as a trace, under the array "multipliers"."""
 
     def system(self) -> list[Store]:
         """out, right, size: what the multipliers solve."""
         self.trace.stiffened = self._stiffened
         tau = self.trace.vector("tau")
-        return self.trace.loop_system(lambda dof: tau(dof) + self.forces[dof])
+        return loop_system(self.trace, lambda dof: tau(dof) + self.forces[dof])
 
     def _stiffened(self, link: Link) -> Link:
         stiff = super()._stiffened(link)
@@ -113,10 +116,25 @@ class MultiplierStep(Step):
 
     def _accelerations(self, tau: Callable[[int], Value]) -> Columns:
         trace = self.trace
-        trace.place_links(moves=True)
-        loads = trace._combined(trace.vector("multipliers"))
-        done, rates, _ = trace.reduce(lambda dof: tau(dof) + loads.get(dof, 0.0), moves=True, loads=True)
-        return {item.index[0]: item.value for item in trace.expand(done, rates, trace.base)}
+        place_links(trace, moves=True)
+        loads = combine_rows(trace, trace.vector("multipliers"))
+        done, rates, _ = reduce(trace, lambda dof: tau(dof) + loads.get(dof, 0.0), moves=True, loads=True)
+        return {item.index[0]: item.value for item in expand(trace, done, rates, trace.base_acceleration)}
 
     def _unresolved(self) -> Value:
         return 1.0 - less(self.trace.epsilon**0.5, self.trace.graph.input("resolved", 0))
+
+
+def step(trace: Trace, embedding: Embedding, qdd: bool = False, status: bool = False) -> list[Store]:
+    """out = qd', q_out = q', qdd_out, status of a step with loops embedded"""
+    return ClosedStep(trace, embedding).stores(qdd, status)
+
+
+def step_with_multipliers(trace: Trace, qdd: bool = False, status: bool = False) -> list[Store]:
+    """out = qd', q_out = q', qdd_out, status of a step of the open tree under the array "multipliers\""""
+    return MultiplierStep(trace).stores(qdd, status)
+
+
+def step_system(trace: Trace) -> list[Store]:
+    """out, right, size: the system that the multipliers of a step solve, as :func:`.multipliers.loop_system`"""
+    return MultiplierStep(trace).system()

@@ -1,0 +1,157 @@
+"""Sweeps of the articulated-body recursion over a tree: factors and forces inward, accelerations outward."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from ..trace.emission import Store
+from ..trace.scalars import Value, is_constant
+from ..trace.spatial import Articulated, Vector, total
+from . import articulated
+from .links import Link
+from .motion import STILL
+
+if TYPE_CHECKING:
+    from .tracing import Trace
+
+
+def factor_tree(trace: Trace) -> dict[int, articulated.Factor]:
+    """Return the factor of every link, by id."""
+    return factor(trace)[0]
+
+
+def factor(trace: Trace) -> tuple[dict[int, articulated.Factor], list[Store]]:
+    """Return the factors of every link, by id, and the stores that send them to other pieces."""
+    done: dict[int, articulated.Factor] = {}
+    inner: dict[int, Articulated] = {}
+    stores: list[Store] = []
+    for link, outward in trace.traversal():
+        if outward:
+            trace.place(link)
+            continue
+        eliminate(trace, link, done, inner)
+        stores += trace.send_to_parent("P", link, inner[id(link)].packed)
+    return done, stores
+
+
+def eliminate(trace: Trace, link: Link, done: dict[int, articulated.Factor], inner: dict[int, Articulated]) -> None:
+    """Add the factor of a link to ``done``, and P+ in its parent's frame to ``inner``, after its children's."""
+    trace.label(link, "P")
+    carried = trace.from_children(link, "P", inner, Articulated.unpacked)
+    through = [(trace.places[id(child)].pose, done[id(child)].P) for child in link.children if id(child) in done]
+    place = trace.places[id(link)]
+    done[id(link)] = factor = articulated.factor(trace.stiffened(link), place, carried, through, trace.epsilon)
+    inner[id(link)] = factor.in_parent
+
+
+def reduce(
+    trace: Trace, tau: Callable[[int], Value], moves: bool, loads: bool, letters: str = "Pz"
+) -> tuple[dict, dict, list[Store]]:
+    """Sweep inward: return the factors, D^-1 [I - H psi K] (tau - velocity terms - loads), and the stores that send.
+
+    Args:
+        tau: force of a dof. moves: links have velocities. loads: subtract the external wrenches.
+        letters: of the messages to other pieces; "P" among them sends the articulated inertias.
+    """
+    done: dict[int, articulated.Factor] = {}
+    rates: dict[int, list[Value]] = {}
+    inner: dict[int, Articulated] = {}
+    forces: dict[int, Vector] = {}
+    stores: list[Store] = []
+    for link, outward in trace.traversal():
+        key = id(link)
+        if outward:
+            trace.place(link, moves)
+            continue
+        eliminate(trace, link, done, inner)
+        place, move, factor = trace.places[key], trace.motions[key], done[key]
+        trace.label(link, "z")
+        z = articulated.gyroscopic(link.inertia, move)
+        if loads:
+            z = z - trace.external_wrench(link)
+        for force in trace.from_children(link, letters[-1], forces, Vector):
+            z = z + force
+        right = [tau(dof) for dof in link.dofs]
+        rates[key], forces[key] = articulated.reduced(link, place, factor, move, z, right)
+        stores += trace.send_to_parent("P", link, inner[key].packed) if "P" in letters else []
+        stores += trace.send_to_parent(letters[-1], link, forces[key])
+    return done, rates, stores
+
+
+def expand(
+    trace: Trace, done: dict, rates: dict, base: tuple[Vector, Vector], letter: str = "a", name: str = "out"
+) -> list[Store]:
+    """Sweep outward: return stores of qdd in the array ``name``, for ``rates`` of :func:`reduce`."""
+    alpha: dict[int, tuple[Vector, Vector]] = {}
+    stores = []
+    for link in trace.own_links:
+        trace.label(link, "a")
+        key = id(link)
+        if link.parent is None:
+            above = base
+        elif id(link.parent) in trace.own:
+            above = alpha[id(link.parent)]
+        else:
+            received = trace.receive(letter, trace.piece.parent)  # type: ignore[union-attr, arg-type]
+            above = Vector(received[:3]), Vector(received[3:])
+        qdd, alpha[key] = articulated.expanded(
+            link, trace.places[key], done[key], rates[key], trace.motions[key], above
+        )
+        stores += [Store(name, (dof,), value) for dof, value in zip(link.dofs, qdd, strict=True)]
+        if trace.piece is not None and trace.piece.children and link is trace.piece.links[-1]:
+            stores += trace.send(letter, trace.piece, (*alpha[key][0], *alpha[key][1]))
+    return stores
+
+
+def propagate_inward(trace: Trace, done: dict, link: Link, force: Vector, right: list[Value]) -> dict[int, list[Value]]:
+    """Return D^-1 [I - H psi K] of ``right`` at a link's dofs and a ``force`` on it, by link on the way to the root."""
+    rates, over = {}, link
+    while True:
+        key = id(over)
+        rates[key], force = articulated.reduced(over, trace.places[key], done[key], STILL, force, right)
+        if over.parent is None:
+            return rates
+        over = over.parent
+        right = [0.0] * len(over.dofs)
+
+
+def weighted_products(trace: Trace, D: dict, nothing: Value, columns: dict) -> dict[tuple[int, int], Value]:
+    """Return the upper triangle of Y* D Y + nothing for columns of Y by link.
+
+    Entries of two columns without a common link are absent, unless a pivot may be lost.
+    """
+    entries: dict[tuple[int, int], Value] = {}
+    names = list(columns)
+    for at, i in enumerate(names):
+        trace.graph.step = f"column {i}|m"
+        weighted = {key: [rate * d for rate, d in zip(rates, D[key], strict=True)] for key, rates in columns[i].items()}
+        for j in names[: at + 1]:
+            both = [key for key in columns[j] if key in weighted]
+            pairs = (pair for key in both for pair in zip(weighted[key], columns[j][key], strict=True))
+            entry = total(a * b for a, b in pairs) + nothing
+            if both or not is_constant(nothing) or nothing != 0.0:
+                entries[j, i] = entry
+    return entries
+
+
+def mirror(entries: dict[tuple[int, int], Value]) -> list[Store]:
+    """Return stores of both triangles of a symmetric matrix for the entries of one."""
+    return [
+        Store("out", place, value)
+        for (i, j), value in entries.items()
+        for place in ([(i, j)] if i == j else [(i, j), (j, i)])
+    ]
+
+
+def pack(stores: list[Store]) -> list[Store]:
+    """Return stores of a lower triangle as a row of entries, row after row."""
+    entries = {item.index: item.value for item in stores if item.index[0] >= item.index[1]}
+    return [Store("out", (i,), entries[index]) for i, index in enumerate(sorted(entries))]
+
+
+def pivots(done: dict[int, articulated.Factor]) -> tuple[dict[int, list[Value]], Value]:
+    """Return D by link; and NaN, or zero, for lost pivots that no other result would show."""
+    return {key: [pivot.D for pivot in factor.pivots] for key, factor in done.items()}, total(
+        factor.nothing for factor in done.values()
+    )

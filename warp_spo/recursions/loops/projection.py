@@ -1,0 +1,88 @@
+"""Projection onto the closures of embedded loops: small steps of q and qd, and the closures' errors and Jacobian."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ...trace.emission import Store
+from ...trace.scalars import Value, is_constant, reciprocal, sqrt
+from ...trace.spatial import Vector, dot, total
+from .. import kinematics
+from ..links import FREE, HELIX, SLIDE, TURN, Link, quaternion_rotation
+from .closures import closures
+from .clusters import Columns
+from .embedded import ClosedLoops, Embedding
+
+if TYPE_CHECKING:
+    from ..tracing import Trace
+
+
+def place_links(trace: Trace, moves: bool = False) -> None:
+    """Place every link; with ``moves`` compute velocity terms too."""
+    for link in trace.links.links:
+        trace.place(link, moves)
+
+
+def closure_error(trace: Trace) -> list[Store]:
+    """out [row] = g"""
+    place_links(trace)
+    constraints = closures(trace.links)
+    values = [value for c in constraints for value in c.error(trace.places, trace.vector("q"))]
+    return [Store("out", (i,), value) for i, value in enumerate(values)]
+
+
+def closure_jacobian(trace: Trace) -> list[Store]:
+    """out [row, dof] = Y"""
+    place_links(trace)
+    constraints = closures(trace.links)
+    rows = [row for c in constraints for row in c.jacobian(trace.places)]
+    return [Store("out", (i, dof), value) for i, row in enumerate(rows) for dof, value in row.items()]
+
+
+def project_position(trace: Trace, embedding: Embedding, fixed: tuple[int, ...] = ()) -> list[Store]:
+    """out [coordinate] = q after the shortest step of the dofs not ``fixed`` that makes g zero to first order"""
+    q, loops = trace.vector("q"), ClosedLoops(trace, embedding)
+    place_links(trace)
+    step: Columns = {}
+    for cluster in loops.clusters:
+        tied = loops.tie(cluster, fixed)
+        step |= tied.space.particular([-g for g in tied.errors(trace.places, q)])
+    return move_all(trace, step)
+
+
+def move_all(trace: Trace, step: Columns) -> list[Store]:
+    """out [coordinate] = q after a small step"""
+    stores = []
+    for link in trace.links.links:
+        trace.label(link, "q")
+        coordinates = move(trace, link, [step.get(dof, 0.0) for dof in link.dofs])
+        stores += [Store("out", (link.coordinate + i,), value) for i, value in enumerate(coordinates)]
+    return stores
+
+
+def move(trace: Trace, link: Link, step: list[Value]) -> list[Value]:
+    """Return the coordinates of a link after a small step of its dofs."""
+    q, first = trace.vector("q"), link.coordinate
+    if link.motion in (TURN, SLIDE, HELIX):
+        return [q(first) + step[0]]
+    if all(is_constant(x) and x == 0.0 for x in step):
+        return [q(first + i) for i in range(7 if link.motion == FREE else 4)]
+    at = first + (3 if link.motion == FREE else 0)
+    old = Vector(q(at + i) for i in range(4))
+    turn = kinematics.multiplied(Vector((*(0.5 * x for x in step[-3:]), 1.0)), old)
+    turn = turn * reciprocal(sqrt(dot(turn, turn)))
+    if link.motion != FREE:
+        return list(turn)
+    arm = trace.places[id(link)].turned @ link.com - quaternion_rotation(*turn) @ link.com  # type: ignore
+    return [*(Vector(q(first + i) for i in range(3)) + Vector(step[:3]) + arm), *turn]
+
+
+def project_velocity(trace: Trace, embedding: Embedding, fixed: tuple[int, ...] = ()) -> list[Store]:
+    """out [dof] = qd after the shortest change of the dofs not ``fixed`` that makes Y qd zero"""
+    qd, loops = trace.vector("qd"), ClosedLoops(trace, embedding)
+    place_links(trace)
+    step: Columns = {}
+    for cluster in loops.clusters:
+        tied = loops.tie(cluster, fixed)
+        step |= tied.space.particular([-total(x * qd(dof) for dof, x in row.items()) for row in tied.rows])
+    return [Store("out", (dof,), qd(dof) + step.get(dof, 0.0)) for dof in range(trace.links.scene.dof_count)]

@@ -1,0 +1,155 @@
+"""The state of one symbolic evaluation of a scene: its inputs, where links are placed, and messages between pieces.
+
+The recursions are functions of a :class:`Trace` that return what they store. ``label`` names in the emitted code which
+link and which letter of the paper a value belongs to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+from ..trace.emission import Store
+from ..trace.scalars import Value
+from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector
+from . import messages, motion, newton_euler
+from .links import Link, Links, Placed, placed
+from .motion import STILL, Motion
+from .pieces import Piece
+
+EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}
+
+
+class Trace:
+    """One evaluation of a scene, or of one piece of it: what is shared between the recursions on it.
+
+    Args:
+        links: the scene's links.
+        dtype: "float32" or "float64"; pivots are compared with its rounding.
+        inputs: names of the arrays that are read: "qd", "tau", "qdd", "body_f", "b"; an array that is not among them is
+            zero and costs nothing.
+        piece: trace the work on this piece alone. The motion of its ancestors is computed anew; what it receives from
+            other pieces and sends to them goes through the array "sent" or "returned", from ``slot(letter, piece)`` on.
+        slot: first entry of a message, by letter and piece.
+
+    Attributes:
+        places: by id of the link: its placement. motions: its velocity terms. axes: its axes in the inertial frame.
+        stiffened: returns a link with what a time step adds to its armature.
+        news: messages that a piece sends apart from the others, because pieces of equal structure do not all send them.
+        rounds: what a piece stores after it has received all news, in turns of which many may be alike.
+        ahead: values that the passes of a loop share, formed once before the loop.
+        checks: stores that check a pass; they read their inputs anew, so that no register is kept for them.
+    """
+
+    def __init__(
+        self,
+        links: Links,
+        dtype: str,
+        inputs: tuple[str, ...],
+        piece: Piece | None = None,
+        slot: Callable[[str, Piece], int] | None = None,
+    ):
+        self.links, self.graph, self.epsilon, self.inputs = links, links.graph, EPSILON[dtype], inputs
+        self.piece, self.slot = piece, slot
+        self.news: list[Store] = []
+        self.rounds: list[list[Store]] = []
+        self.ahead: list[Value] = []
+        self.checks: list[Store] = []
+        self._mail: dict[tuple[str, int], list[Value]] = {}  # messages between pieces of this trace
+        self.own = set(map(id, links.links if piece is None else piece.links))
+        self.active = set(self.own)
+        above = None if piece is None else piece.links[0].parent
+        while above is not None:
+            self.active.add(id(above))
+            above = above.parent
+        self.places: dict[int, Placed] = {}
+        self.motions: dict[int, Motion] = {}
+        self.axes: dict[int, Matrix] = {}
+        self.stiffened: Callable[[Link], Link] = lambda link: link
+        self.bodies: dict[int, list[int]] = {}  # by link: the bodies that sit on it
+        for body, seat in links.seats.items():
+            if seat.link is not None:
+                self.bodies.setdefault(id(seat.link), []).append(body)
+
+    # -- inputs ----------------------------------------------------------------------------------------------------
+    def vector(self, name: str) -> Callable[[int], Value]:
+        """Return ``entry(i)`` of an array; zero if the array is not among the inputs."""
+        if name not in self.inputs:
+            return lambda i: 0.0
+        return lambda i: self.graph.input(name, i)
+
+    def label(self, link: Link, letter: str) -> None:
+        """Name the scalars that follow after a link and a letter."""
+        self.graph.step = f"{link.label}|{letter}"
+
+    def place(self, link: Link, moves: bool = False) -> None:
+        """Place a link by its coordinates; with ``moves`` compute its velocity terms too."""
+        self.label(link, "x")
+        self.places[id(link)] = place = placed(link, self.vector("q"))
+        self.label(link, "w")
+        parent = None if link.parent is None else self.motions[id(link.parent)]
+        qd = self.vector("qd") if moves else None
+        self.motions[id(link)] = motion.moved(link, place, parent, qd) if moves else STILL
+        if "body_f" in self.inputs:
+            R = IDENTITY if link.parent is None else self.axes[id(link.parent)]
+            self.axes[id(link)] = R @ place.pose.rotation
+
+    def external_wrench(self, link: Link) -> Vector:
+        """Return (n; f) of the external wrenches on the bodies of a link, in its frame."""
+        n, f = ZERO, ZERO
+        if "body_f" not in self.inputs:
+            return Vector((*n, *f))
+        axes = self.axes[id(link)]
+        for body in self.bodies.get(id(link), ()):
+            seat = self.links.seats[body]
+            entries = Vector(self.graph.input("body_f", body, c) for c in range(6))
+            com = seat.offset + seat.matrix @ self.links.nodes[body].com
+            n_body, f_body = newton_euler.wrench(axes, com, Vector(entries[:3]), Vector(entries[3:]))
+            n, f = n + n_body, f + f_body
+        return Vector((*n, *f))
+
+    @property
+    def base_acceleration(self) -> tuple[Vector, Vector]:
+        """Angular and linear acceleration of the inertial frame that stand for gravity."""
+        return ZERO, -self.links.gravity
+
+    # -- pieces ----------------------------------------------------------------------------------------------------
+    def traversal(self) -> Iterator[tuple[Link, bool]]:
+        """Yield (link, True) outward for this piece and its ancestors, (link, False) back for this piece's links."""
+        for link, outward in self.links.traversal():
+            if id(link) in self.active and (outward or id(link) in self.own):
+                yield link, outward
+
+    @property
+    def own_links(self) -> list[Link]:
+        """The links of this piece, parents first; all links where the whole tree is traced."""
+        return [link for link in self.links.links if id(link) in self.own]
+
+    def send(self, letter: str, piece: Piece, values: Iterable[Value]) -> list[Store]:
+        """Return the stores that send a message of ``piece``; a trace of the whole tree keeps the values instead."""
+        if self.piece is None:
+            self._mail[letter, piece.index] = list(values)
+            return []
+        assert self.slot is not None
+        first = self.slot(letter, piece)
+        return [Store(messages.way(letter), (first + i,), value) for i, value in enumerate(values)]
+
+    def receive(self, letter: str, piece: Piece) -> list[Value]:
+        """Return the message that ``piece`` sends."""
+        if self.piece is None:
+            return self._mail[letter, piece.index]
+        assert self.slot is not None
+        first = self.slot(letter, piece)
+        return [self.graph.input(messages.way(letter), first + i) for i in range(messages.size(letter, piece))]
+
+    def from_children(self, link: Link, letter: str, known: dict[int, Any], build: Callable[[list], Any]) -> list[Any]:
+        """Return the results of a link's children: those ``known`` here, or built from messages of other pieces."""
+        if self.piece is None or id(link.children[0] if link.children else link) in self.own:
+            return [known[id(child)] for child in link.children]
+        return [build(self.receive(letter, piece)) for piece in self.piece.children]
+
+    def send_to_parent(self, letter: str, link: Link, values: Iterable[Value]) -> list[Store]:
+        """Return the stores that send a result of a link to its parent, if another piece works on the parent."""
+        if self.piece is None or link is not self.piece.links[0] or link.parent is None:
+            return []
+        return self.send(letter, self.piece, values)
