@@ -14,7 +14,7 @@ from warp_spo.execution import node_functions, teams
 from warp_spo.execution import sweeps as levels
 from warp_spo.graph import blocks
 from warp_spo.kernels import straight
-from warp_spo.recursions import articulated, inverse, links, messages, newton_euler, pieces, traced
+from warp_spo.recursions import articulated, articulated_sweeps, inverse, links, messages, newton_euler, pieces
 from warp_spo.trace import scalars as graph
 from warp_spo.trace import spatial
 
@@ -141,7 +141,8 @@ MUTANTS = {
     "gyroscopic moment of qdd": (articulated, "gyroscopic", "*cross(motion.spin, inertia.inertia @ motion.spin)",
                                  "*(-cross(motion.spin, inertia.inertia @ motion.spin))", "forward_dynamics", ("qd",)),
     "mirror of P": (spatial.Articulated, "entry", "self.C[j][i - 3]", "self.C[i - 3][j]", "forward_dynamics", ("tau",)),
-    "mirror of the output": (traced, "_mirrored", "((j, i), value)", "((j, i), -value)", "mass_matrix", ()),
+    "mirror of the output": (articulated_sweeps, "mirror", "place, value)",
+                             "place, value if place == (i, j) else -value)", "mass_matrix", ()),
     "mirror of a symmetric matrix": (links, "symmetric", "[xz, yz, zz]", "[yz, xz, zz]", "inverse_dynamics", ("qd",)),
     "turn the wrong way": (spatial.Pose, "to_child", "c * v[1] - s * v[0]", "c * v[1] + s * v[0]",
                            "inverse_dynamics", ("qdd",)),
