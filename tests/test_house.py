@@ -15,12 +15,37 @@ KERNELS = pathlib.Path(warp_spo.kernels.__path__[0])
 HOST = sorted(path for path in PACKAGE.rglob("*.py") if "kernels" not in path.parts)
 SYMBOLIC = sorted(path for folder in ("trace", "recursions") for path in (PACKAGE / folder).rglob("*.py"))
 DEVICE = sorted(KERNELS.glob("*.py"))
+REPOSITORY = pathlib.Path(__file__).parent.parent
+LONGEST, LONG, LONG_FILES = 600, 400, 15  # lines; at most so many files may be longer than LONG
+
+ROOMS = (
+    "errors",
+    "status",
+    "torch",
+    "arrays",
+    "kernels",
+    "reference",
+    "scene",
+    "graph",
+    "trace",
+    "recursions",
+    "execution",
+    "dynamics",
+    "newton",
+    "trials",
+    "examples",
+    "__main__",
+)
+"""Modules and folders of the package. Each may import those named before it; ``warp_spo`` itself lists names of all."""
 
 
 def imports(path):
-    """Top-level names of the absolute imports of a file, anywhere in it."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    """Top-level names of the absolute imports that a file makes when it runs, anywhere in it."""
+    found, tree = set(), ast.parse(path.read_text())
+    tree.body = [
+        node for node in tree.body if not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
+    ]
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name.split(".")[0] for alias in node.names}
         if isinstance(node, ast.ImportFrom) and node.level == 0:
@@ -55,6 +80,48 @@ def test_steps_know_no_device(path):
     """Traces and the recursions that they come from are plain Python and NumPy."""
     assert imports(path) <= sys.stdlib_module_names | {"numpy"}
     assert "kernels" not in path.read_text()
+
+
+def rooms_imported(path):
+    """Return (line, room) of every import of the package in a file of it, imports inside functions included."""
+    own = path.relative_to(PACKAGE).parts[:-1]
+    found = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            above = own[: len(own) + 1 - node.level]
+            full = (*above, *(node.module or "").split(".")) if node.module else above
+        elif isinstance(node, ast.ImportFrom) and node.module.split(".")[0] == PACKAGE.name:
+            full = tuple(node.module.split(".")[1:])
+        else:
+            continue
+        names = [full[0]] if full else [alias.name for alias in node.names]
+        found += [
+            (node.lineno, name) for name in names if (PACKAGE / name).is_dir() or (PACKAGE / f"{name}.py").exists()
+        ]
+    return found
+
+
+@pytest.mark.parametrize("path", HOST, ids=named)
+def test_imports_among_rooms_point_one_way(path):
+    room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    if room == "__init__":
+        return
+    assert room in ROOMS, f"{room} is new: give it its place in ROOMS, after all that it imports"
+    for line, imported in rooms_imported(path):
+        assert imported == room or imported in ROOMS[: ROOMS.index(room)], f"line {line}: {room} imports {imported}"
+
+
+def test_files_are_short():
+    """Lines of every Python and Markdown file of the repository; kernels/ counts once, not through its link."""
+    folders = [REPOSITORY / name for name in ("warp_spo", "kernels", "tests", "benchmarks", "docs")]
+    files = {path.resolve() for folder in folders for kind in ("*.py", "*.md") for path in folder.rglob(kind)}
+    files |= set(REPOSITORY.glob("*.md"))
+    lines = {str(path.relative_to(REPOSITORY)): len(path.read_text().splitlines()) for path in files}
+    assert len(lines) > 100 and "kernels/straight.py" in lines
+    longest = {name: count for name, count in lines.items() if count > LONGEST}
+    assert not longest, f"more than {LONGEST} lines: {longest}"
+    long = {name: count for name, count in lines.items() if count > LONG}
+    assert len(long) <= LONG_FILES, f"{len(long)} files have more than {LONG} lines, {LONG_FILES} may: {long}"
 
 
 def test_the_reference_imports_numpy_alone():

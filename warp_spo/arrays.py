@@ -28,6 +28,18 @@ NUMPY, WARP, TORCH = "NumPy", "Warp", "torch"
 _DTYPES = {"float32": wp.float32, "float64": wp.float64}
 
 
+def broadcast_worlds(array: wp.array, axis: int, worlds: int) -> wp.array:
+    """Return ``array`` seen with ``worlds`` entries along its world axis, where it has 1 or ``worlds``; no copy."""
+    if array.shape[axis] == worlds:
+        return array
+    shape, strides = list(array.shape), list(array.strides)
+    shape[axis], strides[axis] = worlds, 0
+    place = {"ptr": array.ptr, "shape": tuple(shape), "strides": tuple(strides)}
+    view: Any = wp.array(**place, dtype=array.dtype, device=array.device)
+    view._ref = array  # keeps the memory
+    return view
+
+
 def parse_dtype(dtype, call: str = "dtype") -> type:
     """Return ``wp.float32`` or ``wp.float64`` for the name or the NumPy, Warp or torch type of that name.
 

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..arrays import Call, shape_of
+from ..arrays import Call, broadcast_worlds, shape_of
 from ..errors import refuse_masked
-from ..execution.parameters import broadcast_worlds
 from ..execution.programs import Programs
 from ..execution.sweeps import Sweeps
 from ..kernels import cholesky

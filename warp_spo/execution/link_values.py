@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import warp as wp
 
+from ..arrays import broadcast_worlds
 from ..kernels import native, straight
 from ..recursions.links import Links
 from ..trace.differentiation import reverse
 from ..trace.emission import Emitter, Store, render
 from ..trace.scalars import ordered
-from .parameters import Derived, Parameters, broadcast_worlds
+from .parameters import Derived, Parameters
 
 
 def table(parameters: Parameters, links: Links, name: str) -> wp.array:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from ..arrays import broadcast_worlds
 from ..kernels import parameters as kernels
 from ..kernels.spatial import POSE, RIGID
 from ..kernels.topology import Topology
@@ -33,18 +34,6 @@ VARIABLE = (
     "gravity",
 )
 RIGID_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c")
-
-
-def broadcast_worlds(array: wp.array, axis: int, worlds: int) -> wp.array:
-    """``array`` with its world axis, of length 1 or ``worlds``, seen as ``worlds`` long; no copy."""
-    if array.shape[axis] == worlds:
-        return array
-    shape, strides = list(array.shape), list(array.strides)
-    shape[axis], strides[axis] = worlds, 0
-    place = {"ptr": array.ptr, "shape": tuple(shape), "strides": tuple(strides)}
-    view: Any = wp.array(**place, dtype=array.dtype, device=array.device)
-    view._ref = array  # keeps the memory
-    return view
 
 
 class Derived(NamedTuple):

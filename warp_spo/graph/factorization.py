@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..execution.parameters import broadcast_worlds
+from ..arrays import broadcast_worlds
 from ..kernels import factorization as kernels
 from ..scene.tree import Tree
 from .blocks import Blocks, new_weights, weights_array
