@@ -1,13 +1,13 @@
-"""Impedance of the hinges: springs, dampers, drives, limits and friction, implicit in the step that they act in.
+"""Forces of the hinges in a time step: springs, dampers, drives, limits and friction, all implicit.
 
-A step of h seconds takes qd to qd' = qd + u and, along the way, q by h qd'. Every law of a dof is then one line, cut
-off at both ends,
+A step of h seconds takes qd to qd' = qd + u and moves q along h qd'. The force of every law of a dof is a linear
+function of u between two bounds,
 
     f(u) = force - resistance u, held between ``least`` and ``most``,
 
-and never grows with u. A piece of it is linear, so that one more piece of armature, h resistance, and one more force
-make it implicit: (Mass + h R) qdd = tau - bias_force + F, u = h qdd. Which piece holds is guessed and seen afterwards:
-a semismooth Newton iteration, exact as soon as the guess was right.
+that does not increase with u. Each of its three pieces is linear, so that an armature h resistance and a force make it
+implicit: (Mass + h R) qdd = tau - bias_force + F, u = h qdd. The active piece is guessed and checked afterwards, a
+semismooth Newton iteration that is exact once the guess is right.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from .integration import rotation_vector
 from .links import BALL, FREE, Link, Links
 from .tracing import Trace
 
-CREEP = 1e-4  # rate [rad/s, m/s] below which dry friction sticks: there it is a damper, which this rate saturates
+CREEP = 1e-4  # rate [rad/s, m/s] below which dry friction is a damper; it saturates at this rate
 TURNING = (BALL, FREE)  # motions with a quaternion
-DEFAULT_BOUND = 1e6  # effort and velocity limits from here on bound nothing: Newton's value where nothing is said
-HOLD = 300.0  # resistance of a velocity limit, in inertias / h: what a step would exceed it by shrinks by this
-NOISE = 4.0  # roundings of a law's terms by which two of its pieces may differ where they meet
+DEFAULT_BOUND = 1e6  # effort and velocity limits of this size and more are no limits; Newton's default
+HOLD = 300.0  # resistance of a velocity limit, in inertias / h; the excess over the limit shrinks by this factor
+NOISE = 4.0  # roundings of a law's terms; two pieces may differ by so much where they meet
 
 
 class Law(NamedTuple):
-    """f(u) = scale (force - resistance u), that not below ``least`` and not above ``most`` (None: unbounded).
+    """f(u) = scale * clip(force - resistance u, least, most); None is no bound.
 
-    ``scale``, not below zero, has no say in which piece holds: where it vanishes, slopes by it are those of the piece.
+    ``scale`` is zero or more and does not influence which piece is active, so that derivatives by it exist at zero.
     """
 
     force: Value
@@ -62,11 +62,11 @@ class Law(NamedTuple):
         return line
 
     def at(self, u: Value) -> Value:
-        """The force itself."""
+        """Return f(u)."""
         return self.scale * self.bounded(self.line(u))
 
     def piece(self, u: Value) -> Law:
-        """The piece that holds at ``u``, as a law that does not bend."""
+        """Return the piece that is active at ``u``, as a law without bounds."""
         if not self.bends:
             return self
         line = self.line(u)
@@ -80,7 +80,7 @@ class Law(NamedTuple):
         return Law(self.scale * force, self.scale * resistance)
 
     def missed(self, guess: Value, u: Value, epsilon: float) -> Value:
-        """Not 0 where the piece that was taken at ``guess`` is not the law at ``u``, by more than rounding."""
+        """Return non-zero where the piece at ``guess`` differs from the law at ``u`` by more than rounding."""
         if not self.bends:
             return 0.0
         one = self._replace(scale=1.0)
@@ -89,7 +89,7 @@ class Law(NamedTuple):
         return less(NOISE * epsilon * size, absolute(one.at(u) - piece.line(u)))
 
     def holding(self, u: Value, epsilon: float) -> Value:
-        """What the law resists at ``u``; where a bound begins, within rounding, as short of it."""
+        """Return the resistance at ``u``; within rounding of a bound, that of the unbounded piece."""
         if not self.bends:
             return self.resistance
         line, size = self.line(u), absolute(self.force) + absolute(self.resistance * u)
@@ -97,7 +97,7 @@ class Law(NamedTuple):
         return select(cut, 0.0, self.scale * self.resistance)
 
     def skipped(self, guess: Value, u: Value) -> Value:
-        """Not 0 where the way from ``guess`` to ``u`` leads from one bound to the other."""
+        """Return non-zero where ``guess`` and ``u`` lie beyond opposite bounds."""
         if self.least is None or self.most is None:
             return 0.0
         before, after = self.line(guess), self.line(u)
@@ -107,12 +107,12 @@ class Law(NamedTuple):
 
     @property
     def middle(self) -> Value:
-        """u at which the law crosses zero."""
+        """The u at which the force is zero."""
         return self.force * reciprocal(self.resistance)
 
 
 def added(laws: list[Law]) -> Law:
-    """One law for several that do not bend."""
+    """Return the sum of laws without bounds."""
     return Law(total(law.force for law in laws), total(law.resistance for law in laws))
 
 
@@ -143,7 +143,7 @@ class Impedance:
         self._inertias: np.ndarray | None = None
 
     def laws(self, link: Link) -> list[list[Law]]:
-        """All laws of each dof of a link; those that nothing bends come first, as one."""
+        """Return all laws of each dof of a link; those without bounds come first, added up."""
         every = []
         for i, dof in enumerate(link.dofs):
             straight = [*self._damper(dof), *self._spring(link, i, "joint_stiffness", self._rest)]
@@ -154,7 +154,7 @@ class Impedance:
         return every
 
     def passive(self, link: Link) -> list[Law]:
-        """Damper and spring of each dof of a link."""
+        """Return damper and spring of each dof of a link, added up."""
         return [
             added([*self._damper(dof), *self._spring(link, i, "joint_stiffness", self._rest)])
             for i, dof in enumerate(link.dofs)
@@ -162,14 +162,14 @@ class Impedance:
 
     # -- values ----------------------------------------------------------------------------------------------------
     def value(self, name: str, index: int) -> Value:
-        """A value of the scene by dof, or by coordinate for joint_rest_q."""
+        """Return a value of the scene by dof, or by coordinate for joint_rest_q."""
         column = self.scene.values[name][:, index]
         if name in self.links.variable or (column != column[0]).any():
             return self.links.graph.input(name, index)
         return float(column[0])
 
     def _bound(self, name: str, dof: int, none: float) -> Value | None:
-        """A bound, or None where it is ``none`` or beyond in all worlds."""
+        """Return a bound; None if it is ``none`` or larger in all worlds."""
         if (np.abs(self.scene.values[name][:, dof]) >= none).all():
             return None
         return self.value(name, dof)
@@ -181,7 +181,7 @@ class Impedance:
         return float(self.scene.neutral_q[coordinate])
 
     def _inertia(self, dof: int) -> float:
-        """What a force at the dof feels at the neutral configuration, all others being free, of world 0."""
+        """Return the inertia at a dof in the neutral configuration of world 0, all other dofs being free."""
         if self._inertias is None:
             self._inertias = neutral_inertias(self.scene)
         return float(self._inertias[dof])
@@ -200,7 +200,7 @@ class Impedance:
         return [Law(-k * (stretch + self.ahead(link.dofs[i])), self.h * k)]
 
     def _stretch(self, link: Link, i: int, rest: Callable[[int], Value]) -> Value:
-        """q - rest of one dof of a link; of a rotation, an entry of its rotation vector."""
+        """Return q - rest of one dof of a link; of a rotation, an entry of its rotation vector."""
         first = link.coordinate
         if link.motion in TURNING and (link.motion != FREE or i >= 3):
             start = first + 3 * (link.motion == FREE)
@@ -222,7 +222,7 @@ class Impedance:
         return [law] if effort is None else [law._replace(least=-effort, most=effort)]
 
     def _limits(self, link: Link, i: int) -> list[Law]:
-        """Springs that push back into the range, never pull; where q is outside, with dampers."""
+        """Return springs that push back into the range and never pull; outside the range with dampers."""
         dof, laws = link.dofs[i], []
         for name, inward in (("joint_limit_lower", 1.0), ("joint_limit_upper", -1.0)):
             bound = self._bound(name, dof, UNLIMITED)
@@ -244,14 +244,14 @@ class Impedance:
         return laws
 
     def _friction(self, dof: int) -> list[Law]:
-        """A force of at most ``joint_friction`` against the motion; below CREEP, as a damper."""
+        """Return a force of at most ``joint_friction`` against the motion; a damper below CREEP."""
         f = self.value("joint_friction", dof)
         return [] if is_number(f, 0.0) else [Law(-(1.0 / CREEP) * self.qd(dof), 1.0 / CREEP, -1.0, 1.0, f)]
 
     def _rate_limit(self, dof: int, others: list[Law]) -> list[Law]:
-        """Dampers on what exceeds the velocity limit, HOLD times as heavy as the inertia is in a step.
+        """Return dampers on the excess over the velocity limit, HOLD times the inertia over the step.
 
-        Without inertia, as what the ``others`` resist.
+        A dof without inertia takes the resistance of the ``others`` instead.
         """
         bound = self._bound("joint_velocity_limit", dof, DEFAULT_BOUND)
         if bound is None or is_number(self.h, 0.0):
@@ -268,7 +268,7 @@ def is_number(x: Value, number: float) -> bool:
 
 
 def neutral_inertias(scene: Scene) -> np.ndarray:
-    """1 / diagonal of Mass^-1 at the neutral configuration, of world 0 [dof]; of Mass, where it has no inverse."""
+    """Return 1 / diagonal of Mass^-1 at the neutral configuration of world 0 [dof]; of Mass where it is singular."""
     one = scene.with_values(**{name: array[:1] for name, array in scene.values.items()})
     entries = mass_matrix(Trace(Links(one), "float64", ("q",)))
     mass = np.zeros((scene.dof_count, scene.dof_count))

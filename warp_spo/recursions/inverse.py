@@ -1,8 +1,8 @@
 """All of Mass^-1 = Y* D Y, Y = D^-1 [I - H psi K] (eq. 1), a few operations an entry, piece by piece.
 
-Going inward, a unit force at dof j makes the rates Y_j in its piece and leaves the force F_j on the link under it. What
-F_j then does further in is linear in its six numbers: coming back, a piece learns the rates of every pivot further in
-for each of them, N, and its columns of Y are complete. Two columns meet in the pivots that both branches have.
+Inward, a unit force at dof j gives the rates Y_j in its piece and a force F_j on the link that the piece is mounted on.
+The rates further in are linear in the six numbers of F_j: outward, a piece receives them as a matrix N, with which its
+columns of Y are complete. The product of two columns is a sum over the pivots that both branches share.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class Inverse:
     Columns of Y are lists over the pivots from the root out to the end of a piece; it has one pivot for each dof.
 
     Attributes:
-        entries: by (row, column), one of the two triangles' entries each.
-        rounds: the entries that the trace's own piece has in common with others, those of one dof of theirs at a time.
-        stores: what is sent. news: likewise, to the pieces that meet this one.
+        entries: by (row, column), one triangle.
+        rounds: the entries that the trace's own piece shares with others, for one dof of another piece at a time.
+        stores: messages. news: messages to the pieces that share entries with this one.
     """
 
     def __init__(self, trace: Trace):
@@ -59,7 +59,7 @@ class Inverse:
                     self._meet(piece, other)
 
     def _inward(self, links: list[Link], force: Vector, right: list[Value]) -> tuple[list[Value], Vector]:
-        """Rates that a ``force`` on the last link and ``right`` at its dofs make, and what they leave further in."""
+        """Return the rates for a ``force`` on the last link and ``right`` at its dofs, and the force further in."""
         rates: list[Value] = []
         for link in reversed(links):
             key = id(link)
@@ -70,7 +70,7 @@ class Inverse:
         return rates, NO_FORCE if links[0].parent is None else force
 
     def _come_back(self, piece: Piece) -> None:
-        """Complete the columns of a piece and multiply them with one another."""
+        """Complete the columns of a piece and multiply them with each other."""
         trace = self.trace
         further = [one for one in reversed(piece.ancestors)]
         N = [] if piece.parent is None else _sixes(trace.receive("N", piece.parent))
@@ -101,7 +101,7 @@ class Inverse:
         self.stores += trace.send("V", piece, [x for j in piece.dofs for x in self._columns[j] + rest[j]])
 
     def _meet(self, piece: Piece, other: Piece) -> None:
-        """The entries of two branches, or of one and what carries it: columns meet in the pivots that both have."""
+        """Compute the entries of two branches, or of a branch and one that carries it, over shared pivots."""
         fork = piece.fork(other)
         assert fork is not None
         common = len(fork.all_dofs)
@@ -115,7 +115,7 @@ class Inverse:
 
 
 def _meeting(first: list[Value], second: list[Value]) -> Value:
-    """Sum over the pivots that both have."""
+    """Return the sum of products over the pivots that both share."""
     return total(a * b for a, b in zip(first, second, strict=False))
 
 

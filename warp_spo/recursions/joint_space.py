@@ -1,8 +1,8 @@
-"""Mass and bias force of a short system, formed once, and solved for many diagonals: Mass + Delta = U D U*.
+"""Mass and bias force of a system of few dofs, formed once and solved for many diagonals: Mass + Delta = U D U*.
 
-The sweeps find the same factors, [I + H phi K] D [I + H phi K]*, in O(dof), and start from the links each time. Where
-only Delta changes from solve to solve and dofs are few, the entries of Mass give them with less work. What the tree
-leaves out of Mass stays out: eliminating from the leaves fills nothing in; where dofs are numbered otherwise, a little.
+The sweeps give the same factors, [I + H phi K] D [I + H phi K]*, in O(dof), but start from the links each time. Where
+only Delta changes from solve to solve and dofs are few, factoring the entries of Mass takes less work. Elimination from
+the leaves fills in no entry that the tree leaves zero; with another numbering of the dofs it fills in a few.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Entries = dict[tuple[int, int], Value]  # (row, column), row <= column
 
 
 class JointSpace:
-    """Mass and bias force less the loads of a trace's state.
+    """Mass, and bias force less the loads, at the state of a trace.
 
     Attributes:
         mass: entries of the upper triangle that the tree allows. bias: by dof.
@@ -35,7 +35,7 @@ class JointSpace:
         self.bias = {item.index[0]: item.value for item in inverse_dynamics(trace, qdd=lambda dof: 0.0)}
 
     def solve(self, delta: Callable[[int], Value], b: Callable[[int], Value]) -> list[Value]:
-        """(Mass + diag(delta))^-1 (b - bias), by dof; NaN where a pivot is not positive beyond rounding."""
+        """Return (Mass + diag(delta))^-1 (b - bias), by dof; NaN where a pivot is not positive beyond rounding."""
         U, x = dict(self.mass), [b(dof) - self.bias[dof] for dof in self.dofs]
         inverse: dict[int, Value] = {}
         for k in self.dofs:

@@ -1,4 +1,4 @@
-"""Pieces: a scene's links cut into serial chains that work side by side, and who waits for whom.
+"""Pieces: a scene's links cut into serial chains that warps work on side by side, and their order.
 
 A piece is a segment of the paper's strictly canonical tree: it ends where the tree branches. One warp works on each
 leaf piece; a piece further in is taken on by the warp of its deepest child. Work proceeds in stages with a barrier
@@ -14,13 +14,13 @@ from .links import Link, Links
 
 @dataclasses.dataclass(eq=False)
 class Piece:
-    """A chain of links.
+    """A serial chain of links.
 
     Attributes:
         index: its place in :attr:`Pieces.pieces`.
         links: from the innermost out.
         parent, children: the pieces that it moves on and that move on it.
-        warp: who works on it. inward, outward: in which stage.
+        warp: index of the warp that works on it. inward, outward: stage of its inward and of its outward sweep.
     """
 
     index: int
@@ -55,14 +55,14 @@ class Piece:
         return [dof for piece in reversed([self, *self.ancestors]) for dof in piece.dofs]
 
     def fork(self, other: Piece) -> Piece | None:
-        """The last piece that carries both, or None."""
+        """Return the last piece that carries both, or None."""
         mine = [self, *self.ancestors]
         return next((piece for piece in (other, *other.ancestors) if piece in mine), None)
 
     def looks_at(self, other: Piece) -> bool:
-        """Whether this piece, not ``other``, works out what two branches have in common.
+        """Return whether this piece, not ``other``, computes the entries that two branches share.
 
-        One of the two does: a leaf; then the one with less of its own to do; then now the earlier, now the later one.
+        A leaf computes them; between two leaves the one with fewer dofs; between equals the two alternate.
         """
         fork = self.fork(other)
         if fork is None or fork in (self, other):
@@ -80,7 +80,7 @@ class Pieces:
     """All pieces of a scene, parents first.
 
     Attributes:
-        warps: how many work on a world. stages: how many there are, one barrier less.
+        warps: number of warps that work on a world. stages: number of stages, with a barrier between any two.
     """
 
     def __init__(self, links: Links):

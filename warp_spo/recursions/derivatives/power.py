@@ -1,9 +1,9 @@
-"""Backwards through inverse dynamics: how lambda . tau(q, qd, qdd) changes with its arguments.
+"""Reverse mode of inverse dynamics: the gradient of lambda . tau(q, qd, qdd) by its arguments.
 
-lambda . tau = sum over the links of mu . f + sum over the dofs of lambda Delta qdd, with mu the velocities (omega; v)
-that the rates lambda give and f the force that gives a link its acceleration, less the external one. How a link moves
-follows from how its parent does, so one sweep outward makes the sum, and one inward says link by link how it changes
-with the motion of each; with mu it changes as the force that the link transmits.
+lambda . tau = sum over the links of mu . f + sum over the dofs of lambda Delta qdd, where mu are the velocities
+(omega; v) for the rates lambda, and f is the force that accelerates a link, less the external one. The motion of a link follows
+from that of its parent, so one outward sweep forms the sum, and one inward sweep its gradient by the motion of each
+link; the gradient by mu is the force that the link transmits.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 Entry = Callable[[int], Value]
 Ways = dict[tuple, Value]
-"""How the sum changes, by what an input of the trace is called."""
+"""Gradient of the sum, by name and index of an input of the trace."""
 
 
 class Moving(NamedTuple):
-    """How a link moves, in its axes.
+    """Motion of a link, in its axes.
 
     Attributes:
         spin: omega. w, v: acceleration, classical. mu_w, mu_v: the velocities mu.
@@ -41,10 +41,10 @@ class Moving(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What a link shows of itself to its bodies and to its children, each scalar cut.
+    """Quantities of a link that its bodies and children read, each scalar cut from its history.
 
     Attributes:
-        axes: in the inertial frame, if forces are given there. turning: follows from how it moves.
+        axes: in the inertial frame, if external forces are given. turning: a point's acceleration by its arm.
     """
 
     moving: Moving
@@ -62,10 +62,10 @@ class Seen(NamedTuple):
 
 
 class Carried(NamedTuple):
-    """Vectors that a link takes from its parent, in its own axes: its motion but for its own rates, and the axes.
+    """Vectors that a link receives from its parent, in its own axes: motion without its own rates, and axes.
 
     Attributes:
-        raw: as they were made. apart: the same, cut.
+        raw: as computed. apart: the same, cut from their history.
     """
 
     raw: list[Vector]
@@ -80,15 +80,15 @@ class Carried(NamedTuple):
 
 
 class Power:
-    """The sum for one trace, of a whole scene or of a piece, and how it changes.
+    """The sum for one trace, of a whole scene or of a piece, and its gradient.
 
     Args:
         multiplier, qdd: lambda and the accelerations, by dof: inputs, or what other recursions make.
         base: acceleration of the inertial frame; gravity unless given.
 
     Attributes:
-        ways: how it changes with entries of "q", "qd", "qdd", "body_f" and of the scene's values, each by the name and
-            the index of that input. stores: what other pieces need of it. forces: tau, by dof.
+        ways: gradient by entries of "q", "qd", "qdd", "body_f" and of the scene's values, by name and index of the input.
+        stores: messages to other pieces. forces: tau, by dof.
     """
 
     def __init__(self, trace: Trace, multiplier: Entry, qdd: Entry, base: tuple[Vector, Vector] | None = None):
@@ -117,7 +117,7 @@ class Power:
             self.stores += trace.send_to_parent("B", link, bars[key])
 
     def _moved(self, link: Link, carried: list[Vector]) -> Moving:
-        """With what the link's own rates add."""
+        """Return the motion of a link with its own rates added."""
         place, (spin, w, v, mu_w, mu_v, *_) = self.trace.places[id(link)], carried
         rates = self.trace.vector("qd"), self.qdd, self.multiplier
         (w_d, v_d), (w_dd, v_dd), (w_l, v_l) = (in_link(link, place, rate) for rate in rates)
@@ -128,7 +128,7 @@ class Power:
     def _handed(
         self, link: Link, mine: Seen, moved: Moving, carried: Carried, parent: Seen, others: list[list[Value]]
     ) -> list[Value]:
-        """How the sum changes with what the link's parent shows of itself; ``others``: so say the link's children."""
+        """Return the gradient by what the link's parent exposes; ``others``: the same from the link's children."""
         bars = self._back([_power(link.grouped, self.trace.external_wrench(link), mine)], [1.0], mine.all)
         for other in others:
             bars = [a + b for a, b in zip(bars, other, strict=True)]
@@ -153,7 +153,7 @@ class Power:
         return self._back(_flat(carried.raw), bars, [*ends, *turn])[: len(ends)]
 
     def _back(self, outputs: list[Value], bars: list[Value], ends: list[Value]) -> list[Value]:
-        """How the sum changes with ``ends``, each scalar of them counted once; what reaches inputs goes to ``ways``."""
+        """Return the gradient by ``ends``, each scalar counted once; gradients by inputs are added to ``ways``."""
         stops = list({x.key: x for x in ends if not is_constant(x)}.values())
         leaves = [x for x in ordered(outputs, stops) if x.op == "input"]
         found = reverse(outputs, [*stops, *leaves], bars)
@@ -167,12 +167,12 @@ class Power:
 
 
 def turning_of(moving: Moving) -> Matrix:
-    """omega'~ + omega~ omega~: acceleration of a point per unit of its arm."""
+    """Return omega'~ + omega~ omega~: the acceleration of a point per unit of its arm."""
     return skew(moving.w) + whirl(moving.spin)
 
 
 def _power(inertia: Rigid | None, external: Vector, seen: Seen) -> Value:
-    """mu . f of the bodies of a link, with ``external`` (n; f) at its origin."""
+    """Return mu . f of the bodies of a link, with ``external`` (n; f) at its origin."""
     (spin, w, v, mu_w, mu_v), n, f = seen.moving, -Vector(external[:3]), -Vector(external[3:])
     if inertia is not None:
         n = n + inertia.inertia @ w + cross(inertia.moment, v) + cross(spin, inertia.inertia @ spin)

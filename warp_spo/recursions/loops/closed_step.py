@@ -1,12 +1,12 @@
-"""Time steps of scenes whose loops are closed: implicit in all hinges, and put back onto the closures.
+"""Time steps of scenes with closed loops: implicit in all hinges, then projected onto the closures.
 
-Embedded: what the laws of a hinge leave of themselves is armature and force, inside a cluster as elsewhere, so that
-D = X* (Mass + h R) X holds the share of every dof that a loop ties. The state after the step leaves the closures by
-O(h^2) of what turns. Newton's steps take it back along the shortest way, position first, then velocity, all with one
-factorisation of Y, where the step ended: the first leaves O(h^4), the second O(h^6).
+Embedded loops: the forces of a hinge enter as armature and force, in a cluster as elsewhere, so that
+D = X* (Mass + h R) X includes every dof that a loop ties. A step leaves the closures by O(h^2). Newton steps correct
+the state along the shortest way, position first, then velocity, all with one factorisation of Y at the end of the step: the
+first leaves O(h^4), the second O(h^6).
 
-By multipliers: Mass + h R is the open tree's, (Y (Mass + h R)^-1 Y*) lambda = -(Y qdd(0) + Y' qd) a system between two
-launches. Passes would have to span them all, so that laws that bend are refused.
+Multipliers: Mass + h R is that of the open tree, and (Y (Mass + h R)^-1 Y*) lambda = -(Y qdd(0) + Y' qd) is solved
+between two launches. Passes of a loop cannot span several launches, so that limits and friction are refused.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from .projection import place_links
 if TYPE_CHECKING:
     from ..tracing import Trace
 
-NEWTON_STEPS = 2  # of position and of velocity, where a loop joint is; couplings are linear and take one
-RESOLVED = 4.0  # roundings: a margin that is no larger may be rounding alone
+NEWTON_STEPS = 2  # of position and of velocity for clusters with loop joints; couplings are linear and take one
+RESOLVED = 4.0  # roundings; a smaller margin may be rounding alone
 
 
 class ClosedStep(Step):
@@ -55,7 +55,7 @@ class ClosedStep(Step):
         return self.loops.outward_accelerations(swept, self.trace.base_acceleration)
 
     def put_back(self, stores: list[Store]) -> list[Store]:
-        """The stores with q' and qd' on the closures."""
+        """Return the stores with q' and qd' projected onto the closures."""
         q, qd = ({s.index[0]: s.value for s in stores if s.array == array} for array in ("q_out", "out"))
         for cluster in self.loops.clusters:
             self.loops.label(cluster, "c")
@@ -83,7 +83,7 @@ class ClosedStep(Step):
             qd |= {dof: qd[dof] + change for dof, change in step.items()}
 
     def _weightless(self, link: Link) -> bool:
-        """What a loop ties may carry what is on its other side."""
+        """Return whether no mass is on the link or further out; a link in a loop may carry what is beyond the loop."""
         return id(link) not in self.loops.cluster_of and super()._weightless(link)
 
     def _unresolved(self) -> Value:

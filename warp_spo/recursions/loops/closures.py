@@ -1,8 +1,9 @@
-"""Closures: what a loop joint or a coupling demands of the tree, by rows: g(q) = 0, Y qd = 0, Y qdd + Y' qd = 0.
+"""Constraint rows of loop joints and couplings: g(q) = 0, Y qd = 0, Y qdd + Y' qd = 0.
 
-A loop joint is seen from the lowest link that carries both of its anchors, held still: positions are then no larger
-than the loop, and what the robot does as a whole does not matter. A row is a direction of the relative twist of the
-anchors, (omega; v) at the child anchor, that the joint does not allow. All vectors are in the axes of that lowest link.
+The rows of a loop joint are formed in the frame of the lowest link that carries both of its anchors, as if that link
+stood still: positions are then no larger than the loop, and the motion of the robot as a whole does not enter. A row is
+a direction of the relative twist of the anchors, (omega; v) at the child anchor, that the joint does not allow. All
+vectors are in the axes of that lowest link.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ from ..links import Link, Links, Placed, Seat
 from ..motion import in_link
 
 PARALLEL = 1e-6  # sine of the angle between two axes of a loop joint, below which they are one
-OPEN = 1e-5  # [rad], or distance over arm, beyond which a closure is open: float32 rounds a few turns by less
-SLOW = 1e-4  # [rad/s, m/s]: of slower rates no share is asked, those of a truss are rounding alone
+OPEN = 1e-5  # [rad], or distance over arm; a larger error is an open closure. Float32 rounds a few turns by less
+SLOW = 1e-4  # [rad/s, m/s]; slower rates are not judged: the rates of a rigid truss are rounding alone
 
 
 class State(NamedTuple):
-    """Where a link is and how it moves: axes, origin; omega, v of the origin; their rates."""
+    """Position and motion of a link: axes, origin; angular velocity, velocity of the origin; their rates."""
 
     axes: Matrix
     origin: Vector
@@ -41,7 +42,7 @@ REST = State(IDENTITY, ZERO, ZERO, ZERO, ZERO, ZERO)
 
 
 class Row(NamedTuple):
-    """A direction (w; v) of the relative twist at the child anchor, and how fast w turns; v turns with the parent."""
+    """A direction (w; v) of the relative twist at the child anchor, and the rate of w; v turns with the parent."""
 
     w: Vector
     v: Vector
@@ -102,7 +103,7 @@ class Closure:
 
     # -- positions -------------------------------------------------------------------------------------------------
     def error(self, places: dict[int, Placed], q: Any) -> list[Value]:
-        """g: distances [m], and angles [rad] as twice the tangent of their half: no turn but none has g = 0."""
+        """Return g: distances [m], and angles [rad] as twice the tangent of their half, zero only at zero."""
         inner, outer = self._anchors(places)
         back = inner.axes.T
         r = back @ (outer.origin - inner.origin)
@@ -121,7 +122,7 @@ class Closure:
 
     # -- rates -----------------------------------------------------------------------------------------------------
     def jacobian(self, places: dict[int, Placed]) -> list[dict[int, Value]]:
-        """Y, each row by dof."""
+        """Return Y, each row by dof."""
         inner, outer = self._anchors(places)
         found: list[dict[int, Value]] = [{} for _ in range(self.rows)]
         rows = self._rows(inner, outer)
@@ -131,7 +132,7 @@ class Closure:
         return found
 
     def sizes(self, places: dict[int, Placed]) -> list[Value]:
-        """Sum of squares of the twists that each row of Y is a projection of."""
+        """Return, for each row of Y, the sum of squares of the twists that it is a projection of."""
         _, outer = self._anchors(places)
         turning, sliding = 0.0, 0.0
         for _, w, v in self._columns(places, outer):
@@ -139,7 +140,7 @@ class Closure:
         return [sliding] * len(self.slides) + [turning] * (self.rows - len(self.slides))
 
     def _columns(self, places: dict[int, Placed], outer: State) -> Iterator[tuple[int, Vector, Vector]]:
-        """(dof, w, v): the relative twist at the child anchor per unit rate of each dof."""
+        """Yield (dof, w, v): the relative twist at the child anchor per unit rate of each dof."""
         for path, sign in ((self.inner_path, -1.0), (self.outer_path, 1.0)):
             for link, state in zip(path, self._states(path, places), strict=True):
                 arm = outer.origin - state.origin
@@ -148,7 +149,7 @@ class Closure:
                     yield dof, w * sign, (v + cross(w, arm)) * sign
 
     def acceleration(self, places: dict[int, Placed], qd: Any, qdd: Callable[[int], Value]) -> list[Value]:
-        """Y qdd + Y' qd; ``qd`` None is zero."""
+        """Return Y qdd + Y' qd; ``qd`` None is zero."""
         inner, outer = self._anchors(places, qd, qdd)
         w, v = outer.spin - inner.spin, outer.velocity - inner.velocity
         arm = outer.origin - inner.origin  # of the point of the parent that is at the child anchor
@@ -178,7 +179,7 @@ class Closure:
         return inner, outer
 
     def _states(self, path: list[Link], places: dict[int, Placed], qd: Any = None, qdd: Any = None) -> list[State]:
-        """How the links of a path are and move, seen from the common link."""
+        """Return the position and motion of each link of a path, relative to the common link."""
         found, state = [], REST
         for link in path:
             state = _moved(link, places[id(link)], state, qd, qdd)
@@ -211,7 +212,7 @@ def _carried(link: State, anchor: Seat) -> State:
 
 
 def _ancestors(link: Link | None) -> list[Link]:
-    """A link and its ancestors, outward."""
+    """Return a link and its ancestors, root first."""
     found: list[Link] = []
     while link is not None:
         found.insert(0, link)
@@ -220,8 +221,11 @@ def _ancestors(link: Link | None) -> list[Link]:
 
 
 def _directions(loop: Loop) -> tuple[list[Vector], list[Vector], list[tuple[Vector, Vector]]]:
-    """What a joint does not allow, in its parent anchor's axes: directions of translation; axes of turning; pairs of
-    axes, one in either anchor, whose angle stays."""
+    """Return the constraints of a loop joint, in its parent anchor's axes.
+
+    Directions along which the anchors do not slide; axes about which they do not turn; pairs of axes, one fixed in each
+    anchor, whose angle stays constant.
+    """
     call = f"Loop({loop.label!r})" if loop.label else f"Loop({loop.kind!r})"
     turns = [np.array(axis) for axis, angular, _ in loop.screws if angular]
     slides = [np.array(axis) for axis, angular, _ in loop.screws if not angular]
@@ -257,7 +261,7 @@ def _complement(axes: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def closures(links: Links) -> list[Closure | Ratio]:
-    """All that a scene demands: loop joints, then couplings."""
+    """Return the constraints of a scene: of its loop joints, then of its couplings."""
     scene = links.scene
     by_dof = {link.dofs[0]: link for link in links.links}
     found: list[Closure | Ratio] = [Closure(links, loop) for loop in scene.loops]
@@ -270,7 +274,7 @@ def closures(links: Links) -> list[Closure | Ratio]:
 def opened(
     constraints: list[Closure | Ratio], places: dict[int, Placed], q: Callable[[int], Value], qd: Callable[[int], Value]
 ) -> Value:
-    """How many rows are open by more than OPEN, in g, or in Y qd as a share of the rates; measured by their sizes."""
+    """Return how many rows are open by more than OPEN: in g relative to its size, or in Y qd relative to the rates."""
     found = []
     for constraint in constraints:
         dofs = [dof for link in constraint.path for dof in link.dofs]

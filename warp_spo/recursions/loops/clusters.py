@@ -1,9 +1,9 @@
 """Clusters: links that loops and couplings tie, eliminated as one node of the tree (Jain's aggregates).
 
-What a loop ties are the links on both ways to the lowest link that carries both of its ends, that link left out;
-overlapping sets are one. Every such set hangs on one link outside, or on the inertial frame, so that what is left is a
-tree of clusters. With Y qd = 0 of the cluster's own dofs, X spanning what Y allows and k the shortest acceleration that
-its velocities demand,
+A loop ties the links on both paths to the lowest link that carries both of its ends, without that link; overlapping
+sets are merged. Every such set hangs on one link outside, or on the inertial frame, so that the clusters form a tree.
+With Y qd = 0 of the cluster's own dofs, X a basis of the rates that Y allows and k the shortest acceleration that its
+velocities demand,
 
     qd = X y,  qdd = X y' + k,  D = X* M X,  U = F X,
     P+ = P - U D^-1 U*,  z+ = z + U D^-1 eps,  eps = X* (tau - t),  y' = D^-1 (eps - U* alpha(p))
@@ -33,11 +33,11 @@ Columns = dict[int, Value]  # by dof
 
 @dataclasses.dataclass
 class Cluster:
-    """Links that move together.
+    """Links that loops or couplings tie to each other.
 
     Attributes:
         links: parents before children. parent: the link outside that they hang on.
-        constraints: (row of the scene's first one, what ties them).
+        constraints: (number of its first row in the scene, constraint).
     """
 
     links: list[Link]
@@ -50,12 +50,12 @@ class Cluster:
 
     @property
     def rows(self) -> list[int]:
-        """Numbers of its rows among the scene's."""
+        """Numbers of the cluster's rows in the scene."""
         return [first + i for first, constraint in self.constraints for i in range(constraint.rows)]
 
 
 def clusters(links: Links, constraints: list[Closure | Ratio]) -> list[Cluster]:
-    """The clusters of a scene, in the order of their first links."""
+    """Return the clusters of a scene, in the order of their first links."""
     owner = {id(link): id(link) for link in links.links}
 
     def find(key: int) -> int:
@@ -84,7 +84,7 @@ def clusters(links: Links, constraints: list[Closure | Ratio]) -> list[Cluster]:
 
 @dataclasses.dataclass
 class Tied:
-    """A cluster at a configuration: its rows that count, factored."""
+    """A cluster at a configuration: its independent rows, factored."""
 
     cluster: Cluster
     space: NullSpace
@@ -94,12 +94,12 @@ class Tied:
     def accelerations(
         self, places: dict[int, Placed], qd: Any, qdd: Callable[[int], Value] = lambda dof: 0.0
     ) -> list[Value]:
-        """Y qdd + Y' qd"""
+        """Return Y qdd + Y' qd."""
         values = [value for _, c in self.cluster.constraints for value in c.acceleration(places, qd, qdd)]
         return [values[i] for i in self.numbers]
 
     def errors(self, places: dict[int, Placed], q: Any) -> list[Value]:
-        """g"""
+        """Return g."""
         values = [value for _, c in self.cluster.constraints for value in c.error(places, q)]
         return [values[i] for i in self.numbers]
 
@@ -107,7 +107,7 @@ class Tied:
 def tied(
     cluster: Cluster, places: dict[int, Placed], kept: Any, epsilon: float, held: frozenset[int] = frozenset()
 ) -> Tied:
-    """The rows ``kept``, numbers among the scene's, of a cluster; ``held`` dofs do not move."""
+    """Return a cluster with the rows ``kept``, by number in the scene; dofs in ``held`` do not move."""
     rows = [row for _, constraint in cluster.constraints for row in constraint.jacobian(places)]
     sizes = [size for _, constraint in cluster.constraints for size in constraint.sizes(places)]
     numbers = [i for i, number in enumerate(cluster.rows) if number in kept]
@@ -119,7 +119,7 @@ def tied(
 
 @dataclasses.dataclass
 class Factor:
-    """What a cluster leaves behind going in.
+    """Results of eliminating a cluster.
 
     Attributes:
         X: columns by dof. L: unit lower triangular rows of D = L diag(d) L*; inverse: 1 / d.
@@ -137,14 +137,14 @@ class Factor:
     nothing: Value
 
     def forward(self, b: list[Value]) -> list[Value]:
-        """L^-1 b"""
+        """Return L^-1 b."""
         found: list[Value] = []
         for row, value in zip(self.L, b, strict=True):
             found.append(value - total(a * x for a, x in zip(row, found, strict=False)))
         return found
 
     def solve(self, b: list[Value]) -> list[Value]:
-        """D^-1 b"""
+        """Return D^-1 b."""
         x = [value * inverse for value, inverse in zip(self.forward(b), self.inverse, strict=True)]
         for i in reversed(range(len(x))):
             x[i] = x[i] - total(self.L[k][i] * x[k] for k in range(i + 1, len(x)))
@@ -161,7 +161,7 @@ def factor(
 ) -> Factor:
     """Eliminate the rates of a cluster from the articulated inertias that its links carry, ``own``.
 
-    ``stiffened``: a link with all that its pivots feel beside its inertia.
+    ``stiffened``: returns a link with what a time step adds to its armature.
     """
     X, inside = space.basis, set(map(id, cluster.links))
     carried: dict[int, Articulated] = {}
@@ -201,9 +201,9 @@ def factor(
 
 
 def _pivots(D: list[list[Value]], least: list[Value]) -> tuple[list[list[Value]], list[Value], list[Value]]:
-    """L, d and 1 / d of D = L diag(d) L*, the lower triangle given; what is not above ``least`` becomes NaN.
+    """Return L, d and 1 / d of D = L diag(d) L*, from the lower triangle; a pivot not above ``least`` becomes NaN.
 
-    Least is some roundings of (|x| sqrt(diag M))^2, which bounds all that cancels in x* M x.
+    ``least`` is some roundings of (|x| sqrt(diag M))^2, an upper bound of the terms that cancel in x* M x.
     """
     L: list[list[Value]] = []
     d: list[Value] = []
@@ -228,7 +228,7 @@ def hinge_forces(
     qdd: Any,
     stiffened: Callable[[Link], Link] = lambda link: link,
 ) -> tuple[Columns, Vector]:
-    """t by dof, and z in the parent's frame, at ``qdd`` and alpha(p) = 0; ``loads`` are the z that links carry."""
+    """Return t by dof, and z in the parent's frame, at ``qdd`` and alpha(p) = 0; ``loads`` holds z of each link."""
     alpha: dict[int, tuple[Vector, Vector]] = {}
     for link in cluster.links:
         above = alpha.get(id(link.parent), (ZERO, ZERO))
@@ -255,7 +255,7 @@ def hinge_forces(
 
 
 def expanded(cluster: Cluster, done: Factor, rates: list[Value], k: Columns, above: tuple[Vector, Vector]) -> Columns:
-    """qdd by dof, for rates = D^-1 eps and the acceleration ``above`` of the parent."""
+    """Return qdd by dof, for rates = D^-1 eps and the acceleration ``above`` of the parent."""
     alpha = (*above[0], *above[1])
     y = [a - b for a, b in zip(rates, done.solve([dot(column, alpha) for column in done.U]), strict=True)]
     columns = list(zip(done.X, y, strict=True))

@@ -1,9 +1,9 @@
-"""What rows Y leave free: Y = [L 0] Q* by Householder's reflections, branch-free, zeros of the scene kept.
+"""The null space of constraint rows: Y = [L 0] Q* by Householder reflections, branch-free, with zeros kept as zeros.
 
-The columns of Q beyond L are an orthonormal basis of what Y allows, wherever the rows are independent: no dof has to be
-declared dependent, so nothing happens where a choice of dependent dofs would turn singular (the dead point of a crank).
-What is left of a row beyond the rows before it, over the size of what it was made of, is a sine; where it is rounding
-alone the rows are dependent, and NaN says so.
+The columns of Q beyond L are an orthonormal basis of the rates that Y allows, wherever the rows are independent. No dof
+is declared dependent, so the dead point of a crank, where a fixed choice of dependent dofs is singular, is an ordinary
+configuration. The remainder of a row after projection on the rows before it, over the size of its terms, is a sine;
+where the remainder is rounding alone the rows are dependent, and results become NaN.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from ...trace.scalars import Value, absolute, guarded, is_constant, reciprocal, 
 from ...trace.spatial import total
 from ..articulated import lost
 
-LEAST = 64.0  # roundings: what is less than so many of a row may be rounding alone
+LEAST = 64.0  # roundings of a row's size; a smaller remainder may be rounding alone
 
 
 class Reflection(NamedTuple):
@@ -32,7 +32,7 @@ class Reflection(NamedTuple):
 
 
 class Basis(NamedTuple):
-    """Columns of one's own choice that rows leave free, by dof; NaN where the rows are lost, otherwise zero."""
+    """Chosen columns that the rows allow, by dof; ``nothing`` is NaN where the rows lose rank, otherwise zero."""
 
     basis: list[dict[int, Value]]
     nothing: Value
@@ -43,14 +43,14 @@ class NullSpace:
 
     Args:
         rows: entries by column, no more than there are columns.
-        sizes: square of what each row is a projection of: what cancels in it.
+        sizes: of each row, the sum of squares of the terms that may cancel in it.
         columns: all of them.
         epsilon: rounding of the dtype.
 
     Attributes:
         basis: orthonormal vectors that Y makes zero, by column.
-        margins: of each row, the square of what is left of it beyond the rows before it, over its size.
-        nothing: zero, or NaN where a row is lost, which the basis alone need not show.
+        margins: of each row, the square of its remainder after the rows before it, over its size.
+        nothing: zero, or NaN where a row is lost; the basis alone need not show that.
     """
 
     def __init__(self, rows: list[dict[int, Value]], sizes: list[Value], columns: list[int], epsilon: float):
@@ -94,7 +94,7 @@ class NullSpace:
         return x
 
     def particular(self, right: list[Value]) -> dict[int, Value]:
-        """The shortest x with Y x = ``right``, by column."""
+        """Return the shortest x with Y x = ``right``, by column."""
         found: dict[int, Value] = {}
         for row, pivot, inverse, _ in self._steps:
             known = total(self._rows[row].get(column, 0.0) * x for column, x in found.items())
@@ -102,7 +102,7 @@ class NullSpace:
         return self._turned(found)
 
     def multipliers(self, force: Callable[[int], Value]) -> list[Value]:
-        """What Y* has to be times, by row, to give the part of a force, by column, that X* does not see."""
+        """Return mu, by row, with Y* mu = the part of a ``force``, by column, that X* maps to zero."""
         x = {column: force(column) for column in self._columns}
         for _, _, _, reflection in self._steps:
             x = x if reflection is None else reflection.apply(x)
