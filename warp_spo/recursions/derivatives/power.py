@@ -1,9 +1,9 @@
 """Reverse mode of inverse dynamics: the gradient of lambda . tau(q, qd, qdd) by its arguments.
 
 lambda . tau = sum over the links of mu . f + sum over the dofs of lambda Delta qdd, where mu are the velocities
-(omega; v) for the rates lambda, and f is the force that accelerates a link, less the external one. The motion of a link follows
-from that of its parent, so one outward sweep forms the sum, and one inward sweep its gradient by the motion of each
-link; the gradient by mu is the force that the link transmits.
+(omega; v) for the rates lambda, and f is the force that accelerates a link, less the external one. The motion of a link
+follows from that of its parent, so one outward sweep forms the sum, and one inward sweep its gradient by the motion of
+each link; the gradient by mu is the force that the link transmits.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Power:
         base: acceleration of the inertial frame; gravity unless given.
 
     Attributes:
-        ways: gradient by entries of "q", "qd", "qdd", "body_f" and of the scene's values, by name and index of the input.
+        ways: gradient by entries of "q", "qd", "qdd", "body_f" and of the scene's values, by name and index.
         stores: messages to other pieces. forces: tau, by dof.
     """
 

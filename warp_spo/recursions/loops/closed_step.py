@@ -2,7 +2,7 @@
 
 Embedded loops: the forces of a hinge enter as armature and force, in a cluster as elsewhere, so that
 D = X* (Mass + h R) X includes every dof that a loop ties. A step leaves the closures by O(h^2). Newton steps correct
-the state along the shortest way, position first, then velocity, all with one factorisation of Y at the end of the step: the
+the state along the shortest way, position first, then velocity, with one factorisation of Y at the end of the step: the
 first leaves O(h^4), the second O(h^6).
 
 Multipliers: Mass + h R is that of the open tree, and (Y (Mass + h R)^-1 Y*) lambda = -(Y qdd(0) + Y' qd) is solved
