@@ -12,7 +12,7 @@ AROUND = 0.25  # how far outside the frame drawn things are looked for, as a sha
 
 def pixels(text, width):
     """Return an SVG's pixels [row, column, RGBA], 0 to 1."""
-    png = resvg_py.svg_to_bytes(svg_string=text, width=width, dpi=96)
+    png = resvg_py.svg_to_bytes(svg_string=text, width=width)
     return matplotlib.image.imread(io.BytesIO(bytes(png)), format="png")
 
 

@@ -93,11 +93,17 @@ def color(peer: str | None) -> str:
 
 
 def svg(figure: Any) -> str:
-    """Return a figure as SVG text; equal figures give equal texts."""
+    """Return a figure as SVG text, its size in pixels; equal figures give equal texts.
+
+    Points, matplotlib's unit, have no size where a renderer knows no resolution.
+    """
     out = io.StringIO()
     with style():
         figure.savefig(out, format="svg", metadata={"Date": None})
-    return re.sub(r"\n\s+", "\n", out.getvalue())
+    text = re.sub(
+        r'(width|height)="([\d.]+)pt"', lambda size: f'{size[1]}="{float(size[2]) * 4 / 3:g}"', out.getvalue()
+    )
+    return re.sub(r"\n\s+", "\n", text)
 
 
 def time_text(microseconds: float) -> str:
