@@ -1,12 +1,17 @@
-"""Device code, one recursion a file. A file's kernels of one scalar type share a Warp module, compiled once."""
+"""Device code, one recursion a file. The kernels of a file for one scalar type share a Warp module, compiled once."""
+
+import types
 
 
-def declare(file, kind) -> None:
-    """Make every kernel of ``file``, so that the first launch compiles them all together.
+def declare(file: types.ModuleType, kind: object) -> None:
+    """Create every kernel of ``file``, so that the first launch compiles all of them together.
 
-    ``kind``: the scalar type or, for kernels at node granularity, the steps of that type; what the factories take.
+    A kernel that joined its Warp module after the first launch would make Warp compile the whole module again.
 
-    A kernel that joins its module after the first launch would have the whole module compiled again.
+    Args:
+        file: a module of this package.
+        kind: the argument of its factories: the scalar type or, for kernels at node granularity, the node functions of
+            that type (:mod:`warp_spo.execution.node_functions`).
     """
     for factory in file.KERNELS:
         factory(kind)

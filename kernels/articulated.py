@@ -1,8 +1,9 @@
 """Articulated-body factorisation and solution: Mass = [I + H phi K] D [I + H phi K]* (eq. 1).
 
-A hinge of several degrees of freedom is eliminated one at a time, outermost first, as if massless bodies lay between:
-D(k) never has to be factorised, and its scalar pivots are those of L^T D L of the mass matrix. Going out, the order is
-reversed. ``gain`` holds U = P H*, ``pivot`` D, one column each.
+A hinge of several degrees of freedom is eliminated one degree of freedom at a time, outermost first, as if massless
+bodies lay between them. D(k) therefore never has to be factorised; its scalar pivots are those of the factorisation
+L^T D L of the mass matrix. The outward sweep takes the degrees of freedom in the reverse order. The array ``gain``
+holds U = P H*, one column for each degree of freedom, and ``pivot`` holds D.
 """
 
 import functools
@@ -16,9 +17,10 @@ from .topology import Topology
 def factor(s) -> wp.Kernel:
     """Inward, one level: P(k) = M(k) + sum over children phi P+ phi*, U = P H*, D = H U + Delta, P+ = P - U D^-1 U*.
 
-    A pivot that rounding may have invented becomes NaN: whatever depends on it is lost, and says so. That is one of at
-    most 4 eps times the size of what cancels in it: |H| |P| |H*| + |Delta|, entry by entry, and what the columns of the
-    hinge that are eliminated before it bring along. Along an axis of the node frame nothing cancels: any D > 0 is kept.
+    A pivot that may consist of rounding errors becomes NaN, and so does every result that depends on it. Such a pivot
+    is at most 4 eps times the sum of |H| |P| |H*| + |Delta|, entry by entry, and of the cancellation that the columns
+    of the same hinge cause which were eliminated before it. Along an axis of the node frame nothing cancels: any D > 0
+    is kept.
     """
     T = s.T
     least = T(s.least)
@@ -44,21 +46,21 @@ def factor(s) -> wp.Kernel:
         first = topology.qd_start[node]
         count = topology.dof_count[node]
         P_0 = P
-        for dof in range(first, first + count):  # the size of what cancels in D, kept in D's place until D is known
+        for dof in range(first, first + count):  # the size of the terms that cancel in D waits in the place of D
             h = s.load_motion(axis, dof, world)
             pivot_out[dof, world] = s.magnitude(P, h, h) + wp.abs(armature[dof, world])
         for e in range(count):
             dof = first + count - 1 - e
             h = s.load_motion(axis, dof, world)
             size = pivot_out[dof, world]
-            found = s.eliminated(P, h, armature[dof, world], least * size)
+            found = s.eliminate(P, h, armature[dof, world], least * size)
             P, U, D = found[0:21], found[21:27], found[27]
             s.store_motion(gain_out, dof, world, U)
             pivot_out[dof, world] = D
             for other in range(first, dof):
                 g = s.load_motion(axis, other, world)
                 share = wp.abs(wp.dot(g, U)) / D
-                pivot_out[other, world] += s.brought(s.magnitude(P_0, g, h), share, size)
+                pivot_out[other, world] += s.cancellation(s.magnitude(P_0, g, h), share, size)
         if topology.parent[node] >= 0:
             s.store_articulated(
                 articulated_out, node, world, s.articulated_to_parent(s.load_pose(pose, node, world), P)
@@ -68,10 +70,10 @@ def factor(s) -> wp.Kernel:
 
 
 @functools.cache
-def reduce(s) -> wp.Kernel:
+def eliminate(s) -> wp.Kernel:
     """Inward, one level: z(k) = force(k) + sum over children phi (z + G eps), eps = b - H z; out = D^-1 eps.
 
-    One thread for each (node, column, world). ``b`` absent is zero, or with ``identity`` the unit matrix.
+    One thread for each (node, column, world). Without ``b``, b is zero, or with ``identity`` the unit matrix.
     """
     T = s.T
 
@@ -109,7 +111,7 @@ def reduce(s) -> wp.Kernel:
             elif identity and dof == column:
                 right = T(1.0)
             h, U = s.load_motion(axis, dof, world), s.load_motion(gain, dof, world)
-            found = s.taken(h, U, pivot[dof, world], z, right)
+            found = s.eliminate_force(h, U, pivot[dof, world], z, right)
             z = found[1:7]
             out[world, dof, column] = found[0]
         if topology.parent[node] >= 0:
@@ -119,10 +121,11 @@ def reduce(s) -> wp.Kernel:
 
 
 @functools.cache
-def expand(s) -> wp.Kernel:
-    """Outward, one level: out = D^-1 eps - G* alpha(p), alpha(k) = phi* alpha(p) + H* out; gravity moves the frame.
+def back_substitute(s) -> wp.Kernel:
+    """Outward, one level: out = D^-1 eps - G* alpha(p), alpha(k) = phi* alpha(p) + H* out.
 
-    One thread for each (node, column, world); ``out`` comes in as D^-1 eps.
+    One thread for each (node, column, world). ``out`` holds D^-1 eps before. With ``gravity``, the inertial frame
+    accelerates by -gravity.
     """
     T = s.T
 
@@ -144,14 +147,14 @@ def expand(s) -> wp.Kernel:
         column = first_column + c
         node = topology.order[level + i]
         parent = topology.parent[node]
-        alpha = s.base(gravity, world)
+        alpha = s.base_acceleration(gravity, world)
         if parent >= 0:
             alpha = s.load_motion(alpha_out, parent, lane)
         alpha = s.motion_to_child(s.load_pose(pose, node, world), alpha)
         first = topology.qd_start[node]
         for dof in range(first, first + topology.dof_count[node]):
             h, U = s.load_motion(axis, dof, world), s.load_motion(gain, dof, world)
-            found = s.released(h, U, pivot[dof, world], alpha, out[world, dof, column])
+            found = s.back_substitute(h, U, pivot[dof, world], alpha, out[world, dof, column])
             alpha = found[1:7]
             out[world, dof, column] = found[0]
         s.store_motion(alpha_out, node, lane, alpha)
@@ -161,7 +164,7 @@ def expand(s) -> wp.Kernel:
 
 @functools.cache
 def log_determinant(s) -> wp.Kernel:
-    """log det Mass = sum of log D, added in float64; one thread for each world."""
+    """Compute log det Mass, the sum of log D, added in float64; one thread for each world."""
 
     T = s.T
 
@@ -178,9 +181,9 @@ def log_determinant(s) -> wp.Kernel:
 
 @functools.cache
 def weighted_product(s) -> wp.Kernel:
-    """``out = Y* D Y`` for Y = D^-1 [I - H psi K] B, so that out = B* Mass^-1 B; one thread for each entry.
+    """Compute Y* D Y for Y = D^-1 [I - H psi K] B, which is B* Mass^-1 B; one thread for each entry.
 
-    Y is [world, dof, column]. The lower triangle is computed and mirrored.
+    Y is [world, dof, column]. The kernel computes the lower triangle and copies it to the upper one.
     """
 
     T = s.T
@@ -199,4 +202,4 @@ def weighted_product(s) -> wp.Kernel:
     return kernel
 
 
-KERNELS = (factor, reduce, expand, log_determinant, weighted_product)
+KERNELS = (factor, eliminate, back_substitute, log_determinant, weighted_product)

@@ -1,14 +1,15 @@
 """Products and sweeps with block-sparse matrices whose block sizes are run-time values.
 
-A matrix is a list of dense blocks, each row-major somewhere in one row of ``weights`` [world or 1, scalar]. A table
-says which blocks meet which row of the result::
+A matrix is a list of dense blocks. Each block lies row-major in the row of its world in ``weights`` [world or 1,
+scalar]. Two tables say which blocks contribute to which row of the result::
 
-    rows[i]    = (row, begin, end)     entries begin to end - 1 meet this row
+    rows[i]    = (row, begin, end)     entries begin to end - 1 contribute to this row
     entries[e] = (source, count, base, row_stride, source_stride)
 
-so that, in one world, (block e) x = sum_k weights[base + row row_stride + k source_stride] x[source + k].
+The contribution of entry e, in one world, is the sum over k of
+weights[base + row row_stride + k source_stride] x[source + k].
 A matrix and its transpose differ in their tables only. One thread works on one (world, row, column) and adds in the
-order of the table: no atomics, the same bits in every run.
+order of the table, without atomics, so that every run gives the same bits.
 """
 
 import functools
@@ -28,7 +29,7 @@ def row_times(
     column: int,
     x: wp.array3d(dtype=Any),
 ):
-    """One row of the matrix times one column of x."""
+    """Return one row of the matrix times one column of x."""
     weights_world = wp.where(weights.shape[0] == 1, 0, world)  # one world of weights is shared by all
     total = weights.dtype(0.0)
     for index in range(row[1], row[2]):
@@ -41,7 +42,7 @@ def row_times(
 
 @functools.cache
 def gather(T):
-    """``out = alpha B x``, or ``out += alpha B x``. Launch over (row, column, world)."""
+    """Compute ``out = alpha B x``, or with ``accumulate`` ``out += alpha B x``. Launch over (row, column, world)."""
 
     @wp.kernel(module=f"warp_spo_block_sparse_{T.__name__}", enable_backward=False)
     def block_gather(
@@ -65,9 +66,9 @@ def gather(T):
 
 @functools.cache
 def sweep(T):
-    """One level of ``y = alpha x + B y``, that is y = alpha (I - B)^-1 x (Jain, eq. 9).
+    """Compute one level of ``y = alpha x + B y``, that is y = alpha (I - B)^-1 x (Jain, eq. 9).
 
-    Launch over (row of the level, column, world), levels in the order in which B y meets finished rows only.
+    Launch over (row of the level, column, world), the levels in an order in which B y reads finished rows only.
     """
 
     @wp.kernel(module=f"warp_spo_block_sparse_{T.__name__}", enable_backward=False)
@@ -90,7 +91,7 @@ def sweep(T):
 
 @functools.cache
 def scale(T):
-    """``out = alpha x``, or ``out += alpha x``. Launch over (world, row, column)."""
+    """Compute ``out = alpha x``, or with ``accumulate`` ``out += alpha x``. Launch over (world, row, column)."""
 
     @wp.kernel(module=f"warp_spo_block_sparse_{T.__name__}", enable_backward=False)
     def block_scale(alpha: T, accumulate: bool, x: wp.array3d(dtype=T), y_out: wp.array3d(dtype=T)):
@@ -105,7 +106,7 @@ def scale(T):
 
 @functools.cache
 def unit(T):
-    """Columns ``first``, ``first + 1``, ... of the identity. Launch over (world, row, column)."""
+    """Write columns ``first``, ``first + 1``, ... of the identity. Launch over (world, row, column)."""
 
     @wp.kernel(module=f"warp_spo_block_sparse_{T.__name__}", enable_backward=False)
     def block_unit(first: int, out: wp.array3d(dtype=T)):

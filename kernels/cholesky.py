@@ -1,4 +1,4 @@
-"""Inverses of symmetric positive definite matrices, a thread a world: A = L D L*, W = L^-1, A^-1 = W* D^-1 W."""
+"""Inverses of symmetric positive definite matrices, one thread a world: A = L D L*, W = L^-1, A^-1 = W* D^-1 W."""
 
 import functools
 
@@ -7,10 +7,10 @@ import warp as wp
 
 @functools.cache
 def inverse(T) -> wp.Kernel:
-    """out = A^-1, both triangles; A [world, n, n] becomes L and D^-1. One thread for each world.
+    """Compute A^-1, both triangles; A [world, n, n] is overwritten with L and D^-1. One thread for each world.
 
-    Row k of W says of which rows of A a pivot is made, D(k) = W(k) A W(k)*, so that what cancels in it is at most
-    (sum of |W(k, i)| sqrt(A(i, i)))^2. A pivot that is not above 16 roundings of that makes the world NaN.
+    A pivot is D(k) = W(k) A W(k)* for row k of W, so the terms that cancel in it are at most
+    (sum of |W(k, i)| sqrt(A(i, i)))^2. The world becomes NaN if a pivot is not above 16 roundings of that bound.
     """
     least = T(16.0 * (2.0**-23 if T is wp.float32 else 2.0**-52))
 

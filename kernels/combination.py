@@ -1,4 +1,4 @@
-"""Sums of states: what integrators do between evaluations."""
+"""Linear combinations of states, for integrators."""
 
 import functools
 
@@ -7,7 +7,7 @@ import warp as wp
 
 @functools.cache
 def combine(T) -> wp.Kernel:
-    """``out = a x + b y``, entry by entry; ``out`` may be either."""
+    """Compute ``out = a x + b y``, entry by entry; ``out`` may be ``x`` or ``y``."""
 
     @wp.kernel(module=f"warp_spo_combination_{T.__name__}", enable_backward=False)
     def kernel(a: T, x: wp.array2d[T], b: T, y: wp.array2d[T], out: wp.array2d[T]):

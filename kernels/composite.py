@@ -9,7 +9,7 @@ from .topology import Topology
 
 @functools.cache
 def composite(s) -> wp.Kernel:
-    """Inward, one level: R(k) = M(k) + sum over children phi R phi*; ``composite_out`` may be read by parents only."""
+    """Inward, one level: R(k) = M(k) + sum over children phi R phi*."""
     T = s.T
 
     @wp.kernel(module=f"warp_spo_composite_{T.__name__}", enable_backward=False)
@@ -27,10 +27,10 @@ def composite(s) -> wp.Kernel:
 
 @functools.cache
 def mass_matrix(s) -> wp.Kernel:
-    """Rows and columns of one degree of freedom against its own hinge and its ancestors; [world, dof, dof].
+    """Write the entries of the mass matrix between a degree of freedom, its own hinge and the ancestors' hinges.
 
-    One thread for each (dof, world) carries F = R(k) H*(k) to the root; entries between branches are zero and written
-    by nobody here.
+    One thread for each (dof, world) propagates F = R(k) H*(k) to the root. The entries between different branches are
+    zero; this kernel does not write them. The matrix is [world, dof, dof].
     """
     T = s.T
 

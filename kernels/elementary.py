@@ -1,8 +1,9 @@
-"""Elementary functions for emitted code: branch-free, so that the compiler can reorder around them.
+"""Elementary functions for generated code, without branches, so that the compiler can reorder statements around them.
 
-Sine and cosine reduce by three parts of pi / 2 and evaluate a polynomial, to about one unit in the last place while
-|x| is below ``reach``. On CUDA the caller of ``sincos`` sees to that, with ``reduced``, which takes off turns in
-float64; ``sincos_any`` looks for itself. The reciprocal is the hardware's, refined once (twice in float64).
+Sine and cosine reduce the angle by pi / 2 in three parts and evaluate a polynomial, with an error of about one unit in
+the last place while |x| is below ``reach``. On CUDA, the caller of ``sincos`` brings larger angles into this range with
+``reduced``, which subtracts full turns in float64; ``sincos_any`` does so itself. The reciprocal is the approximation
+of the hardware with one Newton step (two in float64).
 """
 
 import warp as wp

@@ -1,4 +1,4 @@
-"""Between flat arrays of all worlds, as Newton keeps them, and arrays [world, entry]."""
+"""Copies between Newton's flat arrays of all worlds and arrays [world, entry]."""
 
 import functools
 
@@ -7,7 +7,7 @@ import warp as wp
 
 @functools.cache
 def gather(T) -> wp.Kernel:
-    """``out[world, i] = flat[index[world, i]]``"""
+    """Set ``out[world, i] = flat[index[world, i]]``."""
 
     @wp.kernel(module=f"warp_spo_exchange_{T.__name__}", enable_backward=False)
     def kernel(index: wp.array2d[int], flat: wp.array[T], out: wp.array2d[T]):
@@ -19,7 +19,7 @@ def gather(T) -> wp.Kernel:
 
 @functools.cache
 def scatter(T) -> wp.Kernel:
-    """``flat[index[world, i]] = array[world, i]``, in the worlds of ``mask``, all without one."""
+    """Set ``flat[index[world, i]] = array[world, i]`` in the worlds where ``mask`` is True; without a mask, in all."""
 
     @wp.kernel(module=f"warp_spo_exchange_{T.__name__}", enable_backward=False)
     def kernel(index: wp.array2d[int], mask: wp.array[wp.bool], array: wp.array2d[T], flat_out: wp.array[T]):
@@ -34,7 +34,7 @@ def scatter(T) -> wp.Kernel:
 
 @functools.cache
 def scale(T) -> wp.Kernel:
-    """``out[world, i] = factor[i] array[world, i]``; nothing comes of a factor of zero."""
+    """Set ``out[world, i] = factor[i] array[world, i]``; a factor of zero gives zero even where ``array`` holds NaN."""
 
     @wp.kernel(module=f"warp_spo_exchange_{T.__name__}", enable_backward=False)
     def kernel(factor: wp.array[T], array: wp.array2d[T], out: wp.array2d[T]):
@@ -46,9 +46,10 @@ def scale(T) -> wp.Kernel:
 
 @functools.cache
 def turn_wrenches(T) -> wp.Kernel:
-    """World wrenches on free hinges into the axes of their parent anchors, in place.
+    """Rotate wrenches on free hinges, in place, from world axes into the axes of the hinges' parent anchors.
 
-    ``hinge`` [n, 3]: first dof, hinge, parent body or -1. ``poses`` [world, body, 7].
+    ``hinge`` [n, 3] holds the first dof, the hinge, and the parent body or -1. ``anchor`` [world, hinge, 7] and
+    ``poses`` [world, body, 7] are poses; ``tau`` [world, dof] holds the wrenches.
     """
     quat = wp.types.quaternion(T)
     vec3 = wp.types.vector(3, T)

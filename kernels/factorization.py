@@ -1,8 +1,8 @@
 """The Riccati recursion of any spatial kernel operator: P, D, G and the weights of E_psi, for all block sizes.
 
 P(k) = M(k) + sum over children w P+ w*, D = H P H* + Delta, G = P H* D^-1, P+ = P - G H P, w_psi = w (I - G H).
-Blocks are packed row after row, one after the other, [world, scalar]; sizes are run-time values, so one kernel serves
-every system, rigid or not.
+The blocks lie one after the other, each row-major, in arrays [world, scalar]. Their sizes are run-time values, so that
+one kernel serves every system, rigid or not.
 """
 
 import functools
@@ -12,6 +12,8 @@ import warp as wp
 
 @wp.struct
 class BlockTables:
+    """Sizes and places of the blocks of every node."""
+
     order: wp.array[int]  # nodes, level by level, roots first
     parent: wp.array[int]
     child_start: wp.array[int]
@@ -26,7 +28,7 @@ class BlockTables:
 
 @functools.cache
 def factorize(T) -> wp.Kernel:
-    """Inward, one level; one thread for each (node, world). A D that is not positive definite gives NaN."""
+    """Factorise one level, inward; one thread for each (node, world). NaN where D is not positive definite."""
 
     @wp.kernel(module=f"warp_spo_factorization_{T.__name__}", enable_backward=False)
     def kernel(

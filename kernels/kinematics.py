@@ -1,4 +1,4 @@
-"""Position, velocity and acceleration of every node: hinge motion, then outward sweeps V = phi* H* qd (eq. 20)."""
+"""Pose, velocity and acceleration of every node: hinge motion, then outward sweeps V = phi* H* qd (eq. 20)."""
 
 import functools
 
@@ -49,11 +49,11 @@ def hinge(s) -> wp.Kernel:
                     s.store_motion(axis_out, first + j, world, carried)
                 h = s.motion(axis * turn, axis * slide)
                 s.store_motion(axis_out, first + i, world, h)
-                pose = s.placed_on(pose, inner)
+                pose = s.compose(pose, inner)
                 if velocity_out:
                     own = h * qd[world, first + i]
-                    bias = s.accelerated(inner, velocity, bias, own, vec6())
-                    velocity = s.moved(inner, velocity, own)
+                    bias = s.node_acceleration(inner, velocity, bias, own, vec6())
+                    velocity = s.node_velocity(inner, velocity, own)
         else:
             angular = first
             at = coord
@@ -77,7 +77,7 @@ def hinge(s) -> wp.Kernel:
                         velocity += s.motion(vec3(), column * qd[world, first + i])
             velocity += s.motion(w, wp.cross(r, w))
             bias = s.motion(vec3(), wp.cross(w, wp.cross(r, w)))  # about the CoM, which moves straight
-            pose = s.placed_on(pose, s.pose(R, p))
+            pose = s.compose(pose, s.pose(R, p))
         s.store_pose(pose_out, node, world, pose)
         if velocity_out:
             s.store_motion(velocity_out, node, world, velocity)
@@ -87,15 +87,15 @@ def hinge(s) -> wp.Kernel:
 
 
 @functools.cache
-def motion(s) -> wp.Kernel:
-    """Outward, one level: V(k) = phi* V(p) + H* qd, alpha(k) = phi* alpha(p) + H* qdd + a(k); what is absent is zero.
+def node_motion(s) -> wp.Kernel:
+    """Outward, one level: V(k) = phi* V(p) + H* qd, alpha(k) = phi* alpha(p) + H* qdd + a(k).
 
-    ``velocity_out`` comes in as H* qd and leaves as V; gravity is the acceleration -g of the inertial frame. Without
-    ``acceleration_out`` only V is computed.
+    ``velocity_out`` holds H* qd before and V after. Gravity is the acceleration -g of the inertial frame. An absent
+    input is zero; without ``acceleration_out``, only V is computed.
 
     ``acceleration_out`` is (d omega/dt; dv/dt) of the node's origin as an observer at rest sees it, alpha + (0; omega x
-    v): Jain's alpha and V's linear part both grow with the distance from the root, and what they add to the force
-    cancels. From this form v is gone: a(k) consists of omega and of what lies between k and p alone.
+    v). Jain's alpha and the linear part of V both grow with the distance from the root, and their contributions to the
+    force cancel. This form does not contain v: a(k) depends only on omega and on the vectors between k and p.
     """
     T, vec6 = s.T, s.vec6
 
@@ -120,14 +120,14 @@ def motion(s) -> wp.Kernel:
             own = s.load_motion(velocity_out, node, world)
             if parent >= 0:
                 above = s.load_motion(velocity_out, parent, world)
-            s.store_motion(velocity_out, node, world, s.moved(place, above, own))
+            s.store_motion(velocity_out, node, world, s.node_velocity(place, above, own))
         if acceleration_out:
-            alpha = s.base(gravity, world)
+            alpha = s.base_acceleration(gravity, world)
             if parent >= 0:
                 alpha = s.load_motion(acceleration_out, parent, world)
             if velocity_out:
                 a = s.load_motion(bias, node, world)
-            alpha = s.accelerated(place, above, alpha, own, a)
+            alpha = s.node_acceleration(place, above, alpha, own, a)
             if qdd:
                 first = topology.qd_start[node]
                 for dof in range(first, first + topology.dof_count[node]):
@@ -138,8 +138,8 @@ def motion(s) -> wp.Kernel:
 
 
 @functools.cache
-def poses(s) -> wp.Kernel:
-    """Outward, one level: pose of every node frame in the inertial frame."""
+def world_poses(s) -> wp.Kernel:
+    """Outward, one level: compute the pose of every node frame in the inertial frame."""
     T = s.T
 
     @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
@@ -147,20 +147,20 @@ def poses(s) -> wp.Kernel:
         i, world = wp.tid()
         node = topology.order[level + i]
         parent = topology.parent[node]
-        found = s.load_pose(pose, node, world)
+        place = s.load_pose(pose, node, world)
         if parent >= 0:
-            found = s.placed_on(s.load_pose(world_pose_out, parent, world), found)
-        s.store_pose(world_pose_out, node, world, found)
+            place = s.compose(s.load_pose(world_pose_out, parent, world), place)
+        s.store_pose(world_pose_out, node, world, place)
 
     return kernel
 
 
 @functools.cache
 def body_poses(s) -> wp.Kernel:
-    """Position and quaternion (xyzw) of every frame that sits at ``anchor`` in the node frame's inverse sense.
+    """Write the position and quaternion (xyzw) of every body, or without ``anchor`` of every node frame.
 
-    One thread for each (node, world): with ``anchor`` the body's pose is node pose * anchor^-1, as Newton's body_q;
-    without it the pose is the node frame's own.
+    One thread for each (node, world). ``anchor`` is the pose of the node frame in the body, so the body's pose is
+    node pose * anchor^-1, as in Newton's body_q.
     """
     T = s.T
 
@@ -169,7 +169,7 @@ def body_poses(s) -> wp.Kernel:
         node, world = wp.tid()
         pose = s.load_pose(world_pose, node, world)
         if anchor:
-            pose = s.placed_under(pose, s.load_pose(anchor, node, world))
+            pose = s.compose_inverse(pose, s.load_pose(anchor, node, world))
         quaternion = wp.quat_from_matrix(s.rotation_of(pose))
         for c in range(3):
             out[world, node, c] = pose[9 + c]
@@ -181,14 +181,14 @@ def body_poses(s) -> wp.Kernel:
 
 @functools.cache
 def body_velocities(s) -> wp.Kernel:
-    """CoM velocity and angular velocity in inertial axes, as Newton's body_qd; one thread for each (node, world)."""
+    """Write CoM and angular velocity in inertial axes, as Newton's body_qd; one thread for each (node, world)."""
     T = s.T
 
     @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
     def kernel(world_pose: wp.array3d[T], com: wp.array3d[T], velocity: wp.array3d[T], out: wp.array3d[T]):
         node, world = wp.tid()
         V = s.load_motion(velocity, node, world)
-        v = s.velocity(s.load_pose(world_pose, node, world), V, s.load3(com, node, world))
+        v = s.point_velocity(s.load_pose(world_pose, node, world), V, s.load3(com, node, world))
         for c in range(6):
             out[world, node, c] = v[c]
 
@@ -197,10 +197,10 @@ def body_velocities(s) -> wp.Kernel:
 
 @functools.cache
 def jacobian(s) -> wp.Kernel:
-    """Velocity of a frame's origin, then angular velocity, in inertial axes, for unit velocity of every hinge.
+    """Write the velocity of a frame's origin, then its angular velocity, in inertial axes, for unit qd of every dof.
 
-    One thread for each (frame, world) walks from the frame's body to its root. The lever arm is carried along in the
-    axes of each ancestor, so that the distance from the world's origin never enters.
+    One thread for each (frame, world) walks from the frame's body to its root. It keeps the lever arm in the axes of
+    the current ancestor, so that the distance from the world's origin does not enter.
     """
     T, vec3 = s.T, s.vec3
 
@@ -226,7 +226,7 @@ def jacobian(s) -> wp.Kernel:
             place = s.load_pose(world_pose, node, world)
             first = topology.qd_start[node]
             for dof in range(first, first + topology.dof_count[node]):
-                v = s.velocity(place, s.load_motion(axis, dof, world), arm)
+                v = s.point_velocity(place, s.load_motion(axis, dof, world), arm)
                 for c in range(6):
                     jacobian_out[world, frame, c, dof] = v[c]
             arm = s.point_to_parent(s.load_pose(pose, node, world), arm)
@@ -235,4 +235,4 @@ def jacobian(s) -> wp.Kernel:
     return kernel
 
 
-KERNELS = (hinge, motion, poses, body_poses, body_velocities, jacobian)
+KERNELS = (hinge, node_motion, world_poses, body_poses, body_velocities, jacobian)

@@ -1,4 +1,4 @@
-"""Multipliers of loops: symmetric positive semidefinite systems of any rank, a thread a world; the status of loops."""
+"""Multipliers of loops: symmetric positive semidefinite systems of any rank, one thread a world; status of loops."""
 
 import functools
 
@@ -8,31 +8,32 @@ from .status import NOT_FINITE, OK, PIVOT
 
 NOT_SETTLED, LOOPS, OPEN = 5, 6, 7  # as warp_spo.Status, which kernels cannot import; a test compares
 EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
-SWEEPS = 10  # of Jacobi's rotations: quadratic convergence; 6 to 8 do for 36 rows
-NOISE = 32.0  # times rows and eps: eigenvalues below this share of the largest are zero
+JACOBI_SWEEPS = 10  # their convergence is quadratic; 36 rows need 6 to 8
+NOISE = 32.0  # eigenvalues below NOISE * rows * eps times the largest one count as zero
 
 
 @functools.cache
-def least_norm(T) -> wp.Kernel:
-    """out = -A^+ right, rank = how many eigenvalues of A are not zero; A [world, n, n] is destroyed.
+def solve_least_norm(T: type) -> wp.Kernel:
+    """Compute out = -A^+ right and the rank of A, its number of nonzero eigenvalues; A [world, n, n] is overwritten.
 
-    Rows are measured by their ``size``, s: s^-1/2 A s^-1/2 = V E V*, by cyclic Jacobi rotations in a fixed order. Of
-    all that solve A x = -right, or come nearest, out is the one with the least sum of s x^2: no choice of units changes
-    it. resolved = the smallest eigenvalue that counts, over the largest. A rank below ``expected`` makes out NaN and
-    resolved 0. Where the pivots of Cholesky are all far above rounding they give the one solution, many times sooner.
+    The kernel scales rows by their ``size`` s and decomposes s^-1/2 A s^-1/2 = V E V* by cyclic Jacobi rotations in a
+    fixed order. Of all least-squares solutions of A x = -right, out is the one with the least sum of s x^2, which does
+    not depend on the choice of units. ``resolved`` is the ratio of the smallest nonzero eigenvalue to the largest. A
+    rank below ``expected`` makes out NaN and resolved 0. Where all pivots of a Cholesky factorisation are far above
+    rounding, the kernel uses that factorisation instead, which is many times faster.
     """
     eps = T(EPSILON[T])
 
     @wp.func
     def rotate_entries(A: wp.array3d[T], world: int, i: int, j: int, k: int, l: int, c: T, s: T):
-        """Rotate the entries (i, j) and (k, l)."""
+        """Apply the rotation (c, s) to the entries (i, j) and (k, l) of A."""
         a, b = T(A[world, i, j]), T(A[world, k, l])
         A[world, i, j] = c * a - s * b
         A[world, k, l] = s * a + c * b
 
     @wp.func
     def solve_positive(A: wp.array3d[T], L: wp.array3d[T], x: wp.array2d[T], world: int, least: T):
-        """Smallest pivot of A = L L* over ``least``; where it is above one also x = A^-1 x."""
+        """Return the smallest pivot of A = L L* over ``least``; where that is above one, also set x = A^-1 x."""
         n = A.shape[1]
         smallest = T(2.0)
         for k in range(n):
@@ -79,7 +80,7 @@ def least_norm(T) -> wp.Kernel:
             s = size[world, i]
             healthy = healthy and wp.isfinite(A[world, i, i]) and wp.isfinite(right[world, i])
             scale_out[world, i] = wp.where(s > T(0.0), T(1.0) / wp.sqrt(s), T(0.0))
-        bound = T(0.0)  # of the largest eigenvalue
+        bound = T(0.0)  # upper bound of the largest eigenvalue
         for i in range(n):
             for j in range(n):
                 A[world, i, j] = A[world, i, j] * scale_out[world, i] * scale_out[world, j]
@@ -94,7 +95,7 @@ def least_norm(T) -> wp.Kernel:
         for i in range(n):
             for j in range(n):
                 V_out[world, i, j] = wp.where(i == j, T(1.0), T(0.0))
-        for _sweep in range(wp.static(SWEEPS)):
+        for _sweep in range(wp.static(JACOBI_SWEEPS)):
             for p in range(n):
                 for q in range(p + 1, n):
                     off = A[world, p, q]
@@ -141,9 +142,11 @@ def least_norm(T) -> wp.Kernel:
 
 @functools.cache
 def status_word(T) -> wp.Kernel:
-    """The worst of what is true of a world: NOT_FINITE, LOOPS, PIVOT.
+    """Write the first word of NOT_FINITE, LOOPS, PIVOT that applies to a world; one thread for each world.
 
-    LOOPS where a margin [world, n] is below ``least``, or NaN; PIVOT where the result is NaN for another reason.
+    NOT_FINITE: an input is not finite. LOOPS: a margin [world, n] is NaN or not above ``least``. PIVOT: the result is
+        not
+    finite for another reason.
     """
 
     @wp.kernel(module=f"warp_spo_loops_{T.__name__}", enable_backward=False)
@@ -158,36 +161,36 @@ def status_word(T) -> wp.Kernel:
         status_out: wp.array[wp.int32],
     ):
         world = wp.tid()
-        given, finite, resolved = bool(True), bool(True), bool(True)
+        inputs_finite, finite, resolved = bool(True), bool(True), bool(True)
         for i in range(q.shape[1]):
-            given = given and wp.isfinite(q[world, i])
+            inputs_finite = inputs_finite and wp.isfinite(q[world, i])
         for dof in range(qdd.shape[1]):
             finite = finite and wp.isfinite(qdd[world, dof])
             if qd:
-                given = given and wp.isfinite(qd[world, dof])
+                inputs_finite = inputs_finite and wp.isfinite(qd[world, dof])
             if tau:
-                given = given and wp.isfinite(tau[world, dof])
+                inputs_finite = inputs_finite and wp.isfinite(tau[world, dof])
         if body_f:
             for body in range(body_f.shape[1]):
                 for c in range(6):
-                    given = given and wp.isfinite(body_f[world, body, c])
+                    inputs_finite = inputs_finite and wp.isfinite(body_f[world, body, c])
         for i in range(margin.shape[1]):
             resolved = resolved and margin[world, i] > least
-        found = int(OK)
-        if not given:
-            found = int(NOT_FINITE)
+        word = int(OK)
+        if not inputs_finite:
+            word = int(NOT_FINITE)
         elif not resolved:
-            found = int(LOOPS)
+            word = int(LOOPS)
         elif not finite:
-            found = int(PIVOT)
-        status_out[world] = found
+            word = int(PIVOT)
+        status_out[world] = word
 
     return kernel
 
 
 @functools.cache
 def mark_open(T) -> wp.Kernel:
-    """Set the word OPEN for worlds in which closures are open, and nothing worse is true."""
+    """Set the word OPEN in worlds whose closures are open and whose word is FINE or NOT_SETTLED."""
 
     @wp.kernel(module=f"warp_spo_loops_{T.__name__}", enable_backward=False)
     def kernel(
@@ -195,11 +198,11 @@ def mark_open(T) -> wp.Kernel:
         status_out: wp.array[wp.int32],
     ):
         world = wp.tid()
-        found = status_out[world]
-        if rows[world, 0] > T(0.0) and (found == OK or found == NOT_SETTLED):
+        word = status_out[world]
+        if rows[world, 0] > T(0.0) and (word == OK or word == NOT_SETTLED):
             status_out[world] = OPEN
 
     return kernel
 
 
-KERNELS = (least_norm, status_word, mark_open)
+KERNELS = (solve_least_norm, status_word, mark_open)

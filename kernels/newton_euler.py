@@ -1,4 +1,4 @@
-"""Newton-Euler recursion: tau = H phi (M alpha + b) + Delta qdd, b = crf(V) M V; the force relation dual to eq. 20."""
+"""Newton-Euler recursion: tau = H phi (M alpha + b) + Delta qdd, b = crf(V) M V; dual to eq. 20."""
 
 import functools
 
@@ -9,11 +9,11 @@ from .topology import Topology
 
 @functools.cache
 def body_force(s) -> wp.Kernel:
-    """M alpha + crf(V) M V - (external wrench) of every node, in its frame; one thread for each (node, world).
+    """Compute M alpha + crf(V) M V - (external wrench) of every node, in its frame; one thread for each (node, world).
 
-    With alpha as the kernel ``motion`` gives it, (d omega/dt; dv/dt) of the node's origin, crf(V) M V loses its linear
-    velocity: (omega x J omega; omega x (omega x m c)).
-    ``body_f`` is force, then torque, in inertial axes at the CoM; ``world_pose`` belongs to it.
+    With alpha from the kernel ``node_motion``, (d omega/dt; dv/dt) of the node's origin, crf(V) M V does not contain
+    the linear velocity: it is (omega x J omega; omega x (omega x m c)).
+    ``body_f`` is force, then torque, in inertial axes at the CoM; it needs ``world_pose``. An absent input is zero.
     """
     T, vec6 = s.T, s.vec6
 

@@ -1,8 +1,8 @@
-"""What the recursions need of a body and a hinge, derived from Newton's values in float64 and rounded once.
+"""Parameters of bodies and hinges for kernels at node granularity, derived from Newton's values in float64.
 
-In the axes and about the origin of node frames: the pose of a parent anchor in the parent's node frame (``tree``), the
-pose of the node frame in the body (``anchor``), the CoM, and the rigid inertia (mass, first moment, inertia about the
-origin; parallel axes).
+``tree`` is the pose of a hinge's parent anchor in the parent's node frame, and ``anchor`` the pose of the node frame in
+the body. ``com`` is the CoM in the node frame, and ``rigid`` the rigid inertia in its axes: mass, first moment, and
+inertia about its origin. Each is rounded to the scalar type once.
 """
 
 import functools
@@ -15,12 +15,12 @@ from .topology import Topology
 
 @functools.cache
 def derive(s) -> wp.Kernel:
-    """One thread for each (node, world). Values are float64, [world, ...] as Newton has them."""
+    """Compute all four; one thread for each (node, world). Inputs are Newton's values in float64, [world, ...]."""
     T, d = s.T, s.wide
     vec3, vec10 = d.vec3, d.vec10
 
     @wp.func
-    def placed(pose: wp.array3d[wp.float64], world: int, i: int):
+    def load_anchor(pose: wp.array3d[wp.float64], world: int, i: int):
         p = vec3(pose[world, i, 0], pose[world, i, 1], pose[world, i, 2])
         R = d.quaternion_rotation(pose[world, i, 3], pose[world, i, 4], pose[world, i, 5], pose[world, i, 6])
         return d.pose(R, p)
@@ -43,10 +43,10 @@ def derive(s) -> wp.Kernel:
         hinge = hinge_of[node]
         parent = topology.parent[node]
 
-        tree = placed(joint_X_p, world, hinge)
+        tree = load_anchor(joint_X_p, world, hinge)
         if parent >= 0:
-            tree = d.placed_in(placed(joint_X_c, world, hinge_of[parent]), tree)
-        anchor = placed(joint_X_c, world, hinge)
+            tree = d.relative_pose(load_anchor(joint_X_c, world, hinge_of[parent]), tree)
+        anchor = load_anchor(joint_X_c, world, hinge)
         for c in range(POSE):
             tree_out[node, c, world] = T(tree[c])
             anchor_out[node, c, world] = T(anchor[c])
@@ -69,8 +69,7 @@ def derive(s) -> wp.Kernel:
 
 @functools.cache
 def transpose(s) -> wp.Kernel:
-    """``out[i, world] = value[world, i]``, rounded: armature by dof, gravity by component."""
-
+    """Set ``out[i, world] = value[world, i]``, rounded: for armature i is the dof, for gravity the component."""
     T = s.T
 
     @wp.kernel(module=f"warp_spo_parameters_{T.__name__}", enable_backward=False)
@@ -83,8 +82,7 @@ def transpose(s) -> wp.Kernel:
 
 @functools.cache
 def widen(s) -> wp.Kernel:
-    """``out = float64(value)``, for values that a user sets in the object's scalar type."""
-
+    """Set ``out = float64(value)``, for values that a user sets in the scalar type of a Dynamics."""
     T = s.T
 
     @wp.kernel(module=f"warp_spo_parameters_{T.__name__}", enable_backward=False)

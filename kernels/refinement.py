@@ -1,4 +1,4 @@
-"""What iterative refinement does between a solution in float32 and a residual in float64."""
+"""Iterative refinement: casts, and the sums between a solution in float32 and a residual in float64."""
 
 import functools
 
@@ -7,7 +7,7 @@ import warp as wp
 
 @functools.cache
 def cast(S, T) -> wp.Kernel:
-    """``out = T(x)``"""
+    """Set ``out = T(x)``; x is of type ``S``."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def kernel(x: wp.array2d[S], x_out: wp.array2d[T]):
@@ -19,22 +19,22 @@ def cast(S, T) -> wp.Kernel:
 
 @functools.cache
 def residual(S) -> wp.Kernel:
-    """``right - force`` in float64, rounded once; ``right`` absent is zero."""
+    """Compute ``right - force`` in float64 and round it to float32; without ``right``, right is zero."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def kernel(right: wp.array2d[S], force: wp.array2d[wp.float64], residual_out: wp.array2d[wp.float32]):
         world, dof = wp.tid()
-        wanted = wp.float64(0.0)
+        total = wp.float64(0.0)
         if right:
-            wanted = wp.float64(right[world, dof])
-        residual_out[world, dof] = wp.float32(wanted - force[world, dof])
+            total = wp.float64(right[world, dof])
+        residual_out[world, dof] = wp.float32(total - force[world, dof])
 
     return kernel
 
 
 @functools.cache
 def add() -> wp.Kernel:
-    """``x += step``"""
+    """Add ``step`` to x."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def kernel(step: wp.array2d[wp.float32], x_out: wp.array2d[wp.float64]):

@@ -1,4 +1,4 @@
-"""The blocks of a rigid-body system, for the operators: phi(p, k), H(k) and M(k) as dense row-major matrices."""
+"""The blocks phi(p, k), H(k), M(k) and Delta(k) of a rigid-body system as dense row-major matrices."""
 
 import functools
 
@@ -10,11 +10,11 @@ from .topology import Topology
 
 @functools.cache
 def fill(s) -> wp.Kernel:
-    """One thread for each (node, world) writes the node's blocks; see kernels/factorization.py for their places."""
+    """Write the blocks of every node at the places of ``tables``; one thread for each (node, world)."""
     T = s.T
 
     @wp.func
-    def put(out: wp.array2d[T], world: int, first: int, row: int, column: int, m: s.mat33):
+    def write_block(out: wp.array2d[T], world: int, first: int, row: int, column: int, m: s.mat33):
         for a in range(3):
             for b in range(3):
                 out[world, first + 6 * (row + a) + column + b] = m[a, b]
@@ -37,16 +37,16 @@ def fill(s) -> wp.Kernel:
             place = s.load_pose(pose, node, world)
             R, l = s.rotation_of(place), s.vec3(place[9], place[10], place[11])
             at = tables.weight[node]
-            put(weight_out, world, at, 0, 0, R)
-            put(weight_out, world, at, 0, 3, s.skew(l) * R)
-            put(weight_out, world, at, 3, 0, s.mat33())
-            put(weight_out, world, at, 3, 3, R)
+            write_block(weight_out, world, at, 0, 0, R)
+            write_block(weight_out, world, at, 0, 3, s.skew(l) * R)
+            write_block(weight_out, world, at, 3, 0, s.mat33())
+            write_block(weight_out, world, at, 3, 3, R)
         M = s.articulated(s.load_rigid(rigid, node, world))
         at = tables.square[node]
-        put(M_out, world, at, 0, 0, s.J_of(M))
-        put(M_out, world, at, 0, 3, s.C_of(M))
-        put(M_out, world, at, 3, 0, wp.transpose(s.C_of(M)))
-        put(M_out, world, at, 3, 3, s.m_of(M))
+        write_block(M_out, world, at, 0, 0, s.J_of(M))
+        write_block(M_out, world, at, 0, 3, s.C_of(M))
+        write_block(M_out, world, at, 3, 0, wp.transpose(s.C_of(M)))
+        write_block(M_out, world, at, 3, 3, s.m_of(M))
         first, count = topology.qd_start[node], topology.dof_count[node]
         for i in range(count):
             for c in range(6):

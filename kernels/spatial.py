@@ -1,9 +1,10 @@
 """Spatial quantities in memory and in registers, in the paper's order, V = (omega; v) and f = (n; f).
 
-A quantity of a node is a vector: a pose (R by rows, l), a motion or force, a rigid inertia (mass, first moment, inertia
-about the frame's origin: xx, yy, zz, xy, xz, yz), an articulated inertia (the upper triangle of P by rows). Arrays
-inside the library are ``[node or dof, component, world]``, worlds neighbouring, so that the threads of a warp read
-neighbouring addresses. What is done with them comes from the traces, see :mod:`warp_spo.node_functions`.
+A quantity of a node is one vector: a pose (R by rows, then l), a motion or a force, a rigid inertia (mass, first
+    moment,
+inertia about the frame's origin: xx, yy, zz, xy, xz, yz), or an articulated inertia (the upper triangle of P by rows).
+Arrays inside the library are ``[node or dof, component, world]`` with neighbouring worlds at neighbouring addresses, so
+that the reads of a warp are contiguous. Functions of these vectors are in :mod:`warp_spo.execution.node_functions`.
 """
 
 import functools
@@ -14,7 +15,7 @@ import warp as wp
 from . import native
 from .elementary import C_TYPE
 
-POSE, MOTION, RIGID, ARTICULATED = 12, 6, 10, 21  # components of one of each
+POSE, MOTION, RIGID, ARTICULATED = 12, 6, 10, 21  # numbers of components
 ENTRY = (
     "const long long part = a.strides[1]; {c}* at = ({c}*)((char*)a.data + i * (long long)a.strides[0]\n"
     "    + world * (long long)a.strides[2]);\n"
@@ -23,8 +24,8 @@ COMPONENT = "*({c}*)((char*)at + {k} * part)"
 
 
 @functools.cache
-def spatial(T) -> types.SimpleNamespace:
-    """The types and functions below for scalars of type ``T`` (wp.float32 or wp.float64)."""
+def spatial(T: type) -> types.SimpleNamespace:
+    """Return the types and functions below, by name, for scalars of type ``T`` (wp.float32 or wp.float64)."""
     vec3 = wp.types.vector(3, T)
     vec6 = wp.types.vector(MOTION, T)
     vec10 = wp.types.vector(RIGID, T)
@@ -32,11 +33,11 @@ def spatial(T) -> types.SimpleNamespace:
     vec21 = wp.types.vector(ARTICULATED, T)
     mat33 = wp.types.matrix((3, 3), T)
 
-    load3, store3 = _memory(3, T)
-    load_pose, store_pose = _memory(POSE, T)
-    load_motion, store_motion = _memory(MOTION, T)
-    load_rigid, store_rigid = _memory(RIGID, T)
-    load_articulated, store_articulated = _memory(ARTICULATED, T)
+    load3, store3 = _load_and_store(3, T)
+    load_pose, store_pose = _load_and_store(POSE, T)
+    load_motion, store_motion = _load_and_store(MOTION, T)
+    load_rigid, store_rigid = _load_and_store(RIGID, T)
+    load_articulated, store_articulated = _load_and_store(ARTICULATED, T)
 
     @wp.func
     def pose(R: mat33, l: vec3):
@@ -53,16 +54,16 @@ def spatial(T) -> types.SimpleNamespace:
         return vec6(w[0], w[1], w[2], v[0], v[1], v[2])
 
     @wp.func
-    def base(gravity: wp.array2d[T], world: int):
-        """Acceleration of the inertial frame: gravity's, the other way; without gravity none."""
+    def base_acceleration(gravity: wp.array2d[T], world: int):
+        """Return the spatial acceleration of the inertial frame that stands for gravity: (0; -gravity)."""
         v = vec3()
         if gravity:
             v = -vec3(gravity[0, world], gravity[1, world], gravity[2, world])
         return motion(vec3(), v)
 
     @wp.func
-    def packed(J: mat33, C: mat33, m: mat33):
-        """P = [[J, C], [C*, m]]"""
+    def pack(J: mat33, C: mat33, m: mat33):
+        """Return the 21 numbers of P = [[J, C], [C*, m]]."""
         return vec21(
             J[0, 0], J[0, 1], J[0, 2], C[0, 0], C[0, 1], C[0, 2],
             J[1, 1], J[1, 2], C[1, 0], C[1, 1], C[1, 2],
@@ -89,7 +90,7 @@ def spatial(T) -> types.SimpleNamespace:
 
     @wp.func
     def rotation(axis: vec3, angle: T):
-        """exp(angle axis~), from the half angle: 1 - cos would cancel."""
+        """Return exp(angle axis~), computed from the half angle because 1 - cos would cancel."""
         s = wp.sin(T(0.5) * angle)
         c = wp.cos(T(0.5) * angle)
         a = skew(axis)
@@ -98,8 +99,8 @@ def spatial(T) -> types.SimpleNamespace:
     return types.SimpleNamespace(**locals())
 
 
-def _memory(n: int, T):
-    """Functions that load, and store, the ``n`` components a[i, :, world] as one vector."""
+def _load_and_store(n: int, T: type) -> tuple[wp.Function, wp.Function]:
+    """Return a function that loads the ``n`` components a[i, :, world] as one vector, and one that stores them."""
     c, vector, array = C_TYPE[T], wp.types.vector(n, T), wp.array3d[T]
     entry, places = ENTRY.format(c=c), [COMPONENT.format(c=c, k=k) for k in range(n)]
     loads = "".join(f"v[{k}] = {place};\n" for k, place in enumerate(places))

@@ -6,7 +6,8 @@ psi for phi,
 
     S(k) = sum over children phi [(I - G H) S (I - G H)* + L] phi* + L
 
-driven by L, diagonal, the size of what the node itself rounds. First order, constants of the order of one: an estimate.
+driven by the diagonal matrix L, the size of the numbers that the node itself rounds. S is an estimate to first order,
+up to constant factors of the order of one.
 """
 
 import functools
@@ -18,20 +19,23 @@ from .topology import Topology
 
 OK, PIVOT, NOT_FINITE, DIGITS, RANGE = range(5)  # as warp_spo.Status, which kernels cannot import; a test compares
 EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
-NORMAL = {wp.float32: (2.0**-126, 2.0**127), wp.float64: (2.0**-1022, 2.0**1023)}  # smallest and large numbers
+NORMAL = {
+    wp.float32: (2.0**-126, 2.0**127),
+    wp.float64: (2.0**-1022, 2.0**1023),
+}  # the smallest normal number, and half of the largest power of two
 
 
 @functools.cache
 def lost_digits(s) -> wp.Kernel:
     """Inward, one level, after ``factor``: lost = (H S H* + |H| |P| |H*| + |Delta|) / D, the error of D in eps.
 
-    In place of the number: -PIVOT where D is NaN for want of a positive pivot, -RANGE where D or what it
-    is made of leaves the normal range of T, NaN where D is NaN because of another node.
+    Instead of the error, ``lost`` is -PIVOT where D is NaN because its pivot is not positive, -RANGE where D or one of
+    its terms leaves the normal range of T, and NaN where D is NaN because of another node.
 
-    L has the squares of ``d = diag(P)^1/2`` for its entries, since |P(i, j)| <= d(i) d(j): what is small stays small
-    where nothing mixes it with the large. A hinge along one axis of the node frame reads P without rounding, and
-    cancels its own row to zero without; an oblique one multiplies by how far |H| |P| |H*| lies above D. A rotation
-    about a frame axis keeps small entries, any other does not.
+    The entries of L are the squares of ``d = diag(P)^1/2``, since |P(i, j)| <= d(i) d(j), so that small entries have
+    small errors as long as nothing mixes them with large ones. A hinge along one axis of the node frame reads its entry
+    of P without rounding and cancels its own row to exactly zero; an oblique hinge multiplies the error by the ratio of
+    |H| |P| |H*| to D. A rotation about a frame axis keeps small entries small, any other rotation does not.
     """
     T, vec3, mat33 = s.T, s.vec3, s.mat33
     smallest = T(NORMAL[T][0] / EPSILON[T])  # below, products that carry the last digit of D are subnormal
@@ -47,10 +51,11 @@ def lost_digits(s) -> wp.Kernel:
         return vec3(wp.sqrt(wp.max(a[0, 0], zero)), wp.sqrt(wp.max(a[1, 1], zero)), wp.sqrt(wp.max(a[2, 2], zero)))
 
     @wp.func
-    def mixing(R: mat33, R_tree: mat33, screws: int):
-        """|R| as far as its small entries are exact, to what absolute errors of eps make of them elsewhere: |2 R|^1/2.
+    def error_rotation(R: mat33, R_tree: mat33, screws: int):
+        """Return |R| where an entry is exact, and |2 R|^1/2 where it has an absolute error of eps.
 
-        Exact are zeros, and the sines of a turn about one axis of a frame whose anchor turns by right angles.
+        Exact entries are zeros, and the sines of a rotation about one axis of a frame whose anchor is rotated by right
+        angles.
         """
         one_axis, right_angles = bool(False), bool(True)
         for i in range(3):
@@ -66,12 +71,15 @@ def lost_digits(s) -> wp.Kernel:
         return a
 
     @wp.func
-    def rounded(h: vec3, u: vec3, d: vec3, after: mat33, D: T, own: T):
-        """L after eliminating a hinge along a frame axis: ``own`` d^2 in its row, P+ and what was taken elsewhere."""
-        found = vec3()
+    def rounding_of_rows(h: vec3, u: vec3, d: vec3, after: mat33, D: T, own: T):
+        """Return the diagonal of L after the elimination of a hinge along a frame axis.
+
+        It is ``own`` d^2 in the row of the hinge, and |P+| plus twice the subtracted term elsewhere.
+        """
+        rows = vec3()
         for i in range(3):
-            found[i] = wp.where(h[i] == T(0.0), wp.abs(after[i, i]) + T(2.0) * u[i] * u[i] / D, own * d[i] * d[i])
-        return found
+            rows[i] = wp.where(h[i] == T(0.0), wp.abs(after[i, i]) + T(2.0) * u[i] * u[i] / D, own * d[i] * d[i])
+        return rows
 
     @wp.kernel(module=f"warp_spo_status_{T.__name__}", enable_backward=False)
     def kernel(
@@ -117,7 +125,7 @@ def lost_digits(s) -> wp.Kernel:
             for c in range(3):
                 entries += wp.where(w[c] == T(0.0), 0, 1) + wp.where(v[c] == T(0.0), 0, 1)
                 if count > 1 and w[c] != T(0.0):
-                    w_a[c] = T(1.0)  # a turned axis has absolute errors
+                    w_a[c] = T(1.0)  # an oblique axis has absolute errors
             along = entries == 1
             size = wp.dot(w_a, n_a) + wp.dot(v_a, f_a)
 
@@ -136,14 +144,14 @@ def lost_digits(s) -> wp.Kernel:
             S_J += wp.outer(n_D, error * n_D - n_S) - wp.outer(n_S, n_D)
             S_C += wp.outer(n_D, error * f_D - f_S) - wp.outer(n_S, f_D)
             S_m += wp.outer(f_D, error * f_D - f_S) - wp.outer(f_S, f_D)
-            P = s.without(P, U, D)
+            P = s.downdate(P, U, D)
             J, C, m = s.J_of(P), s.C_of(P), s.m_of(P)
             if along:
                 own = T(0.0)
-                if delta > T(0.0):  # which leaves P Delta / D of the row, as the difference of two larger numbers
+                if delta > T(0.0):  # the row keeps P Delta / D, the difference of two larger numbers
                     own = T(2.0)
-                S_J += wp.diag(rounded(w, n, d_n, J, D, own))
-                S_m += wp.diag(rounded(v, f, d_f, m, D, own))
+                S_J += wp.diag(rounding_of_rows(w, n, d_n, J, D, own))
+                S_m += wp.diag(rounding_of_rows(v, f, d_f, m, D, own))
             else:
                 scale = T(1.0) + wp.sqrt(size / D)
                 S_J += scale * scale * wp.diag(wp.cw_mul(d_n, d_n))
@@ -152,11 +160,11 @@ def lost_digits(s) -> wp.Kernel:
             place = s.load_pose(pose, node, world)
             l = vec3(place[9], place[10], place[11])
             R_tree = s.rotation_of(s.load_pose(tree, node, world))
-            R_a = mixing(s.rotation_of(place), R_tree, wp.where(topology.motion[node] == SCREWS, 1, 0))
+            R_a = error_rotation(s.rotation_of(place), R_tree, wp.where(topology.motion[node] == SCREWS, 1, 0))
             f_d = R_a * root_of_diagonal(m)
             n_d = R_a * root_of_diagonal(J) + absolute(s.skew(l)) * f_d
-            S = s.articulated_to_parent(place, s.packed(S_J, S_C, S_m))
-            S += s.packed(wp.diag(wp.cw_mul(n_d, n_d)), mat33(), wp.diag(wp.cw_mul(f_d, f_d)))
+            S = s.articulated_to_parent(place, s.pack(S_J, S_C, S_m))
+            S += s.pack(wp.diag(wp.cw_mul(n_d, n_d)), mat33(), wp.diag(wp.cw_mul(f_d, f_d)))
             s.store_articulated(rounding_out, node, world, S)
 
     return kernel
@@ -164,11 +172,13 @@ def lost_digits(s) -> wp.Kernel:
 
 @functools.cache
 def status_word(s) -> wp.Kernel:
-    """The worst of what is true of a world, one thread for each: NOT_FINITE, PIVOT, RANGE, DIGITS.
+    """Write the first word of NOT_FINITE, PIVOT, RANGE, DIGITS that applies to a world; one thread for each world.
 
-    DIGITS: D may have lost half of the digits of T, lost > 2 eps^-1/2: measured errors are .02 to .8 of ``lost``.
-    PIVOT as the sweeps see it; and where a result is not finite and D may be rounding alone, since another form
-    of the recursion refuses other pivots. RANGE also where the result overflows, or all of it is subnormal.
+    NOT_FINITE: an input is not finite. PIVOT: the sweeps found a pivot that is not positive, or the result is not
+        finite
+    and D may consist of rounding errors, because another form of the recursion refuses other pivots. RANGE: D left the
+    normal range, the result overflows, or every entry of it is subnormal. DIGITS: D may have lost half of the digits of
+    T, lost > 2 eps^-1/2; measured errors are 0.02 to 0.8 of ``lost``.
     """
     T = s.T
     most = T(2.0 * EPSILON[T] ** -0.5)
@@ -199,41 +209,41 @@ def status_word(s) -> wp.Kernel:
         status_out: wp.array[wp.int32],
     ):
         world = wp.tid()
-        given = finite(tree, world) and finite(com, world) and finite(rigid, world)
+        inputs_finite = finite(tree, world) and finite(com, world) and finite(rigid, world)
         if gravity:
             for c in range(3):
-                given = given and wp.isfinite(gravity[c, world])
+                inputs_finite = inputs_finite and wp.isfinite(gravity[c, world])
         for i in range(q.shape[1]):
-            given = given and wp.isfinite(q[world, i])
+            inputs_finite = inputs_finite and wp.isfinite(q[world, i])
         if body_f:
             for body in range(body_f.shape[1]):
                 for c in range(6):
-                    given = given and wp.isfinite(body_f[world, body, c])
+                    inputs_finite = inputs_finite and wp.isfinite(body_f[world, body, c])
         positive, in_range, resolved = bool(True), bool(True), bool(True)
         overflow, hopeless = bool(False), bool(False)
         largest = T(0.0)
         for dof in range(qdd.shape[1]):
-            given = given and wp.isfinite(armature[dof, world])
+            inputs_finite = inputs_finite and wp.isfinite(armature[dof, world])
             if qd:
-                given = given and wp.isfinite(qd[world, dof])
+                inputs_finite = inputs_finite and wp.isfinite(qd[world, dof])
             if tau:
-                given = given and wp.isfinite(tau[world, dof])
+                inputs_finite = inputs_finite and wp.isfinite(tau[world, dof])
             positive = positive and lost[dof, world] != T(-float(PIVOT))
             hopeless = hopeless or lost[dof, world] > none
             in_range = in_range and lost[dof, world] != T(-float(RANGE))
             resolved = resolved and not lost[dof, world] > most
             overflow = overflow or not wp.isfinite(qdd[world, dof])
             largest = wp.max(largest, wp.abs(qdd[world, dof]))
-        found = int(OK)
-        if not given:
-            found = int(NOT_FINITE)
+        word = int(OK)
+        if not inputs_finite:
+            word = int(NOT_FINITE)
         elif not positive or (overflow and hopeless):
-            found = int(PIVOT)
+            word = int(PIVOT)
         elif overflow or not in_range or (largest > T(0.0) and largest < tiny):
-            found = int(RANGE)
+            word = int(RANGE)
         elif not resolved:
-            found = int(DIGITS)
-        status_out[world] = found
+            word = int(DIGITS)
+        status_out[world] = word
 
     return kernel
 

@@ -1,10 +1,12 @@
-"""The tables of a scene's tree that every recursion reads; filled by warp_spo.dynamics."""
+"""The tables of a scene's tree that every recursion reads; :mod:`warp_spo.execution.sweeps` fills them."""
 
 import warp as wp
 
 
 @wp.struct
 class Topology:
+    """The tree over the nodes, and the entries of q and qd that belong to each node."""
+
     order: wp.array[int]  # nodes, level by level, roots first
     parent: wp.array[int]  # [node], -1 = the inertial frame
     child_start: wp.array[int]  # [node + 1], into children

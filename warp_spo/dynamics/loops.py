@@ -243,7 +243,9 @@ class Loops(Applications):
         found, rank, resolved = self._solution()
         vectors, scale = run.array("loop vectors", self.worlds, n, n), run.array("loop scale", self.worlds, n)
         outputs = [vectors, scale, found, rank, resolved.reshape((self.worlds,))]
-        run.launch(kernels.least_norm, self.worlds, [system, more["right"], more["size"], self._usual_rank], outputs)
+        run.launch(
+            kernels.solve_least_norm, self.worlds, [system, more["right"], more["size"], self._usual_rank], outputs
+        )
         return found, rank, resolved
 
     def _find_multipliers(self, q: Any, qd: Any, tau: Any, body_f: Any) -> None:

@@ -112,7 +112,7 @@ class Sweeps:
         """V = phi* H* qd, after hinges with qd."""
         velocity = self.array("velocity")
         inputs = [self.array("pose"), self.array("axis"), self.array("bias"), None, None]
-        self._sweep(kinematics.motion, self.plan.outward, inputs, [velocity, None])
+        self._sweep(kinematics.node_motion, self.plan.outward, inputs, [velocity, None])
         return velocity
 
     def accelerations(self, qdd: wp.array | None, moves: bool, gravity: bool) -> tuple[wp.array, wp.array | None]:
@@ -121,13 +121,13 @@ class Sweeps:
         acceleration = self._per_node("acceleration", MOTION)
         base = self.parameters.gravity if gravity else None
         inputs = [self.array("pose"), self.array("axis"), bias, base, qdd]
-        self._sweep(kinematics.motion, self.plan.outward, inputs, [velocity, acceleration])
+        self._sweep(kinematics.node_motion, self.plan.outward, inputs, [velocity, acceleration])
         return acceleration, velocity
 
     def world_poses(self) -> wp.array:
         """Pose of every node frame in the inertial frame."""
         world_pose = self._per_node("world_pose", POSE)
-        self._sweep(kinematics.poses, self.plan.outward, [self.array("pose")], [world_pose])
+        self._sweep(kinematics.world_poses, self.plan.outward, [self.array("pose")], [world_pose])
         return world_pose
 
     def frames(self, frames: tuple) -> tuple[wp.array, wp.array]:
@@ -194,7 +194,9 @@ class Sweeps:
         base = self.parameters.gravity if gravity else None
         for columns, work in self._chunks(shape[2]):
             self._reduce(columns, force, b, False, work, out)
-            self._sweep_columns(articulated.expand, self.plan.outward, columns, [*self._factors, base], [work, out])
+            self._sweep_columns(
+                articulated.back_substitute, self.plan.outward, columns, [*self._factors, base], [work, out]
+            )
 
     def sandwich(self, b: wp.array | None, columns: int, out: wp.array) -> None:
         """out = b* Mass^-1 b [world, column, column] for b [world, dof, column], None = unit matrix; after factor."""
@@ -210,7 +212,7 @@ class Sweeps:
     def _reduce(self, columns: tuple, force: Any, b: Any, identity: bool, work: wp.array, out: wp.array) -> None:
         """out = D^-1 [I - H psi K] (b - H phi force)."""
         inputs = [*self._factors, force, b, identity]
-        self._sweep_columns(articulated.reduce, self.plan.inward, columns, inputs, [work, out])
+        self._sweep_columns(articulated.eliminate, self.plan.inward, columns, inputs, [work, out])
 
     def _chunks(self, columns: int) -> list[tuple[tuple[int, int], wp.array]]:
         """(first, count) of the right-hand sides that go together, each with the workspace that it needs."""
