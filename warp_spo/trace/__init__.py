@@ -1,1 +1,1 @@
-"""Symbolic scalars: tracing with constant folding, derivatives, and C++ emission."""
+"""Symbolic scalars: tracing with constant folding, differentiation, and emission of C++."""

@@ -1,7 +1,7 @@
-"""Derivatives of a trace: new scalars of the same graph, forward along a direction, reverse for all inputs at once.
+"""Derivatives of a trace, as new scalars of the same graph: forward along a direction, reverse for all inputs at once.
 
-With J = d outputs / d inputs, :func:`forward` gives J seeds and :func:`reverse` J* seeds. What is constant has the
-derivative 0.0, which folds like every other constant, so that a structural zero costs nothing here either.
+With J = d outputs / d inputs, :func:`forward` returns J seeds and :func:`reverse` returns J* seeds. The derivative of a
+constant is 0.0, which folds like every other constant, so that structural zeros generate no code.
 """
 
 from __future__ import annotations
@@ -10,37 +10,37 @@ from collections.abc import Iterable
 
 from .scalars import Scalar, Value, cos, is_constant, ordered, reciprocal, select, sin
 
-UNIT = ("add", "cut", "reduced", "guarded")  # of each argument, a guard's limit excepted
-FLAT = ("input", "lost", "less")  # a lost pivot is 0 or NaN, wherever it is
+UNIT_DERIVATIVE = ("add", "cut", "reduced", "guarded")  # by each argument, except the limit of "guarded"
+ZERO_DERIVATIVE = ("input", "lost", "less")  # piecewise constant; "lost" is 0 or NaN
 
 
 def forward(outputs: Iterable[Value], inputs: Iterable[Scalar], seeds: Iterable[Value]) -> list[Value]:
-    """How each output changes when every input moves by its seed.
+    """Return the rate of each output when every input changes at the rate of its seed.
 
     Args:
         outputs: values of one graph.
-        inputs: scalars that move by themselves: inputs of the graph, or anything between.
-        seeds: one for each input.
+        inputs: the independent scalars: inputs of the graph, or intermediate scalars, which then depend on nothing.
+        seeds: one value for each input.
     """
     outputs, inputs = list(outputs), list(inputs)
     rates: dict[tuple, Value] = {x.key: seed for x, seed in zip(inputs, seeds, strict=True)}
     for scalar in ordered(outputs, inputs):
-        with _Step(scalar):
+        with _DerivativeNames(scalar):
             rate: Value = 0.0
             for at, argument in enumerate(scalar.args):
-                if _moves(argument) and not _vanishes(rates[argument.key]):
+                if _is_scalar(argument) and not _is_zero(rates[argument.key]):
                     rate = rate + partial(scalar, at) * rates[argument.key]
         rates[scalar.key] = rate
     return [0.0 if is_constant(y) else rates[y.key] for y in outputs]
 
 
 def reverse(outputs: Iterable[Value], inputs: Iterable[Scalar], seeds: Iterable[Value]) -> list[Value]:
-    """How the sum of seed times output changes with each input.
+    """Return the derivative of the sum of seed times output with respect to each input.
 
     Args:
         outputs: values of one graph.
-        inputs: as in :func:`forward`; what lies behind them is not looked at.
-        seeds: one for each output.
+        inputs: the independent scalars, as in :func:`forward`.
+        seeds: one value for each output.
     """
     outputs, inputs = list(outputs), list(inputs)
     duals: dict[tuple, Value] = {}
@@ -49,21 +49,21 @@ def reverse(outputs: Iterable[Value], inputs: Iterable[Scalar], seeds: Iterable[
             duals[y.key] = duals.get(y.key, 0.0) + seed
     for scalar in reversed(ordered(outputs, inputs)):
         dual = duals.get(scalar.key, 0.0)
-        if _vanishes(dual):
+        if _is_zero(dual):
             continue
-        with _Step(scalar):
+        with _DerivativeNames(scalar):
             for at, argument in enumerate(scalar.args):
-                if _moves(argument):
+                if _is_scalar(argument):
                     duals[argument.key] = duals.get(argument.key, 0.0) + partial(scalar, at) * dual
     return [duals.get(x.key, 0.0) for x in inputs]
 
 
 def partial(scalar: Scalar, at: int) -> Value:
-    """d scalar / d its argument ``at``."""
+    """Return the derivative of a scalar with respect to its argument number ``at``."""
     op, args = scalar.op, scalar.args
-    if op in FLAT or (op == "guarded" and at == 1):
+    if op in ZERO_DERIVATIVE or (op == "guarded" and at == 1):
         return 0.0
-    if op in UNIT:
+    if op in UNIT_DERIVATIVE:
         return 1.0
     if op == "sub":
         return 1.0 - 2.0 * at
@@ -82,7 +82,7 @@ def partial(scalar: Scalar, at: int) -> Value:
     if op == "quotient":
         return reciprocal(args[1]) if at == 0 else -(scalar * reciprocal(args[1]))
     if op == "absolute":
-        return select(args[0] + scalar, 1.0, -1.0)  # of zero, too
+        return select(args[0] + scalar, 1.0, -1.0)  # the derivative at zero is 1
     if op == "select":
         return select(args[0], 1.0, 0.0) if at == 1 else select(args[0], 0.0, 1.0) if at == 2 else 0.0
     if op == "arctangent":
@@ -91,19 +91,19 @@ def partial(scalar: Scalar, at: int) -> Value:
         return x * scale if at == 0 else -(y * scale)
     if op == "sum_of_logarithms":
         return reciprocal(args[at])
-    raise AssertionError(f"no derivative of {op!r}: add its rule here")
+    raise AssertionError(f"partial: the operation {op!r} has no derivative rule; add one to this function")
 
 
-def _moves(argument: object) -> bool:
+def _is_scalar(argument: object) -> bool:
     return argument.__class__ is Scalar
 
 
-def _vanishes(x: Value) -> bool:
+def _is_zero(x: Value) -> bool:
     return is_constant(x) and x == 0.0
 
 
-class _Step:
-    """Names what is made after the value that it is the derivative of."""
+class _DerivativeNames:
+    """A context in which new scalars are named after ``scalar``, whose derivative they compute."""
 
     def __init__(self, scalar: Scalar):
         self.graph, (where, bar, letter) = scalar.graph, scalar.step.rpartition("|")

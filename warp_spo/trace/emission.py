@@ -1,4 +1,4 @@
-"""A trace as straight-line C++, the same text for CUDA and for the CPU."""
+"""Emission of a trace as straight-line C++, the same text for CUDA and for the CPU."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .scalars import Scalar, Value, is_constant, ordered
 
 C_TYPE = {"float32": "float", "float64": "double"}
 BINARY = {"add": "+", "sub": "-", "mul": "*", "quotient": "/"}
-COST = {
+COST = {  # floating-point operations of a statement
     "add": 1,
     "sub": 1,
     "mul": 1,
@@ -27,11 +27,11 @@ COST = {
     "lost": 1,
     "input": 0,
 }
-COST_ELSE = 8  # about what a sine, a root or a reciprocal takes in additions
+COST_ELSE = 8  # of the other statements: sines, roots and reciprocals take about as long as 8 additions
 
 
 class Store(NamedTuple):
-    """One output: an array, an index into it, and the value that goes there."""
+    """The assignment of a value to the entry ``index`` of an array."""
 
     array: str
     index: tuple[int, ...]  # type: ignore[assignment]  # a tuple's own method of that name is not needed
@@ -39,6 +39,7 @@ class Store(NamedTuple):
 
 
 def literal(x: float, dtype: str) -> str:
+    """Return the C++ literal of a number in the scalar type ``dtype``."""
     if x != x:
         return "nan"
     if x in (float("inf"), -float("inf")):
@@ -49,11 +50,15 @@ def literal(x: float, dtype: str) -> str:
 
 
 class Listing(NamedTuple):
-    """Statements in which what may differ between equal pieces of a robot is left open.
+    """Statements with placeholders for everything that may differ between equal pieces of a robot.
 
-    Two limbs of equal structure give equal ``text``; their numbers are in ``constants``, the entries of arrays that
-    they read and write in ``indices`` as (array, entry), the names of their links in ``labels``. ``angles`` says which
-    of the indices are coordinates whose sine is taken as they are.
+    Two limbs of equal structure have equal ``text``.
+
+    Attributes:
+        text: the statements.
+        constants: the numbers in the statements.
+        indices: (array, entry) of every array entry that the statements read or write.
+        labels: the names of the links, for comments.
     """
 
     text: str
@@ -63,24 +68,30 @@ class Listing(NamedTuple):
 
 
 class RangeReduction(enum.Enum):
-    """Where turns are taken off: in the rows, in shared memory; before the work; or, if need be, in a second try."""
+    """When full turns are subtracted from coordinates that are beyond the reach of the branch-free sine, on CUDA.
+
+    IN_PLACE: first, in the rows in shared memory. FIRST: first, in copies of the coordinates. AGAIN: in a second run of
+    the statements, if the first run found a coordinate beyond reach.
+    """
 
     IN_PLACE, FIRST, AGAIN = range(3)
 
 
 CONSTANT, INDEX, LABEL, PREFIX = "\x01", "\x02", "\x03", "\x05"
-OPEN = re.compile("([\x01\x02\x03])(\\d+)\x04")
+PLACEHOLDER = re.compile("([\x01\x02\x03])(\\d+)\x04")
 
 
 class Emitter:
-    """Emits the statements of one trace, region by region; what a region computes the later ones may use.
+    """Emits the statements of one trace, region by region; later regions may use the values of earlier ones.
 
     Args:
         dtype: "float32" or "float64".
-        load, store: C++ for reading and writing an entry of an array, given the array's name and the entry's text.
-        flat: entry of an array for the index of an input.
-        angles: what is done about angles that are too far for the branch-free sine, on CUDA.
-        late: arrays whose entries are loaded where they are first needed, whenever the trace met them.
+        load: returns C++ that reads an array entry, given the array's name and the text of the entry.
+        store: returns C++ that writes a value to an array entry, given the array's name, the entry and the value.
+        flat: returns the entry of an array for the index of an input.
+        angles: when full turns are subtracted from large angles.
+        late: the names of the arrays whose entries are loaded where they are first used, instead of where the trace
+            first read them.
     """
 
     def __init__(
@@ -104,17 +115,18 @@ class Emitter:
         self._place: str | None = None
 
     def branch(self, stores: Iterable[Store]) -> Listing:
-        """A region inside braces: no later one uses what it computes."""
+        """Return the statements of a region inside braces, whose values later regions do not see."""
         known, count = dict(self._names), self._count
         listing = self.region(stores)
         self._names, self._count = known, count
         return listing
 
     def region(self, stores: Iterable[Store], ahead: Iterable[Value] = ()) -> Listing:
-        """Statements that compute and store what is asked for, in the order in which the steps made it.
+        """Return the statements that compute and store values, in the order in which the trace computed them.
 
         Args:
-            ahead: values to compute that a later region stores.
+            stores: the assignments.
+            ahead: values to compute here that a later region stores.
         """
         self._constants, self._indices, self._labels, self._place = [], [], [], None
         lines = self._lines = []
@@ -122,12 +134,12 @@ class Emitter:
         values, known = [value for value in ahead if not is_constant(value)], []
         for item in stores:
             if is_constant(item.value) or item.value.key in self._names:
-                known.append(item)  # at the end: what it overwrites may be read before
+                known.append(item)  # stored last, because earlier statements may read the entry that it overwrites
             else:
                 values.append(item.value)
                 due.setdefault(item.value.key, []).append(item)
         needed = [scalar for scalar in ordered(values) if scalar.key not in self._names]
-        lines += self._near(needed)
+        lines += self._reduce_angles(needed)
         needed = [scalar for scalar in needed if not self._is_late(scalar) or scalar.key in due]
         for scalar in sorted(needed, key=lambda scalar: scalar.number):
             where, _, step = scalar.step.rpartition("|")
@@ -139,17 +151,18 @@ class Emitter:
                 lines += self._statement(scalar, step)
                 self.counts[scalar.op] += 1
             for item in due.get(scalar.key, ()):
-                self._stored(item)
+                self._emit_store(item)
         for item in known:
-            self._stored(item)
+            self._emit_store(item)
         return Listing("\n".join(lines), self._constants, self._indices, self._labels)
 
-    def _near(self, needed: list[Scalar]) -> list[str]:
-        """Take turns off the coordinates whose sines will be taken, where they are too far for the branch-free sine.
+    def _reduce_angles(self, needed: list[Scalar]) -> list[str]:
+        """Return statements that subtract full turns from coordinates beyond the reach of the branch-free sine.
 
-        That hardly ever happens. Rows in shared memory are changed where they are; warps of a team may do it to one
-        another's rows: twice changes nothing. Otherwise the angles are read first; a thread that works by itself then
-        goes on with them as they are, and starts ``again`` if one was too far.
+        They concern coordinates whose sines are needed, and hardly ever apply. Rows in shared memory are changed in
+        place; two warps of a team may both reduce an angle, because a second reduction changes nothing. Otherwise the
+        angles are read first. A thread without a team then uses them as they are, and starts ``again`` if one of them
+        was beyond reach.
         """
         T = C_TYPE[self.dtype]
         sines = (scalar.args[0] for scalar in needed if scalar.op in ("sin", "cos"))
@@ -176,7 +189,7 @@ class Emitter:
 
     @property
     def operations(self) -> int:
-        """Floating-point operations so far, a multiplication and an addition one each."""
+        """The number of floating-point operations so far; a multiplication and an addition count as one each."""
         return sum(count * COST.get(op, COST_ELSE) for op, count in self.counts.items())
 
     def _text(self, value: Value) -> str:
@@ -194,7 +207,7 @@ class Emitter:
     def _is_late(self, scalar: Scalar) -> bool:
         return scalar.op == "input" and scalar.args[0] in self._late
 
-    def _stored(self, item: Store) -> None:
+    def _emit_store(self, item: Store) -> None:
         entry = self._entry(item.array, item.index)
         self._lines.append(self._store(item.array, entry, self._text(item.value)))
 
@@ -210,7 +223,7 @@ class Emitter:
         if op in ("sin", "cos"):
             angle = self._text(args[0])
             sine, cosine = (self._name(scalar.graph.make(name, *args), name) for name in ("sin", "cos"))
-            which = "sincos" if args[0].op == "input" else "sincos_any"  # a coordinate has been looked at
+            which = "sincos" if args[0].op == "input" else "sincos_any"  # coordinates are within reach already
             return [f"{T} {sine}, {cosine};", f"on::{which}({angle}, {sine}, {cosine});"]
         texts = [self._text(a) for a in args]
         name = self._name(scalar, step)
@@ -234,12 +247,12 @@ class Emitter:
 
 
 def fill_in(listing: Listing, constants: list[str], indices: list[str], labels: list[str], prefix: str = "") -> str:
-    """The statements of a listing with what it leaves open fill_in in."""
-    given = {CONSTANT: constants, INDEX: indices, LABEL: labels}
-    return OPEN.sub(lambda found: given[found[1]][int(found[2])], listing.text).replace(PREFIX, prefix)
+    """Return the statements of a listing with these texts for its placeholders and ``prefix`` before its names."""
+    texts = {CONSTANT: constants, INDEX: indices, LABEL: labels}
+    return PLACEHOLDER.sub(lambda match: texts[match[1]][int(match[2])], listing.text).replace(PREFIX, prefix)
 
 
 def render(listing: Listing, dtype: str, prefix: str = "") -> str:
-    """The statements of a listing as they are for itself."""
+    """Return the statements of a listing with its own constants, indices and labels."""
     constants = [literal(x, dtype) for x in listing.constants]
     return fill_in(listing, constants, [str(entry) for _, entry in listing.indices], listing.labels, prefix)

@@ -1,4 +1,4 @@
-"""A trace evaluated by NumPy, in any precision: what the emitted code must agree with."""
+"""Evaluation of a trace by NumPy, in any precision; emitted code must agree with it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,13 @@ FUNCTIONS: dict[str, Callable] = {
 
 
 def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype: Any = np.float64) -> list[np.ndarray]:
-    """The outputs, for ``load(array, index)`` a number or an array over worlds."""
+    """Return the values of the outputs.
+
+    Args:
+        outputs: values of one graph.
+        load: ``load(array, index)`` returns an input, as a number or as an array over worlds.
+        dtype: the precision.
+    """
     outputs, values = list(outputs), {}
     for scalar in ordered(outputs):
         if scalar.op == "input":

@@ -1,8 +1,8 @@
-"""Scalars of a trace: a hash-consed graph in which constants fold and equal expressions are one node.
+"""Scalars of a trace: nodes of a graph in which constants fold and equal expressions are one node.
 
-A constant is a plain Python float, so arithmetic among constants is Python's own, in float64. What meets a symbol is
-simplified on the spot: 0 x, 1 x, -1 x, x + 0, -(-x), c (d x); signs move outward and into sums, where they cost
-nothing. Structural zeros thus vanish with everything that they multiply (0 times NaN is 0 here, by intent).
+A constant is a Python float, so that arithmetic between constants is Python's float64. Every operation on a symbolic
+scalar is simplified at once: 0 x, 1 x, -1 x, x + 0, -(-x), c (d x). Signs move outward and into sums, where they cost
+nothing. A structural zero removes every term that it multiplies; 0 times NaN is 0 here, by intent.
 """
 
 from __future__ import annotations
@@ -11,17 +11,16 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
-COMMUTATIVE = ("add", "mul")
 FUNCTIONS = {"sin": math.sin, "cos": math.cos, "sqrt": math.sqrt, "reciprocal": lambda x: 1.0 / x if x else math.nan}
 
-Value = Any  # a Scalar, or a float: a constant
+Value = Any  # a Scalar, or a float, which is a constant
 
 
 class Graph:
     """The scalars of one trace.
 
     Attributes:
-        step: what is being computed; new scalars are named after it.
+        step: the name of the current step, "link|letter"; new scalars are named after it.
     """
 
     def __init__(self) -> None:
@@ -30,13 +29,15 @@ class Graph:
 
     @property
     def empty(self) -> bool:
+        """Whether the graph has no scalars."""
         return not self._known
 
     def input(self, array: str, *index: int) -> Scalar:
-        """An element of an array that is given at run time."""
+        """Return the scalar for an element of an array that the kernel reads."""
         return self.make("input", array, *index)
 
     def make(self, op: str, *args: Any) -> Scalar:
+        """Return the scalar of an operation, without simplification; equal operations give the same scalar."""
         key = (op, *[a if a.__class__ is not Scalar else a.key for a in args])
         found = self._known.get(key)
         if found is None:
@@ -45,7 +46,7 @@ class Graph:
 
 
 class Scalar:
-    """One value of a trace: an operation and what it takes."""
+    """One value of a trace: an operation and its arguments."""
 
     __slots__ = ("args", "graph", "key", "op", "step")
 
@@ -56,6 +57,7 @@ class Scalar:
 
     @property
     def number(self) -> int:
+        """The position of the scalar in the order in which its graph grew."""
         return self.key[0]
 
     def __repr__(self) -> str:
@@ -82,14 +84,19 @@ class Scalar:
         return negative(self)
 
     def __bool__(self) -> bool:
-        raise TypeError("a traced scalar has no truth value: a step may depend on the scene, not on the state")
+        raise TypeError(
+            "bool: a traced scalar has no truth value, because a step may branch on the scene, not on the state; use "
+            "select(mask, x, y) to choose between two values"
+        )
 
 
 def is_constant(x: Value) -> bool:
+    """Return whether a value is a constant."""
     return x.__class__ is not Scalar
 
 
 def negative(x: Value) -> Value:
+    """Return -x."""
     if is_constant(x):
         return -x
     if x.op == "neg":
@@ -102,6 +109,7 @@ def negative(x: Value) -> Value:
 
 
 def add(x: Value, y: Value) -> Value:
+    """Return x + y; a constant is stored as the second argument, otherwise the older scalar as the first."""
     if is_constant(x):
         x, y = y, x
     if is_constant(x):
@@ -123,7 +131,7 @@ def add(x: Value, y: Value) -> Value:
 
 
 def multiply(x: Value, y: Value) -> Value:
-    """Constants come first; otherwise the older scalar does."""
+    """Return x y; a constant, or else the older scalar, is stored as the first argument."""
     if is_constant(y):
         x, y = y, x
     if is_constant(y):
@@ -147,8 +155,8 @@ def multiply(x: Value, y: Value) -> Value:
     return negative(product) if sign else product
 
 
-def function(name: str, x: Value) -> Value:
-    """sin, cos, sqrt or reciprocal of ``x``; the sign of an argument moves outward."""
+def apply_function(name: str, x: Value) -> Value:
+    """Return sin, cos, sqrt or reciprocal of ``x``; the sign of an argument moves outward."""
     if is_constant(x):
         return FUNCTIONS[name](x)
     if x.op == "neg" and name in ("sin", "cos", "reciprocal"):
@@ -158,36 +166,36 @@ def function(name: str, x: Value) -> Value:
 
 
 def sin(x: Value) -> Value:
-    return function("sin", x)
+    return apply_function("sin", x)
 
 
 def cos(x: Value) -> Value:
-    return function("cos", x)
+    return apply_function("cos", x)
 
 
 def reduced(x: Value) -> Value:
-    """An angle less the full turns in it."""
+    """Return an angle minus its full turns."""
     return x if is_constant(x) else x.graph.make("reduced", x)
 
 
 def sqrt(x: Value) -> Value:
-    return function("sqrt", x)
+    return apply_function("sqrt", x)
 
 
 def reciprocal(x: Value) -> Value:
-    """1 / x; of a constant zero, NaN."""
-    return function("reciprocal", x)
+    """Return 1 / x; NaN for a constant zero."""
+    return apply_function("reciprocal", x)
 
 
 def quotient(x: Value, y: Value) -> Value:
-    """x / y, rounded once: 1 where they are equal, which a product with the reciprocal need not be."""
+    """Return x / y with one rounding, so that x / x is 1; x times the reciprocal of x need not be 1."""
     if is_constant(y) or (is_constant(x) and x == 0.0):
         return multiply(x, reciprocal(y)) if is_constant(y) else 0.0
     return y.graph.make("quotient", x, y)
 
 
 def guarded(x: Value, least: Value) -> Value:
-    """``x``, or NaN if it is not above ``least``."""
+    """Return ``x``, or NaN where it is not above ``least``."""
     if is_constant(x) and is_constant(least):
         return x if x > least else math.nan
     graph = x.graph if not is_constant(x) else least.graph
@@ -195,7 +203,7 @@ def guarded(x: Value, least: Value) -> Value:
 
 
 def select(mask: Value, x: Value, y: Value) -> Value:
-    """``x`` where ``mask`` is not zero, else ``y``, whatever the other one is; no branch."""
+    """Return ``x`` where ``mask`` is not zero, else ``y``, without a branch; the other value may be NaN."""
     if is_constant(mask):
         return x if mask else y
     if x is y or (is_constant(x) and is_constant(y) and x == y):
@@ -204,7 +212,7 @@ def select(mask: Value, x: Value, y: Value) -> Value:
 
 
 def less(x: Value, y: Value) -> Value:
-    """1 where ``x`` is less than ``y``, else 0; of a NaN, 0."""
+    """Return 1 where ``x`` is less than ``y``, else 0; 0 if one of them is NaN."""
     if is_constant(x) and is_constant(y):
         return 1.0 if x < y else 0.0
     graph = x.graph if not is_constant(x) else y.graph
@@ -212,7 +220,7 @@ def less(x: Value, y: Value) -> Value:
 
 
 def arctangent(y: Value, x: Value) -> Value:
-    """The angle of the point (x, y) [rad]."""
+    """Return the angle of the point (x, y) [rad]."""
     if is_constant(x) and is_constant(y):
         return math.atan2(y, x)
     graph = x.graph if not is_constant(x) else y.graph
@@ -220,11 +228,12 @@ def arctangent(y: Value, x: Value) -> Value:
 
 
 def cut(x: Value) -> Value:
-    """``x`` by another name, behind which neither simplification nor a derivative that ends here looks."""
+    """Return a new scalar equal to ``x``, at which simplification stops and which can be an independent input."""
     return x if is_constant(x) else x.graph.make("cut", x)
 
 
 def absolute(x: Value) -> Value:
+    """Return the absolute value of ``x``."""
     if is_constant(x):
         return abs(x)
     if x.op in ("neg", "absolute"):
@@ -233,7 +242,7 @@ def absolute(x: Value) -> Value:
 
 
 def sum_of_logarithms(terms: Iterable[Value]) -> Value:
-    """log of each term, added in float64."""
+    """Return the sum of the logarithms of the terms, added in float64."""
     terms = list(terms)
     symbols = [term for term in terms if not is_constant(term)]
     constant = sum(math.log(term) if term > 0.0 else math.nan for term in terms if is_constant(term))
@@ -241,9 +250,9 @@ def sum_of_logarithms(terms: Iterable[Value]) -> Value:
 
 
 def ordered(outputs: Iterable[Value], known: Iterable[Scalar] = ()) -> list[Scalar]:
-    """Every scalar that the outputs need, depth first: each just before its first use, so that few live at once.
+    """Return every scalar that the outputs need, depth first, so that few values are alive at the same time.
 
-    Those that are ``known`` are left out, with all that only they need.
+    The list leaves out the scalars in ``known``, and the scalars that only these need.
     """
     seen: set[tuple] = {x.key for x in known}
     order: list[Scalar] = []

@@ -1,19 +1,20 @@
 """Spatial algebra over traced scalars, in the paper's order: V = (omega; v), f = (n; f).
 
-Vectors and matrices are tuples of values, so that a structural zero is simply 0.0. A pose maps a link's axes into its
-parent's in up to two turns: first about the link's own z axis, by the hinge, then by a matrix, the scene's. Kept apart
-they cost less than their product.
+Vectors and matrices are tuples of values, so that a structural zero is the constant 0.0. A pose maps a link's axes to
+its parent's in up to two rotations: first about the link's own z axis, by the hinge's angle, then by a matrix of the
+scene. Two separate rotations cost less than their product.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 from .scalars import Value, absolute, is_constant
 
 
 def total(values: Iterable[Value]) -> Value:
+    """Return the sum of the values, added from left to right."""
     result: Value = 0.0
     for value in values:
         result = result + value
@@ -25,34 +26,34 @@ class Vector(tuple):
 
     __slots__ = ()
 
-    def __add__(self, other: Any) -> Vector:
+    def __add__(self, other: Iterable[Value]) -> Vector:
         return Vector(a + b for a, b in zip(self, other, strict=True))
 
-    def __sub__(self, other: Any) -> Vector:
+    def __sub__(self, other: Iterable[Value]) -> Vector:
         return Vector(a - b for a, b in zip(self, other, strict=True))
 
     def __neg__(self) -> Vector:
         return Vector(-a for a in self)
 
-    def __mul__(self, scale: Any) -> Vector:
+    def __mul__(self, scale: Value) -> Vector:
         return Vector(a * scale for a in self)
 
     __rmul__ = __mul__
 
     @property
     def vanishes(self) -> bool:
-        """All entries are the constant zero."""
+        """Whether all entries are the constant zero."""
         return all(is_constant(a) and a == 0.0 for a in self)
 
 
 ZERO = Vector((0.0, 0.0, 0.0))
 
 
-def dot(a: Any, b: Any) -> Value:
+def dot(a: Iterable[Value], b: Iterable[Value]) -> Value:
     return total(x * y for x, y in zip(a, b, strict=True))
 
 
-def cross(a: Any, b: Any) -> Vector:
+def cross(a: Sequence[Value], b: Sequence[Value]) -> Vector:
     return Vector((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
 
 
@@ -62,7 +63,8 @@ class Matrix(tuple):
     __slots__ = ()
 
     @classmethod
-    def of(cls, rows: Any) -> Matrix:
+    def of(cls, rows: Iterable[Iterable[Value]]) -> Matrix:
+        """Return the matrix with these rows."""
         return cls(Vector(row) for row in rows)
 
     @property
@@ -78,7 +80,7 @@ class Matrix(tuple):
     def __add__(self, other: Any) -> Matrix:
         return Matrix(a + b for a, b in zip(self, other, strict=True))
 
-    def __sub__(self, other: Any) -> Matrix:
+    def __sub__(self, other: Matrix) -> Matrix:
         return Matrix(a - b for a, b in zip(self, other, strict=True))
 
     def __neg__(self) -> Matrix:
@@ -88,17 +90,18 @@ class Matrix(tuple):
 IDENTITY = Matrix.of([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-def skew(v: Any) -> Matrix:
-    """v~, with v~ a = v x a."""
+def skew(v: Sequence[Value]) -> Matrix:
+    """Return v~, the matrix with v~ a = v x a."""
     return Matrix.of([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def symmetric(xx: Value, yy: Value, zz: Value, xy: Value, xz: Value, yz: Value) -> Matrix:
+    """Return the symmetric matrix with these entries."""
     return Matrix.of([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
-def upper(entry: Any) -> Matrix:
-    """The symmetric matrix with ``entry(row, column)``, asked for row <= column only."""
+def upper(entry: Callable[[int, int], Value]) -> Matrix:
+    """Return the symmetric matrix of ``entry(row, column)``, which is called for row <= column only."""
     found = {(i, j): entry(i, j) for i in range(3) for j in range(i, 3)}
     return Matrix.of([[found[min(i, j), max(i, j)] for j in range(3)] for i in range(3)])
 
@@ -114,21 +117,23 @@ class Rigid(NamedTuple):
         return Rigid(self.mass + other.mass, self.moment + other.moment, self.inertia + other.inertia)
 
     def apply(self, w: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """M (omega; v)."""
+        """Return M (omega; v)."""
         return self.inertia @ w + cross(self.moment, v), self.mass * v - cross(self.moment, w)
 
     @property
     def packed(self) -> list[Value]:
-        """The 10 numbers."""
+        """The 10 numbers: mass, first moment, and the moments xx, yy, zz and products xy, xz, yz of inertia."""
         J = self.inertia
         return [self.mass, *self.moment, J[0][0], J[1][1], J[2][2], J[0][1], J[0][2], J[1][2]]
 
     @classmethod
-    def unpacked(cls, values: Any) -> Rigid:
+    def unpacked(cls, values: Sequence[Value]) -> Rigid:
+        """Return the inertia with these 10 numbers, in the order of :attr:`packed`."""
         return cls(values[0], Vector(values[1:4]), symmetric(*values[4:]))
 
     @property
     def articulated(self) -> Articulated:
+        """The same inertia as a 6 x 6 matrix."""
         mass = self.mass
         return Articulated(self.inertia, skew(self.moment), symmetric(mass, mass, mass, 0.0, 0.0, 0.0))
 
@@ -144,54 +149,59 @@ class Articulated(NamedTuple):
         return Articulated(self.J + other.J, self.C + other.C, self.m + other.m)
 
     def apply(self, w: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """P (omega; v)."""
+        """Return P (omega; v)."""
         return self.J @ w + self.C @ v, self.C.T @ w + self.m @ v
 
     def entry(self, i: int, j: int) -> Value:
+        """Return the entry (i, j) of the 6 x 6 matrix."""
         if i < 3:
             return self.J[i][j] if j < 3 else self.C[i][j - 3]
         return self.C[j][i - 3] if j < 3 else self.m[i - 3][j - 3]
 
     @classmethod
-    def build(cls, entry: Any) -> Articulated:
-        """From ``entry(i, j)``, asked for i <= j only."""
+    def build(cls, entry: Callable[..., Value]) -> Articulated:
+        """Return the inertia whose entries are ``entry(i, j)``, which is called for i <= j only."""
         C = Matrix.of([[entry(i, j + 3) for j in range(3)] for i in range(3)])
         return cls(upper(entry), C, upper(lambda i, j: entry(i + 3, j + 3)))
 
     @property
     def packed(self) -> list[Value]:
-        """The 21 numbers."""
+        """The 21 numbers of the upper triangle, by rows."""
         return [self.entry(i, j) for i in range(6) for j in range(i, 6)]
 
     @classmethod
-    def unpacked(cls, values: Any) -> Articulated:
+    def unpacked(cls, values: Sequence[Value]) -> Articulated:
+        """Return the inertia with these 21 numbers, in the order of :attr:`packed`."""
         places = {(i, j): k for k, (i, j) in enumerate((i, j) for i in range(6) for j in range(i, 6))}
         return cls.build(lambda i, j: values[places[i, j]])
 
-    def less(self, U: Any, scaled: Any) -> Articulated:
-        """P - U scaled*, for ``scaled`` a multiple of U: the result is symmetric."""
+    def less(self, U: Sequence[Value], scaled: Sequence[Value]) -> Articulated:
+        """Return P - U scaled*. ``scaled`` is a multiple of U, so that the result is symmetric."""
         return Articulated.build(lambda i, j: self.entry(i, j) - U[i] * scaled[j])
 
 
 class Pose(NamedTuple):
-    """Where a link's frame sits in its parent's: turned about z by (cos, sin), then by ``matrix``; origin at ``l``.
+    """The pose of a link's frame in its parent's.
 
-    Where either turn is None there is none.
+    Attributes:
+        turn: cosine and sine of the angle of the first rotation, about z; None if there is none.
+        matrix: the second rotation; None if there is none.
+        l: the origin of the link's frame in the parent's frame.
     """
 
     turn: tuple[Value, Value] | None
     matrix: Matrix | None
     l: Vector
 
-    def to_parent(self, v: Any) -> Vector:
-        """The components of a free vector in the parent's axes."""
+    def to_parent(self, v: Sequence[Value]) -> Vector:
+        """Return a free vector in the parent's axes, given its components in the link's axes."""
         if self.turn is not None:
             c, s = self.turn
             v = Vector((c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]))
         return Vector(v) if self.matrix is None else self.matrix @ v
 
-    def to_child(self, v: Any) -> Vector:
-        """The components of the parent's free vector in the link's axes."""
+    def to_child(self, v: Sequence[Value]) -> Vector:
+        """Return a free vector in the link's axes, given its components in the parent's axes."""
         if self.matrix is not None:
             v = self.matrix.T @ v
         if self.turn is not None:
@@ -199,26 +209,27 @@ class Pose(NamedTuple):
             v = Vector((c * v[0] + s * v[1], c * v[1] - s * v[0], v[2]))
         return Vector(v)
 
-    def point_to_parent(self, r: Any) -> Vector:
-        """Where a point at ``r`` from the link's origin lies, from the parent's."""
+    def point_to_parent(self, r: Sequence[Value]) -> Vector:
+        """Return the position of a point in the parent's frame, given its position ``r`` in the link's frame."""
         return self.l + self.to_parent(r)
 
     @property
     def rotation(self) -> Matrix:
-        """The product of the turns: the link's axes in the parent's."""
+        """The product of both rotations: its columns are the link's axes in the parent's frame."""
         columns = [self.to_parent(axis) for axis in IDENTITY]
         return Matrix(columns).T
 
     def force_to_parent(self, n: Vector, f: Vector) -> tuple[Vector, Vector]:
-        """phi(p, k) (n; f)"""
+        """Return phi(p, k) (n; f)."""
         f = self.to_parent(f)
         return self.to_parent(n) + cross(self.l, f), f
 
     def motion_to_child(self, w: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """phi*(p, k) (omega; v)"""
+        """Return phi*(p, k) (omega; v)."""
         return self.to_child(w), self.to_child(v + cross(w, self.l))
 
-    def _turned_symmetric(self, S: Matrix) -> Matrix:
+    def _rotate_symmetric(self, S: Matrix) -> Matrix:
+        """Return R S R* for a symmetric matrix S."""
         if self.turn is not None:
             c, s = self.turn
             cc, ss, cs = c * c, s * s, c * s
@@ -232,36 +243,36 @@ class Pose(NamedTuple):
         return S
 
     def turned(self, C: Matrix) -> Matrix:
-        """R C R*"""
+        """Return R C R*."""
         rows = Matrix(self.to_parent(row) for row in C)  # C R*
         return Matrix(self.to_parent(column) for column in rows.T).T
 
     def rigid_to_parent(self, body: Rigid) -> Rigid:
-        """phi M phi* of a rigid inertia."""
+        """Return phi M phi* for a rigid inertia M."""
         h = self.to_parent(body.moment)
         moment = h + self.l * body.mass
-        inertia = self._turned_symmetric(body.inertia)
+        inertia = self._rotate_symmetric(body.inertia)
         l = self.l
         cross_terms = upper(lambda i, j: _double(l, h, i, j) + _double(moment, l, i, j))
         return Rigid(body.mass, moment, inertia - cross_terms)
 
     def articulated_to_parent(self, P: Articulated) -> Articulated:
-        """phi P phi*, block by block."""
-        m, C_r, J = self._turned_symmetric(P.m), self.turned(P.C), self._turned_symmetric(P.J)
+        """Return phi P phi*, computed block by block."""
+        m, C_r, J = self._rotate_symmetric(P.m), self.turned(P.C), self._rotate_symmetric(P.J)
         L = skew(self.l)
         C = C_r + L @ m
         first, second = L @ C_r.T, C @ L
         return Articulated(upper(lambda i, j: J[i][j] + first[i][j] - second[i][j]), C, m)
 
 
-def _double(a: Any, b: Any, i: int, j: int) -> Value:
-    """Entry of a~ b~ = b a* - (a . b) I."""
+def _double(a: Sequence[Value], b: Sequence[Value], i: int, j: int) -> Value:
+    """Return the entry (i, j) of a~ b~ = b a* - (a . b) I."""
     if i != j:
         return b[i] * a[j]
     return -total(a[k] * b[k] for k in range(3) if k != i)
 
 
-def magnitude(a: Any, P: Articulated, b: Any) -> Value:
-    """|a|* |P| |b|, entry by entry: the size of what cancels in a* P b."""
+def magnitude(a: Sequence[Value], P: Articulated, b: Sequence[Value]) -> Value:
+    """Return |a|* |P| |b|, with absolute values entry by entry: the size of the terms that cancel in a* P b."""
     terms = ((absolute(a[i]) * absolute(P.entry(i, j))) * absolute(b[j]) for i in range(6) for j in range(6))
     return total(terms)
