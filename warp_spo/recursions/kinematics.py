@@ -100,7 +100,7 @@ def zero(dof: int) -> Value:
 
 
 def place_axes(trace: Trace, link: Link) -> None:
-    """Place a link and find its axes in the inertial frame."""
+    """Place a link and compute its axes in the inertial frame."""
     trace.place(link)
     trace.label(link, "R")
     parent = IDENTITY if link.parent is None else trace.axes[id(link.parent)]
@@ -108,7 +108,7 @@ def place_axes(trace: Trace, link: Link) -> None:
 
 
 def frame_on_link(trace: Trace, body: int, origin: tuple) -> tuple[Link | None, Vector]:
-    """The link that carries a frame of a body, and the frame's origin in the link's frame."""
+    """Return the link that carries a frame of a body, and the frame's origin in the link's frame."""
     seat = trace.links.seats[body]
     R, p = trace.links.nodes[body].anchor
     return seat.link, seat.offset + seat.matrix @ (R.T @ (Vector(origin) - p))
@@ -179,7 +179,7 @@ def body_states(trace: Trace) -> list[Store]:
 
 
 def place_all(trace: Trace, moves: bool = False) -> dict[int, Vector]:
-    """Place every link and find its axes; its origin in inertial axes, from the origin of the first root's link."""
+    """Place every link, compute its axes, and return its origin in inertial axes from the first root's link."""
     origins: dict[int, Vector] = {}
     for link in trace.links.links:
         trace.place(link, moves)
@@ -197,7 +197,7 @@ def place_all(trace: Trace, moves: bool = False) -> dict[int, Vector]:
 
 
 def link_accelerations(trace: Trace, qdd: Callable[[int], Value]) -> dict[int, tuple[Vector, Vector]]:
-    """Accelerations of the links without gravity: phi* (H* qdd + a)."""
+    """Return the accelerations of the links without gravity: phi* (H* qdd + a)."""
     alpha: dict[int, tuple[Vector, Vector]] = {}
     for link in trace.links.links:
         trace.label(link, "a")
@@ -220,7 +220,7 @@ def frame_accelerations(trace: Trace, frames: tuple) -> list[Store]:
 
 
 def accelerations_of_frames(trace: Trace, frames: tuple, alpha: dict[int, tuple[Vector, Vector]]) -> list[Store]:
-    """out [frame, 6]: how frames accelerate whose links do as ``alpha`` says, inertial axes."""
+    """out [frame, 6]: accelerations of frames for those of their links ``alpha``, inertial axes"""
     stores = []
     for index, (body, origin) in enumerate(frames):
         link, arm = frame_on_link(trace, body, origin)

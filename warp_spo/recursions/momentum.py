@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def composite_inertias(trace: Trace) -> dict[int, Rigid]:
-    """R(k) of every placed link: the rigid inertia of all that it carries, in its frame."""
+    """Return R(k) of every placed link: the rigid inertia of all that it carries, in its frame."""
     found: dict[int, Rigid] = {}
     for link in reversed(trace.links.links):
         trace.label(link, "R")
@@ -29,7 +29,7 @@ def composite_inertias(trace: Trace) -> dict[int, Rigid]:
 
 
 def center_of_mass(trace: Trace, bodies: dict[int, Rigid], origins: dict[int, Vector]) -> tuple[Value, Vector]:
-    """1 / mass, and the CoM of all that moves, inertial axes, from the origin of the first root's link."""
+    """Return 1 / mass, and the CoM of all moving bodies in inertial axes, from the first root's link."""
     trace.graph.step = "whole|c"
     mass: Value = 0.0
     moment = ZERO
@@ -43,7 +43,7 @@ def center_of_mass(trace: Trace, bodies: dict[int, Rigid], origins: dict[int, Ve
 
 
 def momenta(trace: Trace, link: Link, body: Rigid) -> list[tuple[Vector, Vector]]:
-    """(n; f) = R(k) H* of each dof of a link, inertial axes, about the link's origin."""
+    """Return (n; f) = R(k) H* of each dof of a link, inertial axes, about the link's origin."""
     R, found = trace.axes[id(link)], []
     for H in articulated.columns(link, trace.places[id(link)]):
         n, f = body.apply(Vector(H[:3]), Vector(H[3:]))

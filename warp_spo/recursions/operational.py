@@ -30,7 +30,7 @@ def operational_inertia_inverse(trace: Trace, frames: tuple) -> list[Store]:
 
 
 def unit_wrenches(trace: Trace, frames: tuple) -> Iterator[tuple[Link | None, Vector]]:
-    """The link of each frame, and (n; f) in its frame of three unit forces, then torques."""
+    """Yield, for each frame, its link and (n; f) in the link's frame of three unit forces, then of three torques."""
     for index, (body, origin) in enumerate(frames):
         link, arm = frame_on_link(trace, body, origin)
         for c in range(6):
@@ -67,7 +67,7 @@ def operational_inertia_inverse_product(trace: Trace, frames: tuple) -> list[Sto
 
 
 def wrenches_on_links(trace: Trace, frames: tuple) -> dict[int, Vector]:
-    """(n; f) by link, in its frame, of the wrenches x on the frames; after the links are placed."""
+    """Return (n; f) by link, in its frame, of the wrenches x on the frames; after the links are placed."""
     x, found = trace.vector("x"), dict[int, Vector]()
     for index, (body, origin) in enumerate(frames):
         link, arm = frame_on_link(trace, body, origin)

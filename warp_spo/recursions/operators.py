@@ -1,8 +1,8 @@
-"""The operators themselves, applied to traced vectors: phi, psi and their kin, and what is composed of them.
+"""The spatial operators and their compositions, applied to traced vectors.
 
 A vector over nodes gives a node's (omega; v) or (n; f) in its node frame, a vector over hinges the entries of a node's
-hinge. Either is worked out node by node when it is first asked for, so that the factors of a product run into each
-other as the passes of a recursion do, and few values live at once.
+hinge. Entries are computed node by node at their first use, so that the factors of a product are evaluated together, as
+in a recursion, and few values live at once.
 
 An expression is a letter, or a tuple: ``("resolvent", E)``, ``("transpose", A)``, ``("scaled", a, A)``, ``("sum", A,
 B, ...)``, ``("product", A, B, ...)``, ``("identity",)``.
@@ -38,16 +38,16 @@ SPACES = {
     "D_inverse": (HINGES, HINGES),
     "G": (NODES, HINGES),
 }
-"""Letter -> what its rows and its columns are."""
+"""Letter -> the spaces of its rows and of its columns."""
 RESOLVENTS = {"E_phi": "phi", "E_psi": "psi"}
 NONE: tuple[None, None] = (None, None)
 
 
 def spaces(expression: Expression) -> tuple[str | None, str | None]:
-    """What the rows and the columns of an expression are; None for any.
+    """Return the spaces of the rows and of the columns of an expression; None for any space.
 
     Raises:
-        ValueError: factors or terms that do not meet, even if their sizes happen to agree.
+        ValueError: spaces of factors or terms that differ, even if their sizes agree.
     """
     if isinstance(expression, str):
         return SPACES[expression]
@@ -70,7 +70,7 @@ def spaces(expression: Expression) -> tuple[str | None, str | None]:
 
 
 def meet(expression: Expression) -> bool:
-    """No vector over nodes is taken for one over hinges, even where their sizes agree."""
+    """Return whether the spaces of an expression's factors and terms agree."""
     try:
         spaces(expression)
     except ValueError:
@@ -79,7 +79,7 @@ def meet(expression: Expression) -> bool:
 
 
 def written(expression: Expression) -> str:
-    """The expression as one would write it."""
+    """Return the expression as a user writes it."""
     if isinstance(expression, str):
         return expression
     form, *operands = expression
@@ -102,7 +102,7 @@ def _bracketed(expression: Expression) -> str:
 
 
 class Operators:
-    """The operators of the scene that a trace evaluates."""
+    """The operators of the scene of a trace."""
 
     def __init__(self, trace: Trace):
         self.trace, self.links, self.graph = trace, trace.links, trace.graph
@@ -129,7 +129,7 @@ class Operators:
         return found
 
     def given(self, space: str) -> Field:
-        """The array x."""
+        """Return the input array x as a vector over a space."""
 
         def at(node: int) -> Vector:
             first = self._first(space, node)
@@ -148,7 +148,7 @@ class Operators:
         self.graph.step = f"{self.scene.body_labels[node]}|{letter}"
 
     def _finished(self) -> Iterator[int]:
-        """Every node after all that it carries, limb by limb."""
+        """Yield every node after all that it carries, limb by limb."""
         stack = [(node, False) for node in reversed(self.scene.tree.roots)]
         while stack:
             node, carried = stack.pop()
@@ -160,7 +160,7 @@ class Operators:
 
     # -- composing -------------------------------------------------------------------------------------------------
     def applied(self, expression: Expression, x: Field, transposed: bool = False) -> Field:
-        """``expression x``, or its transpose's."""
+        """Return ``expression x``, or the transpose times x."""
         if isinstance(expression, str):
             return self._letter(expression, x, transposed)
         form, *operands = expression
@@ -324,7 +324,7 @@ class Operators:
         return Vector(a * value for a, value in zip(own, x, strict=True))
 
     def _gain(self, node: int, right: Vector) -> Vector:
-        """G right: what the hinge hands on inward when it gives ``right`` and nothing acts on the body."""
+        """Return G right: the force on the parent for hinge forces ``right`` and no force on the body."""
         z, at = Vector((*ZERO, *ZERO)), len(right)
         inner = self._inner(node)
         for link, pose, first in inner:
@@ -429,14 +429,14 @@ class Operators:
 
     # -- what is shared --------------------------------------------------------------------------------------------
     def place(self, link: Link) -> Placed:
-        """A link where q puts it."""
+        """Return the placement of a link."""
         if id(link) not in self._places:
             self.graph.step = f"{link.label}|x"
             self._places[id(link)] = placed(link, self.q)
         return self._places[id(link)]
 
     def hops(self, node: int) -> list[tuple[Link | None, Pose]]:
-        """From the parent's node frame to the node's: over the hinge's links, then to the seat on the last if apart."""
+        """Return the poses from the parent's node frame to the node's: along the hinge's links, then to the seat."""
         if node not in self._hops:
             chain, seat = self.chains[node], self.links.seats[node]
             found: list[tuple[Link | None, Pose]] = []
@@ -459,7 +459,7 @@ class Operators:
         return [(link, pose, link is self.chains[node][0]) for link, pose in reversed(self.hops(node))]
 
     def factor(self, top: Link) -> articulated.Factor:
-        """What is left of a link, going in; see :func:`warp_spo.recursions.articulated.factor`."""
+        """Return the factor of a link; see :func:`warp_spo.recursions.articulated.factor`."""
         below, stack = [], [top]
         while stack:
             below.append(stack.pop())
@@ -481,7 +481,7 @@ class Operators:
 
 
 def _once(value: Field) -> Field:
-    """``value``, asked for at most once a node."""
+    """Return ``value`` with its results kept by node."""
     known: dict[int, Vector] = {}
 
     def at(node: int) -> Vector:

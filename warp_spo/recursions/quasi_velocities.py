@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def factor_by_dofs(trace: Trace) -> dict[int, articulated.Factor]:
-    """Factors of every link in the coordinates of qd: Mass = U D U*, U unit upper triangular, parents first."""
+    """Return the factors of every link in the coordinates of qd: Mass = U D U*, U unit upper triangular."""
     done: dict[int, articulated.Factor] = {}
     for link, outward in trace.traversal():
         if outward:

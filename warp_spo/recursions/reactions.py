@@ -1,4 +1,4 @@
-"""What bodies feel: their accelerations, and the wrenches that reach them through their hinges; inertial axes."""
+"""Accelerations of bodies, and the wrenches that they receive through their hinges, in inertial axes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def body_accelerations(trace: Trace) -> list[Store]:
 def body_reactions(trace: Trace) -> list[Store]:
     """out [body, 6] = force, moment about the CoM, that a body's hinge puts on it
 
-    A body takes for itself what moves it, and hands on what its children need; forces meet at CoMs.
+    The wrench on a body accelerates it and is passed on to its children; moments are about CoMs.
     """
     origins, alpha = _moving(trace)
     tree, seats, stores = trace.links.scene.tree, trace.links.seats, []
@@ -66,7 +66,7 @@ def body_reactions(trace: Trace) -> list[Store]:
 
 
 def _moving(trace: Trace) -> tuple[dict[int, Vector], dict[int, tuple[Vector, Vector]]]:
-    """Origins and accelerations of all links, gravity in them as the other way round."""
+    """Return origins and accelerations of all links, with gravity as an acceleration of the base."""
     origins = place_all(trace, moves=True)
     qdd = trace.vector("qdd")
     alpha: dict[int, tuple[Vector, Vector]] = {}

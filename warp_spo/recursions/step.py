@@ -1,11 +1,11 @@
 """One time step of a scene, linearly implicit: (Mass + h R) qdd = tau - bias_force + F, and q moved along the new qd.
 
-R and F are what the hinges' laws leave of themselves, see :mod:`.impedance`; where laws bend, a pass solves for the
-pieces at its guess of u = qd' - qd and says whether they were the right ones. Passes share one text, run in a loop
-until they were: sweeps over the tree, or with few dofs the solution of a system that is formed before the loop.
+R and F are resistance and force of the hinges' laws, see :mod:`.impedance`. Where laws have bounds, a pass solves with
+the pieces at its guess of u = qd' - qd and checks whether these pieces were the right ones. Passes share one text, run
+in a loop until all were right: sweeps over the tree, or for few dofs the solution of a system formed before the loop.
 
-Pieces that work side by side keep the guesses of their own dofs, and their state after the step follows the last pass:
-no other piece needs the state before it any more.
+Pieces that work side by side keep the guesses of their own dofs and store the state after the last pass, when no other
+piece reads the state before the step any more.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from .pieces import Piece, Pieces
 from .tracing import Trace
 
 GUESS, GAIN, MISSED = "guess", "gain", "missed"
-"""Variables of a loop over passes, zero at first: by dof of a piece, the guess of u, and u; whether one missed."""
+"""Variables of the loop over passes, zero at first: guess of u, and u, by dof of a piece; number of wrong guesses."""
 LOOPED = (GUESS, GAIN, MISSED)
 WIDE = {BALL: 4, FREE: 7}  # coordinates of a hinge with a quaternion
-SHORT = 10  # dofs up to which passes solve a system that is formed once
-FAINT = 1e-12  # share of its laws' resistances that holds a weightless dof in a pass in which none of them does
+SHORT = 10  # dofs; up to so many, passes solve a system that is formed once
+FAINT = 1e-12  # resistance of a massless dof without active law, as a share of the resistances of its laws
 
 
 class Step:
-    """The step as a trace.
+    """One time step as a trace.
 
-    The sweep sees the state ``q``, ``qd``. The step starts there too, unless ``q_from`` and ``qd_from`` are given: the
-    sweep's state is then a point on the way, at which its laws are taken.
+    The sweep is evaluated at the state ``q``, ``qd``. The step starts there too, unless ``q_from`` and ``qd_from`` are
+    inputs: the sweep's state is then an intermediate point, at which the laws are evaluated.
     """
 
     def __init__(self, trace: Trace):
@@ -65,9 +65,9 @@ class Step:
         self._kept = {dof: at for at, dof in enumerate(trace.piece.dofs)} if trace.piece else {}
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
-        """out = qd', q_out = q'; with ``qdd`` qdd_out = (qd' - qd) / h, with ``status`` the word of each world.
+        """Return the stores out = qd', q_out = q'; with ``qdd`` qdd_out = (qd' - qd) / h, with ``status`` the status.
 
-        Of a piece, a pass; what comes after the last one is news.
+        For a piece, the stores of one pass; stores after the last pass are the trace's ``news``.
         """
         trace = self.trace
         trace.stiffened = self._stiffened
@@ -97,7 +97,7 @@ class Step:
         return looped + stores
 
     def _accelerations(self, tau: Callable[[int], Value]) -> dict[int, Value]:
-        """qdd by dof for ``tau``, the pieces that hold at the guess in Mass."""
+        """Return qdd by dof for ``tau``, with the resistances of the active pieces added to Mass."""
         if self._short:
             return self._in_joint_space(tau)
         done, rates, sent = reduce(self.trace, tau, moves=True, loads=True)
@@ -107,13 +107,13 @@ class Step:
 
     @property
     def _short(self) -> bool:
-        """Several passes over few dofs, by one thread."""
+        """Whether one thread makes several passes over few dofs."""
         if self.trace.links.scene.dof_count > SHORT or self.trace.piece is not None:
             return False
         return any(law.bends for link in self.links for laws in self.impedance.laws(link) for law in laws)
 
     def _in_joint_space(self, tau: Callable[[int], Value]) -> dict[int, Value]:
-        """The same, of a system that is formed once for all passes."""
+        """Return the same from a system that is formed once for all passes."""
         system = JointSpace(self.trace)
         pieces: dict[int, Law] = {}
         self.trace.ahead = [*system.mass.values(), *system.bias.values()]
@@ -123,15 +123,15 @@ class Step:
         return dict(enumerate(system.solve(lambda dof: self.h * pieces[dof].resistance, tau)))
 
     def put_back(self, stores: list[Store]) -> list[Store]:
-        """The stores with what constrains the state after the step seen to."""
+        """Return the stores with the state after the step projected onto its constraints."""
         return stores
 
     def _unresolved(self) -> Value:
-        """Not 0 where constraints lose rank."""
+        """Return non-zero where constraints lose rank."""
         return 0.0
 
     def _open(self) -> Value:
-        """Not 0 where constraints do not hold after the step."""
+        """Return non-zero where constraints do not hold after the step."""
         return 0.0
 
     def _stiffened(self, link: Link) -> Link:
@@ -139,7 +139,7 @@ class Step:
         return dataclasses.replace(link, armature=tuple(a + self.h * piece.resistance for a, piece in pieces))
 
     def _pieces(self, link: Link) -> list[Law]:
-        """What holds at the guess, of each dof; of a weightless one where nothing does, what drives it on."""
+        """Return the active pieces of each dof, added up; a massless dof without one gets a faint resistance."""
         self.laws |= dict(zip(link.dofs, self.impedance.laws(link), strict=True))
         pieces = [added([law.piece(self._guess(dof)) for law in self.laws[dof]]) for dof in link.dofs]
         if self._weightless(link):
@@ -150,12 +150,12 @@ class Step:
         return pieces
 
     def _weightless(self, link: Link) -> bool:
-        """Whether forces alone move the link's one dof, as far as a law that bends lets them: it carries nothing."""
+        """Whether the link's one dof carries no mass and has a law with bounds, so that forces alone move it."""
         bare = len(link.dofs) == 1 and is_number(link.armature[0], 0.0) and carries_nothing(link)
         return bare and any(law.bends for law in self.laws[link.dofs[0]])
 
     def _solved(self, gains: dict[int, Value]) -> dict[int, Value]:
-        """u, NaN of a weightless dof that no law holds."""
+        """Return u by dof; NaN of a massless dof that no law resists."""
         for link in self.links:
             if self._weightless(link):
                 (dof,) = link.dofs
@@ -164,9 +164,9 @@ class Step:
         return gains
 
     def _guess(self, dof: int) -> Value:
-        """Of u; what the pass before has found, unless a law asked for another; of a piece, by itself.
+        """Return the guess of u of a dof: u of the pass before, unless a law asked for another value.
 
-        A piece finds u anew in every pass, and until then has its registers for other things.
+        A piece keeps its guess apart: it computes u anew in every pass, and until then its registers are free.
         """
         apart = any(law.least is not None and law.most is not None for law in self.laws[dof])
         apart = apart or self.trace.piece is not None
@@ -176,9 +176,9 @@ class Step:
         return self.trace.graph.input(name, self._kept.get(dof, dof))
 
     def _looped(self, gains: dict[int, Value]) -> list[Store]:
-        """What a pass leaves behind; of the whole tree, nothing if no law bends.
+        """Return the stores at the end of a pass; none for a whole tree without bounded laws.
 
-        A piece has few registers left in its pass: it checks its guesses afterwards, with what it reads anew.
+        A piece has few registers left in its pass, so it checks its guesses afterwards with inputs that it reads anew.
         """
         bends = any(law.bends for laws in self.laws.values() for law in laws)
         if not bends and self.trace.piece is None:
@@ -209,14 +209,14 @@ class Step:
         return found
 
     def _word(self, results: list[Value], looped: bool) -> Value:
-        """The worst that is true of the world."""
+        """Return the most severe status of the world."""
         settled = less(self.trace.graph.input(MISSED, 0), 0.5) if looped else 1.0
         word = select(self._open(), Status.OPEN, select(settled, 0.0, Status.NOT_SETTLED))
         word = select(_finite(results), word, Status.PIVOT)
         return select(_finite(self._inputs()), select(self._unresolved(), Status.LOOPS, word), Status.NOT_FINITE)
 
     def _words(self, own: Piece, results: list[Value]) -> list[Store]:
-        """What a piece says to the first one, which makes one word of what all say: the larger, the worse."""
+        """Return the stores that send a piece's status to the first piece, which stores the most severe of all."""
         trace, graph = self.trace, self.trace.graph
         graph.step = "status|s"
         finite = select(_finite(self._inputs()), select(_finite(results), 0.0, Status.PIVOT), Status.NOT_FINITE)
@@ -230,7 +230,7 @@ class Step:
         return trace.send("S", own, [finite])
 
     def _inputs(self) -> list[Value]:
-        """What the links are given; the first piece has the bodies that do not move, too."""
+        """Return all inputs of the piece's links; for the first piece also those of bodies that do not move."""
         trace, inputs = self.trace, [self.h]
         dofs = sorted(dof for link in self.links for dof in link.dofs)
         wide = ((link.coordinate, WIDE.get(link.motion, 1)) for link in self.links)
@@ -258,7 +258,7 @@ def carries_nothing(link: Link) -> bool:
 
 
 def _finite(values: list[Value]) -> Value:
-    """1 if all are finite, else 0."""
+    """Return 1 if all are finite, else 0."""
     return less(-1.0, total(v.graph.make("lost", v) for v in values if not isinstance(v, float)))
 
 
