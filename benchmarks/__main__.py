@@ -61,8 +61,8 @@ def parser() -> argparse.ArgumentParser:
         type=Path,
         const=evidence.RESULTS,
         metavar="JSON",
-        help="put tables and pictures of a file or folder (default: benchmarks/results) into README.md; run nothing "
-        "unless there is --everything before it",
+        help="put tables and pictures of a file or folder (default: benchmarks/results) into its README.md and the "
+        "headline into the first README.md; run nothing unless there is --everything before it",
     )
     return p
 
@@ -142,17 +142,18 @@ def measure(chosen: list[dict], options: Any, device: wp.Device, pyplot: Any) ->
 
 
 def write_readme(pyplot: Any, source: Path) -> None:
-    """Tables into README.md, pictures beside the results.
+    """Write the headline into README.md, tables and pictures into benchmarks/results.
 
     Raises:
-        ValueError: there is no run, or no place in the README.
+        ValueError: there is no run, or no place in one of the two READMEs.
     """
     found = evidence.gather(evidence.read(file) for file in evidence.files([source]))
-    table.rewrite(table.ROOT / "README.md", table.readme(found))
+    for file, text in table.filled(evidence.ROOT, evidence.RESULTS, found).items():
+        file.write_text(text)
     for name, figure in zip(table.PICTURES, (pictures.headline, pictures.scaling), strict=True):
         drawn = figure(pyplot, found[0])
         if drawn is not None:
-            (table.RESULTS / name).write_text(drawing.svg(drawn))
+            (evidence.RESULTS / name).write_text(drawing.svg(drawn))
             pyplot.close(drawn)
 
 

@@ -1,19 +1,70 @@
-"""The README's tables, from the JSON files of runs."""
+"""Tables of measured results, from the JSON files of runs.
+
+:func:`filled` has two places to fill: the headline of README.md, and benchmarks/results/README.md with all tables.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from warp_spo.trials.operations import OPERATIONS
 
 from .cases import SCENES
-from .evidence import RESULTS, ROOT, Evidence, usual_worlds
+from .evidence import Evidence, usual_worlds
 from .precisions import HEADLINE
 from .robots import ROBOTS
 
-BEGIN, END = "<!-- benchmarks:begin -->", "<!-- benchmarks:end -->"
 PICTURES = {"error-time.svg": "error against run time", "scaling.svg": "run time against size"}
+
+
+class Claim(NamedTuple):
+    """One line of the headline: the same work done by this library and by others.
+
+    Attributes:
+        what: the work, in words.
+        ours: keys and values of our row.
+        others: name in the table, and keys and values of the row; the fastest such row counts.
+    """
+
+    what: str
+    ours: dict
+    others: dict[str, dict]
+
+
+def _dynamics(scene: str, op: str, **more: str) -> dict:
+    return dict(scene=scene, op=op) | more
+
+
+CLAIMS = (
+    Claim(
+        "one time step of a Panda arm with drives and joint limits",
+        dict(name="SolverSPO.step"),
+        {
+            "Newton's SolverSteel": dict(name="SolverSteel.step"),
+            "Newton's SolverMuJoCo": dict(name="SolverMuJoCo.step"),
+        },
+    ),
+    Claim(
+        "forward dynamics of a G1 humanoid (35 degrees of freedom)",
+        _dynamics("g1", "forward_dynamics", dtype="float32"),
+        {
+            "GRiD": _dynamics("g1", "forward_dynamics", peer="GRiD"),
+            "mujoco_warp": _dynamics("g1", "forward_dynamics", peer="mujoco_warp"),
+            "Pinocchio in float64 on one CPU core": _dynamics(
+                "g1", "forward_dynamics", peer="Pinocchio", variant="one core", dtype="float64"
+            ),
+        },
+    ),
+    Claim(
+        "operational-space inertia of the G1's two feet",
+        dict(name="g1 operational_inertia_inverse of two feet"),
+        {"mujoco_warp": dict(name="g1 mujoco_warp kinematics, com_pos, crb, factor_m, 2 jac, 12 solve_m")},
+    ),
+)
+COST = _dynamics("panda", "forward_dynamics", dtype="float32")  # of one call, replayed, eager and from torch
+HEADLINE_WORLDS = 4096
 
 
 def plain(evidence: Evidence) -> list[dict]:
@@ -54,7 +105,10 @@ def markdown(evidence: Evidence, operations: Sequence[str] | None = None) -> str
 
 
 def rates(evidence: Evidence) -> str:
-    """Released robots in float32: latency, throughput, and the fastest peer of the same work at the usual count."""
+    """Released robots in float32: latency, cost of a call, throughput, and the fastest peer of the same work.
+
+    The cost of a call and the peer are at the usual count of worlds.
+    """
     rows = [row for row in plain(evidence) if row["dtype"] == "float32" and row["scene"] in ROBOTS and "us" in row]
     usual, most = usual_worlds(rows), max((row["worlds"] for row in rows), default=0)
     lines = {(row["scene"], row["op"]): {} for row in rows if row["worlds"] == most and most > usual}
@@ -66,7 +120,9 @@ def rates(evidence: Evidence) -> str:
         "float32",
         "µs, 1 world",
         f"µs, {usual:,} worlds",
-        f"10⁹/s, {most:,} worlds",
+        "called from Python",
+        "from torch",
+        f"10⁹ evaluations/s, {most:,} worlds",
         "error",
         f"fastest other, {usual:,} worlds",
         "its error",
@@ -83,7 +139,8 @@ def rates(evidence: Evidence) -> str:
             theirs = [f"{other['peer']}: {time(other)}, {ratio:.0f} ×", f"{other['error']:.1e}"]
         rate = f"{most / mine[most]['us'] / 1e3:.3g}"
         error = f"{worst([row['error'] for row in mine.values()]):.1e}"
-        cells = [f"{scene}, `{op}`", time(mine.get(1)), time(mine.get(usual)), rate, error, *theirs]
+        called = [time(mine.get(usual), key) for key in ("us", "eager_us", "torch_us")]
+        cells = [f"{scene}, `{op}`", time(mine.get(1)), *called, rate, error, *theirs]
         text.append("| " + " | ".join(cells) + " |")
     return "\n".join(text) + "\n\n"
 
@@ -107,39 +164,97 @@ def worst(errors: Sequence[float]) -> float:
     return max(errors) if errors and all(error == error for error in errors) else float("nan")
 
 
-def time(row: dict | None) -> str:
-    """Three digits, such as 3.17, 21.6 or 1363."""
-    if row is None or "us" not in row:
+def time(row: dict | None, key: str = "us") -> str:
+    """Return a time [µs] with three digits, such as 3.17, 21.6 or 1363; a dash where there is none."""
+    if row is None or key not in row:
         return "–"
-    return f"{row['us']:.{max(0, 3 - len(str(int(row['us']))))}f}"
+    return f"{row[key]:.{max(0, 3 - len(str(int(row[key]))))}f}"
 
 
-def readme(everything: Sequence[Evidence]) -> str:
-    """What stands between the markers: every machine with its table, under the first one the pictures."""
+def headline(evidence: Evidence) -> str:
+    """Return the headline of README.md: a line for each of :data:`CLAIMS` that was measured, then what a call costs."""
+    found = [row for row in plain(evidence) if row["worlds"] == HEADLINE_WORLDS and "us" in row]
+    rows = [*found, *(row for row in evidence.capabilities if row["worlds"] == HEADLINE_WORLDS and "us" in row)]
+    peers = [row for row in evidence.peers if row["worlds"] == HEADLINE_WORLDS and "us" in row]
+    text = []
+    for claim in CLAIMS:
+        ours = _fastest(rows, claim.ours)
+        others = {name: _fastest([*rows, *peers], keys) for name, keys in claim.others.items()}
+        if ours:
+            cells = [f"{name} {spoken(row)} ({ratio(row, ours)}×)" for name, row in others.items() if row]
+            text.append(f"| {claim.what} | **{spoken(ours)}** | {', '.join(cells) or '–'} |")
+    if text:
+        of = f"{HEADLINE_WORLDS:,} worlds at once, {evidence.machine['device']}, float32"
+        text = [f"| {of} | `warp_spo` | the same work elsewhere, and how many times as long |", "|---|---:|---|", *text]
+    cost = _fastest(rows, COST)
+    if cost and "eager_us" in cost:
+        text += [
+            "",
+            "Times are of one call, replayed in a CUDA graph. Launched one by one, calls cost more: forward dynamics "
+            f"of {HEADLINE_WORLDS:,} Panda arms takes",
+            f"**{time(cost)} µs replayed, {time(cost, 'eager_us')} µs called from Python, {time(cost, 'torch_us')} µs "
+            f"called with torch tensors**. So capture your loop in a graph.",
+        ]
+    return "\n".join(text).lstrip("\n") + "\n" if text else ""
+
+
+def _fastest(rows: Sequence[dict], keys: dict) -> dict | None:
+    """Return the fastest row that agrees with ``keys``; a peer's name agrees without its version."""
+    agree = lambda row, key, value: str(row.get(key, "")).startswith(value) if key == "peer" else row.get(key) == value  # noqa: E731
+    mine = [row for row in rows if all(agree(row, key, value) for key, value in keys.items())]
+    return min(mine, key=lambda row: row["us"], default=None)
+
+
+def spoken(row: dict) -> str:
+    """Return the run time with its unit, such as 8.96 µs or 30.0 ms."""
+    return f"{time(row)} µs" if row["us"] < 1e4 else f"{time(dict(us=1e-3 * row['us']))} ms"
+
+
+def ratio(row: dict, ours: dict) -> str:
+    """Return how many times as long as ours a row takes, to two digits: 23, 350, 3,300."""
+    quotient = row["us"] / ours["us"]
+    return f"{float(f'{quotient:.2g}'):,.0f}"
+
+
+def page(everything: Sequence[Evidence]) -> str:
+    """Return what stands between the markers of the results' page: every machine's tables, and the pictures."""
     text = []
     for evidence in everything:
         worlds = usual_worlds(plain(evidence))
         shown = evidence._replace(rows=[row for row in evidence.rows if row["worlds"] == worlds])
         operations = None if evidence is everything[0] else HEADLINE
-        text += [*evidence.sources, "", rates(evidence) + markdown(shown, operations)]
+        text += [f"## {evidence.machine['device']}", "", *evidence.sources, ""]
+        text += [rates(evidence) + markdown(shown, operations)]
         if evidence is everything[0]:
-            folder = RESULTS.relative_to(ROOT).as_posix()
             text += [beyond(evidence)] if evidence.capabilities else []
-            text += [f"![{what}]({folder}/{name})" for name, what in PICTURES.items()] + [""]
+            text += [line for name, what in PICTURES.items() for line in (f"![{what}]({name})", "")]
     return "\n".join(text).rstrip("\n") + "\n"
 
 
-def rewrite(readme: Path, block: str) -> None:
-    """Put ``block`` between the two marker comments of ``readme``.
+def filled(root: Path, results: Path, everything: Sequence[Evidence]) -> dict[Path, str]:
+    """Return the text of ``results``/README.md with the tables in it, and of ``root``/README.md with the headline.
+
+    Raises:
+        ValueError: a file is missing, or has not one of each of its markers, in order.
+    """
+    texts = {results / "README.md": between(results / "README.md", "benchmarks", page(everything))}
+    if first := headline(everything[0]):
+        texts[root / "README.md"] = between(root / "README.md", "headline", first)
+    return texts
+
+
+def between(file: Path, name: str, block: str) -> str:
+    """Return the text of ``file`` with ``block`` between its two marker comments.
 
     Raises:
         ValueError: no such file, or not one of each marker, in order.
     """
-    if not readme.is_file():
-        raise ValueError(f"benchmarks: no file {str(readme)!r}; expected a README with {BEGIN} and {END}")
-    text = readme.read_text()
-    head, begin, rest = text.partition(BEGIN)
-    _, end, tail = rest.partition(END)
-    if not (begin and end) or BEGIN in tail or END in tail:
-        raise ValueError(f"benchmarks: {str(readme)!r} does not hold {BEGIN} and then {END}, once; put them there")
-    readme.write_text(f"{head}{BEGIN}\n{block}{END}{tail}")
+    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+    if not file.is_file():
+        raise ValueError(f"benchmarks: no file {str(file)!r}; expected one with {begin} and {end}")
+    text = file.read_text()
+    head, found, rest = text.partition(begin)
+    _, found_end, tail = rest.partition(end)
+    if not (found and found_end) or begin in tail or end in tail:
+        raise ValueError(f"benchmarks: {str(file)!r} does not hold {begin} and then {end}, once; put them there")
+    return f"{head}{begin}\n{block}{end}{tail}"

@@ -42,12 +42,14 @@ def test_newest_rows_of_every_kind_are_gathered():
     assert len(found[0].sources) == 2 and "GPU X (P 1), commit old, 2025-01-01" in found[0].sources[1]
 
 
-def test_readme_is_rewritten_between_the_markers(tmp_path, monkeypatch, capsys):
-    readme, results = tmp_path / "README.md", tmp_path / "benchmarks" / "results"
+def test_tables_and_headline_are_rewritten_between_the_markers(tmp_path, monkeypatch, capsys):
+    first, results = tmp_path / "README.md", tmp_path / "benchmarks" / "results"
     results.mkdir(parents=True)
-    readme.write_text(f"before\n{table.BEGIN}\nold\n{table.END}\nafter\n")
-    monkeypatch.setattr(table, "ROOT", tmp_path)
-    monkeypatch.setattr(table, "RESULTS", results)
+    every = results / "README.md"
+    first.write_text("above\n<!-- headline:begin -->\nold\n<!-- headline:end -->\nbelow\n")
+    every.write_text("before\n<!-- benchmarks:begin -->\nold\n<!-- benchmarks:end -->\nafter\n")
+    monkeypatch.setattr(evidence, "ROOT", tmp_path)
+    monkeypatch.setattr(evidence, "RESULTS", results)
     assert main(["--readme", str(results)]) == 2  # no run yet
     assert "no JSON in" in capsys.readouterr().err
     runner.save(_data() | dict(date="2025-01-01T00:00:00+00:00"), results)
@@ -58,14 +60,36 @@ def test_readme_is_rewritten_between_the_markers(tmp_path, monkeypatch, capsys):
     runner.save(newest, results)
     for _ in range(2):  # twice: the markers stay
         assert main(["--readme", str(results)]) == 0
-        assert readme.read_text() == f"before\n{table.BEGIN}\n{table.readme(_gathered(newest))}{table.END}\nafter\n"
-    assert "chain" not in readme.read_text() and "| `forward_dynamics` | 30.0 / – |" in readme.read_text()
+        text = every.read_text()
+        assert text.startswith("before\n<!-- benchmarks:begin -->\n") and text.endswith(
+            "<!-- benchmarks:end -->\nafter\n"
+        )
+        assert table.page(_gathered(newest)) in text and "old" not in text
+    assert "chain" not in text and "| `forward_dynamics` | 30.0 / – |" in text
+    assert "\nold\n" in first.read_text()  # nothing of the headline was measured
     for name in table.PICTURES:
-        assert f"(benchmarks/results/{name})" in readme.read_text()
+        assert f"({name})" in text
         assert re.search(r"<!-- run time of all ([\d,]+ robots|worlds) -->", (results / name).read_text())
-    readme.write_text("no markers")
-    assert main(["--readme", str(results)]) == 2
-    assert readme.read_text() == "no markers"
+    newest["rows"].append(_row("panda", "forward_dynamics", "float32", 2.4395, 1e-7, eager_us=106.33, torch_us=153.48))
+    newest["rows"].append(_row("g1", "forward_dynamics", "float32", 8.0, 1e-7))
+    newest["rows"].append(_row("g1", "forward_dynamics", "float32", 2000.0, 1e-7, peer="GRiD 1", variant="aba"))
+    runner.save(newest, results)
+    assert main(["--readme", str(results)]) == 0
+    assert "| **8.00 µs** | GRiD 2000 µs (250×) |" in first.read_text()
+    assert "**2.44 µs replayed, 106 µs called from Python, 153 µs called with torch tensors**" in first.read_text()
+    for file in (first, every):
+        kept = file.read_text()
+        file.write_text("no markers")
+        others = [other.read_text() for other in (first, every)]
+        assert main(["--readme", str(results)]) == 2
+        assert others == [other.read_text() for other in (first, every)]
+        file.write_text(kept)
+
+
+def test_committed_tables_are_those_of_the_committed_runs():
+    found = evidence.gather(evidence.read(file) for file in evidence.files([evidence.RESULTS]))
+    for file, text in table.filled(evidence.ROOT, evidence.RESULTS, found).items():
+        assert file.read_text() == text, f"{file.name}: python -m benchmarks --readme writes it anew"
 
 
 def test_report_is_one_page_with_tables_pictures_and_the_stress_suite(tmp_path, capsys):

@@ -246,9 +246,10 @@ class Hinge:
         linear, angular: up to three axes each of a d6; translations first, then rotations, inboard first.
         pitch: of a helical hinge [m/rad].
         parent_pose, child_pose: the hinge's anchor in the parent body and in the child body [m, unit quaternion].
-        armature [kg m^2 or kg], damping [N m s or N s/m], friction [N m or N], stiffness [N m or N/m], target_ke,
-            target_kd, limit_lower, limit_upper [rad or m], limit_ke, limit_kd, effort_limit, velocity_limit: one
-            number for all degrees of freedom or one each.
+        armature, damping, friction, stiffness: [kg m^2 or kg], [N m s or N s/m], [N m or N], [N m or N/m], one number
+            for all degrees of freedom or one each; so are all that follow but ``rest``.
+        target_ke, target_kd: gains of the drive. limit_lower, limit_upper: [rad or m]. limit_ke, limit_kd: stiffness
+            and damping of the limits. effort_limit, velocity_limit: bounds of the drive's force and of the velocity.
         rest: coordinates at which the spring is relaxed, one per coordinate.
         label: name in tables and errors.
 

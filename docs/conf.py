@@ -1,0 +1,38 @@
+"""Sphinx configuration: ``python -m sphinx -W -b html docs docs/_build``, without network."""
+
+import warp as wp
+
+wp.config.log_level = wp.LOG_WARNING  # before newton is imported
+
+import warp_spo  # noqa: E402
+
+project = "warp_spo"
+author = "the warp_spo developers"
+release = warp_spo.__version__
+
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "myst_parser"]
+exclude_patterns = ["_build"]
+myst_heading_anchors = 3
+autosummary_generate = False  # tables alone; every call has its entry on the page below them
+autodoc_typehints = "none"  # docstrings give kinds, shapes and units
+autodoc_member_order = "bysource"
+napoleon_use_rtype = False
+napoleon_custom_sections = [
+    ("Attributes", "params_style")
+]  # a list within the entry of the class, several names a line
+python_maximum_signature_line_length = 100
+
+html_theme = "pydata_sphinx_theme"
+html_title = f"warp_spo {release}"
+html_theme_options = {
+    "navbar_align": "left",
+    "show_nav_level": 2,
+    "show_prev_next": False,
+    "footer_start": ["copyright"],
+    "footer_end": [],
+}
+html_sidebars = {page: [] for page in ("index", "start", "concepts", "closed_loops", "theory", "results")}
+html_static_path = ["_static"]
+html_css_files = ["page.css"]
+html_show_sourcelink = False
+copyright = "the warp_spo developers, Apache-2.0"
