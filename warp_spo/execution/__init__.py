@@ -1,1 +1,1 @@
-"""How recursions run on a device: the plan, generated kernels, launches a level, and the values that kernels read."""
+"""How recursions run on a device: the plan, generated kernels, level-by-level launches, and the values kernels read."""

@@ -1,6 +1,6 @@
-"""What links are made of where it varies: one kernel of a scene computes it in float64, and rounds once, at the store.
+"""The variable parts of links: a kernel of the scene computes them in float64 and rounds each of them once.
 
-It runs when a value is set, not when an operation is called.
+The kernel runs when a value is set, not when an operation is called.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from ..recursions.links import Links
 from ..trace.differentiation import reverse
 from ..trace.emission import Emitter, Store, render
 from ..trace.scalars import ordered
-from .parameters import Derived, Parameters
+from .parameters import DerivedArrays, Parameters
 
 
 def table(parameters: Parameters, links: Links, name: str) -> wp.array:
-    """The scalars ``links.tables[name]`` as [entry, world], with stride 0 where all worlds share them."""
+    """Return the scalars ``links.tables[name]`` as [entry, world], with stride 0 where all worlds share them."""
 
-    def build() -> Derived:
+    def build() -> DerivedArrays:
         values = list(links.tables[name])
         sources = list(dict.fromkeys(scalar.args[0] for scalar in ordered(values) if scalar.op == "input"))
         T, device, worlds = parameters.dtype, parameters.device, parameters.rows(sources)
@@ -27,13 +27,13 @@ def table(parameters: Parameters, links: Links, name: str) -> wp.array:
         inputs = [worlds, *(parameters.entries(source, worlds) for source in sources)]
         kernel = _kernel(name, values, sources, T)
         fill = lambda: wp.launch(kernel, worlds, inputs, [own], device=device)  # noqa: E731
-        return Derived([broadcast_worlds(own, 1, parameters.worlds)], sources, fill)
+        return DerivedArrays([broadcast_worlds(own, 1, parameters.worlds)], sources, fill)
 
-    return parameters.derived(name, build)[0]
+    return parameters.derived_arrays(name, build)[0]
 
 
 def _kernel(name: str, values: list, sources: list[str], T: type) -> wp.Kernel:
-    """A thread a world: Newton's values [entry, world] in, the table [entry, world] out."""
+    """Return the kernel that computes a table [entry, world] from Newton's values, one thread a world."""
     emitter = Emitter(
         "float64",
         lambda array, entry: f"FIELD({array}, {entry})",
@@ -48,9 +48,15 @@ def _kernel(name: str, values: list, sources: list[str], T: type) -> wp.Kernel:
 
 
 def pull_back(parameters: Parameters, links: Links, cotangent: wp.array, gradients: dict[str, wp.array]) -> None:
-    """``gradients[name]`` [world, entry] by Newton's values, of those by the table "value" ``cotangent``.
+    """Write the gradients with respect to Newton's values, given those with respect to the links.
 
-    In float64, rounded once.
+    The kernel computes in float64 and rounds once.
+
+    Args:
+        parameters: the values of the scene.
+        links: the links of the scene.
+        cotangent: the gradient with respect to the table "value" of the links [world, entry].
+        gradients: by the names of Newton's values, the arrays [world, entry] for the results.
     """
     kernel, sources = _reverse(parameters, links, tuple(gradients))
     inputs = [parameters.worlds, *(parameters.entries(source, parameters.worlds) for source in sources), cotangent]
@@ -58,15 +64,15 @@ def pull_back(parameters: Parameters, links: Links, cotangent: wp.array, gradien
 
 
 def _reverse(parameters: Parameters, links: Links, names: tuple[str, ...]) -> tuple[wp.Kernel, list[str]]:
-    """The kernel of a list of names, kept with the links whose graph it belongs to."""
+    """Return the kernel for a list of names and the names of its inputs; ``links`` keeps them for the next call."""
     key = names, parameters.dtype
     if key not in links.reverses:
         values = list(links.tables["value"])
         inputs = [scalar for scalar in ordered(values) if scalar.op == "input"]
         seeds = [links.graph.input("cotangent", slot) for slot in range(len(values))]
-        found = dict(zip((x.args for x in inputs), reverse(values, inputs, seeds), strict=True))
+        derivatives = dict(zip((x.args for x in inputs), reverse(values, inputs, seeds), strict=True))
         sizes = {name: links.scene.values[name][0].size for name in names}
-        stores = [Store(name, (i,), found.get((name, i), 0.0)) for name in names for i in range(sizes[name])]
+        stores = [Store(name, (i,), derivatives.get((name, i), 0.0)) for name in names for i in range(sizes[name])]
         read = ordered([item.value for item in stores])
         sources = list(dict.fromkeys(x.args[0] for x in read if x.op == "input" and x.args[0] != "cotangent"))
         links.reverses[key] = _reverse_kernel(stores, sources, len(values), sizes, parameters.dtype), sources
@@ -74,6 +80,8 @@ def _reverse(parameters: Parameters, links: Links, names: tuple[str, ...]) -> tu
 
 
 def _reverse_kernel(stores: list[Store], sources: list[str], size: int, sizes: dict[str, int], T: type) -> wp.Kernel:
+    """Return the kernel that makes ``stores``; ``size`` is the length of the cotangent, ``sizes`` of the gradients."""
+
     def load(array: str, entry: str) -> str:
         return f"FIELD({array}, {entry})" if array in sources else f"{array}.data[world * {size} + {entry}]"
 

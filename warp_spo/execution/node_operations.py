@@ -1,6 +1,7 @@
-"""The operations at node granularity: each a row of sweeps, a launch a level; they serve every scene.
+"""The operations at node granularity: each is a sequence of sweeps with one launch a level, and serves every scene.
 
-``run`` is the scene's :class:`Sweeps`; arrays are Warp's, [world, ...], absent ones None.
+``run`` launches the sweeps of the scene. ``out`` and the arguments are Warp arrays [world, ...] as those of the method
+of :class:`Dynamics` with the same name; an absent argument is None.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ def forward_dynamics(run: Sweeps, out: wp.array, q: Any, qd: Any = None, tau: An
     run.hinges(q, qd)
     force = None
     if qd is not None or body_f is not None:
-        # gravity stays out of the velocity terms: as the frame's acceleration it meets nothing to cancel
+        # the outward sweep adds gravity as the acceleration of the base, so that it cancels with no velocity term
         alpha, velocity = run.accelerations(None, True, gravity=False) if qd is not None else (None, None)
         force = run.body_forces(alpha, velocity, body_f)
     run.factor()
@@ -40,7 +41,7 @@ def mass_matrix(run: Sweeps, out: wp.array, q: wp.array) -> None:
 def mass_matrix_inverse(run: Sweeps, out: wp.array, q: wp.array) -> None:
     run.hinges(q)
     run.factor()
-    run.sandwich(None, run.scene.dof_count, out)
+    run.inverse_product(None, run.scene.dof_count, out)
 
 
 def solve_mass_matrix(run: Sweeps, out: wp.array, q: wp.array, b: wp.array) -> None:
@@ -76,4 +77,4 @@ def operational_inertia_inverse(run: Sweeps, out: wp.array, q: wp.array, frames:
     J = run.array(("jacobian", len(frames)), run.worlds, len(frames), 6, dofs)
     run.jacobian(*run.frames(frames), J)
     run.factor()
-    run.sandwich(J.reshape((run.worlds, rows, dofs)).transpose((0, 2, 1)), rows, out)
+    run.inverse_product(J.reshape((run.worlds, rows, dofs)).transpose((0, 2, 1)), rows, out)

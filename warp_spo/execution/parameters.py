@@ -1,7 +1,7 @@
-"""A scene's values on a device: kept in float64 as Newton names them, derived for the kernels and rounded once.
+"""A scene's values on a device: Newton's values in float64, and arrays for kernels that are derived from them.
 
-What every world shares is stored once and read through an axis of stride zero, so that kernels never ask. What is
-``variable`` owns one row a world and is refreshed by launches alone.
+Values that all worlds share are stored once; kernels read them through a world axis of stride zero, as if every world
+had its own. A ``variable`` value has one row a world, and launches alone refresh the arrays that depend on it.
 """
 
 from __future__ import annotations
@@ -36,28 +36,34 @@ VARIABLE = (
 RIGID_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c")
 
 
-class Derived(NamedTuple):
-    """Arrays that ``fill()``, launches alone, makes of the values ``of`` these names.
+class DerivedArrays(NamedTuple):
+    """Arrays that are computed from some of a scene's values.
 
     Attributes:
-        each_time: at every request, as graphs that set values were captured before it was made.
+        arrays: the arrays.
+        sources: the names of the values.
+        fill: computes the arrays, by launches alone.
+        always: ``fill`` runs at every request, because a graph that was captured before the arrays existed may change
+            the values without computing the arrays.
     """
 
     arrays: list[wp.array]
-    of: Sequence[str]
+    sources: Sequence[str]
     fill: Callable[[], None]
-    each_time: bool = False
+    always: bool = False
 
 
 class Parameters:
-    """The values of ``scene`` for ``worlds`` worlds, and what is made of them at the first request."""
+    """The values of ``scene`` for ``worlds`` worlds, and arrays derived from them, computed at the first request."""
 
-    def __init__(self, scene: Scene, topology: Topology, worlds: int, device: wp.Device, dtype: type, variable: tuple):
+    def __init__(
+        self, scene: Scene, topology: Topology, worlds: int, device: wp.Device, dtype: type, variable: tuple[str, ...]
+    ):
         self.scene, self.worlds, self.device, self.dtype = scene, worlds, device, dtype
         self.variable = variable
         self._topology = topology
         self._hinge_of: Any = wp.array(scene.hinge_of, dtype=int, device=device)
-        self._derived: dict[str, Derived] = {}
+        self._derived: dict[str, DerivedArrays] = {}
         self._captured = False
         self._version = 0
         self._sharers: list[Parameters] = []
@@ -71,86 +77,90 @@ class Parameters:
 
     @property
     def version(self) -> int | None:
-        """Equal as long as no value has changed; None if a graph may change them unseen."""
+        """A number that is equal as long as no value has changed; None if a captured graph may change values."""
         return None if self._captured else self._version
 
-    def derived(self, key: str, build: Callable[[], Derived]) -> list[wp.array]:
-        """The arrays of that name; ``build()`` allocates them at the first request."""
-        found = self._derived.get(key)
-        if found is None:
-            found = self._derived[key] = build()._replace(each_time=self._captured)
-            found.fill()
-        elif found.each_time:
-            found.fill()
-        return found.arrays
+    def derived_arrays(self, key: str, build: Callable[[], DerivedArrays]) -> list[wp.array]:
+        """Return the derived arrays of this name; ``build()`` allocates them at the first request."""
+        known = self._derived.get(key)
+        if known is None:
+            known = self._derived[key] = build()._replace(always=self._captured)
+            known.fill()
+        elif known.always:
+            known.fill()
+        return known.arrays
 
     def rows(self, names: Iterable[str]) -> int:
-        """1 if all worlds share these values, else the number of worlds."""
+        """Return 1 if all worlds share these values, else the number of worlds."""
         return max((self._values[name].shape[0] for name in names), default=1)
 
     def entries(self, name: str, worlds: int) -> wp.array:
-        """Newton's numbers as [entry, world], float64; no copy."""
+        """Return Newton's values of this name as [entry, world], float64, without a copy."""
         value = self._values[name]
         flat = value.reshape((value.shape[0], math.prod(value.shape[1:])))
         return broadcast_worlds(flat.transpose(), 1, worlds)
 
-    def _bodies(self) -> list:
-        """tree, anchor, com, rigid: see :mod:`warp_spo.kernels.parameters`, [node, component, world]."""
+    def _bodies(self) -> list[wp.array]:
+        """Return tree, anchor, com and rigid of :mod:`warp_spo.kernels.parameters`, [node, component, world]."""
 
-        def build() -> Derived:
+        def build() -> DerivedArrays:
             scene, worlds = self.scene, self.rows(RIGID_VALUES)
             values = [broadcast_worlds(self._values[name], 0, worlds) for name in RIGID_VALUES]
-            own: list = [
+            own: list[wp.array] = [
                 wp.empty((scene.body_count, components, worlds), dtype=self.dtype, device=self.device)
                 for components in (POSE, POSE, 3, RIGID)
             ]
             inputs, dim = [self._topology, self._hinge_of, *values], (scene.body_count, worlds)
             fill = lambda: wp.launch(kernels.derive(node_functions(self.dtype)), dim, inputs, own, device=self.device)  # noqa: E731
-            return Derived([broadcast_worlds(array, 2, self.worlds) for array in own], RIGID_VALUES, fill)
+            return DerivedArrays([broadcast_worlds(array, 2, self.worlds) for array in own], RIGID_VALUES, fill)
 
-        return self.derived("bodies", build)
+        return self.derived_arrays("bodies", build)
 
     @property
     def tree(self) -> wp.array:
+        """Pose of the hinge's parent anchor in the parent's node frame [node, 12, world]."""
         return self._bodies()[0]
 
     @property
     def anchor(self) -> wp.array:
+        """Pose of the node frame in the body frame [node, 12, world]."""
         return self._bodies()[1]
 
     @property
     def com(self) -> wp.array:
+        """CoM in the node frame [node, 3, world], [m]."""
         return self._bodies()[2]
 
     @property
     def rigid(self) -> wp.array:
+        """Rigid inertia in the axes and about the origin of the node frame [node, 10, world]."""
         return self._bodies()[3]
 
     def field(self, name: str) -> wp.array:
-        """``values[name]`` as [dof, coordinate or component, world], rounded."""
+        """Return the value of this name, rounded, with the world axis last: [dof, coordinate or component, world]."""
 
-        def build() -> Derived:
+        def build() -> DerivedArrays:
             value = self._values[name]
             own: Any = wp.empty(value.shape[::-1], dtype=self.dtype, device=self.device)
             kernel = kernels.transpose(node_functions(self.dtype))
             fill = lambda: wp.launch(kernel, own.shape, [value], [own], device=self.device)  # noqa: E731
-            return Derived([broadcast_worlds(own, 1, self.worlds)], (name,), fill)
+            return DerivedArrays([broadcast_worlds(own, 1, self.worlds)], (name,), fill)
 
-        return self.derived(name, build)[0]
+        return self.derived_arrays(name, build)[0]
 
     @property
     def gravity(self) -> wp.array | None:
-        """[3, world], or None where it is zero and stays so."""
+        """Gravity [3, world], [m/s^2]; None where it is zero and not variable."""
         if "gravity" not in self.variable and not self.scene.values["gravity"].any():
             return None
         return self.field("gravity")
 
     def value(self, name: str) -> wp.array:
-        """Newton's numbers as they are kept [1 or worlds, ...], float64."""
+        """Return Newton's value of this name [1 or worlds, ...], float64, without a copy."""
         return self._values[name]
 
     def copy_in(self, name: str, value: wp.array) -> None:
-        """Copy a variable value [world, ...] or [...] into place; launches only."""
+        """Set a variable value from an array [world, ...] or [...], by launches alone."""
         own = self._values[name]
         size = math.prod(own.shape[1:])
         if value.ndim == own.ndim:
@@ -166,24 +176,24 @@ class Parameters:
         )
 
     def adopt_variable(self, other: Parameters) -> None:
-        """Take over the variable values of ``other``."""
+        """Copy the variable values of ``other``."""
         for name in self.variable:
             wp.copy(self._values[name], other._values[name])
         self._version = other._version
         self.refresh(self.variable)
 
     def share(self, other: Parameters) -> None:
-        """Have the values of ``other``, from here on the same memory, and follow its :meth:`refresh`."""
+        """Use the memory of ``other``'s values from now on; :meth:`refresh` of ``other`` also refreshes this object."""
         self._values = other._values
         self._derived.clear()
         other._sharers.append(self)
 
     def refresh(self, names: Iterable[str]) -> None:
-        """Derive anew what depends on the named values."""
+        """Compute again the arrays that depend on the named values."""
         for sharer in self._sharers:
             sharer.refresh(names)
         self._captured |= bool(self.device.is_capturing)
         self._version += 1
-        for found in self._derived.values():
-            if any(name in found.of for name in names):
-                found.fill()
+        for known in self._derived.values():
+            if any(name in known.sources for name in names):
+                known.fill()

@@ -1,4 +1,4 @@
-"""The word of each world that says whether its forward dynamics can be trusted; see ``Dynamics.forward_dynamics``."""
+"""The status word of each world, which says whether its forward dynamics can be trusted; see :class:`Status`."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from .sweeps import Sweeps
 def write(
     run: Sweeps, q: wp.array, qd: Any, tau: Any, body_f: Any, qdd: wp.array, status: wp.array, factored: bool
 ) -> None:
-    """Fill ``status`` [world] for forward dynamics that has just run: one sweep inward, and a launch over the worlds.
+    """Write ``status`` [world] after forward dynamics, by one inward sweep and one launch over the worlds.
 
-    Reads pose, axis, articulated, gain and pivot. Sweeps have left them in the workspace (``factored``); for a
-    recursion that keeps them elsewhere the factorisation is swept now. What that loses bounds what the other form
-    loses, whose hinges lie along axes.
+    The sweep reads pose, axis, articulated, gain and pivot. With ``factored``, forward dynamics has left them in the
+    workspace. Otherwise a generated kernel computed forward dynamics, and the sweeps factorise now. The digits that
+    they lose are an upper bound for the generated kernel, whose hinges lie along axes.
     """
     declare(kernels, run.functions)
     if not factored:

@@ -1,7 +1,7 @@
-"""The sweeps of a scene at node granularity, a launch a level, one method for each.
+"""The sweeps of a scene at node granularity: one method a sweep, one launch a level.
 
-A method launches its kernels and leaves the results in the workspace, [node or dof, component, world]; later methods
-read what earlier ones left. The workspace is allocated at first use and kept.
+A method launches its kernels and leaves the results in the workspace, [node or dof, component, world], where later
+methods read them. The first use of a workspace array allocates it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .plan import Plan
 
 
 class Sweeps:
-    """Launches of one scene's recursions.
+    """The sweeps of one scene.
 
     Attributes:
         topology: the tree's tables on the device.
@@ -46,7 +46,7 @@ class Sweeps:
         self._frames: dict[tuple, tuple[wp.array, wp.array]] = {}
 
     def replace_values(self, scene: Scene) -> None:
-        """Take the values of ``scene``, the same topology; variable values stay as they were set."""
+        """Take the values of ``scene``, which has the same topology; variable values stay as they were set."""
         before, variable = self.parameters, self.parameters.variable
         self.scene = scene
         self.parameters = Parameters(scene, self.topology, self.worlds, self.device, self.dtype, variable)
@@ -55,18 +55,18 @@ class Sweeps:
     # -- launching -------------------------------------------------------------------------------------------------
     @property
     def nodes(self) -> tuple[int, int]:
-        """Launch dimensions of a kernel with one thread for each (node, world)."""
+        """The launch dimensions of a kernel with one thread for each (node, world)."""
         return self.scene.body_count, self.worlds
 
     @property
     def workspace_bytes(self) -> int:
-        """Device memory that the calls so far have taken."""
+        """The size of the workspace that the calls so far have allocated."""
         return sum(array.capacity for array in self._workspace.values())
 
     def array(self, name: Any, *shape: int) -> wp.array:
-        """The workspace array of that name; the first use gives its shape."""
+        """Return the workspace array of this name; the first use gives its shape."""
         if name not in self._workspace:
-            assert shape, f"workspace array {name!r} is read before it is written"
+            assert shape, f"Sweeps.array: the workspace array {name!r} is read before a sweep has written it"
             self._workspace[name] = wp.empty(shape, dtype=self.dtype, device=self.device)
         return self._workspace[name]
 
@@ -74,6 +74,7 @@ class Sweeps:
         return self.array(name, self.scene.body_count, components, self.worlds)
 
     def launch(self, factory: Callable, dim: Any, inputs: list, outputs: list) -> None:
+        """Launch a kernel whose factory takes the scalar type."""
         wp.launch(factory(self.dtype), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def launch_nodes(self, factory: Callable, dim: Any, inputs: list, outputs: list) -> None:
@@ -81,7 +82,7 @@ class Sweeps:
         wp.launch(factory(self.functions), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def _sweep(self, factory: Callable, levels: Sequence[tuple[int, int]], inputs: list, outputs: list) -> None:
-        """One launch a level, one thread for each (node, world)."""
+        """Launch a kernel once a level, with one thread for each (node, world)."""
         kernel = factory(self.functions)
         for first, count in levels:
             arguments = [self.topology, first, *inputs]
@@ -90,7 +91,7 @@ class Sweeps:
     def _sweep_columns(
         self, factory: Callable, levels: Sequence, columns: tuple[int, int], inputs: list, outputs: list
     ) -> None:
-        """One launch a level, one thread for each (node, column, world); ``columns`` = (first, count)."""
+        """Launch a kernel once a level, one thread for each (node, column, world); ``columns`` is (first, count)."""
         kernel = factory(self.functions)
         for first, count in levels:
             arguments = [self.topology, first, columns[0], *inputs]
@@ -98,7 +99,7 @@ class Sweeps:
 
     # -- kinematics ------------------------------------------------------------------------------------------------
     def hinges(self, q: wp.array, qd: wp.array | None = None) -> None:
-        """Pose and H* of every node; with qd also H* qd and dH*/dt qd."""
+        """Compute the pose and H* of every node; with qd also the hinges' velocities H* qd and bias accelerations."""
         outputs = [
             self._per_node("pose", POSE),
             self.array("axis", self.scene.dof_count, MOTION, self.worlds),
@@ -109,15 +110,21 @@ class Sweeps:
         self.launch_nodes(kinematics.hinge, self.nodes, inputs, outputs)
 
     def velocities(self) -> wp.array:
-        """V = phi* H* qd, after hinges with qd."""
+        """Return V = phi* H* qd of every node; after :meth:`hinges` with qd."""
         velocity = self.array("velocity")
         inputs = [self.array("pose"), self.array("axis"), self.array("bias"), None, None]
         self._sweep(kinematics.node_motion, self.plan.outward, inputs, [velocity, None])
         return velocity
 
-    def accelerations(self, qdd: wp.array | None, moves: bool, gravity: bool) -> tuple[wp.array, wp.array | None]:
-        """alpha = phi* (H* qdd + a), with or without gravity, and V if it ``moves``: after hinges with qd."""
-        velocity, bias = (self.array("velocity"), self.array("bias")) if moves else (None, None)
+    def accelerations(self, qdd: wp.array | None, moving: bool, gravity: bool) -> tuple[wp.array, wp.array | None]:
+        """Return alpha = phi* (H* qdd + a) and V of every node.
+
+        Args:
+            qdd: None is zero.
+            moving: qd is not zero; :meth:`hinges` was called with qd. Otherwise V is None.
+            gravity: alpha includes gravity as the acceleration of the base.
+        """
+        velocity, bias = (self.array("velocity"), self.array("bias")) if moving else (None, None)
         acceleration = self._per_node("acceleration", MOTION)
         base = self.parameters.gravity if gravity else None
         inputs = [self.array("pose"), self.array("axis"), bias, base, qdd]
@@ -125,13 +132,13 @@ class Sweeps:
         return acceleration, velocity
 
     def world_poses(self) -> wp.array:
-        """Pose of every node frame in the inertial frame."""
+        """Return the pose of every node frame in the inertial frame; after :meth:`hinges`."""
         world_pose = self._per_node("world_pose", POSE)
         self._sweep(kinematics.world_poses, self.plan.outward, [self.array("pose")], [world_pose])
         return world_pose
 
     def frames(self, frames: tuple) -> tuple[wp.array, wp.array]:
-        """Bodies [frame] and origins in the body frame [frame, 3] on the device; the same arrays for equal frames."""
+        """Return bodies [frame] and origins in the body frame [frame, 3]; equal frames give the same arrays."""
         if frames not in self._frames:
             bodies: Any = wp.array([body for body, _ in frames], dtype=int, device=self.device)
             origins: Any = wp.array(np.array([origin for _, origin in frames]), dtype=self.dtype, device=self.device)
@@ -139,14 +146,14 @@ class Sweeps:
         return self._frames[frames]
 
     def jacobian(self, frame_nodes: wp.array, frame_offsets: wp.array, out: wp.array) -> None:
-        """Jacobians of frames, [world, frame, 6, dof]."""
+        """Write the Jacobians of frames into ``out`` [world, frame, 6, dof]; after :meth:`hinges`."""
         where = [frame_nodes, frame_offsets, self.parameters.anchor]
         inputs = [self.topology, *where, self.array("pose"), self.world_poses(), self.array("axis")]
         self.launch_nodes(kinematics.jacobian, (len(frame_nodes), self.worlds), inputs, [out])
 
     # -- Newton-Euler ----------------------------------------------------------------------------------------------
     def body_forces(self, acceleration: Any, velocity: Any, body_f: Any) -> wp.array:
-        """M alpha + crf(V) M V less the external wrench, of every node by itself; None is zero."""
+        """Return M alpha + crf(V) M V - (external wrench) of every node alone; an argument None is zero."""
         force = self._per_node("force", MOTION)
         world_pose = None if body_f is None else self.world_poses()
         inputs = [self.parameters.rigid, self.parameters.com, acceleration, velocity, body_f, world_pose]
@@ -154,13 +161,13 @@ class Sweeps:
         return force
 
     def hinge_forces(self, qdd: wp.array | None, force: wp.array, out: wp.array) -> None:
-        """out = H phi force + Delta qdd."""
+        """Write H phi force + Delta qdd into ``out`` [world, dof]; after :meth:`hinges`."""
         inputs = [self.array("pose"), self.array("axis"), self.parameters.field("joint_armature"), qdd]
         self._sweep(newton_euler.force, self.plan.inward, inputs, [force, out])
 
     # -- mass matrix -----------------------------------------------------------------------------------------------
     def mass_matrix(self, out: wp.array) -> None:
-        """Mass by composite bodies, [world, dof, dof]."""
+        """Write the mass matrix into ``out`` [world, dof, dof] by composite bodies; after :meth:`hinges`."""
         pose, axis, bodies = self.array("pose"), self.array("axis"), self._per_node("composite", RIGID)
         self._sweep(composite.composite, self.plan.inward, [pose, self.parameters.rigid], [bodies])
         out.zero_()
@@ -168,7 +175,7 @@ class Sweeps:
         self.launch_nodes(composite.mass_matrix, (self.scene.dof_count, self.worlds), inputs, [out])
 
     def factor(self) -> wp.array:
-        """Mass = [I + H phi K] D [I + H phi K]*; returns the pivots of D [dof, world]."""
+        """Factorise Mass = [I + H phi K] D [I + H phi K]*, after :meth:`hinges`; return the pivots of D [dof, world]."""
         dofs = self.scene.dof_count
         inputs = [
             self.array("pose"),
@@ -185,37 +192,41 @@ class Sweeps:
         return outputs[2]
 
     def solve(self, b: wp.array | None, out: wp.array, force: wp.array | None = None, gravity: bool = False) -> None:
-        """out = Mass^-1 (b - H phi force), less what gravity takes; after :meth:`factor`.
+        """Write Mass^-1 (b - H phi force) into ``out``; after :meth:`factor`.
 
-        b and out are [world, dof] or [world, dof, column]; None is zero.
+        ``b`` and ``out`` are [world, dof] or [world, dof, column]; None is zero. With ``gravity``, the base accelerates
+        by -gravity.
         """
         shape = (*out.shape[:2], math.prod(out.shape[2:]))
         out, b = out.reshape(shape), None if b is None else b.reshape(shape)
         base = self.parameters.gravity if gravity else None
         for columns, work in self._chunks(shape[2]):
-            self._reduce(columns, force, b, False, work, out)
+            self._eliminate(columns, force, b, False, work, out)
             self._sweep_columns(
                 articulated.back_substitute, self.plan.outward, columns, [*self._factors, base], [work, out]
             )
 
-    def sandwich(self, b: wp.array | None, columns: int, out: wp.array) -> None:
-        """out = b* Mass^-1 b [world, column, column] for b [world, dof, column], None = unit matrix; after factor."""
+    def inverse_product(self, b: wp.array | None, columns: int, out: wp.array) -> None:
+        """Write b* Mass^-1 b into ``out`` [world, column, column]; after :meth:`factor`.
+
+        ``b`` is [world, dof, column]; None is the unit matrix.
+        """
         half = self.array(("half", columns), self.worlds, self.scene.dof_count, columns)
         for chunk, work in self._chunks(columns):
-            self._reduce(chunk, None, b, b is None, work, half)
+            self._eliminate(chunk, None, b, b is None, work, half)
         self.launch_nodes(articulated.weighted_product, out.shape, [half, self.array("pivot")], [out])
 
     @property
     def _factors(self) -> list[wp.array]:
         return [self.array(name) for name in ("pose", "axis", "gain", "pivot")]
 
-    def _reduce(self, columns: tuple, force: Any, b: Any, identity: bool, work: wp.array, out: wp.array) -> None:
-        """out = D^-1 [I - H psi K] (b - H phi force)."""
+    def _eliminate(self, columns: tuple, force: Any, b: Any, identity: bool, work: wp.array, out: wp.array) -> None:
+        """Write D^-1 [I - H psi K] (b - H phi force) into ``out``."""
         inputs = [*self._factors, force, b, identity]
         self._sweep_columns(articulated.eliminate, self.plan.inward, columns, inputs, [work, out])
 
     def _chunks(self, columns: int) -> list[tuple[tuple[int, int], wp.array]]:
-        """(first, count) of the right-hand sides that go together, each with the workspace that it needs."""
+        """Return (first, count) of each group of right-hand sides that one launch solves, with its workspace."""
         scalar = wp.types.type_size_in_bytes(self.dtype)
         size = self.plan.column_chunk(columns, self.scene.body_count * MOTION * self.worlds * scalar)
         work = self.array(("columns", size), self.scene.body_count, MOTION, size * self.worlds)
@@ -223,6 +234,7 @@ class Sweeps:
 
 
 def _topology(scene: Scene, device: wp.Device) -> Topology:
+    """Return the tables of the scene's tree on the device."""
     tree, hinge_of = scene.tree, scene.hinge_of
     hinges = [scene.hinges[h] for h in hinge_of]
     dof_node = np.zeros(scene.dof_count, dtype=np.int32)
