@@ -180,9 +180,9 @@ TEAM_MUTANTS = {
     "no barrier before the trunk": (pieces.Pieces, "__init__", "child.inward + (child is not heir)", "child.inward"),
     "no barrier after the trunk": (pieces.Pieces, "__init__",
                                    "piece.parent.outward + (piece.warp != piece.parent.warp)", "piece.parent.outward"),
-    "another limb's entries": (teams.Team, "_filled", "zip(*shifts.columns, strict=True)",
+    "another limb's entries": (teams.Team, "_fill_in", "zip(*shifts.columns, strict=True)",
                                "[*zip(*shifts.columns, strict=True)][::-1]"),
-    "another limb's constants": (teams.Team, "_filled", "zip(*constants.columns, strict=True)",
+    "another limb's constants": (teams.Team, "_fill_in", "zip(*constants.columns, strict=True)",
                                  "[*zip(*constants.columns, strict=True)][::-1]"),
 }  # fmt: skip
 
@@ -207,8 +207,13 @@ INVERSE_MUTANTS = {
     "what lies further in": (inverse.Inverse, "_come_back", "[dot(row, force) for row in N]", "[0.0 for row in N]"),
     "parted too early": (pieces.Piece, "fork", "(other, *other.ancestors)", "reversed((other, *other.ancestors))"),
     "no barrier before they meet": (teams.Team, "cuda", "BARRIER, self._rounds(alike)", "self._rounds(alike)"),
-    "another limb's turns": (teams.Team, "_apart", "initial=0", "initial=1"),
-    "a turn too few": (teams.Team, "_apart", "counts.values())}; ++turn", "[n - 1 for n in counts.values()])}; ++turn"),
+    "another limb's turns": (teams.Team, "_take_turns", "initial=0", "initial=1"),
+    "a turn too few": (
+        teams.Team,
+        "_take_turns",
+        "counts.values())}; ++turn",
+        "[n - 1 for n in counts.values()])}; ++turn",
+    ),
 }
 
 

@@ -184,7 +184,7 @@ BUGS = {
         straight, "repeat_team_passes", "going = __syncthreads_or(missed_row[0] > 0)", "going = missed_row[0] > -1"),
     "a guess that stays": (Step, "_looped", "after = gain\n", "after = 0.0 * gain\n"),
     "a limb that is not asked": (straight, "repeat_team_passes", "for warp in range(warps)", "for warp in range(1)"),
-    "a word before it is said": (teams.Team, "_in_passes", "if last and any(found)", "if False"),
+    "a word before it is said": (teams.Team, "_in_passes", "if last and any(text_of_ranks)", "if False"),
     "a word unheard": (Step, "_words", "select(less(worst, word), word, worst)", "word"),
 }  # fmt: skip
 NEEDS = {"flags in one place": "roots", "a limb that is not asked": "hand"}

@@ -175,7 +175,7 @@ class Sweeps:
         self.launch_nodes(composite.mass_matrix, (self.scene.dof_count, self.worlds), inputs, [out])
 
     def factor(self) -> wp.array:
-        """Factorise Mass = [I + H phi K] D [I + H phi K]*, after :meth:`hinges`; return the pivots of D [dof, world]."""
+        """Factorise Mass = [I + H phi K] D [I + H phi K]*, after :meth:`hinges`; return the pivots D [dof, world]."""
         dofs = self.scene.dof_count
         inputs = [
             self.array("pose"),

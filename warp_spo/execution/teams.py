@@ -1,4 +1,7 @@
-"""Teams: the statements of a scene's pieces put together, a warp for each leaf piece, barriers between the stages."""
+"""Teams: the kernel text in which several warps share the pieces of a robot, one warp for each leaf piece.
+
+Barriers separate the stages, because a piece reads what other pieces have sent.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,19 @@ from ..recursions.pieces import Piece, Pieces
 from ..trace.emission import C_TYPE, Listing, fill_in, literal, render
 
 BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
-CACHED = 8192  # operations of a world whose code an instruction cache holds
+CACHED = 8192  # largest number of operations of a world whose code fits into the instruction cache
 
 
 class Work(NamedTuple):
-    """What one piece has to do: going in, coming out, checking a pass, telling others, and, in rounds, what those said.
+    """The statements of one piece.
 
-    Of work in passes, the last two come when all passes are done.
+    Attributes:
+        piece: the piece.
+        inward: the inward sweep.
+        outward: the outward sweep.
+        check: the check whether the guesses of a pass were right.
+        news: what the piece sends to the others after the outward sweep; in work with passes, after the last pass.
+        rounds: what the piece computes, message by message, from the news of the other pieces.
     """
 
     piece: Piece
@@ -30,38 +39,41 @@ class Work(NamedTuple):
 
     @property
     def text(self) -> tuple[str, str, str]:
+        """The statements without their numbers and entries; equal for pieces of equal structure."""
         return self.inward.text, self.outward.text, self.check.text
 
 
 class Passes(NamedTuple):
-    """Passes in which a team goes round all its work, until every warp's guesses were right.
+    """Work that a team repeats in passes, until the guesses of every warp were right.
 
     Attributes:
-        kept: names of what a piece keeps from pass to pass, by dof of its own: arrays of a thread whose indices are
-            constants, so that they live in registers.
-        flags: where in the memory that warps share the flags begin; None: there is nothing to guess, one pass will do.
+        kept: the names of the values that a piece keeps from pass to pass, one for each of its dofs. They are arrays of
+            the thread with constant indices, which the compiler keeps in registers.
+        flags: the place of the flags in the memory that the warps share; None if one pass suffices, because there is
+            nothing to guess.
     """
 
     kept: tuple[str, ...]
     flags: int | None
 
-    def declared(self, entries: dict[str, int], c: str) -> str:
-        """What pieces keep, by the prefix of their names: so many entries each."""
+    def declare(self, entries: dict[str, int], c: str) -> str:
+        """Return declarations of the kept values; ``entries`` gives their number by the prefix of their names."""
         sizes = entries.items()
         return "\n".join(f"{c} {prefix}{name}_row[{count}] = {{}};" for prefix, count in sizes for name in self.kept)
 
 
 class Team:
-    """The work of all pieces of a scene.
+    """The work of all pieces of a scene, and the kernel text made of it.
 
     Args:
-        pieces, dtype: of the scene.
-        passes: the work is done in passes, see :class:`Passes`.
+        pieces: the pieces.
+        dtype: the scalar type, "float32" or "float64".
+        passes: the team repeats its work in passes; None if it does not.
 
     Attributes:
-        table: constants in which equal pieces differ. shifts: likewise, distances of the entries that they read and
-            write. Both as the kernel's arrays hold them.
-        operations: floating-point operations of one world.
+        table: the constants in which equal pieces differ, as the kernel's array holds them.
+        shifts: the distances of the entries that equal pieces read and write, as the kernel's array holds them.
+        operations: the number of floating-point operations of one world.
     """
 
     def __init__(self, pieces: Pieces, dtype: str, passes: Passes | None = None):
@@ -72,23 +84,23 @@ class Team:
         self._work: dict[int, Work] = {}
 
     def add(self, work: Work, operations: int) -> None:
-        """Take on the work of a piece, whose ``rounds`` may use all that others sent."""
+        """Add the work of a piece and its number of operations."""
         self._work[work.piece.index] = work
         self.operations += operations
 
     @property
     def _last(self) -> int:
-        """The last stage in which there is something to do."""
+        """The last stage that has statements."""
         stages = [0]
         for piece, inward, outward, _, _, rounds in self._work.values():
             stages += [piece.inward] if inward.text else []
             stages += [piece.outward] if outward.text else []
             if rounds and not self.passes:
-                stages.append(self.pieces.stages - 1)  # pieces further in meet in the last one
+                stages.append(self.pieces.stages - 1)  # inner pieces read the news in the last stage
         return max(stages)
 
     def cpu(self) -> str:
-        """Everything in order, by one thread."""
+        """Return the statements of all pieces in order, for one thread."""
         text: list[str] = []
         later: list[str] = []
         for stage in range(self._last + 1):
@@ -105,14 +117,15 @@ class Team:
             later += [self._branch(work.piece, listing) for listing in work.rounds]
         if self.passes:
             kept = {f"p{piece.index}_": piece.weight for piece in self.pieces.pieces}
-            text = [self.passes.declared(kept, self.c), straight.repeat_thread_passes("\n".join(text), self.c)]
+            text = [self.passes.declare(kept, self.c), straight.repeat_thread_passes("\n".join(text), self.c)]
         return "\n".join(text + later)
 
     def _branch(self, piece: Piece, listing: Listing) -> str:
+        """Return the statements of a piece in braces."""
         return "\n".join(["{", render(listing, self.dtype, f"p{piece.index}_"), "}"])
 
     def cuda(self) -> str:
-        """A branch for each kind of leaf piece, which its warps enter together."""
+        """Return a branch for each structure of leaf pieces, which the warps of these pieces enter together."""
         kinds: dict[tuple, list[Work]] = {}
         for work in self._work.values():
             if not work.piece.children:
@@ -123,16 +136,16 @@ class Team:
             inward, outward = self._shared(alike)
             text += [inward, self._inner([work.piece.warp for work in alike]), outward]
             if not self.passes and any(work.rounds for works in kinds.values() for work in works):
-                text += [self._apart(alike, [[work.news] for work in alike], "n_"), BARRIER, self._rounds(alike)]
+                text += [self._take_turns(alike, [[work.news] for work in alike], "n_"), BARRIER, self._rounds(alike)]
             text.append("}")
         return self._in_passes("\n".join(text)) if self.passes else "\n".join(text)
 
     def _in_passes(self, a_pass: str) -> str:
-        """``a_pass`` until all agree, then every piece's news, and what the first makes of them."""
+        """Return ``a_pass`` in a loop, then the news of every piece, then the rounds."""
         assert self.passes is not None
         leaves = [work for work in self._work.values() if not work.piece.children]
         inner = [work for work in self._work.values() if work.piece.children]
-        ranks: list[dict[int, Work]] = [{leaf.piece.warp: leaf for leaf in leaves}]  # by warp: one of its pieces
+        ranks: list[dict[int, Work]] = [{leaf.piece.warp: leaf for leaf in leaves}]  # by warp, one of its pieces each
         for work in inner:
             warp = work.piece.warp
             free = next((rank for rank in ranks if warp not in rank), None)
@@ -141,25 +154,25 @@ class Team:
             free[warp] = work
         names = ["", *(f"i{at}_" for at in range(len(ranks) - 1))]
         kept = {name: max(work.piece.weight for work in rank.values()) for name, rank in zip(names, ranks, strict=True)}
-        text = [self.passes.declared(kept, self.c)]
+        text = [self.passes.declare(kept, self.c)]
         text += [
             straight.run_one_pass(a_pass, BARRIER, self.c)
             if self.passes.flags is None
             else straight.repeat_team_passes(a_pass, self.passes.flags, self.pieces.warps, self.c)
         ]
         for last in (False, True):
-            found = []
+            text_of_ranks = []
             for at, (name, rank) in enumerate(zip(names, ranks, strict=True)):
-                said = [rank.get(leaf.piece.warp) for leaf in leaves]
-                its = [[] if one is None else one.rounds if last else [one.news] for one in said]
-                found.append(self._apart(leaves, its, f"c{at}_", name))
-            if last and any(found):
+                works = [rank.get(leaf.piece.warp) for leaf in leaves]
+                turns = [[] if work is None else work.rounds if last else [work.news] for work in works]
+                text_of_ranks.append(self._take_turns(leaves, turns, f"c{at}_", name))
+            if last and any(text_of_ranks):
                 text.append(BARRIER)
-            text += found
+            text += text_of_ranks
         return "\n".join(text)
 
     def _inner(self, warps: list[int]) -> str:
-        """The stages between the leaves' way in and their way out, with the pieces that some of ``warps`` take on."""
+        """Return the stages between the inward and outward sweeps of the leaves, for the inner pieces of ``warps``."""
         owners: dict[tuple, list[list[Work]]] = {}
         for warp in warps:
             mine = [work for work in self._work.values() if work.piece.children and work.piece.warp == warp]
@@ -177,7 +190,9 @@ class Team:
                     if alike[0].piece.outward == stage:
                         text.append(outward)
                         if not self.passes:
-                            text.append(self._apart(alike, [[work.news] for work in alike], f"i{at}_n_", f"i{at}_"))
+                            text.append(
+                                self._take_turns(alike, [[work.news] for work in alike], f"i{at}_n_", f"i{at}_")
+                            )
             if not self.passes:
                 text += [self._rounds(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
             text.append("}")
@@ -187,11 +202,11 @@ class Team:
         return "\n".join(text or idle)
 
     def _rounds(self, alike: Sequence[Work], prefix: str = "") -> str:
-        """What pieces of equal structure make of what the others said."""
-        return self._apart(alike, [work.rounds for work in alike], f"{prefix}x_", prefix)
+        """Return the rounds of pieces of equal structure."""
+        return self._take_turns(alike, [work.rounds for work in alike], f"{prefix}x_", prefix)
 
-    def _apart(self, alike: Sequence[Work], turns: list[list[Listing]], tables: str, prefix: str = "") -> str:
-        """What pieces of equal structure do each for themselves, in turns: those that do the same share its text."""
+    def _take_turns(self, alike: Sequence[Work], turns: list[list[Listing]], tables: str, prefix: str = "") -> str:
+        """Return the statements that pieces of equal structure execute in turns; equal statements share one text."""
         kinds: dict[str, list[tuple[int, Listing]]] = {}
         for work, listings in zip(alike, turns, strict=True):
             for at, listing in enumerate(listings):
@@ -203,16 +218,16 @@ class Team:
             counts = Counter(warp for warp, _ in some)
             warps, name = list(counts), f"{tables}{at}_"
             several = max(counts.values()) > 1
-            who = f"{name}first + turn" if several else _chosen(warps, range(len(warps)))
-            head, (body,) = self._filled([[listing for _, listing in some]], prefix, name, who)
+            who = f"{name}first + turn" if several else _choose(warps, range(len(warps)))
+            head, (body,) = self._fill_in([[listing for _, listing in some]], prefix, name, who)
             condition = "" if len(warps) == len(alike) else f"if ({_any_of(warps)}) "
             inside = [head, body]
             if several:
                 starts = itertools.accumulate(counts.values(), initial=0)
                 inside = [
-                    f"const int {name}first = {_chosen(warps, starts)};",
+                    f"const int {name}first = {_choose(warps, starts)};",
                     "#pragma unroll 1",
-                    f"for (int turn = 0; turn < {_chosen(warps, counts.values())}; ++turn) {{",
+                    f"for (int turn = 0; turn < {_choose(warps, counts.values())}; ++turn) {{",
                     *inside,
                     "}",
                 ]
@@ -221,26 +236,28 @@ class Team:
 
     @property
     def _loops(self) -> bool:
-        """Turns are loops, slower than statements in a row that an instruction cache holds."""
+        """Whether turns are loops, which are slower than a sequence of statements if that fits into the cache."""
         return self.operations > CACHED
 
     def _shared(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str]:
-        """One text, in and out, for pieces of equal structure."""
+        """Return one text for the inward and one for the outward sweeps of pieces of equal structure."""
         regions = [[work.inward for work in alike], [work.outward for work in alike], [work.check for work in alike]]
-        who = _chosen([work.piece.warp for work in alike], range(len(alike)))
-        head, (inward, outward, check) = self._filled(regions, prefix, prefix, who)
+        who = _choose([work.piece.warp for work in alike], range(len(alike)))
+        head, (inward, outward, check) = self._fill_in(regions, prefix, prefix, who)
         outward = "\n".join([outward, "{", check, "}"]) if check else outward
         return f"{head}\n{inward}" if head else inward, outward
 
-    def _filled(self, regions: list[list[Listing]], prefix: str, tables: str, who: str) -> tuple[str, list[str]]:
-        """The text of each region, for any of those whose listings it has; what differs comes from the tables.
+    def _fill_in(self, regions: list[list[Listing]], prefix: str, tables: str, who: str) -> tuple[str, list[str]]:
+        """Return one text for each region; a warp reads the numbers and entries in which it differs from the tables.
 
         Args:
-            prefix: of the names of values. tables: of the names of what is read from the tables.
-            who: C++ for which of the listings it is.
+            regions: for each region, the listings of all pieces of equal structure.
+            prefix: the prefix of the names of values.
+            tables: the prefix of the names of values that are read from the tables.
+            who: C++ for the index of the warp's listing.
 
         Returns:
-            What comes first, and the regions.
+            The statements that read the tables, and the text of each region.
         """
         constants, shifts = _Columns(), _Columns()
 
@@ -276,13 +293,14 @@ class Team:
 
 
 class _Columns:
-    """Distinct tuples, one value for each member, in the order in which they were met."""
+    """Distinct tuples, one value for each piece of equal structure, in the order of their first use."""
 
     def __init__(self) -> None:
         self.columns: list[tuple] = []
         self._known: dict[tuple, int] = {}
 
     def of(self, values: tuple) -> int:
+        """Return the position of a tuple, which is appended if it is new."""
         if values not in self._known:
             self._known[values] = len(self.columns)
             self.columns.append(values)
@@ -290,11 +308,12 @@ class _Columns:
 
 
 def _any_of(warps: list[int]) -> str:
+    """Return a C++ condition that is true in these warps."""
     return " || ".join(f"warp == {warp}" for warp in warps)
 
 
-def _chosen(warps: Sequence[int], numbers: Iterable[int]) -> str:
-    """C++ for the number of this warp, one of ``warps``."""
+def _choose(warps: Sequence[int], numbers: Iterable[int]) -> str:
+    """Return C++ for the number that belongs to the executing warp, one of ``warps``."""
     *others, last = zip(warps, numbers, strict=False)
     if all(number == last[1] for _, number in others):
         return str(last[1])
