@@ -1,4 +1,7 @@
-"""The errors a caller may want to tell apart; every other mistake is a plain ValueError or TypeError."""
+"""Errors that callers may want to tell apart, and checks of arguments.
+
+Every other mistake of a caller raises a plain ValueError or TypeError.
+"""
 
 import operator
 from typing import Any
@@ -7,32 +10,37 @@ import numpy as np
 
 
 def refuse_masked(call: str, name: str, array: Any) -> None:
-    """Raise TypeError of a NumPy masked array: its mask would be dropped in silence."""
+    """Raise TypeError if ``array`` is a NumPy masked array, because its mask would be ignored."""
     if isinstance(array, np.ma.MaskedArray):
         raise TypeError(
-            f"{call}: {name} is a masked array, whose mask nothing here looks at; expected a plain NumPy array; pass "
-            f"its .filled(number), or its .data to use what is under the mask"
+            f"{call}: {name} is a masked array, whose mask would be ignored; expected a plain NumPy array; pass "
+            f"its .filled(number), or its .data to use the numbers under the mask"
         )
 
 
 def as_names(call: str, what: str, names: Any, such: tuple[str, ...]) -> tuple[str, ...]:
-    """One name, or an iterable of them, as a tuple; raise TypeError of anything else, showing ``such`` as one would."""
+    """Return one name, or an iterable of names, as a tuple.
+
+    Raises:
+        TypeError: ``names`` is anything else. The message names the ``call`` and the argument ``what``, and shows
+            ``such`` as an example.
+    """
     try:
-        found: tuple = (names,) if isinstance(names, str) else tuple(names)
+        listed: tuple = (names,) if isinstance(names, str) else tuple(names)
     except TypeError:
-        found = (None,)
-    if not all(isinstance(name, str) for name in found):
+        listed = (None,)
+    if not all(isinstance(name, str) for name in listed):
         raise TypeError(f"{call}: {what} is {names!r}; expected names, such as {such}")
-    return tuple(map(str, found))  # NumPy's are strings of a type of their own
+    return tuple(map(str, listed))  # NumPy's strings are of a subclass
 
 
 def is_bool(value: Any) -> bool:
-    """Whether a value is true or false, of Python, NumPy or torch; arrays of them too."""
+    """Return whether a value is a bool or an array of bools, of Python, NumPy or torch."""
     return isinstance(value, bool) or str(getattr(value, "dtype", "")).endswith("bool")
 
 
 def as_integer(value: Any) -> int | None:
-    """A whole number, of Python, NumPy or torch, as an int; None of anything else. A bool is none."""
+    """Return an integer of Python, NumPy or torch as an int; None for anything else, a bool included."""
     try:
         return operator.index(value) if not is_bool(value) and not getattr(value, "ndim", 0) else None
     except (TypeError, RuntimeError):  # RuntimeError: a tensor without memory
@@ -40,13 +48,14 @@ def as_integer(value: Any) -> int | None:
 
 
 class DirectedLoopError(ValueError):
-    """The edges contain a directed loop, so that (I - E)^-1 has no meaning as a sum over paths.
+    """The edges contain a directed loop, so that (I - E)^-1 is not a sum over paths.
 
-    Raised on topology, not on a determinant: two loops that share a node can have det(I - E) = -1 and still no
-    resolvent in the sense of the paper.
+    The test is one of topology, not of a determinant: two loops that share a node can have det(I - E) = -1, and still
+        have
+    no resolvent in the sense of the paper.
 
     Attributes:
-        cycle: nodes of one loop, each the parent of the next, the last the parent of the first.
+        cycle: the nodes of one loop. Each is the parent of the next, and the last is the parent of the first.
     """
 
     def __init__(self, call: str, cycle: list[int]):
@@ -62,7 +71,7 @@ class UnsupportedError(ValueError):
     """The model is valid, but holds something that this library does not represent.
 
     Attributes:
-        what: the thing that is not supported, by name.
+        what: the name of the unsupported thing.
     """
 
     def __init__(self, call: str, what: str, way_out: str = ""):

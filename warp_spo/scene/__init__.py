@@ -1,4 +1,4 @@
-"""What a user describes: bodies, hinges, loops, the tree that they form, and frames on bodies."""
+"""Scenes: bodies, hinges and loops that a user describes, the tree that they form, and frames on bodies."""
 
 from .parts import Body, Coupling, Hinge, Loop
 from .scene import Scene

@@ -1,4 +1,4 @@
-"""Bodies, hinges, loops and couplings: the values a scene is made of, with units, checked once and never repaired.
+"""Bodies, hinges, loops and couplings: the parts of a scene, with units; their values are checked, never repaired.
 
 Every hinge is one of three kinds of motion from its parent anchor to its child anchor:
 
@@ -60,10 +60,11 @@ def checked_array(call: str, name: str, value: Any, shape: tuple[int, ...]) -> n
 
 
 def real(value: Any) -> np.ndarray:
-    """A copy in float64: what the caller does to his later changes nothing.
+    """Return a copy of an array in float64, which later changes of the caller's array do not affect.
 
-    TypeError of text, None, complex numbers, what float64 does not reach, and torch tensors that require grad, in lists
-    too: nothing is differentiated through a copy.
+    Raises:
+        TypeError: ``value`` is or contains text, None, complex numbers, integers beyond float64, or torch tensors that
+            require grad, because no derivative passes through a copy.
     """
     try:
         array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
@@ -98,10 +99,11 @@ def _pose(call: str, name: str, value: Any) -> np.ndarray:
 class Body:
     """A rigid body.
 
-    An inertia whose largest principal moment exceeds the sum of the others is accepted, though no distribution of
-    positive mass has it: robot files are full of them, Mass stays positive definite and every formula holds as it is.
-    What is refused is what would make a kinetic energy negative. ``spo.load`` passes files through Newton, which
-    repairs such inertias, and names the bodies.
+    The largest principal moment of inertia may exceed the sum of the others, although no distribution of positive mass
+    has such an inertia: it is common in robot files, and the mass matrix stays positive definite. Values that would
+        make a
+    kinetic energy negative are refused. ``spo.load`` reads files through Newton, which repairs such inertias, and names
+    the bodies.
 
     Args:
         mass: [kg], not negative.
@@ -110,7 +112,7 @@ class Body:
         label: name in tables and errors.
 
     Raises:
-        ValueError: a value that no rigid body has.
+        ValueError: a value is invalid; the message names it.
         UnsupportedError: ``modes`` (flexible bodies) is reserved.
     """
 
@@ -133,10 +135,10 @@ class Body:
 
 
 def checked_inertia(call: str, inertia: np.ndarray) -> np.ndarray:
-    """``inertia`` [..., 3, 3] less the rounding that its two triangles differ by; see :class:`Body` for what it may be.
+    """Return ``inertia`` [..., 3, 3] made exactly symmetric; see :class:`Body` for the values that it may have.
 
     Raises:
-        ValueError: it is not symmetric, or has a negative eigenvalue.
+        ValueError: the inertia is not symmetric up to rounding, or has a negative eigenvalue.
     """
     scale = np.abs(inertia).max(axis=(-1, -2))
     skew = np.abs(inertia - np.swapaxes(inertia, -1, -2)).max(axis=(-1, -2))
@@ -150,7 +152,7 @@ def checked_inertia(call: str, inertia: np.ndarray) -> np.ndarray:
 
 
 def _axes(call: str, kind: str, axis: Any, linear: Any, angular: Any, pitch: float) -> list[Screw]:
-    """The screws of a hinge, inboard first."""
+    """Return the screws of a hinge, inboard first."""
 
     def rows(name: str, value: Any, counts: Sequence[int]) -> np.ndarray:
         refuse_masked(call, name, value)
@@ -209,7 +211,7 @@ def _axes(call: str, kind: str, axis: Any, linear: Any, angular: Any, pitch: flo
 
 
 def in_plane(normal: np.ndarray) -> np.ndarray:
-    """Two unit vectors (2, 3) whose cross product is the unit ``normal``; the first lies nearest to x or y."""
+    """Return two unit vectors (2, 3) whose cross product is the unit ``normal``; the first is nearest to x or y."""
     seed = np.eye(3)[0] if abs(normal[0]) < 0.9 else np.eye(3)[1]
     first = seed - normal * (seed @ normal)
     first /= np.linalg.norm(first)
@@ -254,7 +256,7 @@ class Hinge:
         label: name in tables and errors.
 
     Raises:
-        ValueError: a value that no hinge has, named.
+        ValueError: a value is invalid; the message names it.
         UnsupportedError: ``rotor`` (geared motors) is reserved.
     """
 
@@ -331,7 +333,7 @@ class Hinge:
 class Loop:
     """A hinge that closes a loop: it constrains two bodies and owns no entry of ``q`` and ``qd``.
 
-    Args: as those of :class:`Hinge`; ``parent`` may be -1, the inertial frame.
+    The arguments are those of :class:`Hinge`; ``parent`` may be -1, the inertial frame.
     """
 
     kind: str

@@ -1,7 +1,7 @@
-"""Scenes: a multibody system as plain float64 values, checked once and never repaired.
+"""Scenes: a multibody system as plain float64 values, which are checked once and never repaired.
 
-A scene is one world's topology and the values that may differ between worlds. Node k of the paper is body k here, its
-frame is the child anchor of the hinge that carries it, and the columns of H.T come in the order of ``qd``.
+A scene is the topology of one world, and values that may differ between worlds. Node k of the paper is body k. Its
+frame is the child anchor of the hinge that carries the body, and the columns of H.T are in the order of ``qd``.
 """
 
 from __future__ import annotations
@@ -33,13 +33,15 @@ NOT_NEGATIVE = ("body_mass", "joint_friction", "joint_effort_limit", "joint_velo
 
 
 def _refuse_negative(call: str, name: str, array: np.ndarray) -> None:
+    """Raise ValueError if a value that may not be negative is."""
     if name in NOT_NEGATIVE and array.size and array.min() < 0.0:
         raise ValueError(f"{call}: {name} holds {array.min()}; expected zero or more")
 
 
-def _parts(name: str, given: Any, kind: type) -> tuple:
-    parts = tuple(given) if isinstance(given, Iterable) else (given,)
-    if not isinstance(given, Iterable) or not all(isinstance(part, kind) for part in parts):
+def _parts(name: str, value: Any, kind: type) -> tuple:
+    """Return a list of parts as a tuple; raise TypeError if one is not of type ``kind``."""
+    parts = tuple(value) if isinstance(value, Iterable) else (value,)
+    if not isinstance(value, Iterable) or not all(isinstance(part, kind) for part in parts):
         came = ", ".join(sorted({type(part).__name__ for part in parts}))
         raise TypeError(f"Scene: {name} holds {came}; expected a list of {kind.__name__}")
     return parts
@@ -48,18 +50,18 @@ def _parts(name: str, given: Any, kind: type) -> tuple:
 class Scene:
     """A multibody system: a forest of bodies, and the values that kernels read.
 
-    Values are checked and never repaired. Masses and principal moments may be zero, of any ratio, and break the
-    triangle inequality (see :class:`Body`); below zero they are refused.
+    The constructor checks values and never repairs them. Masses and principal moments may be zero, may have any ratio,
+    and need not satisfy the triangle inequality (see :class:`Body`), but may not be negative.
 
     Args:
-        bodies: body k is node k.
-        hinges: one for each body, in the order of ``q``; any order, any numbering of the bodies.
+        bodies: the bodies; body k is node k.
+        hinges: one hinge for each body. Their order is that of ``q``, whatever the numbering of the bodies.
         gravity: acceleration of a falling body [m/s^2], inertial axes, shape (3,).
-        loops: hinges beyond the tree; :class:`Dynamics` asks what to do with them.
-        couplings: mimics.
+        loops: hinges that close loops of the tree; ``loops=`` of :class:`Dynamics` says what to do with them.
+        couplings: linear relations between two coordinates.
 
     Attributes:
-        bodies, hinges, loops, couplings: as given; :meth:`with_values` changes ``values`` alone.
+        bodies, hinges, loops, couplings: the arguments; :meth:`with_values` changes only ``values``.
         tree: the :class:`Tree` over the bodies.
         hinge_of: index of the hinge that carries each body [body].
         q_start, qd_start: first entry of q and qd of each hinge, and the total at the end [hinge + 1].
@@ -72,8 +74,9 @@ class Scene:
         q_index, dof_index: entries [worlds, n] of the source model's flat joint_q and joint_qd.
 
     Raises:
-        ValueError: indices that make no forest, or values that no scene has.
-        DirectedLoopError: hinges whose parents form a directed loop.
+        ValueError: the indices do not form a forest, or a value is invalid.
+        TypeError: a list holds something else, or an index is not an integer.
+        DirectedLoopError: the parents of hinges form a directed loop.
     """
 
     def __init__(
@@ -120,6 +123,7 @@ class Scene:
 
     @staticmethod
     def _screws_of(hinge: Hinge) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the axes [dof, 3], and radians and metres per unit of each coordinate [dof]."""
         if hinge.motion == SCREWS:
             axes, angular, linear = (np.array([screw[i] for screw in hinge.screws]) for i in range(3))
             return axes.reshape(-1, 3), angular, linear
@@ -128,6 +132,7 @@ class Scene:
         return axes, angular, 1.0 - angular
 
     def _check_indices(self) -> None:
+        """Raise an error if hinges, loops and couplings do not name the right bodies and hinges."""
         count = len(self.bodies)
         if count == 0:
             raise ValueError("Scene: no bodies; expected one or more")
@@ -170,21 +175,22 @@ class Scene:
     # -- sizes and names -------------------------------------------------------------------------------------------
     @property
     def worlds(self) -> int:
-        """Worlds of the source model, or whose values the scene holds; a scene of one world serves any number."""
+        """The number of worlds of the source model or of the values; a scene of one world serves any number."""
         return max(array.shape[0] for array in (self.q_index, *self.values.values()))
 
     @property
     def body_count(self) -> int:
+        """The number of bodies."""
         return len(self.bodies)
 
     @property
     def coord_count(self) -> int:
-        """Length of one world's q."""
+        """The length of one world's q."""
         return int(self.q_start[-1])
 
     @property
     def dof_count(self) -> int:
-        """Length of one world's qd."""
+        """The length of one world's qd."""
         return int(self.qd_start[-1])
 
     @property
@@ -194,19 +200,22 @@ class Scene:
 
     @property
     def hinge_sizes(self) -> tuple[int, ...]:
-        """The paper's r_k, by node: degrees of freedom of the hinge that carries it."""
+        """The paper's r_k, by node: the degrees of freedom of the hinge that carries the node."""
         return tuple(self.hinges[h].dof_count for h in self.hinge_of)
 
     @property
     def body_labels(self) -> list[str]:
+        """The label of every body; body_k where there is none."""
         return [body.label or f"body_{k}" for k, body in enumerate(self.bodies)]
 
     @property
     def joint_labels(self) -> list[str]:
+        """The label of every hinge; joint_k where there is none."""
         return [hinge.label or f"joint_{k}" for k, hinge in enumerate(self.hinges)]
 
     @property
     def dof_labels(self) -> list[str]:
+        """The label of every entry of qd: the hinge's label, with :0, :1, ... where the hinge has several."""
         return [
             label if hinge.dof_count == 1 else f"{label}:{i}"
             for label, hinge in zip(self.joint_labels, self.hinges, strict=True)
@@ -215,7 +224,7 @@ class Scene:
 
     @property
     def ties(self) -> str:
-        """What holds beyond the tree, in words: loop joints and couplings; empty if there is nothing."""
+        """A list in words of the loop joints and couplings, for messages; empty if there are none."""
         loops = [loop.label or f"body {loop.parent} to body {loop.child}" for loop in self.loops]
         labels = self.joint_labels
         couplings = [f"{labels[c.hinge]} follows {labels[c.reference]}" for c in self.couplings]
@@ -224,7 +233,7 @@ class Scene:
 
     @property
     def neutral_q(self) -> np.ndarray:
-        """Coordinates at which every hinge's anchors coincide [coordinate]: zeros and identity quaternions."""
+        """The q at which the anchors of every hinge coincide [coordinate]: zeros and identity quaternions."""
         q = np.zeros(self.coord_count)
         for hinge, start in zip(self.hinges, self.q_start, strict=False):
             if hinge.motion != SCREWS:
@@ -232,10 +241,10 @@ class Scene:
         return q
 
     def with_values(self, **values: Any) -> Scene:
-        """A copy with some of ``values`` replaced, [...] for all worlds or [worlds, ...] for each.
+        """Return a copy of the scene with other ``values``, [...] for all worlds or [worlds, ...] for each world.
 
         Raises:
-            ValueError: an unknown name, a wrong shape, numbers that are not finite, or unequal world counts.
+            ValueError: a name is unknown, a shape is wrong, numbers are not finite, or world counts differ.
         """
         scene = object.__new__(Scene)
         scene.__dict__.update(self.__dict__)
@@ -251,7 +260,7 @@ class Scene:
         return scene
 
     def check_value(self, call: str, name: str, value: Any) -> np.ndarray:
-        """``value`` as a float64 array [1 or worlds, ...], if it is one that ``values[name]`` can be."""
+        """Return ``value`` as a checked float64 array [1 or worlds, ...] for ``values[name]``; ValueError otherwise."""
         if name not in self.values:
             raise ValueError(f"{call}: unknown value {name!r}; expected one of {', '.join(sorted(self.values))}")
         shape = self.values[name].shape[1:]

@@ -1,7 +1,8 @@
 """Directed graphs and trees: the topology that every sweep follows (Jain, section II).
 
-An edge runs from a parent to a child. The inertial frame is not a node: a node without a parent is a child of it, so a
-``Tree`` may have several roots. A ``Digraph`` may give a node several parents; neither may hold a directed loop.
+An edge goes from a parent to a child. The inertial frame is not a node; a node without a parent is a child of it, so
+that a ``Tree`` may have several roots. In a ``Digraph``, a node may have several parents. Neither may contain a
+directed loop.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from ..errors import DirectedLoopError, as_integer
 
 
 def _index(call: str, what: str, value: Any, low: int, high: int) -> int:
+    """Return a checked integer from ``low`` to ``high - 1``."""
     index = as_integer(value)
     if index is None:
         raise TypeError(f"{call}: {what} is {value!r}; expected an integer")
@@ -25,6 +27,7 @@ def _index(call: str, what: str, value: Any, low: int, high: int) -> int:
 
 
 def _checked_edges(call: str, edges: Iterable, nodes: Any, lowest_parent: int) -> tuple[list[tuple[int, int]], int]:
+    """Return the checked (parent, child) pairs and the number of nodes."""
     if not isinstance(edges, Iterable):
         raise TypeError(f"{call}: edges is {edges!r}; expected a list of (parent, child)")
     pairs = []
@@ -44,7 +47,7 @@ def _checked_edges(call: str, edges: Iterable, nodes: Any, lowest_parent: int) -
 
 
 def _find_loop(edges: Sequence[tuple[int, int]], among: set[int]) -> list[int]:
-    """A directed loop among nodes each of which has a parent among them, parents first."""
+    """Return the nodes of a directed loop, parents first; every node of ``among`` has a parent in ``among``."""
     parent_of = {child: parent for parent, child in reversed(edges) if parent in among and child in among}
     node, seen = min(among), []
     while node not in seen:
@@ -63,11 +66,11 @@ class Digraph:
     Attributes:
         node_count: number of nodes.
         edges: the edges, in the order given.
-        levels: nodes by the length of the longest path from a root, so that parents come in earlier levels.
+        levels: the nodes by the length of the longest path from a root, so that parents are in earlier levels.
 
     Raises:
         DirectedLoopError: the edges contain a directed loop.
-        ValueError, TypeError: an edge or a count that is none.
+        ValueError, TypeError: an edge or the number of nodes is invalid.
     """
 
     def __init__(self, edges: Iterable, nodes: int | None = None):
@@ -77,11 +80,11 @@ class Digraph:
 
     @property
     def depth(self) -> int:
-        """Edges on the longest path."""
+        """The number of edges on the longest path."""
         return len(self.levels) - 1
 
     def adjacency(self) -> np.ndarray:
-        """S of eq. 2, [node, node]: entry [i, j] counts the edges from i to its child j."""
+        """Return S of eq. 2, [node, node]: entry [i, j] is the number of edges from i to its child j."""
         matrix = np.zeros((self.node_count, self.node_count), dtype=np.int64)
         for parent, child in self.edges:
             matrix[parent, child] += 1
@@ -98,6 +101,7 @@ class Digraph:
 
 
 def _levels(call: str, edges: Sequence[tuple[int, int]], count: int) -> tuple[tuple[int, ...], ...]:
+    """Return the nodes by the length of the longest path from a root; DirectedLoopError if there is a loop."""
     children: list[list[int]] = [[] for _ in range(count)]
     waiting = [0] * count
     for parent, child in edges:
@@ -120,7 +124,7 @@ def _levels(call: str, edges: Sequence[tuple[int, int]], count: int) -> tuple[tu
 
 
 class Tree:
-    """A forest of rooted trees, in any numbering; frozen and hashable.
+    """A forest of rooted trees with any numbering of the nodes; immutable and hashable.
 
     Args:
         parent: parent of each node; -1 = child of the inertial frame.
@@ -135,7 +139,7 @@ class Tree:
 
     Raises:
         DirectedLoopError: the parents form a directed loop.
-        ValueError, TypeError: a parent that is no node.
+        ValueError, TypeError: a parent is not a node.
     """
 
     def __init__(self, parent: Sequence[int]):
@@ -166,23 +170,24 @@ class Tree:
     children: tuple[tuple[int, ...], ...]
 
     def __setattr__(self, name: str, value: object) -> None:
-        raise AttributeError(f"Tree.{name} cannot be set: a tree is frozen; build a new one")
+        raise AttributeError(f"Tree.{name} cannot be set, because a tree is immutable; build a new Tree instead")
 
     @classmethod
     def from_edges(cls, edges: Iterable, nodes: int | None = None) -> tuple[Tree, list[int]]:
-        """A spanning tree of a directed graph, and the edges that had to be cut.
+        """Return a spanning tree of a directed graph, and the edges that it cuts.
 
-        Breadth first from the inertial frame; among the edges that reach a node first, the earliest is kept.
+        The search is breadth first from the inertial frame; of the edges that reach a node first, the tree keeps the
+        earliest.
 
         Args:
             edges: (parent, child); parent -1 = the inertial frame. A node that no edge enters is a child of it.
             nodes: number of nodes; by default one more than the largest index.
 
         Returns:
-            the tree, and the indices of the cut edges, ascending.
+            The tree, and the indices of the cut edges in ascending order.
 
         Raises:
-            DirectedLoopError: nodes that no root reaches.
+            DirectedLoopError: there are nodes that no path from a root reaches.
         """
         pairs, count = _checked_edges("Tree.from_edges", edges, nodes, lowest_parent=-1)
         entered = {child for _, child in pairs}
@@ -207,11 +212,12 @@ class Tree:
 
     @property
     def depth(self) -> int:
+        """The number of edges on the longest path from a root."""
         return len(self.levels) - 1
 
     @functools.cached_property
     def _postorder(self) -> tuple[list[int], list[int]]:
-        """Number of each node in a depth-first postorder, and the smallest number in its subtree."""
+        """The number of each node in a depth-first postorder, and the smallest number in its subtree."""
         number, first, counter = [0] * self.node_count, [0] * self.node_count, 0
         for root in self.roots:
             stack = [(root, False)]
@@ -227,11 +233,11 @@ class Tree:
         return number, first
 
     def strictly_canonical(self) -> list[int]:
-        """New number of each node: parents above their children, serial segments numbered consecutively."""
+        """Return a new number for each node: parents above their children, the nodes of a segment consecutive."""
         return list(self._postorder[0])
 
     def canonical(self) -> list[int]:
-        """New number of each node: parents above their children, level by level (deepest lowest)."""
+        """Return a new number for each node: parents above their children, level by level, the deepest level lowest."""
         number = [0] * self.node_count
         for position, node in enumerate(node for level in reversed(self.levels) for node in level):
             number[node] = position
@@ -239,7 +245,7 @@ class Tree:
 
     @functools.cached_property
     def segments(self) -> tuple[tuple[int, ...], ...]:
-        """Maximal serial chains, each from inboard to outboard; every node lies in one."""
+        """The maximal serial chains, each from inboard to outboard; every node belongs to one chain."""
         segments = []
         for node in (node for level in self.levels for node in level):
             p = self.parent[node]
@@ -252,20 +258,23 @@ class Tree:
         return tuple(segments)
 
     def is_ancestor(self, i: int, j: int) -> bool:
-        """Whether a path leads from node i to node j; False for i = j."""
+        """Return whether a path leads from node i to node j; False for i = j."""
         i, j = (_index("Tree.is_ancestor", "a node", k, 0, self.node_count) for k in (i, j))
         number, first = self._postorder
         return first[i] <= number[j] < number[i]
 
     def lca(self, i: int, j: int) -> int:
-        """Lowest common ancestor, a node counting as its own; -1 if the inertial frame is the only one."""
+        """Return the lowest common ancestor of two nodes; -1 if the inertial frame is the only one.
+
+        A node counts as an ancestor of itself.
+        """
         i, j = (_index("Tree.lca", "a node", k, 0, self.node_count) for k in (i, j))
         while i >= 0 and i != j and not self.is_ancestor(i, j):
             i = self.parent[i]
         return i
 
     def adjacency(self) -> np.ndarray:
-        """S of eq. 2, [node, node]: entry [i, j] is 1 if j is a child of i."""
+        """Return S of eq. 2, [node, node]: entry [i, j] is 1 if j is a child of i."""
         matrix = np.zeros((self.node_count, self.node_count), dtype=np.int64)
         for p, k in self.edges:
             matrix[p, k] = 1
