@@ -1,4 +1,4 @@
-"""Newton's side of the border: scenes from its models and files, and time steps as one of its solvers."""
+"""Scenes from Newton's models and from robot files, and :class:`SolverSPO`, which steps a Newton model."""
 
 from .files import SHIPPED, load, shipped
 from .model import from_newton

@@ -1,4 +1,7 @@
-"""Scenes from robot files, read by Newton's importers; what these misread is refused, or put right first."""
+"""Scenes from URDF, MJCF and USD files, read by Newton's importers.
+
+Features that an importer reads wrongly are corrected before the import, or raise UnsupportedError.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +15,20 @@ import numpy as np
 
 from ..errors import UnsupportedError
 from ..scene.scene import Scene
-from .model import from_newton, host, names_of
+from .model import from_newton
 from .robot_files import (
     MISREAD,
+    find_misread,
     mjcf_gravity,
-    mjcf_misread,
+    mjcf_needs_meshes,
     mjcf_source,
     mjcf_tree,
-    mjcf_weighs_by_mesh,
     robot_format,
     urdf_source,
 )
+from .worlds import quote_labels, to_numpy
 
-REPAIR = 1e-5  # relative: an inertia that finalize moved by more was repaired, not rounded
+REPAIR = 1e-5  # relative change of a mass or inertia above which finalize() repaired it; float32 rounds by less
 
 SHIPPED = {
     "humanoid": "nv_humanoid.xml",
@@ -35,39 +39,41 @@ SHIPPED = {
 
 
 def shipped(name: str) -> Path:
-    """Path of a robot that comes with Newton: "humanoid", "ant", "quadruped" or "cartpole".
+    """Return the path of a robot file that comes with Newton: "humanoid", "ant", "quadruped" or "cartpole".
 
     Raises:
-        ValueError: another name.
+        ValueError: The name is none of these.
     """
     if name not in SHIPPED:
-        raise ValueError(f"shipped: unknown robot {name!r}; expected one of {', '.join(SHIPPED)}, or load(path)")
+        raise ValueError(
+            f"shipped: unknown robot {name!r}; expected one of {', '.join(SHIPPED)}; "
+            "call load(path) for a file of your own"
+        )
     return Path(newton.__file__).parent / "examples" / "assets" / SHIPPED[name]
 
 
-# -- a model -----------------------------------------------------------------------------------------------------------
+def load(path: str | os.PathLike[str], floating: bool | None = None) -> Scene:
+    """Return the scene of a robot file: URDF (.urdf), MJCF (.xml, .mjcf) or USD (.usd, .usda, .usdc, .usdz).
 
-
-def load(path: str | os.PathLike, floating: bool | None = None) -> Scene:
-    """The scene of a robot file: URDF (.urdf), MJCF (.xml, .mjcf) or USD (.usd, .usda, .usdc, .usdz).
-
-    Visuals and collision shapes are skipped, so meshes are read only where a body that moves takes its mass from them.
+    Visual and collision shapes are skipped. A mesh file is read only if a body that can move takes its mass from it.
 
     Args:
-        path: the file.
-        floating: whether the root body floats (True) or is fixed to the world (False); None: as the format says (URDF:
-            fixed, MJCF: as its joints say, USD: floating unless a joint holds it).
+        path: The robot file.
+        floating: Whether the root body floats (True) or is fixed to the world (False). None keeps the format's own
+            rule: a URDF root is fixed, an MJCF root has the joints that the file gives it, and a USD root floats unless
+            a joint fixes it.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: a suffix, or contents, that no importer reads.
-        ImportError: a package for meshes or USD is missing; names the extra that installs it.
-        UnsupportedError, DirectedLoopError: as :func:`from_newton`.
-        UnsupportedError: MJCF that Newton 1.8 misreads: in one body a slide after a hinge or joints with different
-            ``pos``, a joint's ``ref``, ``shellinertia`` where shapes give the mass, ``settotalmass``.
+        FileNotFoundError: There is no such file.
+        ValueError: No importer reads files with this suffix, or the file's contents.
+        ImportError: A package for meshes or USD is missing. The message names the extra that installs it.
+        UnsupportedError, DirectedLoopError: As :func:`from_newton`.
+        UnsupportedError: The MJCF file uses a feature that Newton 1.8 misreads, such as a slide after a hinge in one
+            body, joints of one body with different ``pos``, a joint's ``ref``, ``shellinertia`` where shapes give the
+            mass, or ``settotalmass``. The message says what to write instead.
 
     Warns:
-        UserWarning: Newton replaced a mass or an inertia that no rigid body has; names the bodies.
+        UserWarning: Newton replaced a mass or an inertia that no rigid body can have. The message names the bodies.
     """
     file = Path(path)
     importer = robot_format(file)
@@ -77,31 +83,31 @@ def load(path: str | os.PathLike, floating: bool | None = None) -> Scene:
         raise ValueError(f"load: {str(file)!r} is not XML: {error}; expected {importer.upper()}") from None
     except ImportError as error:
         extra = "usd" if importer == "usd" else "meshes"
-        reason = "USD" if importer == "usd" else "a body that moves has no <inertial>, and meshes that give its mass"
+        need = "USD files" if importer == "usd" else "the meshes that give the mass of a body without <inertial>"
         raise ImportError(
-            f"load: {str(file)!r} needs a package that is missing ({error}) to read {reason}; "
+            f"load: {str(file)!r} needs a package that is missing ({error}) to read {need}; "
             f"pip install warp_spo[{extra}]"
         ) from error
     return from_newton(_finalize(builder))
 
 
 def _finalize(builder: newton.ModelBuilder) -> newton.Model:
-    """The model on the CPU; a warning that names the bodies replaces Newton's, which counts them."""
+    """Return the model on the CPU, and name the bodies that were repaired in a warning; Newton's only counts them."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Inertia validation corrected", category=newton.NewtonWarning)
-        # from_newton checks the topology itself, and takes joints outside articulations, which USD files have
+        # from_newton checks the topology itself, and it accepts joints outside articulations, which USD files have.
         model = builder.finalize(device="cpu", skip_validation_joints=True)
     if builder.body_count == 0:
         return model
-    before, after = np.array(builder.body_inertia, dtype=np.float64).reshape(-1, 3, 3), host(model, "body_inertia")
+    before, after = np.array(builder.body_inertia, dtype=np.float64).reshape(-1, 3, 3), to_numpy(model, "body_inertia")
     scale = np.maximum(np.abs(before).max(axis=(1, 2)), np.finfo(np.float32).tiny)
     moved = np.abs(after - before).max(axis=(1, 2)) > REPAIR * scale
-    moved |= ~np.isclose(builder.body_mass, host(model, "body_mass"), rtol=REPAIR, atol=0.0)
+    moved |= ~np.isclose(builder.body_mass, to_numpy(model, "body_mass"), rtol=REPAIR, atol=0.0)
     if moved.any():
-        names = names_of([builder.body_label[body] for body in np.flatnonzero(moved)])
+        names = quote_labels([builder.body_label[body] for body in np.flatnonzero(moved)])
         warnings.warn(
-            f"load: Newton replaced the mass or inertia of {names}: as written no rigid body has them "
-            "(negative, or one principal moment above the sum of the others); correct the file",
+            f"load: Newton replaced the mass or inertia of {names}: the file's values are those of no rigid body "
+            "(negative, or one principal moment exceeds the sum of the others); correct the file",
             UserWarning,
             stacklevel=3,
         )
@@ -116,21 +122,21 @@ def _read_urdf(file: Path, floating: bool | None) -> newton.ModelBuilder:
 
 def _read_mjcf(file: Path, floating: bool | None) -> newton.ModelBuilder:
     root = mjcf_tree(file)
-    misread = mjcf_misread(root, floating)
+    misread = find_misread(root, floating)
     if misread:
         features = [
-            f"{feature} ({'class' if '<default>' in feature else 'body'} {names_of(where)})"
+            f"{feature} ({'class' if '<default>' in feature else 'body'} {quote_labels(where)})"
             for feature, where in misread.items()
         ]
         ways_out = dict.fromkeys(MISREAD[feature] for feature in misread)
         raise UnsupportedError("load", f"{str(file)!r} with {', '.join(features)}", "; ".join(ways_out))
 
-    source, weighs_by_mesh = mjcf_source(file, root), mjcf_weighs_by_mesh(root)
-    if weighs_by_mesh and source != str(file):
+    source, needs_meshes = mjcf_source(file, root), mjcf_needs_meshes(root)
+    if needs_meshes and source != str(file):
         raise UnsupportedError(
             "load",
             f"{str(file)!r} with a default class 'main' beside masses from meshes",
-            "remove class='main', which is what the outermost <default> is, or write the <inertial> of each body",
+            "remove class='main', which the outermost <default> has anyway, or write the <inertial> of each body",
         )
 
     def import_with(parse_mujoco_options: bool) -> newton.ModelBuilder:
@@ -139,7 +145,7 @@ def _read_mjcf(file: Path, floating: bool | None) -> newton.ModelBuilder:
             source,
             floating=floating,
             parse_visuals=False,
-            parse_meshes=weighs_by_mesh,
+            parse_meshes=needs_meshes,
             parse_mujoco_options=parse_mujoco_options,
         )
         return builder
@@ -147,12 +153,12 @@ def _read_mjcf(file: Path, floating: bool | None) -> newton.ModelBuilder:
     try:
         builder = import_with(parse_mujoco_options=True)
     except ValueError as error:
-        # gymnasium's solver="pgs" is one of MuJoCo's options that Newton 1.8 cannot read; a scene has no such options
+        # Newton 1.8 cannot read some of MuJoCo's options, such as gymnasium's solver="pgs"; a scene needs none of them.
         try:
             builder = import_with(parse_mujoco_options=False)
         except ValueError:
             raise error from None
-    gravity = mjcf_gravity(root)  # which Newton 1.8 does not read
+    gravity = mjcf_gravity(root)  # Newton 1.8 does not read it
     if gravity is not None:
         builder.gravity = gravity
     return builder

@@ -1,6 +1,6 @@
-"""SolverSPO for Isaac Lab: what its Newton manager asks of a solver, without importing Isaac Lab.
+"""SolverSPO as a solver of Isaac Lab's Newton manager.
 
-Isaac Lab's classes are handed in, because they need a simulator to be imported::
+Isaac Lab's classes are arguments here, because importing them needs a running simulator::
 
     from isaaclab_newton.physics import NewtonManager, NewtonSolverCfg
     Manager, Cfg = adapter(NewtonManager, NewtonSolverCfg)
@@ -16,7 +16,7 @@ from .solver import DEFAULT_VARIABLE, SolverSPO
 
 @dataclasses.dataclass
 class Options:
-    """Fields of the configuration, as :class:`SolverSPO` takes them."""
+    """The options of :class:`SolverSPO` as fields of Isaac Lab's configuration."""
 
     variable: tuple[str, ...] = DEFAULT_VARIABLE
     loops: str = "raise"
@@ -25,10 +25,18 @@ class Options:
 
 
 def adapter(manager: Any, configuration: Any) -> tuple[type, type]:
-    """A manager and its configuration, subclasses of Isaac Lab's NewtonManager and NewtonSolverCfg."""
+    """Return subclasses of Isaac Lab's NewtonManager and NewtonSolverCfg whose solver is SolverSPO.
+
+    Args:
+        manager: Isaac Lab's class ``NewtonManager``.
+        configuration: Isaac Lab's class ``NewtonSolverCfg``.
+
+    Returns:
+        The manager's class and the configuration's class.
+    """
 
     class NewtonSPOManager(manager):
-        """Isaac Lab's manager with SolverSPO in its four slots. A state steps in place; contacts are not computed."""
+        """Isaac Lab's manager with SolverSPO. It steps one state in place and computes no contacts."""
 
         @classmethod
         def _build_solver(cls, model: Any, solver_cfg: Any) -> None:
@@ -40,7 +48,7 @@ def adapter(manager: Any, configuration: Any) -> tuple[type, type]:
 
         @classmethod
         def _requires_initial_reset_before_graph_capture(cls) -> bool:
-            return False  # the constructor compiles and allocates everything
+            return False  # the solver's constructor has compiled and allocated everything
 
     class SPOSolverCfg(Options, configuration):
         """Configuration of SolverSPO."""

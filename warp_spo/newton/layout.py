@@ -1,4 +1,4 @@
-"""Newton's flat arrays of all worlds, seen as [world, ...] without a copy where they are laid out so."""
+"""Newton's flat arrays of all worlds as arrays [world, ...], without a copy where the memory is laid out that way."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ from ..kernels import exchange
 
 
 class Layout:
-    """Which entries of a flat array are ours.
+    """The entries of a flat array that belong to the scene.
 
     Args:
-        rows: [world, n], rows of the model's array. shape: of one world, n rows of components.
-        like: the model's array; those that come later are of its size.
+        rows: Rows of the model's array that belong to each world [world, n].
+        shape: Shape of the scene's array for one world: n rows and their components.
+        device: Where the arrays are.
+        like: The model's array. Arrays that are read or written later must have its size.
     """
 
     def __init__(self, rows: np.ndarray, shape: tuple[int, ...], device: wp.Device, like: Any):
@@ -30,13 +32,13 @@ class Layout:
         self._buffers: dict[str, wp.array] = {}
 
     def buffer(self, name: str) -> wp.array:
-        """An array of our own, made at the first request."""
+        """Return the solver's own array [world, ...] of that name, allocated at the first call."""
         if name not in self._buffers:
             self._buffers[name] = wp.zeros(self.shape, dtype=wp.float32, device=self.device)
         return self._buffers[name]
 
     def read(self, flat: Any, name: str) -> wp.array:
-        """The entries as [world, ...]: a view, or gathered into the buffer of that name."""
+        """Return the entries of ``flat`` as [world, ...]: a view of it, or the buffer ``name`` with a copy of them."""
         self._check(flat, name)
         if self.plain:
             return view(flat.ptr, self.shape, wp.float32, self.device.alias)
@@ -45,23 +47,23 @@ class Layout:
         return out
 
     def target(self, flat: Any, name: str) -> wp.array:
-        """Where to write what :meth:`write` brings into ``flat``."""
+        """Return the array to fill before :meth:`write`: a view of ``flat``, or the buffer ``name``."""
         self._check(flat, name)
         return view(flat.ptr, self.shape, wp.float32, self.device.alias) if self.plain else self.buffer(name)
 
     def write(self, array: wp.array, flat: Any, mask: Any = None) -> None:
-        """Bring an array into a flat one, in the worlds of a ``mask``; nothing if it is there already."""
+        """Copy ``array`` [world, ...] into ``flat``, in the worlds of ``mask``; do nothing if it is a view of it."""
         if array.ptr != flat.ptr:
             self._launch(exchange.scatter, [self._index, mask, array.reshape(self._flat_shape)], _scalars(flat))
 
-    def scaled(self, array: wp.array, factor: wp.array, name: str) -> wp.array:
-        """``array`` with each entry of a world times its factor, in the buffer of that name."""
+    def scale(self, array: wp.array, factor: wp.array, name: str) -> wp.array:
+        """Return ``array`` [world, n] times ``factor`` [n], in the buffer ``name``."""
         out = self.buffer(name)
         self._launch(exchange.scale, [factor, array], out)
         return out
 
     def _check(self, flat: Any, name: str) -> None:
-        """Raise unless the memory of an array is what is read or written there: nothing behind it would be noticed."""
+        """Raise TypeError or ValueError unless the array's memory is as the model's; kernels read it by its address."""
         expected = f"a Warp array float32 of {self._count} numbers on {self.device}, as the model has it"
         if not isinstance(flat, wp.array):
             raise TypeError(f"SolverSPO: {name} is of type {type(flat).__name__}; expected {expected}")
@@ -69,7 +71,7 @@ class Layout:
         if count != self._count or scalar is not wp.float32 or flat.device != self.device or not flat.is_contiguous:
             strides = "" if flat.is_contiguous else " with strides"
             came = f"a Warp array {scalar.__name__} of {count} numbers on {flat.device}{strides}"
-            raise ValueError(f"SolverSPO: {name} is {came}; expected {expected}; take it from this solver's model")
+            raise ValueError(f"SolverSPO: {name} is {came}; expected {expected}; use an array of this solver's model")
 
     def _launch(self, factory: Any, inputs: list, out: wp.array) -> None:
         if self._index.size:
@@ -77,10 +79,11 @@ class Layout:
 
 
 def _scalars(flat: Any) -> wp.array:
-    """An array of vectors, matrices or transforms as one of its numbers."""
+    """Return an array of vectors, matrices or transforms as a flat array of its numbers."""
     return view(flat.ptr, (flat.size * _components(flat.dtype),), wp.float32, flat.device.alias)
 
 
 @functools.cache
 def _components(dtype: Any) -> int:
+    """Return the count of numbers in one entry."""
     return int(np.prod(getattr(dtype, "_shape_", ()) or (1,)))

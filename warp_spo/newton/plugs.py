@@ -1,4 +1,4 @@
-"""Where Newton asks a solver for its inertia: actuators, operational-space control, coupling of solvers."""
+"""The inertia of SolverSPO's robots for Newton's actuators, operational-space controllers and coupled solvers."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from ..dynamics.dynamics import Dynamics
 from ..errors import UnsupportedError
 from ..scene.frames import Frame
 from .layout import Layout
-from .model import host
+from .worlds import to_numpy
 
 
 class Plugs(CouplingInterface):
-    """What SolverSPO inherits."""
+    """Base class of SolverSPO with the methods by which other parts of Newton ask for its mass matrix."""
 
     model: newton.Model
     dynamics: Dynamics
     _q: Layout
 
     def solve_inverse(self, state: newton.State) -> Callable[[wp.array, wp.array], None]:
-        """``solve(x, y)``: x = Mass^-1 y at a state, armature included, both [world, dof] of the scene.
+        """Return ``solve(x, y)``, which writes x = Mass^-1 y at ``state``, armature included.
 
-        For ``newton.actuators.JointSpaceResponse``; ``dof_map`` is needed where loop joints own entries::
+        x and y are [world, dof] of the scene. The function is meant for ``newton.actuators.JointSpaceResponse``, which
+        needs ``dof_map`` if loop joints have entries in joint_qd::
 
             response.refresh_from_solve(solver.solve_inverse(state), dof_map=solver.dof_map)
         """
@@ -38,17 +39,19 @@ class Plugs(CouplingInterface):
 
     @property
     def dof_map(self) -> wp.array:
-        """The model's entry of joint_qd for each dof of the scene, int32 [world, dof]."""
+        """Entry of the model's joint_qd for each dof of the scene, int32 [world, dof]."""
         return wp.array(self.dynamics.scene.dof_index, dtype=wp.int32, device=self.model.device)
 
     def operational_space(self, state: newton.State, frame: Frame, inputs: Any) -> None:
-        """Fill ``jacobian_tool_world``, ``mass_matrix`` and ``gravity_force`` of a controller's inputs; None is left.
+        """Fill ``jacobian_tool_world``, ``mass_matrix`` and ``gravity_force`` of a controller's inputs.
 
-        For ``newton.controllers.ControllerOperationalSpaceModelFree`` that controls every dof of every world, one
-        robot a world. Launches only.
+        The method serves a ``newton.controllers.ControllerOperationalSpaceModelFree`` that controls every dof of every
+        world, one robot a world. It only launches kernels.
 
         Args:
-            frame: of the tool: a body's index or label, or (body, pose in the body).
+            state: The state at which they are computed.
+            frame: The tool's frame: a body's index or label, or (body, pose in the body).
+            inputs: The controller's inputs. A ``mass_matrix`` or ``gravity_force`` that is None stays None.
         """
         self._check_open("operational_space")
         dyn, q = self.dynamics, self._q.read(state.joint_q, "q")
@@ -61,17 +64,18 @@ class Plugs(CouplingInterface):
 
     # -- coupling --------------------------------------------------------------------------------------------------
     def coupling_effective_mass_refresh_flags(self) -> int:
-        """Flags after which effective masses are different."""
+        """Return the flags of ``notify_model_changed`` that change effective masses."""
         flags = ModelFlags.BODY_INERTIAL_PROPERTIES | ModelFlags.JOINT_PROPERTIES | ModelFlags.JOINT_DOF_PROPERTIES
         return int(flags | ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES)
 
     def coupling_supports_inertial_property_refresh(self) -> bool:
+        """Whether masses and inertias may change without rebuilding the solver."""
         return "body_mass" in self.dynamics.variable and "body_inertia" in self.dynamics.variable
 
     def coupling_eval_effective_mass(
         self, endpoint_kind: Any, endpoint_index: Any, endpoint_local_pos: Any, out: Any
     ) -> None:
-        """As :meth:`coupling_eval_effective_mass_block`, masses alone."""
+        """Compute the masses of :meth:`coupling_eval_effective_mass_block` without the inertias."""
         self.coupling_eval_effective_mass_block(endpoint_kind, endpoint_index, endpoint_local_pos, out)
 
     def coupling_eval_effective_mass_block(
@@ -82,32 +86,37 @@ class Plugs(CouplingInterface):
         out_mass: Any,
         out_inertia: Any = None,
     ) -> None:
-        """What points of bodies weigh to a force on them at ``model.joint_q``; on the host, outside of captures.
+        """Compute the effective mass and inertia of points of bodies at ``model.joint_q``, on the host.
 
-        The mass [kg] is 3 / trace(J Mass^-1 J*) of the point's linear Jacobian; infinite mobility is none: a point
-        that cannot move has mass 0, as Newton's particles and bodies that are fixed have. The inertia [kg m^2] is
-        (J Mass^-1 J*)^-1 of the body's rotation, in its own axes, where all three are free, and the body's own inertia,
-        its least, where they are not.
+        The mass [kg] is 3 / trace(J Mass^-1 J*) with the point's linear Jacobian J. A point that cannot move has mass
+        0, as fixed bodies and particles have in Newton. The inertia [kg m^2], in the body's axes, is (J Mass^-1 J*)^-1
+        with the body's angular Jacobian J. If the body cannot turn about all three axes it is the body's own inertia,
+        which is a lower bound. The method reads back from the device, so it cannot run inside a graph capture.
 
         Args:
-            endpoint_kind: int [n]; only 0, bodies. endpoint_index: the model's bodies [n].
-            endpoint_local_pos: from the CoM, body axes [m] [n, 3].
-            out_mass: [n]. out_inertia: [n, 3, 3] or None.
+            endpoint_kind: Kinds of the endpoints, int [n]; only 0, a body, is supported.
+            endpoint_index: The model's bodies, int [n].
+            endpoint_local_pos: Points from the CoM in body axes [n, 3] [m].
+            out_mass: Receives the masses [n].
+            out_inertia: Receives the inertias [n, 3, 3], or None.
 
         Raises:
-            ValueError: an endpoint that is no body.
+            ValueError: An endpoint is not a body.
         """
         self._check_open("coupling_eval_effective_mass_block")
         kinds, bodies = endpoint_kind.numpy(), endpoint_index.numpy()
         if kinds.any():
-            raise ValueError("SolverSPO: a coupling endpoint that is no body; expected kinds of BODY alone")
+            raise ValueError(
+                f"SolverSPO: a coupling endpoint of kind {kinds[kinds != 0][0]} is no body; expected kind 0 (BODY); "
+                "couple a point of a body"
+            )
         dyn, scene = self.dynamics, self.dynamics.scene
         q = self._q.read(self.model.joint_q, "coupled").numpy()
         frames = list(range(scene.body_count))
         J = dyn.jacobian(q, frames).astype(np.float64)
         poses, minv = dyn.body_poses(q), dyn.mass_matrix_inverse(q).astype(np.float64)
         at = {int(body): divmod(i, scene.body_count) for i, body in enumerate(self._body_rows.ravel())}
-        com, own = host(self.model, "body_com"), host(self.model, "body_inertia")
+        com, own = to_numpy(self.model, "body_com"), to_numpy(self.model, "body_inertia")
         mass, inertia = np.zeros(len(bodies), np.float32), own[bodies].astype(np.float32)
         for i, (body, place) in enumerate(zip(bodies, endpoint_local_pos.numpy(), strict=True)):
             world, k = at[int(body)]
@@ -124,14 +133,18 @@ class Plugs(CouplingInterface):
             out_inertia.assign(inertia)
 
     def _check_open(self, call: str) -> None:
-        """What these calls mean by the mass matrix is that of a tree."""
+        """Raise UnsupportedError if loops are closed: these calls compute with the mass matrix of the tree."""
         if self.dynamics.closed:
             what = f"loops={self.dynamics.loops!r}"
-            raise UnsupportedError(f"SolverSPO.{call}", what, "ask solver.dynamics, or a solver with loops='cut'")
+            raise UnsupportedError(
+                f"SolverSPO.{call}", what, "call solver.dynamics, or build the solver with loops='cut'"
+            )
 
     def coupling_prepare_proxy_contacts(self, *_: Any, **__: Any) -> Any:
-        """Refused: contacts are not computed."""
-        raise NotImplementedError("SolverSPO cannot be a proxy coupling destination: it takes no contacts")
+        """Raise NotImplementedError, because SolverSPO computes no contacts."""
+        raise NotImplementedError(
+            "SolverSPO cannot be a proxy coupling destination, because it takes no contacts; make it the source"
+        )
 
     coupling_rewind_proxy_body = coupling_rewind_proxy_particle = coupling_prepare_proxy_contacts
     coupling_harvest_proxy_wrenches = coupling_harvest_proxy_particle_forces = coupling_prepare_proxy_contacts

@@ -1,9 +1,9 @@
-"""Robot files before an importer reads them: which format they have, and what of them a scene needs.
+"""Robot files before an importer reads them: their format, and the parts of them that a scene needs.
 
-A scene has masses and hinges, no pictures and no contacts. URDF text is stripped of shapes that weigh nothing, so that
-neither their meshes nor a mesh library is asked for; an MJCF tree, its includes pasted in, is asked whether masses come
-from meshes, for the gravity that Newton's importer does not read, and for what it misreads, and is written anew where
-the importer would lose the default class "main". Nothing here imports it.
+A scene has masses and hinges, but no visual shapes and no contacts. From URDF text the shapes that give no mass are
+removed, so that their mesh files and a mesh library are not needed. An MJCF tree is searched, includes pasted in, for
+masses that come from meshes, for gravity, which Newton's importer does not read, and for features that it misreads. It
+is written anew where the importer would lose the default class "main". Nothing here imports Newton.
 """
 
 from __future__ import annotations
@@ -15,95 +15,97 @@ from collections.abc import Iterator
 from pathlib import Path
 
 FORMATS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf"} | dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "usd")
-"""Suffix, lower case -> format."""
+"""Format by suffix in lower case."""
 
 
 def robot_format(file: Path) -> str:
-    """Format of an existing robot file, by its suffix: "urdf", "mjcf" or "usd".
+    """Return the format of an existing robot file by its suffix: "urdf", "mjcf" or "usd".
 
     Raises:
-        ValueError: another suffix.
-        FileNotFoundError: no such file.
+        ValueError: The suffix is none of a robot file.
+        FileNotFoundError: There is no such file.
     """
     name = FORMATS.get(file.suffix.lower())
     if name is None:
         raise ValueError(f"load: {str(file)!r} ends in {file.suffix!r}; expected one of {', '.join(FORMATS)}")
     if not file.is_file():
         raise FileNotFoundError(
-            f"load: no file {str(file)!r} (from {os.getcwd()!r}); expected a path to a "
-            f"{name.upper()} file, or shipped(name) for one of Newton's"
+            f"load: no file {str(file)!r} (from {os.getcwd()!r}); expected the path of a "
+            f"{name.upper()} file; call shipped(name) for a robot that comes with Newton"
         )
     return name
 
 
 # -- URDF --------------------------------------------------------------------------------------------------------------
 def urdf_source(file: Path, floating: bool | None) -> str:
-    """What to hand to a URDF importer: the file's text without shapes that give no mass, or the path of the file.
+    """Return the source for a URDF importer: the file's text without shapes that give no mass, or the file's path.
 
-    A collision shape gives its link's mass where the link has no complete <inertial>. One that is a mesh is kept only
-    on a link that can move, itself or because the root does (``floating``). Text has no folder to find meshes in: if a
-    mesh is left, the result is the path.
+    A collision shape gives its link's mass if the link has no complete <inertial>. A mesh is kept only on a link that
+    can move, because of a joint of its own or because the root floats (``floating``). If a mesh is left, the result is
+    the path, because an importer that reads text has no folder in which to look for meshes.
 
     Raises:
-        ET.ParseError: the file is not XML.
+        ET.ParseError: The file is not XML.
     """
     robot = ET.parse(file).getroot()
-    held_by = _holders(robot)
+    fixed_to = _fixed_links(robot)
 
     def moves(name: str | None) -> bool:
-        while name in held_by:
-            name = held_by[name]
+        while name in fixed_to:
+            name = fixed_to[name]
             if name is None:
                 return True
         return bool(floating)
 
     for link in robot.findall("link"):
         inertial = link.find("inertial")
-        weighed = inertial is not None and inertial.find("mass") is not None and inertial.find("inertia") is not None
+        has_mass = inertial is not None and inertial.find("mass") is not None and inertial.find("inertia") is not None
         for shape in [*link.findall("visual"), *link.findall("collision")]:
-            weightless = shape.tag == "visual" or weighed
-            if weightless or (shape.find(".//mesh") is not None and not moves(link.get("name"))):
+            gives_no_mass = shape.tag == "visual" or has_mass
+            if gives_no_mass or (shape.find(".//mesh") is not None and not moves(link.get("name"))):
                 link.remove(shape)
     return str(file) if robot.find(".//mesh") is not None else ET.tostring(robot, encoding="unicode")
 
 
-def _holders(robot: ET.Element) -> dict[str | None, str | None]:
-    """Child link -> the link that holds it fast, None if the joint between them can move."""
-    held_by = {}
+def _fixed_links(robot: ET.Element) -> dict[str | None, str | None]:
+    """Return by child link the parent link if a fixed joint joins them, and None if their joint can move."""
+    fixed_to = {}
     for joint in robot.findall("joint"):
         parent, child = joint.find("parent"), joint.find("child")
         if parent is not None and child is not None:
-            held_by[child.get("link")] = parent.get("link") if joint.get("type") == "fixed" else None
-    return held_by
+            fixed_to[child.get("link")] = parent.get("link") if joint.get("type") == "fixed" else None
+    return fixed_to
 
 
 # -- MJCF --------------------------------------------------------------------------------------------------------------
 def mjcf_tree(file: Path) -> ET.Element:
-    """The XML tree of an MJCF file with the files that it includes pasted in.
+    """Return the XML tree of an MJCF file with the files that it includes pasted in.
 
     Raises:
-        ET.ParseError: the file, or one that it includes, is not XML.
-        ValueError: XML that is not MJCF.
+        ET.ParseError: The file, or a file that it includes, is not XML.
+        ValueError: The file is XML but not MJCF.
     """
-    root = _included(file, file.parent)
+    root = _read_with_includes(file, file.parent)
     if root.tag not in ("mujoco", "mujocoinclude"):
-        raise ValueError(f"load: {str(file)!r} holds <{root.tag}>; expected <mujoco>, or a suffix that fits")
+        raise ValueError(
+            f"load: {str(file)!r} holds <{root.tag}>; expected <mujoco>; if it is URDF, let its name end in .urdf"
+        )
     return root
 
 
-def _included(file: Path, folder: Path, above: tuple[Path, ...] = ()) -> ET.Element:
-    """As :func:`mjcf_tree`; paths are relative to ``folder``, and ``above`` are the files that include this one."""
+def _read_with_includes(file: Path, folder: Path, above: tuple[Path, ...] = ()) -> ET.Element:
+    """Return the tree of ``file``. Paths in it are relative to ``folder``; the files ``above`` include this one."""
     root = ET.parse(file).getroot()
     for parent in list(root.iter()):
         for index, child in reversed(list(enumerate(parent))):
             included = folder / child.get("file", "") if child.tag == "include" else None
             if included is not None and included.is_file() and included not in above:
-                parent[index : index + 1] = list(_included(included, folder, (*above, included)))
+                parent[index : index + 1] = list(_read_with_includes(included, folder, (*above, included)))
     return root
 
 
-def mjcf_weighs_by_mesh(root: ET.Element) -> bool:
-    """Whether a body of the MJCF tree takes its mass from meshes: it has some and no <inertial>."""
+def mjcf_needs_meshes(root: ET.Element) -> bool:
+    """Whether a body of the MJCF tree takes its mass from meshes: it has a mesh and no <inertial>."""
 
     def shapes(element: ET.Element) -> list[ET.Element]:
         frames = [shape for frame in element.findall("frame") for shape in shapes(frame)]
@@ -117,7 +119,7 @@ def mjcf_weighs_by_mesh(root: ET.Element) -> bool:
 
 
 def mjcf_gravity(root: ET.Element) -> list[float] | None:
-    """Gravity [m/s^2] that the MJCF tree sets, the last one if several; None if it sets none."""
+    """Return the gravity [m/s^2] that the MJCF tree sets, the last one if there are several, None if there is none."""
     if root.find("option/flag[@gravity='disable']") is not None:
         return [0.0, 0.0, 0.0]
     options = root.findall("option[@gravity]")
@@ -125,12 +127,12 @@ def mjcf_gravity(root: ET.Element) -> list[float] | None:
 
 
 def mjcf_source(file: Path, root: ET.Element) -> str:
-    """What to hand to an MJCF importer: the path of the file, or its text with "main" as a class like others.
+    """Return the source for an MJCF importer: the path of the file, or text in which "main" is a class like others.
 
-    Newton 1.8 takes the outermost <default> for everybody's only if it has no class, and then knows no class "main" by
-    which an element may step out of its childclass. In the text there is one outermost <default> without a class, in
-    which everything is that stands in those of the file, and an empty class "main" in it. Text has no folder to find
-    meshes in.
+    Newton 1.8 applies the outermost <default> to all elements only if it has no class, and then it has no class "main"
+    by which an element could opt out of its childclass. The text has one outermost <default> without a class, which
+    holds the elements of all those in the file, and an empty class "main" inside it. An importer that reads text has no
+    folder in which to look for meshes.
     """
     named = any(default.get("class") == "main" for default in root.findall("default"))
     asked = any("main" in (element.get("class"), element.get("childclass")) for element in root.iter())
@@ -165,26 +167,27 @@ MISREAD = {
     "a root joint's pos under floating=False": "load it with floating=None, and make the root's hinge fixed",
     "an outermost <default> with a class of its own": "remove its class, or name it main",
 }
-"""What Newton 1.8's importer reads wrongly without a word -> a way out."""
+"""Features that Newton 1.8's importer reads wrongly without a warning, and what to write instead."""
 
 
-def mjcf_misread(root: ET.Element, floating: bool | None) -> dict[str, list[str]]:
-    """The keys of :data:`MISREAD` that change the robot of the MJCF tree -> the bodies, or classes, that use them.
+def find_misread(root: ET.Element, floating: bool | None) -> dict[str, list[str]]:
+    """Return the keys of :data:`MISREAD` that the MJCF tree uses, each with the bodies, or classes, that use it.
 
-    One hinge stands for all joints of a body: it slides before it turns, and about the first joint's ``pos``. A slide's
-    own ``pos`` changes nothing, nor do the joints of a root body if ``floating`` replaces them, but that a fixed base
-    stands at the first joint's ``pos``. Joints and inertials in a frame, and what a <replicate> holds, are lost.
+    Newton makes one joint of all joints of a body. It slides before it turns, and it turns about the first joint's
+    ``pos``. A slide's own ``pos`` changes nothing. The joints of a root body change nothing if ``floating`` replaces
+    them, except that a fixed base stands at the first joint's ``pos``. Newton ignores joints and inertials inside a
+    <frame>, and everything inside a <replicate>.
     """
     compiler = {name: value for element in root.iter("compiler") for name, value in element.items()}
     by_geom = compiler.get("inertiafromgeom", "auto")
     low, high = (int(group) for group in compiler.get("inertiagrouprange", "0 5").split())
     classes = _mjcf_classes(root)
     found: dict[str, list[str]] = {feature: [] for feature in MISREAD}
-    slide_after, anchors, ref, shell, total, framed, replicated, fixed_at, renamed = found.values()
-    renamed += [d.get("class", "") for d in root.findall("default") if d.get("class", "main") != "main"]
+    slide_after, anchors, ref, shell, total, in_frame, in_replicate, base_pos, other_class = found.values()
+    other_class += [d.get("class", "") for d in root.findall("default") if d.get("class", "main") != "main"]
     rescaled = float(compiler.get("settotalmass", -1)) > 0.0
 
-    def weighs(geom: dict[str, str]) -> bool:
+    def gives_mass(geom: dict[str, str]) -> bool:
         solid = geom.get("type", "sphere") in SOLIDS and low <= int(geom.get("group", 0)) <= high
         return solid and float(geom.get("mass", geom.get("density", 1000))) != 0.0
 
@@ -192,14 +195,14 @@ def mjcf_misread(root: ET.Element, floating: bool | None) -> dict[str, list[str]
         members = list(_mjcf_members(holder, childclass))
         tags = {child.tag for child, _ in members}
         copies = [child for child, _ in members if child.tag == "replicate"]
-        weighed_by_geoms = by_geom == "true" or (by_geom == "auto" and "inertial" not in tags)
-        counted = ["body", "joint", "geom"] if holder.tag == "body" and weighed_by_geoms else ["body", "joint"]
+        mass_from_geoms = by_geom == "true" or (by_geom == "auto" and "inertial" not in tags)
+        counted = ["body", "joint", "geom"] if holder.tag == "body" and mass_from_geoms else ["body", "joint"]
         if any(c.find(f".//{tag}") is not None for c in copies for tag in counted):
-            replicated.append(label)
+            in_replicate.append(label)
         if holder.tag == "body":
             lost = {child.tag for frame in holder.findall("frame") for child, _ in _mjcf_members(frame, childclass)}
             if (lost & {"joint", "freejoint"} and not replaced) or ("inertial" in lost and by_geom != "true"):
-                framed.append(label)
+                in_frame.append(label)
             joints, geoms = (
                 [
                     classes.get(child.get("class", default), {}).get(tag, {}) | child.attrib
@@ -212,15 +215,15 @@ def mjcf_misread(root: ET.Element, floating: bool | None) -> dict[str, list[str]
             turns = [i for i, kind in enumerate(kinds) if kind in ("hinge", "ball")]
             pos = [[float(x) for x in joint.get("pos", "0 0 0").split()] for joint in joints]
             if replaced and floating is False and pos and any(pos[0]):
-                fixed_at.append(label)
+                base_pos.append(label)
             if turns and "slide" in kinds[turns[0] :]:
                 slide_after.append(label)
             if any(pos[i] != pos[0] for i in turns):
                 anchors.append(label)
             if any(k in ("hinge", "slide") and float(j.get("ref", 0)) for k, j in zip(kinds, joints, strict=False)):
                 ref.append(label)
-            if weighed_by_geoms:
-                if any(geom.get("shellinertia") == "true" and weighs(geom) for geom in geoms):
+            if mass_from_geoms:
+                if any(geom.get("shellinertia") == "true" and gives_mass(geom) for geom in geoms):
                     shell.append(label)
             if rescaled:
                 total.append(label)
@@ -235,7 +238,7 @@ def mjcf_misread(root: ET.Element, floating: bool | None) -> dict[str, list[str]
 
 
 def _mjcf_classes(root: ET.Element) -> dict[str, dict[str, dict[str, str]]]:
-    """Default class, "main" for the outermost -> tag -> attributes."""
+    """Return the attributes by default class and tag; the outermost class is "main"."""
     classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
 
     def read(default: ET.Element, name: str, outer: str) -> None:
@@ -253,7 +256,7 @@ def _mjcf_classes(root: ET.Element) -> dict[str, dict[str, dict[str, str]]]:
 
 
 def _mjcf_members(holder: ET.Element, childclass: str) -> Iterator[tuple[ET.Element, str]]:
-    """Children of a body, those of its frames included, and the default class that they inherit."""
+    """Yield the children of a body, those of its frames included, each with the default class that it inherits."""
     childclass = holder.get("childclass", childclass)
     for child in holder:
         if child.tag == "frame":

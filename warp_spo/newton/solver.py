@@ -1,4 +1,4 @@
-"""Newton's solver: a whole implicit step of every articulation, see :meth:`warp_spo.Dynamics.step`."""
+"""SolverSPO: a Newton solver that advances all articulations by implicit steps, see :meth:`warp_spo.Dynamics.step`."""
 
 from __future__ import annotations
 
@@ -10,19 +10,22 @@ from typing import Any, ClassVar
 import newton
 import numpy as np
 import warp as wp
-from newton import JointTargetMode, ModelFlags, StateFlags
+from newton import ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
 from ..dynamics.dynamics import Dynamics
 from ..dynamics.steps import INTEGRATORS
 from ..errors import UnsupportedError, as_integer, as_names
 from ..kernels import declare, exchange
-from ..scene.parts import DOF_VALUES, FREE
-from ..scene.scene import Scene
+from ..scene.parts import DOF_VALUES
+from .drives import GAINS, Drives
+from .joint_forces import JointForces, Layouts
 from .layout import Layout
 from .loop_joints import check_loop_joints
-from .model import Worlds, from_newton, host
+from .model import from_newton
+from .model_arrays import ModelArrays, check_flags_in_capture, flag_of_name, names_of_flags
 from .plugs import Plugs
+from .worlds import Worlds, to_numpy
 
 DEFAULT_VARIABLE = (
     "body_mass",
@@ -34,26 +37,12 @@ DEFAULT_VARIABLE = (
     "joint_target_kd",
     "gravity",
 )
-GAINS = ("joint_target_ke", "joint_target_kd")
-FORCE_VALUES = tuple(name for name in DOF_VALUES if name != "joint_armature")
-FLAGS = {
-    ModelFlags.BODY_INERTIAL_PROPERTIES: ("body_mass", "body_com", "body_inertia"),
-    ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES: ("joint_armature",),
-    ModelFlags.JOINT_DOF_FORCE_PROPERTIES: (*FORCE_VALUES, "joint_target_mode"),
-    ModelFlags.JOINT_REFERENCE_POSE_PROPERTIES: ("joint_rest_q",),
-    ModelFlags.JOINT_DOF_PROPERTIES: (*DOF_VALUES, "joint_target_mode", "joint_rest_q"),
-    ModelFlags.JOINT_PROPERTIES: ("joint_X_p", "joint_X_c", "joint_axis"),
-    ModelFlags.CONSTRAINT_PROPERTIES: ("joint_mimic_coeffs",),
-    ModelFlags.MODEL_PROPERTIES: ("gravity",),
-}
-"""Arrays of the model that each flag speaks of. Flags that are not here speak of nothing that a step depends on."""
-WATCHED = tuple(dict.fromkeys(name for names in FLAGS.values() for name in names))
-CLOSING_STEPS = 8  # Newton's steps onto the closures in a reset; each squares the error
+CLOSING_STEPS = 8  # iterations of Newton's method that close the loops in a reset; each squares the error
 
 
 @dataclasses.dataclass(eq=False)
 class Observables(SolverBase.Observables):
-    """What a step can tell beside the state."""
+    """Results of a step beside the state."""
 
     joint_qdd: Any = SolverBase.Observables.field(  # noqa: RUF009
         dtype=wp.float32, frequency=newton.Model.AttributeFrequency.JOINT_DOF
@@ -62,41 +51,43 @@ class Observables(SolverBase.Observables):
     status: Any = SolverBase.Observables.field(  # noqa: RUF009
         dtype=wp.int32, frequency=newton.Model.AttributeFrequency.WORLD
     )
-    """Whether the step can be trusted, 0 if so: the words of :meth:`warp_spo.Dynamics.step`, shape (world_count,)."""
+    """A :class:`warp_spo.Status` for each world, 0 if the step can be trusted, shape (world_count,)."""
 
 
 class SolverSPO(Plugs, SolverBase):
-    """Articulations in reduced coordinates, implicit in all that their joints do.
+    """A Newton solver for articulations in reduced coordinates, implicit in all forces of the joints.
 
-    Damping, springs, drives with their effort limits, position limits, dry friction and velocity limits, see
-    :meth:`warp_spo.Dynamics.step` for each law. ``joint_target_mode`` says which of a drive's gains count: POSITION
-    both, with a target velocity of zero; VELOCITY ``joint_target_kd``; POSITION_VELOCITY both; NONE and EFFORT neither.
-    A drive goes on beyond a position limit. BALL, FREE and DISTANCE joints have drives, and no position limits.
+    These forces are damping, springs, drives with their effort limits, position limits, dry friction and velocity
+    limits; :meth:`warp_spo.Dynamics.step` gives the law of each. ``joint_target_mode`` says which gains of a drive
+    count: POSITION uses both gains and a target velocity of zero, VELOCITY uses ``joint_target_kd``, POSITION_VELOCITY
+    uses both, NONE and EFFORT use neither. A drive also acts beyond a position limit. BALL, FREE and DISTANCE joints
+    may have drives, but no position limits.
 
     A step writes ``joint_q``, ``joint_qd``, ``body_q`` and ``body_qd`` of its second state, which may be the first. It
-    allocates nothing, reads nothing back and is bitwise repeatable; a CUDA graph may capture any number of them.
-    A world with a NaN is NaN alone.
+    allocates nothing, reads nothing back and is bitwise repeatable, and a CUDA graph may capture any number of steps. A
+    NaN in one world stays in that world.
 
-    Loop joints, which belong to no articulation, and mimics hold if ``loops`` says so, after every step to float32's
-    rounding. A loop joint is a constraint alone: its entries of joint_q and joint_qd stay as they are, as in Newton's
-    eval_ik, those of joint_f are not applied, and drives, springs, damping, friction, limits and armature of it are
-    refused. Bring a first state onto the closures with :meth:`reset`, or by hand with ``solver.dynamics.project``; a
-    step takes an open one there along the shortest way. The observable ``status`` is 7 where it did not get there.
+    Loop joints, which belong to no articulation, and mimics hold after every step to float32's rounding if ``loops`` is
+    "embed" or "multipliers". A loop joint can only be a constraint. Its entries of joint_q and joint_qd keep their
+    values, as in Newton's eval_ik. Its entries of joint_f are not applied. Drives, springs, damping, friction, limits
+    and armature of a loop joint raise UnsupportedError. Close the loops of a first state with :meth:`reset` or with
+    ``solver.dynamics.project``; a step moves an open state to the nearest closed one. The observable ``status`` is
+    ``Status.OPEN`` in worlds whose loops are still open after the step.
 
     Args:
-        model: finalized; all worlds have one topology. ``model.requires_grad`` is not looked at.
-        variable: names of arrays of the model that :meth:`notify_model_changed` refreshes by launches alone. All others
-            fold into the kernels.
-        loops: "raise": loop joints and mimics are refused, for the choice is yours. "embed": they hold, one sweep a
-            step. "multipliers": they hold by multipliers, see :meth:`warp_spo.Dynamics.step`. "cut": they stay open.
-        integrator: as :meth:`warp_spo.Dynamics.step`; "midpoint" and "rk4" give no observables.
-        granularity: as :class:`warp_spo.Dynamics`.
+        model: A finalized model whose worlds all have the same topology. ``model.requires_grad`` is ignored.
+        variable: Names of arrays of the model that :meth:`notify_model_changed` updates by launches alone. The values
+            of all other arrays are compiled into the kernels.
+        loops: "raise" raises an error if there are loop joints or mimics, because they need a choice. "embed" holds
+            them in one sweep a step. "multipliers" holds them by Lagrange multipliers, see
+            :meth:`warp_spo.Dynamics.step`. "cut" ignores them.
+        integrator: As in :meth:`warp_spo.Dynamics.step`. "midpoint" and "rk4" have no observables.
+        granularity: As in :class:`warp_spo.Dynamics`.
 
     Raises:
-        UnsupportedError: what :func:`warp_spo.from_newton` refuses, worlds that differ in topology among it, naming the
-            first difference; mimic joints with loops="raise"; loop joints with more than a constraint; particles;
-            position limits on BALL, FREE or DISTANCE joints.
-        ValueError: an unknown name or option, loop joints.
+        UnsupportedError: :func:`warp_spo.from_newton` cannot represent the model; mimic joints with loops="raise"; a
+            loop joint with forces of its own; particles; position limits on BALL, FREE or DISTANCE joints.
+        ValueError: A name or option is unknown, or there are loop joints with loops="raise".
     """
 
     Observables = Observables
@@ -120,12 +111,17 @@ class SolverSPO(Plugs, SolverBase):
         if integrator not in INTEGRATORS:
             raise ValueError(f"SolverSPO: integrator is {integrator!r}; expected one of {', '.join(INTEGRATORS)}")
         if model.particle_count:
-            raise UnsupportedError("SolverSPO", f"{model.particle_count} particles", "another solver for a model view")
+            raise UnsupportedError(
+                "SolverSPO",
+                f"{model.particle_count} particles",
+                "simulate them with another solver on a view of the model",
+            )
         self.integrator = integrator
         self._options: dict[str, Any] = {"loops": loops, "granularity": granularity}
         self._build()
 
     def _build(self) -> None:
+        """Compile and allocate everything for the model as it is now."""
         model = self.model
         scene = from_newton(model)
         if scene.couplings and self._options["loops"] == "raise":
@@ -134,29 +130,18 @@ class SolverSPO(Plugs, SolverBase):
                 "SolverSPO", f"mimic joints: {names}", "loops='embed' closes them, loops='cut' leaves them open"
             )
         worlds = Worlds(model)
-        modes = host(model, "joint_target_mode")[scene.dof_index]
-        if (modes != modes[:1]).any():
-            raise UnsupportedError("SolverSPO", "joint_target_mode that differs between worlds", "set gains to zero")
-        position = np.isin(modes[0], (JointTargetMode.POSITION, JointTargetMode.POSITION_VELOCITY))
-        rate = np.isin(modes[0], (JointTargetMode.VELOCITY, JointTargetMode.POSITION_VELOCITY))
-        scene = _with_drives(scene, position, position | rate)
-        variable = tuple(name for name in self._asked if name not in GAINS or (position | rate).any())
+        self._drives = Drives(model, scene)
+        scene = self._drives.apply(scene)
+        variable = tuple(name for name in self._asked if name not in GAINS or self._drives.any)
         W, device = scene.worlds, model.device
         self.dynamics = Dynamics(scene, W, device, "float32", variable, **self._options)
         if self.dynamics.closed:
             check_loop_joints(model, worlds.loops)
         declare(exchange, wp.float32)
-        factor: Any = lambda mask: wp.array(mask, dtype=wp.float32, device=device)  # noqa: E731
-        self._factors = {
-            "joint_target_ke": factor(position),
-            "joint_target_kd": factor(position | rate),
-            "joint_target_qd": factor(rate),
-        }
-        self._driven, self._tracks_rates = bool((position | rate).any()), bool(rate.any())
         bodies, hinges = worlds.bodies, worlds.hinges
         self._body_rows = bodies
-        gravity = np.arange(W) if worlds.declared else np.full(W, len(host(model, "gravity")) - 1)
-        self._mask_from = 0 if worlds.declared else -1  # bodies outside worlds go with the last entry of a mask
+        gravity = np.arange(W) if worlds.declared else np.full(W, len(to_numpy(model, "gravity")) - 1)
+        self._mask_from = 0 if worlds.declared else -1  # a mask's last entry is for bodies outside worlds
 
         def layout(like: str, rows: np.ndarray, *shape: int) -> Layout:
             return Layout(rows, (*rows.shape[1:], *shape), device, getattr(model, like))
@@ -164,7 +149,7 @@ class SolverSPO(Plugs, SolverBase):
         self._q, self._qd = layout("joint_q", scene.q_index), layout("joint_qd", scene.dof_index)
         self._poses, self._wrenches = layout("body_q", bodies, 7), layout("body_qd", bodies, 6)
         self._anchors = layout("joint_X_p", hinges, 7)
-        self._layouts = {name: self._qd for name in DOF_VALUES} | {
+        layouts = {name: self._qd for name in DOF_VALUES} | {
             "joint_rest_q": self._q,
             "joint_X_p": self._anchors,
             "joint_X_c": self._anchors,
@@ -173,35 +158,24 @@ class SolverSPO(Plugs, SolverBase):
             "body_inertia": layout("body_inertia", bodies, 3, 3),
             "gravity": Layout(gravity[:, None], (3,), device, model.gravity),
         }
-        self._used = {name: wp.clone(getattr(model, name)) for name in WATCHED}
-        self._status = wp.zeros(W, dtype=wp.int32, device=device)  # where none is asked for: one kernel serves both
-        self._turned = self._turned_hinges(scene)
+        self._arrays = ModelArrays(model, layouts, self._drives.factors)
+        # Steps with observables write status here if the caller does not ask for it: one kernel serves both.
+        self._status = wp.zeros(W, dtype=wp.int32, device=device)
+        self._joint_forces = JointForces(self.dynamics, Layouts(self._qd, self._poses, self._anchors))
         self._prepare()
 
-    def _turned_hinges(self, scene: Scene) -> Any:
-        """Rows (first dof, hinge, parent body) of the free hinges whose parent anchor may be turned in the world."""
-        level = (scene.values["joint_X_p"][..., 3:6] == 0.0).all(axis=(0, 2))
-        level &= "joint_X_p" not in self.dynamics.variable
-        rows = [
-            (scene.qd_start[h], h, hinge.parent)
-            for h, hinge in enumerate(scene.hinges)
-            if hinge.motion == FREE and (hinge.parent >= 0 or not level[h])
-        ]
-        self._turned_inside = any(parent >= 0 for *_, parent in rows)
-        return wp.array(np.array(rows), dtype=wp.int32, device=self.device) if rows else None
-
     def _prepare(self) -> None:
-        """Compile and allocate all that steps need."""
+        """Run a step and a reset, so that later calls compile and allocate nothing."""
         state, control = self.model.state(), self.model.control()
         if self.integrator == "semi_implicit":
             self.step(state, state, control, None, 1e-3, observables=self.observables(self.supported_observables))
         self.step(state, state, control, None, 1e-3)
         self.reset(state)
-        self._refresh(self.dynamics.variable)
+        self._arrays.set(self.dynamics, self.dynamics.variable)
 
     @property
     def supported_observables(self) -> frozenset[str]:
-        """All of them; but what bodies receive through joints is not known where loops are closed or nothing moves."""
+        """Names of the observables. BODY_PARENT_F is missing if loops are closed or the scene has no dof."""
         unknown = self.dynamics.closed or not self.dynamics.scene.dof_count
         return self.SUPPORTED_OBSERVABLES - ({SolverBase.ObservableKind.BODY_PARENT_F} if unknown else set())
 
@@ -216,15 +190,15 @@ class SolverSPO(Plugs, SolverBase):
         *,
         observables: SolverBase.Observables | None = None,
     ) -> None:
-        """Advance ``state_in`` by ``dt`` [s] into ``state_out``, which may be the same.
+        """Advance ``state_in`` by ``dt`` [s] and write the result to ``state_out``, which may be the same state.
 
-        ``control.joint_f`` of FREE and DISTANCE joints is a world wrench at the child's CoM. ``state_in.body_f`` acts
-        on all bodies. ``contacts`` must be None or empty: their count is read back, outside of graph captures alone;
-        inside one only contacts without capacity pass.
+        ``control.joint_f`` of FREE and DISTANCE joints is a wrench in world axes at the child's CoM. The forces
+        ``state_in.body_f`` act on all bodies. ``contacts`` must be None or empty. Outside of a graph capture their
+        count is read back; in a capture only contacts without capacity are accepted.
 
         Raises:
-            UnsupportedError: contacts that are not empty, or inside a capture may become so.
-            ValueError: observables of another solver, or with an integrator that has none.
+            UnsupportedError: There are contacts, or, inside a capture, there could be some at replay.
+            ValueError: The observables belong to another solver, or the integrator has none.
         """
         self.validate_observables(observables)
         for name, state in (("state_in", state_in), ("state_out", state_out)):
@@ -240,15 +214,18 @@ class SolverSPO(Plugs, SolverBase):
             control = self.model.control(clone_variables=False)
         q, qd = self._q.read(state_in.joint_q, "joint_q"), self._qd.read(state_in.joint_qd, "joint_qd")
         body_f = None if state_in.body_f is None else self._wrenches.read(state_in.body_f, "body_f")
-        given = dict(tau=self._joint_force(control, q), body_f=body_f, **self._targets(control))
+        tau = self._joint_forces.read(control.joint_f, q, self._arrays.used["joint_X_p"])
+        given = dict(tau=tau, body_f=body_f, **self._drives.targets(control, self._q, self._qd))
         if observables is None or not observables.kinds:
             q_out, qd_out = self._q.target(state_out.joint_q, "q_out"), self._qd.target(state_out.joint_qd, "qd_out")
             self.dynamics.step(q, qd, dt=dt, integrator=self.integrator, out=(q_out, qd_out), **given)
-        else:  # they need the state before the step, too
+        else:  # observables are computed from the state before the step, which state_out must not overwrite yet
             q_out, qd_out, qdd = self._q.buffer("q_out"), self._qd.buffer("qd_out"), self._qd.buffer("qdd")
-            self.dynamics.step(q, qd, dt=dt, out=(q_out, qd_out), qdd=qdd, status=self._words(observables), **given)
+            asked: Any = observables
+            status = self._status if asked.status is None else asked.status
+            self.dynamics.step(q, qd, dt=dt, out=(q_out, qd_out), qdd=qdd, status=status, **given)
             self._observe(observables, q, qd, qdd, body_f)
-        if state_out is not state_in and not self._q.plain:  # entries of loop joints stay as they are
+        if state_out is not state_in and not self._q.plain:  # entries of loop joints keep their values
             for name in ("joint_q", "joint_qd"):
                 wp.copy(getattr(state_out, name), getattr(state_in, name))
         self._q.write(q_out, state_out.joint_q)
@@ -260,33 +237,6 @@ class SolverSPO(Plugs, SolverBase):
         self.dynamics.body_states(q, qd, out=(poses, rates))
         self._poses.write(poses, state.body_q)
         self._wrenches.write(rates, state.body_qd)
-
-    def _joint_force(self, control: newton.Control, q: wp.array) -> Any:
-        if control.joint_f is None:
-            return None
-        tau = self._qd.read(control.joint_f, "joint_f")
-        if self._turned is None:
-            return tau
-        own, poses = self._qd.buffer("tau"), self._poses.buffer("before")
-        wp.copy(own, tau)
-        if self._turned_inside:
-            self.dynamics.body_poses(q, out=poses)
-        anchors = self._anchors.read(self._used["joint_X_p"], "anchors")
-        dim, inputs = (self.dynamics.worlds, len(self._turned)), [self._turned, anchors, poses]
-        wp.launch(exchange.turn_wrenches(wp.float32), dim, inputs, [own], device=self.device)
-        return own
-
-    def _targets(self, control: newton.Control) -> dict[str, Any]:
-        if not self._driven:
-            return {}
-        found = {"target_q": self._q.read(control.joint_target_q, "joint_target_q")}
-        if self._tracks_rates:
-            rates = self._qd.read(control.joint_target_qd, "joint_target_qd")
-            found["target_qd"] = self._qd.scaled(rates, self._factors["joint_target_qd"], "target_qd")
-        return found
-
-    def _words(self, observables: Any) -> wp.array:
-        return self._status if observables.status is None else observables.status
 
     def _observe(self, observables: Any, q: wp.array, qd: wp.array, qdd: wp.array, body_f: Any) -> None:
         kinds = SolverBase.ObservableKind
@@ -310,25 +260,30 @@ class SolverSPO(Plugs, SolverBase):
             return
         if self.device.is_capturing:
             raise UnsupportedError(
-                "SolverSPO.step", "contacts inside a graph capture, where their count cannot be read,", "pass None"
+                "SolverSPO.step",
+                "contacts inside a graph capture, where their count cannot be read,",
+                "pass contacts=None",
             )
         count = int(contacts.rigid_contact_count.numpy()[0]) + int(contacts.soft_contact_count.numpy()[0])
         if count:
-            raise UnsupportedError("SolverSPO.step", f"{count} contacts", "pass contacts=None to let bodies pass")
+            raise UnsupportedError(
+                "SolverSPO.step", f"{count} contacts", "pass contacts=None; bodies then pass through each other"
+            )
 
     # -- resets ----------------------------------------------------------------------------------------------------
     def reset(self, state: newton.State, world_mask: Any = None, flags: Any = None) -> None:
-        """Put worlds back to the model's ``joint_q`` and ``joint_qd``, and their bodies where these put them.
+        """Reset worlds to the model's ``joint_q`` and ``joint_qd``, and their bodies to the poses that follow.
 
-        Loops and mimics that hold are closed: what is put back goes to the nearest state, see
-        :meth:`warp_spo.Dynamics.project`; a world where that is not found is NaN, or open still: a start nearer to it
-        is needed.
+        Loops and mimics that hold are closed: the state is moved to the nearest closed one, see
+        :meth:`warp_spo.Dynamics.project`. A world in which none is found is NaN or stays open; its model's ``joint_q``
+        must be nearer to a closed state.
 
         Args:
-            state: changed in place.
-            world_mask: bool [world_count + 1], the last entry for what belongs to no world; None is all worlds.
-            flags: JOINT_Q, JOINT_QD, BODY_Q or BODY_QD (both), BODY_F; None is all of them, 0 none: the solver keeps
-                nothing from step to step.
+            state: The state, changed in place.
+            world_mask: The worlds to reset, bool [world_count + 1], with a last entry for bodies outside worlds. None
+                resets all worlds.
+            flags: The arrays to reset: JOINT_Q, JOINT_QD, BODY_Q or BODY_QD (each resets both), BODY_F. None resets
+                all; 0 resets nothing, because the solver itself keeps no state between steps.
         """
         _check_state("SolverSPO.reset", "state", state)
         flags = _flags("SolverSPO.reset", StateFlags, StateFlags.ALL if flags is None else flags)
@@ -360,30 +315,25 @@ class SolverSPO(Plugs, SolverBase):
 
     # -- values ----------------------------------------------------------------------------------------------------
     def notify_model_changed(self, flags: ModelFlags | int) -> None:
-        """Take over arrays of the model that have changed.
+        """Update the solver with arrays of the model that have changed.
 
-        Variable ones are copied by launches, also inside a capture. Folded ones that differ from what is in use rebuild
-        the solver, with a warning; captured graphs are then out of date. Inside a capture nothing can be compared: what
-        a flag names beside variable arrays stays as it is, which :meth:`check_model` tells afterwards.
+        Variable arrays are copied by launches, also inside a graph capture. If another array differs from the values
+        that are compiled into the kernels, the solver is rebuilt with a warning, and graphs captured before are out of
+        date. A capture cannot compare arrays: arrays that are not variable then keep their old values, which
+        :meth:`check_model` finds afterwards.
+
+        Args:
+            flags: The flags that name the changed arrays.
 
         Raises:
-            ValueError: inside a capture, a flag that names folded arrays alone.
+            ValueError: Inside a capture, a flag names no variable array.
         """
-        flags, names = _flags("SolverSPO.notify_model_changed", ModelFlags, flags), []
-        for flag, those in FLAGS.items():
-            if flags & int(flag):
-                names += [name for name in those if name in self._used and name not in names]
+        names = names_of_flags(_flags("SolverSPO.notify_model_changed", ModelFlags, flags))
         variable = [name for name in names if name in self.dynamics.variable]
-        folded = [name for name in names if name not in variable]
         if self.device.is_capturing:
-            for flag, those in FLAGS.items():
-                if flags & int(flag) and not set(those) & set(variable):
-                    raise ValueError(
-                        f"SolverSPO.notify_model_changed: {flag.name} inside a graph capture; expected flags of "
-                        f"variable arrays; build the solver with variable=({', '.join(map(repr, those))})"
-                    )
+            check_flags_in_capture(int(flags), variable)
         else:
-            changed = [name for name in folded if self._difference(name)]
+            changed = self._arrays.differences(name for name in names if name not in variable)
             if changed:
                 warnings.warn(
                     f"SolverSPO.notify_model_changed: {', '.join(changed)} folded into the kernels, which are rebuilt; "
@@ -392,12 +342,11 @@ class SolverSPO(Plugs, SolverBase):
                 )
                 self._rebuild()
                 return
-        for name in variable:
-            wp.copy(self._used[name], getattr(self.model, name))
-        self._refresh(variable)
+        self._arrays.copy(variable)
+        self._arrays.set(self.dynamics, variable)
 
     def _rebuild(self) -> None:
-        """Build anew, or stay as before where the model has become one that is refused."""
+        """Build the solver anew. If the changed model raises an error, restore the solver as it was."""
         before = dict(self.__dict__)
         try:
             self._build()
@@ -405,59 +354,29 @@ class SolverSPO(Plugs, SolverBase):
             self.__dict__.update(before)
             raise
 
-    def _refresh(self, names: Sequence[str]) -> None:
-        for name in names:
-            layout = self._layouts[name]
-            value = layout.read(self._used[name], name)
-            if name in self._factors:
-                value = layout.scaled(value, self._factors[name], "driven")
-            self.dynamics.set(**{name: value})
-
     def check_model(self) -> None:
-        """Compare the model's arrays with what the solver uses; reads them back.
+        """Compare the model's arrays with the values that the solver uses. Both are read back from the device.
 
         Raises:
-            ValueError: an array changed without notice; names it, its first entry that did, and the flag that tells.
+            ValueError: An array has changed without :meth:`notify_model_changed`. The message names the array, its
+                first entry that differs, and the flag to pass.
         """
-        for name in self._used:
-            difference = self._difference(name)
-            if difference:
-                flag = next(flag.name for flag, names in FLAGS.items() if name in names)
-                raise ValueError(
-                    f"SolverSPO.check_model: model.{name} {difference}; call notify_model_changed(ModelFlags.{flag})"
-                )
-
-    def _difference(self, name: str) -> str:
-        """What the solver uses and the model holds, where they first differ; empty if they do not."""
-        used, held = self._used[name].numpy(), getattr(self.model, name).numpy()
-        differ = (
-            np.argwhere((used != held) & ~(np.isnan(used) & np.isnan(held)))
-            if used.dtype.kind == "f"
-            else (np.argwhere(used != held))
-        )
-        if not len(differ):
-            return ""
-        at = tuple(differ[0].tolist())
-        return f"is {held[at]} at {list(at)} where the solver uses {used[at]}"
+        for name, difference in self._arrays.differences(self._arrays.used).items():
+            raise ValueError(
+                f"SolverSPO.check_model: model.{name} {difference}; "
+                f"call notify_model_changed(ModelFlags.{flag_of_name(name).name})"
+            )
 
 
 def _check_state(call: str, name: str, state: Any) -> None:
+    """Raise TypeError unless ``state`` is a state."""
     if not hasattr(state, "joint_q"):
         raise TypeError(f"{call}: {name} is of type {type(state).__name__}; expected a newton.State")
 
 
 def _flags(call: str, kind: type, flags: Any) -> int:
+    """Return ``flags`` as an int, or raise TypeError."""
     bits = as_integer(flags)
     if bits is None:
         raise TypeError(f"{call}: flags is {flags!r}; expected newton.{kind.__name__}, or an integer of their bits")
     return bits
-
-
-def _with_drives(scene: Scene, position: np.ndarray, driven: np.ndarray) -> Scene:
-    """The scene with the gains that the joints' modes ask for; a drive that has none is bounded by zero: no code."""
-    values = scene.values
-    return scene.with_values(
-        joint_target_ke=np.where(position, values["joint_target_ke"], 0.0),
-        joint_target_kd=np.where(driven, values["joint_target_kd"], 0.0),
-        joint_effort_limit=np.where(driven, values["joint_effort_limit"], 0.0),
-    )

@@ -1,0 +1,92 @@
+"""The arrays of a Newton model that SolverSPO uses, and which of them each flag of ``notify_model_changed`` names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import newton
+import numpy as np
+import warp as wp
+from newton import ModelFlags
+
+from ..dynamics.dynamics import Dynamics
+from ..scene.parts import DOF_VALUES
+from .layout import Layout
+
+FORCE_VALUES = tuple(name for name in DOF_VALUES if name != "joint_armature")
+FLAGS = {
+    ModelFlags.BODY_INERTIAL_PROPERTIES: ("body_mass", "body_com", "body_inertia"),
+    ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES: ("joint_armature",),
+    ModelFlags.JOINT_DOF_FORCE_PROPERTIES: (*FORCE_VALUES, "joint_target_mode"),
+    ModelFlags.JOINT_REFERENCE_POSE_PROPERTIES: ("joint_rest_q",),
+    ModelFlags.JOINT_DOF_PROPERTIES: (*DOF_VALUES, "joint_target_mode", "joint_rest_q"),
+    ModelFlags.JOINT_PROPERTIES: ("joint_X_p", "joint_X_c", "joint_axis"),
+    ModelFlags.CONSTRAINT_PROPERTIES: ("joint_mimic_coeffs",),
+    ModelFlags.MODEL_PROPERTIES: ("gravity",),
+}
+"""Arrays of the model that each flag names. A step depends on no array that another flag would name."""
+WATCHED = tuple(dict.fromkeys(name for names in FLAGS.values() for name in names))
+
+
+class ModelArrays:
+    """Copies of the model's arrays as the solver uses them, so that changes of the model can be found.
+
+    Args:
+        model: The Newton model.
+        layouts: How the model's array is laid out, for each name that Dynamics may have as a variable value.
+        factors: 1 or 0 for each dof [dof], for the gains that count only in some modes of a drive.
+    """
+
+    def __init__(self, model: newton.Model, layouts: Mapping[str, Layout], factors: Mapping[str, wp.array]):
+        self.model, self._layouts, self._factors = model, layouts, factors
+        self.used = {name: wp.clone(getattr(model, name)) for name in WATCHED}
+
+    def copy(self, names: Iterable[str]) -> None:
+        """Copy arrays of the model; launches only."""
+        for name in names:
+            wp.copy(self.used[name], getattr(self.model, name))
+
+    def set(self, dynamics: Dynamics, names: Iterable[str]) -> None:
+        """Set the values of ``dynamics`` to the copies; launches only."""
+        for name in names:
+            layout = self._layouts[name]
+            value = layout.read(self.used[name], name)
+            if name in self._factors:
+                value = layout.scale(value, self._factors[name], "driven")
+            dynamics.set(**{name: value})
+
+    def differences(self, names: Iterable[str]) -> dict[str, str]:
+        """Return by name a sentence about the first entry in which the model differs from its copy; reads back."""
+        found = {name: self._difference(name) for name in names}
+        return {name: difference for name, difference in found.items() if difference}
+
+    def _difference(self, name: str) -> str:
+        used, now = self.used[name].numpy(), getattr(self.model, name).numpy()
+        differs = used != now
+        if used.dtype.kind == "f":
+            differs &= ~(np.isnan(used) & np.isnan(now))
+        places = np.argwhere(differs)
+        if not len(places):
+            return ""
+        at = tuple(places[0].tolist())
+        return f"is {now[at]} at {list(at)} where the solver uses {used[at]}"
+
+
+def names_of_flags(flags: int) -> list[str]:
+    """Return the names of the arrays that ``flags`` name."""
+    return list(dict.fromkeys(name for flag, names in FLAGS.items() if flags & int(flag) for name in names))
+
+
+def flag_of_name(name: str) -> ModelFlags:
+    """Return the first flag that names an array."""
+    return next(flag for flag, names in FLAGS.items() if name in names)
+
+
+def check_flags_in_capture(flags: int, variable: Sequence[str]) -> None:
+    """Raise ValueError if a flag names only arrays that are not variable: a graph capture cannot rebuild the solver."""
+    for flag, names in FLAGS.items():
+        if flags & int(flag) and not set(names) & set(variable):
+            raise ValueError(
+                f"SolverSPO.notify_model_changed: {flag.name} inside a graph capture; expected flags of "
+                f"variable arrays; build the solver with variable=({', '.join(map(repr, names))})"
+            )
