@@ -1,8 +1,8 @@
-"""The border between the caller's arrays and Warp's: one :class:`Call` for every public call.
+"""Checks and converts the arrays of every public call: :class:`Call`.
 
-The caller's arrays are torch tensors, Warp arrays or NumPy arrays, ``[world, ...]`` and C-contiguous. torch and Warp
-arrays are used where they are: they must have the object's dtype and device, nothing is copied silently. NumPy arrays
-are cast and copied. The kind of the first array is the kind of the result.
+The caller's arrays are torch tensors, Warp arrays or NumPy arrays, ``[world, ...]`` and C-contiguous. Kernels read and
+write torch and Warp arrays in place, so these must have the object's dtype and device; nothing is copied silently.
+NumPy arrays are cast and copied. The kind of the first array is the kind of the result.
 
 :data:`ArrayT` says so to editors and type checkers: ``def f(self, q: ArrayT, out: ArrayT | None = None) -> ArrayT``
 returns a ``torch.Tensor`` for a ``torch.Tensor`` (or a ``torch.nn.Parameter``), a ``wp.array`` for a ``wp.array``, and
@@ -44,43 +44,45 @@ def parse_dtype(dtype, call: str = "dtype") -> type:
     """Return ``wp.float32`` or ``wp.float64`` for the name or the NumPy, Warp or torch type of that name.
 
     Raises:
-        ValueError: any other type. Python's ``float`` too, which is float32 to Warp and float64 to NumPy.
+        ValueError: The type is another one. Python's ``float`` is refused too, because it is float32 for Warp and
+            float64 for NumPy.
     """
     name = getattr(dtype, "__name__", None) or str(dtype).removeprefix("torch.")
     if name not in _DTYPES:
         raise ValueError(
-            f'{call}: dtype is {dtype!r}; expected "float32" or "float64" (or Warp\'s, NumPy\'s, torch\'s)'
+            f'{call}: dtype is {dtype!r}; expected "float32" or "float64", or the type of that name of Warp, NumPy or '
+            f"torch"
         )
     return _DTYPES[name]
 
 
 def parse_device(device=None, call: str = "device") -> wp.Device:
-    """Return the Warp device for a name, a Warp device or a torch device; None is Warp's current one.
+    """Return the Warp device for a name, a Warp device or a torch device. None is Warp's current device.
 
     Raises:
-        ValueError: no device of this machine.
+        ValueError: This machine has no such device.
     """
     try:
         if device is not None and type(device).__module__ == "torch":
-            return wp.get_device(_torch().device_name(device))
+            return wp.get_device(torch_border().device_name(device))
         return wp.get_device(device)
-    except (TypeError, ValueError, RuntimeError, AssertionError):  # AssertionError: torch without CUDA
+    except (TypeError, ValueError, RuntimeError, AssertionError):  # AssertionError comes from a torch without CUDA
         known = ", ".join(repr(known.alias) for known in wp.get_devices())
-        raise ValueError(f"{call}: device is {device!r}; expected one of this machine's: {known}") from None
+        raise ValueError(f"{call}: device is {device!r}; expected one of this machine's devices: {known}") from None
 
 
 def kind_of(array, call: str, name: str) -> str:
     """Return ``NUMPY``, ``WARP`` or ``TORCH``.
 
     Raises:
-        TypeError: anything else.
+        TypeError: ``array`` is none of the three, or it is a NumPy masked array.
     """
     if isinstance(array, wp.array):
         return WARP
     if isinstance(array, np.ndarray):
         refuse_masked(call, name, array)
         return NUMPY
-    if "torch" in sys.modules and _torch().is_tensor(array):
+    if "torch" in sys.modules and torch_border().is_tensor(array):
         return TORCH
     raise TypeError(
         f"{call}: {name} is of type {type(array).__name__}; expected a torch tensor, a Warp array or a NumPy array; "
@@ -89,56 +91,12 @@ def kind_of(array, call: str, name: str) -> str:
 
 
 def shape_of(array) -> tuple:
-    """Return the shape in scalars: Warp's vectors, matrices and transforms are trailing axes."""
+    """Return the shape counted in scalars: the entries of Warp's vectors, matrices and transforms are trailing axes."""
     return tuple(array.shape) + tuple(getattr(array.dtype, "_shape_", ()) if isinstance(array, wp.array) else ())
 
 
-class Values:
-    """The tensors, on record by torch, that values of a scene were set to, by name.
-
-    A value keeps its stamp as long as it is set to the same tensor, unchanged.
-    """
-
-    def __init__(self) -> None:
-        self.tensors: dict[str, Any] = {}
-        self.stamps: dict[str, int] = {}
-        self._versions: dict[str, int] = {}
-        self._count = 0
-
-    def set(self, name: str, value: Any) -> None:
-        """Take note of a value."""
-        tracked = recorded((value,))
-        if tracked and name in self.tensors and self.tensors[name] is value:
-            if self._versions[name] == value._version:
-                return
-        self._count += 1
-        self.stamps[name] = self._count
-        self.tensors.pop(name, None)
-        if tracked:
-            self.tensors[name], self._versions[name] = value, value._version
-
-
-def recorded(arguments: tuple, values: Values | None = None) -> bool:
-    """Whether torch is to go back through a call with these arguments, of an object with these values."""
-    if "torch" not in sys.modules:
-        return False
-    torch = _torch()
-    return torch.is_grad_enabled() and (bool(values and values.tensors) or any(map(torch.requires_grad, arguments)))
-
-
-def check_plain(call: str, name: str, value: Any) -> None:
-    """Raise ValueError of a torch tensor whose tangent, or transform, a copy of its numbers would lose."""
-    if "torch" in sys.modules and _torch().is_tensor(value):
-        _torch().pointer(call, name, value)
-
-
-def differentiated(*call: Any) -> Any:
-    """See :func:`warp_spo.torch.differentiated`."""
-    return _torch().differentiated(*call)
-
-
 class Call:
-    """One call: takes the caller's arrays in, gives the result back in the caller's kind.
+    """Checks the arrays of one public call, and returns its result in the kind of the caller's arrays.
 
     ::
 
@@ -148,19 +106,19 @@ class Call:
             wp.launch(...)
         return call.result
 
-    Inside the block Warp's current stream of the device is torch's, if any array is a torch tensor on CUDA. With
-    torch and Warp arrays and ``out`` given, nothing is allocated, copied or waited for. NumPy results and NumPy arrays
-    passed to :meth:`update` are filled when the block ends.
+    If any array is a torch tensor on CUDA, Warp's current stream of the device is torch's inside the block. With torch
+    and Warp arrays and with ``out``, the call allocates, copies and waits for nothing. NumPy results, and NumPy arrays
+    passed to :meth:`update`, are filled when the block ends.
 
     Args:
-        name: the call, for errors.
-        device: where the kernels run.
+        name: Name of the call, for errors.
+        device: The device on which the kernels run.
         dtype: ``wp.float32`` or ``wp.float64``.
-        kind: kind of the result where no array says it.
+        kind: Kind of the result if the call reads no array.
 
     Attributes:
-        result: what :meth:`write` was given or made, in the caller's kind; a tuple if :meth:`write` was called more
-            than once. Set when the block ends without an exception.
+        result: The array of :meth:`write` in the caller's kind, or a tuple of them if :meth:`write` was called more
+            than once. It is set when the block ends without an exception.
     """
 
     __slots__ = (
@@ -200,45 +158,51 @@ class Call:
                 wp.set_stream(self._saved_stream, self.device, sync=False)
 
     def read(self, name: str, array, shape: tuple, meaning: str = "", *, dtype=None, optional: bool = False):
-        """Return an input as a Warp array of scalars on the device; None stays None if ``optional``.
+        """Return an input as a Warp array of scalars on the device. None stays None if ``optional``.
 
         Args:
-            name: the argument, for errors.
-            array: the caller's array.
-            shape: expected shape; -1 is any size.
-            meaning: the axes in words, such as ``"[world, dof]"``.
-            dtype: expected scalar type, the call's unless given.
+            name: Name of the argument, for errors.
+            array: The caller's array.
+            shape: Expected shape; -1 matches any size.
+            meaning: The axes in words, such as ``"[world, dof]"``.
+            dtype: Expected scalar type; None is the call's dtype.
+            optional: Whether ``array`` may be None.
 
         Raises:
-            TypeError: not an array.
-            ValueError: wrong shape, dtype, device; not contiguous; requires grad; overlaps an output.
+            TypeError: ``array`` is not an array.
+            ValueError: The array has another shape, dtype or device, is not contiguous, requires grad, or overlaps an
+                output.
         """
         if array is None and optional:
             return None
-        taken = self._take(name, array, shape, meaning, dtype or self.dtype)
-        self._check_apart(name, array, taken, self._outputs)
-        self._inputs.append((name, array, taken))
-        return taken
+        warp_array = self._as_warp(name, array, shape, meaning, dtype or self.dtype)
+        self._check_apart(name, array, warp_array, self._outputs)
+        self._inputs.append((name, array, warp_array))
+        return warp_array
 
     def update(self, name: str, array, shape: tuple, meaning: str = "", *, dtype=None, optional: bool = True):
-        """Return an array that the call changes in place; as :meth:`read`, a NumPy array is written back."""
+        """Return an array that the call changes in place. Arguments and errors are those of :meth:`read`."""
         if array is None and optional:
             return None
-        taken = self._take(name, array, shape, meaning, dtype or self.dtype, change=True)
-        self._add_output(name, array, taken)
+        warp_array = self._as_warp(name, array, shape, meaning, dtype or self.dtype, change=True)
+        self._add_output(name, array, warp_array)
         if isinstance(array, np.ndarray):
-            self._staged.append((array, taken))
-        return taken
+            self._staged.append((array, warp_array))
+        return warp_array
 
     def write(self, out, shape: tuple, meaning: str = "", *, name: str = "out", dtype=None, over: str = ""):
-        """Return the array for a result: ``out`` itself, or a new one of the kind of the first array read.
+        """Return the Warp array for a result, of undefined content: that of ``out``, or a new one if ``out`` is None.
 
-        It may be the very array that was read as ``over``.
-        Its content is undefined. Raises as :meth:`read`, and TypeError if ``out`` is of another kind.
+        A new one has the kind of the first array of the call. ``out`` must not overlap an input, but it may be the very
+        array that was read under the name ``over``.
+
+        Raises:
+            TypeError: ``out`` is of another kind than the first array.
+            ValueError: As :meth:`read`.
         """
         dtype = dtype or self.dtype
         if out is None:
-            out, taken = self._new(tuple(shape), dtype)
+            out, warp_array = self._new(tuple(shape), dtype)
         else:
             kind = kind_of(out, self.name, name)
             if self.kind is not None and kind != self.kind:
@@ -248,14 +212,14 @@ class Call:
                 )
             if kind == NUMPY:
                 self._check(name, out, kind, out.shape, shape, meaning, dtype, out.dtype.name == dtype.__name__)
-                taken = wp.empty(tuple(shape), dtype=dtype, device=self.device)
+                warp_array = wp.empty(tuple(shape), dtype=dtype, device=self.device)
                 self._check_writeable(name, out)
-                self._staged.append((out, taken))
+                self._staged.append((out, warp_array))
             else:
-                taken = self._take(name, out, shape, meaning, dtype, change=True)
-            self._add_output(name, out, taken, over)
-        self._results.append((out, taken))
-        return taken
+                warp_array = self._as_warp(name, out, shape, meaning, dtype, change=True)
+            self._add_output(name, out, warp_array, over)
+        self._results.append((out, warp_array))
+        return warp_array
 
     def _new(self, shape, dtype):
         if self.kind == TORCH and self.device.is_cuda:
@@ -263,17 +227,18 @@ class Call:
         owner, array = new(self.kind, shape, dtype, self.device)
         return (None if self.kind in (None, NUMPY) else owner), array
 
-    def _take(self, name, array, shape, meaning, dtype, change=False):
+    def _as_warp(self, name, array, shape, meaning, dtype, change=False):
+        """Return a Warp array of scalars over the caller's memory, or over a copy of a NumPy array."""
         kind = kind_of(array, self.name, name)
         if self.kind is None:
             self.kind = kind
         if kind == NUMPY:
-            return self._take_numpy(name, array, shape, meaning, dtype, change)
+            return self._copy_numpy(name, array, shape, meaning, dtype, change)
         if kind == WARP:
             came = array.shape
             same = array.dtype is dtype
             if not same and getattr(array.dtype, "_wp_scalar_type_", None) is dtype:
-                # vectors and transforms are scalars with further axes
+                # the entries of vectors and transforms become trailing axes
                 came = came + array.dtype._shape_
                 same = True
             self._check(name, array, kind, came, shape, meaning, dtype, same)
@@ -282,19 +247,19 @@ class Call:
             if array.requires_grad and wp._src.context.runtime.tape is not None:
                 self._refuse_grad(name, "is recorded by wp.Tape", "leave the tape's block")
             return array if array.dtype is dtype else view(array.ptr, came, dtype, self.device.alias)
-        torch = _torch()
+        torch = torch_border()
         pointer = torch.pointer(self.name, name, array)
         self._check(name, array, kind, array.shape, shape, meaning, dtype, torch.has_dtype(array, dtype))
         if not torch.is_on(array, self.device) or not array.is_contiguous():
             self._refuse_place(name, array, kind, array.is_contiguous(), change)
         if not pointer and array.numel():
             raise ValueError(
-                f"{self.name}: {name} holds no memory; expected numbers in memory; of a lazy zero tensor pass "
+                f"{self.name}: {name} holds no memory; expected numbers in memory; if it is a lazy zero tensor, pass "
                 f"{name}.clone()"
             )
-        if array.is_neg():  # the memory holds the numbers with the other sign
+        if array.is_neg():  # the memory holds the numbers with the opposite sign
             raise ValueError(
-                f"{self.name}: {name} is a lazy negative view; expected plain memory; pass {name}.resolve_neg()"
+                f"{self.name}: {name} is a lazy negative view; expected a plain tensor; pass {name}.resolve_neg()"
             )
         if array.requires_grad and torch.is_grad_enabled():
             self._refuse_grad(name, "requires grad", f"pass {name}.detach(), or call inside torch.no_grad()")
@@ -304,7 +269,7 @@ class Call:
             torch.mark_changed(array)
         return view(pointer, tuple(array.shape), dtype, self.device.alias)
 
-    def _take_numpy(self, name, array, shape, meaning, dtype, change):
+    def _copy_numpy(self, name, array, shape, meaning, dtype, change):
         kinds = {wp.float32: "biuf", wp.float64: "biuf", wp.bool: "b"}.get(dtype, "iu")
         fits = array.dtype.name == dtype.__name__ if change else array.dtype.kind in kinds
         self._check(name, array, NUMPY, array.shape, shape, meaning, dtype, fits)
@@ -319,9 +284,9 @@ class Call:
         staged = wp.array(host, dtype=dtype, device="cpu", copy=False) if host.size else None
         if staged is None or self.device.is_cpu:
             return staged if staged is not None else wp.empty(array.shape, dtype=dtype, device=self.device)
-        taken = wp.empty(array.shape, dtype=dtype, device=self.device)
-        wp.copy(taken, staged)  # on the current stream: wp.array(host, device=...) would use the null stream
-        return taken
+        warp_array = wp.empty(array.shape, dtype=dtype, device=self.device)
+        wp.copy(warp_array, staged)  # on the current stream; wp.array(host, device=...) would use the null stream
+        return warp_array
 
     def _check(self, name, array, kind, came, shape, meaning, dtype, dtype_fits):
         if came == shape or (len(came) == len(shape) and all(e in (-1, c) for c, e in zip(came, shape, strict=True))):
@@ -337,7 +302,7 @@ class Call:
         raise ValueError(f"{self.name}: {name} is {_describe(array, kind)}; expected {expected}; {way}")
 
     def _refuse_place(self, name, array, kind, contiguous, change):
-        if kind == TORCH and not _torch().is_dense(array):
+        if kind == TORCH and not torch_border().is_dense(array):
             raise ValueError(
                 f"{self.name}: {name} is {_describe(array, kind)}, {array.layout}; expected a dense one; "
                 f"pass {name}.to_dense()"
@@ -357,7 +322,9 @@ class Call:
 
     def _check_writeable(self, name, array):
         if not array.flags.writeable:
-            raise ValueError(f"{self.name}: {name} is a read-only NumPy array; expected one to write into; pass a copy")
+            raise ValueError(
+                f"{self.name}: {name} is a read-only NumPy array; expected one that can be written; pass a copy"
+            )
         extents = zip(array.strides, array.shape, strict=True)
         if array.size and any(stride == 0 and size > 1 for stride, size in extents):
             raise ValueError(
@@ -365,53 +332,53 @@ class Call:
                 f"expected one entry for each number of the result; pass a fresh array"
             )
 
-    def _add_output(self, name, array, taken, over=""):
+    def _add_output(self, name, array, warp_array, over=""):
         same = [one for one in self._inputs if one[0] == over
-                and (_same_memory(taken, one[2]) or _same_numbers(array, one[1]))]  # fmt: skip
-        self._check_apart(name, array, taken, [other for other in self._inputs if other not in same])
-        self._check_apart(name, array, taken, self._outputs)
-        self._outputs.append((name, array, taken))
+                and (_same_memory(warp_array, one[2]) or _same_numpy(array, one[1]))]  # fmt: skip
+        self._check_apart(name, array, warp_array, [other for other in self._inputs if other not in same])
+        self._check_apart(name, array, warp_array, self._outputs)
+        self._outputs.append((name, array, warp_array))
 
-    def _check_apart(self, name, array, taken, others):
-        for other_name, other, other_taken in others:
+    def _check_apart(self, name, array, warp_array, others):
+        for other_name, other, other_warp in others:
             if isinstance(array, np.ndarray):
                 overlap = isinstance(other, np.ndarray) and np.shares_memory(array, other)
             else:
-                overlap = taken.size and other_taken.size and _bytes_meet(taken, other_taken)
+                overlap = warp_array.size and other_warp.size and _share_memory(warp_array, other_warp)
             if overlap:
                 raise ValueError(
-                    f"{self.name}: {name} overlaps {other_name} in memory; expected an array that is written to "
-                    f"be apart from every other; pass a fresh array for one of them"
+                    f"{self.name}: {name} overlaps {other_name} in memory; expected memory that is apart from that of "
+                    f"every other array, because the call writes it; pass a fresh array for one of them"
                 )
 
     def _enter_stream(self):
         if self._saved_stream is None:
             current = self.device.stream
-            wanted = _torch().stream(self.device)
+            wanted = torch_border().stream(self.device)
             self._saved_stream = current
             if wanted.cuda_stream != current.cuda_stream:
-                # NumPy arrays of this call may be on their way on the other stream; without any, nothing may wait,
-                # because waiting on a stream outside of a capture ends the capture.
+                # Copies of this call's NumPy arrays may still run on the other stream. Without NumPy arrays nothing may
+                # wait, because waiting for a stream outside of a graph capture would end the capture.
                 numpy_came = any(isinstance(array, np.ndarray) for _, array, _ in self._inputs + self._outputs)
                 wp.set_stream(wanted, self.device, sync=numpy_came)
 
     def _finish(self):
         numpy_came = any(isinstance(array, np.ndarray) for _, array, _ in self._inputs)
         if self.device.is_cuda and (numpy_came or self._staged or self.kind in (None, NUMPY)):
-            wp.synchronize_stream(self.device.stream)  # also: copies made here are freed in no stream's order
-        for array, taken in self._staged:
-            array[...] = taken.numpy()
-        results = tuple(taken.numpy() if out is None else out for out, taken in self._results)
+            wp.synchronize_stream(self.device.stream)  # copies made here are freed without regard to streams
+        for array, warp_array in self._staged:
+            array[...] = warp_array.numpy()
+        results = tuple(warp_array.numpy() if out is None else out for out, warp_array in self._results)
         self.result = results[0] if len(results) == 1 else results or None
 
 
 def new(kind: str | None, shape: tuple, dtype: type, device: wp.Device) -> tuple:
-    """Return (owner, Warp array) of undefined content; the memory is free again when the owner is dropped.
+    """Return (owner, Warp array) of undefined content. The memory is freed with the owner.
 
-    For torch the owner is a tensor, so that torch orders the reuse of the memory on the stream it was used on.
+    For torch the owner is a tensor, so that torch reuses the memory in the order of the stream that used it.
     """
     if kind == TORCH:
-        tensor = _torch().empty(shape, dtype, device)
+        tensor = torch_border().empty(shape, dtype, device)
         return tensor, view(tensor.data_ptr(), shape, dtype, device.alias)
     array = wp.empty(shape, dtype=dtype, device=device)
     return array, array
@@ -419,22 +386,24 @@ def new(kind: str | None, shape: tuple, dtype: type, device: wp.Device) -> tuple
 
 @functools.lru_cache(maxsize=4096)
 def view(pointer: int, shape: tuple, dtype: type, device: str) -> wp.array:
-    """Return a Warp array over memory that someone else owns. Cached, because making one takes 4 us."""
+    """Return a Warp array over memory that another object owns. Cached, because making one takes 4 us."""
     return wp.array(ptr=pointer, shape=shape, dtype=dtype, device=device)
 
 
 def _same_memory(a, b) -> bool:
+    """Whether two Warp arrays have the same memory and shape."""
     return a.ptr == b.ptr and a.shape == b.shape
 
 
-def _same_numbers(a, b) -> bool:
-    """Whether two NumPy arrays are one: it is read at the start of a call, and filled at its end."""
+def _same_numpy(a, b) -> bool:
+    """Whether a and b are the same NumPy array. A call may read and write it: it is copied first and filled last."""
     if not (isinstance(a, np.ndarray) and isinstance(b, np.ndarray)):
         return False
     return a.ctypes.data == b.ctypes.data and a.shape == b.shape and a.strides == b.strides and a.dtype == b.dtype
 
 
-def _bytes_meet(a, b) -> bool:
+def _share_memory(a, b) -> bool:
+    """Whether two Warp arrays have a byte in common."""
     return a.ptr < b.ptr + b.size * wp.types.type_size_in_bytes(b.dtype) and b.ptr < a.ptr + a.size * (
         wp.types.type_size_in_bytes(a.dtype)
     )
@@ -450,7 +419,8 @@ def _describe(array, kind) -> str:
 
 
 @functools.cache
-def _torch():
-    from . import torch  # torch is met in that file only, and only if the caller has brought it
+def torch_border() -> Any:
+    """Return the module :mod:`warp_spo.torch`."""
+    from . import torch  # the only file that imports torch, used only if the caller has imported torch
 
     return torch

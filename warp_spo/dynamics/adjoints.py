@@ -15,12 +15,13 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from ..arrays import Call, Values, differentiated, recorded
+from ..arrays import Call
 from ..errors import UnsupportedError, as_names
 from ..execution import link_values
 from ..execution.plan import MOST_DOFS
 from ..execution.programs import Programs
 from ..execution.sweeps import Sweeps
+from ..gradients import TensorValues, call_with_gradient, records_gradient
 from ..recursions.links import LINK_VALUES
 from ..scene.frames import check_frames
 from ..scene.scene import Scene
@@ -59,11 +60,11 @@ def differentiable(method: Callable) -> Callable:
 
     @functools.wraps(method)
     def call(self: Any, *args: Any, **more: Any) -> Any:
-        if not recorded((*args, *more.values()), self.values):
+        if not records_gradient((*args, *more.values()), self.values):
             return method(self, *args, **more)
         arguments = signature.bind(self, *args, **more).arguments
         del arguments["self"]
-        return differentiated(self, operation, method, arguments, ARGUMENTS[operation], self.entering(operation))
+        return call_with_gradient(self, operation, method, arguments, ARGUMENTS[operation], self.entering(operation))
 
     return call
 
@@ -79,7 +80,7 @@ class Adjoints:
     variable: tuple[str, ...]
     recursions: Sweeps
     programs: Programs
-    values: Values
+    values: TensorValues
     closed: bool
     embedding: Any
     _minimal: int

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..arrays import Call, Values, parse_device, parse_dtype, recorded, shape_of
+from ..arrays import Call, parse_device, parse_dtype, shape_of
 from ..errors import UnsupportedError, as_integer, as_names
 from ..execution import node_operations as nodes
 from ..execution import plan as plans
@@ -21,6 +21,7 @@ from ..execution import status_words as words
 from ..execution.parameters import RIGID_VALUES, VARIABLE
 from ..execution.programs import Programs
 from ..execution.sweeps import Sweeps
+from ..gradients import TensorValues, records_gradient
 from ..scene.frames import Frame, check_frames
 from ..scene.parts import real
 from ..scene.scene import Scene
@@ -94,7 +95,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
         self.granularity = self.plan.granularity
         self.recursions = Sweeps(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)
-        self.values = Values()
+        self.values = TensorValues()
         self._close(loops, independent)
         count = as_integer(refine)
         if count is None or count < 0:
@@ -128,7 +129,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
                 shape = self.scene.values[name].shape[1:]
                 if len(shape_of(value)) > len(shape):
                     shape = (self.worlds, *shape)
-                followed = name in self.variable and name in self.differentiable_values and recorded((value,))
+                followed = name in self.variable and name in self.differentiable_values and records_gradient((value,))
                 plain = value.detach() if followed else value
                 array = call.read(name, plain, shape, "[world, ...] or [...] as Newton has it")
                 if name in self.variable:
@@ -438,7 +439,7 @@ class Dynamics(Loops, Steps, Derivatives, Adjoints, Preparation):
 
     def _call(self, name: str) -> Call:
         self._check_operation(name)
-        if self.values.tensors and recorded((), self.values):
+        if self.values.tensors and records_gradient((), self.values):
             names = ", ".join(self.values.tensors)
             raise ValueError(
                 f"Dynamics.{name}: {names} was set to a tensor that requires grad; derivatives are not available "

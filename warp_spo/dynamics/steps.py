@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..arrays import Call, check_plain
+from ..arrays import Call
 from ..errors import UnsupportedError, is_bool
 from ..execution.sweeps import Sweeps
+from ..gradients import check_plain
 from ..kernels import combination, loops
 from ..recursions.impedance import DEFAULT_BOUND
 from ..recursions.loops.closed_step import NEWTON_STEPS

@@ -7,8 +7,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from ..arrays import check_plain
 from ..errors import as_integer, refuse_masked
+from ..gradients import check_plain
 from .parts import IDENTITY_POSE, real
 from .scene import Scene
 

@@ -1,0 +1,39 @@
+"""torch tensors in and out: :class:`Module` and :func:`custom_op`.
+
+Only this package, and the environments, import torch. The rest of ``warp_spo`` reaches it through
+:mod:`warp_spo.arrays` and :mod:`warp_spo.gradients`, and only if the caller has imported torch.
+"""
+
+from .autograd import call_with_gradient
+from .compiled import custom_op
+from .module import Module
+from .tensors import (
+    device_name,
+    empty,
+    has_dtype,
+    is_dense,
+    is_grad_enabled,
+    is_on,
+    is_tensor,
+    mark_changed,
+    pointer,
+    requires_grad,
+    stream,
+)
+
+__all__ = [
+    "Module",
+    "call_with_gradient",
+    "custom_op",
+    "device_name",
+    "empty",
+    "has_dtype",
+    "is_dense",
+    "is_grad_enabled",
+    "is_on",
+    "is_tensor",
+    "mark_changed",
+    "pointer",
+    "requires_grad",
+    "stream",
+]

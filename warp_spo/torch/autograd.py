@@ -1,0 +1,147 @@
+"""Operations of Dynamics in torch's autograd, with analytic gradients."""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from .tensors import is_tensor, pointer, requires_grad
+
+if TYPE_CHECKING:
+    from ..dynamics.dynamics import Dynamics
+
+
+def call_with_gradient(
+    dyn: "Dynamics", operation: str, method: Callable[..., Any], arguments: dict[str, Any], by: tuple, values: tuple
+) -> Any:
+    """Return ``method(dyn, **arguments)`` as a result through which torch's backward pass can go.
+
+    Args:
+        dyn: The Dynamics.
+        operation: Public name of the method.
+        method: The method without torch's autograd.
+        arguments: Its arguments by name.
+        by: Names of the arguments that the operation can be differentiated by.
+        values: Names of the values of the scene on which the operation depends.
+    """
+    value_tensors = {name: tensor for name, tensor in dyn.values.tensors.items() if name in values}
+    inputs = {name: arguments.pop(name) for name in by if arguments.get(name) is not None}
+    tensors = {**inputs, **value_tensors}
+    if not any(map(requires_grad, tensors.values())):
+        # If another argument requires grad, the call refuses it.
+        with torch.set_grad_enabled(any(map(requires_grad, arguments.values()))):
+            return method(dyn, **inputs, **arguments)
+    call = f"Dynamics.{operation}"
+    for name, x in tensors.items():
+        if not is_tensor(x):
+            other = next(n for n, y in tensors.items() if requires_grad(y))
+            raise TypeError(
+                f"{call}: {other} requires grad and {name} is of type {type(x).__name__}; expected torch tensors only; "
+                f"pass torch.as_tensor({name}), or call inside torch.no_grad()"
+            )
+        pointer(call, name, x)
+    if arguments.get("integrator", "semi_implicit") != "semi_implicit" or arguments.get("qdd") is not None:
+        raise ValueError(
+            f"{call}: an input requires grad; expected integrator='semi_implicit' and no qdd=, because only this step "
+            f"has gradients; call inside torch.no_grad()"
+        )
+    out = arguments.pop("out", None)
+    if any(x is not None for x in (out if isinstance(out, tuple | list) else (out,))):
+        raise ValueError(
+            f"{call}: out is given and an input requires grad; expected no out=, because a result with gradients is a "
+            f"new tensor; leave out=, or call inside torch.no_grad()"
+        )
+    record = Record(dyn, operation, method, arguments, tuple(inputs), tuple(value_tensors))
+    with torch.no_grad():
+        dyn.check_gradient(operation)
+    return _Differentiable.apply(record, *tensors.values())
+
+
+class Record:
+    """A call of an operation without its tensors, so that it can be run and differentiated.
+
+    Args:
+        dyn: The Dynamics.
+        operation: Public name of the method.
+        method: The method without torch's autograd.
+        options: Arguments that are not differentiated.
+        inputs: Names of the arguments that are tensors.
+        values: Names of the values of the scene that are tensors.
+    """
+
+    def __init__(
+        self, dyn: "Dynamics", operation: str, method: Callable[..., Any], options: dict, inputs: tuple, values: tuple
+    ):
+        self.dyn, self.operation, self.method, self.options = dyn, operation, method, options
+        self.inputs, self.values = inputs, values
+        self.stamps = dict(dyn.values.stamps)
+
+    def run(self, tensors: Sequence[torch.Tensor]) -> tuple[Any, tuple]:
+        """Return the result, and all tensors that the backward pass needs of it."""
+        more = {}
+        if self.operation == "step":
+            more["qdd"] = torch.empty_like(tensors[self.inputs.index("qd")])
+        result = self.method(self.dyn, **dict(zip(self.inputs, tensors, strict=False)), **self.options, **more)
+        return result, (*(result if isinstance(result, tuple) else (result,)), *more.values())
+
+    def gradients(self, wanted: list[str], tensors: Sequence[torch.Tensor], results: tuple, cotangents: tuple) -> dict:
+        """Return the gradients by name, at the values of the scene that the call saw.
+
+        Raises:
+            RuntimeError: A value was set since the call, and the tensors do not hold its old numbers.
+        """
+        by_name = dict(zip((*self.inputs, *self.values), tensors, strict=True))
+        changed = [name for name, stamp in self.dyn.values.stamps.items() if self.stamps.get(name) != stamp]
+        entering = self.dyn.entering(self.operation)
+        lost = [name for name in changed if name not in self.values and name in entering]
+        if lost:
+            raise RuntimeError(
+                f"Dynamics.{self.operation}: {', '.join(lost)} was set between this call and its backward pass; "
+                f"expected the values of the call; call backward before Dynamics.set, or set tensors that require grad"
+            )
+        arrays = {name: by_name[name] for name in self.inputs}
+        with self.dyn.held({name: by_name[name] for name in changed if name in self.values}):
+            return self.dyn.pulled_back(self.operation, arrays, self.options, results, cotangents, wanted)
+
+
+class _Differentiable(torch.autograd.Function):
+    """An operation of Dynamics with its analytic gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, record: Record, *tensors: torch.Tensor) -> Any:
+        ctx.record = record
+        result, kept = record.run([x.detach() for x in tensors])
+        ctx.save_for_backward(*tensors, *kept)
+        return result
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple:
+        record, names = ctx.record, (*ctx.record.inputs, *ctx.record.values)
+        tensors, results = ctx.saved_tensors[: len(names)], ctx.saved_tensors[len(names) :]
+        wanted = [name for name, needed in zip(names, ctx.needs_input_grad[1:], strict=True) if needed]
+        with torch.no_grad():
+            detached = [x.detach() for x in tensors], tuple(y.detach() for y in results)
+            found = record.gradients(wanted, *detached, tuple(c.contiguous() for c in cotangents))
+            for name, tensor in zip(names, tensors, strict=True):
+                if name in found and found[name].dim() > tensor.dim():  # all worlds share the value
+                    found[name] = found[name].sum(0)
+        if torch.is_grad_enabled():
+            sources = [x for x in (*tensors, *cotangents) if x.requires_grad]
+            found = {name: _FirstOrder.apply(record.operation, value, *sources) for name, value in found.items()}
+        return None, *(found.get(name) for name in names)
+
+
+class _FirstOrder(torch.autograd.Function):
+    """The gradient itself, with a backward pass that raises: ``create_graph=True`` asks for second derivatives."""
+
+    @staticmethod
+    def forward(ctx: Any, operation: str, gradient: torch.Tensor, *sources: torch.Tensor) -> torch.Tensor:
+        ctx.operation = operation
+        return gradient.view_as(gradient)
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple:
+        raise RuntimeError(
+            f"Dynamics.{ctx.operation}: its gradient is differentiated once more; expected first derivatives only, "
+            f"because they are analytic and not recorded; take finite differences of gradients for second derivatives"
+        )
