@@ -96,7 +96,7 @@ def test_loops_are_cut_and_named(tmp_path, capsys, monkeypatch, device):
         ([__file__], "ends in '.py'"),
         (["cartpole", "--worlds", "0"], "worlds is 0; expected 1 to 2147483647"),
         (["cartpole", "--worlds", "99999999999"], "worlds is 99999999999; expected 1 to 2147483647"),
-        (["cartpole", "--device", "abacus"], "--device is 'abacus'; expected one of those here: cpu"),
+        (["cartpole", "--device", "abacus"], "--device is 'abacus'; expected one of this machine's devices: cpu"),
     ],
 )
 def test_mistakes_are_one_line(arguments, expected, capsys):

@@ -1,8 +1,8 @@
 """``python -m warp_spo [ROBOT]``: run every operation on a robot in many worlds, with error and run time of each.
 
-ROBOT is a URDF, MJCF or USD file, or one that Newton ships: humanoid (the default), ant, quadruped, cartpole. A sample
-of worlds is compared with the dense float64 reference. Exit code 0: every error is within its tolerance; 1: one is
-not; 2: a mistake in the call.
+ROBOT is a URDF, MJCF or USD file, or a robot that comes with Newton: humanoid (the default), ant, quadruped, cartpole.
+The results of some worlds are compared with the dense float64 reference. The exit code is 0 if every error is within
+its tolerance, 1 if an error is not, and 2 if the command line is wrong.
 """
 
 from __future__ import annotations
@@ -24,31 +24,38 @@ from .trials.operations import OPERATIONS, TOLERANCE, Inputs
 from .trials.trial import SAMPLE, Subject, Trial
 
 WORLDS = {False: 1024, True: 4096}  # on a CPU, on a GPU
-WARM_UP, BUDGET = 0.05, 0.3  # [s] for each operation: all of them in well under a minute
-SETS = {False: 1, True: 4}  # sets of inputs; one graph goes through them in turn
+WARM_UP, BUDGET = 0.05, 0.3  # [s] for each operation, so that all together take less than a minute
+SETS = {False: 1, True: 4}  # sets of inputs on a CPU, on a GPU; one graph evaluates them in turn
 REPORT = "report.html"
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line."""
+    """A parser whose errors are one line."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message}; see --help\n")
 
 
 def parser() -> Parser:
+    """Return the parser of the command line."""
     text = argparse.RawDescriptionHelpFormatter
     p = Parser(prog="python -m warp_spo", description=__doc__, formatter_class=text)
-    p.add_argument("robot", nargs="?", default="humanoid", metavar="ROBOT", help="a file, or a robot that Newton ships")
-    p.add_argument("--worlds", type=int, metavar="N", help="default: 1024 on a CPU, 4096 on a GPU")
+    p.add_argument(
+        "robot", nargs="?", default="humanoid", metavar="ROBOT", help="a file, or a robot that comes with Newton"
+    )
+    p.add_argument("--worlds", type=int, metavar="N", help="number of worlds; default: 1024 on a CPU, 4096 on a GPU")
     p.add_argument("--device", metavar="D", help="Warp device, such as cpu or cuda:0; default: the current one")
     p.add_argument("--dtype", choices=("float32", "float64", "both"), default="both", help="default: both")
-    p.add_argument("--report", type=Path, metavar="DIR", help=f"write {REPORT} there: table and picture")
+    p.add_argument("--report", type=Path, metavar="DIR", help=f"folder for {REPORT}, with the table and a picture")
     return p
 
 
 def main(argv: list[str] | None = None) -> int:
-    """The main job; returns the exit code. ``argv``: arguments, those of the process unless given."""
+    """Run the command and return the exit code.
+
+    Args:
+        argv: Arguments; None takes those of the process.
+    """
     options = parser().parse_args(argv)
     wp.config.log_level = wp.LOG_WARNING  # before newton is imported
     try:
@@ -90,40 +97,40 @@ def main(argv: list[str] | None = None) -> int:
     failed = [row for row in rows if not row["error"] <= TOLERANCE[row["dtype"]]]
     for row in failed:
         lost = row["error"] != row["error"]
-        what = "gives NaN (does a hinge move no inertia?)" if lost else f"has error {row['error']:.1e}"
+        what = "gives NaN (is there a hinge that moves no inertia?)" if lost else f"has error {row['error']:.1e}"
         expected = f"expected at most {TOLERANCE[row['dtype']]:.0e}"
         print(f"FAILED: {row['op']} in {row['dtype']} {what}; {expected}", file=sys.stderr)
     return 1 if failed else 0
 
 
 def refuse(message: str) -> int:
-    """Say what is wrong in one line on stderr; return the exit code."""
+    """Print an error in one line on stderr and return the exit code 2."""
     print(f"python -m warp_spo: {' '.join(message.split())}", file=sys.stderr)
     return 2
 
 
 def find_device(name: str | None) -> wp.Device:
-    """The Warp device of that name; None is the current one.
+    """Return the Warp device of that name; None is the current one.
 
     Raises:
-        ValueError: no such device here; lists those that are.
+        ValueError: This machine has no such device. The message lists its devices.
     """
     try:
         return wp.get_device(name)
     except (ValueError, RuntimeError):
         found = ", ".join(device.alias for device in wp.get_devices())
-        raise ValueError(f"--device is {name!r}; expected one of those here: {found}") from None
+        raise ValueError(f"--device is {name!r}; expected one of this machine's devices: {found}") from None
 
 
 def load(robot: str) -> Scene:
-    """The scene of a file, or of a robot that Newton ships; warnings become lines on stderr.
+    """Return the scene of a file, or of a robot that comes with Newton. Warnings become lines on stderr.
 
     Raises:
-        ValueError, OSError, ImportError: as :func:`warp_spo.newton.load`.
+        ValueError, OSError, ImportError: As :func:`warp_spo.newton.load`.
     """
     if os.sep in robot or Path(robot).suffix:
         path = Path(robot)
-        if not path.is_file():  # says so without the seconds that newton's import takes
+        if not path.is_file():  # checked here, because importing newton takes seconds
             raise FileNotFoundError(f"no file {robot!r} (from {os.getcwd()!r}); expected a URDF, MJCF or USD file")
     from . import newton
 
@@ -137,10 +144,13 @@ def load(robot: str) -> Scene:
 
 
 def run(dyns: list[Dynamics]) -> Iterator[dict[str, Any]]:
-    """Yield a row for each operation and Dynamics (of one scene and world count), the precisions next to each other.
+    """Yield a row for each operation and each Dynamics; rows of one operation follow each other.
 
-    Rows have op, granularity, dtype, worlds, error (see ``Operation.error``) and seconds, the
-    median run time of one evaluation of all worlds.
+    A row has op, granularity, dtype, worlds, error (see ``Operation.error``) and seconds, the median run time of one
+    evaluation of all worlds.
+
+    Args:
+        dyns: Dynamics of the same scene and number of worlds.
     """
     scene, worlds, cuda = dyns[0].scene, dyns[0].worlds, dyns[0].device.is_cuda
     inputs = [Inputs(scene, worlds, seed) for seed in range(SETS[cuda])]
@@ -157,15 +167,17 @@ def run(dyns: list[Dynamics]) -> Iterator[dict[str, Any]]:
 
 
 def _make_folder(path: Path) -> None:
-    """Before anything runs.
+    """Create the folder, before anything runs.
 
     Raises:
-        ValueError: there is none, and none can be made.
+        ValueError: The folder does not exist and cannot be created.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"--report is {str(path)!r}: {error.strerror}; expected a folder") from None
+        raise ValueError(
+            f"--report is {str(path)!r}: {error.strerror}; expected a folder that exists or can be created"
+        ) from None
 
 
 if __name__ == "__main__":

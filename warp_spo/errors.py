@@ -50,9 +50,8 @@ def as_integer(value: Any) -> int | None:
 class DirectedLoopError(ValueError):
     """The edges contain a directed loop, so that (I - E)^-1 is not a sum over paths.
 
-    The test is one of topology, not of a determinant: two loops that share a node can have det(I - E) = -1, and still
-        have
-    no resolvent in the sense of the paper.
+    The topology decides, not a determinant: with two loops that share a node, det(I - E) may be -1, and the sum over
+    paths still does not end.
 
     Attributes:
         cycle: the nodes of one loop. Each is the parent of the next, and the last is the parent of the first.

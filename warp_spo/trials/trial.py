@@ -1,4 +1,4 @@
-"""Trials: one operation in all worlds, compared with the dense reference, then timed on the same inputs."""
+"""Trials: evaluate one operation in all worlds, compare it with the dense reference, and time it on the same inputs."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from ..dynamics.spatial_operators import SpatialOperators
 from ..graph.algebra import Operator
 from .operations import Inputs, Operation
 
-SAMPLE = 8  # worlds that the reference computes; it takes 10 to 100 ms for one
-WARM_UP = 0.2  # [s]: clocks rise and caches fill
-GRAPH_ROUNDS = 64  # times that a graph goes through all sets of inputs: its launch, 8 us, is spread over them
-GRAPH_SECONDS = 0.05  # fewer rounds where they would take longer
-MOST_SUMMED = 2**30  # entries of a sum, which are counted in 32 bits
+SAMPLE = 8  # worlds that are compared with the reference, which takes 10 to 100 ms a world
+WARM_UP = 0.2  # [s] of evaluations before timing, in which clocks rise and caches fill
+GRAPH_ROUNDS = 64  # times that a graph evaluates all sets of inputs, over which its launch of 8 us is spread
+GRAPH_SECONDS = 0.05  # a graph has fewer rounds if they would take longer
+MOST_SUMMED = 2**30  # entries in one call of array_sum, which counts them in 32 bits
 
 
 class Subject:
-    """A Dynamics under trial, with random inputs on its device that all its trials share.
+    """A Dynamics to try, and random inputs on its device that all its trials share.
 
     Args:
-        dyn: the Dynamics.
-        inputs: sets of inputs for its scene and worlds; evaluations in a row take them in turn.
+        dyn: The Dynamics.
+        inputs: Sets of inputs for its scene and worlds. Evaluations in a row use them in turn.
     """
 
     def __init__(self, dyn: Dynamics, inputs: list[Inputs]):
@@ -35,7 +35,7 @@ class Subject:
         self._arrays: dict[tuple[str, int], wp.array] = {}
 
     def array(self, name: str, index: int) -> wp.array:
-        """Input ``name`` of set ``index`` on the device [world, n]."""
+        """Return the input ``name`` of set ``index`` on the device [world, n]."""
         key = name, index
         if key not in self._arrays:
             host = self.inputs[index].array(name)
@@ -44,12 +44,12 @@ class Subject:
 
     @functools.cached_property
     def operators(self) -> SpatialOperators:
-        """phi, psi and their kin."""
+        """The spatial operators at the first set of inputs: phi, psi and the others."""
         return self.dyn.operators(self.array("q", 0))
 
     @functools.cached_property
     def mass(self) -> Operator:
-        """The mass matrix as an expression of them."""
+        """The mass matrix as an expression of these operators."""
         o = self.operators
         return o.H @ o.phi @ o.M @ o.phi.T @ o.H.T + o.Delta
 
@@ -63,19 +63,19 @@ class Timing(NamedTuple):
 
 
 class Trial:
-    """One operation of a subject.
+    """One operation of a subject. The constructor runs the first evaluation.
 
     Args:
-        subject: on what.
-        operation: which.
-        sample: worlds that are compared with the reference, spread evenly.
+        subject: The Dynamics and its inputs.
+        operation: The operation.
+        sample: Number of worlds, evenly spread, that are compared with the reference.
 
     Attributes:
-        forward_errors: relative errors of all worlds compared so far, NaN for a result that is not finite.
-        backward_errors: their backward errors, if the operation solves an equation.
-        first_call: wall time of the first evaluation [s]: kernels that no earlier trial brought are compiled, or loaded
-            from Warp's cache, and the workspace is allocated.
-        bytes: of the caller's arrays that one evaluation reads and writes; None where the result is inside.
+        forward_errors: Relative errors of all worlds compared so far; NaN for a result that is not finite.
+        backward_errors: Backward errors of the same worlds if the operation solves an equation, else empty.
+        first_call: Wall time of the first evaluation [s]. It includes compiling new kernels, or loading them from
+            Warp's cache, and allocating the workspace.
+        bytes: Bytes of the caller's arrays that one evaluation reads and writes. None if the result is not among them.
     """
 
     def __init__(self, subject: Subject, operation: Operation, sample: int = SAMPLE):
@@ -102,14 +102,16 @@ class Trial:
         self.operation.call(self.subject, *self._inputs[index], out=self.out)
 
     def poison(self) -> None:
-        """Fill what an evaluation writes with NaN."""
+        """Fill the result with NaN, so that an evaluation must write all of it."""
         self.out.fill_(float("nan"))
         if self.operation.reveal:
-            nowhere: Any = wp.full(self._inputs[0][0].shape, float("nan"), self.out.dtype, self.out.device)
-            self.subject.operators.update(nowhere)
+            nan: Any = wp.full(self._inputs[0][0].shape, float("nan"), self.out.dtype, self.out.device)
+            self.subject.operators.update(nan)
 
     def error(self, index: int) -> float:
-        """Largest relative error of a sample of worlds, after an evaluation at set ``index``; NaN if any world has one.
+        """Return the largest relative error of the sample after an evaluation at set ``index``.
+
+        The error is NaN if the result of any world is not finite.
 
         See :meth:`warp_spo.trials.operations.Operation.error`.
         """
@@ -123,16 +125,16 @@ class Trial:
         at = subject.inputs[0] if operation.at_first_q else inputs
         for world in np.unique(np.linspace(0, worlds - 1, self.sample).astype(int)).tolist():
             expected = inputs.expected(operation, at, world)
-            given = [inputs.array(name)[world] for name in operation.reads]
+            arguments = [inputs.array(name)[world] for name in operation.reads]
             result = (self.out[world : world + 1] if self.out.size else self.out).numpy()[0]
-            errors.append(operation.error(at.dense(world), given, result, expected))
+            errors.append(operation.error(at.dense(world), arguments, result, expected))
             if operation.solves:
-                self.backward_errors.append(operation.backward_error(at.dense(world), given, result))
+                self.backward_errors.append(operation.backward_error(at.dense(world), arguments, result))
         self.forward_errors += errors
         return float(np.max(errors))
 
     def check(self) -> float:
-        """Evaluate every set of inputs, each into a poisoned result; return the largest error."""
+        """Evaluate every set of inputs into a poisoned result, and return the largest error."""
         errors = []
         for index in range(self.sets):
             self.poison()
@@ -141,17 +143,18 @@ class Trial:
         return float(np.max(errors))
 
     def measure(self, repeats: int = 20, warm_up: float = WARM_UP, budget: float = 1.0) -> tuple[Timing, float]:
-        """Time evaluations in a row, at the sets of inputs in turn, and check what the timed run left.
+        """Time evaluations in a row, at the sets of inputs in turn, and check the result of the last one.
 
-        CUDA: the evaluations are captured into one graph, replayed, and timed by events. CPU: wall time of calls.
+        On CUDA the evaluations are captured into one graph, which is replayed and timed by events. On the CPU the wall
+        time of calls is taken.
 
         Args:
-            repeats: how often the row is timed.
-            warm_up: [s] of evaluations before.
-            budget: on the CPU, fewer repeats, 3 at least, where they would take longer [s].
+            repeats: How often the row is timed.
+            warm_up: Time of evaluations before the timing [s].
+            budget: Time after which a CPU stops repeating, with 3 repeats at least [s].
 
         Returns:
-            run time of one evaluation; error, as :meth:`error`.
+            The run time of one evaluation, and the error as of :meth:`error`.
         """
         device = self.subject.dyn.device
         once = self._warm_up(self._row, warm_up) / self.sets
@@ -176,18 +179,19 @@ class Trial:
         return Timing(float(median), float(low), float(high)), self.error(self.sets - 1)
 
     def eager(self, convert: Callable[[wp.array], Any] | None = None, repeats: int = 20, budget: float = 0.2) -> Timing:
-        """Wall time of single calls, each waited for: what a user pays who captures nothing.
+        """Return the wall time of single calls, each waited for: the run time without graph capture.
 
         Args:
-            convert: makes of a Warp array what the calls are given, such as ``wp.to_torch``; it is not timed.
-            repeats: how many calls are timed, after one round to warm up.
-            budget: fewer, 3 at least, where they would take longer [s].
+            convert: Function from a Warp array to the array that the calls receive, such as ``wp.to_torch``. It is not
+                timed. None passes Warp arrays.
+            repeats: Number of timed calls, after one call for each set of inputs to warm up.
+            budget: Time after which calls are no longer repeated, with 3 calls at least [s].
         """
         device, calls = self.subject.dyn.device, []
         out = self.out if convert is None else convert(self.out)
         for inputs in self._inputs:
-            given = inputs if convert is None else [convert(array) for array in inputs]
-            calls.append(functools.partial(self.operation.call, self.subject, *given, out=out))
+            arrays = inputs if convert is None else [convert(array) for array in inputs]
+            calls.append(functools.partial(self.operation.call, self.subject, *arrays, out=out))
         seconds: list[float] = []
         for count in range(len(calls) + repeats):
             start = time.perf_counter()
@@ -201,11 +205,12 @@ class Trial:
         return Timing(float(median), float(low), float(high))
 
     def _row(self) -> None:
+        """Launch one evaluation at each set of inputs."""
         for index in range(self.sets):
             self.evaluate(index)
 
-    def _warm_up(self, run: Any, seconds: float) -> float:
-        """Run for some time; return the wall time of the last run [s]."""
+    def _warm_up(self, run: Callable[[], Any], seconds: float) -> float:
+        """Call ``run`` for some ``seconds`` and return the wall time of the last call [s]."""
         device, begin = self.subject.dyn.device, time.perf_counter()
         while True:
             start = time.perf_counter()
@@ -215,8 +220,8 @@ class Trial:
             if end - begin >= seconds:
                 return end - start
 
-    def _replay(self, graph: Any, repeats: int) -> list[float]:
-        """Seconds of each of ``repeats`` replays."""
+    def _replay(self, graph: wp.Graph, repeats: int) -> list[float]:
+        """Return the run time of each of ``repeats`` replays [s]."""
         device = self.subject.dyn.device
         events = [[wp.Event(device, enable_timing=True) for _ in range(2)] for _ in range(repeats)]
         for start, end in events:
@@ -228,7 +233,7 @@ class Trial:
 
 
 def all_finite(array: wp.array) -> bool:
-    """NaN and infinity outlast a sum, and no gigabytes travel."""
+    """Whether all entries are finite. They are summed on the device, because NaN and infinity survive a sum."""
     flat, size = array.flatten(), array.size
     parts = (flat[at : min(at + MOST_SUMMED, size)] for at in range(0, size, MOST_SUMMED))
     return all(np.isfinite(wp.utils.array_sum(part)) for part in parts)
