@@ -1,7 +1,7 @@
-"""Run ``python -m benchmarks [FILTER]``: check against the dense reference, time, print ``case.metric value``.
+"""Run ``python -m benchmarks [FILTER]``: check cases with the dense reference, time them, print ``case.metric value``.
 
-``--everything --json benchmarks/results/ --readme`` measures all that the README shows, peers too, and puts it there;
-``--report`` writes one HTML page.
+``--everything --json benchmarks/results/ --readme`` measures all numbers of the README, also those of other libraries,
+and writes them into it. ``--report`` writes one HTML page.
 """
 
 import argparse
@@ -19,10 +19,8 @@ from . import everything, evidence, parts, pictures, report, roofline, runner, t
 from .cases import case_name
 from .precisions import PRECISIONS
 
-ALLOWED = 0.05  # two runs on one machine differ by less, for cases of 20 us or more
+ALLOWED = 0.05  # largest difference of two runs on one machine, for cases of 20 us or more
 SHOWN = 10  # differences that --compare prints
-
-
 PLAN = "plan"  # the granularity that the plan chooses
 
 
@@ -40,35 +38,44 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--granularity", nargs="+", choices=names, metavar="G", help=f"{', '.join(names)}; default: {PLAN}")
     p.add_argument("--sweeps", action="store_true", help="growing world counts, chains and trees instead of robots")
     p.add_argument(
-        "--everything", action="store_true", help="ours, the peers that are there, and the stress suite, part by part; "
-        "FILTER is of parts' names; goes on where an earlier run of this commit stopped"
+        "--everything", action="store_true", help="measure ours, all installed peers and the stress suite, in parts; "
+        "FILTER selects parts; continues an earlier run of this commit"
     )  # fmt: skip
-    p.add_argument("--budget", type=float, default=3600.0, metavar="S", help="[s] of --everything; default: 3600")
-    p.add_argument("--jobs", type=int, metavar="N", help="processes that compile at a time; default: nearly all cores")
-    p.add_argument("--gpus", type=int, default=1, metavar="N", help="--everything takes so many, the last to compile")
-    p.add_argument("--check", action="store_true", help="compare with the reference, time nothing")
-    p.add_argument("--compile", action="store_true", help="evaluate once: kernels come into Warp's cache")
+    p.add_argument("--budget", type=float, default=3600.0, metavar="S", help="time for --everything [s]; default: 3600")
+    p.add_argument(
+        "--jobs", type=int, metavar="N", help="processes that compile at the same time; default: nearly all cores"
+    )
+    p.add_argument(
+        "--gpus", type=int, default=1, metavar="N", help="GPUs for --everything; of 3 or more the last one compiles"
+    )
+    p.add_argument("--check", action="store_true", help="compare with the reference, and time nothing")
+    p.add_argument("--compile", action="store_true", help="compile the kernels into Warp's cache, and time nothing")
     p.add_argument("--json", type=Path, metavar="OUT", help="write the run to this file, or by date into this folder")
     p.add_argument("--report", type=Path, metavar="DIR", help="write the run as one page, DIR/report.html")
     p.add_argument(
         "--from", type=Path, nargs="+", dest="source", metavar="JSON", help="report these files or folders, run nothing"
     )
     p.add_argument("--table", type=Path, metavar="JSON", help="print the Markdown table of a run, and run nothing")
-    p.add_argument("--compare", type=Path, nargs=2, metavar=("A", "B"), help="how far two runs lie apart; run nothing")
+    p.add_argument(
+        "--compare", type=Path, nargs=2, metavar=("A", "B"), help="print the differences of two runs; run nothing"
+    )
     p.add_argument(
         "--readme",
         nargs="?",
         type=Path,
         const=evidence.RESULTS,
         metavar="JSON",
-        help="put tables and pictures of a file or folder (default: benchmarks/results) into its README.md and the "
-        "headline into the first README.md; run nothing unless there is --everything before it",
+        help="write tables and pictures of a file or folder (default: benchmarks/results) into the folder's README.md, and "
+        "the main numbers into README.md; run nothing unless --everything is given",
     )
     return p
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Returns 0; 1 if an error is beyond its tolerance, two runs differ or time ran out, 2 for a caller's mistake."""
+    """Run the command; return its exit code.
+
+    0: all is well; 1: an error exceeds its tolerance, two runs differ, or time ran out; 2: a mistake in the call.
+    """
     options = parser().parse_args(argv)
     wp.config.log_level = wp.LOG_WARNING
     try:
@@ -95,7 +102,7 @@ def main(argv: list[str] | None = None) -> int:
             return 0
         if options.source:
             if not options.report:
-                raise ValueError("benchmarks: --from reports files that are there; say where to with --report DIR")
+                raise ValueError("benchmarks: --from needs --report DIR, the folder in which to write the report")
             runs = [evidence.read(file) for file in evidence.files(options.source)]
             print(f"wrote {report.write(pyplot, evidence.gather(runs), options.report)}", file=sys.stderr)
             return 0
@@ -108,10 +115,10 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def choose(options: Any, cuda: bool) -> list[dict]:
-    """The cases that are asked for.
+    """Return the cases that the options select.
 
     Raises:
-        ValueError: there are none.
+        ValueError: they select none.
     """
     worlds = options.worlds or (data.WORLDS if cuda else data.CPU_WORLDS)
     granularities = [None if name == PLAN else name for name in options.granularity or [PLAN]]
@@ -119,7 +126,7 @@ def choose(options: Any, cuda: bool) -> list[dict]:
 
 
 def measure(chosen: list[dict], options: Any, device: wp.Device, pyplot: Any) -> int:
-    """Run, print, write; returns the exit code."""
+    """Measure the cases, print and write their rows, and return the exit code."""
     if options.compile:
         runner.compile_only(chosen, device)
         return 0
@@ -129,7 +136,7 @@ def measure(chosen: list[dict], options: Any, device: wp.Device, pyplot: Any) ->
     for row in runner.run(chosen, device, options.check, roof):
         rows.append(row)
         print("\n".join(runner.lines(row)), flush=True)
-        if options.json:  # after each row: what was measured before an interrupt is kept
+        if options.json:  # after each row, so that an interrupt loses no row
             file = runner.save(whole, options.json)
     if file:
         print(f"wrote {file}", file=sys.stderr)
@@ -137,15 +144,15 @@ def measure(chosen: list[dict], options: Any, device: wp.Device, pyplot: Any) ->
         print(f"wrote {report.write(pyplot, evidence.gather([whole]), options.report)}", file=sys.stderr)
     failed = [case_name(row) for row in rows if not row["error"] <= runner.tolerance(row)]
     if failed:
-        print(f"benchmarks: the error is NaN or beyond its tolerance in {', '.join(failed)}", file=sys.stderr)
+        print(f"benchmarks: the error is NaN or exceeds its tolerance in {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0
 
 
 def write_readme(pyplot: Any, source: Path) -> None:
-    """Write the headline into README.md, tables and pictures into benchmarks/results.
+    """Write the main numbers of the runs in ``source`` into README.md, tables and pictures into benchmarks/results.
 
     Raises:
-        ValueError: there is no run, or no place in one of the two READMEs.
+        ValueError: there is no run, or one of the two READMEs has no place for the numbers.
     """
     found = evidence.gather(evidence.read(file) for file in evidence.files([source]))
     for file, text in table.filled(evidence.ROOT, evidence.RESULTS, found).items():
@@ -158,7 +165,7 @@ def write_readme(pyplot: Any, source: Path) -> None:
 
 
 def compare(a: Path, b: Path) -> int:
-    """Print the largest differences of two runs; 1 if one is beyond ``ALLOWED``."""
+    """Print the largest differences of two runs; return 1 if one exceeds ``ALLOWED``, else 0."""
     found = evidence.compare(evidence.read(a), evidence.read(b))
     for difference, x, y in found[:SHOWN]:
         name = case_name(x) if "dtype" in x else f"{x['group']}: {x['name']}.w{x['worlds']}"

@@ -1,18 +1,18 @@
-"""What the library does beyond one evaluation of the dynamics, beside those who do the same, on one device.
+"""Time steps, derivatives, inverses and closed loops, and other libraries that compute the same, on one device.
 
     python -m benchmarks.capabilities [PATTERN] [--device cuda:0] [--worlds 4096 65536] [--json FILE]
 
-* steps: a whole step of Newton's SolverMuJoCo, SolverSteel and SolverFeatherstone and of SolverSPO, on Newton's model
-  of the Panda with drives and the limits of its file: steps in a row, that start anywhere and are driven elsewhere;
-* derivatives: dense derivatives of forward dynamics, and its vector-Jacobian product beside forward dynamics;
-* operational: the inverse operational-space inertia of G1's two feet, beside the Jacobians and twelve columns of M^-1
-  that it takes in mujoco_warp;
-* inverse: all of M^-1;
-* loops: forward dynamics of a biped with closed ankles, embedded, beside the same robot with its loops cut.
+* steps: a step of SolverSPO and of Newton's SolverMuJoCo, SolverSteel and SolverFeatherstone, on Newton's model of
+  the Panda with drives and the limits of its file; each world starts at a random state and is driven to another;
+* derivatives: forward dynamics, its dense derivatives, and its vector-Jacobian product;
+* operational: the inverse operational-space inertia of G1's two feet; in mujoco_warp the two Jacobians and twelve
+  columns of M^-1 that are needed for it;
+* inverse: the whole of M^-1;
+* loops: forward dynamics of a biped with closed ankles, with its loops embedded, and with its loops cut.
 
-Calls are captured into a CUDA graph, several in a row, and replayed; on a CPU they are timed one by one. A line is the
-time of one call; what cannot run is skipped with its reason. Derivatives and inverses are compared with their
-references, the other results checked to be finite.
+Several calls in a row are captured into a CUDA graph, which is replayed; on a CPU calls are timed one by one. A printed
+line has the time of one call, or the reason why it cannot run. Derivatives and inverses are compared with their
+references; the other results are checked to be finite.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ from . import robots, runner
 
 DT = 2e-3  # [s]
 SETS = 4
-CALLS = 48  # in one graph, whose launch takes 8 us
+CALLS = 48  # calls in one graph, whose launch takes 8 us
 REPEATS = 15
-SAMPLE = 2  # worlds that are compared; the reference of G1's derivatives takes a second for one
-WARM_UP = 0.2  # [s]: a GPU that has waited for a model to be built takes this long to come to its clocks
+SAMPLE = 2  # worlds that are compared; the reference of G1's derivatives takes a second for each
+WARM_UP = 0.2  # [s] that an idle GPU needs until its clocks have risen
 KE, KD = 200.0, 20.0  # drives [N m/rad, N m s/rad]
 
 
-def timed(run: Callable[[int], Any], device: wp.Device) -> float:
-    """Median time of ``run(index)`` [us], index going round the sets of inputs."""
+def measure_time(run: Callable[[int], Any], device: wp.Device) -> float:
+    """Return the median time of ``run(index)`` [us], where the index cycles through the sets of inputs."""
     for index in range(SETS):
         run(index)
     wp.synchronize_device(device)
@@ -75,13 +75,14 @@ def _wall(run: Callable[[int], Any], index: int) -> float:
 
 # -- steps -------------------------------------------------------------------------------------------------------------
 def steps(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], dict]]]:
+    """Yield the cases of steps: name, and the function that measures it."""
     import newton
 
     from warp_spo.newton import SolverSPO
 
     def model() -> Any:
         one = newton.ModelBuilder()
-        one.add_urdf(robots.urdf("panda"), floating=False)
+        one.add_urdf(robots.urdf_text("panda"), floating=False)
         one.joint_target_ke[:] = [KE] * len(one.joint_target_ke)
         one.joint_target_kd[:] = [KD] * len(one.joint_target_kd)
         one.joint_target_mode[:] = [int(newton.JointTargetMode.POSITION)] * len(one.joint_target_mode)
@@ -107,8 +108,8 @@ def steps(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], di
             before, then = (now, after) if index % 2 == 0 else (after, now)
             solver.step(before, then, control, None, DT)
 
-        us = timed(run, device)
-        assert np.isfinite(now.joint_qd.numpy()).all(), f"{name}: not finite"
+        us = measure_time(run, device)
+        assert np.isfinite(now.joint_qd.numpy()).all(), f"{name}: the velocities are not finite"
         return dict(us=us)
 
     yield "SolverSPO.step", lambda: step("SolverSPO")
@@ -120,11 +121,12 @@ def steps(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], di
 
 # -- ours --------------------------------------------------------------------------------------------------------------
 def inputs(scene: spo.Scene, worlds: int) -> list[Inputs]:
+    """Return SETS sets of random inputs."""
     return [Inputs(scene, worlds, seed) for seed in range(SETS)]
 
 
-def of_operations(*names: str) -> Callable[..., Iterator[tuple[str, Callable[[], dict]]]]:
-    """Operations on each of the robots, compared with their references."""
+def operation_cases(*names: str) -> Callable[..., Iterator[tuple[str, Callable[[], dict]]]]:
+    """Return a group: a case for each robot and operation in ``names``, which is compared with its reference."""
 
     def cases(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], dict]]]:
         for robot in robots.ROBOTS:
@@ -132,22 +134,23 @@ def of_operations(*names: str) -> Callable[..., Iterator[tuple[str, Callable[[],
             subject = functools.cache(lambda scene=scene: Subject(spo.Dynamics(scene, worlds, device),
                                                                   inputs(scene, worlds)))  # fmt: skip
             for name in names:
-                yield f"{robot} {name}", lambda name=name, subject=subject: compared(subject(), name)
+                yield f"{robot} {name}", lambda name=name, subject=subject: measure_operation(subject(), name)
 
     return cases
 
 
-def compared(subject: Subject, name: str) -> dict:
+def measure_operation(subject: Subject, name: str) -> dict:
+    """Return ``us`` and ``error`` of an operation; an error beyond the tolerance raises AssertionError."""
     trial = Trial(subject, (OPERATIONS | APPLICATIONS)[name], SAMPLE)
     checked = trial.check()
     timing, left = trial.measure(REPEATS)
     error, tolerance = float(np.max([checked, left])), TOLERANCE["float32"]
-    assert error <= tolerance, f"error {error:.1e} beyond {tolerance:.0e}"
+    assert error <= tolerance, f"error {error:.1e} exceeds the tolerance {tolerance:.0e}"
     return dict(us=1e6 * timing.median, error=error)
 
 
 class Ours:
-    """Dynamics of one scene with inputs on the device."""
+    """A Dynamics of one scene, with inputs on its device."""
 
     def __init__(self, scene: spo.Scene, worlds: int, device: wp.Device, **options: Any):
         self.dyn, self.scene, self.device = spo.Dynamics(scene, worlds, device, **options), scene, device
@@ -157,14 +160,15 @@ class Ours:
         ]
 
     def time(self, call: Callable[[spo.Dynamics, dict, wp.array], Any], *shape: int) -> dict:
-        """Of ``call(dyn, set, out)``, ``out`` a result [world, *shape]."""
+        """Return ``us`` of ``call(dyn, inputs, out)``, where ``out`` is a result [world, *shape]."""
         out = wp.empty((self.dyn.worlds, *shape), dtype=wp.float32, device=self.device)
-        us = timed(lambda index: call(self.dyn, self.sets[index], out), self.device)
-        assert all_finite(out), "not finite"
+        us = measure_time(lambda index: call(self.dyn, self.sets[index], out), self.device)
+        assert all_finite(out), "the result is not finite"
         return dict(us=us)
 
 
 def operational(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], dict]]]:
+    """Yield the cases of operational-space inertia: name, and the function that measures it."""
     scene = robots.scene("g1")
     feet = [label for label in scene.body_labels if label.endswith("ankle_roll_link")]
 
@@ -187,7 +191,7 @@ def operational(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[
         bodies = [
             1 + owners[place] for place, dof in enumerate(peer.robot.dofs) if "ankle_roll" in scene.dof_labels[dof]
         ]
-        assert len(bodies) == 2, f"{len(bodies)} feet"
+        assert len(bodies) == 2, f"G1 has {len(bodies)} feet; expected 2"
         J = [[wp.zeros((worlds, 3, nv), dtype=wp.float32, device=device) for _ in range(2)] for _ in bodies]
         x = wp.empty((worlds, nv), dtype=wp.float32, device=device)
         columns = [part[:, row].contiguous() for pair in J for part in pair for row in range(3)]
@@ -206,13 +210,14 @@ def operational(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[
                 mjw.solve_m(m, d, x, column)
 
         with wp.ScopedDevice(device):
-            return dict(us=timed(run, device))
+            return dict(us=measure_time(run, device))
 
     yield "g1 operational_inertia_inverse of two feet", ours
     yield "g1 mujoco_warp kinematics, com_pos, crb, factor_m, 2 jac, 12 solve_m", mujoco
 
 
 def loops(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], dict]]]:
+    """Yield the cases of closed loops: name, and the function that measures it."""
     from warp_spo.examples.biped import scene as biped
 
     def ours(how: str) -> dict:
@@ -233,8 +238,8 @@ def loops(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[[], di
 
 GROUPS = dict(
     steps=steps,
-    derivatives=of_operations("forward_dynamics", "forward_dynamics_derivatives", "forward_dynamics_vjp"),
-    inverse=of_operations("mass_matrix_inverse"),
+    derivatives=operation_cases("forward_dynamics", "forward_dynamics_derivatives", "forward_dynamics_vjp"),
+    inverse=operation_cases("mass_matrix_inverse"),
     operational=operational,
     loops=loops,
 )
@@ -259,7 +264,7 @@ def main(arguments: list[str] | None = None) -> int:
                 try:
                     row |= measure()
                     text = f"{row['us']:.4g} us, {worlds / row['us']:.4g} 10^6/s"
-                except Exception as error:  # the others go on
+                except Exception as error:  # the other cases go on
                     row["skipped"] = f"{type(error).__name__}: {error}"
                     text, failed = f"skipped: {row['skipped'][:300]}", failed + 1
                 print(f"{group} {name}, {worlds} worlds: {text}", flush=True)

@@ -16,13 +16,13 @@ from .precisions import PRECISIONS
 from .shapes import SHAPES
 
 WORLDS = (4096,)
-CPU_WORLDS = (1024,)  # one core works on them one after the other
+CPU_WORLDS = (1024,)  # fewer: one core computes them one after the other
 DTYPES = ("float32", "float64")
-GRANULARITIES = (None, "node", "segment", "tree")  # None: what the plan chooses
+GRANULARITIES = (None, "node", "segment", "tree")  # None: the plan's choice
 
 
 def arm() -> spo.Scene:
-    """A 7-dof arm from code: links of 0.25 m and 2 kg on revolute hinges about z and y in turn, each with armature."""
+    """Return a 7-dof arm: links of 0.25 m and 2 kg on revolute hinges about z and y in turn, each with armature."""
     inertia, up = np.diag([0.012, 0.012, 0.002]), (0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0)
     bodies = [spo.Body(2.0, (0.0, 0.0, 0.125), inertia, label=f"link_{k}") for k in range(7)]
     axes = np.eye(3)[[2, 1]]
@@ -30,20 +30,20 @@ def arm() -> spo.Scene:
     return spo.Scene(bodies, hinges)
 
 
-def _shipped(name: str, floating: bool | None = None) -> spo.Scene:
+def _newton_robot(name: str, floating: bool | None = None) -> spo.Scene:
     from warp_spo.newton import shipped
 
     return spo.load(shipped(name), floating=floating)
 
 
 SCENES = {
-    "cartpole": functools.partial(_shipped, "cartpole"),
+    "cartpole": functools.partial(_newton_robot, "cartpole"),
     "arm7": arm,
-    "ant": functools.partial(_shipped, "ant"),
-    "quadruped": functools.partial(_shipped, "quadruped", floating=True),
-    "humanoid": functools.partial(_shipped, "humanoid"),
+    "ant": functools.partial(_newton_robot, "ant"),
+    "quadruped": functools.partial(_newton_robot, "quadruped", floating=True),
+    "humanoid": functools.partial(_newton_robot, "humanoid"),
 } | {name: functools.partial(robots.scene, name) for name in robots.ROBOTS}
-"""Name -> scene factory. Released robots raise ImportError where the extra ``robots`` is not installed."""
+"""Name -> function that makes the scene; released robots raise ImportError without the extra ``robots``."""
 
 
 FACTORIES = SCENES | SHAPES
@@ -51,14 +51,14 @@ FACTORIES = SCENES | SHAPES
 
 @dataclasses.dataclass(frozen=True)
 class Sweep:
-    """Scenes or world counts that grow, in float32.
+    """Cases in float32 whose scene or world count grows.
 
     Attributes:
-        name: of what grows.
-        scenes: names.
+        name: name of the quantity that grows.
+        scenes: names of the scenes.
         worlds: world counts on a GPU.
-        cpu_worlds: on a CPU.
-        granularity: None is the plan's choice.
+        cpu_worlds: world counts on a CPU.
+        granularity: granularity of all cases; None: the plan's choice.
     """
 
     name: str
@@ -74,12 +74,12 @@ def _family(name: str) -> list[str]:
 
 SWEEPS = (
     Sweep("worlds", ("arm7", "humanoid"), [4**k for k in range(11)], [4**k for k in range(7)]),
-    # node: the one granularity that needs no compilation for a scene, however large
+    # Only granularity "node" compiles nothing for a scene; the others would take minutes for the largest scenes.
     *(Sweep(name, _family(name), (1024,), (4,), "node") for name in ("chain", "tree", "deep", "branching")),
 )
 SWEPT = ("forward_dynamics", "inverse_dynamics")
-SAMPLE, FEWER = 16, 4  # worlds of each set of inputs that are compared with the reference: usually, and
-MANY = 4096  # of more than so many, and in sweeps
+SAMPLE, FEWER = 16, 4  # worlds of each set of inputs that are compared with the reference; FEWER in sweeps, and
+MANY = 4096  # where a case has more worlds than this
 
 
 def cases(
@@ -90,20 +90,23 @@ def cases(
     sweeps: bool = False,
     cuda: bool = True,
 ) -> list[dict]:
-    """Cases of all scenes and operations whose ``case_name`` holds a match of the regular expression ``pattern``.
+    """Return the cases whose ``case_name`` has a match of the regular expression ``pattern``.
 
-    A released robot that is not at hand is left out unless ``pattern`` names it. ``sweeps``: the cases of
-    :data:`SWEEPS` instead, at the sizes for a GPU or a CPU.
+    Args:
+        pattern: a released robot that is not available is left out unless ``pattern`` names it.
+        worlds, dtypes, granularities: values of which all combinations are cases.
+        sweeps: return cases of :data:`SWEEPS` instead.
+        cuda: whether sweeps have the sizes for a GPU, or those for a CPU.
 
     Raises:
-        ValueError: no case does, naming what there is; or a world count below one.
+        ValueError: no case matches, or a world count is below one.
     """
     if min(worlds) < 1:
         raise ValueError(f"benchmarks: --worlds has {min(worlds)}; expected one or more")
     every = [
         _case(scene, count, op, dtype, granularity, FEWER if count > MANY else SAMPLE)
         for scene in SCENES
-        if scene not in robots.ROBOTS or scene in pattern or robots.at_hand(scene)
+        if scene not in robots.ROBOTS or scene in pattern or robots.is_available(scene)
         for count in worlds
         for dtype in dtypes
         for granularity in granularities
@@ -136,6 +139,6 @@ def _case(scene: str, worlds: int, op: str, dtype: str, granularity: str | None,
 
 
 def case_name(case: dict) -> str:
-    """Such as ``humanoid.forward_dynamics.float32.w4096``, and behind it ``.node`` where that was asked for."""
+    """Return a name such as ``humanoid.forward_dynamics.float32.w4096``, with ``.node`` if the case asks for it."""
     asked = case.get("granularity") and not case.get("chosen")
     return f"{case['name']}.{case['dtype']}.w{case['worlds']}" + (f".{case['granularity']}" if asked else "")

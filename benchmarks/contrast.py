@@ -1,7 +1,6 @@
-"""Forms of forward dynamics that the library does not offer, in NumPy float32, for contrast.
+"""Other forms of forward dynamics in NumPy float32, to show what their errors would be. The library has none of them.
 
-Each is a function ``(scene, q, tau) -> (qdd, D)``, [world, dof], D None where the form has none. NaN where it breaks
-down.
+Each form is a function ``(scene, q, tau) -> (qdd, D)``, [world, dof]. A result is NaN where the form breaks down.
 """
 
 from __future__ import annotations
@@ -36,8 +35,8 @@ def _world_poses(links: list[Link], outward: list[int]) -> tuple[list, list]:
     return R, x
 
 
-def _moved(link: Link, R: np.ndarray, x: np.ndarray, l: np.ndarray) -> Link:
-    """The link in world axes about the point that lies ``-x`` from its origin, ``l`` from the parent's point."""
+def _move_link(link: Link, R: np.ndarray, x: np.ndarray, l: np.ndarray) -> Link:
+    """Return the link in world axes, about the point at ``-x`` from its origin and at ``l`` from the parent's point."""
     force = force_transform(R, x)
     motion = block(R, R * 0, skew(x) @ R, R)
     unit = np.broadcast_to(np.eye(3, dtype=R.dtype), R.shape)
@@ -45,32 +44,32 @@ def _moved(link: Link, R: np.ndarray, x: np.ndarray, l: np.ndarray) -> Link:
 
 
 def world_axes(links: list[Link], outward: list[int]) -> list[Link]:
-    """World axes, link origins, rotated local offsets."""
+    """Return the links in world axes about their origins; offsets are rotated from the local ones."""
     R, x = _world_poses(links, outward)
     moved = []
     for k, link in enumerate(links):
         offset = link.l if link.parent < 0 else (R[link.parent] @ link.l[..., None])[..., 0]
-        moved.append(_moved(link, R[k], x[k] * 0, offset))
+        moved.append(_move_link(link, R[k], x[k] * 0, offset))
     return moved
 
 
-def subtracted(links: list[Link], outward: list[int]) -> list[Link]:
-    """World axes, link origins, offsets subtracted from world positions."""
+def world_axes_by_subtraction(links: list[Link], outward: list[int]) -> list[Link]:
+    """Return the links in world axes about their origins; offsets are differences of world positions."""
     R, x = _world_poses(links, outward)
     return [
-        _moved(link, R[k], x[k] * 0, x[k] - (x[link.parent] if link.parent >= 0 else 0 * x[k]))
+        _move_link(link, R[k], x[k] * 0, x[k] - (x[link.parent] if link.parent >= 0 else 0 * x[k]))
         for k, link in enumerate(links)
     ]
 
 
 def world_origin(links: list[Link], outward: list[int]) -> list[Link]:
-    """World axes, everything about the world's origin: phi = identity."""
+    """Return the links in world axes about the world's origin, where phi is the identity."""
     R, x = _world_poses(links, outward)
-    return [_moved(link, R[k], x[k], x[k] * 0) for k, link in enumerate(links)]
+    return [_move_link(link, R[k], x[k], x[k] * 0) for k, link in enumerate(links)]
 
 
 def square_root(scene: Any, q: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """P = L L*, combined and eliminated by QR of stacked factors (array form); only D and U = P H* leave it."""
+    """Return qdd and D by the square-root form: P = L L* is only known by L, which QR of stacked factors updates."""
     sweep = Sweep(scene, q, "float32")
     factors: list[list] = [[] for _ in sweep.links]
     for k in reversed(sweep.outward):
@@ -92,7 +91,7 @@ def square_root(scene: Any, q: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray,
 
 
 def _body_root(M: np.ndarray) -> np.ndarray:
-    """L with L L* = M for a body of positive mass: [[J_c^1/2, c~ m^1/2], [0, m^1/2]]."""
+    """Return L = [[J_c^1/2, c~ m^1/2], [0, m^1/2]], for which L L* = M, of a body with positive mass."""
     root = np.sqrt(M[:, 3:, 3:])  # diagonal
     s = M[:, :3, 3:] / M[:, 3, 3][:, None, None]
     J = M[:, :3, :3] - M[:, :3, 3:] @ transpose(s)
@@ -101,7 +100,7 @@ def _body_root(M: np.ndarray) -> np.ndarray:
 
 
 def cholesky(mass: np.ndarray, right: np.ndarray, dtype: Any = FLOAT32) -> np.ndarray:
-    """mass^-1 right by a dense Cholesky in ``dtype``, [world, dof, dof] and [world, dof]; NaN where it breaks down."""
+    """Return mass^-1 right [world, dof] by a dense Cholesky factorisation in ``dtype``; NaN where it breaks down."""
     out = np.full(right.shape, np.nan, dtype)
     for world, (M, b) in enumerate(zip(mass.astype(dtype), right.astype(dtype), strict=True)):
         try:
@@ -116,7 +115,7 @@ FORMS: dict[str, Callable] = {
     "body axes, NumPy": _sweep,
     "full 6 x 6 P": functools.partial(_sweep, symmetric=False),
     "world axes": functools.partial(_sweep, change=world_axes),
-    "subtracted offsets": functools.partial(_sweep, change=subtracted),
+    "subtracted offsets": functools.partial(_sweep, change=world_axes_by_subtraction),
     "world origin": functools.partial(_sweep, change=world_origin),
     "square root": square_root,
     "float32 sum": _sweep,

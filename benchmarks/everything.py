@@ -1,8 +1,8 @@
-"""``python -m benchmarks --everything``: every number and picture of the README, ours and the peers', in one go.
+"""``python -m benchmarks --everything``: measure every number of the README, ours and the peers', in one command.
 
-The work is cut into parts, each a process with a file of rows. Kernels of all parts are compiled side by side, on all
-cores; what is compiled is measured, one part at a time on a GPU. Parts come in order of importance: what the time
-budget leaves out is named, and the same command goes on from there.
+The work consists of parts, each a process that writes a file of rows. The kernels of several parts are compiled at the
+same time, on all cores. A part whose kernels are compiled is measured, one part at a time on each GPU. Parts come in
+order of importance. Parts that the time budget leaves out are named, and the same command continues with them.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from . import evidence, runner
 from .evidence import ROOT
 
 FOLDER = ROOT / "build" / "evidence"
-PEERS_FOLDER = "WARP_SPO_PEERS"  # where peers' own programs are, or are built
-GRACE = 15.0  # [s] between an interrupt and the end of a process
-LAST = 8.0  # [s]: with less left, no part is begun
+PEERS_FOLDER = "WARP_SPO_PEERS"  # environment variable: folder of the peers' own programs, which may be built there
+GRACE = 15.0  # [s] that an interrupted process has to end by itself
+LEAST = 8.0  # [s] of the budget that must be left to begin a part
 
 
 class Part(NamedTuple):
-    """Some cases that are compiled and measured by one process each.
+    """Cases that one process compiles and another one measures.
 
     Attributes:
-        name: of its files.
-        measure: arguments of ``python -m``, to which ``--json FILE`` is added.
-        compile: the same for what compiles its kernels and measures nothing; None: nothing is worth it.
-        seconds: most that measuring may take.
-        alone: it measures the host's cores: nothing is compiled or measured beside it.
+        name: name of its files.
+        measure: arguments of ``python -m`` that measure the cases; ``--json FILE`` is added.
+        compile: arguments of ``python -m`` that compile their kernels; None: they are compiled while measuring.
+        seconds: longest time that measuring may take.
+        alone: whether nothing else may run meanwhile, because the part measures the host's cores.
     """
 
     name: str
@@ -43,8 +43,8 @@ class Part(NamedTuple):
     alone: bool = False
 
 
-class Measuring(NamedTuple):
-    """A part that is being measured, until ``end``."""
+class Job(NamedTuple):
+    """A part that is being measured; it is stopped at the time ``end``."""
 
     part: Part
     job: subprocess.Popen
@@ -52,57 +52,59 @@ class Measuring(NamedTuple):
     end: float
 
 
-class Lanes:
-    """Processes of parts: many that compile, and one that measures on each GPU.
+class Scheduler:
+    """Runs the processes of parts: several that compile, and one on each GPU that measures.
 
     Args:
-        folder: for rows and logs; a part that has its ``.done`` there is not run again.
-        budget: [s] from now.
-        jobs: how many compile at a time.
-        alone: measure nothing until everything is compiled, as where both need the same cores.
-        gpus: to measure on. Of three or more the last one is left to what compiles.
+        folder: folder of rows and logs; a part with a ``.done`` file there is not run again.
+        budget: time for everything, from now on [s].
+        jobs: largest number of processes that compile at the same time.
+        alone: measure nothing until everything is compiled, for compiling and measuring need the same cores.
+        gpus: number of GPUs to measure on; the last one of three or more is used for compiling.
     """
 
     def __init__(self, folder: Path, budget: float, jobs: int, alone: bool, gpus: int = 1):
         self.folder, self.end, self.jobs, self.alone, self.gpus = folder, time.monotonic() + budget, jobs, alone, gpus
         self.begin = time.monotonic()
         self.compiling: dict[str, subprocess.Popen] = {}
-        self.measuring: dict[int, Measuring] = {}
+        self.measuring: dict[int, Job] = {}
         folder.mkdir(parents=True, exist_ok=True)
 
     @property
     def left(self) -> float:
+        """Time that is left of the budget [s]."""
         return self.end - time.monotonic()
 
     def say(self, text: str) -> None:
+        """Print a line, with the time that has passed and that is left."""
         print(f"[{time.monotonic() - self.begin:4.0f} s, {max(0.0, self.left):4.0f} s left] {text}", flush=True)
 
     def start(self, arguments: Sequence[str], log: Path, gpu: int) -> subprocess.Popen:
-        """``python -m arguments``, in a process group of its own, which sees one of several GPUs."""
+        """Start ``python -m arguments`` in a process group of its own, which sees only one of several GPUs."""
         sees = {"CUDA_VISIBLE_DEVICES": str(gpu)} if self.gpus > 1 else {}
         with log.open("w") as out:
             return subprocess.Popen([sys.executable, "-m", *arguments], cwd=ROOT, stdout=out, stderr=subprocess.STDOUT,
                                     start_new_session=True, env=os.environ | sees)  # fmt: skip
 
     def run(self, parts: Sequence[Part]) -> list[Part]:
-        """Compile and measure; returns the parts that the budget left out or cut short."""
+        """Compile and measure the parts; return those that were left out or stopped for lack of time."""
         waiting = [part for part in parts if not self._is_done(part)]
         if len(waiting) < len(parts):
             self.say(f"{len(parts) - len(waiting)} parts are there already, in {self.folder}")
         queue, unfinished = [part for part in waiting if part.compile], []
-        lanes = range(self.gpus - 1 if self.gpus > 2 else self.gpus)
+        gpus = range(self.gpus - 1 if self.gpus > 2 else self.gpus)
         try:
-            while self.measuring or (waiting and self.left > LAST):
+            while self.measuring or (waiting and self.left > LEAST):
                 while queue and sum(job.poll() is None for job in self.compiling.values()) < self.jobs:
                     part = queue.pop(0)
                     log = self.folder / f"{part.name}.compile.log"
                     self.compiling[part.name] = self.start(part.compile or (), log, self.gpus - 1)
-                unfinished += [part for lane in list(self.measuring) if (part := self._ended(lane))]
-                for lane in lanes:
-                    part = self._ready(waiting, bool(queue)) if self.left > LAST else None
-                    if lane not in self.measuring and part:
+                unfinished += [part for gpu in list(self.measuring) if (part := self._finish(gpu))]
+                for gpu in gpus:
+                    part = self._next_part(waiting, bool(queue)) if self.left > LEAST else None
+                    if gpu not in self.measuring and part:
                         waiting.remove(part)
-                        self._measure(part, lane)
+                        self._measure(part, gpu)
                 time.sleep(0.1)
         finally:
             for job in [*self.compiling.values(), *(each.job for each in self.measuring.values())]:
@@ -113,8 +115,11 @@ class Lanes:
         file = self.folder / f"{part.name}.json"
         return (self.folder / f"{part.name}.done").exists() and (is_run(file) or not file.exists())
 
-    def _ready(self, waiting: list[Part], queued: bool) -> Part | None:
-        """The first part whose kernels are compiled; what compiles its own comes when all others' are."""
+    def _next_part(self, waiting: list[Part], queued: bool) -> Part | None:
+        """Return the first part that can be measured now, or None.
+
+        A part that compiles its own kernels must wait until the kernels of all other parts are compiled.
+        """
         busy = {name for name, job in self.compiling.items() if job.poll() is None}
         if any(each.part.alone for each in self.measuring.values()):
             return None
@@ -125,33 +130,33 @@ class Lanes:
         return next((part for part in waiting if (part.name in compiled or (idle and not part.compile))
                      and (not part.alone or (idle and not self.measuring))), None)  # fmt: skip
 
-    def _measure(self, part: Part, lane: int) -> None:
+    def _measure(self, part: Part, gpu: int) -> None:
         file, log, begin = self.folder / f"{part.name}.json", self.folder / f"{part.name}.log", time.monotonic()
-        job = self.start([*part.measure, "--json", str(file)], log, lane)
-        self.measuring[lane] = Measuring(part, job, begin, begin + max(1.0, min(part.seconds, self.left)))
+        job = self.start([*part.measure, "--json", str(file)], log, gpu)
+        self.measuring[gpu] = Job(part, job, begin, begin + max(1.0, min(part.seconds, self.left)))
 
-    def _ended(self, lane: int) -> Part | None:
-        """Report what the lane has measured, once that is over; returns a part that did not come to its end."""
-        part, job, begin, end = self.measuring[lane]
+    def _finish(self, gpu: int) -> Part | None:
+        """Say what the GPU's job has measured, if the job is over; return the job's part if it was not completed."""
+        part, job, begin, end = self.measuring[gpu]
         code = job.poll()
         if code is None and time.monotonic() < end:
             return None
         stop(job, GRACE)
-        del self.measuring[lane]
+        del self.measuring[gpu]
         file, log = self.folder / f"{part.name}.json", self.folder / f"{part.name}.log"
         rows = len(evidence.read(file)["rows"]) if is_run(file) else 0
         how = "stopped, out of time" if code is None else "" if code == 0 else f"returned {code}"
         reasons = [line for line in log.read_text().splitlines() if line.startswith(("skipped", "benchmarks:"))]
         self.say("; ".join([f"{part.name}: {rows} rows in {time.monotonic() - begin:.0f} s", *filter(None, [how])]))
         print("".join(f"    {line[:200]}\n" for line in dict.fromkeys(reasons)), end="", flush=True)
-        if code not in (0, 1):  # 1: measured, and something is beyond its tolerance, as the log says
+        if code not in (0, 1):  # 1: it was measured, and the log says which error exceeds its tolerance
             return part
         (self.folder / f"{part.name}.done").touch()
         return None
 
 
 def stop(job: subprocess.Popen, grace: float) -> None:
-    """Interrupt a process and its children; end them where they do not listen."""
+    """Interrupt a process and its children, and kill them if they have not ended after ``grace`` seconds."""
     for number, wait in ((signal.SIGINT, grace), (signal.SIGKILL, None)):
         if job.poll() is not None:
             return
@@ -163,7 +168,7 @@ def stop(job: subprocess.Popen, grace: float) -> None:
 
 
 def is_run(file: Path) -> bool:
-    """Whether the file is there and holds a run; one that was cut off in writing does not."""
+    """Return whether the file exists and holds a whole run."""
     try:
         evidence.read(file)
     except ValueError:
@@ -171,8 +176,8 @@ def is_run(file: Path) -> bool:
     return True
 
 
-def merged(files: Sequence[Path]) -> dict:
-    """The runs in files of one commit and machine as one run."""
+def merge(files: Sequence[Path]) -> dict:
+    """Return the runs in ``files``, which have one commit and machine, as one run."""
     runs = sorted(map(evidence.read, files), key=lambda run: run["date"])
     whole: dict[str, Any] = dict(runs[-1], rows=[])
     for key in ("machine", "versions"):
@@ -183,40 +188,43 @@ def merged(files: Sequence[Path]) -> dict:
     return whole | (dict(stress=stress) if stress else {})
 
 
-def short(machine: dict) -> str:
-    """Such as h200 or cpu."""
+def short_name(machine: dict) -> str:
+    """Return a machine's name for files, such as "h200" or "cpu"."""
     return machine["device"].split()[-1].lower() if "device_memory_GiB" in machine else "cpu"
 
 
 def run(
     parts: Sequence[Part], device: Any, budget: float, jobs: int | None, out: Path, gpus: int = 1
 ) -> tuple[Path, list[Part]]:
-    """Run parts, write their rows as one run into the file or folder ``out``; returns the file, and parts left out.
+    """Run the parts, write their rows as one run into the file or folder ``out``, and return the file.
+
+    Returns:
+        The file, and the parts that were left out.
 
     Raises:
-        ValueError: there was no time for a single row; budget, jobs or gpus are not positive.
+        ValueError: not a single row was measured, or ``budget``, ``jobs`` or ``gpus`` is not positive.
     """
     for name, value in (("budget", budget), ("jobs", jobs), ("gpus", gpus)):
         if value is not None and not value > 0:
             raise ValueError(f"benchmarks: --{name} is {value:g}; expected more than 0")
     found = runner.machine(device)
     cuda = "device_memory_GiB" in found
-    folder = FOLDER / f"{short(found)}-{runner.commit()[:12]}"
+    folder = FOLDER / f"{short_name(found)}-{runner.commit()[:12]}"
     os.environ.setdefault(PEERS_FOLDER, str(FOLDER / "peers"))
     Path(os.environ[PEERS_FOLDER]).mkdir(parents=True, exist_ok=True)
     cores = os.cpu_count() or 1
-    lanes = Lanes(folder, budget, jobs or (max(1, cores - 2) if cuda else cores), alone=not cuda, gpus=gpus)
+    scheduler = Scheduler(folder, budget, jobs or (max(1, cores - 2) if cuda else cores), alone=not cuda, gpus=gpus)
     most = sum(part.seconds for part in parts)
-    lanes.say(f"{found['device']}: {len(parts)} parts, at most {most:.0f} s of measuring")
-    left_out = lanes.run(parts)
+    scheduler.say(f"{found['device']}: {len(parts)} parts, at most {most:.0f} s of measuring")
+    left_out = scheduler.run(parts)
     files = [file for part in parts if is_run(file := folder / f"{part.name}.json")]
     if not files:
-        raise ValueError(f"benchmarks: nothing was measured in {budget:g} s; logs are in {folder}")
-    whole = merged(files)
+        raise ValueError(f"benchmarks: no case was measured in {budget:g} s; the logs are in {folder}")
+    whole = merge(files)
     if out.is_dir() or not out.suffix:
-        out = out / f"{whole['date'][:10]}-{short(found)}.json"
-    lanes.say(f"wrote {runner.save(whole, out)}")
+        out = out / f"{whole['date'][:10]}-{short_name(found)}.json"
+    scheduler.say(f"wrote {runner.save(whole, out)}")
     if left_out:
         names = ", ".join(part.name for part in left_out)
-        lanes.say(f"left out: {names}; the same command goes on with them")
+        scheduler.say(f"left out: {names}; the same command continues with them")
     return out, left_out

@@ -1,4 +1,4 @@
-"""What is known of each machine, gathered from the JSON files of runs: our rows, peers' rows, the stress suite's."""
+"""Rows of each machine, gathered from the JSON files of runs: ours, the peers' and the stress suite's."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 IDENTITY = ("scene", "op", "worlds", "dtype", "granularity", "peer", "variant", "sweep", "group", "name")
-"""Keys that tell one measurement from another; a row has some of them."""
+"""Keys that tell one measurement from another; each row has some of them."""
 RUN = {"rows": list, "machine": dict, "date": str, "commit": str, "versions": dict}
 MEASURED = {"name", "scene", "op", "worlds", "dtype"}
 ROWS = {
@@ -19,19 +19,21 @@ ROWS = {
     "stress": {"case", "parameters", "verdict"},
     "capabilities": {"group", "name", "worlds"},
 }
-"""What the file of a run holds, and every row of a kind."""
+"""Kind of rows -> keys that every row of the kind has."""
 
 
 class Evidence(NamedTuple):
-    """Rows of one machine, each kind from the newest commit that has it (of every peer: its newest).
+    """Rows of one machine, each kind of row (and each peer) from the newest commit that has measured it.
 
-    Files of one commit complete each other; where they have the same row, the newer one counts.
+    All files of that commit are used; where two have the same row, the newer file counts.
 
     Attributes:
-        machine: what the newest file says of it, its peaks too.
-        rows: ours; ``peers``: with "peer", its name; ``stress``: with "case" and "verdict".
-        sources: a line for each file that rows come from: machine, what, commit, date, versions.
-        capabilities: with "group", see :mod:`.capabilities`.
+        machine: names, memory and peaks of the machine, from the newest file that has each.
+        rows: our rows.
+        peers: rows of other libraries; "peer" is the library's name.
+        stress: rows of the stress suite, with "case" and "verdict".
+        sources: a line for each file that rows come from: machine, kinds of rows, commit, date, versions.
+        capabilities: rows of :mod:`.capabilities`, with "group".
     """
 
     machine: dict
@@ -43,24 +45,27 @@ class Evidence(NamedTuple):
 
     @property
     def is_gpu(self) -> bool:
+        """Whether the machine is a GPU."""
         return "device_memory_GiB" in self.machine
 
 
 def identity(row: dict) -> tuple:
-    """What two runs of the same measurement have in common."""
+    """Return the values by which two rows are the same measurement."""
     return tuple(row.get(key) for key in IDENTITY)
 
 
 def read(path: Path) -> dict:
-    """The run in a JSON file.
+    """Return the run in a JSON file.
 
     Raises:
-        ValueError: no such file, or one that no run wrote.
+        ValueError: there is no such file, or it is not the file of a run.
     """
     try:
         data = json.loads(Path(path).read_text())
     except OSError as error:
-        raise ValueError(f"benchmarks: cannot read {str(path)!r}: {error.strerror}; expected a run's JSON") from None
+        raise ValueError(
+            f"benchmarks: cannot read {str(path)!r}: {error.strerror}; expected the JSON of a run"
+        ) from None
     except ValueError:
         data = None
     if not _is_run(data):
@@ -69,7 +74,7 @@ def read(path: Path) -> dict:
 
 
 def _is_run(data: Any) -> bool:
-    """Whether all is there that tables, pictures and reports look up without asking."""
+    """Return whether ``data`` has the keys that tables, pictures and reports need."""
     if not isinstance(data, dict) or not all(isinstance(data.get(key), kind) for key, kind in RUN.items()):
         return False
     stress = data.get("stress", [])
@@ -79,10 +84,10 @@ def _is_run(data: Any) -> bool:
 
 
 def files(paths: Iterable[Path]) -> list[Path]:
-    """The files named, and every JSON file of the folders named.
+    """Return the files among ``paths``, and every JSON file of the folders among them.
 
     Raises:
-        ValueError: there is none.
+        ValueError: there is no file.
     """
     found = [file for path in paths for file in (sorted(path.glob("*.json")) if path.is_dir() else [path])]
     if not found:
@@ -92,16 +97,16 @@ def files(paths: Iterable[Path]) -> list[Path]:
 
 
 def gather(runs: Iterable[dict]) -> list[Evidence]:
-    """Evidence of every machine among the runs, GPUs first."""
+    """Return the evidence of every machine among the runs, GPUs first."""
     machines: dict[str, list[dict]] = {}
     for data in sorted(runs, key=lambda data: data["date"], reverse=True):
         machines.setdefault(data["machine"]["device"], []).append(data)
-    found = [_of_machine(mine) for mine in machines.values()]
+    found = [_gather_machine(mine) for mine in machines.values()]
     return sorted(found, key=lambda evidence: not evidence.is_gpu)
 
 
-def _of_machine(runs: list[dict]) -> Evidence:
-    """Evidence of one machine; ``runs`` come newest first."""
+def _gather_machine(runs: list[dict]) -> Evidence:
+    """Return the evidence of one machine; ``runs`` are its runs, newest first."""
     newest: dict[tuple, str] = {}  # kind of rows -> commit that they come from
     rows: dict[str, list[dict]] = {"ours": [], "peers": [], "stress": [], "capabilities": []}
     used: dict[int, dict[str, None]] = {}
@@ -117,7 +122,7 @@ def _of_machine(runs: list[dict]) -> Evidence:
                 rows[kind].append(row)
                 used.setdefault(index, {})[row.get("peer") or kind] = None
     machine = {key: value for data in runs[::-1] for key, value in data["machine"].items()}
-    lines = [_source(data, list(used[index])) for index, data in enumerate(runs) if index in used]
+    lines = [_source_line(data, list(used[index])) for index, data in enumerate(runs) if index in used]
     sources = list(dict.fromkeys(lines))
     return Evidence(machine, rows["ours"], rows["peers"], rows["stress"], sources, rows["capabilities"])
 
@@ -128,7 +133,7 @@ def _kind(row: dict) -> str:
     return "stress" if "verdict" in row else "peers" if row.get("peer") else "ours"
 
 
-def _source(data: dict, kinds: list[str]) -> str:
+def _source_line(data: dict, kinds: list[str]) -> str:
     named = [kind for kind in kinds if kind != "ours"]
     what = "" if "ours" in kinds else f" ({', '.join(named)})"
     versions = ", ".join(f"{name} {version}" for name, version in data["versions"].items())
@@ -136,15 +141,15 @@ def _source(data: dict, kinds: list[str]) -> str:
 
 
 def usual_worlds(rows: Iterable[dict]) -> int:
-    """The world count that most rows have; 0 without rows."""
+    """Return the world count that most rows have; 0 without rows."""
     counts = [row["worlds"] for row in rows]
     return max(counts, key=lambda worlds: (counts.count(worlds), worlds), default=0)
 
 
 def compare(a: dict, b: dict, least: float = 20.0) -> list[tuple[float, dict, dict]]:
-    """How far two runs lie apart, largest difference first: (|us_a - us_b| / the smaller, row of a, row of b).
+    """Return (|us_a - us_b| / the smaller, row of a, row of b) of each row that both runs have, largest first.
 
-    Rows that only one run has, or that take less than ``least`` us in both, are left out.
+    Rows that take less than ``least`` µs in both are left out.
 
     Raises:
         ValueError: no row is left.

@@ -1,8 +1,9 @@
-"""Forward dynamics of a scene by one sweep in any arithmetic: what the stress suite compares with, and its contrasts.
+"""Forward dynamics of a scene in any arithmetic: the reference of the stress suite.
 
-Nothing is shared with the library. Spatial vectors are [omega; v] and [n; f]; arrays are [world, ...] in the numbers of
-an :class:`Arithmetic`: float32, float64, the machine's extended precision, or mpmath with 50 digits. Articulated-body
-recursion: Jain, "Graph Theory Roots of Spatial Operators", eq. 1; full 6 x 6 blocks, one hinge column at a time.
+It shares no code with the library. Spatial vectors are [omega; v] and [n; f]. Arrays are [world, ...] in the numbers of
+an :class:`Arithmetic`: float32, float64, the machine's extended precision, or mpmath with 50 digits. The algorithm is
+the articulated-body recursion, Jain, "Graph Theory Roots of Spatial Operators", eq. 1, with full 6 x 6 blocks; it
+eliminates one dof at a time.
 """
 
 from __future__ import annotations
@@ -23,23 +24,30 @@ BALL, FREE = 1, 2  # Hinge.motion
 
 @dataclasses.dataclass(frozen=True)
 class Arithmetic:
-    """Numbers, and the functions that a scene needs of them."""
+    """Numbers of one kind and their functions.
+
+    Attributes:
+        name: such as "float32".
+        number: converts an array to these numbers.
+        sin, log: functions of such arrays.
+        constants: name of the arithmetic for values that do not depend on q; "" is this one.
+    """
 
     name: str
     number: Callable[[Any], np.ndarray]
     sin: Callable[[Any], Any] = np.sin
     log: Callable[[Any], Any] = np.log
-    constants: str = ""  # arithmetic in which what does not depend on q is computed; default: this one
+    constants: str = ""
 
 
 def _to_mp(x: Any) -> Any:
     if not isinstance(x, np.longdouble):
         return MP.mpf(x)
-    high = np.float64(x)  # mpmath knows no extended numbers
+    high = np.float64(x)  # mpmath cannot convert extended numbers
     return MP.mpf(high) + MP.mpf(np.float64(x - high))
 
 
-def _mp(function: Callable) -> Callable:
+def _vectorize(function: Callable) -> Callable:
     return np.vectorize(function, otypes=[object])
 
 
@@ -47,53 +55,63 @@ ARITHMETIC = {
     "float32": Arithmetic("float32", lambda x: np.asarray(x, dtype=np.float32), constants="float64"),
     "float64": Arithmetic("float64", lambda x: np.asarray(x, dtype=np.float64)),
     "extended": Arithmetic("extended", lambda x: np.asarray(x, dtype=np.longdouble)),
-    "mp50": Arithmetic("mp50", lambda x: _mp(_to_mp)(np.asarray(x)), _mp(MP.sin), _mp(MP.log)),
+    "mp50": Arithmetic("mp50", lambda x: _vectorize(_to_mp)(np.asarray(x)), _vectorize(MP.sin), _vectorize(MP.log)),
 }
 
 
 def skew(v: np.ndarray) -> np.ndarray:
-    """a~ with a~ b = a x b, [..., 3] to [..., 3, 3]."""
+    """Return v~ [..., 3, 3], for which v~ b = v x b, of v [..., 3]."""
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
     o = x * 0
     return np.stack([np.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], -2)
 
 
 def transpose(matrix: np.ndarray) -> np.ndarray:
+    """Return the transposes of matrices [..., i, j]."""
     return np.swapaxes(matrix, -1, -2)
 
 
 def block(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """[[a, b], [c, d]] of [..., 3, 3]."""
+    """Return [[a, b], [c, d]] [..., 6, 6] of blocks [..., 3, 3]."""
     return np.concatenate([np.concatenate([a, b], -1), np.concatenate([c, d], -1)], -2)
 
 
 def force_transform(R: np.ndarray, l: np.ndarray) -> np.ndarray:
-    """phi = [[R, l~ R], [0, R]]: forces of a frame at (R, l) as the inboard frame has them; eq. 15."""
+    """Return phi = [[R, l~ R], [0, R]], which takes forces from a frame at (R, l) to the inboard frame; eq. 15."""
     return block(R, skew(l) @ R, R * 0, R)
 
 
 def crm(V: np.ndarray) -> np.ndarray:
-    """V x of motions: [[w~, 0], [v~, w~]]; of forces it is the negative transpose."""
+    """Return the cross product by V of motions, [[w~, 0], [v~, w~]]; that of forces is its negative transpose."""
     w, v = skew(V[..., :3]), skew(V[..., 3:])
     return block(w, w * 0, v, w)
 
 
 def rotation(a: Arithmetic, quaternion: np.ndarray) -> np.ndarray:
-    """Of a quaternion xyzw of any length, [..., 4] to [..., 3, 3]."""
+    """Return the rotation matrix [..., 3, 3] of a quaternion xyzw [..., 4] of any length."""
     k, w = skew(quaternion[..., :3]), quaternion[..., 3, None, None]
     square = (quaternion * quaternion).sum(-1)[..., None, None]
     return a.number(np.eye(3)) + (w * k + k @ k) * 2 / square
 
 
-def turn(a: Arithmetic, axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """About a unit axis [3], by ``angle`` [world]: [world, 3, 3]."""
+def axis_rotation(a: Arithmetic, axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Return the rotation matrix [world, 3, 3] about a unit axis [3] by ``angle`` [world]."""
     k, half = skew(axis), a.sin(angle / 2)[:, None, None]
     return a.number(np.eye(3)) + a.sin(angle)[:, None, None] * k + 2 * half * half * (k @ k)
 
 
 @dataclasses.dataclass
 class Link:
-    """One node: pose (R, l) in the parent's node frame, columns H* [world, 6, r], inertia M [world, 6, 6]."""
+    """One node of the tree.
+
+    Attributes:
+        parent: index of the parent; -1: the world.
+        dofs: indices of its dofs.
+        R, l: pose in the parent's node frame.
+        H: columns H* [world, 6, dof].
+        M: spatial inertia [world, 6, 6].
+        armature: of its dofs [world, dof].
+    """
 
     parent: int
     dofs: np.ndarray
@@ -105,11 +123,12 @@ class Link:
 
     @functools.cached_property
     def phi(self) -> np.ndarray:
+        """Takes forces from this node's frame to the parent's, [world, 6, 6]."""
         return force_transform(self.R, self.l)
 
 
 def links(a: Arithmetic, scene: Any, q: np.ndarray) -> list[Link]:
-    """Every node of ``scene`` at q [world, coordinate], in node frames (the child anchors of the hinges)."""
+    """Return every node of ``scene`` at q [world, coordinate]; a node's frame is its hinge's child anchor."""
     c = ARITHMETIC[a.constants or a.name]
     worlds, q = len(q), a.number(q)
     value = {
@@ -143,7 +162,7 @@ def links(a: Arithmetic, scene: Any, q: np.ndarray) -> list[Link]:
 
 
 def _hinge(a: Arithmetic, hinge: Any, q: np.ndarray, com: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pose of the child anchor in the parent anchor, and columns H* in the child anchor's frame."""
+    """Return the child anchor's pose (R, l) in the parent anchor, and the columns H* in the child anchor's frame."""
     worlds = len(q)
     unit = np.broadcast_to(a.number(np.eye(3)), (worlds, 3, 3))
     R, l, H = unit, np.broadcast_to(a.number(np.zeros(3)), (worlds, 3)), a.number(np.zeros((worlds, 6, 0)))
@@ -155,7 +174,7 @@ def _hinge(a: Arithmetic, hinge: Any, q: np.ndarray, com: np.ndarray) -> tuple[n
         return R, q[:, :3], block(zero, axes, axes, skew(com) @ axes)
     for i, (axis, angular, linear) in enumerate(hinge.screws):
         axis, angular, linear = a.number(axis), a.number(angular), a.number(linear)
-        R_i, l_i = turn(a, axis, q[:, i] * angular), axis * (q[:, i] * linear)[:, None]
+        R_i, l_i = axis_rotation(a, axis, q[:, i] * angular), axis * (q[:, i] * linear)[:, None]
         column = np.broadcast_to(np.concatenate([axis * angular, axis * linear]), (worlds, 6))[..., None]
         H = np.concatenate([transpose(force_transform(R_i, l_i)) @ H, column], -1)
         R, l = R @ R_i, l + (R @ l_i[..., None])[..., 0]
@@ -163,16 +182,17 @@ def _hinge(a: Arithmetic, hinge: Any, q: np.ndarray, com: np.ndarray) -> tuple[n
 
 
 class Sweep:
-    """Mass = [I + H phi K] D [I + H phi K]* and its inverse's action, of ``scene`` at q [world, coordinate].
+    """The factorisation Mass = [I + H phi K] D [I + H phi K]* of ``scene`` at q [world, coordinate].
 
     Args:
-        q: [m, rad, quaternion xyzw]; qd, tau of :meth:`forward` are the library's.
+        scene: the scene; the values of all worlds are used.
+        q: coordinates [m, rad, quaternion xyzw].
         arithmetic: a name in ARITHMETIC.
-        change: function of (links, nodes outward) that returns the links in other frames; see contrast.
+        change: function of (links, nodes from the root outward) that returns the links in other frames.
         symmetric: whether P is made symmetric after each elimination.
 
     Attributes:
-        D: pivots [world, dof], the outermost column of a hinge first.
+        D: pivots [world, dof]; a hinge's last dof is eliminated first.
         P_trace: trace of P at each hinge [world, dof].
         D_cond: largest condition number of a hinge's block H P H* + Delta [world], float64.
     """
@@ -214,7 +234,7 @@ class Sweep:
                 P[link.parent] = P[link.parent] + link.phi @ P[k] @ transpose(link.phi)
 
     def forward(self, tau: np.ndarray | None = None, qd: np.ndarray | None = None) -> np.ndarray:
-        """qdd [world, dof] for tau and qd [world, dof]; qd for hinges of screws only."""
+        """Return qdd [world, dof] for tau and qd [world, dof]; qd must be None if a hinge is a ball or free."""
         a = self.arithmetic
         zero = a.number(np.zeros((self.worlds, 6, 1)))
         z, alpha, eps = [zero] * len(self.links), [zero] * len(self.links), {}
@@ -241,7 +261,7 @@ class Sweep:
         return qdd
 
     def _velocity_forces(self, qd: np.ndarray) -> list:
-        """M a + V x* M V of every body, a the acceleration that velocities alone give."""
+        """Return M a + V x* M V of every body, where a is the acceleration for qdd = 0."""
         V, A, force = [None] * len(self.links), [None] * len(self.links), [None] * len(self.links)
         for k in self.outward:
             link = self.links[k]
@@ -256,5 +276,5 @@ class Sweep:
         return force
 
     def log_det(self) -> np.ndarray:
-        """log det of the mass matrix [world]."""
+        """Return the log of the mass matrix's determinant [world]."""
         return self.arithmetic.log(self.D).sum(1)

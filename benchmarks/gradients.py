@@ -1,11 +1,11 @@
-"""Gradients of a rollout by the starting state: warp_spo's, and those of wp.Tape through Newton's SolverFeatherstone.
+"""Compare gradients of a rollout by its start: those of warp_spo, and of wp.Tape through Newton's SolverFeatherstone.
 
     python -m benchmarks.gradients [--dt 0.01]
 
-A damped arm of three hinges falls; the loss is |q|^2 + |qd|^2 of its last state. Each gradient is compared with central
-differences of the same solver's own loss, so that what differs between solvers does not count. SolverFeatherstone keeps
-one mass matrix and one Jacobian for all steps, which the tape then reads as the last step left them; with a solver of
-its own for each step its gradients are right, at the memory of as many solvers.
+A damped arm of three hinges falls. The loss is |q|^2 + |qd|^2 of its last state. Each gradient is compared with central
+differences of the same solver's loss, so that differences between solvers do not count. SolverFeatherstone has one mass
+matrix and one Jacobian, which every step overwrites, and the tape reads those of the last step. With a separate solver
+for each step its gradients are right, at the price of the memory of all these solvers.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ import warp_spo as spo
 
 STEPS = (1, 5, 20, 50)
 START = np.array([[0.4, -0.7, 0.9], [0.5, 1.0, -0.8]])  # q, qd
-NUDGE = {"float32": 1e-2, "float64": 1e-5}  # of central differences
+NUDGE = {"float32": 1e-2, "float64": 1e-5}  # step of central differences
 
 
 def arm() -> Any:
-    """Bars of 0.4 m about z, y and y, with damping and armature, as Newton's model on the CPU."""
+    """Return Newton's model of three bars of 0.4 m about z, y and y, with damping and armature, on the CPU."""
     import newton
 
     builder, joints = newton.ModelBuilder(), []
@@ -40,7 +40,7 @@ def arm() -> Any:
 
 
 class Featherstone:
-    """Loss and gradient by Newton's solver. ``apart``: a solver of its own for each step."""
+    """Loss and gradient by Newton's solver; ``apart``: with a separate solver for each step."""
 
     dtype = "float32"
 
@@ -53,6 +53,7 @@ class Featherstone:
         self.states = [model.state() for _ in range(steps + 1)]
 
     def rollout(self, start: np.ndarray) -> Any:
+        """Return the last state of a rollout from ``start`` (q; qd)."""
         first, last = self.states[0], self.states[-1]
         first.joint_q.assign(start[0].astype(np.float32))
         first.joint_qd.assign(start[1].astype(np.float32))
@@ -63,10 +64,12 @@ class Featherstone:
         return last
 
     def loss(self, start: np.ndarray) -> float:
+        """Return the loss of a rollout from ``start`` (q; qd)."""
         last = self.rollout(start)
         return sum(float(np.square(x.numpy().astype(float)).sum()) for x in (last.joint_q, last.joint_qd))
 
     def gradient(self, start: np.ndarray) -> np.ndarray:
+        """Return the gradient of the loss by q and qd [2, 3]."""
         tape = wp.Tape()
         with tape:
             last = self.rollout(start)
@@ -92,12 +95,14 @@ class Spo:
         return q.square().sum() + qd.square().sum()
 
     def loss(self, start: np.ndarray) -> float:
+        """Return the loss of a rollout from ``start`` (q; qd)."""
         import torch
 
         q, qd = torch.as_tensor(start, dtype=getattr(torch, self.dtype))[:, None]
         return self._loss(q, qd).item()
 
     def gradient(self, start: np.ndarray) -> np.ndarray:
+        """Return the gradient of the loss by q and qd [2, 3]."""
         import torch
 
         state = [x.clone().requires_grad_() for x in torch.as_tensor(start, dtype=getattr(torch, self.dtype))[:, None]]
@@ -105,7 +110,7 @@ class Spo:
 
 
 def errors(solver: Any) -> np.ndarray:
-    """Of the gradient by q and of that by qd, 2-norms over those of central differences of the solver's loss."""
+    """Return the relative errors (2-norm) of the gradients by q and by qd, against central differences [2]."""
     nudge, wanted = NUDGE[solver.dtype], np.zeros_like(START)
     for at in np.ndindex(*START.shape):
         away = np.zeros_like(START)
@@ -115,7 +120,7 @@ def errors(solver: Any) -> np.ndarray:
 
 
 def table(dt: float, counts: tuple[int, ...] = STEPS) -> dict[str, list[np.ndarray]]:
-    """Errors by solver, an entry for each number of steps."""
+    """Return solver -> errors for each number of steps in ``counts``."""
     model = arm()
     solvers: dict[str, Callable[[int], Any]] = {
         "warp_spo, float64": lambda steps: Spo(model, steps, dt, "float64"),
@@ -128,9 +133,9 @@ def table(dt: float, counts: tuple[int, ...] = STEPS) -> dict[str, list[np.ndarr
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--dt", type=float, default=0.01, help="of a step [s]")
+    parser.add_argument("--dt", type=float, default=0.01, help="length of a step [s]")
     dt = parser.parse_args().dt
-    print(f"relative error of the gradient by q / by qd of a loss after so many steps of {1e3 * dt:g} ms")
+    print(f"relative error of the gradient by q / by qd after a number of steps of {1e3 * dt:g} ms")
     print("| steps | " + " | ".join(map(str, STEPS)) + " |\n|---|" + "---|" * len(STEPS))
     for name, row in table(dt).items():
         print(f"| {name} | " + " | ".join(" / ".join(f"{e:.1e}" for e in both) for both in row) + " |")

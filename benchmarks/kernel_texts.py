@@ -63,7 +63,7 @@ def every_hinge() -> spo.Scene:
 
 
 SCENES: dict[str, Callable[[], spo.Scene]] = {
-    **{name: (lambda name=name: robots.scene(name)) for name in robots.ROBOTS if robots.at_hand(name)},
+    **{name: (lambda name=name: robots.scene(name)) for name in robots.ROBOTS if robots.is_available(name)},
     "arm": lambda: shapes.chain(7),
     "tree": lambda: shapes.random_tree(32),
     "hinges": every_hinge,

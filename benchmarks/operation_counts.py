@@ -1,9 +1,9 @@
 """Floating-point operations of each operation in one world, counted from the algorithm, node by node and dof by dof.
 
-An addition, a multiplication, a division, a root, a sine and a cosine count one each. Counted is what the recursions
-need for general numbers: rotations as 3 x 3 matrices, symmetric blocks by their 6 or 21 numbers, sparsity of the tree
-used. Nothing is folded, and nothing that only guards against rounding counts. What is done along the way (poses,
-factorisation) counts in every operation that needs it.
+An addition, a multiplication, a division, a root, a sine and a cosine count one each. The counts are those of the
+recursions for general numbers: rotations are 3 x 3 matrices, symmetric blocks have 6 or 21 numbers, the tree's sparsity
+is used. No constant is folded. Operations that only guard against rounding do not count. Poses and factorisation count
+in every operation that needs them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from warp_spo.scene.parts import FREE, SCREWS
 from warp_spo.trials.operations import two_frames
 
 ADD, DOT, CROSS, ROTATE, MATMUL = 3, 5, 9, 15, 45  # of 3-vectors; matrix by vector; matrix by matrix
-SYMMETRIC = 30  # R (S R^T) of a symmetric matrix, of which 6 numbers are wanted, after S R^T
+SYMMETRIC = 30  # the 6 different entries of R (S R^T), S symmetric and S R^T known
 SHIFT = 2 * ROTATE + CROSS + ADD  # phi or phi* by a spatial vector
 COMPOSE = MATMUL + ROTATE + ADD  # pose after pose
 INERTIA = ROTATE + 2 * CROSS + 3 + 2 * ADD  # M V of a rigid body
@@ -28,7 +28,7 @@ TURN = 75  # a quaternion times exp(half angle), renormalised
 
 
 class Count:
-    """Operations of the parts that algorithms are made of, summed over a scene's tree."""
+    """Operations of each part of the recursions, summed over a scene's tree."""
 
     def __init__(self, scene: spo.Scene):
         self.scene, self.parent = scene, scene.tree.parent
@@ -38,17 +38,17 @@ class Count:
         self.roots = len(self.parent) - self.children
 
     def path(self, node: int) -> Iterator[int]:
-        """The node and its ancestors."""
+        """Yield the node and its ancestors."""
         while node >= 0:
             yield node
             node = self.parent[node]
 
     def path_dofs(self, node: int) -> int:
-        """Degrees of freedom of the node and its ancestors."""
+        """Return the number of dofs of the node and its ancestors."""
         return sum(self.hinges[k].dof_count for k in self.path(node))
 
     def pose(self) -> int:
-        """Pose and H* of every hinge."""
+        """Count pose and H* of every hinge."""
         total = 0
         for hinge in self.hinges:
             r = hinge.dof_count
@@ -59,7 +59,7 @@ class Count:
         return total
 
     def rates(self) -> int:
-        """H* qd and dH*/dt qd of every hinge."""
+        """Count H* qd and dH*/dt qd of every hinge."""
         total = 0
         for hinge in self.hinges:
             r = hinge.dof_count
@@ -70,48 +70,57 @@ class Count:
         return total
 
     def velocities(self) -> int:
+        """Count V = phi* V(parent) + H* qd of every body."""
         return self.children * (SHIFT + 6)
 
     def accelerations(self, velocity: bool, given: bool, gravity: bool) -> int:
-        """phi* (H* qdd + a), each part if there is one."""
+        """Count phi* (H* qdd + a) of every body; the flags say which terms there are."""
         total = self.children * SHIFT + (self.roots * ROTATE if gravity else 0)
         total += self.children * (BRACKET + 6) + 6 * len(self.parent) if velocity else 0
         return total + (12 * self.dofs if given else 0)
 
     def body_forces(self, velocity: bool) -> int:
+        """Count M a, and with velocities V x* M V, of every body."""
         return len(self.parent) * (INERTIA + (INERTIA + BRACKET + 6 if velocity else 0))
 
     def hinge_forces(self, given: bool) -> int:
+        """Count the inward sum of forces and H f of every hinge; ``given``: with armature times qdd."""
         return self.children * (SHIFT + 6) + self.dofs * (2 * DOT + 1 + (2 if given else 0))
 
     def factor(self) -> int:
+        """Count the articulated inertias and the elimination of every dof."""
         return self.children * (ARTICULATED_SHIFT + 21) + self.dofs * ELIMINATE
 
     def solve(self) -> int:
+        """Count the inward and the outward sweep that solve with the factors."""
         inward = self.children * (SHIFT + 6) + self.dofs * (2 * DOT + 3 + 12)
         return inward + self.children * SHIFT + self.dofs * (2 * DOT + 3 + 12)
 
     def world_poses(self) -> int:
+        """Count the composition of every pose with its parent's."""
         return self.children * COMPOSE
 
     def columns(self, starts: list[int]) -> int:
-        """y = D^-1 [I - H psi K] b for a b at each node of ``starts``, along its path, then y* D y."""
+        """Count y = D^-1 [I - H psi K] b along the path of each node of ``starts``, then y* D y."""
         total, meets = 0, [0] * len(self.parent)
         for start in starts:
             for node in self.path(start):
                 total += SHIFT + self.hinges[node].dof_count * (2 * DOT + 2 + 12)
                 meets[node] += 1
         for node, columns in enumerate(meets):
-            total += self.hinges[node].dof_count * columns * (columns + 2)  # half of columns^2 products, and D y
+            total += self.hinges[node].dof_count * columns * (columns + 2)  # D y, and one triangle of y* (D y)
         return total
 
     def dof_nodes(self) -> list[int]:
+        """Return the node of every dof."""
         return [node for node, hinge in enumerate(self.hinges) for _ in range(hinge.dof_count)]
 
     def frames(self) -> list[int]:
+        """Return the bodies of the two frames whose Jacobians are computed."""
         return [frame[0] if isinstance(frame, tuple) else frame for frame in two_frames(self.scene)]
 
     def jacobian(self) -> int:
+        """Count the Jacobians of the two frames."""
         walk = sum(len(list(self.path(node))) * (ROTATE + ADD) for node in self.frames())
         return walk + sum(self.path_dofs(node) for node in self.frames()) * (2 * ROTATE + CROSS + ADD)
 
@@ -134,13 +143,13 @@ def _mass_matrix(c: Count) -> int:
 
 
 def _weights(c: Count) -> int:
-    """A sweep with general blocks, each entry a product and a sum."""
+    """Count a sweep with general blocks: a product and a sum for each entry."""
     sizes = c.scene.node_sizes
     return sum(2 * sizes[k] * sizes[parent] for k, parent in enumerate(c.parent) if parent >= 0)
 
 
 def _update(c: Count) -> int:
-    """The Riccati recursion with general 6 x 6 blocks, symmetry used: w P+ w*, U, D, G, P+, w - w G H."""
+    """Count the Riccati recursion, symmetric blocks by a triangle: w P+ w*, U, D, G, P+, w - w G H."""
     blocks = c.children * (6 * 6 * 11 + 21 * 12)
     return (
         c.pose()
@@ -182,5 +191,5 @@ COUNTS: dict[str, Callable[[Count], int]] = {
 
 
 def count(scene: spo.Scene, operation: str) -> int | None:
-    """Operations of one world's evaluation; None for an operation that nobody counted."""
+    """Return the floating-point operations of an operation in one world; None for one that has no count here."""
     return COUNTS[operation](Count(scene)) if operation in COUNTS else None

@@ -11,13 +11,13 @@ from .precisions import HEADLINE
 from .robots import ROBOTS
 
 BASIC = f"({'|'.join(HEADLINE)})"
-MOST = 65536  # worlds at which what runs at more is compiled
-WORLDS, CPU_WORLDS = ("1", "16", "128", "1024", "4096", "65536"), ("1", "128")  # of peers
-LONG = "n1023$|n1024$|n4096$|million|4096_worlds"  # of the stress suite
+MOST = 65536  # largest world count at which kernels are compiled; cases with more worlds use the same kernels
+WORLDS, CPU_WORLDS = ("1", "16", "128", "1024", "4096", "65536"), ("1", "128")  # world counts of peers
+LONG = "n1023$|n1024$|n4096$|million|4096_worlds"  # cases of the stress suite that take minutes
 
 
 def ours(name: str, cases: str, seconds: float, *options: str, worlds: Sequence[str] = ()) -> Part:
-    """A part of ``python -m benchmarks``."""
+    """Return a part that runs ``python -m benchmarks``."""
 
     def command(counts: Sequence[str]) -> list[str]:
         return ["benchmarks", cases, *options, *(["--worlds", *counts] if counts else [])]
@@ -29,15 +29,15 @@ def ours(name: str, cases: str, seconds: float, *options: str, worlds: Sequence[
 def peer(
     name: str, scenes: Sequence[str], seconds: float, worlds: Sequence[str], cases: str = "", kind: str = ""
 ) -> Part:
-    """A part of ``python -m benchmarks.peers``: a peer, or ``kind`` of it, with some robots."""
+    """Return a part that runs a peer on some robots; ``kind`` names the part where a peer has several."""
     head = ["benchmarks.peers", cases, "--peers", name, "--scenes", *scenes]
     label = ".".join([name, *scenes[:1], *([kind] if kind else [])]) if len(scenes) == 1 else name
     return Part(label, [*head, "--worlds", *worlds], [*head, "--worlds", "1", "--compile"], seconds)
 
 
 def newton(robot: str) -> list[Part]:
-    """Newton's are cut by what they compile, which takes minutes."""
-    few = WORLDS[:-1] if robot == "g1" else WORLDS  # 2.5 s a step at 65536 worlds
+    """Return Newton's parts for a robot: one for each of its functions, because each compiles for minutes."""
+    few = WORLDS[:-1] if robot == "g1" else WORLDS  # a step of G1 at 65536 worlds takes 2.5 s
     return [
         peer("newton", [robot], 30.0, WORLDS, "eval_mass_matrix", "mass"),
         peer("newton", [robot], 90.0, WORLDS, "SolverSteel", "steel"),
@@ -46,8 +46,8 @@ def newton(robot: str) -> list[Part]:
     ]
 
 
-def on_gpu() -> list[Part]:
-    """What the README shows; the other rows of ours; peers; the stress suite."""
+def gpu_parts() -> list[Part]:
+    """Return all parts for a GPU: the README's rows, our other rows, peers, the stress suite."""
     both, jobs = ("--dtype", "float32", "float64"), str(max(1, (os.cpu_count() or 2) * 3 // 4))
     parts = [
         ours(f"headline.{robot}", rf"^{robot}\.{BASIC}\.", 180.0, *both, worlds=("1", "4096", "65536", "1048576"))
@@ -81,7 +81,8 @@ def on_gpu() -> list[Part]:
     return parts
 
 
-def on_cpu() -> list[Part]:
+def cpu_parts() -> list[Part]:
+    """Return all parts for a CPU, which are fewer and smaller."""
     both = ("--dtype", "float32", "float64")
     parts = [ours(f"headline.{robot}", rf"^{robot}\.{BASIC}\.", 90.0, *both) for robot in (*ROBOTS, "humanoid")]
     for robot in ROBOTS:
@@ -94,12 +95,12 @@ def on_cpu() -> list[Part]:
 
 
 def choose(pattern: str, cuda: bool, device: str) -> list[Part]:
-    """Parts whose name holds a match of the regular expression, on ``device``.
+    """Return the parts whose name has a match of the regular expression ``pattern``, for ``device``.
 
     Raises:
-        ValueError: none does, or it is no regular expression.
+        ValueError: no part has, or ``pattern`` is not a regular expression.
     """
-    everything = on_gpu() if cuda else on_cpu()
+    everything = gpu_parts() if cuda else cpu_parts()
     try:
         chosen = [part for part in everything if re.search(pattern, part.name)]
     except re.error as error:

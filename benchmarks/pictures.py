@@ -1,4 +1,7 @@
-"""Pictures of the rows: error against run time, and run time against size. Colour: which library; marker: precision."""
+"""Pictures of the rows: error against run time, and run time against size.
+
+Colours are libraries and markers are precisions, see :mod:`warp_spo.trials.drawing`.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ PANELS = {
 """Sweep -> key of what grows, the axis' label, the panel's title."""
 
 
-def who(row: dict) -> str:
+def series_name(row: dict) -> str:
     """Return a peer's name and variant, or our granularity."""
     return f"{row['peer']} {row.get('variant', '')}".strip() if row.get("peer") else row["granularity"]
 
@@ -147,7 +150,7 @@ def _newest(rows: Sequence[dict]) -> list[dict]:
     """Return our rows first, and of two rows with the same name and precision the one that the plan chose."""
     best: dict[tuple, dict] = {}
     for row in sorted(rows, key=lambda row: (bool(row.get("peer")), not row.get("chosen", True))):
-        best.setdefault((who(row), row["dtype"]), row)
+        best.setdefault((series_name(row), row["dtype"]), row)
     return list(best.values())
 
 

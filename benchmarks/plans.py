@@ -1,9 +1,10 @@
-"""Does the plan choose well? Forward dynamics of ten random trees at each granularity, beside what the plan takes.
+"""Check the plan's choice of granularity: time forward dynamics of ten random trees at each, and at the plan's choice.
 
     python -m benchmarks.plans [--device cuda:0] [--trees 0 1 ...] [--worlds 1 256 4096 65536] [--compile]
 
-A line is one tree and world count: the time at each granularity in us, the choice, and its time over the best one's.
-All kernels are compiled first, side by side. The exit code is 1 if a choice takes more than ``ALLOWED`` of the best.
+A line gives, for one tree and world count, the time at each granularity [us], the plan's choice, and its time over the
+shortest. All kernels are compiled first, several at a time. The exit code is 1 if a choice takes more than ``ALLOWED``
+times the shortest.
 """
 
 import argparse
@@ -19,27 +20,29 @@ from warp_spo.kernels.slots import WARP_SIZE
 from warp_spo.trials.operations import OPERATIONS, Inputs
 from warp_spo.trials.trial import Subject, Trial
 
-sys.path.append(str(Path(__file__).parent.parent / "tests"))  # the trees are those of the tests
+sys.path.append(str(Path(__file__).parent.parent / "tests"))  # the random trees come from the tests
 import zoo
 
 OPERATION = "forward_dynamics"
 WORLDS = (1, 256, 4096, 65536)
-NODE_WORLDS = 256  # up to which node granularity is worth a look: it needs no compilation, but a launch a level
-ALLOWED = 1.1
+NODE_WORLDS = 256  # largest world count at which granularity "node", one launch for each level, is timed
+ALLOWED = 1.1  # largest time of the plan's choice, over the shortest
 SAMPLE, REPEATS, WARM_UP, BUDGET = 1, 10, 0.01, 0.1
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="benchmarks.plans", description="The plan's choice beside the best.")
+    parser = argparse.ArgumentParser(prog="benchmarks.plans", description="Compare the plan's choice with the best.")
     parser.add_argument("--device", help="Warp device, default: the current one")
     parser.add_argument("--trees", nargs="+", type=int, default=list(range(len(zoo.BRANCHED))))
     parser.add_argument("--worlds", nargs="+", type=int, default=WORLDS)
-    parser.add_argument("--compile", action="store_true", help="fill Warp's cache, time nothing")
+    parser.add_argument(
+        "--compile", action="store_true", help="compile the kernels into Warp's cache, and time nothing"
+    )
     options = parser.parse_args(arguments)
     start = time.perf_counter()
     scenes = {which: zoo.branched(which) for which in options.trees}
-    made = {which: prepared(scene, options.worlds, options.device) for which, scene in scenes.items()}
-    load(made)
+    made = {which: trace_dynamics(scene, options.worlds, options.device) for which, scene in scenes.items()}
+    compile_kernels(made)
     print(f"traced and compiled in {time.perf_counter() - start:.0f} s", flush=True)
     if options.compile:
         return 0
@@ -66,8 +69,8 @@ def main(arguments: list[str] | None = None) -> int:
     return 1 if beyond else 0
 
 
-def prepared(scene: spo.Scene, counts: list[int], device: str | None) -> dict[tuple[str, int], spo.Dynamics]:
-    """Traced, not compiled, by granularity and worlds; plans that differ in nothing else share their programs."""
+def trace_dynamics(scene: spo.Scene, counts: list[int], device: str | None) -> dict[tuple[str, int], spo.Dynamics]:
+    """Return a Dynamics for each granularity and world count, traced but not compiled; equal plans share programs."""
     made, programs = {}, {}
     for name in ("tree", "segment"):
         for worlds in counts:
@@ -82,8 +85,8 @@ def prepared(scene: spo.Scene, counts: list[int], device: str | None) -> dict[tu
     return made
 
 
-def load(made: dict) -> None:
-    """Compile the kernels side by side."""
+def compile_kernels(made: dict) -> None:
+    """Compile the kernels of all Dynamics, several at a time."""
     blocks: dict[int, dict] = {}
     device = None
     for dyns in made.values():

@@ -1,4 +1,4 @@
-"""Precisions are data: what a case's ``dtype`` means to the runner."""
+"""Precisions as data: how the runner computes a case of each ``dtype``."""
 
 import dataclasses
 import functools
@@ -19,10 +19,10 @@ class Precision:
     """How a scene is computed.
 
     Attributes:
-        subject: ``subject(scene, worlds, device, granularity, inputs)``.
-        operations: name -> operation, those that it has.
+        subject: function of (scene, worlds, device, granularity, inputs) that makes the subject of trials.
+        operations: name -> operation, of all operations that the precision has.
         tolerance: largest error that counts as correct.
-        scalar: whose peak bounds it; None where two are mixed.
+        scalar: the scalar type whose measured peak bounds the speed; None where two types are mixed.
     """
 
     subject: Callable[..., Subject]
@@ -31,7 +31,7 @@ class Precision:
     scalar: str | None
 
 
-def of(
+def make_subject(
     dtype: str,
     scene: spo.Scene,
     worlds: int,
@@ -40,22 +40,22 @@ def of(
     inputs: list[Inputs],
     **options: Any,
 ) -> Subject:
-    """A subject whose arrays are of one scalar type."""
+    """Return a subject whose arrays have one scalar type."""
     return Subject(spo.Dynamics(scene, worlds, device, dtype, granularity=granularity, **options), inputs)
 
 
 PRECISIONS = {
-    "float32": Precision(functools.partial(of, "float32"), OPERATIONS, TOLERANCE["float32"], "float32"),
-    # a step takes the error of float32 once more; without it nothing is under 1e-8
+    "float32": Precision(functools.partial(make_subject, "float32"), OPERATIONS, TOLERANCE["float32"], "float32"),
+    # One refinement step squares float32's relative error; without the step no error is below 1e-8.
     "refined": Precision(
-        functools.partial(of, "float64", refine=1), {name: OPERATIONS[name] for name in REFINED}, 1e-8, None
+        functools.partial(make_subject, "float64", refine=1), {name: OPERATIONS[name] for name in REFINED}, 1e-8, None
     ),
-    # inertias are inputs, as domain randomisation has them, each world's its own
+    # Inertias differ by world, as in domain randomisation.
     "randomised": Precision(
-        functools.partial(of, "float32", variable=RANDOMISED),
+        functools.partial(make_subject, "float32", variable=RANDOMISED),
         {name: OPERATIONS[name] for name in HEADLINE},
         TOLERANCE["float32"],
         "float32",
     ),
-    "float64": Precision(functools.partial(of, "float64"), OPERATIONS, TOLERANCE["float64"], "float64"),
+    "float64": Precision(functools.partial(make_subject, "float64"), OPERATIONS, TOLERANCE["float64"], "float64"),
 }

@@ -1,4 +1,4 @@
-"""What an evaluation takes of the device: its launches, and registers and local memory of their kernels."""
+"""Launches of an evaluation, and the registers and local memory of their kernels."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import warp as wp
 
 
 @contextlib.contextmanager
-def recorded() -> Iterator[list[tuple[wp.Kernel, int]]]:
-    """Collect (kernel, threads of a block) of every ``wp.launch`` in the block."""
+def record_launches() -> Iterator[list[tuple[wp.Kernel, int]]]:
+    """Yield a list that receives (kernel, threads of a block) of every ``wp.launch`` in the ``with`` block."""
     launch, found = wp.launch, []
 
     def recording(kernel: wp.Kernel, *args: Any, **kwargs: Any) -> Any:
@@ -26,9 +26,10 @@ def recorded() -> Iterator[list[tuple[wp.Kernel, int]]]:
 
 
 def resources(found: list[tuple[wp.Kernel, int]], device: wp.Device) -> dict[str, int]:
-    """launches; on CUDA registers and local_bytes of a thread, arrays and spills: the largest of all kernels.
+    """Return ``launches``, and on CUDA ``registers`` and ``local_bytes`` of a thread, the largest of all kernels.
 
-    What is not known is absent: launches that were not made by ``wp.launch``, a Warp without the query, a CPU.
+    An entry is absent where it is not known: for launches that ``wp.launch`` did not make, on a CPU, and in versions of
+    Warp that cannot be asked.
     """
     row = {"launches": len(found)} if found else {}
     if device.is_cuda and found and hasattr(wp, "get_cuda_kernel_properties"):

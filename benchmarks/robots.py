@@ -1,7 +1,7 @@
 """Released robots from the package example-robot-data: a 7-dof arm, a quadruped (18 dof), a humanoid (35 dof).
 
-Only the URDF text is needed. What is used of it is masses, hinges and their places: shapes, damping and friction of
-joints, and mimics are taken out, joints under ``locked`` are held at zero; the rest of the file is as released.
+Only the URDF text is needed. Its masses, joints and their placements are used as they are. Shapes, damping, friction
+and mimics of joints are removed, and the joints under ``locked`` are fixed at zero.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ INSTALLED = "cmeel.prefix/share/example-robot-data/robots"
 
 
 class Robot(NamedTuple):
-    """Where a robot is in the package, whether its root floats, and joints that are held at zero."""
+    """Path of a robot's file in the package, whether its root floats, and names of joints that are fixed at zero."""
 
     path: str
     floating: bool
@@ -35,18 +35,20 @@ ROBOTS = {
 }
 
 
-def released(name: str) -> Path:
-    """The URDF file of a robot.
+def urdf_file(name: str) -> Path:
+    """Return the path of a robot's URDF file.
 
     Raises:
-        ImportError: neither a folder is named nor the package installed; says what installs it.
-        FileNotFoundError: the folder that is named holds no such robot.
+        ImportError: the environment variable FOLDER is not set, and the package is not installed.
+        FileNotFoundError: FOLDER is set, and the folder does not have the robot.
     """
     folder = os.environ.get(FOLDER)
     if folder:
         file = Path(folder) / f"{name}.urdf"
         if not file.is_file():
-            raise FileNotFoundError(f"robots: no file {str(file)!r}; {FOLDER} expects {name}.urdf in that folder")
+            raise FileNotFoundError(
+                f"robots: there is no file {str(file)!r}; expected {name}.urdf in the folder that {FOLDER} names"
+            )
         return file
     try:
         return Path(str(metadata.distribution(PACKAGE).locate_file(f"{INSTALLED}/{ROBOTS[name].path}")))
@@ -57,27 +59,27 @@ def released(name: str) -> Path:
         ) from None
 
 
-def at_hand(name: str) -> bool:
-    """Whether a robot's file is there."""
+def is_available(name: str) -> bool:
+    """Return whether a robot's file exists."""
     try:
-        return released(name).is_file()
+        return urdf_file(name).is_file()
     except (ImportError, FileNotFoundError):
         return False
 
 
-def urdf(name: str) -> str:
-    """URDF text of a robot, stripped as this file says.
+def urdf_text(name: str) -> str:
+    """Return the URDF text of a robot, without the elements that this module's docstring lists.
 
     Raises:
-        ImportError, FileNotFoundError: as :func:`released`.
+        ImportError, FileNotFoundError: as :func:`urdf_file`.
     """
-    root = ET.parse(released(name)).getroot()
+    root = ET.parse(urdf_file(name)).getroot()
     _strip(root, ROBOTS[name].locked)
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
-def without_shapes(root: ET.Element) -> None:
-    """Leave links and joints, and no shapes on them."""
+def remove_shapes(root: ET.Element) -> None:
+    """Remove from a URDF all but links and joints, and the shapes of the links."""
     for child in list(root):
         if child.tag not in ("link", "joint"):
             root.remove(child)
@@ -87,7 +89,7 @@ def without_shapes(root: ET.Element) -> None:
 
 
 def _strip(root: ET.Element, locked: tuple[str, ...]) -> None:
-    without_shapes(root)
+    remove_shapes(root)
     for joint in root.findall("joint"):
         if joint.get("name") in locked:
             joint.set("type", "fixed")
@@ -97,13 +99,13 @@ def _strip(root: ET.Element, locked: tuple[str, ...]) -> None:
 
 
 def scene(name: str) -> spo.Scene:
-    """A robot of :data:`ROBOTS`, no armature, gravity 9.81 m/s^2 along -z.
+    """Return a robot of :data:`ROBOTS`, without armature, in gravity of 9.81 m/s^2 along -z.
 
     Raises:
-        ImportError, FileNotFoundError: as :func:`released`.
+        ImportError, FileNotFoundError: as :func:`urdf_file`.
     """
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name}.urdf"
-        file.write_text(urdf(name))
+        file.write_text(urdf_text(name))
         loaded = spo.load(file, floating=ROBOTS[name].floating)
     return loaded.with_values(joint_armature=0.0 * loaded.values["joint_armature"])

@@ -1,9 +1,9 @@
-"""The roof: how fast a machine could do an operation, from its measured peak and copy bandwidth.
+"""The roof: the highest speed that a machine allows an operation, from its measured peak and copy bandwidth.
 
     share of the roof = max(operations / peak, bytes / bandwidth) / run time
 
-Operations are those of the algorithm (:mod:`benchmarks.operation_counts`), bytes the caller's arrays, read and written
-once: what has to be done, not what the kernels happen to do.
+Operations are those of the algorithm (:mod:`benchmarks.operation_counts`). Bytes are those of the caller's arrays, read
+and written once. Further operations and transfers of the kernels do not count.
 """
 
 import functools
@@ -16,9 +16,9 @@ import warp_spo as spo
 
 from .operation_counts import count
 
-LANES, STEPS = 16, 2048  # independent multiply-adds of a thread, and how many follow each other
-THREADS = {False: 64, True: 132 * 2048 * 8}  # on a CPU, on a GPU: several waves
-COPY_BYTES = {False: 1 << 27, True: 1 << 30}  # far beyond the caches
+LANES, STEPS = 16, 2048  # independent chains of multiply-adds in a thread, and the length of a chain
+THREADS = {False: 64, True: 132 * 2048 * 8}  # on a CPU, and on a GPU, which needs several waves of threads
+COPY_BYTES = {False: 1 << 27, True: 1 << 30}  # far larger than the caches
 REPEATS = 9
 
 
@@ -29,16 +29,16 @@ class Roof(NamedTuple):
     bandwidth: float
 
     def share(self, operations: float, size: float, scalar: str | None, seconds: float) -> float:
-        """Share of the roof of ``operations`` and ``size`` bytes in ``seconds``; without ``scalar``, of bytes alone."""
+        """Return the share of the roof; ``size`` is in bytes. Without ``scalar`` the operations do not count."""
         by_operations = operations / self.peak[scalar] if scalar else 0.0
         return max(by_operations, size / self.bandwidth) / seconds
 
 
 def operations(dyn: spo.Dynamics, name: str) -> float | None:
-    """Floating-point operations of one world's evaluation of operation ``name``; None where nobody counted them.
+    """Return the floating-point operations of ``name`` in one world; None where they are not known.
 
-    Straight-line code, in which constants of the scene are folded, knows its own (``dyn.operation_counts``); the
-    algorithm's count is an upper bound there, so no share of the roof is made of it.
+    Straight-line code, in which the scene's constants are folded, counts its own (``dyn.operation_counts``). The count
+    of the algorithm is used at granularity "node" alone: for straight-line code it is only an upper bound.
     """
     own = dyn.operation_counts.get(name)
     if own is not None:
@@ -48,7 +48,7 @@ def operations(dyn: spo.Dynamics, name: str) -> float | None:
 
 @functools.cache
 def multiply_add(T: type) -> wp.Kernel:
-    """``LANES`` chains of a = a b + c in each thread."""
+    """Return a kernel of ``LANES`` chains of a = a b + c in each thread."""
     lanes = wp.types.vector(LANES, T)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -63,7 +63,7 @@ def multiply_add(T: type) -> wp.Kernel:
 
 
 def measure(device: Any = None) -> Roof:
-    """Measure a device; a fraction of a second. On a CPU, Warp's kernels run on one core, and so does this one."""
+    """Return the roof of a device, measured in a fraction of a second; on a CPU that of one core, as Warp uses one."""
     device = wp.get_device(device)
     threads, peak = THREADS[device.is_cuda], {}
     for T in (wp.float32, wp.float64):
@@ -78,7 +78,7 @@ def measure(device: Any = None) -> Roof:
 
 
 def _seconds(run: Any, device: wp.Device) -> float:
-    """Shortest of several runs after one to warm up."""
+    """Return the shortest time of several runs after a first one [s]."""
     found = []
     for _ in range(1 + REPEATS):
         wp.synchronize_device(device)

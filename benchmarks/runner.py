@@ -1,4 +1,4 @@
-"""Run cases: check each against the reference, then time it; one row of numbers a case, one JSON file a run."""
+"""Run cases: compare each with the reference, then time it. A case gives one row of numbers, a run one JSON file."""
 
 import dataclasses
 import datetime
@@ -26,13 +26,13 @@ from warp_spo.trials.trial import Trial
 from . import roofline
 from .cases import FACTORIES, case_name
 from .precisions import PRECISIONS
-from .resources import recorded, resources
+from .resources import record_launches, resources
 from .shapes import Recursive
 
 SETS = 4  # sets of inputs that evaluations in a row take in turn
-WARM_UP, BUDGET = 0.05, 0.5  # [s] a case: the peers' and ours together fit into minutes
-SWEEP_TOLERANCE = 1e-2  # errors grow with a chain, that is what a sweep shows; what is wrong is off by more
-METRICS = (  # printed, if the row has them
+WARM_UP, BUDGET = 0.05, 0.5  # [s] for each case, so that a run takes minutes
+SWEEP_TOLERANCE = 1e-2  # errors grow with the length of a chain, but a wrong result differs by more than this
+METRICS = (  # those that a row has are printed
     *("us", "eager_us", "torch_us", "evals_per_s", "GBps", "GFLOPs", "roof", "spread", "error", "error_median"),
     *("error_p99", "backward_error", "compile_s", "memory_MiB", "launches", "registers", "local_bytes"),
 )
@@ -41,35 +41,41 @@ METRICS = (  # printed, if the row has them
 def run(
     cases: Iterable[dict], device: Any = None, check: bool = False, roof: roofline.Roof | None = None
 ) -> Iterator[dict]:
-    """Yield one row for each case: the case and what was measured. What this version does not offer is said on stderr.
+    """Yield one row for each case, with the numbers that were measured. A case that is not offered is named on stderr.
 
-    Rows have ``error``, ``error_median`` and ``error_p99`` (relative, over ``sample`` worlds of each set of inputs, and
-    over the timed run; NaN if any is), ``backward_error`` (the largest, where the result solves an
-    equation), ``reference`` ("dense", or "float64" for recursions), ``compile_s`` (first call, see
-    ``Trial``), ``launches``, on CUDA ``registers`` and ``local_bytes`` (the largest of a kernel's
-    threads), ``granularity``, ``chosen`` (by the plan, not asked for), sizes of the scene and, unless ``check``:
+    Every row has:
 
-    * ``us`` (median of one evaluation of all worlds; CUDA: in a graph of many), ``p10_us``, ``p90_us``, ``spread``
-      ((p90 - p10) / median), ``evals_per_s`` (worlds per second);
-    * ``eager_us``, ``torch_us``: host's call to result, from Warp and from torch arrays, where torch serves the device;
-    * ``flops`` (operations of one world's evaluation, counted), ``bytes`` (the caller's arrays, all worlds), their
-      rates ``GFLOPs`` and ``GBps``, and with ``roof`` the share of it that was reached;
-    * on CUDA ``memory_MiB`` in use: operations keep their workspace, so it is the most that this subject's have taken.
+    * ``error``, ``error_median``, ``error_p99``: relative errors over ``sample`` worlds of each set of inputs and over
+      the timed run; NaN if any is;
+    * ``backward_error``: the largest one, where the result solves an equation;
+    * ``reference``: "dense", or "float64" for the float64 recursions;
+    * ``compile_s``: seconds of the first call, see ``Trial``;
+    * ``launches``, and on CUDA ``registers`` and ``local_bytes`` of a thread, the largest of all kernels;
+    * ``granularity``, whether the plan has ``chosen`` it, and sizes of the scene.
+
+    Unless ``check`` is set, a row also has:
+
+    * ``us``, ``p10_us``, ``p90_us``: median and percentiles of the time of one evaluation of all worlds, on CUDA in a
+      graph of many; ``spread``, (p90 - p10) / median; ``evals_per_s``, worlds per second;
+    * ``eager_us``, ``torch_us``: time of one call on the host until its result is there, from Warp and from torch;
+    * ``flops``: counted operations of one world; ``bytes``: of the caller's arrays, all worlds; their rates ``GFLOPs``
+      and ``GBps``; and the share of ``roof`` that was reached;
+    * on CUDA ``memory_MiB``: memory in use, the workspaces of this scene's earlier cases included.
     """
-    for case, subject, name in _subjects(cases, device, 1 if check else SETS):
+    for case, subject, name in _subjects_of(cases, device, 1 if check else SETS):
         granularity = subject.dyn.plan.of(case["op"])
         row = case | dict(granularity=granularity, chosen=case["granularity"] is None)
-        yield row | dict(reference=name) | _measured(case, subject, name, check, roof)
+        yield row | dict(reference=name) | _measure(case, subject, name, check, roof)
 
 
 def compile_only(cases: Iterable[dict], device: Any = None) -> None:
-    """Evaluate each case once: its kernels are compiled into Warp's cache."""
-    for case, subject, _ in _subjects(cases, device, 1):
+    """Compile the kernels of each case into Warp's cache, by evaluating it once."""
+    for case, subject, _ in _subjects_of(cases, device, 1):
         Trial(subject, PRECISIONS[case["dtype"]].operations[case["op"]], 1)
 
 
-def _subjects(cases: Iterable[dict], device: Any, sets: int) -> Iterator[tuple[dict, Any, str]]:
-    """Each case that is not another one again, its subject, and the name of its reference."""
+def _subjects_of(cases: Iterable[dict], device: Any, sets: int) -> Iterator[tuple[dict, Any, str]]:
+    """Yield each case that is no repetition of another, its subject, and the name of its reference."""
     key = subject = subject_key = None
     skipped: set[str] = set()
     done: set[tuple] = set()
@@ -85,7 +91,7 @@ def _subjects(cases: Iterable[dict], device: Any, sets: int) -> Iterator[tuple[d
             if (*key, case["dtype"], case["granularity"]) != subject_key:
                 subject, subject_key = None, (*key, case["dtype"], case["granularity"])  # frees its memory first
                 subject = precision.subject(scene, case["worlds"], device, case["granularity"], inputs)
-            if subject is None:  # refused before
+            if subject is None:  # this combination was refused before
                 continue
             identity = (*key, case["op"], case["dtype"], subject.dyn.plan.of(case["op"]), case.get("sweep"))
             if identity not in done:
@@ -97,14 +103,14 @@ def _subjects(cases: Iterable[dict], device: Any, sets: int) -> Iterator[tuple[d
                 print(f"skipped {case['scene']} {case['dtype']}: {error}", file=sys.stderr)
 
 
-def _measured(case: dict, subject: Any, reference: str, check: bool, roof: roofline.Roof | None) -> dict:
+def _measure(case: dict, subject: Any, reference: str, check: bool, roof: roofline.Roof | None) -> dict:
     precision, dyn = PRECISIONS[case["dtype"]], subject.dyn
     operation = precision.operations[case["op"]]
-    if reference != "dense":  # no matrix to take the residual with
+    if reference != "dense":  # there is no matrix to compute a residual with
         operation = dataclasses.replace(operation, solves=None)
-    with recorded() as launched:
+    with record_launches() as launched:
         trial = Trial(subject, operation, case["sample"])
-        del launched[:]  # the first call may do what later ones need not
+        del launched[:]  # launches that only the first call makes do not count
         trial.evaluate(0)
     row = dict(bodies=dyn.scene.body_count, dof=dyn.scene.dof_count, depth=dyn.scene.tree.depth)
     row |= dict(compile_s=trial.first_call) | resources(launched, dyn.device)
@@ -116,7 +122,7 @@ def _measured(case: dict, subject: Any, reference: str, check: bool, roof: roofl
         row["eager_us"] = 1e6 * trial.eager().median
         if precision.scalar and _torch_serves(dyn.device):
             row["torch_us"] = 1e6 * trial.eager(wp.to_torch).median
-        row |= _work(case, trial, precision.scalar, timing.median, roof)
+        row |= _rates(case, trial, precision.scalar, timing.median, roof)
         if dyn.device.is_cuda and dyn.device.is_mempool_enabled:
             row["memory_MiB"] = wp.get_mempool_used_mem_current(dyn.device) / 2**20
     errors = np.array(trial.forward_errors)
@@ -126,8 +132,8 @@ def _measured(case: dict, subject: Any, reference: str, check: bool, roof: roofl
     return row
 
 
-def _work(case: dict, trial: Trial, scalar: str | None, seconds: float, roof: roofline.Roof | None) -> dict:
-    """Operations and bytes, their rates, and the share of the roof."""
+def _rates(case: dict, trial: Trial, scalar: str | None, seconds: float, roof: roofline.Roof | None) -> dict:
+    """Return operations and bytes of a case, their rates, and the share of the roof."""
     row: dict = {}
     operations = roofline.operations(trial.subject.dyn, case["op"]) if scalar else None
     if operations is not None:
@@ -148,17 +154,17 @@ def _torch_serves(device: wp.Device) -> bool:
 
 
 def tolerance(row: dict) -> float:
-    """Largest error of a row that counts as correct."""
+    """Return the largest error with which a row counts as correct."""
     return SWEEP_TOLERANCE if row.get("sweep") else PRECISIONS[row["dtype"]].tolerance
 
 
 def lines(row: dict) -> list[str]:
-    """``case.metric value`` for every number that was measured."""
+    """Return a line ``case.metric value`` for every number of a row."""
     return [f"{case_name(row)}.{metric} {row[metric]:.4g}" for metric in METRICS if metric in row]
 
 
 def record(rows: list[dict], device: Any = None, roof: roofline.Roof | None = None) -> dict:
-    """What a JSON file holds: where the rows come from, and the rows."""
+    """Return a run as it is written to JSON: commit, date, machine, versions, and ``rows``."""
     found = machine(device)
     if roof:
         found |= dict(peak_GFLOPs={name: 1e-9 * peak for name, peak in roof.peak.items()})
@@ -173,10 +179,10 @@ def record(rows: list[dict], device: Any = None, roof: roofline.Roof | None = No
 
 
 def check_place(option: str, out: Path) -> None:
-    """Make the folder of a file, or the folder ``out``, before anything is measured.
+    """Make the folder ``out``, or that of the file ``out``, and check that it can be written to.
 
     Raises:
-        ValueError: nothing can be written there.
+        ValueError: it cannot.
     """
     folder = out if out.is_dir() or not out.suffix else out.parent
     try:
@@ -190,9 +196,9 @@ def check_place(option: str, out: Path) -> None:
 
 
 def save(data: dict, out: Path) -> Path:
-    """Write ``data`` to the file ``out``, or into the folder ``out`` under its date; return the file.
+    """Write a run to the file ``out``, or into the folder ``out`` under its date; return the file.
 
-    A row is a line, numbers have five digits: files that are kept stay small.
+    Each row is one line, and numbers have five digits, so that files stay small.
     """
     if out.is_dir() or not out.suffix:
         out = out / f"{data['date'][:19].replace(':', '')}.json"
@@ -203,25 +209,25 @@ def save(data: dict, out: Path) -> Path:
 
 def _text(value: Any) -> str:
     if isinstance(value, list) and value and isinstance(value[0], dict):
-        return "[\n" + ",\n".join(f"  {json.dumps(_rounded(row))}" for row in value) + "\n ]"
-    return json.dumps(_rounded(value))
+        return "[\n" + ",\n".join(f"  {json.dumps(_round_floats(row))}" for row in value) + "\n ]"
+    return json.dumps(_round_floats(value))
 
 
-def _rounded(value: Any) -> Any:
-    """The same with five digits in every float, NaN and infinity as they are."""
+def _round_floats(value: Any) -> Any:
+    """Return a value with every float in it rounded to five digits."""
     if isinstance(value, dict):
-        return {key: _rounded(one) for key, one in value.items()}
+        return {key: _round_floats(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
-        return [_rounded(one) for one in value]
+        return [_round_floats(one) for one in value]
     if isinstance(value, float | np.floating):
         return float(f"{value:.5g}") if math.isfinite(value) else float(value)
     return value
 
 
 def commit() -> str:
-    """The commit of this checkout, "-dirty" behind it if tracked files differ.
+    """Return the commit of this checkout, followed by "-dirty" if tracked files have been changed.
 
-    Outside git, where a copy of it runs, what the environment variable ``WARP_SPO_COMMIT`` says, or "unknown".
+    Outside a git checkout it is the environment variable ``WARP_SPO_COMMIT``, or "unknown".
     """
     command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
@@ -232,7 +238,7 @@ def commit() -> str:
 
 
 def machine(device: Any = None) -> dict:
-    """Names and memory [GiB] of the device and of the host."""
+    """Return names and memory [GiB] of the device and of the host."""
     device, cpu = wp.get_device(device), platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.is_file():
@@ -244,7 +250,7 @@ def machine(device: Any = None) -> dict:
 
 
 def versions() -> dict:
-    """Versions of what the numbers depend on; torch's if something imported it."""
+    """Return the versions of Python and of the packages that the numbers depend on; torch's only if it is imported."""
     packages = ["warp-lang", "numpy", "newton", "warp_spo"] + (["torch"] if "torch" in sys.modules else [])
     found = {"python": platform.python_version()}
     for name in packages:
@@ -252,7 +258,7 @@ def versions() -> dict:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             found[name] = "unknown"
-    if found["warp_spo"] == "unknown":  # a checkout that is not installed
+    if found["warp_spo"] == "unknown":  # warp_spo runs from a checkout and is not installed
         project = (Path(__file__).parent.parent / "pyproject.toml").read_text()
         found["warp_spo"] = re.search(r'^version = "(.*)"', project, re.MULTILINE)[1]
     return found

@@ -1,8 +1,8 @@
-"""Scenes by shape, to see how run time and error grow: chains, random trees, and fixed size in growing depth or width.
+"""Scenes that show how run time and error grow: chains, random trees, and trees of fixed size by depth and branching.
 
-Every body is the rod of the 7-dof arm, every hinge revolute, about z and y in turn. These scenes grow beyond what the
-dense reference can hold: their errors are against the float64 recursions, which the robots' rows and the tests compare
-with the dense reference.
+Every body is the rod of the 7-dof arm, every hinge is revolute, about z and y in turn. The largest of these scenes are
+too large for the dense reference. Their results are compared with the float64 recursions, which the robots' rows and
+the tests compare with the dense reference.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ FIXED = 256  # bodies of the scenes of growing depth or branching
 
 
 def tree(parents: Sequence[int]) -> spo.Scene:
-    """Links of 0.25 m and 2 kg, link k on the tip of link ``parents[k]``, each with armature 0.01 kg m^2."""
+    """Return a tree of links of 0.25 m and 2 kg; link k is on the tip of link ``parents[k]``, -1 being the ground."""
     inertia, up = np.diag([0.012, 0.012, 0.002]), (0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0)
     bodies = [spo.Body(2.0, (0.0, 0.0, 0.125), inertia, label=f"link_{k}") for k in range(len(parents))]
     axes, depth, hinges = np.eye(3)[[2, 1]], [0] * len(parents), []
@@ -30,23 +30,24 @@ def tree(parents: Sequence[int]) -> spo.Scene:
 
 
 def chain(n: int) -> spo.Scene:
+    """Return a chain of n links."""
     return tree(range(-1, n - 1))
 
 
 def random_tree(n: int) -> spo.Scene:
-    """Every body hangs on any one before it: depth grows with log n."""
+    """Return a tree of n links, each on a random earlier one; its depth grows with log n."""
     rng = np.random.default_rng(n)
     return tree([-1, *(int(rng.integers(k)) for k in range(1, n))])
 
 
 def deep(depth: int) -> spo.Scene:
-    """``FIXED`` bodies in equal chains of ``depth`` bodies, side by side on the ground."""
+    """Return ``FIXED`` bodies in chains of ``depth`` bodies that all stand on the ground."""
     width = FIXED // depth
     return tree([k - width if k >= width else -1 for k in range(FIXED)])
 
 
 def branching(children: int) -> spo.Scene:
-    """``FIXED`` bodies, each with ``children`` children until there are no more; 1 is a chain."""
+    """Return a tree of ``FIXED`` bodies, filled level by level, of which each has ``children`` children."""
     return tree([-1, *((k - 1) // children for k in range(1, FIXED))])
 
 
@@ -60,11 +61,11 @@ SHAPES = {
     )
     for size in sizes
 }
-"""Name -> scene factory."""
+"""Name -> function that makes the scene."""
 
 
 class Recursive:
-    """Stands in for the dense reference: the float64 recursions at node granularity, on the CPU.
+    """A reference for large scenes: the float64 recursions at granularity "node", on the CPU.
 
     ``Recursive(scene)`` is a ``reference`` of :class:`warp_spo.trials.operations.Inputs`.
     """
@@ -77,13 +78,15 @@ class Recursive:
 
 
 class Configuration:
-    """One world of a :class:`Recursive` reference, named as :class:`warp_spo.reference.Dense` is."""
+    """One world of a :class:`Recursive` reference; its methods are those of :class:`warp_spo.reference.Dense`."""
 
     def __init__(self, dyn: spo.Dynamics, q: np.ndarray):
         self.dyn, self.scene, self.q = dyn, dyn.scene, np.asarray(q, dtype=np.float64)[None]
 
     def forward_dynamics(self, qd: Any, tau: Any) -> np.ndarray:
+        """Return qdd [dof]."""
         return self.dyn.forward_dynamics(self.q, qd[None], tau[None])[0]
 
     def inverse_dynamics(self, qd: Any, qdd: Any) -> np.ndarray:
+        """Return tau [dof]."""
         return self.dyn.inverse_dynamics(self.q, qd[None], qdd[None])[0]

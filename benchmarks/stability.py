@@ -1,14 +1,16 @@
-"""Released robots left to gravity inside their limits: who stays finite, and what becomes of the energy.
+"""Simulate released robots that move freely under gravity, and report divergence and energy errors.
 
     python -m benchmarks.stability so100 z1 --seconds 10 --peers
 
-Each robot starts at random between its limits, a fixed one at rest, a floating one with its joints moving, and has the
-limits, damping and friction of its file and Newton's default for what the file does not say. The energy is kinetic, of
-gravity and of the springs of limits that are passed, in float64; what it ever exceeds its start by is shown as a share
-of what has been turned over between motion and height. Without friction and limits of position and velocity the first
-half second is compared with MuJoCo at 0.1 ms, which then has the same terms. The semi-implicit step is MuJoCo's own
-scheme: at 2 ms both are equally far from 0.1 ms, by an error of order 1, and at rounding's distance from each other; so
-where that error is beyond a percent, only a step of higher order is within it.
+Each robot starts at random joint positions between its limits. A fixed robot starts at rest, a floating one with moving
+joints. Limits, damping and friction are those of the robot's file, or Newton's defaults. The energy is the sum, in
+float64, of kinetic energy, gravity, springs, and the springs of exceeded limits. The largest rise of the energy above
+its start is reported as a share of the energy that has been exchanged between motion and height.
+
+Without friction and without limits of position and velocity, the first half second is also compared with MuJoCo at a
+step of 0.1 ms, which then has the same equations. The semi-implicit step is MuJoCo's own scheme. At 2 ms both therefore
+have the same error of first order, and differ from each other by rounding. Where that error exceeds a percent, only a
+step of higher order is more accurate.
 """
 
 from __future__ import annotations
@@ -27,13 +29,13 @@ import warp as wp
 
 import warp_spo as spo
 
-from .robots import INSTALLED, PACKAGE, without_shapes
+from .robots import INSTALLED, PACKAGE, remove_shapes
 
 STEPS = (2e-3, 5e-3)  # [s]
-FINE, COMPARED = 1e-4, 0.5  # MuJoCo's step, and how long it is compared [s]
-SPAN = 0.5  # share of its range, in the middle, in which a joint starts
-FREE_RANGE = 0.5  # [rad, m] either side of zero where there are no limits
-GIVE_UP = 20.0  # seconds of clock time after which a slow solver is stopped
+FINE, COMPARED = 1e-4, 0.5  # MuJoCo's step, and the simulated time that is compared with it [s]
+SPAN = 0.5  # a joint starts in the middle of its range, within this share of it
+FREE_RANGE = 0.5  # a joint without limits starts within this distance of zero [rad, m]
+GIVE_UP = 20.0  # wall time after which a slow solver is stopped [s]
 
 
 class Robot(NamedTuple):
@@ -54,10 +56,10 @@ ROBOTS = {
 }
 
 
-def stripped(text: str) -> str:
-    """A URDF without shapes and without mimic joints, which are held at zero; damping and friction stay."""
+def strip_urdf(text: str) -> str:
+    """Return a URDF without shapes, with mimic joints fixed at zero; damping and friction stay."""
     root = ET.fromstring(text)
-    without_shapes(root)
+    remove_shapes(root)
     for joint in root.findall("joint"):
         for mimic in joint.findall("mimic"):
             joint.remove(mimic)
@@ -66,7 +68,7 @@ def stripped(text: str) -> str:
 
 
 def model(name: str) -> Any:
-    """A robot as Newton imports it, one world on the CPU."""
+    """Return a robot as Newton's model of one world on the CPU."""
     import newton
 
     robot = ROBOTS[name]
@@ -74,14 +76,14 @@ def model(name: str) -> Any:
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         file = Path(folder) / f"{name}.urdf"
-        file.write_text(stripped(source.read_text()))
+        file.write_text(strip_urdf(source.read_text()))
         builder = newton.ModelBuilder()
         builder.add_urdf(str(file), floating=robot.floating)
         return builder.finalize(device="cpu")
 
 
 def start(scene: spo.Scene, seed: int = 0) -> np.ndarray:
-    """Coordinates inside the limits, a floating base at the origin, [coordinate]."""
+    """Return random coordinates [coordinate] inside the limits, with a floating base at the origin."""
     rng, q = np.random.default_rng(seed), scene.neutral_q
     lower, upper = scene.values["joint_limit_lower"][0], scene.values["joint_limit_upper"][0]
     for hinge, first, dof in zip(scene.hinges, scene.q_start, scene.qd_start, strict=False):
@@ -94,16 +96,19 @@ def start(scene: spo.Scene, seed: int = 0) -> np.ndarray:
 
 
 def start_rates(scene: spo.Scene, seed: int = 0) -> np.ndarray:
-    """Velocities [dof]: nothing on a fixed base, and N(0, 1) of the joints of a floating robot, its base at rest."""
+    """Return velocities [dof]: zero for a fixed base, else N(0, 1) for the joints and zero for the floating base."""
     qd = np.random.default_rng(seed).normal(size=scene.dof_count)
     qd[:6] = 0.0
     return qd if scene.hinges[0].kind == "free" else 0.0 * qd
 
 
 def energies(scene: spo.Scene, q: np.ndarray, qd: np.ndarray, limits: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Kinetic energy, armature included, and that of gravity, springs and passed limits, at states [n, ...] [J].
+    """Return the kinetic energy with armature, and the energy of gravity, springs and exceeded limits [n] [J].
 
-    ``limits``: they are springs; SolverSteel has none unless asked.
+    Args:
+        scene: the robot.
+        q, qd: n states.
+        limits: whether the solver's limits are springs; SolverSteel's are not.
     """
     dyn = spo.Dynamics(scene, len(q), "cpu", "float64")
     poses, rates = dyn.body_poses(q), dyn.body_velocities(q, qd)
@@ -132,14 +137,14 @@ def energies(scene: spo.Scene, q: np.ndarray, qd: np.ndarray, limits: bool = Tru
 
 
 def excess(kinetic: np.ndarray, potential: np.ndarray) -> float:
-    """Largest rise of the energy above its start, as a share of what had been turned over until then."""
+    """Return the largest rise of the energy above its start, over the sum of changes of kinetic energy until then."""
     turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(kinetic)))])
     rise = kinetic + potential - (kinetic + potential)[0]
     return max(0.0, float((rise[1:] / np.maximum(turned[1:], 1e-12)).max()))
 
 
 class Run(NamedTuple):
-    """A trajectory [step, ...], and when it stopped being finite [s]; None if it never did."""
+    """A trajectory [step, ...], the time at which it diverged [s] or None, and whether it ran to its end."""
 
     q: np.ndarray
     qd: np.ndarray
@@ -148,7 +153,7 @@ class Run(NamedTuple):
 
 
 def run(solver: Any, q: np.ndarray, qd: np.ndarray, dt: float, seconds: float) -> Run:
-    """Swing freely."""
+    """Simulate a model for some seconds without control forces."""
     import newton
 
     state = solver.model.state()
@@ -170,11 +175,11 @@ def run(solver: Any, q: np.ndarray, qd: np.ndarray, dt: float, seconds: float) -
 
 
 def mujoco_errors(scene: spo.Scene, q: np.ndarray, qd: np.ndarray) -> dict[tuple[str, float], float]:
-    """Distances of q after COMPARED seconds, over the way travelled, without limits and friction, ours in float64.
+    """Return distances between q's after COMPARED seconds without limits and friction, over the distance travelled.
 
     Returns:
-        by (who, dt): of "MuJoCo", and of our "semi_implicit" and "midpoint", from MuJoCo at FINE; and "apart", of the
-        semi-implicit step from MuJoCo at the same dt, which is the same scheme.
+        (name, dt) -> distance from MuJoCo at the step FINE, of "MuJoCo" and of our "semi_implicit" and "midpoint" in
+        float64. ("apart", dt) is the distance of the semi-implicit step from MuJoCo at the same dt.
     """
     import mujoco
 
@@ -225,13 +230,13 @@ def mujoco_errors(scene: spo.Scene, q: np.ndarray, qd: np.ndarray) -> dict[tuple
 
 
 def observed_order(errors: dict[tuple[str, float], float]) -> float:
-    """By which power of dt the semi-implicit step comes closer to MuJoCo at FINE."""
+    """Return the power of dt with which the semi-implicit step's distance from MuJoCo at FINE decreases."""
     dt = STEPS[0]
     return float(np.log2(errors["semi_implicit", dt] / errors["semi_implicit", 0.5 * dt]))
 
 
 def row(name: str, seconds: float, peers: bool) -> dict[str, str]:
-    """One line of the table."""
+    """Return a line of the table: head -> text."""
     from newton.solvers import SolverFeatherstone, SolverSteel
 
     from warp_spo.newton import SolverSPO, from_newton
@@ -262,7 +267,7 @@ def row(name: str, seconds: float, peers: bool) -> dict[str, str]:
             for dt in STEPS:
                 peer = other(robot)
                 done = run(peer, q, qd, dt, seconds)
-                said = "finite" if done.finished else f"finite until stopped at {len(done.q) * dt:.2g} s"
+                said = "finite" if done.finished else f"finite, stopped at {len(done.q) * dt:.2g} s"
                 if done.diverged is not None:
                     said = f"diverges at {done.diverged:.3g} s"
                 elif done.finished:

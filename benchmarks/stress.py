@@ -27,25 +27,25 @@ HEADS = (
     "max error",
     "median",
     "law",
-    "x law",
+    "/ law",
     "backward",
     "min D/tr P",
     "status",
     "ns/world",
     "verdict",
-    "law is",
-    "from",
-    "against",
+    "formula of the law",
+    "section",
+    "reference",
 )
-WIDTHS = (36, 18, 9, 8, 8, 7, 8, 10, 10, 8, 8, 22, 26, 8)
+WIDTHS = (36, 18, 9, 8, 8, 7, 8, 10, 10, 8, 8, 22, 26, 9)
 
 
 def rows(
     cases: Iterable[Case], device: Any = None, timed: bool = True, granularity: str | None = None
 ) -> Iterator[dict]:
-    """Yield a row for each case and precision, and for each form for contrast.
+    """Yield a row for each case and precision, and for each form that a case names for contrast.
 
-    A case that reads D where the recursions leave it runs at granularity "node" alone.
+    A case that reads D from the recursions' memory runs at granularity "node" alone.
     """
     for case in cases:
         if case.reads_pivots and granularity not in (None, "node"):
@@ -70,7 +70,7 @@ def rows(
 
 
 def check_rows(pattern: str, device: Any = None, granularity: str | None = None, slow: bool = False) -> Iterator[dict]:
-    """Yield a row for each check whose name holds a match, and precision; the long ones too with ``slow``."""
+    """Yield a row for each precision of each check whose name matches ``pattern``; ``slow``: the long ones too."""
     for name, (check, source) in (CHECKS | (LONG if slow else {})).items():
         if not re.search(pattern, name) or (name in READS_PIVOTS and granularity not in (None, "node")):
             continue
@@ -80,9 +80,9 @@ def check_rows(pattern: str, device: Any = None, granularity: str | None = None,
                 verdict, why = "ok", ""
             except AssertionError as error:
                 verdict, why = "FAILS", str(error).strip()
-            except ValueError:  # of the granularity
+            except ValueError:  # there is no such granularity
                 raise
-            except Exception as error:  # such as a kernel that does not compile: the other checks go on
+            except Exception as error:  # for example a kernel that does not compile; the other checks go on
                 verdict, why = "FAILS", f"{type(error).__name__}: {error}"
             yield dict(
                 case=name,
@@ -95,18 +95,18 @@ def check_rows(pattern: str, device: Any = None, granularity: str | None = None,
             )
 
 
-def side_by_side(
+def rows_in_parallel(
     cases: list[Case], checks: list[str], jobs: int, device: str, granularity: str | None
 ) -> Iterator[dict]:
-    """The rows of cases and checks, untimed, from processes that compile at the same time; in order."""
+    """Yield the rows of cases and checks in order, untimed, from ``jobs`` processes at the same time."""
     work = [("case", case.id) for case in cases] + [("check", name) for name in checks]
     context = multiprocessing.get_context("spawn")  # a device does not survive a fork
     with concurrent.futures.ProcessPoolExecutor(jobs, context) as pool:
-        for found in pool.map(functools.partial(_one, device, granularity), work):
+        for found in pool.map(functools.partial(_rows_of, device, granularity), work):
             yield from found
 
 
-def _one(device: str, granularity: str | None, work: tuple[str, str]) -> list[dict]:
+def _rows_of(device: str, granularity: str | None, work: tuple[str, str]) -> list[dict]:
     kind, name = work
     wp.config.log_level = wp.LOG_WARNING
     pattern = f"^{re.escape(name)}$"
@@ -116,7 +116,7 @@ def _one(device: str, granularity: str | None, work: tuple[str, str]) -> list[di
 
 
 def line(found: dict) -> str:
-    """One line of the printed table."""
+    """Return a row as one line of the printed table."""
 
     def number(key: str, form: str = ".1e") -> str:
         return "" if found.get(key) is None or found[key] != found[key] else f"{found[key]:{form}}"
@@ -145,14 +145,14 @@ def line(found: dict) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Returns 0; 1 if a case misses its law, 2 for a mistake of the caller."""
+    """Run the suite; return 0, 1 if a case misses its law, or 2 for a mistake in the call."""
     p = argparse.ArgumentParser(prog="python -m benchmarks.stress", description=__doc__)
     p.add_argument("filter", nargs="?", default="", help="regular expression, such as S1[1-3] or gimbal.*delta0.001")
     p.add_argument("--device", help="Warp device; default: the current one")
     p.add_argument("--granularity", help="of the library's recursions; default: what the plan chooses")
-    p.add_argument("--slow", action="store_true", help="the long sizes too")
-    p.add_argument("--check", action="store_true", help="time nothing")
-    p.add_argument("--jobs", type=int, default=1, metavar="N", help="with --check: processes side by side")
+    p.add_argument("--slow", action="store_true", help="run the slow cases too")
+    p.add_argument("--check", action="store_true", help="compare with the laws, and time nothing")
+    p.add_argument("--jobs", type=int, default=1, metavar="N", help="with --check: processes at the same time")
     p.add_argument("--json", type=Path, metavar="OUT", help="write the run to this file, or by date into this folder")
     options = p.parse_args(argv)
     wp.config.log_level = wp.LOG_WARNING
@@ -168,7 +168,7 @@ def main(argv: list[str] | None = None) -> int:
     run, file = runner.record(found, where[0]), None
     if options.check and options.jobs > 1:
         checks = [name for name in CHECKS | (LONG if options.slow else {}) if re.search(options.filter, name)]
-        measured = side_by_side(cases, checks, options.jobs, *where)
+        measured = rows_in_parallel(cases, checks, options.jobs, *where)
     else:
         timed = rows(cases, where[0], not options.check, where[1])
         measured = itertools.chain(timed, check_rows(options.filter, *where, options.slow))
@@ -178,11 +178,11 @@ def main(argv: list[str] | None = None) -> int:
             print(line(one), flush=True)
             if options.json:
                 file = runner.save(run, options.json)
-    except ValueError as error:  # of --granularity
+    except ValueError as error:  # --granularity names none
         print(error, file=sys.stderr)
         return 2
     if not found:
-        print(f"stress: no case matches {options.filter!r}", file=sys.stderr)
+        print(f"stress: no case or check matches the filter {options.filter!r}", file=sys.stderr)
         return 2
     if file:
         print(f"wrote {file}", file=sys.stderr)

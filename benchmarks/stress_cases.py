@@ -1,6 +1,6 @@
-"""The stress cases as data: scene, parameters, and the law that the error obeys.
+"""The stress cases as data: scene, parameters, and the law, which is the error to be expected.
 
-A law is written for float32 and scales with eps. More than ``ALLOWED`` times the law fails.
+A law is written for float32 and scales with eps. An error of more than ``ALLOWED`` times the law fails.
 """
 
 from __future__ import annotations
@@ -22,22 +22,25 @@ ALLOWED = 10.0
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Case:
-    """One line of the suite.
+    """One case of the suite.
 
     Args:
         name: such as "S1.chain_rand".
-        build: function of ``parameters`` and worlds that makes the problem.
-        formula, law: the law as printed; and as a function of eps, the parameters, and by world cond() of the mass
-            matrix and D_cond() of the hinges' blocks of D.
-        source: where the law stands.
-        quantity: "qdd", "pivots" (D), "root_pivot" (D of dof 0), "log_det" or "dense" (qdd by the library's mass matrix
-            and a dense Cholesky in the same precision; where it breaks down it says so: an error of 1).
-        metric: "norm" (2-norm of the error over that of the value), "component" (worst entry, each relative) or
-            "absolute".
-        steps: refinement steps with a float64 residual before the error is taken.
-        contrast: forms of :mod:`contrast` to print beside it.
-        words: precision -> the status word that every world has there. Elsewhere a world has 0; or 3, digits lost,
-            where the law lets more than half of the digits go.
+        build: function of ``parameters`` that returns the problem.
+        formula: the law as it is printed.
+        law: the law as a function of eps, the parameters, and two functions that return an array by world: ``cond``,
+            the condition of the mass matrix, and ``D_cond``, the largest condition of a hinge's block of D.
+        source: section of the stress suite that states the law.
+        quantity: "qdd", "pivots" (D), "root_pivot" (D of dof 0), "log_det" or "dense" (qdd from the library's mass
+            matrix by a dense Cholesky in the same precision, whose breakdown counts as an error of 1).
+        metric: "norm" (2-norm of the error over that of the value), "component" (largest relative error of an entry)
+            or "absolute".
+        steps: refinement steps with a float64 residual before the error is measured.
+        contrast: names of forms of :mod:`contrast` that are measured beside it.
+        words: precision -> the status word that every world must have in it. In other precisions a world must have 0,
+            or 3 (digits lost) where the law allows an error of more than half of the digits.
+        slow: whether the case runs only when slow ones are asked for.
+        precisions: those in which the case is judged by its law.
     """
 
     name: str
@@ -56,21 +59,22 @@ class Case:
 
     @property
     def id(self) -> str:
+        """Name and parameters, such as "S1.chain_rand.n16"."""
         return ".".join([self.name, *(f"{key}{_short(value)}" for key, value in self.parameters.items())])
 
     @property
     def shown(self) -> tuple[str, ...]:
-        """Precisions worth a line: those with a law, and one refinement step where the quantity is refined."""
+        """Precisions that are measured: those with a law, and "refined" (one refinement step) for qdd."""
         extra = self.quantity == "qdd" and self.steps == 0 and self.precisions != ("float32",)
         return ("float32", "refined", "float64") if extra else self.precisions
 
     @property
     def reads_pivots(self) -> bool:
-        """Whether the quantity is D as the recursions leave it in memory, which only granularity "node" does."""
+        """Whether the quantity is read from the recursions' memory, where only granularity "node" leaves D."""
         return self.quantity in ("pivots", "root_pivot")
 
     def expects(self, status: np.ndarray, dtype: str, law: np.ndarray) -> np.ndarray:
-        """Whether the status word of each world is one that it may have there."""
+        """Return for each world whether its status word is one that it may have."""
         eps = {"float32": EPS32, "float64": EPS64}[dtype]
         if dtype in self.words:
             return status == self.words[dtype]
@@ -78,6 +82,7 @@ class Case:
 
     @functools.cached_property
     def problem(self) -> Problem:
+        """Scene and states."""
         return self.build(**self.parameters)
 
 
@@ -86,18 +91,19 @@ def _short(value: Any) -> str:
 
 
 def flat(level: float) -> dict:
-    """A law that is the same for every parameter; ``level`` in float32."""
+    """Return formula and law of an error that is the same for every parameter; ``level`` in float32."""
     return dict(formula=f"{level:g}", law=lambda eps, cond, **_: level * eps / EPS32)
 
 
 def every(name: str, build: Callable, source: str, law: dict, values: dict, slow: Iterable = (), **more: Any) -> list:
-    """A case for each value of the one parameter in ``values``; those in ``slow`` are marked."""
+    """Return a case for each value of the one parameter in ``values``, and a slow case for each value in ``slow``."""
     ((key, given),) = values.items()
     made = [Case(name, {key: value}, build, source=source, **law, **more) for value in given]
     return made + [Case(name, {key: value}, build, source=source, slow=True, **law, **more) for value in slow]
 
 
 def by(formula: str, law: Callable) -> dict:
+    """Return formula and law as arguments of a :class:`Case`."""
     return dict(formula=formula, law=law)
 
 
@@ -111,12 +117,12 @@ TILTED = by("eps / (e/I + delta^2)", lambda eps, e, delta, **_: eps / (e / max(s
 WIDE = by("eps sqrt n", lambda eps, n, **_: eps * n**0.5)
 
 
-SUBNORMAL = dict(float32=4)  # inertias down to 1e-37 kg m^2, and their products below what float32 resolves
+SUBNORMAL = dict(float32=4)  # inertias are as small as 1e-37 kg m^2; float32 cannot hold their products
 OBLIQUE_GIMBAL = functools.partial(scenes.gimbal, oblique=True, round_arm=True)
 
 
 def refined(steps: int) -> dict:
-    """Each step takes 1e-3 eps cond, down to what float64 leaves of the residual."""
+    """Return formula and law of refinement: a step multiplies the error by 1e-3 eps cond, down to float64 rounding."""
     law = lambda eps, cond, **_: (1e-3 * EPS32 * cond()) ** (steps + 1) + 1e-3 * EPS64 * cond() + EPS64  # noqa: E731
     return by(f"(1e-3 eps cond)^{steps + 1}", law)
 
@@ -259,26 +265,27 @@ CASES = [
         slow=(1024,),
         quantity="log_det",
         metric="absolute",
-        precisions=("float32",),  # a sum in more digits than D has
+        precisions=("float32",),  # the logarithms are added in more digits than D has
         contrast=("float32 sum",),
     ),
 ]
 
 
 CAUSES = {
-    "S18.scale_sep_qdd": "judged entry by entry: an entry of qdd that nearly cancels carries the rounding of its "
-    "neighbours, 10 to 220 times the law; its median entry is off by 4e-7 in float32, the worst entry of D by 5e-7",
+    "S18.scale_sep_qdd": "its error is measured entry by entry, and an entry of qdd that nearly cancels has the "
+    "rounding error of its neighbours, 10 to 220 times the law; in float32 the median error of an entry is 4e-7, the "
+    "largest error of an entry of D is 5e-7",
 }
-"""Case -> why it misses its law, where that is known and left so."""
+"""Case -> why it misses its law, where the cause is known and accepted."""
 
 
 def choose(pattern: str, slow: bool = True) -> list[Case]:
-    """Cases whose id holds a match of the regular expression; the slow ones too unless told.
+    """Return the cases whose id has a match of the regular expression ``pattern``; ``slow``: the slow ones too.
 
     Raises:
-        ValueError: it is no regular expression.
+        ValueError: ``pattern`` is no regular expression.
     """
     try:
         return [case for case in CASES if re.search(pattern, case.id) and (slow or not case.slow)]
     except re.error as error:
-        raise ValueError(f"stress: filter {pattern!r} is no regular expression: {error}") from None
+        raise ValueError(f"stress: the filter {pattern!r} is not a regular expression: {error}") from None

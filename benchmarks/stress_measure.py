@@ -17,14 +17,14 @@ from .exact import Sweep
 from .stress_cases import ALLOWED, CAUSES, EPS32, EPS64, Case
 from .stress_scenes import Problem
 
-PRECISIONS = ("float32", "refined", "float64")  # refined: float32 and one step with a float64 residual
+PRECISIONS = ("float32", "refined", "float64")  # refined: float32, then one step with a float64 residual
 EPS = {"float32": EPS32, "float64": EPS64}
-MP_BODIES = 32  # larger scenes are compared with extended precision, whose eps is 1/2048 of float64's
-POWER_STEPS = 8  # of the power iteration for the norm of the mass matrix
+MP_BODIES = 32  # scenes with more bodies are compared with extended precision, whose eps is 1/2048 of float64's
+POWER_STEPS = 8  # steps of the power iteration for the norm of the mass matrix
 
 
 class Subject:
-    """A problem on a device in both precisions.
+    """A problem on a device, in float32 and float64.
 
     Args:
         problem: scene and states.
@@ -41,7 +41,7 @@ class Subject:
         self._inputs: dict[str, tuple] = {}
 
     def inputs(self, dtype: str) -> tuple:
-        """q, qd and tau on the device."""
+        """Return q, qd and tau as arrays on the device."""
         if dtype not in self._inputs:
             p = self.problem
             self._inputs[dtype] = tuple(
@@ -52,21 +52,22 @@ class Subject:
 
     @functools.cached_property
     def status(self) -> wp.array:
+        """Status words of the last forward dynamics [world]."""
         return wp.zeros(self.problem.worlds, dtype=wp.int32, device=self.device)
 
     def forward(self, dtype: str, steps: int = 0) -> wp.array:
-        """qdd; from float32 with ``steps`` of refinement, in float64 arrays."""
+        """Return qdd [world, dof]; with ``steps`` refined from float32, in a float64 array."""
         if steps and steps not in self._refined:
             self._refined[steps] = self._make(dtype="float64", refine=steps)
         dyn = self._refined[steps] if steps else self.dyn[dtype]
         return dyn.forward_dynamics(*self.inputs(dyn.dtype.__name__), status=self.status)
 
     def pivots(self, dtype: str) -> np.ndarray:
-        """D [world, dof] of the last forward dynamics in that precision."""
+        """Return D [world, dof] of the last forward dynamics in that precision."""
         return self.dyn[dtype].recursions.array("pivot").numpy().T
 
     def value(self, quantity: str, dtype: str, steps: int) -> np.ndarray:
-        """A case's quantity, [world, ...]."""
+        """Return the quantity of a case, [world, ...]."""
         qdd = self.forward(dtype, steps).numpy()
         if quantity in ("pivots", "root_pivot"):
             D = self.pivots(dtype)
@@ -80,7 +81,7 @@ class Subject:
         return qdd
 
     def mass_norm(self) -> np.ndarray:
-        """An estimate from below of the 2-norm of the mass matrix [world, 1], matrix-free."""
+        """Return a lower bound of the 2-norm of the mass matrix [world, 1], without forming it."""
         dyn = self.dyn["float64"]
         x = np.random.default_rng(0).normal(size=(self.problem.worlds, self.problem.scene.dof_count))
         still = dyn.gravity_force(self.problem.q)
@@ -90,7 +91,7 @@ class Subject:
         return np.linalg.norm(x, axis=1, keepdims=True)
 
     def backward_error(self, qdd: np.ndarray) -> np.ndarray:
-        """|tau - inverse dynamics| over |Mass| |qdd| + |tau| + |bias| [world], all in float64."""
+        """Return |tau - inverse dynamics| / (|Mass| |qdd| + |tau| + |bias|) [world], computed in float64."""
         p, dyn = self.problem, self.dyn["float64"]
         tau = np.zeros_like(qdd, dtype=np.float64) if p.tau is None else p.tau
         norm = functools.partial(np.linalg.norm, axis=1, keepdims=True)
@@ -99,7 +100,7 @@ class Subject:
             return (norm(tau - force) / (self.mass_norm() * norm(qdd) + norm(tau) + norm(bias)))[:, 0]
 
     def microseconds(self, run: Callable, budget: float = 0.1) -> float:
-        """Median run time per world [µs], at least 3 runs after one to warm up."""
+        """Return the median run time per world [µs] of at least 3 runs after a first one."""
         run()
         times: list[float] = []
         while len(times) < 3 or (sum(times) < budget and len(times) < 50):
@@ -113,7 +114,7 @@ class Subject:
 
 @functools.lru_cache(maxsize=16)
 def exact(case: Case) -> tuple[Sweep, np.ndarray]:
-    """The sweep in an arithmetic that is good enough, and the case's quantity [world, ...]."""
+    """Return the case's sweep in 50 digits or extended precision, and the case's quantity from it, [world, ...]."""
     p = case.problem
     sweep = Sweep(p.scene, p.q, "mp50" if p.scene.body_count <= MP_BODIES else "extended")
     if case.quantity in ("pivots", "root_pivot"):
@@ -122,7 +123,7 @@ def exact(case: Case) -> tuple[Sweep, np.ndarray]:
 
 
 def distance(case: Case, value: np.ndarray) -> np.ndarray:
-    """Error by world, in the case's metric; infinite where the value is not a number."""
+    """Return the error by world in the case's metric; infinite where the value is not finite."""
     sweep, wanted = exact(case)
     finite = np.isfinite(value.astype(np.float64)).all(1)
     difference = (sweep.arithmetic.number(np.where(np.isfinite(value), value, 0.0)) - wanted).astype(np.float64)
@@ -135,7 +136,7 @@ def distance(case: Case, value: np.ndarray) -> np.ndarray:
 
 
 def law_of(case: Case, eps: float) -> np.ndarray:
-    """The law's error by world."""
+    """Return the error by world that the law allows."""
     given = dict(cond=lambda: _cond(case), D_cond=lambda: exact(case)[0].D_cond)
     return np.broadcast_to(case.law(eps=eps, **given, **case.parameters), case.problem.worlds)
 
@@ -147,10 +148,10 @@ def _cond(case: Case) -> np.ndarray:
 
 
 def row(case: Case, subject: Subject, precision: str, timed: bool = False) -> dict:
-    """One line of the table: numbers of a case in a precision of ``PRECISIONS``.
+    """Return a row of the table: a case measured in a precision of ``PRECISIONS``.
 
-    A case fails where its error exceeds ALLOWED times the law, and where a status word is one that the law does not
-    expect. ``us`` and ``ns`` are the run time per world-step.
+    The verdict is "FAILS" where the error exceeds ALLOWED times the law, and where a status word is not expected.
+    With ``timed`` the row has ``us`` and ``ns``, the run time of forward dynamics for one world.
     """
     dtype = "float64" if precision == "float64" else "float32"
     steps = case.steps if precision != "refined" else max(1, case.steps)
@@ -191,12 +192,12 @@ def row(case: Case, subject: Subject, precision: str, timed: bool = False) -> di
 
 
 def contrasts(case: Case) -> list[dict]:
-    """Errors of the forms that the library does not offer."""
+    """Return a row for each form of forward dynamics that the case names for contrast."""
     found, p = [], case.problem
     for name in case.contrast:
         with np.errstate(all="ignore"):
             qdd, D = contrast.FORMS[name](p.scene, p.q, p.tau)
-            log_det = np.add.accumulate(np.log(D), axis=1)[:, -1:]  # one after the other, in D's precision
+            log_det = np.add.accumulate(np.log(D), axis=1)[:, -1:]  # added one by one in D's precision
         value = {"qdd": qdd, "pivots": D, "root_pivot": D[:, :1], "log_det": log_det}[case.quantity]
         error = distance(case, value)
         found.append(

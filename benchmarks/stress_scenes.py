@@ -25,7 +25,7 @@ ARM = (0.3, 0.4, 0.5)  # [kg m^2]
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """A scene; q [world, coordinate]; tau and qd [world, dof] or None; the scene's values and states are float32's."""
+    """A scene, q [world, coordinate], tau and qd [world, dof] or None; every number is one that float32 has."""
 
     scene: spo.Scene
     q: np.ndarray
@@ -39,7 +39,7 @@ class Problem:
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """Where a check runs: Warp device, "float32" or "float64", and granularity, None being what the plan chooses."""
+    """Where a check runs: Warp device, "float32" or "float64", and granularity, None for the plan's choice."""
 
     device: Any = None
     dtype: str = "float32"
@@ -47,35 +47,40 @@ class Setting:
 
     @property
     def eps(self) -> float:
+        """Distance of 1 from the next number of the dtype."""
         return {"float32": 2.0**-23, "float64": 2.0**-52}[self.dtype]
 
     def dynamics(self, scene: spo.Scene, worlds: int, **options: Any) -> spo.Dynamics:
+        """Return the Dynamics of a scene on this device, in this precision, at this granularity."""
         return spo.Dynamics(scene, worlds, self.device, self.dtype, granularity=self.granularity, **options)
 
 
-def rounded(array: Any) -> np.ndarray:
+def round_to_float32(array: Any) -> np.ndarray:
+    """Return an array of float64 whose entries are rounded to float32."""
     return np.asarray(array, dtype=np.float32).astype(np.float64)
 
 
 def problem(scene: spo.Scene, q: np.ndarray, tau: Any = None, qd: Any = None) -> Problem:
-    values = {name: rounded(scene.values[name]) for name in ROUNDED}
-    tau, qd = (None if x is None else rounded(x) for x in (tau, qd))
-    return Problem(scene.with_values(**values), rounded(q), tau, qd)
+    """Return a scene and states as a Problem, rounded to float32."""
+    values = {name: round_to_float32(scene.values[name]) for name in ROUNDED}
+    tau, qd = (None if x is None else round_to_float32(x) for x in (tau, qd))
+    return Problem(scene.with_values(**values), round_to_float32(q), tau, qd)
 
 
 def draw(seed: int, worlds: int, size: int, spread: float | None = None) -> np.ndarray:
-    """[world, size] normal, or uniform in (-spread, spread); world 0 has ``seed``."""
+    """Return normal numbers [world, size], or uniform ones in (-spread, spread); world 0 is drawn from ``seed``."""
     rngs = [np.random.default_rng(seed + NEXT_WORLD * world) for world in range(worlds)]
     return np.array([rng.normal(size=size) if spread is None else rng.uniform(-spread, spread, size) for rng in rngs])
 
 
 def rod(mass: float = 1.0, length: float = 1.0) -> spo.Body:
-    """A uniform rod along x from the body's origin."""
+    """Return a uniform rod along x that starts at the body's origin; mass [kg], length [m]."""
     scale = mass * length**2
     return spo.Body(mass, (0.5 * length, 0.0, 0.0), np.diag([0.01 * scale, scale / 12.0, scale / 12.0]))
 
 
 def at(x: float) -> tuple:
+    """Return a pose at x [m] on the x axis, not turned."""
     return (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -87,7 +92,12 @@ def tree(
     gravity: Any = NONE,
     **hinge: Any,
 ) -> spo.Scene:
-    """Revolute hinges about z on even ``depth`` and y on odd, ``offset`` along the parent's x."""
+    """Return a scene of revolute hinges, about z at even ``depth`` and y at odd, ``offset`` [m] along the parent's x.
+
+    Args:
+        parents: of each body; -1: the world.
+        hinge: further arguments of the hinges, a sequence of one value for each hinge.
+    """
     hinges = [
         spo.Hinge(
             "revolute",
@@ -103,6 +113,7 @@ def tree(
 
 
 def chain(masses: Any, lengths: Any = 1.0, gravity: Any = NONE, **hinge: Any) -> spo.Scene:
+    """Return a chain of rods of these masses [kg] and lengths [m] on hinges about z and y in turn."""
     masses, lengths = np.broadcast_arrays(np.atleast_1d(masses), np.atleast_1d(lengths))
     n = len(masses)
     bodies = [rod(m, l) for m, l in zip(masses, lengths, strict=True)]
@@ -110,32 +121,39 @@ def chain(masses: Any, lengths: Any = 1.0, gravity: Any = NONE, **hinge: Any) ->
 
 
 def base(scene: spo.Scene, worlds: int = WORLDS, spread: float = 0.6, tau: Any = "random", qd: Any = None) -> Problem:
+    """Return a scene at random angles in (-spread, spread) [rad] under random forces, or under ``tau``."""
     n = scene.dof_count
     tau = draw(TAU_SEED, worlds, n) if isinstance(tau, str) else tau
     return problem(scene, draw(ANGLE_SEED, worlds, n, spread), tau, qd)
 
 
 def chain_rand(n: int, spread: float = 0.6, worlds: int = WORLDS) -> Problem:
+    """Return a chain of n rods under random forces, without gravity."""
     return base(chain(np.ones(n)), worlds, spread)
 
 
 def chain_gravity(n: int) -> Problem:
+    """Return a chain of n rods under gravity alone."""
     return base(chain(np.ones(n), gravity=GRAVITY), tau=None)
 
 
 def chain_coriolis(n: int) -> Problem:
+    """Return a chain of n rods with random velocities and no force."""
     return base(chain(np.ones(n)), tau=None, qd=draw(5, WORLDS, n))
 
 
 def chain_gravity_torque(n: int) -> Problem:
-    """Gravity as the forces tau = -C that do the same, in float64 before rounding."""
+    """Return a chain of n rods without gravity, under the hinge forces that have the same effect as gravity."""
     one = chain_gravity(n)
     force = spo.Dynamics(one.scene, one.worlds, "cpu", "float64", granularity="node").gravity_force(one.q)
     return problem(one.scene.with_values(gravity=NONE), one.q, -force)
 
 
 def straight(n: int, thin: bool = True) -> Problem:
-    """All in the xy plane along a line; worlds differ by the angle of hinge 0, which no pivot depends on."""
+    """Return a chain of n rods on a straight line in the xy plane, all hinges about z.
+
+    Worlds differ by the angle of hinge 0, on which no pivot depends. ``thin``: no inertia about the rods' own axes.
+    """
     inertia = np.diag([0.0 if thin else 0.01, 1.0 / 12.0, 1.0 / 12.0])
     bodies = [spo.Body(1.0, (0.5, 0.0, 0.0), inertia) for _ in range(n)]
     scene = tree(np.arange(n) - 1, bodies, [0.0] + [1.0] * (n - 1), [0] * n)
@@ -145,6 +163,7 @@ def straight(n: int, thin: bool = True) -> Problem:
 
 
 def binary_tree(n: int) -> Problem:
+    """Return a binary tree of n rods, numbered level by level."""
     parents = (np.arange(n) - 1) // 2
     parents[0] = -1
     depth = np.floor(np.log2(np.arange(n) + 1)).astype(int)
@@ -152,30 +171,36 @@ def binary_tree(n: int) -> Problem:
 
 
 def star(n: int) -> Problem:
+    """Return one rod that carries n rods at its end."""
     return base(tree([-1] + [0] * n, [rod()] * (n + 1), [0.0] + [1.0] * n, [0, *np.arange(n) % 2]))
 
 
 def caterpillar(n: int) -> Problem:
+    """Return a chain of n rods, each of which carries three rods more."""
     parents = [*range(-1, n - 1), *np.repeat(np.arange(n), 3)]
     depth = [*range(n), *np.tile(np.arange(3), n)]
     return base(tree(parents, [rod()] * (4 * n), [0.0] + [1.0] * (4 * n - 1), depth))
 
 
 def heavy_tip(r: float) -> Problem:
-    """8 links, masses in geometric progression, tip over base = r."""
+    """Return a chain of 8 links whose masses grow in geometric progression; the tip's is r times the base's."""
     return base(chain(r ** (np.arange(8) / 7.0)))
 
 
 def light_link(link: int, mu: float) -> Problem:
+    """Return a chain of 8 links in which one link has mass ``mu`` [kg], the others 1 kg."""
     masses = np.ones(8)
     masses[link] = mu
     return base(chain(masses))
 
 
 def gimbal(e: float, delta: float, oblique: bool = False, round_arm: bool = False) -> Problem:
-    """Hinges z, y, z; two rings of inertia e [kg m^2] and mass e [kg]; an arm of 1 kg; delta [rad] off alignment.
+    """Return a gimbal: hinges about z, y, z, two rings and an arm, ``delta`` [rad] away from where it locks.
 
-    ``oblique``: body frames whose axes the hinges' are not; ``round_arm``: one of inertia ARM, thin nowhere.
+    Args:
+        e: mass [kg] and inertia [kg m^2] of each ring; the arm has 1 kg.
+        oblique: the hinges' axes are oblique in the bodies' frames.
+        round_arm: the arm has the principal inertias ARM, and not a rod's.
     """
     ring = spo.Body(e, inertia=e * np.eye(3))
     arm = spo.Body(1.0, inertia=np.diag(ARM)) if round_arm else rod()
@@ -190,7 +215,7 @@ def gimbal(e: float, delta: float, oblique: bool = False, round_arm: bool = Fals
 
 
 def far_origin(x: float, floating: bool = False) -> Problem:
-    """12 links of 0.1 m whose root stands, or floats, at x [m] along every axis."""
+    """Return a chain of 12 links of 0.1 m whose root is at (x, x, x) [m], fixed or floating."""
     scene = chain(np.ones(12), 0.1, gravity=GRAVITY)
     hinges, far = list(scene.hinges), (x, x, x, 0.0, 0.0, 0.0, 1.0)
     hinges[0] = spo.Hinge("free", -1, 0) if floating else dataclasses.replace(hinges[0], parent_pose=far)
@@ -204,24 +229,30 @@ def far_origin(x: float, floating: bool = False) -> Problem:
 
 
 def scale_separation(r: float, n: int = 20) -> Problem:
-    """Lengths 10 r^k [m] of rods of 1 kg."""
+    """Return a chain of n rods of 1 kg; rod k is 10 r^k [m] long."""
     return base(chain(np.ones(n), 10.0 * r ** np.arange(n)))
 
 
 def stiff_armature(s: float, n: int = 16) -> Problem:
-    """Delta = .33 s [kg m^2] on every second hinge."""
+    """Return a chain of n rods with an armature of .33 s [kg m^2] on every second hinge."""
     return base(chain(np.ones(n), armature=np.where(np.arange(n) % 2 == 1, 0.33 * s, 0.0)))
 
 
 def implicit_stiffness(dt: float, ke: float = 1e8, kd: float = 1e4, n: int = 8) -> Problem:
-    """An implicit step dt [s] of springs ke [N m/rad] and dampers kd [N m s/rad]: Delta = dt kd + dt^2 ke."""
+    """Return a chain with the armature and forces of an implicit step: Delta = dt kd + dt^2 ke.
+
+    dt [s], springs ke [N m/rad], dampers kd [N m s/rad].
+    """
     scene = chain(np.ones(n), gravity=GRAVITY, armature=np.full(n, dt * kd + dt**2 * ke))
     q, qd = draw(ANGLE_SEED, WORLDS, n, 0.6), draw(5, WORLDS, n)
     return problem(scene, q, -ke * (1e-3 * q + dt * qd) - kd * qd, qd)
 
 
 def weak_ball(weak: float, floating: bool) -> Problem:
-    """A body of inertia (1, 1, weak) [kg m^2] on a ball hinge at its CoM, any orientation; on a free rod or not."""
+    """Return a body of inertia (1, 1, weak) [kg m^2] on a ball hinge at its CoM, in random orientations.
+
+    ``floating``: the ball hinge sits on a floating rod, and not on the world.
+    """
     body = spo.Body(1.0, inertia=np.diag([1.0, 1.0, weak]))
     bodies, hinges = [body], [spo.Hinge("ball", -1, 0)]
     if floating:
@@ -234,8 +265,15 @@ def weak_ball(weak: float, floating: bool) -> Problem:
 
 
 def three_angles(delta: float) -> Problem:
-    """A rod on a d6 of three angles about z, y, x, the middle one delta [rad] from where it loses a direction."""
+    """Return a rod on a d6 of three angles about z, y, x; the middle angle is ``delta`` [rad] short of 90 degrees."""
     scene = spo.Scene([rod()], [spo.Hinge("d6", -1, 0, angular=np.eye(3)[[2, 1, 0]])], gravity=GRAVITY)
     q = draw(ANGLE_SEED, WORLDS, 3, 0.6)
     q[:, 1] = np.pi / 2.0 - delta
     return problem(scene, q, draw(TAU_SEED, WORLDS, 3))
+
+
+def floating_chain(worlds: int) -> Problem:
+    """Return a floating chain of twelve links in gravity, with velocities and forces, in any number of worlds."""
+    p = far_origin(0.0, floating=True)
+    q, tau = (np.resize(x, (worlds, x.shape[1])) for x in (p.q, p.tau))
+    return Problem(p.scene, q, tau, round_to_float32(draw(5, worlds, p.scene.dof_count)))

@@ -33,7 +33,7 @@ def test_an_error_beyond_its_tolerance_fails_and_is_named(device, capsys, monkey
         assert main([*call, "--check"]) == 1
         out, err = capsys.readouterr()
         assert f"w2.node.error {float(error):.4g}"[:24] in out
-        assert "NaN or beyond its tolerance in arm7.gravity_force.float64.w2.node" in err
+        assert "NaN or exceeds its tolerance in arm7.gravity_force.float64.w2.node" in err
     assert runner.tolerance(dict(dtype="float32", sweep="chain")) == 1e-2
     assert runner.tolerance(dict(dtype="float32")) == TOLERANCE["float32"]
 
@@ -112,7 +112,7 @@ def test_a_part_that_takes_too_long_is_stopped(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(everything, "GRACE", 1.0)
     part = everything.Part("endless", ["endless_part"], seconds=2.0)
     begin = time.monotonic()
-    assert everything.Lanes(tmp_path, 60.0, 1, alone=True).run([part]) == [part]
+    assert everything.Scheduler(tmp_path, 60.0, 1, alone=True).run([part]) == [part]
     assert "endless: 0 rows" in capsys.readouterr().out and 2.0 < time.monotonic() - begin < 20.0
 
 
@@ -129,7 +129,7 @@ def test_parts_share_several_gpus(tmp_path, capsys, monkeypatch):
     compiling = ["one_part", str(tmp_path / "compiled.json")]
     found = [everything.Part("host", ["one_part"], alone=True), everything.Part("first", ["one_part"], compiling)]
     found += [everything.Part(name, ["one_part"]) for name in ("second", "third")]
-    assert everything.Lanes(tmp_path, 60.0, 2, alone=False, gpus=3).run(found) == []
+    assert everything.Scheduler(tmp_path, 60.0, 2, alone=False, gpus=3).run(found) == []
     rows = {part.name: json.loads((tmp_path / f"{part.name}.json").read_text())["rows"][0] for part in found}
     side_by_side = [rows["first"], rows["second"]]
     assert {row["gpu"] for row in side_by_side} == {"0", "1"}

@@ -104,7 +104,7 @@ def test_report_is_one_page_with_tables_pictures_and_the_stress_suite(tmp_path, 
     (page,) = (tmp_path / "page").iterdir()
     text = page.read_text()
     assert '<td class="bad">nan</td>' in text and '<td class="bad">FAILS</td>' in text
-    assert "<td>S1.chain n=4</td>" in text and "5e-7 &amp; more" in text and "1 of 2 within" in text
+    assert "<td>S1.chain n=4</td>" in text and "5e-7 &amp; more" in text and "1 of 2 errors are within" in text
     images = [base64.b64decode(image).decode() for image in re.findall(r"base64,([^\"]+)", text)]
     assert len(images) == 2  # one for each world count
     assert any("1 without a result" in image and "P 1" in image for image in images)

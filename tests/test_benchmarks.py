@@ -28,7 +28,7 @@ from warp_spo.trials.operations import INPUTS, OPERATIONS, TOLERANCE, Inputs, ro
 def test_every_operation_of_every_scene_is_within_its_tolerance(device):
     every = cases.cases("", worlds=[3], granularities=NODE)
     rows = list(runner.run(every, device, check=True))
-    scenes = set(cases.SCENES) - {name for name in robots.ROBOTS if not robots.at_hand(name)}
+    scenes = set(cases.SCENES) - {name for name in robots.ROBOTS if not robots.is_available(name)}
     assert {case["scene"] for case in every} == scenes and len(rows) == len(scenes) * len(OPERATIONS) * 2
     assert {row["name"]: row["error"] for row in rows if not row["error"] <= TOLERANCE[row["dtype"]]} == {}
 

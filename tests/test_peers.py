@@ -37,7 +37,7 @@ def standing_arm():
 
 SCENES = {"arm": standing_arm, "quadruped": cases.SCENES["quadruped"]}
 SMALL = list(SCENES)
-SCENES |= {name: cases.SCENES[name] for name in robots.ROBOTS if robots.at_hand(name)}
+SCENES |= {name: cases.SCENES[name] for name in robots.ROBOTS if robots.is_available(name)}
 
 
 @pytest.fixture(scope="module", params=SCENES)
@@ -195,7 +195,7 @@ def test_command_writes_rows_and_skips_what_is_absent(tmp_path, capsys, monkeypa
     assert row["work"] and row["error"] < TOLERANCE["float32"]
     assert row["evals_per_s"] == pytest.approx(2e6 / row["us"], rel=1e-3)
     printed = capsys.readouterr()
-    assert "skipped grid: no harness" in printed.err
+    assert "skipped grid: WARP_SPO_PEERS names no folder" in printed.err
     assert ".quadruped.mass_matrix.eval_mass_matrix.float32.w2.us" in printed.out
 
 

@@ -54,7 +54,7 @@ def test_error_obeys_its_law(case, precision, granularity, device):
     ],
 )
 def test_check(name, dtype, granularity, device):
-    skip_unless_served(stress_checks.floating_chain(1).scene, granularity)
+    skip_unless_served(stress_scenes.floating_chain(1).scene, granularity)
     stress_checks.CHECKS[name][0](Setting(device, dtype, granularity))
 
 
@@ -102,9 +102,9 @@ def test_digits_lost_are_estimated_from_above_and_not_far(dtype, device):
 
 def test_a_word_costs_nothing_where_it_is_not_asked_for(device, monkeypatch):
     """Not asked for: no launch more, and none of its kernels is made. Asked for: one a level, and one."""
-    p = stress_checks.floating_chain(2)
+    p = stress_scenes.floating_chain(2)
     counts, made = [], []
-    launch, factories = wp.launch, {name: getattr(status_kernels, name) for name in ("digits", "word")}
+    launch, factories = wp.launch, {name: getattr(status_kernels, name) for name in ("lost_digits", "status_word")}
     monkeypatch.setattr(wp, "launch", lambda *args, **kw: (counts.append(0), launch(*args, **kw))[1])
     for name, factory in factories.items():
         monkeypatch.setattr(status_kernels, name, lambda T, f=factory: (made.append(f), f(T))[1])

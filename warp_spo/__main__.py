@@ -91,7 +91,7 @@ def main(argv: list[str] | None = None) -> int:
         figure = report.picture(pyplot, title, rows, TOLERANCE)
         table = report.table(report.HEADS, [report.cells(row) for row in rows])
         path = options.report / REPORT
-        path.write_text(report.page(title, [report.embedded(figure), table, report.paragraph(meaning)]))
+        path.write_text(report.page(title, [report.image(figure), table, report.paragraph(meaning)]))
         pyplot.close(figure)
         print(f"wrote {path}")
     failed = [row for row in rows if not row["error"] <= TOLERANCE[row["dtype"]]]

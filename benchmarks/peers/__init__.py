@@ -1,6 +1,6 @@
-"""Peers on the same robots and states: other libraries timed and checked as the benchmarks time and check this one.
+"""Peers: other libraries that are compared with the same reference and timed, on the same robots and states.
 
-``python -m benchmarks.peers --help``. Each peer is optional: one that is absent is skipped, with the reason printed.
+``python -m benchmarks.peers --help``. Each peer is optional: one that is not installed is skipped, with the reason.
 """
 
 PEERS = {
@@ -13,4 +13,4 @@ PEERS = {
     "pinocchio": "pinocchio_cpu",
     "mujoco": "mujoco_c",
 }
-"""Name on the command line -> module of this package, whose ``PEER`` it is."""
+"""Name on the command line -> module of this package whose ``PEER`` is the peer's class."""

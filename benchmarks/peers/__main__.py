@@ -1,4 +1,4 @@
-"""Run ``python -m benchmarks.peers [FILTER]``: other libraries on our robots and states, checked and timed."""
+"""Run ``python -m benchmarks.peers [FILTER]``: check and time other libraries on our robots and states."""
 
 import argparse
 import importlib
@@ -30,19 +30,22 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("filter", nargs="?", default="", help="regular expression of PEER.SCENE.OPERATION.VARIANT.DTYPE")
     p.add_argument("--device", help="Warp device; default: the current one")
     p.add_argument("--worlds", type=int, nargs="+", default=WORLDS, metavar="N", help="world counts")
-    p.add_argument("--scenes", nargs="+", default=ROBOTS, choices=SCENES, metavar="NAME", help="robots; armature-free")
+    p.add_argument(
+        "--scenes", nargs="+", default=ROBOTS, choices=SCENES, metavar="NAME", help="robots without armature"
+    )
     p.add_argument("--peers", nargs="+", default=list(PEERS), choices=PEERS, metavar="PEER", help=", ".join(PEERS))
-    p.add_argument("--compile", action="store_true", help="evaluate once, time nothing: kernels come into the caches")
+    p.add_argument("--compile", action="store_true", help="compile the kernels into the caches, and time nothing")
     p.add_argument("--json", type=Path, metavar="OUT", help="write the run to this file, or by date into this folder")
     return p
 
 
-def skip(what: str, reason: object) -> None:
+def say_skipped(what: str, reason: object) -> None:
+    """Print on stderr that something is skipped, and why."""
     print(f"skipped {what}: {reason}", file=sys.stderr, flush=True)
 
 
 def rows(options: argparse.Namespace) -> Iterator[dict]:
-    """A row for each case; a peer that fails is skipped with its traceback, and the others go on."""
+    """Yield a row for each case; a peer that fails is skipped with its traceback, and the others go on."""
     pattern, worlds = re.compile(options.filter), sorted(set(options.worlds))
     present = {}
     for name in options.peers:
@@ -50,14 +53,14 @@ def rows(options: argparse.Namespace) -> Iterator[dict]:
             peer = importlib.import_module(f".{PEERS[name]}", __package__).PEER
             present[name] = peer, peer.version()
         except (Absent, ImportError) as reason:
-            skip(name, reason)
+            say_skipped(name, reason)
     for scene in options.scenes:
         if not present:
             return
         try:
             robot = lump(SCENES[scene]())
         except (ImportError, FileNotFoundError, Unsupported) as reason:
-            skip(scene, reason)
+            say_skipped(scene, reason)
             continue
         inputs = [Inputs(robot.scene, worlds[-1], seed) for seed in range(SETS)]
         for name, (kind, version) in present.items():
@@ -72,16 +75,16 @@ def rows(options: argparse.Namespace) -> Iterator[dict]:
                     peer = kind(robot, options.device, dtype)
                     peer.scene, peer.timed = scene, not options.compile
                     for row in peer.rows(inputs, worlds, wanted):
-                        yield finished(row, scene, robot, f"{kind.name} {version}", kind, dtype)
+                        yield complete_row(row, scene, robot, f"{kind.name} {version}", kind, dtype)
                 except (Absent, Unsupported) as reason:
-                    skip(f"{name}.{scene}.{dtype}", reason)
+                    say_skipped(f"{name}.{scene}.{dtype}", reason)
                 except Exception:
-                    skip(f"{name}.{scene}.{dtype}", "it failed")
+                    say_skipped(f"{name}.{scene}.{dtype}", "the peer raised the following error")
                     traceback.print_exc()
 
 
-def finished(row: dict, scene: str, robot: object, peer: str, kind: type, dtype: str) -> dict:
-    """The row as the benchmark runner has it, and ``peer``, ``variant`` and ``work``."""
+def complete_row(row: dict, scene: str, robot: object, peer: str, kind: type, dtype: str) -> dict:
+    """Return a peer's row with the keys of the benchmark's rows, and ``peer``, ``variant``, ``work``."""
     op, variant = row["op"], row["variant"]
     head = dict(name=f"{scene}.{op}", scene=scene, worlds=row["worlds"], op=op, dtype=dtype, peer=peer, variant=variant)
     row = head | dict(work=kind.works[op, variant], bodies=len(robot.links), dof=len(robot.dofs)) | row
@@ -92,13 +95,13 @@ def finished(row: dict, scene: str, robot: object, peer: str, kind: type, dtype:
 
 
 def case_name(row: dict) -> str:
-    """Such as ``mujoco_warp-3.17.0.panda.forward_dynamics.float32.w4096``."""
+    """Return a name such as ``mujoco_warp-3.17.0.panda.forward_dynamics.float32.w4096``."""
     variant = f".{row['variant']}".replace(" ", "_") if row["variant"] else ""
     return f"{row['peer'].replace(' ', '-')}.{row['name']}{variant}.{row['dtype']}.w{row['worlds']}"
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Returns 0; 2 for a mistake of the caller."""
+    """Run the command; return 0, or 2 for a mistake in the call."""
     options = parser().parse_args(argv)
     wp.config.log_level = wp.LOG_WARNING
     try:
@@ -113,10 +116,10 @@ def main(argv: list[str] | None = None) -> int:
     for row in rows(options):
         found.append(row)
         if "skipped" in row:
-            skip(case_name(row), row["skipped"])
+            say_skipped(case_name(row), row["skipped"])
         else:
             print("\n".join(f"{case_name(row)}.{m} {row[m]:.4g}" for m in METRICS if m in row), flush=True)
-        if options.json:  # after each row: a peer may end the process, and one that compiles listens to no interrupt
+        if options.json:  # after each row: a peer may end the process, or ignore interrupts while it compiles
             file = runner.save(run, options.json)
     if file:
         print(f"wrote {file}", file=sys.stderr)

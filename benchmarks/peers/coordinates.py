@@ -1,8 +1,8 @@
-"""States in a peer's coordinates, and its results in the scene's: conventions of a floating root, orders, rounding.
+"""Conversion of states to a peer's coordinates and of its results to the scene's: root conventions, orders, rounding.
 
-The scene's root has (velocity of its CoM, angular velocity) in world axes. A peer has velocities ``T qd`` and
-accelerations ``T qdd + rate``, forces ``T^-T tau``; T is the identity but for the root. A peer's inputs are rounded to
-its precision, and the reference is evaluated at the rounded ones, mapped back.
+The velocity of the scene's root is (velocity of its CoM, angular velocity) in world axes. A peer has velocities
+``T qd``, accelerations ``T qdd + rate`` and forces ``T^-T tau``, where T is the identity except for the root. A peer's
+inputs are rounded to its precision, and the reference is evaluated at the rounded inputs.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from warp_spo.trials.operations import OPERATIONS, Inputs
 from .lumped import Robot, rotation, skew
 
 TWISTS = ("local", "mixed", "com")
-"""What a peer calls the velocity of a floating root: of the link's origin in the link's axes (Pinocchio, GRiD); of the
-origin in world axes, angular in the link's (MuJoCo); of the lumped link's CoM in world axes (Newton)."""
-SETS = 4  # sets of inputs that evaluations in a row take in turn
+"""Conventions for the velocity of a floating root. "local": of the link's origin in the link's axes (Pinocchio, GRiD).
+"mixed": of the origin in world axes, the angular velocity in the link's (MuJoCo). "com": of the lumped link's CoM in
+world axes (Newton)."""
+SETS = 4  # sets of inputs through which evaluations in a row cycle
 
 
 def sample(worlds: int) -> list[int]:
-    """The worlds that the reference computes, four at most."""
+    """Return the worlds that are compared with the reference, at most four."""
     return sorted({0, min(1, worlds - 1), worlds // 2, worlds - 1})
 
 
@@ -33,14 +34,14 @@ class Coordinates:
     Args:
         robot: the robot.
         twist: of :data:`TWISTS`.
-        scalar_first: quaternions are wxyz, not xyzw.
+        scalar_first: whether quaternions are wxyz, and not xyzw.
     """
 
     def __init__(self, robot: Robot, twist: str = "local", scalar_first: bool = False):
         self.robot, self.twist, self.scalar_first = robot, twist, scalar_first
 
     def _root(self, q: np.ndarray, qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """T [world, 6, 6] and rate [world, 6] of the root; q and qd of the scene, in link order."""
+        """Return T [world, 6, 6] and rate [world, 6] of the root; q and qd are the scene's, in the order of links."""
         quaternion = q[:, 3:7] / np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
         R, v, w = rotation(quaternion), qd[:, :3], qd[:, 3:6]
         assert self.robot.root_com is not None
@@ -61,7 +62,7 @@ class Coordinates:
         return T, rate
 
     def to_peer(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray, qdd: np.ndarray) -> dict[str, np.ndarray]:
-        """q, qd, tau, qdd of the scene [world, n] in the peer's coordinates, float64."""
+        """Return q, qd, tau and qdd of the scene [world, n] in the peer's coordinates, in float64."""
         robot = self.robot
         q, qd, tau, qdd = q[:, robot.coords], qd[:, robot.dofs], tau[:, robot.dofs], qdd[:, robot.dofs]
         if robot.floating:
@@ -75,7 +76,7 @@ class Coordinates:
         return dict(q=q, qd=qd, tau=tau, qdd=qdd)
 
     def to_scene(self, own: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """The inverse of :meth:`to_peer`; entries other than q and qd are optional: tau, qdd, and M [world, n, n]."""
+        """Return a peer's q and qd, and tau, qdd and M [world, n, n] where given, in the scene's coordinates."""
         robot = self.robot
         own = {name: np.array(array, dtype=np.float64) for name, array in own.items()}
         q, qd = own["q"], own["qd"]
@@ -108,11 +109,11 @@ def _apply(T: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 class States:
-    """Sets of random states, those of ``Inputs`` in warp_spo.trials, in a peer's coordinates and precision.
+    """The random states of ``warp_spo.trials.operations.Inputs`` in a peer's coordinates and precision.
 
     Args:
-        coordinates: the peer's.
-        inputs: a set of inputs for each set of states.
+        coordinates: the peer's coordinates.
+        inputs: sets of inputs; each gives a set of states.
         dtype: NumPy's name of the peer's precision.
     """
 
@@ -125,7 +126,7 @@ class States:
         self._reference: dict[tuple[int, int], tuple[Dense, dict[str, np.ndarray]]] = {}
 
     def _at(self, index: int, world: int) -> tuple[Dense, dict[str, np.ndarray]]:
-        """The reference and the scene's inputs at the rounded state of one world."""
+        """Return the reference and the scene's inputs at the rounded state of one world."""
         if (index, world) not in self._reference:
             own = {name: array[world : world + 1] for name, array in self.sets[index].items()}
             ours = {name: array[0] for name, array in self.coordinates.to_scene(own).items()}
@@ -133,7 +134,7 @@ class States:
         return self._reference[index, world]
 
     def error(self, op: str, index: int, worlds: list[int], results: np.ndarray) -> float:
-        """Largest error of results in the peer's coordinates, one for each of ``worlds``, as the trial measures it."""
+        """Return the largest error of ``results``, which are in the peer's coordinates, one for each of ``worlds``."""
         operation, errors = OPERATIONS[op], []
         name = {"forward_dynamics": "qdd", "inverse_dynamics": "tau", "mass_matrix": "M"}[op]
         for world, result in zip(worlds, results, strict=True):

@@ -1,9 +1,10 @@
-"""Files between Python and the C++ harnesses: models and states to them, results back, and one JSON line a case.
+"""Files between Python and the C++ harnesses, which read a model and states and write results and a JSON line a case.
 
-Every file is little-endian and without padding. States: int32 (bytes of a number, sets, worlds, nq, nv), then for each
-set q, qd, tau, qdd, row-major [world, n]. Model: int32 links, gravity [3], then 30 float64 for each link (parent, kind,
-rotation, place, axis, mass, com, inertia). Results: where a JSON line says, a block for each set and one for the timed
-run (the last set), each with the sampled worlds.
+Every file is little-endian, without padding. A file of states has int32 (bytes of a number, sets, worlds, nq, nv), then
+for each set q, qd, tau, qdd, row-major [world, n]. A file of a model has int32 (links), gravity [3], then 30 float64
+for each link (parent, kind, rotation, place, axis, mass, com, inertia). In the file of results, a case starts at the
+offset that its JSON line gives: a block for each set and one for the timed run (of the last set), each with the sampled
+worlds.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ KINDS = ("revolute", "prismatic", "free")
 
 
 def write_model(path: Path, robot: Robot) -> None:
-    """The robot's links, in float64."""
+    """Write the robot's links in float64."""
     with path.open("wb") as file:
         file.write(np.array([len(robot.links)], dtype="<i4").tobytes())
         file.write(robot.gravity.astype("<f8").tobytes())
@@ -34,7 +35,7 @@ def write_model(path: Path, robot: Robot) -> None:
 
 
 def write_states(path: Path, states: States) -> None:
-    """All sets of states, in their precision."""
+    """Write all sets of states in their precision."""
     first = states.sets[0]
     head = [first["q"].itemsize, len(states.sets), *first["q"].shape, first["qd"].shape[1]]
     with path.open("wb") as file:
@@ -45,10 +46,10 @@ def write_states(path: Path, states: States) -> None:
 
 
 def rows(command: list[str], results: Path, states: States, timeout: float) -> Iterator[dict[str, Any]]:
-    """Run a harness; yield its rows with ``error``, the largest over sets and sampled worlds.
+    """Run a harness and yield its rows with ``error``, the largest over sets and sampled worlds.
 
     Raises:
-        RuntimeError: it failed; with what it wrote to standard error.
+        RuntimeError: the harness failed; the error has its output on stderr.
     """
     done = subprocess.run(command, capture_output=True, text=True, timeout=timeout)
     if done.returncode:

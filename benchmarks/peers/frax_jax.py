@@ -14,13 +14,13 @@ import numpy as np
 
 from .coordinates import States
 from .lumped import Robot, Unsupported, urdf
-from .peer import Absent, Stepped
+from .peer import Absent, PythonPeer
 
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 
-class Frax(Stepped):
-    """An evaluation is one call of a compiled function; calls in a row are queued, and the last is waited for."""
+class Frax(PythonPeer):
+    """frax, of which an evaluation is one call of a compiled function; calls are queued, and the last is awaited."""
 
     name = "frax"
     works: ClassVar = {
@@ -42,13 +42,13 @@ class Frax(Stepped):
     def __init__(self, robot: Robot, device: Any, dtype: str):
         super().__init__(robot, device, dtype)
         if robot.floating:
-            raise Unsupported("frax: a floating root has other velocities there; robots on a fixed base only")
+            raise Unsupported("frax: the robot floats; expected a fixed base, because frax's free velocities differ")
         import jax
         import jax.numpy as jnp
         from frax.core.manipulator import Manipulator
 
         if np.any(robot.gravity[:2]) or abs(robot.gravity[2] + 9.81) > 1e-6:
-            raise Unsupported(f"frax: gravity is {robot.gravity}; it knows (0, 0, -9.81)")
+            raise Unsupported(f"frax: gravity is {robot.gravity}; expected (0, 0, -9.81), the only one that frax has")
         jax.config.update("jax_default_matmul_precision", "highest")
         jax.config.update("jax_enable_x64", False)
         kind = "gpu" if "cuda" in str(device) else "cpu"
@@ -77,7 +77,7 @@ class Frax(Stepped):
         self.out = self.function(*self.sets[index])
 
     def poison(self) -> None:
-        self.out = None  # results are new arrays
+        self.out = None  # every call returns a new array
 
     def result(self, worlds: list[int]) -> np.ndarray:
         return np.asarray(self.out)[worlds]

@@ -1,11 +1,11 @@
-"""GRiD: CUDA code generated for one robot, one block of threads a world; header only, no Python inside the time.
+"""GRiD: CUDA code that is generated for one robot, with one block of threads for each world; timed without Python.
 
-Generate, compile (CUDA 13, any machine), and name the folder in WARP_SPO_PEERS::
+Generate and compile it (with CUDA 13, on any machine), and name the folder in WARP_SPO_PEERS::
 
     python -m benchmarks.peers.grid FOLDER panda go2 g1 --arch sm_90
 
-which writes each robot's URDF, runs grid-generate (pip install grid-rbd) and nvcc. Headers have megabytes: they are not
-kept in the repository.
+The command writes each robot's URDF and runs grid-generate (pip install grid-rbd) and nvcc. The generated headers are
+megabytes in size and not in the repository.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ from .peer import Absent, Peer
 
 FOLDER = "WARP_SPO_PEERS"
 ALGORITHMS = "aba,forward_dynamics,inverse_dynamics,crba"
-SHARED = 232448  # bytes of shared memory that a block of an H200 may take
-FLAGS = ("-O3", "-std=c++17", "-ftz=true", "-prec-div=false", "-prec-sqrt=false")  # those of GRiD's own build
-SECONDS = 0.03  # a graph
+SHARED = 232448  # bytes of shared memory that a block may use on an H200
+FLAGS = ("-O3", "-std=c++17", "-ftz=true", "-prec-div=false", "-prec-sqrt=false")  # the flags of GRiD's own build
+SECONDS = 0.03  # [s] of a graph
 BLOCK = "one block of threads a world, resource tier and block size swept, the fastest kept"
 
 
 def folder() -> Path:
-    """Where the harnesses are.
+    """Return the folder of the harnesses.
 
     Raises:
-        Absent: nowhere.
+        Absent: WARP_SPO_PEERS does not name a folder with harnesses.
     """
     name = os.environ.get(FOLDER)
     if not name or not list(Path(name).glob("grid_*")):
-        raise Absent(f"no harness: {FOLDER} names no folder with grid_ROBOT; python -m benchmarks.peers.grid makes it")
+        raise Absent(f"{FOLDER} names no folder with a file grid_ROBOT; make it with python -m benchmarks.peers.grid")
     return Path(name)
 
 
@@ -68,14 +68,14 @@ class Grid(Peer):
         if "cuda" not in str(device):
             raise Absent("GRiD runs on CUDA only")
         if np.any(robot.gravity[:2]):
-            raise Unsupported(f"GRiD: gravity is {robot.gravity}; expected it along z")
+            raise Unsupported(f"GRiD: gravity is {robot.gravity}; expected gravity along z")
 
     def rows(self, inputs: list[Inputs], worlds: list[int], wanted: Callable[[str, str], bool]) -> Iterator[dict]:
         if not any(wanted(op, variant) for op, variant in self.works):
             return
         harness = folder() / f"grid_{self.scene}"
         if not harness.is_file():
-            raise Absent(f"no {harness.name} in {FOLDER}")
+            raise Absent(f"there is no {harness.name} in the folder that {FOLDER} names")
         states = States(self.coordinates, inputs, self.dtype)
         with tempfile.TemporaryDirectory() as name:
             place = Path(name)
@@ -88,10 +88,11 @@ class Grid(Peer):
 
 
 def build(out: Path, name: str, robot: Robot, arch: str) -> None:
-    """Write ``grid_NAME`` into the folder ``out``.
+    """Compile ``grid_NAME`` into the folder ``out``.
 
     Raises:
-        subprocess.CalledProcessError: grid-generate or nvcc failed, or siblings come in another order there.
+        subprocess.CalledProcessError: grid-generate or nvcc failed.
+        Unsupported: GRiD orders the joints in another way.
     """
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as place:
@@ -104,7 +105,7 @@ def build(out: Path, name: str, robot: Robot, arch: str) -> None:
         order = [line.strip() for line in log.splitlines() if line.startswith("joint_link_")]
         expected = [f"joint_{link.name}" for link in robot.links if link.kind != "free"]
         if order[: len(expected)] != expected:
-            raise Unsupported(f"grid: joints come as {order}; expected {expected}")
+            raise Unsupported(f"GRiD: the order of joints is {order}; expected {expected}")
         source = Path(__file__).with_name("grid_harness.cu")
         command = ["nvcc", *FLAGS, f"-arch={arch}", f"-I{place}", f'-DGRID_HEADER="{header.name}"', str(source), "-o"]
         subprocess.run([*command, str(out / f"grid_{name}")], check=True)
@@ -121,7 +122,9 @@ def main() -> None:
     for name in options.scenes:
         build(options.folder, name, lump(SCENES[name]()), options.arch)
         print(options.folder / f"grid_{name}", file=sys.stderr)
-    python = Path(shutil.which("grid-generate") or "").with_name("python")  # GRiD may live in an environment of its own
+    python = Path(shutil.which("grid-generate") or "").with_name(
+        "python"
+    )  # GRiD may be installed in another environment
     code = "from importlib.metadata import version; print(version('grid-rbd'))"
     (options.folder / "grid.version").write_text(subprocess.check_output([python, "-c", code], text=True))
 

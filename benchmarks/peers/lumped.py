@@ -1,7 +1,7 @@
-"""The robot that every peer is given: the moving links of a scene, what is fixed to them lumped into them.
+"""The robot that every peer computes: the moving links of a scene, with all fixed bodies lumped into them.
 
-Peers handle fixed joints each in their own way, or not at all; on this tree all do the same work. Numbers are those of
-the scene, in float64. A link's frame is its joint's: the child anchor of the scene's hinge.
+Peers treat fixed joints in different ways, or not at all. On the lumped robot all of them do the same work. Numbers are
+those of the scene, in float64. The frame of a link is that of its joint, the child anchor of the scene's hinge.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import numpy as np
 
 import warp_spo as spo
 
-ROUNDED = 1e-9  # a rotation nearer than this to quarter turns is quarter turns: generated code has its zeros
+ROUNDED = 1e-9  # a rotation closer than this to quarter turns is rounded to them: generated code then has exact zeros
 
 
 class Unsupported(ValueError):
-    """A peer, or this border, has no such robot or operation."""
+    """A peer, or the conversion for peers, does not support this robot or operation."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +29,8 @@ class Link:
         name: unique; in alphabetical order, since GRiD sorts siblings by name.
         parent: index of the link that carries it; -1: the world.
         kind: "revolute", "prismatic" or "free".
-        rotation: [3, 3] and ``place`` [3] of the joint in the frame of ``parent``, at q = 0 [m].
+        rotation: rotation of the joint in the frame of ``parent``, at q = 0 [3, 3].
+        place: position of the joint in the frame of ``parent``, at q = 0 [3] [m].
         axis: unit vector in the link's frame [3].
         mass: [kg].
         com: centre of mass in the link's frame [3] [m].
@@ -49,10 +50,10 @@ class Link:
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
-    """Links, depth first, and where their coordinates are in the scene.
+    """Links in depth-first order, and the indices of their coordinates in the scene.
 
     Attributes:
-        scene: where it comes from.
+        scene: the scene from which the robot is made.
         links: each after its parent, subtrees contiguous.
         coords: entries of the scene's q in the order of the links.
         dofs: entries of the scene's qd in the order of the links.
@@ -69,11 +70,12 @@ class Robot:
 
     @property
     def floating(self) -> bool:
+        """Whether the root floats."""
         return self.root_com is not None
 
 
 def rotation(quaternion: np.ndarray) -> np.ndarray:
-    """Of unit quaternions xyzw, [..., 4] to [..., 3, 3]."""
+    """Return the rotation matrices [..., 3, 3] of unit quaternions xyzw [..., 4]."""
     x, y, z, w = np.moveaxis(quaternion, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -84,7 +86,7 @@ def rotation(quaternion: np.ndarray) -> np.ndarray:
 
 
 def skew(v: np.ndarray) -> np.ndarray:
-    """v~ with v~ u = v x u, [..., 3] to [..., 3, 3]."""
+    """Return v~ [..., 3, 3], for which v~ u = v x u, of v [..., 3]."""
     x, y, z = np.moveaxis(v, -1, 0)
     o = np.zeros_like(x)
     return np.stack([np.stack(row, -1) for row in ([o, -z, y], [z, o, -x], [-y, x, o])], -2)
@@ -105,11 +107,11 @@ def _inverse(a: tuple) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lump(scene: spo.Scene) -> Robot:
-    """The robot of a scene of one world.
+    """Return the robot of a scene.
 
     Raises:
-        Unsupported: hinges other than fixed, revolute, prismatic and a free one at the world's origin; several roots
-            that float; armature.
+        Unsupported: values differ between worlds, there is armature, or a hinge is not fixed, revolute, prismatic, or
+            the free hinge of a single root at the world's origin.
     """
 
     def value(name: str) -> np.ndarray:
@@ -118,7 +120,7 @@ def lump(scene: spo.Scene) -> Robot:
         return np.asarray(scene.values[name][0], dtype=np.float64)
 
     if np.any(value("joint_armature")):
-        raise Unsupported("peers: the scene has armature; expected a robot without")
+        raise Unsupported("peers: the scene has armature; expected a scene without armature")
     children: dict[int, list[int]] = {k: [] for k in range(-1, scene.body_count)}
     for body, hinge in enumerate(scene.hinge_of):
         children[scene.hinges[hinge].parent].append(body)
@@ -126,7 +128,7 @@ def lump(scene: spo.Scene) -> Robot:
     mass, com, inertia = value("body_mass"), value("body_com"), value("body_inertia")
 
     drafts: list[dict[str, Any]] = []
-    carrier = {-1: (-1, (np.eye(3), np.zeros(3)))}  # body: its link, and the body's pose in the link's frame
+    carrier = {-1: (-1, (np.eye(3), np.zeros(3)))}  # body -> its link, and the body's pose in the link's frame
     coords: list[int] = []
     dofs: list[int] = []
     stack = children[-1][::-1]
@@ -151,7 +153,9 @@ def lump(scene: spo.Scene) -> Robot:
             dofs += range(scene.qd_start[h], scene.qd_start[h + 1])
             if hinge.kind == "free":
                 if len(drafts) > 1 or np.any(joint[0] != np.eye(3)) or np.any(joint[1]):
-                    raise Unsupported(f"peers: hinge {h} is free; expected that of one root, at the world's origin")
+                    raise Unsupported(
+                        f"peers: hinge {h} is free; expected a free hinge only at a single root, at the world's origin"
+                    )
                 root_com = body_in_joint[0] @ com[body] + body_in_joint[1]
         link, (R, p) = carrier[body]
         if link >= 0:
@@ -168,7 +172,7 @@ def _sum(bodies: list[tuple[float, np.ndarray, np.ndarray]]) -> dict[str, Any]:
 
 
 def urdf(robot: Robot) -> str:
-    """The robot in URDF, for peers that read nothing else; a floating root is its root link."""
+    """Return the robot as URDF text, for peers that read files; a floating root is the root link."""
 
     def numbers(values: Any) -> str:
         return " ".join(repr(float(v)) for v in values)
@@ -176,7 +180,7 @@ def urdf(robot: Robot) -> str:
     text = ['<robot name="robot">']
     if not robot.floating:
         text += [
-            '  <link name="base">',  # frax asks it for an inertia, which stands still
+            '  <link name="base">',  # frax needs an inertia here; it has no effect
             '    <inertial><origin xyz="0 0 0" rpy="0 0 0"/><mass value="1"/>',
             '      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>',
             "  </link>",
@@ -205,7 +209,7 @@ def urdf(robot: Robot) -> str:
 
 
 def _rpy(R: np.ndarray) -> tuple[float, float, float]:
-    """Angles about fixed x, y, z axes, as URDF has them."""
+    """Return the angles about fixed x, y and z axes that URDF uses."""
     pitch = math.atan2(-R[2, 0], math.hypot(R[0, 0], R[1, 0]))
     if abs(math.cos(pitch)) < 1e-9:
         return math.atan2(-R[1, 2], R[1, 1]), pitch, 0.0

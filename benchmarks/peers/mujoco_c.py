@@ -1,4 +1,4 @@
-"""MuJoCo's C functions on one core, called from Python once a world; the call's cost is in the time."""
+"""MuJoCo's C functions on one core, called from Python for each world; the time includes the cost of these calls."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ import numpy as np
 from .coordinates import States
 from .lumped import Robot
 from .mujoco_model import model
-from .peer import Absent, Stepped
+from .peer import Absent, PythonPeer
 
 CALL = "one core, one world after the other, a few Python calls each"
 
 
-class MujocoC(Stepped):
+class MujocoC(PythonPeer):
+    """MuJoCo on a CPU."""
+
     name = "MuJoCo C"
     dtypes = ("float64",)
     twist, scalar_first = "mixed", True

@@ -1,4 +1,4 @@
-"""mujoco_warp's smooth dynamics: the functions that its step calls before constraints, and nothing else."""
+"""mujoco_warp's smooth dynamics: only the functions that its step calls before constraints."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .lumped import Robot
 from .mujoco_model import model
 from .peer import Absent, WarpPeer
 
-PINNED = "3.17"  # the version that Newton 1.8 asks for
+PINNED = "3.17"  # the version that Newton 1.8 requires
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -23,6 +23,8 @@ def difference(a: wp.array2d[wp.float32], b: wp.array2d[wp.float32], out: wp.arr
 
 
 class MujocoWarp(WarpPeer):
+    """mujoco_warp on a GPU or a CPU."""
+
     name = "mujoco_warp"
     twist, scalar_first = "mixed", True
     works: ClassVar = {
@@ -39,7 +41,7 @@ class MujocoWarp(WarpPeer):
             raise Absent(f"{error}; pip install mujoco-warp~={PINNED}") from None
         found = metadata.version("mujoco-warp")
         if not found.startswith(PINNED):
-            print(f"mujoco_warp is {found}; Newton 1.8 goes with {PINNED}")
+            print(f"mujoco_warp is {found}; expected {PINNED}, which Newton 1.8 requires")
         assert mujoco_warp
         return found
 
@@ -55,7 +57,7 @@ class MujocoWarp(WarpPeer):
     def prepare(self, op: str, variant: str, states: States, worlds: int) -> None:
         with wp.ScopedDevice(self.device):
             if worlds != self.worlds:
-                self.data, self.worlds = None, 0  # frees its memory before the next takes any
+                self.data, self.worlds = None, 0  # frees its memory before new memory is allocated
                 self.data, self.worlds = self.mjw.make_data(self.host, nworld=worlds), worlds
                 self.force = wp.empty((worlds, self.host.nv), dtype=wp.float32)
             self.sets = [
@@ -69,7 +71,7 @@ class MujocoWarp(WarpPeer):
 
     def run(self, index: int) -> None:
         each = self.sets[index]
-        self.data.qpos, self.data.qvel = each["q"], each["qd"]  # their place is the caller's: no copy
+        self.data.qpos, self.data.qvel = each["q"], each["qd"]  # assigns the arrays; nothing is copied
         with wp.ScopedDevice(self.device):
             self.one(each)
 

@@ -10,7 +10,7 @@ from .lumped import Robot
 
 
 def model(robot: Robot) -> Any:
-    """``mujoco.MjModel``; joints and bodies are in the order of the links."""
+    """Return the robot as a ``mujoco.MjModel`` whose joints and bodies are in the order of the links."""
     import mujoco
 
     spec = mujoco.MjSpec()

@@ -15,6 +15,8 @@ DT = 1e-2  # [s]
 
 
 class Newton(WarpPeer):
+    """Newton's mass matrix and solvers."""
+
     name = "Newton"
     twist = "com"
     works: ClassVar = {
@@ -99,7 +101,7 @@ class Newton(WarpPeer):
         (self.H if self.op == "mass_matrix" else self.next.joint_qd).fill_(float("nan"))
 
     def result(self, worlds: list[int]) -> np.ndarray:
-        """The mass matrix; or (qd after - qd before) / dt."""
+        """Return the mass matrix, or as qdd the difference (qd after - qd before) / dt of a step."""
         if self.op == "mass_matrix":
             return np.stack([self.H[world].numpy() for world in worlds])
         after = self.next.joint_qd.numpy().reshape(self.worlds, -1)[worlds].astype(np.float64)

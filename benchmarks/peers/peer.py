@@ -1,7 +1,7 @@
-"""What every peer gives: name, version, operations with the work that is timed, and rows of numbers.
+"""Base classes of peers: name, version, operations with the work that is timed, and rows of numbers.
 
-A peer that launches evaluations one by one gives ``prepare``, ``run`` and ``result``, timed here; one with its own
-program gives ``rows``. Both get the same robot and the same states.
+A peer that is called from Python implements ``prepare``, ``run`` and ``result``, and is timed here. A peer with its own
+program implements ``rows``. Both compute the same robot at the same states.
 """
 
 from __future__ import annotations
@@ -20,31 +20,31 @@ from .coordinates import Coordinates, States, sample
 from .lumped import Robot
 
 WARM_UP = 0.05  # [s] of evaluations before anything is timed
-GRAPH_SECONDS = 0.02  # a graph goes through all sets of inputs up to ROUNDS times, fewer where that would take longer
-ROUNDS = 64
+GRAPH_SECONDS = 0.02  # longest time of a graph [s], by which the rounds are reduced
+ROUNDS = 64  # largest number of times that a graph cycles through all sets of inputs
 REPEATS = 20
-BUDGET = 0.4  # [s]: fewer repeats, 3 at least, where they would take longer
-SLOW = 0.5  # [s]: an operation that takes longer is not measured at more worlds
+BUDGET = 0.4  # longest time of all repeats [s], by which they are reduced, to 3 at least
+SLOW = 0.5  # [s]: an operation that takes longer than this is not measured at larger world counts
 
 
 class Absent(Exception):
-    """The peer cannot run here; the reason."""
+    """A peer cannot run on this machine; the message gives the reason."""
 
 
 class Peer(abc.ABC):
-    """One peer with one robot.
+    """A peer with a robot.
 
     Attributes:
-        name: as rows have it, with the version behind it.
-        scene: name of the robot.
-        timed: False: evaluate once, for what that compiles.
-        dtypes: precisions that it has.
-        works: (operation, variant) -> one line of what is timed.
-        twist, scalar_first: its convention, see :class:`Coordinates`.
+        name: the library's name; rows have it with the version.
+        scene: name of the robot on the command line.
+        timed: whether evaluations are timed; if not, they are only compiled.
+        dtypes: precisions that the peer has.
+        works: (operation, variant) -> a line that says which work is timed.
+        twist, scalar_first: conventions of the peer's states, see :class:`Coordinates`.
     """
 
     name = ""
-    scene = ""  # of the robot, as the command line has it
+    scene = ""
     timed = True
     dtypes: tuple[str, ...] = ("float32",)
     works: ClassVar[dict[tuple[str, str], str]] = {}
@@ -54,42 +54,42 @@ class Peer(abc.ABC):
     @classmethod
     @abc.abstractmethod
     def version(cls) -> str:
-        """Version of the installed package.
+        """Return the version of the installed package.
 
         Raises:
-            Absent: it is not installed, or lacks what it needs.
+            Absent: the package, or something that it needs, is not installed.
         """
 
     def __init__(self, robot: Robot, device: Any, dtype: str):
         """Build the peer's model.
 
         Raises:
-            Absent, Unsupported: it cannot run on this device, or has no such robot.
+            Absent, Unsupported: the peer cannot run on this device, or does not support this robot.
         """
         self.robot, self.device, self.dtype = robot, device, dtype
         self.coordinates = Coordinates(robot, self.twist, self.scalar_first)
 
     @abc.abstractmethod
     def rows(self, inputs: list[Inputs], worlds: list[int], wanted: Callable[[str, str], bool]) -> Iterator[dict]:
-        """Yield a row for each number of worlds and operation; ``skipped`` says why it, and what has more, was not run.
+        """Yield a row for each world count and operation; ``skipped`` gives the reason why one has no numbers.
 
         Args:
-            inputs: sets of inputs, of the largest number of worlds.
-            worlds: rising numbers of worlds.
-            wanted: of an operation and a variant.
+            inputs: sets of inputs of the largest number of worlds.
+            worlds: world counts in rising order; after one that is skipped, larger ones are skipped too.
+            wanted: function of operation and variant that says whether they are measured.
         """
 
 
-class Stepped(Peer):
-    """A peer that launches evaluations one by one, which are timed here."""
+class PythonPeer(Peer):
+    """A peer whose evaluations are called from Python and timed here."""
 
     def states(self, inputs: list[Inputs]) -> Any:
-        """Sets of states as ``prepare`` gets them, with ``error`` of results."""
+        """Return the states for ``prepare``: an object with ``sets`` and with ``error`` for results."""
         return States(self.coordinates, inputs, self.dtype)
 
     @abc.abstractmethod
     def prepare(self, op: str, variant: str, states: States, worlds: int) -> None:
-        """Take the first ``worlds`` of all sets of states to the device, and compile."""
+        """Copy the first ``worlds`` worlds of all sets of states to the device, and compile."""
 
     @abc.abstractmethod
     def run(self, index: int) -> None:
@@ -97,22 +97,22 @@ class Stepped(Peer):
 
     @abc.abstractmethod
     def poison(self) -> None:
-        """Fill what an evaluation writes with NaN."""
+        """Fill the arrays that an evaluation writes with NaN."""
 
     @abc.abstractmethod
     def result(self, worlds: list[int]) -> np.ndarray:
-        """Of the last evaluation: qdd or tau [len(worlds), dof], or the mass matrix [len(worlds), dof, dof]."""
+        """Return qdd or tau [len(worlds), dof], or the mass matrix [len(worlds), dof, dof], of the last evaluation."""
 
     def synchronize(self) -> None:
         """Wait for the device; on a CPU there is nothing to wait for."""
         return
 
     def graph(self, run: Callable[[], None]) -> Callable[[], None] | None:
-        """``run`` captured into a graph; None: there are none here, and calls are timed."""
+        """Return a function that replays ``run`` as a graph, or None where there are no graphs and calls are timed."""
         return None
 
     def events(self, replay: Callable[[], None], repeats: int) -> list[float]:
-        """Seconds of each of ``repeats`` calls of ``replay``."""
+        """Return the time of each of ``repeats`` calls of ``replay`` [s]."""
         seconds = []
         for _ in range(repeats):
             start = time.perf_counter()
@@ -140,7 +140,7 @@ class Stepped(Peer):
                     works.remove((op, variant))
 
     def measure(self, op: str, variant: str, states: States, worlds: int) -> dict[str, Any]:
-        """Check every set of states, each into poisoned memory; then time, and check what the timed run left."""
+        """Return time and error of an operation; results of all sets of states and of the timed run are checked."""
         self.synchronize()
         start = time.perf_counter()
         self.prepare(op, variant, states, worlds)
@@ -180,7 +180,7 @@ class Stepped(Peer):
                     timed=timed)  # fmt: skip
 
     def _warm_up(self, run: Callable[[], None]) -> float:
-        """Run for some time; return the wall time of the last run [s]."""
+        """Call ``run`` for WARM_UP seconds and return the wall time of the last call [s]."""
         begin = time.perf_counter()
         while True:
             start = time.perf_counter()
@@ -191,7 +191,7 @@ class Stepped(Peer):
                 return end - start
 
 
-class WarpPeer(Stepped):
+class WarpPeer(PythonPeer):
     """A peer made of Warp kernels: evaluations are captured into CUDA graphs and timed by events."""
 
     def synchronize(self) -> None:
@@ -207,8 +207,8 @@ class WarpPeer(Stepped):
         try:
             with wp.ScopedCapture(self.device) as capture:
                 run()
-        except Exception as error:  # what reads back or allocates cannot be captured
-            print(f"{self.name}: not captured, calls are timed: {error}", file=sys.stderr)
+        except Exception as error:  # work that allocates or copies to the host cannot be captured
+            print(f"{self.name}: calls are timed, because no graph can be captured: {error}", file=sys.stderr)
             return None
         return lambda: wp.capture_launch(capture.graph)
 

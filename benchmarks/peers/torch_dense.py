@@ -1,4 +1,4 @@
-"""Dense linear algebra in torch: a batched Cholesky of mass matrices that are given, not computed."""
+"""Dense linear algebra in torch: a batched Cholesky solve; this library computes the mass matrices, untimed."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import warp_spo as spo
 
 from .coordinates import States
 from .lumped import Robot
-from .peer import Absent, Stepped
+from .peer import Absent, PythonPeer
 
 
-class TorchDense(Stepped):
-    """In the scene's own coordinates: mass matrix and bias force come from this library."""
+class TorchDense(PythonPeer):
+    """torch in the scene's coordinates; the mass matrix and the bias force come from this library."""
 
     name = "torch"
     dtypes = ("float32", "float64")
@@ -38,7 +38,7 @@ class TorchDense(Stepped):
         import torch
 
         self.torch, self.where = torch, torch.device(str(device))
-        if self.where.type == "cuda":  # MAGMA's batched solve allocates, and so cannot be captured
+        if self.where.type == "cuda":  # MAGMA's batched solve allocates, which a graph cannot capture
             torch.backends.cuda.preferred_linalg_library("cusolver")
 
     def prepare(self, op: str, variant: str, states: States, worlds: int) -> None:
@@ -80,7 +80,8 @@ class TorchDense(Stepped):
             with self.torch.cuda.graph(graph):
                 run()
         except RuntimeError as error:
-            print(f"torch: not captured, calls are timed: {str(error).splitlines()[0]}", file=sys.stderr)
+            reason = str(error).splitlines()[0]
+            print(f"torch: calls are timed, because no graph can be captured: {reason}", file=sys.stderr)
             return None
         return graph.replay
 

@@ -1,7 +1,7 @@
-"""The dense resolvent in torch: phi and psi as matrices, forward dynamics through them, by batched dense algebra.
+"""The dense resolvent in torch: phi, psi and forward dynamics by batched dense algebra, without this library's sweeps.
 
-What a user has without this library's sweeps. The letters E, H, M come from its blocks, untimed; node after node, a
-parent before its children, I - E is upper triangular with unit diagonal, so that its inverse is one triangular solve.
+The matrices E, H and M come from this library, untimed. Because parents come before their children, I - E is triangular
+with a unit diagonal, and its inverse is one triangular solve.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from warp_spo.trials.operations import OPERATIONS, Inputs
 from .lumped import Robot, Unsupported
 from .torch_dense import TorchDense
 
-MOST = 4096  # worlds: matrices of 6 rows a body
+MOST = 4096  # largest world count; the matrices have 6 rows for each body
 
 
 class SceneStates:
-    """Sets of states in the scene's own coordinates and node vectors.
+    """Sets of inputs in the scene's own coordinates.
 
     Args:
-        inputs: a set of inputs for each set of states.
+        inputs: the sets of inputs.
     """
 
     def __init__(self, inputs: list[Inputs]):
         self.sets = inputs
 
     def error(self, op: str, index: int, worlds: list[int], results: np.ndarray) -> float:
-        """Largest error of results, one for each of ``worlds``, as the trial measures it."""
+        """Return the largest error of ``results``, one for each of ``worlds``."""
         operation, given = OPERATIONS[op], self.sets[index]
         at = self.sets[0] if operation.at_first_q else given
         errors = []
@@ -44,7 +44,7 @@ class SceneStates:
 
 
 class DenseResolvent(TorchDense):
-    """In the scene's own coordinates; phi, phi.T and psi at the first set's q, as the library's are timed."""
+    """The dense resolvent in the scene's coordinates; phi, phi.T and psi are those at the q of the first set."""
 
     name = "dense resolvent in torch"
     works: ClassVar = {
@@ -59,14 +59,14 @@ class DenseResolvent(TorchDense):
         super().__init__(robot, device, dtype)
         edges = robot.scene.tree.edges
         if any(parent > child for parent, child in edges):
-            raise Unsupported("the dense resolvent: a body comes before its parent; expected parents first")
+            raise Unsupported("dense resolvent: a body comes before its parent; expected parents before their children")
 
     def states(self, inputs: list[Inputs]) -> Any:
         return SceneStates(inputs)
 
     def prepare(self, op: str, variant: str, states: Any, worlds: int) -> None:
         if worlds > MOST:
-            raise Unsupported(f"{worlds} worlds of dense matrices; {MOST} at most")
+            raise Unsupported(f"dense resolvent: {worlds} worlds; expected at most {MOST}")
         torch, self.op = self.torch, op
         self.sets = []
         dyn = spo.Dynamics(self.robot.scene, worlds, str(self.device), self.dtype)
@@ -85,7 +85,7 @@ class DenseResolvent(TorchDense):
         self.out = torch.empty_like(self.sets[0][-1])
 
     def _letters(self, dyn: spo.Dynamics, q: Any) -> tuple:
-        """I - E, H, M, Delta and I - E_psi [world, row, column]."""
+        """Return I - E, H, M, Delta and I - E_psi [world, row, column]."""
         o = dyn.operators(q)
         one = self.torch.eye(o.phi.shape[0], dtype=getattr(self.torch, self.dtype), device=self.where)
         return one - o.E_phi.dense(), o.H.dense(), o.M.dense(), o.Delta.dense(), one - o.E_psi.dense()

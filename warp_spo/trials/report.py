@@ -1,6 +1,6 @@
-"""What the main job shows: a progress bar, a table, and with error against run time as a picture one HTML page.
+"""Output of the main job: a progress bar, a table, and an HTML page with a picture of error against run time.
 
-A page holds all that it shows, pictures too: one file to send, to open anywhere.
+A page is a single file: its pictures are inside it.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ BAR = 30  # characters
 
 
 class Progress:
-    """A bar on stderr, one step a task; nothing where stderr is not a terminal."""
+    """A progress bar on stderr that advances with each task; it shows nothing where stderr is not a terminal."""
 
     def __init__(self, total: int):
         self._total, self._done = total, 0
         self._show = sys.stderr.isatty()
 
     def step(self, task: str) -> None:
-        """Say that ``task`` begins."""
+        """Show that ``task`` begins."""
         self._draw(task)
         self._done += 1
 
@@ -46,12 +46,12 @@ class Progress:
 
 
 def duration(seconds: float) -> str:
-    """Three digits and a unit, such as "41.2 us"."""
+    """Return a time with three digits and a unit, such as "41.2 us"."""
     return _scaled(seconds, ((1.0, "s"), (1e-3, "ms"), (1e-6, "us"), (0.0, "ns")), 1e-9)
 
 
 def rate(per_second: float) -> str:
-    """Three digits and a letter, such as "14.2 M"."""
+    """Return a rate with three digits and a letter, such as "14.2 M"."""
     return _scaled(per_second, ((1e9, "G"), (1e6, "M"), (1e3, "k"), (0.0, "")), 1.0).rstrip()
 
 
@@ -62,7 +62,7 @@ def _scaled(value: float, units: Sequence[tuple[float, str]], last: float) -> st
 
 
 def cells(row: dict) -> tuple[str, ...]:
-    """One line of the table, in the order of :data:`HEADS`."""
+    """Return a row as the cells of a line, in the order of :data:`HEADS`."""
     return (
         row["op"],
         row["granularity"],
@@ -74,7 +74,7 @@ def cells(row: dict) -> tuple[str, ...]:
 
 
 def text_table(rows: Sequence[dict]) -> str:
-    """The table in columns; the last three are aligned to the right."""
+    """Return the rows as a table for a terminal."""
     lines = [HEADS, *map(cells, rows)]
     widths = [max(len(line[column]) for line in lines) for column in range(len(HEADS))]
     align: list[Callable[..., str]] = [str.ljust] * 3 + [str.rjust] * 3
@@ -88,25 +88,27 @@ table { border-collapse: collapse; font-size: 12px; margin: 1em 0; }
 th, td { padding: 1px 7px; text-align: right; white-space: nowrap; border-bottom: 1px solid #ddd; }
 th:first-child, td:first-child { text-align: left; } th { position: sticky; top: 0; background: #fff; }
 td.bad { color: #c00; font-weight: bold; } img { max-width: 100%; }"""
-BAD = ("nan", "FAILS")  # cells that are coloured
+BAD = ("nan", "FAILS")  # texts of cells that are coloured
 
 
 def page(title: str, parts: Sequence[str]) -> str:
-    """An HTML page of parts that the functions below make."""
+    """Return an HTML page of ``parts``, which the functions below make."""
     head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{STYLE}</style>'
     return "\n".join([f"<!doctype html>{head}", heading(title, 1), *filter(None, parts)]) + "\n"
 
 
 def heading(text: str, level: int = 2) -> str:
+    """Return a heading."""
     return f"<h{level}>{html.escape(text)}</h{level}>"
 
 
 def paragraph(text: str) -> str:
+    """Return a paragraph."""
     return f"<p>{html.escape(text)}</p>"
 
 
 def table(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Cells that say NaN or FAILS are coloured."""
+    """Return a table; cells that say NaN or FAILS are coloured."""
     rows = ["<tr>" + "".join(f"<th>{html.escape(head)}</th>" for head in heads) + "</tr>"]
     for line in lines:
         marked = ((' class="bad"' if cell in BAD else "", html.escape(cell)) for cell in line)
@@ -114,13 +116,13 @@ def table(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     return "<table>\n" + "\n".join(rows) + "\n</table>"
 
 
-def folded(summary: str, part: str) -> str:
-    """A part that shows after a click."""
+def details(summary: str, part: str) -> str:
+    """Return a part that shows after a click on ``summary``."""
     return f"<details><summary>{html.escape(summary)}</summary>\n{part}\n</details>"
 
 
-def embedded(figure: Any) -> str:
-    """A figure inside the page."""
+def image(figure: Any) -> str:
+    """Return a figure as an image inside the page."""
     return f'<img src="data:image/svg+xml;base64,{base64.b64encode(drawing.svg(figure).encode()).decode()}">'
 
 
