@@ -65,7 +65,7 @@ def parser() -> argparse.ArgumentParser:
         type=Path,
         const=evidence.RESULTS,
         metavar="JSON",
-        help="write tables and pictures of a file or folder (default: benchmarks/results) into the folder's README.md, and "
+        help="write tables and pictures of a file or folder (default: benchmarks/results) into benchmarks/results, and "
         "the main numbers into README.md; run nothing unless --everything is given",
     )
     return p
