@@ -1,13 +1,13 @@
-"""The specification: every operator and algorithm as dense float64 NumPy, for one world, dull on purpose.
+"""The specification: every operator and algorithm as dense float64 NumPy for one world, deliberately simple.
 
 A. Jain, "Graph Theory Roots of Spatial Operators for Kinematics and Dynamics". Spatial vectors are [omega; v] and
 [moment; force], in the axes of a node frame and about its origin. Node k is body k; its frame is the child anchor of
 the hinge that carries the body. N = 6 bodies rows, node after node; the columns of H.T are in the order of qd.
 
-Two roads lead to the dynamics and share nothing but poses: the paper's matrices, built by ``inv(I - E)`` (``E_phi``,
-``phi``, ``H``, ``M``, ``mass_matrix``, ``P``, ``D``, ...), and Newton's and Euler's equations for each body in plain
-three-vectors of the world (``inverse_dynamics``, ``bias_force``, ``jacobian``). This file imports NumPy only: a scene
-is read by the names of its attributes.
+There are two independent formulations of the dynamics, which share only poses: the paper's matrices, built by
+``inv(I - E)`` (``E_phi``, ``phi``, ``H``, ``M``, ``mass_matrix``, ``P``, ``D``, ...), and Newton's and Euler's
+equations for each body in three-vectors in world axes (``inverse_dynamics``, ``bias_force``, ``jacobian``). This file
+imports NumPy only and reads a scene by the names of its attributes.
 """
 
 from functools import cached_property
@@ -16,26 +16,26 @@ import numpy as np
 
 
 def skew(vector):
-    """The matrix a~ with a~ b = a x b, shape (3, 3)."""
+    """Return the matrix a~ with a~ b = a x b, shape (3, 3)."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def rotation_about(axis, angle):
-    """Rotation matrix (3, 3) by an angle [rad], of any size, about a unit vector."""
+    """Return the rotation matrix (3, 3) by an angle [rad] of any size about a unit vector."""
     k = skew(axis)
     return np.eye(3) + np.sin(angle) * k + 2.0 * np.sin(0.5 * angle) ** 2 * k @ k
 
 
 def rotation(quaternion):
-    """Rotation matrix (3, 3) of a quaternion xyzw of any length but zero."""
+    """Return the rotation matrix (3, 3) of a quaternion xyzw of any length except zero."""
     x, y, z, w = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(quaternion)
     k = skew((x, y, z))
     return np.eye(3) + 2.0 * w * k + 2.0 * k @ k
 
 
 def quaternion(matrix):
-    """A unit quaternion xyzw, of either sign, of a rotation matrix: the eigenvector of Bar-Itzhack's matrix."""
+    """Return a unit quaternion xyzw, of either sign, of a rotation matrix: the eigenvector of Bar-Itzhack's matrix."""
     b = np.empty((4, 4))
     b[:3, :3] = matrix + matrix.T - np.trace(matrix) * np.eye(3)
     b[:3, 3] = b[3, :3] = matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]
@@ -44,12 +44,12 @@ def quaternion(matrix):
 
 
 def quaternion_product(a, b):
-    """The quaternion xyzw of the rotation b followed by a."""
+    """Return the quaternion xyzw of the rotation b followed by a."""
     return np.array([*(a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3])), a[3] * b[3] - a[:3] @ b[:3]])
 
 
 def rotation_vector(matrix):
-    """Rotation vector [rad], no longer than pi, of a rotation matrix."""
+    """Return the rotation vector [rad], no longer than pi, of a rotation matrix."""
     q = quaternion(matrix)
     q = q if q[3] >= 0.0 else -q
     length = np.linalg.norm(q[:3])
@@ -57,14 +57,14 @@ def rotation_vector(matrix):
 
 
 def homogeneous(pose):
-    """The 4 x 4 matrix of a pose (x, y, z, qx, qy, qz, qw)."""
+    """Return the 4 x 4 matrix of a pose (x, y, z, qx, qy, qz, qw)."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation(pose[3:]), pose[:3]
     return matrix
 
 
 def pose7(matrix):
-    """Pose (x, y, z, qx, qy, qz, qw) of a 4 x 4 matrix; the quaternion has unit length and either sign."""
+    """Return the pose (x, y, z, qx, qy, qz, qw) of a 4 x 4 matrix; the unit quaternion has either sign."""
     return np.concatenate([matrix[:3, 3], quaternion(matrix[:3, :3])])
 
 
@@ -72,14 +72,14 @@ class Dense:
     """A scene at one configuration of one world.
 
     Args:
-        scene: anything with the attributes hinges, hinge_of, values, q_start and qd_start of a Scene.
+        scene: an object with the attributes hinges, hinge_of, values, q_start and qd_start of a Scene.
         q: coordinates [coordinate], [m, rad, unit quaternion xyzw]; quaternions are normalised when read.
-        qd: velocities [dof] that the methods use when they are given none; zero if left out.
-        world: row of ``scene.values``; an array with fewer rows gives its last.
+        qd: velocities [dof] for methods that are called without qd; by default zero.
+        world: the row of ``scene.values``; of an array with fewer rows, the last row is used.
 
     Raises:
-        ValueError: q or qd of a wrong length.
-        numpy.linalg.LinAlgError: from what needs D^-1 or the inverse mass matrix, if a hinge moves no inertia.
+        ValueError: q or qd has a wrong length.
+        numpy.linalg.LinAlgError: a property needs D^-1 or the inverse mass matrix, and a hinge moves no inertia.
     """
 
     def __init__(self, scene, q, qd=None, world=0):
@@ -105,13 +105,13 @@ class Dense:
         return value
 
     def value(self, name):
-        """``scene.values[name]`` of this world."""
+        """Return ``scene.values[name]`` of this world."""
         array = self.scene.values[name]
         return array[min(self.world, array.shape[0] - 1)]
 
     # -- poses -------------------------------------------------------------------------------------------------------
     def _place(self):
-        """World poses as 4 x 4 matrices: of bodies, of node frames, and of the frames between a hinge's screws."""
+        """Set the world poses of bodies, node frames, and the frames between a hinge's screws, as 4 x 4 matrices."""
         self.body_matrix, self.node_matrix = np.empty((2, self.body_count, 4, 4))
         self.stages = [[] for _ in self.hinge]  # by node: the parent anchor, then the frame after each screw
         for k in self.outward:
@@ -150,7 +150,7 @@ class Dense:
     # -- the paper's matrices ----------------------------------------------------------------------------------------
     @cached_property
     def E_phi(self):
-        """[N, N]: w(p, k) = [[R, l~ R], [0, R]], (R, l) the pose of node frame k in node frame p. Eq. 4, 15."""
+        """E_phi [N, N]: w(p, k) = [[R, l~ R], [0, R]] for the pose (R, l) of node frame k in frame p. Eq. 4, 15."""
         E = np.zeros((6 * self.body_count,) * 2)
         for k, p in enumerate(self.parent):
             if p >= 0:
@@ -166,12 +166,12 @@ class Dense:
 
     @cached_property
     def H(self):
-        """[dof, N]: a row is the motion of a node frame against the hinge's parent at unit velocity. Eq. 19."""
+        """H [dof, N]: a row is the motion of a node frame relative to the hinge's parent at unit velocity. Eq. 19."""
         H = np.zeros((self.dof_count, 6 * self.body_count))
         for k, hinge in enumerate(self.hinge):
             R, origin = self.node_matrix[k][:3, :3], self.node_matrix[k][:3, 3]
             for i, dof in enumerate(self.dofs[k]):
-                # omega and v in the world, v being that of the point of the child that is at ``point``
+                # omega and v in world axes; v is the velocity of the child's material point at ``point``
                 if hinge.kind == "ball":
                     omega, v, point = self.stages[k][0][:3, i], np.zeros(3), origin
                 elif hinge.kind == "free":
@@ -260,8 +260,10 @@ class Dense:
 
     # -- classical mechanics in the world ----------------------------------------------------------------------------
     def _motion(self, qd, qdd):
-        """Of every node frame, world axes: angular velocity, velocity and acceleration of the origin, angular
-        acceleration, each [node, 3], by differentiating the poses of the chain of frames twice by hand."""
+        """Return angular velocity, velocity and acceleration of the origin, and angular acceleration of node frames.
+
+        All are [node, 3] in world axes; the formulas are the derivatives of the poses along the chain of frames.
+        """
         W, V, A, AL = np.zeros((4, self.body_count, 3))
         cross = np.cross
         for k in self.outward:
@@ -295,7 +297,7 @@ class Dense:
 
     @cached_property
     def _node_jacobian(self):
-        """Of every node frame's origin, world axes: velocity, then angular velocity [node, 6, dof]."""
+        """Velocity of every node frame's origin, then angular velocity, per unit qd, world axes [node, 6, dof]."""
         columns = [self._motion(unit, np.zeros(self.dof_count)) for unit in np.eye(self.dof_count)]
         return (
             np.stack([np.concatenate([V, W], axis=1) for W, V, _, _ in columns], axis=-1)
@@ -304,12 +306,13 @@ class Dense:
         )
 
     def _jacobian_at(self, body, point):
+        """Return the Jacobian [6, dof] of a body's material point at ``point`` in the world."""
         J = self._node_jacobian[body].copy()
         J[:3] -= skew(point - self.node_matrix[body][:3, 3]) @ J[3:]
         return J
 
     def jacobian(self, frames):
-        """Of every frame: velocity of its origin, then angular velocity, world axes [frame, 6, dof], [m, 1 per unit].
+        """Return the Jacobian of frames: velocity of the origin, then angular velocity, world axes [frame, 6, dof].
 
         Args:
             frames: each a body index, or (body index, pose (7,) in the body).
@@ -322,12 +325,12 @@ class Dense:
         return np.array(rows).reshape(len(rows), 6, self.dof_count)
 
     def operational_inertia_inverse(self, frames):
-        """J mass_matrix^-1 J^T [6 frames, 6 frames], J as in :meth:`jacobian`, frame after frame."""
+        """Return J mass_matrix^-1 J^T [6 frames, 6 frames], with J of :meth:`jacobian`, frame after frame."""
         J = self.jacobian(frames).reshape(6 * len(frames), self.dof_count)
         return J @ np.linalg.solve(self.mass_matrix, J.T)
 
     def body_velocities(self, qd=None):
-        """Of every body: CoM velocity [m/s], then angular velocity [rad/s], world axes [body, 6]; Newton's body_qd."""
+        """Return CoM velocity [m/s], then angular velocity [rad/s] of bodies, world axes [body, 6]; as body_qd."""
         W, V, _, _ = self._motion(self._qd(qd), np.zeros(self.dof_count))
         return np.concatenate([V + np.cross(W, self.com - self.node_matrix[:, :3, 3]), W], axis=1)
 
@@ -335,13 +338,13 @@ class Dense:
         return self.qd if qd is None else self._vector("qd", qd, self.dof_count)
 
     def inverse_dynamics(self, qd, qdd, body_f=None):
-        """tau = mass_matrix qdd + bias [dof], dual to qd [N m, N].
+        """Return tau = mass_matrix qdd + bias [dof], dual to qd [N m, N].
 
-        Newton and Euler for each body at its CoM in world axes, m (a - g) and I alpha + omega x I omega less the
-        external wrench, projected with the CoM's Jacobian (d'Alembert), and the armature.
+        Newton's and Euler's equations for each body at its CoM in world axes, m (a - g) and I alpha + omega x I omega
+        minus the external wrench, projected with the Jacobian of the CoM (d'Alembert), plus armature qdd.
 
         Args:
-            qd, qdd: [dof]; qd None means the constructor's, qdd is the time derivative of qd.
+            qd, qdd: [dof]; qd None is the constructor's qd, qdd is the time derivative of qd.
             body_f: external force [N], then torque [N m] at the CoM, world axes [body, 6]; None: none.
         """
         qdd = self._vector("qdd", qdd, self.dof_count)
@@ -358,7 +361,7 @@ class Dense:
         return tau
 
     def bias_force(self, qd=None, body_f=None):
-        """Inverse dynamics at qdd = 0 [dof]: velocity terms, gravity, less body_f."""
+        """Return inverse dynamics at qdd = 0 [dof]: velocity terms and gravity, minus the effect of body_f."""
         return self.inverse_dynamics(qd, np.zeros(self.dof_count), body_f)
 
     @property
@@ -367,24 +370,24 @@ class Dense:
         return self.bias_force(np.zeros(self.dof_count))
 
     def forward_dynamics(self, qd=None, tau=None, body_f=None):
-        """qdd [dof] by a dense solve; qd None means the constructor's, tau None zero."""
+        """Return qdd [dof] by a dense solve; qd None is the constructor's qd, tau None is zero."""
         tau = np.zeros(self.dof_count) if tau is None else self._vector("tau", tau, self.dof_count)
         return np.linalg.solve(self.mass_matrix, tau - self.bias_force(qd, body_f))
 
     def hybrid_dynamics(self, qd, tau, qdd, prescribed, body_f=None):
-        """(qdd, tau), each [dof]: dofs under the bool mask ``prescribed`` [dof] follow qdd, the others tau.
+        """Return (qdd, tau), each [dof]: dofs under the bool mask ``prescribed`` [dof] follow qdd, the others tau.
 
-        The rows of mass_matrix qdd + bias = tau that are not prescribed, solved for what is not known of qdd.
+        The rows of mass_matrix qdd + bias = tau that are not prescribed are solved for the unknown entries of qdd.
         """
-        qdd, held = np.array(qdd, dtype=np.float64), np.asarray(prescribed)
-        free, M = ~held, self.mass_matrix
-        right = np.asarray(tau, dtype=np.float64) - self.bias_force(qd, body_f) - M[:, held] @ qdd[held]
+        qdd, under_mask = np.array(qdd, dtype=np.float64), np.asarray(prescribed)
+        free, M = ~under_mask, self.mass_matrix
+        right = np.asarray(tau, dtype=np.float64) - self.bias_force(qd, body_f) - M[:, under_mask] @ qdd[under_mask]
         qdd[free] = np.linalg.solve(M[np.ix_(free, free)], right[free])
-        return qdd, np.where(held, self.inverse_dynamics(qd, qdd, body_f), tau)
+        return qdd, np.where(under_mask, self.inverse_dynamics(qd, qdd, body_f), tau)
 
     # -- operational space, momentum, the determinant ----------------------------------------------------------------
     def operational_inertia(self, frames):
-        """(J mass_matrix^-1 J^T)^-1 [6 frames, 6 frames]; LinAlgError where that is singular to working precision."""
+        """Return (J mass_matrix^-1 J^T)^-1 [6 frames, 6 frames]; LinAlgError if it is singular to working precision."""
         inverse = self.operational_inertia_inverse(frames)
         scale = np.sqrt(np.diag(inverse))
         if not scale.all() or np.linalg.cond(inverse / np.outer(scale, scale)) > 1e13:
@@ -392,8 +395,10 @@ class Dense:
         return np.linalg.inv(inverse)
 
     def jacobian_bias(self, qd, frames):
-        """J' qd for J of :meth:`jacobian` [frame, 6]: acceleration of each frame's origin and its angular acceleration
-        at qdd = 0, without gravity, world axes, [m/s^2, rad/s^2]."""
+        """Return J' qd for J of :meth:`jacobian` [frame, 6], world axes, [m/s^2, rad/s^2].
+
+        It is the acceleration of each frame's origin, then its angular acceleration, at qdd = 0 without gravity.
+        """
         W, _, A, AL = self._motion(self._qd(qd), np.zeros(self.dof_count))
         rows = []
         for frame in frames:
@@ -406,7 +411,7 @@ class Dense:
 
     @cached_property
     def _moving(self):
-        """Mass of every body, 0 for one that no hinge lets move [body]."""
+        """Mass of every body [body], 0 for bodies that no hinge can move."""
         moves = np.zeros(self.body_count + 1, dtype=bool)  # the last is the inertial frame
         for k in self.outward:
             moves[k] = moves[self.parent[k]] or len(self.dofs[k]) > 0
@@ -414,7 +419,7 @@ class Dense:
 
     @property
     def center_of_mass(self):
-        """Centre of mass of all that moves, in the world [3], [m]."""
+        """Centre of mass of all bodies that can move, in the world [3], [m]."""
         return self._moving @ self.com / (self._moving.sum() or 1.0)
 
     @property
@@ -424,8 +429,10 @@ class Dense:
 
     @property
     def centroidal_momentum_matrix(self):
-        """Linear momentum, then angular momentum about :attr:`center_of_mass`, per unit qd, world axes [6, dof]: sums
-        over bodies of m v, and of I omega + (c(k) - c) x m v."""
+        """Linear momentum, then angular momentum about :attr:`center_of_mass`, per unit qd, world axes [6, dof].
+
+        They are the sums over bodies of m v, and of I omega + (c(k) - c) x m v.
+        """
         total, c = np.zeros((6, self.dof_count)), self.center_of_mass
         for k, R in enumerate(self.body_matrix[:, :3, :3]):
             J = self._jacobian_at(k, self.com[k])
@@ -435,8 +442,10 @@ class Dense:
         return total
 
     def centroidal_momentum_bias(self, qd=None):
-        """Rate of the momentum of :attr:`centroidal_momentum_matrix` at qdd = 0 [6], [N, N m]: the sum over bodies of
-        m a, and of I alpha + omega x I omega + (c(k) - c) x m a."""
+        """Return the rate of the momentum of :attr:`centroidal_momentum_matrix` at qdd = 0 [6], [N, N m].
+
+        It is the sum over bodies of m a, and of I alpha + omega x I omega + (c(k) - c) x m a.
+        """
         W, _, A, AL = self._motion(self._qd(qd), np.zeros(self.dof_count))
         total, c = np.zeros(6), self.center_of_mass
         for k, R in enumerate(self.body_matrix[:, :3, :3]):
@@ -448,7 +457,7 @@ class Dense:
         return total
 
     def quasi_velocities(self, qd=None):
-        """u^T qd [dof] for mass_matrix = u u^T, u upper triangular where dofs nearer to the root come first."""
+        """Return u^T qd [dof] for mass_matrix = u u^T; u is upper triangular if dofs nearer to the root come first."""
         order = np.concatenate([self.dofs[k] for k in self.outward]).astype(int)
         u = np.linalg.cholesky(self.mass_matrix[np.ix_(order, order)][::-1, ::-1])[::-1, ::-1]
         nu = np.empty(self.dof_count)
@@ -470,15 +479,15 @@ class Dense:
 
     @property
     def fixman_torque(self):
-        """Force of the potential log_det / 2 [dof]."""
+        """Generalised force of the potential log_det / 2 [dof]."""
         return -0.5 * self.log_det_gradient
 
     # -- what belongs to a step --------------------------------------------------------------------------------------
     def passive_force(self, qd=None):
-        """-damping qd - stiffness deviation [dof].
+        """Return -damping qd - stiffness deviation [dof].
 
-        The deviation is q - rest of a screw's coordinate and of a free hinge's position; of a rotation (ball, free) it
-        is the rotation vector of R(q) R(rest)^T, no longer than pi, in the parent anchor's axes, those of qd.
+        The deviation of a screw's coordinate and of a free hinge's position is q - rest. That of a rotation (ball,
+        free) is the rotation vector of R(q) R(rest)^T, no longer than pi, in the parent anchor's axes, those of qd.
         """
         rest, deviation = self.value("joint_rest_q"), np.zeros(self.dof_count)
         for k, h in enumerate(self.scene.hinge_of):
@@ -491,7 +500,7 @@ class Dense:
         return -self.value("joint_damping") * self._qd(qd) - self.value("joint_stiffness") * deviation
 
     def integrate(self, qd, dt):
-        """q after qd has been constant for dt [s]; quaternions come out with unit length.
+        """Return q after dt [s] at constant qd, with quaternions of unit length.
 
         Screws: q + qd dt. Ball and free: the quaternion becomes exp(omega dt) * quaternion, omega in the parent
         anchor's axes. Free: the CoM moves by v dt, and the anchor's origin follows from it.

@@ -1,14 +1,15 @@
-"""The lazy algebra of operators: sums, products, multiples and transposes are written down, then applied.
+"""The lazy algebra of operators: sums, products, multiples and transposes compute nothing until they are applied.
 
-An operator maps ``x`` [world, columns] to [world, rows], each world by itself. ``H @ phi @ M @ phi.T @ H.T`` computes
-nothing; ``that @ x`` applies the factors from the right, each by its own kernels, and no matrix is formed. Where all
-letters belong to one :class:`LetterOwner`, it may apply the whole in one kernel instead.
+An operator maps ``x`` [world, columns] to [world, rows], separately in each world. ``op = H @ phi @ M @ phi.T @ H.T``
+computes nothing; ``op @ x`` applies the factors from the right, each by its own kernels, without forming a matrix. If
+all letters of an expression belong to one :class:`LetterOwner`, it may apply the expression in one kernel instead.
 """
 
 import abc
 import functools
 import itertools
 import numbers
+from collections.abc import Sequence
 from typing import Any, NoReturn, overload
 
 import warp as wp
@@ -18,7 +19,7 @@ from ..kernels import block_sparse, declare
 
 
 class Workspace:
-    """The temporaries of one operator for one number of worlds and columns; made at first use, then kept."""
+    """The temporary arrays of one operator for one number of worlds and columns; the first use allocates them."""
 
     def __init__(self, call: Call, worlds: int, columns: int):
         self._sizes = worlds, columns
@@ -38,11 +39,11 @@ class Workspace:
 
 
 class LetterOwner(abc.ABC):
-    """Whoever owns the numbers of operators that bear letters, and may know of faster ways to apply expressions."""
+    """The owner of operators that are letters of the paper; it may apply an expression of them in one kernel."""
 
     @abc.abstractmethod
     def fill(self) -> None:
-        """Launch what brings the blocks of all letters up to date, where it is not done yet."""
+        """Launch the kernels that compute the blocks of all letters, unless the blocks are up to date."""
 
     @abc.abstractmethod
     def run(self, expression: Any, x: wp.array, out: wp.array) -> bool:
@@ -50,18 +51,18 @@ class LetterOwner(abc.ABC):
 
 
 class Operator(abc.ABC):
-    """A linear map of vectors, one matrix a world (or one for all).
+    """A linear map of vectors, with one matrix a world or one for all worlds.
 
-    A kind of operator says what it does in ``_apply`` and ``_apply_transposed``; everything else is here. Nothing is
-    overridden; to change an operator, wrap it.
+    A subclass defines ``_apply`` and ``_apply_transposed``; everything else is here. Subclasses override nothing; to
+    change an operator, wrap it.
 
     Attributes:
         shape: (rows, columns).
-        worlds: number of worlds; 1 = the same matrix in every world, for any number of worlds.
-        device, dtype: where and in what it computes; arrays it meets must agree.
-        kind: kind of array that :meth:`dense` returns; None = NumPy.
-        letter: (:class:`LetterOwner`, name), for operators that belong to one.
-        form, operands: what a composed operator is made of.
+        worlds: the number of worlds; 1 stands for the same matrix in any number of worlds.
+        device, dtype: the device and the scalar type of the operator and of the arrays that it maps.
+        kind: the kind of array that :meth:`dense` returns; None is NumPy.
+        letter: the owner and the name of the letter; None if the operator is not a letter.
+        form, operands: the name of the composition with its numbers, and the composed operators.
     """
 
     letter: "tuple[LetterOwner, str] | None" = None
@@ -80,7 +81,7 @@ class Operator(abc.ABC):
 
     @functools.cached_property
     def expression(self) -> Any:
-        """The operator in letters, as nested tuples (form, operands); None where there is a part that bears none."""
+        """The operator in letters, as nested tuples (form, operands); None if a part of it is not a letter."""
         if self.letter is not None:
             return self.letter[1]
         parts = [operand.expression for operand in self.operands]
@@ -88,38 +89,42 @@ class Operator(abc.ABC):
 
     @functools.cached_property
     def letters(self) -> "tuple[LetterOwner, ...]":
-        """Who owns the letters of the operator."""
+        """The owners of the letters of the operator."""
         own = () if self.letter is None else (self.letter[0],)
         return tuple(dict.fromkeys([*own, *(owner for operand in self.operands for owner in operand.letters)]))
 
     def _fused(self, x: wp.array, out: wp.array) -> bool:
-        """Launch ``out = op x`` [world, row] as one kernel, if there is one."""
+        """Launch ``out = op x`` [world, row] as one kernel, or return False if there is no such kernel."""
         return len(self.letters) == 1 and self.expression is not None and self.letters[0].run(self.expression, x, out)
 
     def _fill(self) -> None:
+        """Launch the kernels that compute the blocks of the letters, unless the blocks are up to date."""
         for owner in self.letters:
             owner.fill()
 
     @abc.abstractmethod
     def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
-        """Launch ``out = alpha op x``, or ``out += alpha op x``. x, out: [world, row, column], apart."""
+        """Launch ``out = alpha op x``, or with ``accumulate`` ``out += alpha op x``.
+
+        ``x`` and ``out`` are [world, row, column] and do not overlap.
+        """
 
     @abc.abstractmethod
     def _apply_transposed(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
-        """As :meth:`_apply`, of the transpose."""
+        """Launch the same as :meth:`_apply` for the transpose of the operator."""
 
     def apply(self, x: ArrayT, out: ArrayT | None = None) -> ArrayT:
         """Return ``op @ x``.
 
         Args:
             x: [world, columns of op] or [world, columns of op, any]; torch, Warp or NumPy.
-            out: array for the result [world, rows of op (, any)], of the kind of x, apart from x.
+            out: array for the result [world, rows of op (, any)], of the kind of x; it must not overlap x.
 
-        With ``out`` and without NumPy this launches and does nothing else after the first call for a number of worlds
-        and columns. One operator may be applied on one stream at a time, because its temporaries are its own.
+        With ``out`` and without NumPy, every call after the first one for a number of worlds and columns only launches
+        kernels. An operator may be applied on one stream at a time only, because it has one set of temporary arrays.
 
         Raises:
-            ValueError, TypeError: as :class:`warp_spo.arrays.Call`.
+            ValueError, TypeError: an array is refused, see :class:`warp_spo.arrays.Call`.
         """
         name = f"{type(self).__name__}.apply"
         kind_of(x, name, "x")
@@ -141,11 +146,11 @@ class Operator(abc.ABC):
         return call.result
 
     def dense(self) -> Any:
-        """Return the matrix [world, row, column]; world = 1 if it is the same in all. For looking and for testing."""
+        """Return the matrix [world, row, column], for inspection and tests; one world if all worlds share it."""
         return self._columns("dense", 0, self.shape[1], 0, self.shape[0])
 
-    def _columns(self, name, first, count, first_row, rows):
-        """Rows ``first_row`` ... of the columns ``first`` ... of the matrix, in the operator's kind."""
+    def _columns(self, name: str, first: int, count: int, first_row: int, rows: int) -> Any:
+        """Return ``rows`` rows from ``first_row`` on of ``count`` columns from ``first`` on, in the operator's kind."""
         with Call(f"{type(self).__name__}.{name}", self.device, self.dtype, kind=self.kind) as call:
             y = call.write(None, (self.worlds, rows, count))
             if y.size:
@@ -220,7 +225,7 @@ class Identity(Operator):
 
     Args:
         size: number of rows and columns.
-        device: as everywhere; the CPU unless given.
+        device: the CPU unless given.
         dtype: "float32" or "float64".
     """
 
@@ -228,14 +233,14 @@ class Identity(Operator):
         super().__init__((size, size), 1, parse_device(device), parse_dtype(dtype, "Identity"), kind)
         self.form = ("identity",)
 
-    def _apply(self, x, out, alpha, accumulate, space):
+    def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         add_scaled(x, out, alpha, accumulate)
 
     _apply_transposed = _apply
 
 
 class Scaled(Operator):
-    """``(a B) x = a (B x)``; costs nothing, the factor goes into the kernels of B."""
+    """``(a B) x = a (B x)``; the kernels of B apply the factor at no cost."""
 
     def __init__(self, factor: float, operand: Operator):
         super().__init__(operand.shape, operand.worlds, operand.device, operand.dtype, operand.kind)
@@ -243,10 +248,10 @@ class Scaled(Operator):
         self.operand = operand
         self.form, self.operands = ("scaled", self.factor), (operand,)
 
-    def _apply(self, x, out, alpha, accumulate, space):
+    def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         self.operand._apply(x, out, alpha * self.factor, accumulate, space)
 
-    def _apply_transposed(self, x, out, alpha, accumulate, space):
+    def _apply_transposed(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         self.operand._apply_transposed(x, out, alpha * self.factor, accumulate, space)
 
 
@@ -259,15 +264,15 @@ class Transpose(Operator):
         self.form, self.operands = ("transpose",), (operand,)
         self.__dict__["T"] = operand
 
-    def _apply(self, x, out, alpha, accumulate, space):
+    def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         self.operand._apply_transposed(x, out, alpha, accumulate, space)
 
-    def _apply_transposed(self, x, out, alpha, accumulate, space):
+    def _apply_transposed(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         self.operand._apply(x, out, alpha, accumulate, space)
 
 
 class Sum(Operator):
-    """``(B + C) x = B x + C x``, added from left to right."""
+    """``(B + C) x = B x + C x``, summed from left to right."""
 
     def __init__(self, *terms: Operator):
         self.terms = _flatten(Sum, terms, "terms")
@@ -280,11 +285,11 @@ class Sum(Operator):
         super().__init__(self.terms[0].shape, *_common("sum", self.terms))
         self.form, self.operands = ("sum",), self.terms
 
-    def _apply(self, x, out, alpha, accumulate, space):
+    def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         for index, term in enumerate(self.terms):
             term._apply(x, out, alpha, accumulate or index > 0, space)
 
-    def _apply_transposed(self, x, out, alpha, accumulate, space):
+    def _apply_transposed(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         for index, term in enumerate(self.terms):
             term._apply_transposed(x, out, alpha, accumulate or index > 0, space)
 
@@ -303,14 +308,14 @@ class Product(Operator):
         super().__init__((self.factors[0].shape[0], self.factors[-1].shape[1]), *_common("product", self.factors))
         self.form, self.operands = ("product",), self.factors
 
-    def _apply(self, x, out, alpha, accumulate, space):
+    def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         for stage, factor in enumerate(self.factors[:0:-1]):
             between = space.take(self, factor.shape[0], stage % 2)
             factor._apply(x, between, 1.0, False, space)
             x = between
         self.factors[0]._apply(x, out, alpha, accumulate, space)
 
-    def _apply_transposed(self, x, out, alpha, accumulate, space):
+    def _apply_transposed(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         for stage, factor in enumerate(self.factors[:-1]):
             between = space.take(self, factor.shape[1], stage % 2)
             factor._apply_transposed(x, between, 1.0, False, space)
@@ -319,25 +324,26 @@ class Product(Operator):
 
 
 def add_scaled(x: wp.array, out: wp.array, alpha: float, accumulate: bool) -> None:
-    """Launch ``out = alpha x``, or ``out += alpha x``; [world, row, column]."""
+    """Launch ``out = alpha x``, or with ``accumulate`` ``out += alpha x``; both are [world, row, column]."""
     wp.launch(block_sparse.scale(x.dtype), x.shape, [alpha, accumulate, x], [out], device=x.device)
 
 
 def _with_columns(array: wp.array) -> wp.array:
-    """[world, row] as [world, row, 1]."""
+    """Return an array [world, row] as [world, row, 1], without a copy."""
     if array.ndim == 3:
         return array
     return view(array.ptr or 0, (*array.shape, 1), array.dtype, str(array.device))
 
 
-def _flatten(kind: type, operands, name: str) -> tuple:
+def _flatten(kind: type, operands: Sequence[Operator], name: str) -> tuple[Operator, ...]:
+    """Return the operands, with those of type ``kind`` replaced by their parts in the attribute ``name``."""
     return tuple(
         part for operand in operands for part in (getattr(operand, name) if type(operand) is kind else (operand,))
     )
 
 
-def _common(what: str, operands) -> tuple:
-    """Worlds, device, dtype and kind of a composition; ValueError that names two operands that do not fit."""
+def _common(what: str, operands: Sequence[Operator]) -> tuple[int, wp.Device, type, str | None]:
+    """Return worlds, device, dtype and kind of a composition; ValueError that names two operands that do not fit."""
     first = operands[0]
     worlds = 1
     for operand in operands:

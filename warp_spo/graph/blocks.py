@@ -1,7 +1,7 @@
-"""Operators made of dense blocks: a table says which block meets which row, one flat array holds the numbers.
+"""Operators made of dense blocks: a table says which block contributes to which row, and one array holds the numbers.
 
-The array, ``weights`` [world or 1, scalar], is all that changes after construction: whoever owns it may rewrite it on
-the device at any time, and the operator applies what it finds.
+Only the array ``weights`` [world or 1, scalar] changes after construction. Its owner may rewrite it on the device at
+any time; the operator always applies the current numbers.
 """
 
 import functools
@@ -14,11 +14,11 @@ import warp as wp
 
 from ..arrays import NUMPY, WARP, Call, kind_of, parse_device, parse_dtype
 from ..kernels import block_sparse
-from .algebra import Operator
+from .algebra import Operator, Workspace
 
 
 class DeferredWeights:
-    """Room for the blocks of an operator [world, scalar], taken when it is first asked for; see :func:`new_weights`."""
+    """Weights [world, scalar] whose first use allocates them; see :func:`new_weights`."""
 
     ndim = 2
 
@@ -30,17 +30,19 @@ class DeferredWeights:
         return new_weights(*self.shape, self.dtype, self.device)
 
 
-def weights_array(weights: Any) -> wp.array:
-    """The array of weights that may be :class:`DeferredWeights`."""
+def weights_array(weights: wp.array | DeferredWeights) -> wp.array:
+    """Return the array of weights, which may be :class:`DeferredWeights`."""
     return weights.array if isinstance(weights, DeferredWeights) else weights
 
 
 class Table:
-    """The device table by which a list of blocks, or their transposes, is gathered; see kernels/block_sparse.py.
+    """The table on the device by which kernels apply a list of blocks or their transposes; see kernels/block_sparse.py.
 
     Args:
-        row_levels: the rows of the result, in the order of a sweep.
+        row_levels: the rows of the result, level by level in the order of a sweep.
         blocks: (row start, column start, rows, columns, offset in the weights) of each block.
+        transposed: the table is that of the transposed blocks.
+        device: where the table lies.
     """
 
     def __init__(
@@ -68,8 +70,8 @@ class Table:
         self.entries: Any = wp.array(gathered, dtype=block_sparse.Entry, device=device)
         self.levels = list(zip(accumulate(map(len, row_levels), initial=0), map(len, row_levels), strict=False))
 
-    def gather(self, weights, x, out, alpha, add):
-        """Launch ``out = alpha B x``, or ``out += alpha B x``."""
+    def gather(self, weights: wp.array, x: wp.array, out: wp.array, alpha: float, add: bool) -> None:
+        """Launch ``out = alpha B x``, or with ``add`` ``out += alpha B x``."""
         wp.launch(
             block_sparse.gather(x.dtype),
             dim=(out.shape[1], out.shape[2], out.shape[0]),
@@ -78,7 +80,7 @@ class Table:
             device=x.device,
         )
 
-    def sweep(self, weights, x, out, alpha):
+    def sweep(self, weights: wp.array, x: wp.array, out: wp.array, alpha: float) -> None:
         """Launch ``out = alpha (I - B)^-1 x``."""
         for first, count in self.levels:
             wp.launch(
@@ -91,25 +93,25 @@ class Table:
 
 
 class Blocks(Operator):
-    """Dense blocks at given places of a matrix that is zero elsewhere; H, M, P, D, G, Delta and K are such.
+    """Dense blocks at fixed places of a matrix that is zero elsewhere, such as H, M, P, D, G, Delta and K.
 
     Args:
         shape: (rows, columns).
-        places: (row start, column start, rows, columns) of each block. Blocks that overlap add.
-        weights: [world or 1, scalar], a Warp array on the device; the blocks lie in it row-major. Any strides. It is
-            kept, not copied: what is written into it later is what the operator applies. Or :class:`DeferredWeights`.
-        offsets: first scalar of each block in ``weights``; one after the other unless given.
+        places: (row start, column start, rows, columns) of each block. Overlapping blocks are added.
+        weights: a Warp array [world or 1, scalar] on the device, with any strides, or :class:`DeferredWeights`. The
+            blocks lie in it row-major. The operator keeps the array and applies the numbers that are in it at the time.
+        offsets: the first scalar of each block in ``weights``; by default the blocks lie one after the other.
         kind: kind of array that :meth:`dense` returns.
 
     Raises:
-        ValueError: a block outside of the matrix or of the weights.
+        ValueError: a block reaches out of the matrix or of the weights.
     """
 
     def __init__(
         self,
         shape: tuple[int, int],
         places: Sequence[tuple[int, ...]],
-        weights: Any,
+        weights: Any,  # wp.array or DeferredWeights; Warp types an array's device as optional
         offsets: Sequence[int] | None = None,
         kind: str | None = WARP,
     ):
@@ -129,7 +131,10 @@ class Blocks(Operator):
 
     @classmethod
     def diagonal(cls, blocks: Sequence, device=None, dtype=None) -> "Blocks":
-        """Block diagonal matrix of arrays [world, rows, columns] or [rows, columns], NumPy, Warp or torch; copied."""
+        """Return the block diagonal matrix of arrays [world, rows, columns] or [rows, columns], which are copied.
+
+        The arrays are NumPy, Warp or torch.
+        """
         device, dtype, kind = choose_memory("Blocks.diagonal", blocks, device, dtype)
         sizes = [matrix_size("Blocks.diagonal", f"blocks[{index}]", block) for index, block in enumerate(blocks)]
         names = [f"blocks[{index}]" for index in range(len(blocks))]
@@ -140,21 +145,21 @@ class Blocks(Operator):
 
     @property
     def weights(self) -> wp.array:
-        """[world or 1, scalar], up to date."""
+        """The numbers of the blocks [world or 1, scalar], up to date."""
         self._fill()
         return weights_array(self.stored)
 
-    def _apply(self, x, out, alpha, accumulate, space):
+    def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         self._forward.gather(weights_array(self.stored), x, out, alpha, accumulate)
 
-    def _apply_transposed(self, x, out, alpha, accumulate, space):
+    def _apply_transposed(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         self._transposed.gather(weights_array(self.stored), x, out, alpha, accumulate)
 
 
 def new_weights(worlds: int, scalars: int, dtype: type, device: wp.Device) -> wp.array:
-    """Zeros [world, scalar] for the blocks of an operator, one scalar or more; worlds are neighbours in memory.
+    """Return zeros [world, scalar] for the blocks of an operator, with neighbouring worlds at neighbouring addresses.
 
-    Kernels have one thread a world side by side, whether they write the blocks or apply them.
+    Neighbouring threads of the kernels that write or apply the blocks work on neighbouring worlds.
     """
     return wp.zeros((max(1, scalars), worlds), dtype=dtype, device=device).transpose()
 
@@ -173,8 +178,8 @@ def matrix_size(call: str, name: str, array) -> tuple[int, int]:
 def choose_memory(call: str, arrays: Sequence, device, dtype) -> tuple:
     """Return device, dtype and kind for operators made of these arrays.
 
-    Device and dtype are, unless given, those of the first torch or Warp array; if all are NumPy, the CPU and the dtype
-    of the first (float64 for integers). The kind is that of the first array.
+    Unless given, device and dtype are those of the first torch or Warp array. If all arrays are NumPy, they are the CPU
+    and the dtype of the first array (float64 for integers). The kind is that of the first array.
     """
     kinds = [kind_of(array, call, f"array {index}") for index, array in enumerate(arrays)]
     first = next((array for array, kind in zip(arrays, kinds, strict=True) if kind != NUMPY), None)
@@ -190,10 +195,10 @@ def choose_memory(call: str, arrays: Sequence, device, dtype) -> tuple:
 def pack(
     call: str, names: Sequence[str], arrays: Sequence, sizes: Sequence, device: wp.Device, dtype: type
 ) -> wp.array:
-    """Copy matrices [world, rows, columns] or [rows, columns] into one array [world or 1, scalar], one after the other.
+    """Copy matrices [world, rows, columns] or [rows, columns] into one array [world or 1, scalar], and return it.
 
     Raises:
-        ValueError: numbers of worlds that differ, and whatever :class:`warp_spo.arrays.Call` refuses.
+        ValueError: the numbers of worlds differ, or :class:`warp_spo.arrays.Call` refuses an array.
     """
     counts = {array.shape[0] for array in arrays if len(array.shape) == 3} - {1}
     if len(counts) > 1:
@@ -229,8 +234,10 @@ def pack(
     return weights
 
 
-def place_offsets(call: str, sizes: Sequence, weights: wp.array, offsets: Sequence[int] | None) -> tuple[int, ...]:
-    """Return the first scalar of each block in ``weights``, checked."""
+def place_offsets(
+    call: str, sizes: Sequence, weights: wp.array | DeferredWeights, offsets: Sequence[int] | None
+) -> tuple[int, ...]:
+    """Return the first scalar of each block in ``weights``; ValueError if a block reaches out of them."""
     if (
         not isinstance(weights, wp.array | DeferredWeights)
         or weights.ndim != 2

@@ -1,7 +1,7 @@
 """Mass = H phi M phi* H* + Delta factorised by the Riccati recursion, for any spatial kernel operator (eq. 1).
 
-Nothing here is about rigid bodies: node sizes, hinge sizes and weights are arbitrary, and weights need not be square or
-invertible. It is what the paper's identities hold for.
+Node sizes, hinge sizes and weights are arbitrary, and weights need not be square or invertible: the paper's identities
+hold for all such systems, not only for rigid bodies.
 """
 
 from __future__ import annotations
@@ -21,25 +21,26 @@ from .operators import BWA
 
 
 class Factorization:
-    """The operators that belong to E_phi, H, M and Delta; :meth:`update` computes them from what those hold now.
+    """The operators of the factorisation; :meth:`update` computes them from the current E_phi, H, M and Delta.
 
     Args:
         E_phi: block-weighted adjacency of a Tree.
-        H: one block r_k x m_k for each node, in the order of the nodes; its rows may lie anywhere.
+        H: one block r_k x m_k for each node, in the order of the nodes; the blocks may have any rows.
         M: one symmetric block m_k x m_k for each node.
-        Delta: one symmetric block r_k x r_k for each node, at the rows of H; None is zero.
-        store: ``store(scalars)`` makes the weights of the other operators; whoever gives it calls :meth:`update`.
+        Delta: one symmetric block r_k x r_k for each node, at the rows of its block of H; None is zero.
+        store: ``store(scalars)`` returns the weights of the other operators; a caller that passes it also calls
+            :meth:`update`.
 
     Attributes:
         phi: (I - E_phi)^-1.
         P: articulated inertia, P = M + sum over children w P+ w*, P+ = P - G H P.
-        D, D_inverse: H P H* + Delta and its inverse, block diagonal. Not positive definite: NaN.
+        D, D_inverse: H P H* + Delta and its inverse, block diagonal; NaN where D is not positive definite.
         G: gain, P H* D^-1.
         K: E_phi G.
         E_psi, psi: the adjacency with weights w (I - G H), and its resolvent.
 
     Raises:
-        ValueError: blocks that do not fit the tree.
+        ValueError: the blocks do not fit the tree.
     """
 
     def __init__(
@@ -67,7 +68,7 @@ class Factorization:
         self.worlds = max(operator.worlds for operator in (E_phi, H, M, *([Delta] if Delta else [])))
         self.device, self.dtype = E_phi.device, E_phi.dtype
 
-        packed = store or (lambda scalars: new_weights(self.worlds, scalars, self.dtype, self.device))
+        weights_for = store or (lambda scalars: new_weights(self.worlds, scalars, self.dtype, self.device))
 
         N, dofs, kind = E_phi.shape[0], H.shape[0], E_phi.kind
         if Delta is None:
@@ -76,13 +77,13 @@ class Factorization:
         _check_places("Delta", Delta, pivot_places)
         self.E_phi, self.H, self.M, self.Delta = E_phi, H, M, Delta
         self.phi = E_phi.resolvent()
-        self.P = Blocks((N, N), M.places, packed(M.stored.shape[1]), M.offsets, kind)
-        self.D = Blocks((dofs, dofs), pivot_places, packed(Delta.stored.shape[1]), Delta.offsets, kind)
-        self.D_inverse = Blocks((dofs, dofs), pivot_places, packed(Delta.stored.shape[1]), Delta.offsets, kind)
+        self.P = Blocks((N, N), M.places, weights_for(M.stored.shape[1]), M.offsets, kind)
+        self.D = Blocks((dofs, dofs), pivot_places, weights_for(Delta.stored.shape[1]), Delta.offsets, kind)
+        self.D_inverse = Blocks((dofs, dofs), pivot_places, weights_for(Delta.stored.shape[1]), Delta.offsets, kind)
         gain_places = [(E_phi.starts[k], row[k], m[k], r[k]) for k in nodes]
-        self.G = Blocks((N, dofs), gain_places, packed(H.stored.shape[1]), H.offsets, kind)
+        self.G = Blocks((N, dofs), gain_places, weights_for(H.stored.shape[1]), H.offsets, kind)
         self.K = E_phi @ self.G
-        self.E_psi = BWA.packed(tree, m, packed(E_phi.stored.shape[1]), E_phi.offsets, kind)
+        self.E_psi = BWA.packed(tree, m, weights_for(E_phi.stored.shape[1]), E_phi.offsets, kind)
         self.psi = self.E_psi.resolvent()
 
         offset_of = dict(zip((child for _, child in tree.edges), E_phi.offsets, strict=True))
@@ -96,12 +97,12 @@ class Factorization:
             pivot=Delta.offsets,
             device=self.device,
         )
-        self._scratch = [packed(op.stored.shape[1]) for op in (H, Delta, E_phi)]
+        self._scratch = [weights_for(op.stored.shape[1]) for op in (H, Delta, E_phi)]
         if store is None:
             self.update()
 
     def update(self) -> None:
-        """Compute P, D, G and E_psi anew; launches only."""
+        """Compute P, D, G and E_psi again, by launches alone."""
         inputs = [
             broadcast_worlds(weights_array(op.stored), 0, self.worlds)
             for op in (self.E_phi, self.H, self.M, self.Delta)
@@ -120,7 +121,7 @@ class Factorization:
 
 
 def block_tables(tree: Tree, device: wp.Device, **tables) -> kernels.BlockTables:
-    """The tables of a tree's blocks on the device; see :mod:`warp_spo.kernels.factorization`."""
+    """Return the tables of a tree's blocks on the device; see :mod:`warp_spo.kernels.factorization`."""
     tables["order"] = [node for level in tree.levels for node in level]
     tables["parent"] = tree.parent
     tables["child_start"] = np.cumsum([0] + [len(children) for children in tree.children])
@@ -131,7 +132,8 @@ def block_tables(tree: Tree, device: wp.Device, **tables) -> kernels.BlockTables
     return struct
 
 
-def _check_places(name: str, operator: Blocks, expected: list) -> None:
+def _check_places(name: str, operator: Blocks, expected: list[tuple[int, int, int, int]]) -> None:
+    """Raise ValueError if a block is not at its expected place."""
     for node, (came, wanted) in enumerate(zip(operator.places, expected, strict=True)):
         if tuple(came) != tuple(wanted):
             raise ValueError(

@@ -1,20 +1,21 @@
 """The paper's graph layer: the block-weighted adjacency E of a graph and its resolvent A = (I - E)^-1.
 
-``E = sum e_p w(p, k) e_k*`` over the edges, parent p, child k (Jain, eq. 4); ``A = I + E + E^2 + ...`` (eq. 9), a sum
-that ends, because without directed loops E is nilpotent (Lemma 2). A is never formed: ``A @ x`` sweeps from the tips to
-the roots, ``A.T @ x`` from the roots to the tips, one launch a level.
+``E = sum e_p w(p, k) e_k*`` over the edges, parent p, child k (Jain, eq. 4). ``A = I + E + E^2 + ...`` (eq. 9) is a
+finite sum, because E is nilpotent without directed loops (Lemma 2). A is never formed: ``A @ x`` sweeps from the tips
+to the roots, ``A.T @ x`` from the roots to the tips, with one launch a level.
 """
 
 import functools
 from collections.abc import Sequence
 from itertools import accumulate
+from typing import Any
 
 import warp as wp
 
 from ..arrays import WARP
 from ..errors import as_integer
 from ..scene.tree import Digraph, Tree
-from .algebra import Identity, Operator, Product, Scaled, Sum, Transpose, add_scaled
+from .algebra import Identity, Operator, Product, Scaled, Sum, Transpose, Workspace, add_scaled
 from .blocks import Blocks, DeferredWeights, Table, choose_memory, matrix_size, pack, place_offsets, weights_array
 
 __all__ = ["BWA", "Blocks", "Identity", "Operator", "Product", "Resolvent", "Scaled", "Sum", "Transpose"]
@@ -27,18 +28,18 @@ class BWA(Operator):
 
     Args:
         graph: a Tree, with one weight a node, None for the roots; or a Digraph, with one weight an edge.
-        weights: weight k maps the child's vector to the parent's: [world, m_parent, m_child] or [m_parent, m_child];
-            torch, Warp or NumPy. They are copied. Weights without a world axis are shared by all worlds.
-        dims: size m of each node; may be left out where the weights tell it.
-        device, dtype: those of the weights unless given; NumPy: the CPU.
+        weights: weight k maps the child's vector to the parent's. It is [world, m_parent, m_child], or
+            [m_parent, m_child] for all worlds; torch, Warp or NumPy. The weights are copied.
+        dims: the size m of each node; not needed for nodes whose size a weight shows.
+        device, dtype: by default those of the weights; the CPU for NumPy weights.
 
     Attributes:
-        graph, dims: as given.
-        starts: where each node begins in a vector; one more entry for the end.
-        offsets: first scalar of each edge's block in ``weights``, in the order of ``graph.edges``.
+        graph, dims: the graph, and the size of each node.
+        starts: the first entry of each node in a vector, and the length of a vector.
+        offsets: the first scalar of each edge's block in ``weights``, in the order of ``graph.edges``.
 
     Raises:
-        ValueError, TypeError: a weight that is missing, or that does not fit its nodes.
+        ValueError, TypeError: a weight is missing or does not fit its nodes.
     """
 
     def __init__(
@@ -49,7 +50,7 @@ class BWA(Operator):
         sizes = [matrix_size("BWA", label, weight) for label, weight in zip(labels, given, strict=True)]
         dims = _node_dims(graph, labels, sizes, dims)
         packed = pack("BWA", labels, given, sizes, device, dtype)
-        self._set(graph, dims, packed, None, kind)
+        self._initialise(graph, dims, packed, None, kind)
 
     @classmethod
     def packed(
@@ -60,21 +61,29 @@ class BWA(Operator):
         offsets: Sequence[int] | None = None,
         kind: str | None = WARP,
     ) -> "BWA":
-        """Return E over weights that lie on the device already and may be rewritten there.
+        """Return E with weights that already lie on the device, and may be rewritten there.
 
         Args:
-            graph, dims: as above; dims is needed.
-            weights: [world or 1, scalar], any strides; kept, not copied.
-            offsets: first scalar of each edge's block, in the order of ``graph.edges``; one after the other unless
-                given.
-            kind: kind of array that :meth:`dense` returns.
+            graph, dims: as those of the class; dims is required.
+            weights: [world or 1, scalar] with any strides; the operator keeps them without a copy.
+            offsets: the first scalar of each edge's block, in the order of ``graph.edges``; by default the blocks lie
+                one after the other.
+            kind: the kind of array that :meth:`dense` returns.
         """
         _edge_weights(graph, None)
         self = cls.__new__(cls)
-        self._set(graph, _node_dims(graph, [], [], dims), weights, offsets, kind)
+        self._initialise(graph, _node_dims(graph, [], [], dims), weights, offsets, kind)
         return self
 
-    def _set(self, graph, dims, weights, offsets, kind):
+    def _initialise(
+        self,
+        graph: Tree | Digraph,
+        dims: tuple[int, ...],
+        weights: Any,
+        offsets: Sequence[int] | None,
+        kind: str | None,
+    ) -> None:
+        """Set the attributes and build the tables of the sweeps."""
         sizes = [(dims[parent], dims[child]) for parent, child in graph.edges]
         self.graph = graph
         self.dims = dims
@@ -92,30 +101,33 @@ class BWA(Operator):
 
     @property
     def weights(self) -> wp.array:
-        """[world or 1, scalar], the blocks row-major, up to date."""
+        """The blocks, row-major, [world or 1, scalar], up to date."""
         self._fill()
         return weights_array(self.stored)
 
-    def _rows(self, node):
+    def _rows(self, node: int) -> range:
         return range(self.starts[node], self.starts[node + 1])
 
-    def _apply(self, x, out, alpha, accumulate, space):
+    def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         self._up.gather(weights_array(self.stored), x, out, alpha, accumulate)
 
-    def _apply_transposed(self, x, out, alpha, accumulate, space):
+    def _apply_transposed(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         self._down.gather(weights_array(self.stored), x, out, alpha, accumulate)
 
     def resolvent(self) -> "Resolvent":
-        """A = (I - E)^-1."""
+        """Return A = (I - E)^-1."""
         return Resolvent(self)
 
     def power(self, exponent: int) -> Operator:
-        """E^exponent: blocks are products of weights along the paths of that length (Lemma 1). 0 gives the identity."""
+        """Return E^exponent, whose blocks are sums over paths of that length of products of weights (Lemma 1).
+
+        Exponent 0 gives the identity.
+        """
         count = as_integer(exponent)
         if count is None or count < 0:
             raise ValueError(
-                f"BWA.power: exponent is {exponent!r}; expected 0 or more, an integer; E has no inverse, its resolvent "
-                "has"
+                f"BWA.power: exponent is {exponent!r}; expected an integer, 0 or more; E has no inverse, "
+                "but its resolvent has one, E.resolvent().inverse"
             )
         if count == 0:
             return Identity(self.shape[0], self.device, self.dtype, self.kind)
@@ -124,13 +136,14 @@ class BWA(Operator):
 
 
 class Resolvent(Operator):
-    """A = (I - E)^-1 by sweeps; ``A(i, j)`` is the sum over all paths from i to j of the products of weights.
+    """A = (I - E)^-1, applied by sweeps; ``A(i, j)`` is the sum over all paths from i to j of products of weights.
 
-    Up, for A: ``y(k) = x(k) + sum of w(k, j) y(j)`` over the children j. Down, for A.T: ``y(k) = x(k) + sum of
-    w(p, k)* y(p)`` over the parents p. O(nodes), one launch a level.
+    A sweeps inward: ``y(k) = x(k) + sum of w(k, j) y(j)`` over the children j. A.T sweeps outward: ``y(k) = x(k) + sum
+        of
+    w(p, k)* y(p)`` over the parents p. A sweep is O(nodes), with one launch a level.
 
     Attributes:
-        E: the adjacency it belongs to (eq. 10).
+        E: the adjacency (eq. 10).
     """
 
     def __init__(self, E: BWA):
@@ -138,13 +151,15 @@ class Resolvent(Operator):
         self.E = E
         self.form, self.operands = ("resolvent",), (E,)
 
-    def _apply(self, x, out, alpha, accumulate, space):
+    def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         self._sweep(self.E._up, x, out, alpha, accumulate, space)
 
-    def _apply_transposed(self, x, out, alpha, accumulate, space):
+    def _apply_transposed(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         self._sweep(self.E._down, x, out, alpha, accumulate, space)
 
-    def _sweep(self, table, x, out, alpha, accumulate, space):
+    def _sweep(
+        self, table: Table, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace
+    ) -> None:
         # The sweep reads what it has written, so it cannot run on top of other terms of a sum.
         y = space.take(self, self.shape[0]) if accumulate else out
         table.sweep(weights_array(self.E.stored), x, y, alpha)
@@ -153,12 +168,12 @@ class Resolvent(Operator):
 
     @functools.cached_property
     def strict(self) -> Operator:
-        """A - I = E A = A E (eq. 13), without the cancellation of the difference."""
+        """A - I = E A = A E (eq. 13), computed as a product, in which nothing cancels."""
         return Product(self.E, self)
 
     @functools.cached_property
     def inverse(self) -> Operator:
-        """I - E; no sweep."""
+        """I - E, the inverse of A; it needs no sweep."""
         return Sum(Identity(self.shape[0], self.device, self.dtype), Scaled(-1.0, self.E))
 
     def block(self, i: int, j: int):
@@ -173,7 +188,7 @@ class Resolvent(Operator):
 
 
 def _edge_weights(graph, weights) -> tuple[list[str], list]:
-    """The names and weights of the edges, in the order of ``graph.edges``."""
+    """Return the names and weights of the edges, in the order of ``graph.edges``."""
     if not isinstance(graph, Tree | Digraph):
         raise TypeError(f"BWA: graph is of type {type(graph).__name__}; expected a Tree or a Digraph")
     if weights is None:
@@ -191,12 +206,12 @@ def _edge_weights(graph, weights) -> tuple[list[str], list]:
                 f"BWA: weights[{index}] is None; expected [world, m_parent, m_child]; only roots have none"
             )
         if weight is not None and index not in weighted:
-            raise ValueError(f"BWA: weights[{index}] is given, but node {index} is a root; expected None")
+            raise ValueError(f"BWA: weights[{index}] is an array, but node {index} is a root; expected None")
     return [f"weights[{index}]" for index in children], [weights[index] for index in children]
 
 
 def _node_dims(graph, labels, sizes, dims) -> tuple[int, ...]:
-    """The size of every node, from ``dims`` or from the sizes of the weights."""
+    """Return the size of every node, from ``dims`` or from the sizes of the weights."""
     found = {}
     if dims is not None:
         if len(dims) != graph.node_count:
