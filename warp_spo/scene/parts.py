@@ -101,9 +101,8 @@ class Body:
 
     The largest principal moment of inertia may exceed the sum of the others, although no distribution of positive mass
     has such an inertia: it is common in robot files, and the mass matrix stays positive definite. Values that would
-        make a
-    kinetic energy negative are refused. ``spo.load`` reads files through Newton, which repairs such inertias, and names
-    the bodies.
+    make a kinetic energy negative are refused. ``spo.load`` reads files through Newton, which repairs such inertias,
+    and names the bodies.
 
     Args:
         mass: [kg], not negative.
