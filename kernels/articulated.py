@@ -53,8 +53,8 @@ def factor(s) -> wp.Kernel:
             dof = first + count - 1 - e
             h = s.load_motion(axis, dof, world)
             size = pivot_out[dof, world]
-            found = s.eliminate(P, h, armature[dof, world], least * size)
-            P, U, D = found[0:21], found[21:27], found[27]
+            result = s.eliminate(P, h, armature[dof, world], least * size)
+            P, U, D = result[0:21], result[21:27], result[27]
             s.store_motion(gain_out, dof, world, U)
             pivot_out[dof, world] = D
             for other in range(first, dof):
@@ -111,9 +111,9 @@ def eliminate(s) -> wp.Kernel:
             elif identity and dof == column:
                 right = T(1.0)
             h, U = s.load_motion(axis, dof, world), s.load_motion(gain, dof, world)
-            found = s.eliminate_force(h, U, pivot[dof, world], z, right)
-            z = found[1:7]
-            out[world, dof, column] = found[0]
+            result = s.eliminate_force(h, U, pivot[dof, world], z, right)
+            z = result[1:7]
+            out[world, dof, column] = result[0]
         if topology.parent[node] >= 0:
             s.store_motion(z_out, node, lane, s.force_to_parent(s.load_pose(pose, node, world), z))
 
@@ -154,9 +154,9 @@ def back_substitute(s) -> wp.Kernel:
         first = topology.qd_start[node]
         for dof in range(first, first + topology.dof_count[node]):
             h, U = s.load_motion(axis, dof, world), s.load_motion(gain, dof, world)
-            found = s.back_substitute(h, U, pivot[dof, world], alpha, out[world, dof, column])
-            alpha = found[1:7]
-            out[world, dof, column] = found[0]
+            result = s.back_substitute(h, U, pivot[dof, world], alpha, out[world, dof, column])
+            alpha = result[1:7]
+            out[world, dof, column] = result[0]
         s.store_motion(alpha_out, node, lane, alpha)
 
     return kernel

@@ -70,16 +70,14 @@ class KernelLayout(NamedTuple):
 
     Attributes:
         rows: the arrays of the caller that the statements read, as ``name_row[i]``.
-        staged: the block first copies the rows of all its worlds to shared memory. Otherwise each thread reads the row
-            of its own world, which is faster for few worlds and for short rows.
+        staged: the block copies rows to shared memory; else each thread reads its row, faster for few or short rows.
         fields: the names of the arrays [entry, world] that the statements read, as ``FIELD(name, entry)``.
         result: how ``result_row[i]`` is written.
         messages: the number of scalars that the warps of a team send each other, as ``SENT(i)``.
         warps: the number of warps that work on 32 worlds.
         block: the number of threads in a block.
         further: further results, which the statements write as ``name_row[i]``.
-        further_staged: further results go to memory through shared memory, as rows. Otherwise, and if they are
-            integers, each entry goes to memory by itself.
+        further_staged: they go through shared memory, as rows; otherwise each entry, and always integers, by itself.
         retries: the statements run a second time, with ``again`` set, if they left ``farthest`` beyond the reach of the
             branch-free sine.
         cached: for each field, the entries that the threads copy to shared memory before the statements run. A compiler

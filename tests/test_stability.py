@@ -8,11 +8,11 @@ import warp_spo as spo
 from benchmarks import stability
 
 
-def test_stripped_keeps_damping_and_holds_mimics():
+def test_strip_urdf_keeps_damping_and_holds_mimics():
     text = """<robot name="r"><link name="a"><visual/><collision/><inertial/></link><link name="b"/><material/>
     <joint name="j" type="revolute"><dynamics damping="2"/></joint>
     <joint name="k" type="prismatic"><mimic joint="j"/></joint></robot>"""
-    out = stability.stripped(text)
+    out = stability.strip_urdf(text)
     assert 'damping="2"' in out and "<inertial" in out
     for word in ("visual", "collision", "mimic", "material", "prismatic"):
         assert word not in out

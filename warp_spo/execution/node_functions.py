@@ -101,8 +101,8 @@ NODE_FUNCTIONS: dict[str, tuple[Callable, dict[str, ArgumentKind]]] = {
         {"body": RIGID, "v": MOVING, "alpha": PARTS},
     ),
     "wrench": (
-        lambda pose, com, given: newton_euler.wrench(pose.rotation, com, *given),
-        {"pose": PLACE, "com": ARM, "given": PARTS},
+        lambda pose, com, external: newton_euler.wrench(pose.rotation, com, *external),
+        {"pose": PLACE, "com": ARM, "external": PARTS},
     ),
     "force_to_parent": (lambda pose, f: pose.force_to_parent(*f), {"pose": PLACE, "f": PARTS}),
     "momentum": (lambda body, v: body.apply(*v), {"body": RIGID, "v": PARTS}),

@@ -6,15 +6,20 @@ of :class:`Dynamics` with the same name; an absent argument is None.
 
 from __future__ import annotations
 
-from typing import Any
-
 import warp as wp
 
 from ..kernels import articulated, kinematics
 from .sweeps import Sweeps
 
 
-def forward_dynamics(run: Sweeps, out: wp.array, q: Any, qd: Any = None, tau: Any = None, body_f: Any = None) -> None:
+def forward_dynamics(
+    run: Sweeps,
+    out: wp.array,
+    q: wp.array,
+    qd: wp.array | None = None,
+    tau: wp.array | None = None,
+    body_f: wp.array | None = None,
+) -> None:
     run.hinges(q, qd)
     force = None
     if qd is not None or body_f is not None:
@@ -26,7 +31,13 @@ def forward_dynamics(run: Sweeps, out: wp.array, q: Any, qd: Any = None, tau: An
 
 
 def inverse_dynamics(
-    run: Sweeps, out: wp.array, q: Any, qd: Any = None, qdd: Any = None, body_f: Any = None, gravity: bool = True
+    run: Sweeps,
+    out: wp.array,
+    q: wp.array,
+    qd: wp.array | None = None,
+    qdd: wp.array | None = None,
+    body_f: wp.array | None = None,
+    gravity: bool = True,
 ) -> None:
     run.hinges(q, qd)
     force = run.body_forces(*run.accelerations(qdd, qd is not None, gravity), body_f)

@@ -6,8 +6,7 @@ The choice depends on which of them have room in shared memory.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Hashable, Mapping, Sequence
 
 from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import (
@@ -142,7 +141,7 @@ def arrange_stores(stores: list[Store], result: Result) -> tuple[list[Store], li
     """
     out = result.array
     if result.way in (*BY_TABLE, TILED):
-        slots: dict[Any, int] = {}
+        slots: dict[Hashable, int] = {}
         table = [-1] * out.entries
         for item in stores:
             if not _is_zero(item.value):
@@ -167,7 +166,7 @@ def _is_zero(value: Value) -> bool:
     return is_constant(value) and value == 0.0
 
 
-def _identity(value: Value) -> Any:
+def _identity(value: Value) -> Hashable:
     """Return a key that is equal for equal values."""
     return value if is_constant(value) else (id(value.graph), value.key)
 

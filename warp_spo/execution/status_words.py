@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import warp as wp
 
 from ..kernels import declare
@@ -13,7 +11,14 @@ from .sweeps import Sweeps
 
 
 def write(
-    run: Sweeps, q: wp.array, qd: Any, tau: Any, body_f: Any, qdd: wp.array, status: wp.array, factored: bool
+    run: Sweeps,
+    q: wp.array,
+    qd: wp.array | None,
+    tau: wp.array | None,
+    body_f: wp.array | None,
+    qdd: wp.array,
+    status: wp.array,
+    factored: bool,
 ) -> None:
     """Write ``status`` [world] after forward dynamics, by one inward sweep and one launch over the worlds.
 

@@ -7,7 +7,7 @@ methods read them. The first use of a workspace array allocates it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,7 @@ class Sweeps:
         screw = np.column_stack([scene.dof_axis, scene.dof_angular, scene.dof_linear])
         self._screw: Any = wp.array(screw, dtype=dtype, device=device)
         self.parameters = Parameters(scene, self.topology, self.worlds, device, dtype, variable)
-        self._workspace: dict[Any, wp.array] = {}
+        self._workspace: dict[Hashable, wp.array] = {}
         self._frames: dict[tuple, tuple[wp.array, wp.array]] = {}
 
     def replace_values(self, scene: Scene) -> None:
@@ -63,21 +63,21 @@ class Sweeps:
         """The size of the workspace that the calls so far have allocated."""
         return sum(array.capacity for array in self._workspace.values())
 
-    def array(self, name: Any, *shape: int) -> wp.array:
+    def array(self, name: Hashable, *shape: int) -> wp.array:
         """Return the workspace array of this name; the first use gives its shape."""
         if name not in self._workspace:
             assert shape, f"Sweeps.array: the workspace array {name!r} is read before a sweep has written it"
             self._workspace[name] = wp.empty(shape, dtype=self.dtype, device=self.device)
         return self._workspace[name]
 
-    def _per_node(self, name: Any, components: int) -> wp.array:
+    def _per_node(self, name: Hashable, components: int) -> wp.array:
         return self.array(name, self.scene.body_count, components, self.worlds)
 
-    def launch(self, factory: Callable, dim: Any, inputs: list, outputs: list) -> None:
+    def launch(self, factory: Callable, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
         """Launch a kernel whose factory takes the scalar type."""
         wp.launch(factory(self.dtype), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
-    def launch_nodes(self, factory: Callable, dim: Any, inputs: list, outputs: list) -> None:
+    def launch_nodes(self, factory: Callable, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
         """Launch a kernel whose factory takes the node functions."""
         wp.launch(factory(self.functions), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
@@ -152,7 +152,9 @@ class Sweeps:
         self.launch_nodes(kinematics.jacobian, (len(frame_nodes), self.worlds), inputs, [out])
 
     # -- Newton-Euler ----------------------------------------------------------------------------------------------
-    def body_forces(self, acceleration: Any, velocity: Any, body_f: Any) -> wp.array:
+    def body_forces(
+        self, acceleration: wp.array | None, velocity: wp.array | None, body_f: wp.array | None
+    ) -> wp.array:
         """Return M alpha + crf(V) M V - (external wrench) of every node alone; an argument None is zero."""
         force = self._per_node("force", MOTION)
         world_pose = None if body_f is None else self.world_poses()
@@ -220,7 +222,15 @@ class Sweeps:
     def _factors(self) -> list[wp.array]:
         return [self.array(name) for name in ("pose", "axis", "gain", "pivot")]
 
-    def _eliminate(self, columns: tuple, force: Any, b: Any, identity: bool, work: wp.array, out: wp.array) -> None:
+    def _eliminate(
+        self,
+        columns: tuple[int, int],
+        force: wp.array | None,
+        b: wp.array | None,
+        identity: bool,
+        work: wp.array,
+        out: wp.array,
+    ) -> None:
         """Write D^-1 [I - H psi K] (b - H phi force) into ``out``."""
         inputs = [*self._factors, force, b, identity]
         self._sweep_columns(articulated.eliminate, self.plan.inward, columns, inputs, [work, out])

@@ -265,16 +265,16 @@ class Team:
             texts = {literal(value, self.dtype) for value in values}
             return texts.pop() if len(texts) == 1 else f"__ldg({tables}numbers + {constants.of(values)})"
 
-        def entry(found: tuple[tuple[str, int], ...]) -> str:
-            first = found[0][1]
-            distances = tuple(at - first for _, at in found)
+        def entry(places: tuple[tuple[str, int], ...]) -> str:
+            first = places[0][1]
+            distances = tuple(at - first for _, at in places)
             return f"{first} + {tables}shift[{shifts.of(distances)}]" if any(distances) else str(first)
 
         texts = []
         for listings in regions:
             names = [", ".join(dict.fromkeys(label)) for label in zip(*(x.labels for x in listings), strict=True)]
             numbers = [constant(values) for values in zip(*(x.constants for x in listings), strict=True)]
-            entries = [entry(found) for found in zip(*(x.indices for x in listings), strict=True)]
+            entries = [entry(places) for places in zip(*(x.indices for x in listings), strict=True)]
             texts.append(fill_in(listings[0], numbers, entries, names, prefix))
         head = []
         if constants.columns or shifts.columns:

@@ -45,11 +45,11 @@ class BWA(Operator):
     def __init__(
         self, graph: Tree | Digraph, weights: Sequence, dims: Sequence[int] | None = None, device=None, dtype=None
     ):
-        labels, given = _edge_weights(graph, weights)
-        device, dtype, kind = choose_memory("BWA", given, device, dtype)
-        sizes = [matrix_size("BWA", label, weight) for label, weight in zip(labels, given, strict=True)]
+        labels, arrays = _edge_weights(graph, weights)
+        device, dtype, kind = choose_memory("BWA", arrays, device, dtype)
+        sizes = [matrix_size("BWA", label, weight) for label, weight in zip(labels, arrays, strict=True)]
         dims = _node_dims(graph, labels, sizes, dims)
-        packed = pack("BWA", labels, given, sizes, device, dtype)
+        packed = pack("BWA", labels, arrays, sizes, device, dtype)
         self._initialise(graph, dims, packed, None, kind)
 
     @classmethod
@@ -212,7 +212,7 @@ def _edge_weights(graph, weights) -> tuple[list[str], list]:
 
 def _node_dims(graph, labels, sizes, dims) -> tuple[int, ...]:
     """Return the size of every node, from ``dims`` or from the sizes of the weights."""
-    found = {}
+    size_of: dict[int, tuple[int, str]] = {}
     if dims is not None:
         if len(dims) != graph.node_count:
             raise ValueError(f"BWA: {len(dims)} dims; expected {graph.node_count}, one a node")
@@ -220,16 +220,16 @@ def _node_dims(graph, labels, sizes, dims) -> tuple[int, ...]:
             number = as_integer(size)
             if number is None or number < 1:
                 raise ValueError(f"BWA: dims[{node}] is {size!r}; expected 1 or more, an integer")
-            found[node] = number, f"dims[{node}]"
+            size_of[node] = number, f"dims[{node}]"
     for edge, label, size in zip(graph.edges, labels, sizes, strict=False):
         for node, length, place in zip(edge, size, ("rows", "columns"), strict=True):
-            known, source = found.setdefault(node, (length, label))
+            known, source = size_of.setdefault(node, (length, label))
             if length != known or length < 1:
                 raise ValueError(
                     f"BWA: {label} has {length} {place}, which is the size of node {node}; expected {max(known, 1)} by "
                     f"{source}; a weight is [world, m_parent, m_child]"
                 )
-    missing = [node for node in range(graph.node_count) if node not in found]
+    missing = [node for node in range(graph.node_count) if node not in size_of]
     if missing:
         raise ValueError(f"BWA: no weight tells the size of nodes {missing}; expected dims=, the size of every node")
-    return tuple(found[node][0] for node in range(graph.node_count))
+    return tuple(size_of[node][0] for node in range(graph.node_count))

@@ -39,10 +39,10 @@ class Graph:
     def make(self, op: str, *args: Any) -> Scalar:
         """Return the scalar of an operation, without simplification; equal operations give the same scalar."""
         key = (op, *[a if a.__class__ is not Scalar else a.key for a in args])
-        found = self._known.get(key)
-        if found is None:
-            found = self._known[key] = Scalar(self, op, args, len(self._known))
-        return found
+        known = self._known.get(key)
+        if known is None:
+            known = self._known[key] = Scalar(self, op, args, len(self._known))
+        return known
 
 
 class Scalar:

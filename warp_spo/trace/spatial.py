@@ -102,8 +102,8 @@ def symmetric(xx: Value, yy: Value, zz: Value, xy: Value, xz: Value, yz: Value) 
 
 def upper(entry: Callable[[int, int], Value]) -> Matrix:
     """Return the symmetric matrix of ``entry(row, column)``, which is called for row <= column only."""
-    found = {(i, j): entry(i, j) for i in range(3) for j in range(i, 3)}
-    return Matrix.of([[found[min(i, j), max(i, j)] for j in range(3)] for i in range(3)])
+    entries = {(i, j): entry(i, j) for i in range(3) for j in range(i, 3)}
+    return Matrix.of([[entries[min(i, j), max(i, j)] for j in range(3)] for i in range(3)])
 
 
 class Rigid(NamedTuple):
