@@ -19,6 +19,7 @@ MAIN = "forward_dynamics"  # the operation of the README's picture
 ROBOTS = ("panda", "go2", "g1"), ("arm7", "quadruped", "humanoid")  # of that picture: those that peers have, or ours
 TITLES = {"panda": "Panda arm", "go2": "Go2 quadruped", "g1": "G1 humanoid", "arm7": "Arm", "humanoid": "Humanoid"}
 ON_CPU = ("Pinocchio", "MuJoCo C")  # libraries that have no GPU code
+SOLVE_ONLY = ("torch",)  # libraries that only solve, with mass matrix and bias force given
 GUIDE = "time in proportion to size"
 PANELS = {
     "worlds": ("worlds", "number of worlds", "Robots"),
@@ -167,8 +168,9 @@ def _library_name(row: dict) -> str:
     if not row.get("peer"):
         return "warp_spo"
     solver = next((name for name in ("Featherstone", "Steel") if name in row.get("variant", "")), "")
-    cpu = " (CPU)" if drawing.library(row["peer"]) in ON_CPU else ""
-    return f"{drawing.library(row['peer'])} {solver}".strip() + cpu
+    library = drawing.library(row["peer"])
+    note = " (CPU)" if library in ON_CPU else " (solve only)" if library in SOLVE_ONLY else ""
+    return f"{library} {solver}".strip() + note
 
 
 def _points(axes: Any, rows: Sequence[dict], names: Sequence[str]) -> None:
@@ -184,9 +186,10 @@ def _points(axes: Any, rows: Sequence[dict], names: Sequence[str]) -> None:
 
 
 def _speedup(axes: Any, rows: Sequence[dict]) -> None:
-    """Draw an arrow from ours to the fastest peer in float32, and how many times as long the peer takes."""
+    """Draw an arrow from ours to the fastest peer that does the same work in float32, and the ratio of their times."""
     ours = next((row for row in rows if not row.get("peer") and row["dtype"] == "float32"), None)
     peers = [row for row in rows if row.get("peer") and row["dtype"] == "float32"]
+    peers = [row for row in peers if drawing.library(row["peer"]) not in SOLVE_ONLY]
     if not ours or not peers:
         return
     other = min(peers, key=lambda row: row["us"])

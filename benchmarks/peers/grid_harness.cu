@@ -1,11 +1,12 @@
-// GRiD's generated kernels of one robot, timed as the benchmarks time everything: K evaluations in one CUDA graph, input
-// sets in turn, median of replays. Build: nvcc -DGRID_HEADER='"panda.cuh"' (grid.py gives the whole command).
+// Times GRiD's generated kernels of one robot as the benchmarks time ours: several evaluations in one CUDA graph, which
+// cycle through the sets of inputs; median of replays. Compile: nvcc -DGRID_HEADER='"panda.cuh"' (see grid.py).
 //
 //   grid_harness STATES RESULTS GRAVITY SECONDS WORLDS...     GRAVITY along z, -9.81 on Earth
 //
-// STATES: see exchange.py. Prints one JSON line a case; results go to RESULTS: a block for each set, each evaluated
-// into poisoned memory, then what the timed run left; of a block, the worlds of sample().
-// One block of threads a world; resource tier and threads a block are swept first, the fastest are timed and named.
+// The format of STATES is described in exchange.py. Each case prints one JSON line. RESULTS gets, for each case, a block
+// for each set of states, evaluated into memory filled with NaN, and a block with the results of the timed run. A block
+// has the worlds that sample() in coordinates.py chooses. Each world has one block of threads. All resource tiers and
+// numbers of threads are tried first, and the fastest combination is timed.
 #include GRID_HEADER
 
 #include <algorithm>
@@ -41,7 +42,7 @@ using Launch = std::function<bool(Config, const Set &, T *out, int worlds, cudaS
 struct Op {
   const char *name, *variant;
   int size;    // entries of a result in one world
-  int stride;  // as stored
+  int stride;  // entries of a result in one world as GRiD stores it
   bool tiers;
   Launch launch;
 };

@@ -1,11 +1,11 @@
-// Pinocchio's templated algorithms, one core and all, without Python: the model is built from numbers, states come from a
-// file. Build: g++ -O3 -fopenmp -DSCALAR=double (pinocchio_cpu.py gives the whole command); headers only, minutes.
+// Times Pinocchio's templated algorithms on one core and on all cores, without Python. The model and the states come from
+// files. Compile with g++ -O3 -fopenmp -DSCALAR=double (pinocchio_cpu.py has the whole command); this takes minutes.
 //
 //   pinocchio_harness MODEL STATES RESULTS SECONDS WORLDS...
 //
-// MODEL and STATES: see exchange.py. Prints one JSON line a case; results go to RESULTS:
-// a block for each set, each evaluated into poisoned memory, then what the timed run left; of a block, the worlds of
-// sample().
+// The formats of MODEL and STATES are described in exchange.py. Each case prints one JSON line. RESULTS gets, for each case,
+// a block for each set of states, evaluated into memory filled with NaN, and a block with the results of the timed run. A
+// block has the worlds that sample() in coordinates.py chooses.
 #include <omp.h>
 
 #include <algorithm>
@@ -50,7 +50,7 @@ static Model read_model(const char *path) {
   FILE *file = std::fopen(path, "rb");
   int32_t links;
   double gravity[3];
-  if (!file || std::fread(&links, 4, 1, file) != 1 || std::fread(gravity, 8, 3, file) != 3) fail("no model");
+  if (!file || std::fread(&links, 4, 1, file) != 1 || std::fread(gravity, 8, 3, file) != 3) fail("there is no file of a model");
   Model model;
   auto vector = [](double *x) -> Eigen::Matrix<T, 3, 1> { return Eigen::Map<Eigen::Vector3d>(x).cast<T>(); };
   auto matrix = [](double *x) -> Eigen::Matrix<T, 3, 3> {
@@ -83,7 +83,7 @@ struct Bench {
 
   void run(FILE *file, FILE *results, int count, int nq, double seconds, const std::vector<int> &worlds_list) {
     const int nv = model.nv;
-    if (nq != model.nq) fail("states that are not this robot's");
+    if (nq != model.nq) fail("the files are missing, or the states belong to another robot or precision");
     auto read = [&](int n) {
       std::vector<T> values(size_t(all) * n);
       if (std::fread(values.data(), sizeof(T), values.size(), file) != values.size()) fail("short states");
@@ -151,7 +151,7 @@ struct Bench {
           return std::chrono::duration<double, std::micro>(clock::now() - begin).count() / (rounds * sets.size());
         };
         const double once = std::max(row(1), 0.01);
-        // a row lasts a twentieth of the time, and there are 5 rows at least
+        // One repeat takes a twentieth of the time; there are at least 5 repeats.
         const int rounds = std::max(1, int(seconds * 1e6 / 20 / (once * sets.size())));
         const int repeats = std::clamp(int(seconds * 1e6 / (once * sets.size() * rounds)), 5, 20);
         poison();
@@ -177,7 +177,7 @@ int main(int argc, char **argv) {
   FILE *file = std::fopen(argv[2], "rb"), *results = std::fopen(argv[3], "wb");
   int32_t head[5];  // bytes of a number, sets, worlds, nq, nv
   if (!file || !results || std::fread(head, 4, 5, file) != 5 || head[0] != sizeof(T) ||
-      head[4] != model.nv) fail("states that are not this robot's");
+      head[4] != model.nv) fail("the files are missing, or the states belong to another robot or precision");
   std::vector<int> worlds;
   for (int i = 5; i < argc; ++i) worlds.push_back(std::atoi(argv[i]));
   Bench bench{model, {}, head[2]};

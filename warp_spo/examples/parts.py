@@ -1,4 +1,4 @@
-"""What the examples share: bars, anchors, energy, and pictures."""
+"""Functions that several examples use: bars, poses, energy, and pictures."""
 
 import argparse
 import contextlib
@@ -9,33 +9,33 @@ import warp_spo as spo
 
 
 def bar(length, mass=1.0, axis=0, label=""):
-    """A bar from its body's origin along one of its axes, 0 to 2."""
+    """Return a uniform bar that starts at its body's origin, along axis 0, 1 or 2; length [m], mass [kg]."""
     com, inertia = np.zeros(3), np.full(3, mass * length**2 / 12.0)
     com[axis], inertia[axis] = 0.5 * length, 0.05 * inertia[axis]
     return spo.Body(mass, com, np.diag(inertia), label=label)
 
 
 def at(x=0.0, y=0.0, z=0.0, turn=(0.0, 0.0, 0.0, 1.0)):
-    """A pose: position [m], quaternion xyzw."""
+    """Return a pose: position [m], then quaternion xyzw."""
     return (x, y, z, *turn)
 
 
 def about(axis, angle):
-    """A quaternion xyzw."""
+    """Return the quaternion xyzw of a rotation about a unit axis by an angle [rad]."""
     return (*(np.sin(0.5 * angle) * np.asarray(axis, dtype=float)), np.cos(0.5 * angle))
 
 
 def energy(dyn, q, qd):
-    """Kinetic and potential energy [world] [J] of a scene whose loops are embedded."""
+    """Return the sum of kinetic and potential energy [world] [J] of a scene whose loops are embedded."""
     rates = qd[:, dyn.independent_dofs]
     kinetic = 0.5 * np.einsum("wi,wij,wj->w", rates, dyn.mass_matrix(q), rates)
     values, poses = dyn.scene.values, dyn.body_poses(q)
-    com = poses[..., :3] + turned(poses[..., 3:], values["body_com"])
+    com = poses[..., :3] + rotate(poses[..., 3:], values["body_com"])
     return kinetic - np.einsum("b,wbi,i->w", values["body_mass"][0], com, values["gravity"][0])
 
 
-def turned(quaternion, vector):
-    """``vector`` rotated by quaternions xyzw."""
+def rotate(quaternion, vector):
+    """Return ``vector`` rotated by quaternions xyzw."""
     u, w = quaternion[..., :3], quaternion[..., 3:]
     return vector + 2.0 * np.cross(u, np.cross(u, vector) + w * vector)
 

@@ -42,6 +42,7 @@ ANGLES = (0, 180, 90, 270, 45, 315, 135, 225, 20, 340, 160, 200, 65, 295, 115, 2
 REACHES = (6.0, 10.0, 16.0, 24.0, 34.0, 46.0, 60.0)  # distances of a name from its point [pt]
 TICKS = ((6.0, tuple(map(float, range(1, 10)))), (40.0, (1.0, 2.0, 5.0)), (400.0, (1.0, 3.0)))
 """Largest ratio of an axis' ends -> ticks of a decade; only powers of ten where the ratio is larger."""
+CLOSE = 6.0  # price of a place that is nearer to the point of another name, in points of distance
 LEADER = 15.0  # from this distance on a line joins a name and its point [pt]
 
 
@@ -57,7 +58,7 @@ class Point(NamedTuple):
 
 @contextlib.contextmanager
 def style() -> Iterator[None]:
-    """Context and decorator in which figures have the project's style."""
+    """Give figures the project's style; a context manager, which is a decorator too."""
     import matplotlib
 
     with matplotlib.rc_context(STYLE):
@@ -177,6 +178,8 @@ def label_points(
                 outside = mine[0] < frame.x0 or mine[1] < frame.y0 or mine[2] > frame.x1 or mine[3] > frame.y1
                 cost = sum(_overlap(mine, other) for other in taken) / scale**2 + 1e4 * outside
                 cost += 1.2 * reach + 0.3 * rank
+                own = _distance(mine, x, y)
+                cost += CLOSE * sum(_distance(mine, *other) < 1.3 * own for other in places if tuple(other) != (x, y))
                 if best is None or cost < best[0]:
                     best = cost, cx, cy, reach, mine
         assert best is not None
@@ -214,6 +217,11 @@ def _sign(value: float) -> float:
     return math.copysign(1.0, value)
 
 
+def _distance(box: Sequence[float], x: float, y: float) -> float:
+    """Return the distance of a point from a box (x0, y0, x1, y1)."""
+    return math.hypot(max(box[0] - x, 0.0, x - box[2]), max(box[1] - y, 0.0, y - box[3]))
+
+
 def _overlap(a: Sequence[float], b: Sequence[float]) -> float:
-    """Area that two boxes (x0, y0, x1, y1) share."""
+    """Return the area that two boxes (x0, y0, x1, y1) share."""
     return max(0.0, min(a[2], b[2]) - max(a[0], b[0])) * max(0.0, min(a[3], b[3]) - max(a[1], b[1]))
