@@ -145,8 +145,7 @@ def status_word(T) -> wp.Kernel:
     """Write the first word of NOT_FINITE, LOOPS, PIVOT that applies to a world; one thread for each world.
 
     NOT_FINITE: an input is not finite. LOOPS: a margin [world, n] is NaN or not above ``least``. PIVOT: the result is
-        not
-    finite for another reason.
+    not finite for another reason.
     """
 
     @wp.kernel(module=f"warp_spo_loops_{T.__name__}", enable_backward=False)

@@ -175,10 +175,9 @@ def status_word(s) -> wp.Kernel:
     """Write the first word of NOT_FINITE, PIVOT, RANGE, DIGITS that applies to a world; one thread for each world.
 
     NOT_FINITE: an input is not finite. PIVOT: the sweeps found a pivot that is not positive, or the result is not
-        finite
-    and D may consist of rounding errors, because another form of the recursion refuses other pivots. RANGE: D left the
-    normal range, the result overflows, or every entry of it is subnormal. DIGITS: D may have lost half of the digits of
-    T, lost > 2 eps^-1/2; measured errors are 0.02 to 0.8 of ``lost``.
+    finite and D may consist of rounding errors, because another form of the recursion refuses other pivots. RANGE: D
+    left the normal range, the result overflows, or every entry of it is subnormal. DIGITS: D may have lost half of the
+    digits of T, lost > 2 eps^-1/2; measured errors are 0.02 to 0.8 of ``lost``.
     """
     T = s.T
     most = T(2.0 * EPSILON[T] ** -0.5)

@@ -138,9 +138,8 @@ class BWA(Operator):
 class Resolvent(Operator):
     """A = (I - E)^-1, applied by sweeps; ``A(i, j)`` is the sum over all paths from i to j of products of weights.
 
-    A sweeps inward: ``y(k) = x(k) + sum of w(k, j) y(j)`` over the children j. A.T sweeps outward: ``y(k) = x(k) + sum
-        of
-    w(p, k)* y(p)`` over the parents p. A sweep is O(nodes), with one launch a level.
+    A sweeps inward: ``y(k) = x(k) + sum of w(k, j) y(j)`` over the children j. A.T sweeps outward:
+    ``y(k) = x(k) + sum of w(p, k)* y(p)`` over the parents p. A sweep is O(nodes), with one launch a level.
 
     Attributes:
         E: the adjacency (eq. 10).
