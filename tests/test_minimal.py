@@ -12,7 +12,7 @@ from closed_loops import traced
 from mechanisms import MECHANISMS, Closed
 
 import warp_spo as spo
-from warp_spo.dynamics import loops
+from warp_spo.dynamics import inertia
 from warp_spo.dynamics.embedding import Closing, embedding
 from warp_spo.recursions.loops import minimal
 
@@ -231,7 +231,7 @@ def test_solve_mass_matrix_with_several_columns(dtype, device):
     scene, how, s, closed = mechanisms.case("far_loop")
     dyn, size = spo.Dynamics(scene, 3, device=device, dtype=dtype, loops="embed"), len(how.dofs)
     q = wp.array(s.q, dtype=dyn.dtype, device=device)
-    for columns in (0, 1, loops.COLUMNS, 2 * loops.COLUMNS + 1):
+    for columns in (0, 1, inertia.COLUMNS, 2 * inertia.COLUMNS + 1):
         b = np.random.default_rng(columns).normal(size=(3, size, columns)).astype(dtype)
         on, out = (wp.array(x, dtype=dyn.dtype, device=device) for x in (b, np.full_like(b, np.nan)))
         dyn.prepare("solve_mass_matrix", columns=columns)
