@@ -22,7 +22,7 @@ EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
 NORMAL = {
     wp.float32: (2.0**-126, 2.0**127),
     wp.float64: (2.0**-1022, 2.0**1023),
-}  # the smallest normal number, and half of the largest power of two
+}  # the smallest normal number and the largest power of two
 
 
 @functools.cache
