@@ -1,5 +1,7 @@
 """Examples that draw: what they find, and that they stay short and do not need a GPU."""
 
+import importlib
+import inspect
 import subprocess
 import sys
 from pathlib import Path
@@ -7,12 +9,14 @@ from pathlib import Path
 import pytest
 from rendering import assert_is_whole
 
-from warp_spo.examples import floating_arm, identify, reach
+from warp_spo.examples import floating_arm, identify, parts, reach
+
+FOLDER = Path(parts.__file__).parent
 
 
 @pytest.mark.parametrize("module", [floating_arm, identify, reach])
 def test_is_short(module):
-    assert len(Path(module.__file__).read_text().splitlines()) < 80
+    assert len(Path(module.__file__).read_text().splitlines()) < 100
 
 
 def test_a_floating_arm_draws_its_circle(tmp_path):
@@ -33,6 +37,18 @@ def test_gradients_through_500_steps_bring_hands_to_targets(tmp_path):
     losses = reach.main(worlds=2, iterations=6, picture=tmp_path / "reach.png")
     assert losses[-1] < 0.4 * losses[0] and min(losses) == losses[-1]  # 0.23 here
     assert (tmp_path / "reach.png").stat().st_size > 10_000  # pictures need not be SVG
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in FOLDER.glob("[a-z]*.py") if path.stem != "parts"))
+def test_help_is_the_docstring_and_the_arguments(name, monkeypatch, capsys):
+    module = importlib.import_module(f"warp_spo.examples.{name}")
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    with pytest.raises(SystemExit) as end:
+        parts.command(module.main)
+    text = capsys.readouterr().out
+    assert end.value.code == 0 and f"python -m warp_spo.examples.{name}" in text
+    assert module.__doc__.strip() in text and "Later runs load them" in text
+    assert all(f"--{option} " in text for option in inspect.signature(module.main).parameters)
 
 
 def test_pictures_are_asked_for_by_name():

@@ -114,7 +114,7 @@ def test_a_biped_from_a_robot_file(tmp_path, device):
 @pytest.mark.parametrize("name", ["fourbar", "fivebar", "slider_crank", "stewart", "biped", "gripper"])
 def test_an_example_runs(name, capsys):
     module = importlib.import_module(f"warp_spo.examples.{name}")
-    assert len(open(module.__file__).read().splitlines()) < 60
+    assert len(open(module.__file__).read().splitlines()) < 100
     if name in ("fourbar", "stewart", "biped"):
         module.main(seconds=0.02)
     else:

@@ -1,1 +1,1 @@
-"""Small systems that show one thing each: ``python -m warp_spo.examples.fourbar``."""
+"""Small mechanisms, each of which shows one feature. Run one with ``python -m warp_spo.examples.fourbar``."""

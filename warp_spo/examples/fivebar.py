@@ -1,14 +1,19 @@
-"""A five-bar robot: two motors on the ground move one point, and hold the weight of all bars."""
+"""A five-bar robot: two motors on the ground move one point, the tip, and together hold the weight of all bars.
+
+``independent`` names the dofs that have motors, so forces and mass matrices are those of the motors.
+"""
 
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, bar
+from warp_spo.examples.parts import at, bar, command
 
-UPPER, LOWER, APART = 0.3, 0.5, 0.2  # [m]
+UPPER, LOWER, APART = 0.3, 0.5, 0.2  # lengths of the bars, and distance between the motors [m]
+MOTORS = ["left motor", "right motor"]
 
 
 def scene():
+    """Return the robot: two arms of two bars, and a loop joint that pins their ends together."""
     turn = dict(axis=(0, 1, 0))
     hinges = [
         spo.Hinge("revolute", -1, 0, label="left motor", **turn),
@@ -20,24 +25,32 @@ def scene():
     return spo.Scene([bar(UPPER), bar(LOWER), bar(UPPER), bar(LOWER)], hinges, loops=[tip])
 
 
-def closed(dyn):
-    """A configuration with the elbows out and the tip below the motors."""
-    return dyn.project(np.tile([2.4, -1.2, 0.74, 1.2], (dyn.worlds, 1)), iterations=10)
+def main(seconds=0.5, dt=1e-3):
+    dyn = spo.Dynamics(scene(), worlds=1, dtype="float64", loops="embed", independent=MOTORS)
 
+    # A guess with the elbows out and the tip below the motors, moved to the nearest state in which the loop is closed.
+    q = dyn.project(np.array([[2.4, -1.2, 0.74, 1.2]]), iterations=10)
+    qd, tau = np.zeros_like(q), np.zeros_like(q)
 
-def main():
-    dyn = spo.Dynamics(scene(), worlds=1, dtype="float64", loops="embed", independent=["left motor", "right motor"])
-    q, free = closed(dyn), dyn.independent_dofs
-    tau, qd = np.zeros_like(q), np.zeros_like(q)
-    tau[:, free] = dyn.gravity_force(q)
-    for dof in free:
-        print(f"{dyn.scene.dof_labels[dof]} holds the weight with {tau[0, dof]:.3f} N m")
-    print(f"accelerations then: {np.abs(dyn.forward_dynamics(q, qd, tau)).max():.1e} rad/s^2")
-    tau[:, free[0]] += 0.05
-    for _ in range(500):
-        q, qd = dyn.step(q, qd, tau, 1e-3)
-    print(f"pushed for 0.5 s: tip moves, open by {np.abs(dyn.closure_error(q)).max():.1e} m; q {np.round(q[0], 3)} rad")
+    # gravity_force() is the torque of the motors that holds the robot still; tau has an entry for every dof.
+    motors = dyn.independent_dofs
+    tau[:, motors] = dyn.gravity_force(q)
+    for dof in motors:
+        print(f"The {dyn.scene.dof_labels[dof]} holds its share of the weight with {tau[0, dof]:.3f} N m.")
+    rest = np.abs(dyn.forward_dynamics(q, qd, tau)).max()
+    print(f"With these torques the largest acceleration is {rest:.1e} rad/s^2.")
+
+    tau[:, motors[0]] += 0.05  # [N m]
+    before = q
+    for _ in range(round(seconds / dt)):
+        q, qd = dyn.step(q, qd, tau, dt)
+    turns = np.degrees(q - before)[0, motors]
+    print(
+        f"With 0.05 N m more at the left motor, it turns by {turns[0]:.1f} deg in {seconds} s, and the right motor "
+        f"turns by {turns[1]:.1f} deg."
+    )
+    print(f"The tip's loop is open by {np.abs(dyn.closure_error(q)).max():.1e} m.")
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -1,12 +1,16 @@
-"""A gripper: one motor, two fingers that mimic it, a knuckle that turns twice as far the other way."""
+"""A gripper whose single motor moves four hinges: couplings make fingers and finger tips follow.
+
+A coupling holds ``q[hinge] = ratio * q[reference] + offset``, like a mimic joint of a URDF file.
+"""
 
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, bar
+from warp_spo.examples.parts import at, bar, command
 
 
 def scene():
+    """Return a wrist, two fingers that slide, and a tip on each that turns."""
     slide, turn = dict(axis=(0, 1, 0)), dict(axis=(1, 0, 0))
     hinges = [
         spo.Hinge("revolute", -1, 0, axis=(0, 0, 1), armature=0.01, label="wrist"),
@@ -16,9 +20,9 @@ def scene():
         spo.Hinge("revolute", 2, 4, parent_pose=at(z=0.05), label="right tip", **turn),
     ]
     couplings = [
-        spo.Coupling(hinge=2, reference=1, ratio=-1.0),  # the right finger goes the other way
-        spo.Coupling(hinge=3, reference=1, ratio=10.0, offset=0.1),  # [rad/m]
-        spo.Coupling(hinge=4, reference=3, ratio=-1.0),
+        spo.Coupling(hinge=2, reference=1, ratio=-1.0),  # the right finger slides the other way
+        spo.Coupling(hinge=3, reference=1, ratio=10.0, offset=0.1),  # the left tip turns by 10 rad/m, from 0.1 rad on
+        spo.Coupling(hinge=4, reference=3, ratio=-1.0),  # the right tip mirrors the left one
     ]
     bodies = [bar(0.1, 0.5, axis=2)] + [bar(0.05, 0.1, axis=2) for _ in range(4)]
     return spo.Scene(bodies, hinges, couplings=couplings)
@@ -27,14 +31,24 @@ def scene():
 def main():
     dyn = spo.Dynamics(scene(), worlds=2, dtype="float64", loops="embed")
     names = [dyn.scene.dof_labels[dof] for dof in dyn.independent_dofs]
-    print(f"{dyn.scene.dof_count} dofs, {len(names)} independent: {', '.join(names)}")
+    print(f"The gripper has {dyn.scene.dof_count} dofs, {len(names)} independent: {', '.join(names)}.")
+
+    # project() fills in the coordinates that follow; hold=True keeps the independent ones.
     q = dyn.project(np.array([[0.0, 0.02, 0, 0, 0], [0.5, 0.04, 0, 0, 0]]), hold=True)
-    print(f"left finger at {q[:, 1]} m: all are at\n{np.round(q, 4)}")
+    for world in q:
+        right, left_tip, right_tip = world[2:]
+        print(
+            f"With the left finger at {1e3 * world[1]:.0f} mm, the right finger is at {1e3 * right:.0f} mm, and "
+            f"the tips are at {left_tip:.1f} rad and {right_tip:.1f} rad."
+        )
+
     tau = np.zeros_like(q)
-    tau[:, 1] = 1.0  # the motor alone
-    print(f"1 N on the motor accelerates them by\n{np.round(dyn.forward_dynamics(q, None, tau), 3)}")
-    print(f"the inertia of both independent dofs is\n{np.round(dyn.mass_matrix(q)[0], 5)}")
+    tau[:, 1] = 1.0  # [N], of the motor at the left finger alone
+    qdd = dyn.forward_dynamics(q, None, tau)[0]
+    print(f"1 N of the motor accelerates the left finger by {qdd[1]:.3f} m/s^2 and its tip by {qdd[3]:.3f} rad/s^2.")
+    wrist, finger = np.diagonal(dyn.mass_matrix(q)[0])
+    print(f"The motor feels a mass of {finger:.3f} kg, tips included; the wrist feels {wrist:.5f} kg m^2.")
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

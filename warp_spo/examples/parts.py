@@ -1,32 +1,36 @@
-"""Functions that several examples use: bars, poses, energy, and pictures."""
+"""Functions that the examples share: bars, poses, energy, the command line, and pictures."""
 
 import argparse
 import contextlib
+import inspect
+import sys
 
 import numpy as np
+import warp as wp
 
 import warp_spo as spo
 
 
 def bar(length, mass=1.0, axis=0, label=""):
-    """Return a uniform bar that starts at its body's origin, along axis 0, 1 or 2; length [m], mass [kg]."""
+    """Return a thin bar that starts at the body's origin: length [m], mass [kg], direction as axis 0, 1 or 2."""
     com, inertia = np.zeros(3), np.full(3, mass * length**2 / 12.0)
     com[axis], inertia[axis] = 0.5 * length, 0.05 * inertia[axis]
     return spo.Body(mass, com, np.diag(inertia), label=label)
 
 
 def at(x=0.0, y=0.0, z=0.0, turn=(0.0, 0.0, 0.0, 1.0)):
-    """Return a pose: position [m], then quaternion xyzw."""
+    """Return a pose: a position [m] and a quaternion xyzw."""
     return (x, y, z, *turn)
 
 
 def about(axis, angle):
-    """Return the quaternion xyzw of a rotation about a unit axis by an angle [rad]."""
+    """Return the quaternion xyzw of a rotation by ``angle`` [rad] about a unit vector."""
     return (*(np.sin(0.5 * angle) * np.asarray(axis, dtype=float)), np.cos(0.5 * angle))
 
 
 def energy(dyn, q, qd):
-    """Return the sum of kinetic and potential energy [world] [J] of a scene whose loops are embedded."""
+    """Return kinetic plus potential energy [world] [J]. The loops of the scene must be embedded."""
+    # An embedded mass matrix is that of the independent dofs: their velocities give the whole kinetic energy.
     rates = qd[:, dyn.independent_dofs]
     kinetic = 0.5 * np.einsum("wi,wij,wj->w", rates, dyn.mass_matrix(q), rates)
     values, poses = dyn.scene.values, dyn.body_poses(q)
@@ -34,17 +38,44 @@ def energy(dyn, q, qd):
     return kinetic - np.einsum("b,wbi,i->w", values["body_mass"][0], com, values["gravity"][0])
 
 
-def rotate(quaternion, vector):
+def turned(quaternion, vector):
     """Return ``vector`` rotated by quaternions xyzw."""
     u, w = quaternion[..., :3], quaternion[..., 3:]
     return vector + 2.0 * np.cross(u, np.cross(u, vector) + w * vector)
 
 
 def command(main):
-    """Run an example from the command line; ``--picture FILE`` has it draw."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--picture", metavar="FILE", help="draw what happened, as .png, .svg or .pdf; needs matplotlib")
-    main(picture=parser.parse_args().picture)
+    """Run ``main`` of an example from the command line. Its arguments are options, its module's docstring the help."""
+    module = sys.modules[main.__module__]
+    parser = argparse.ArgumentParser(
+        prog=f"python -m {module.__spec__.name}",
+        description=module.__doc__,
+        epilog="The first run compiles kernels, which takes up to a minute. Later runs load them from Warp's cache.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    for name, parameter in inspect.signature(main).parameters.items():
+        if name == "picture":
+            parser.add_argument("--picture", metavar="FILE", help="draw the result as .png, .svg or .pdf (matplotlib)")
+        else:
+            kind, text = type(parameter.default), f"{OPTIONS[name]}; default: {parameter.default}"
+            parser.add_argument(f"--{name}", type=kind, default=parameter.default, metavar="N", help=text)
+    options = vars(parser.parse_args())
+    wp.config.log_level = wp.LOG_WARNING  # the example's sentences are all that is printed
+    main(**options)
+
+
+OPTIONS = {
+    "seconds": "simulated time [s]",
+    "dt": "time step [s]",
+    "worlds": "number of worlds",
+    "steps": "number of time steps",
+    "samples": "number of samples",
+    "iterations": "number of iterations",
+    "angles": "number of crank angles",
+    "speed": "speed of the crank [rad/s]",
+    "noise": "measurement noise, as a multiple of that of good encoders",
+    "seed": "seed of the random numbers",
+}
 
 
 @contextlib.contextmanager

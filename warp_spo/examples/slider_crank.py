@@ -1,14 +1,18 @@
-"""A slider-crank at constant speed: the torque that it takes over a turn, dead points included."""
+"""A slider-crank at constant speed: the torque that the crank needs over a turn, dead points included.
+
+Every world is one crank angle, so the whole turn is one call of inverse dynamics.
+"""
 
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, bar
+from warp_spo.examples.parts import at, bar, command
 
-CRANK, ROD = 0.1, 0.3  # [m]
+CRANK, ROD = 0.1, 0.3  # lengths [m]
 
 
 def scene():
+    """Return crank, rod and piston without gravity. A loop joint pins the rod's end to the piston."""
     hinges = [
         spo.Hinge("revolute", -1, 0, axis=(0, 1, 0), label="crank"),
         spo.Hinge("revolute", 0, 1, axis=(0, 1, 0), parent_pose=at(CRANK), label="rod"),
@@ -19,17 +23,26 @@ def scene():
 
 
 def main(speed=100.0, angles=24):
+    # The crank is the independent dof. The piston could not be one: at the dead points it stands still while the crank
+    # turns.
     dyn = spo.Dynamics(scene(), worlds=angles, dtype="float64", loops="embed", independent=["crank"])
+
+    # project() with hold=True keeps angle and speed of the crank, and moves rod and piston so that the loop is closed.
     crank = np.linspace(0.0, 2.0 * np.pi, angles, endpoint=False)
     q = np.stack([crank, -crank, CRANK * np.cos(crank) + ROD], axis=1)
     qd = np.tile([speed, 0.0, 0.0], (angles, 1))
-    q, qd = dyn.project(q, qd, hold=True, iterations=8)  # the crank stays, rod and piston follow
-    torque = dyn.inverse_dynamics(q, qd)  # of the crank, at constant speed
+    q, qd = dyn.project(q, qd, hold=True, iterations=8)
+
+    torque = dyn.inverse_dynamics(q, qd)  # without qdd: the crank's acceleration is zero
     for i in range(0, angles, 3):
-        print(f"crank {np.degrees(crank[i]):5.1f} deg: piston at {q[i, 2]:.4f} m, torque {torque[i, 0]:8.2f} N m")
+        print(
+            f"At {np.degrees(crank[i]):3.0f} deg the piston is at {1e3 * q[i, 2]:5.1f} mm, and the crank needs "
+            f"{round(torque[i, 0], 2) + 0.0:6.2f} N m to keep {speed:g} rad/s."
+        )
     exact = CRANK * np.cos(crank) + np.sqrt(ROD**2 - (CRANK * np.sin(crank)) ** 2)
-    print(f"piston against its closed form: {np.abs(q[:, 2] - exact).max():.1e} m; mean torque {torque.mean():.1e} N m")
+    print(f"The piston's position differs from its closed form by {np.abs(q[:, 2] - exact).max():.1e} m at most.")
+    print(f"The mean torque over a turn is {torque.mean():.1e} N m, because nothing does work.")
 
 
 if __name__ == "__main__":
-    main()
+    command(main)
