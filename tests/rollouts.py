@@ -5,7 +5,7 @@ import math
 import numpy as np
 import warp as wp
 
-from warp_spo.examples.parts import turned
+from warp_spo.examples.parts import rotate
 
 
 def rollout(dyn, q, qd, h, steps, integrator="semi_implicit", tau=None):
@@ -27,10 +27,10 @@ def conserved(dyn, q, qd):
     values = {name: array[0] for name, array in dyn.scene.values.items()}
     poses, rates = dyn.body_poses(q), dyn.body_velocities(q, qd)
     mass, quaternion, inertia = values["body_mass"], poses[..., 3:], values["body_inertia"]
-    com = poses[..., :3] + turned(quaternion, values["body_com"])
-    spin = turned(quaternion * [-1.0, -1.0, -1.0, 1.0], rates[..., 3:])
+    com = poses[..., :3] + rotate(quaternion, values["body_com"])
+    spin = rotate(quaternion * [-1.0, -1.0, -1.0, 1.0], rates[..., 3:])
     moment = np.einsum("bij,wbj->wbi", inertia, spin)
     push = mass[:, None] * rates[..., :3]
-    angular = np.cross(com, push) + turned(quaternion, moment)
+    angular = np.cross(com, push) + rotate(quaternion, moment)
     energy = (push * rates[..., :3]).sum((1, 2)) + (moment * spin).sum((1, 2)) + qd**2 @ values["joint_armature"]
     return push.sum(1), angular.sum(1), 0.5 * energy

@@ -38,7 +38,7 @@ def energy(dyn, q, qd):
     return kinetic - np.einsum("b,wbi,i->w", values["body_mass"][0], com, values["gravity"][0])
 
 
-def turned(quaternion, vector):
+def rotate(quaternion, vector):
     """Return ``vector`` rotated by quaternions xyzw."""
     u, w = quaternion[..., :3], quaternion[..., 3:]
     return vector + 2.0 * np.cross(u, np.cross(u, vector) + w * vector)
