@@ -5,10 +5,10 @@ import pytest
 import symbolic
 import zoo
 from robots import ROBOTS
-
 from warp_spo.recursions.composite import mass_matrix
-from warp_spo.recursions.links import Links
 from warp_spo.recursions.tracing import Trace
+
+from warp_spo.recursions.links import Links
 from warp_spo.trace import scalars as g
 from warp_spo.trace.differentiation import forward, partial, reverse
 from warp_spo.trace.evaluation import FUNCTIONS, evaluate
@@ -25,9 +25,7 @@ FINITE_DIFFERENCE = 1e-6  # eps / h + h^2
 
 def traced(name, operation):
     links = Links(SCENES[name]())
-    stores = sorted(
-        symbolic.function(operation)(Trace(links, "float64", ARRAYS[operation])), key=lambda item: item.index
-    )
+    stores = sorted(symbolic.function(operation)(Trace(links, "float64", ARRAYS[operation])), key=lambda item: item.index)
     outputs = [item.value for item in stores]
     inputs = [x for x in g.ordered(outputs) if x.op == "input"]
     rng = np.random.default_rng(0)
@@ -116,6 +114,9 @@ RULES = {
     "select": lambda x, y: g.select(x, x * y, y) + g.select(x.graph.make("lost", x), x, y * y),
     "less": lambda x, y: g.less(x, y) + x * y,
     "arctangent": lambda x, y: g.arctangent(x * x + 1.0, y),
+    "exponential": lambda x, y: g.exponential(x * y),
+    "logarithm": lambda x, y: g.logarithm(x * x + y * y),
+    "power": lambda x, y: g.power(x * x + 0.5, 1.7) + g.power(y * y, x),
     "sum_of_logarithms": lambda x, y: g.sum_of_logarithms([x * x, x * x + y * y]),
 }
 

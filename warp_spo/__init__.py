@@ -10,6 +10,7 @@ from .dynamics.dynamics import Dynamics
 from .errors import DirectedLoopError, UnsupportedError
 from .graph.factorization import Factorization
 from .graph.operators import BWA, Blocks, Identity, Operator
+from .hinges.functions import clip, spline, where
 from .scene.parts import Body, Coupling, Hinge, Loop
 from .scene.scene import Scene
 from .scene.tree import Digraph, Tree
@@ -40,8 +41,11 @@ __all__ = [
     "Tree",
     "UnsupportedError",
     "__version__",
+    "clip",
     "from_newton",
     "load",
+    "spline",
+    "where",
 ]
 
 

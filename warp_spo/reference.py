@@ -14,6 +14,8 @@ from functools import cached_property
 
 import numpy as np
 
+from .reference_jets import curve
+
 
 def skew(vector):
     """Return the matrix a~ with a~ b = a x b, shape (3, 3)."""
@@ -124,6 +126,10 @@ class Dense:
                 self.stages[k].append(self.stages[k][0] @ homogeneous([0.0, 0.0, 0.0, *q]))
             elif hinge.kind == "free":
                 self.stages[k].append(self.stages[k][0] @ homogeneous(q))
+            elif hinge.kind == "custom":
+                step = np.eye(4)
+                (step[:3, 3], *_), (step[:3, :3], *_) = curve(hinge.pose, q, 0.0 * q, 0.0 * q)
+                self.stages[k].append(self.stages[k][0] @ step)
             else:
                 for (axis, angular, linear), x in zip(hinge.screws, q, strict=True):
                     step = np.eye(4)
@@ -177,6 +183,10 @@ class Dense:
                 elif hinge.kind == "free":
                     direction, point = self.stages[k][0][:3, i % 3], self.com[k]
                     omega, v = (np.zeros(3), direction) if i < 3 else (direction, np.zeros(3))
+                elif hinge.kind == "custom":
+                    unit = np.eye(len(self.dofs[k]))[i]
+                    (_, v, _), omega, _ = self._custom(k, unit, 0.0 * unit)
+                    v, omega, point = self.stages[k][0][:3, :3] @ v, self.stages[k][0][:3, :3] @ omega, origin
                 else:
                     axis, angular, linear = hinge.screws[i]
                     direction, point = self.stages[k][i][:3, :3] @ axis, self.stages[k][i][:3, 3]
@@ -284,6 +294,12 @@ class Dense:
                 a = a + cross(al, r) + cross(w, cross(w, r)) + 2.0 * cross(w, slide) + anchor[:3, :3] @ xd[:3]
                 w, al = w + spin, al + cross(w, spin) + anchor[:3, :3] @ xd[3:]
                 v, a = v + cross(w, s), a + cross(al, s) + cross(w, cross(w, s))
+            elif self.hinge[k].kind == "custom":
+                axes, (path, spin, turning) = anchor[:3, :3], self._custom(k, x, xd)
+                r, slide, push, spin, turning = (axes @ u for u in (*path, spin, turning))
+                v = v + cross(w, r) + slide
+                a = a + cross(al, r) + cross(w, cross(w, r) + 2.0 * slide) + push
+                w, al = w + spin, al + cross(w, spin) + turning
             else:
                 for i, (axis, angular, linear) in enumerate(self.hinge[k].screws):
                     direction = self.stages[k][i][:3, :3] @ axis
@@ -294,6 +310,15 @@ class Dense:
                     w, al = w + spin, al + cross(w, spin) + angular * xd[i] * direction
             W[k], V[k], A[k], AL[k] = w, v, a, al
         return W, V, A, AL
+
+    def _custom(self, k, qd, qdd):
+        """Of node k's custom hinge, in the parent anchor's axes: position with its two rates, angular velocity,
+        angular acceleration."""
+        h = self.scene.hinge_of[k]
+        q = self.q[self.scene.q_start[h] : self.scene.q_start[h + 1]]
+        path, (R, R_1, R_2) = curve(self.hinge[k].pose, q, qd, qdd)
+        axial = lambda A: 0.5 * np.array([A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1]])  # noqa: E731
+        return path, axial(R_1 @ R.T), axial(R_2 @ R.T + R_1 @ R_1.T)
 
     @cached_property
     def _node_jacobian(self):

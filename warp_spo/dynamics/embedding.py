@@ -18,7 +18,7 @@ from ..recursions.loops.clusters import clusters
 from ..recursions.loops.embedded import Embedding
 from ..recursions.loops.projection import closure_error, closure_jacobian, move
 from ..recursions.tracing import Trace
-from ..scene.parts import SCREWS, UNLIMITED
+from ..scene.parts import UNLIMITED
 from ..scene.scene import Scene
 from ..trace.evaluation import evaluate
 
@@ -95,11 +95,10 @@ def drawn(scene: Scene, count: int, seed: int = 0) -> np.ndarray:
     q = np.tile(scene.neutral_q, (count, 1))
     lower, upper = (scene.values[f"joint_limit_{side}"][0] for side in ("lower", "upper"))
     for hinge, coordinate, dof in zip(scene.hinges, scene.q_start, scene.qd_start, strict=False):
-        if hinge.motion != SCREWS:
+        for first in coordinate + np.array(hinge.quaternions, dtype=int):
             turn = rng.normal(size=(count, 4))
-            q[:, coordinate + hinge.coord_count - 4 : coordinate + hinge.coord_count] = turn / np.linalg.norm(
-                turn, axis=1, keepdims=True
-            )
+            q[:, first : first + 4] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
+        if hinge.quaternions:
             continue
         for i in range(hinge.dof_count):
             bounded = lower[dof + i] > -UNLIMITED and upper[dof + i] < UNLIMITED and lower[dof + i] < upper[dof + i]

@@ -17,6 +17,7 @@ from ..kernels import articulated, composite, declare, kinematics, newton_euler,
 from ..kernels.spatial import ARTICULATED, MOTION, POSE, RIGID
 from ..kernels.topology import Topology
 from ..scene.scene import Scene
+from . import node_hinges
 from .node_functions import node_functions
 from .parameters import Parameters
 from .plan import Plan
@@ -44,6 +45,7 @@ class Sweeps:
         self.parameters = Parameters(scene, self.topology, self.worlds, device, dtype, variable)
         self._workspace: dict[Hashable, wp.array] = {}
         self._frames: dict[tuple, tuple[wp.array, wp.array]] = {}
+        self._hinge_kernels: dict[bool, wp.Kernel | None] = {}  # with velocities or not
 
     def replace_values(self, scene: Scene) -> None:
         """Take the values of ``scene``, which has the same topology; variable values stay as they were set."""
@@ -108,6 +110,17 @@ class Sweeps:
         ]
         inputs = [self.topology, self._screw, self.parameters.tree, self.parameters.com, q, qd]
         self.launch_nodes(kinematics.hinge, self.nodes, inputs, outputs)
+        self._traced_hinges([q, *([] if qd is None else [qd]), self.parameters.tree], outputs)
+
+    def _traced_hinges(self, inputs: list, outputs: list) -> None:
+        """Place the nodes that need a kernel of the scene; see :mod:`.node_hinges`."""
+        moves = outputs[-1] is not None
+        if moves not in self._hinge_kernels:
+            self._hinge_kernels[moves] = node_hinges.kernel(self.scene, self.dtype, moves)
+        kernel = self._hinge_kernels[moves]
+        if kernel is not None:
+            found = [array for array in outputs if array is not None]
+            wp.launch(kernel, self.worlds, [self.worlds, *inputs], found, device=self.device)
 
     def velocities(self) -> wp.array:
         """Return V = phi* H* qd of every node; after :meth:`hinges` with qd."""

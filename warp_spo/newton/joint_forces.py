@@ -10,7 +10,6 @@ import warp as wp
 
 from ..dynamics.dynamics import Dynamics
 from ..kernels import exchange
-from ..scene.parts import FREE
 from .layout import Layout
 
 
@@ -43,7 +42,7 @@ class JointForces:
         rows = [
             (scene.qd_start[h], h, hinge.parent)
             for h, hinge in enumerate(scene.hinges)
-            if hinge.motion == FREE and (hinge.parent >= 0 or not level[h])
+            if hinge.unconstrained and (hinge.parent >= 0 or not level[h])
         ]
         self._on_bodies = any(parent >= 0 for *_, parent in rows)
         self._rows: Any = wp.array(np.array(rows), dtype=wp.int32, device=dynamics.device) if rows else None

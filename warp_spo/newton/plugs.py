@@ -35,11 +35,7 @@ class Plugs(CouplingInterface):
         """
         self._check_open("solve_inverse")
         q = self._q.read(state.joint_q, "q")
-
-        def solve(x: wp.array, y: wp.array) -> None:
-            self.dynamics.solve_mass_matrix(q, y, out=x)
-
-        return solve
+        return lambda x, y: self.dynamics.solve_mass_matrix(q, y, out=x) and None
 
     @property
     def dof_map(self) -> wp.array:

@@ -15,13 +15,12 @@ import numpy as np
 
 from ..trace.scalars import Value, absolute, guarded, is_constant, quotient, reciprocal
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Rigid, Vector, cross, dot, magnitude, symmetric, total
-from .links import BALL, FREE, SLIDE, TURN, Link, Placed
+from .links import Link, Placed
 from .motion import NONE, Motion, carried, in_hinge, in_link
 
 LEAST = 4.0  # pivots of less than this many roundings of what cancels in them may be rounding alone
 SOLID = 1e-2  # share of what it carries, and of itself, that a body's inertia must reach to vouch for its pivots
 NO_INERTIA = Articulated(NONE, NONE, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-UNIT = {TURN: [2], SLIDE: [5], BALL: [0, 1, 2], FREE: [3, 4, 5, 0, 1, 2]}  # entry of (omega; v) that each dof moves
 
 
 class Pivot(NamedTuple):
@@ -77,16 +76,17 @@ def factor(
         P = P + other
     triples = [link.armature[i : i + 3] for i in range(0, len(link.armature), 3)]
     alike = all(len(set(triple)) == 1 for triple in triples)
-    turned = link.motion in (BALL, FREE) and alike
-    whole = link.motion == FREE and all(is_constant(a) and a == 0.0 for a in link.armature)
+    hinge = link.hinge
+    turned = hinge.rates_in_parent and alike
+    whole = hinge.unconstrained and all(is_constant(a) and a == 0.0 for a in link.armature)
     pivots = []
-    if turned or link.motion in (TURN, SLIDE):
-        units = UNIT[link.motion][::-1]
+    if hinge.units is not None and (turned or not hinge.rates_in_parent):
+        units = list(hinge.units[::-1])
         sizes = cancelling(link, P, units, through)
         for at, (unit, armature) in enumerate(zip(units, link.armature[::-1], strict=True)):
             pivot, P = eliminate_unit(P, unit, armature, LEAST * epsilon * sizes[at])
             pivots.append(pivot)
-            for later in range(at + 1, len(units) if link.motion == BALL else 0):
+            for later in range(at + 1, len(units) if hinge.cancels else 0):
                 U = pivot.U[units[later]]
                 sizes[later] = sizes[later] + brought(U, U * pivot.inverse, sizes[at])
     else:
@@ -204,17 +204,14 @@ def reduced(
 ) -> tuple[list[Value], Vector]:
     """eps = tau - H z of each pivot, and z+ in the parent's frame; ``force`` is z: (n; f) in the link's frame."""
     eps, z = [], force
-    if done.turned:
-        given = [*place.turned.T @ Vector(tau[-3:])]  # type: ignore[union-attr]
-        if link.motion == FREE:
-            given = [*(place.turned.T @ Vector(tau[:3])), *given]  # type: ignore[union-attr]
-    else:
-        given = list(tau)
+    given = list(tau)
+    for first in range(len(given) - 3, -1, -3) if done.turned else ():
+        given[first : first + 3] = link.hinge.in_link_axes(place, given[first : first + 3])
     for pivot, b in zip(done.pivots, given[::-1], strict=True):
         rate, z = taken(pivot, z, b)
         eps.append(rate)
     if link.parent is not None and done.whole:  # nothing but the force that the hinge itself transmits
-        z = Vector((*place.turned.T @ Vector(tau[3:]), *place.turned.T @ Vector(tau[:3])))  # type: ignore[union-attr]
+        z = Vector((*given[3:], *given[:3]))
     return eps, handed_to_parent(link, place, done, motion, z)
 
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from ..trace.differentiation import reverse
 from ..trace.emission import Store
-from ..trace.scalars import Value, sum_of_logarithms
+from ..trace.scalars import Value, ordered, sum_of_logarithms
 from ..trace.spatial import ZERO, Articulated, Matrix, Pose, Vector, dot
 from . import motion
 from .articulated import NO_INERTIA, Factor
 from .articulated_sweeps import factor_tree
+from .derivatives.tangents import tangent_gradient
 
 if TYPE_CHECKING:
     from .tracing import Trace
@@ -71,6 +73,8 @@ def log_det_mass_matrix(trace: Trace) -> list[Store]:
 def log_det_mass_matrix_gradient(trace: Trace, scale: float = 1.0) -> list[Store]:
     """out = d log det Mass / dq, dual to qd"""
     done = factor_tree(trace)
+    if any(link.hinge.columns_vary for link in trace.links.links):
+        return _by_reverse(trace, done, scale)
     carried: dict[int, Articulated] = {}
     stores = []
     for link in trace.links.links:
@@ -92,6 +96,14 @@ def log_det_mass_matrix_gradient(trace: Trace, scale: float = 1.0) -> list[Store
         values = motion.in_hinge(link, place, w, v)
         stores += [Store("out", (dof,), 2.0 * scale * x) for dof, x in zip(link.dofs, values, strict=True)]
     return stores
+
+
+def _by_reverse(trace: Trace, done: dict[int, Factor], scale: float) -> list[Store]:
+    """The same as the reverse of the sweep that finds D: of hinges whose columns depend on q, too."""
+    value = sum_of_logarithms(pivot.D for factor in done.values() for pivot in factor.pivots)
+    inputs = [x for x in ordered([value]) if x.op == "input" and x.args[0] == "q"]
+    gradient = dict(zip((x.args for x in inputs), reverse([value], inputs, [scale]), strict=True))
+    return [Store("out", index, entry) for index, entry in tangent_gradient(trace, gradient)]
 
 
 def fixman_torque(trace: Trace) -> list[Store]:

@@ -14,7 +14,7 @@ from ..trace.scalars import Value, is_constant, select
 from ..trace.spatial import Articulated, Pose, Vector, dot, total
 from . import articulated
 from .articulated import LEAST, NO_INERTIA, Factor, Pivot
-from .links import SLIDE, TURN, Link, Placed
+from .links import Link, Placed
 from .motion import Motion, carried
 
 if TYPE_CHECKING:
@@ -45,10 +45,13 @@ def factor(
     P = NO_INERTIA if link.inertia is None else link.inertia.articulated
     for other in carried_on:
         P = P + other
-    unit = articulated.UNIT[link.motion][0] if link.motion in (TURN, SLIDE) else None
+    hinge = link.hinge
+    units: tuple[int | None, ...] = (None,) * hinge.dofs
+    if hinge.units is not None and not hinge.rates_in_parent:
+        units = hinge.units
     pivots = []
-    for column, armature, held in zip(
-        articulated.columns(link, place)[::-1], link.armature[::-1], mask[::-1], strict=True
+    for column, unit, armature, held in zip(
+        articulated.columns(link, place)[::-1], units[::-1], link.armature[::-1], mask[::-1], strict=True
     ):
         if is_constant(held) and held:
             n, f = P.apply(Vector(column[:3]), Vector(column[3:]))

@@ -22,14 +22,12 @@ from ..scene.parts import UNLIMITED
 from ..scene.scene import Scene
 from ..trace.evaluation import evaluate
 from ..trace.scalars import Value, absolute, is_constant, less, reciprocal, select
-from ..trace.spatial import Vector, total
+from ..trace.spatial import total
 from .composite import mass_matrix
-from .integration import rotation_vector
-from .links import BALL, FREE, Link, Links
+from .links import Link, Links
 from .tracing import Trace
 
 CREEP = 1e-4  # rate [rad/s, m/s] below which dry friction is a damper; it saturates at this rate
-TURNING = (BALL, FREE)  # motions with a quaternion
 DEFAULT_BOUND = 1e6  # effort and velocity limits of this size and more are no limits; Newton's default
 HOLD = 300.0  # resistance of a velocity limit, in inertias / h; the excess over the limit shrinks by this factor
 NOISE = 4.0  # roundings of a law's terms; two pieces may differ by so much where they meet
@@ -202,11 +200,7 @@ class Impedance:
     def _stretch(self, link: Link, i: int, rest: Callable[[int], Value]) -> Value:
         """Return q - rest of one dof of a link; of a rotation, an entry of its rotation vector."""
         first = link.coordinate
-        if link.motion in TURNING and (link.motion != FREE or i >= 3):
-            start = first + 3 * (link.motion == FREE)
-            q, r = (Vector(entry(start + c) for c in range(4)) for entry in (self.q, rest))
-            return rotation_vector(q, r)[i % 3]
-        return self.q(first + i) - rest(first + i)
+        return link.hinge.displacement(i, lambda c: self.q(first + c), lambda c: rest(first + c))
 
     def _drive(self, link: Link, i: int) -> list[Law]:
         """ke (target_q - q') + kd (target_qd - qd'), within the effort limit."""
@@ -228,7 +222,7 @@ class Impedance:
             bound = self._bound(name, dof, UNLIMITED)
             if bound is None:
                 continue
-            if link.motion in TURNING:
+            if link.hinge.quaternion is not None:
                 label = self.scene.dof_labels[dof]
                 raise UnsupportedError(
                     "Dynamics.step",

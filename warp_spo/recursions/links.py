@@ -1,9 +1,8 @@
 """Links: a scene as the recursions see it, one degree of freedom at a time, constants folded.
 
-A hinge that is a chain of screws becomes a chain of links without inertia, the last one with the body's; each has its
-screw along its own z axis. A ball or a free hinge is one link that turns by a quaternion, about the anchor or about the
-body's centre of mass. What a fixed hinge carries belongs to the link under it. So H is a unit vector, or several, in
-every link, and a body that does not move costs nothing.
+A hinge that is a sequence of elementary ones becomes a chain of links without inertia, the last one with the body's;
+each has one elementary hinge, an object of :mod:`warp_spo.hinges`, and its axis along its own z axis. What a fixed
+hinge carries belongs to the link under it, so that a body that does not move costs nothing.
 
 Values that vary are symbols here, Newton's own. An operation works on an opened copy, in which what came out of them is
 read from tables: what depends on the scene alone is computed once, not in every call.
@@ -18,14 +17,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..scene.parts import BALL as BALL
-from ..scene.parts import FREE, SCREWS
+from ..hinges.kind import Kind
+from ..hinges.kind import Placed as Placed
+from ..hinges.quaternions import quaternion_rotation
 from ..scene.scene import Scene
-from ..trace.scalars import Graph, Scalar, Value, cos, is_constant, reciprocal, reduced, sin
+from ..trace.scalars import Graph, Scalar, Value, is_constant
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
 
-TURN, SLIDE, HELIX = "turn", "slide", "helix"
-SCREW_MOTIONS = (TURN, SLIDE, HELIX)
 LINK_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c", "joint_armature", "gravity")
 TABLES = ("value", "node_value")  # what links are made of; what bodies by themselves are, for the operators
 NOTHING = Rigid(0.0, ZERO, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
@@ -39,25 +37,26 @@ class Link:
 
     Attributes:
         parent: the link it moves on, or None for the inertial frame.
-        motion: TURN, SLIDE, HELIX, BALL or FREE.
+        hinge: the elementary hinge that moves it.
         matrix, offset: axes and origin of the hinge's frame at rest in the parent link's frame.
-        pitch: of a HELIX [m/rad].
-        dofs: its entries of qd; several for BALL and FREE, linear first.
+        align: the hinge's axes in those of the scene's hinge, whose z axis is the hinge's own axis; None: the same.
+        dofs: its entries of qd.
         coordinate: its first entry of q.
         armature: of each dof.
         inertia: of the bodies it carries, in its frame; None where it carries none.
         grouped: the same for sums of forces and composite inertias, where it may be counted elsewhere: what turns about
             its own axis, or does not turn, belongs to the parent as well as to the link. It need not be positive.
         node: the body whose hinge it belongs to; label: its name.
-        com: of a FREE hinge's body, from the anchor, in the link's axes.
+        com: the link's origin from the child anchor, in the link's axes: the body's centre of mass, if the hinge moves
+            that.
         children: the links that move on it.
     """
 
     parent: Link | None
-    motion: Any
+    hinge: Kind
     matrix: Matrix | None
     offset: Vector
-    pitch: float
+    align: Matrix | None
     dofs: tuple[int, ...]
     coordinate: int
     armature: tuple
@@ -178,7 +177,7 @@ class Links:
 
     def thrown(self, link: Link) -> float | None:
         """Mass that a free link on the inertial frame carries, itself included; None of others, and if it varies."""
-        if link.motion != FREE or link.parent is not None:
+        if not link.hinge.unconstrained or link.parent is not None:
             return None
         mass, carried = 0.0, [link]
         while carried:
@@ -237,8 +236,8 @@ class Links:
     def on_parent_node(self, link: Link) -> Link:
         """The first link of a hinge as it sits in the parent's node frame, instead of in the parent's link."""
         matrix, offset = self.nodes[link.node].tree
-        if link.motion not in (BALL, FREE):
-            matrix = matrix @ _aligned(self.scene.dof_axis[link.dofs[0]])
+        if link.align is not None:
+            matrix = matrix @ link.align
         return dataclasses.replace(link, matrix=_still(matrix), offset=offset)
 
     # -- building --------------------------------------------------------------------------------------------------
@@ -253,35 +252,40 @@ class Links:
         scene = self.scene
         parent = scene.tree.parent[node]
         seat = self.seats[parent] if parent >= 0 else Seat(None, IDENTITY, ZERO)
-        self.nodes[node] = own = self._node(node)
-        R, l = own.tree
+        self.nodes[node] = body = self._node(node)
+        R, l = body.tree
         matrix, offset, link = seat.matrix @ R, seat.offset + seat.matrix @ l, seat.link
         index = scene.hinge_of[node]
-        hinge, dof, coordinate = scene.hinges[index], int(scene.qd_start[index]), int(scene.q_start[index])
+        dof, coordinate = int(scene.qd_start[index]), int(scene.q_start[index])
         label, armatures = scene.body_labels[node], self._values["joint_armature"].tolist()
-        if hinge.motion == SCREWS:
-            for i in range(hinge.dof_count):
-                align = _aligned(scene.dof_axis[dof + i])
-                angular, linear = float(scene.dof_angular[dof + i]), float(scene.dof_linear[dof + i])
-                motion = SLIDE if angular == 0.0 else TURN if linear == 0.0 else HELIX
-                pitch = linear / angular if motion is HELIX else 0.0
-                armature = (armatures[dof + i],)
-                link = self._append(
-                    link, motion, matrix @ align, offset, pitch, (dof + i,), coordinate + i, armature, node, label
-                )
-                matrix, offset = align.T, ZERO
-            rest = Seat(link, matrix, offset)
-        else:
-            count = hinge.dof_count
-            dofs = tuple(range(dof, dof + count))
-            armature = tuple(armatures[dof : dof + count])
-            link = self._append(link, hinge.motion, matrix, offset, 0.0, dofs, coordinate, armature, node, label)
-            if hinge.motion == FREE:  # its frame sits at the centre of mass: its six rates are then six unit vectors
-                link.com = own.com
-            rest = Seat(link, IDENTITY, -link.com)
+        for kind, axis in scene.hinges[index].elements:
+            align = None if axis is None else _aligned(axis)
+            own = range(dof, dof + kind.dofs)
+            link = Link(
+                link,
+                kind,
+                _still(matrix if align is None else matrix @ align),
+                offset,
+                align,
+                tuple(own),
+                coordinate,
+                tuple(armatures[i] for i in own),
+                node,
+                label,
+                body.com if kind.at_com else ZERO,
+            )
+            self._append(link)
+            matrix, offset = IDENTITY if align is None else align.T, -link.com if kind.at_com else ZERO
+            dof, coordinate = dof + kind.dofs, coordinate + kind.coordinates
+        rest = Seat(link, matrix, offset)
         self.seats[node] = rest
         if rest.link is not None:
-            rest.link.add(Pose(None, rest.matrix, rest.offset).rigid_to_parent(own.rigid))
+            rest.link.add(Pose(None, rest.matrix, rest.offset).rigid_to_parent(body.rigid))
+
+    def _append(self, link: Link) -> None:
+        self.links.append(link)
+        if link.parent is not None:
+            link.parent.children.append(link)
 
     def _group(self) -> None:
         """Hand inward what a hinge does not move: a rod on the axis of a turn, the moments of inertia of a slide.
@@ -293,18 +297,14 @@ class Links:
             link.grouped = link.inertia
         for link in reversed(self.links):
             own = link.grouped
-            if own is None or link.motion not in (TURN, SLIDE):
+            if own is None:
                 continue
             if not all(map(is_constant, (*own.packed, *link.offset, *(x for row in link.matrix or () for x in row)))):
                 continue
-            (xx, xy, xz), (_, yy, yz), (_, _, zz) = own.inertia
-            if link.motion == TURN:
-                handed = Rigid(own.mass, Vector((0.0, 0.0, own.moment[2])), symmetric(yy, yy, 0.0, 0.0, 0.0, 0.0))
-                xx = 0.0 if abs(xx - yy) <= ROUNDING * abs(yy) else xx - yy
-                kept = Rigid(0.0, Vector((*own.moment[:2], 0.0)), symmetric(xx, 0.0, zz, xy, xz, yz))
-            else:
-                handed = Rigid(0.0, ZERO, own.inertia)
-                kept = Rigid(own.mass, own.moment, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+            parts = link.hinge.regrouped(own)
+            if parts is None:
+                continue
+            handed, kept = parts
             parent = link.parent
             if parent is None:
                 link.grouped = kept
@@ -314,68 +314,10 @@ class Links:
             if _price(kept) + _price(after) < _price(own) + _price(before):
                 link.grouped, parent.grouped = kept, after
 
-    def _append(
-        self,
-        parent: Link | None,
-        motion: Any,
-        matrix: Matrix,
-        offset: Vector,
-        pitch: float,
-        dofs: tuple,
-        coordinate: int,
-        armature: tuple,
-        node: int,
-        label: str,
-    ) -> Link:
-        link = Link(parent, motion, _still(matrix), offset, pitch, dofs, coordinate, armature, node, label)
-        self.links.append(link)
-        if parent is not None:
-            parent.children.append(link)
-        return link
-
-
-class Placed(NamedTuple):
-    """A link at a configuration: its pose in the parent link, and how a ball or free hinge turned, in its own axes."""
-
-    pose: Pose
-    turned: Matrix | None
-
 
 def placed(link: Link, q: Any) -> Placed:
-    """``link`` where the coordinates put it; ``q(i)`` is entry i."""
-    matrix, l = link.matrix, link.offset
-    if link.motion in SCREW_MOTIONS:
-        x, turn = q(link.coordinate), None
-        if link.motion != SLIDE:
-            angle = x if link.motion == TURN else reduced(x)
-            turn = (cos(angle), sin(angle))
-        if link.motion != TURN:
-            axis = IDENTITY[2] if matrix is None else matrix.T[2]
-            l = l + axis * (x if link.motion == SLIDE else link.pitch * x)
-        return Placed(Pose(turn, matrix, l), None)
-    first = link.coordinate
-    if link.motion == FREE:
-        position = Vector(q(first + i) for i in range(3))
-        l = l + (position if matrix is None else matrix @ position)
-        first += 3
-    turned = quaternion_rotation(*(q(first + i) for i in range(4)))
-    R = turned if matrix is None else matrix @ turned
-    return Placed(Pose(None, R, l + R @ link.com), turned)
-
-
-def quaternion_rotation(x: Value, y: Value, z: Value, w: Value) -> Matrix:
-    """Rotation of the quaternion after normalising it; NaN for a zero quaternion."""
-    s = 2.0 * reciprocal((x * x + y * y) + (z * z + w * w))
-    sx, sy, sz = s * x, s * y, s * z
-    xx, yy, zz, xy, xz, yz = sx * x, sy * y, sz * z, sx * y, sx * z, sy * z
-    wx, wy, wz = sx * w, sy * w, sz * w
-    return Matrix.of(
-        [
-            [1.0 - (yy + zz), xy - wz, xz + wy],
-            [xy + wz, 1.0 - (xx + zz), yz - wx],
-            [xz - wy, yz + wx, 1.0 - (xx + yy)],
-        ]
-    )
+    """Return ``link`` where the coordinates put it; ``q(i)`` is entry i."""
+    return link.hinge.placed(link, q)
 
 
 def _numbers(array: np.ndarray) -> np.ndarray:

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from ..trace.scalars import Value
-from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Vector, cross, symmetric
-from .links import BALL, HELIX, SLIDE, TURN, Link, Placed
+from ..trace.spatial import ZERO, Matrix, Pose, Vector, cross, symmetric
+from .links import Link, Placed
 
 NONE = Matrix.of([[0.0] * 3] * 3)
 
@@ -42,38 +42,27 @@ def whirl(w: Vector) -> Matrix:
 
 
 def in_link(link: Link, place: Placed, rate: Any) -> tuple[Vector, Vector]:
-    """(omega; v) of the hinge in the link's axes, H* rate, for ``rate(dof)``."""
-    z = IDENTITY[2]
-    rates = [rate(dof) for dof in link.dofs]
-    if link.motion == TURN:
-        return z * rates[0], ZERO
-    if link.motion == SLIDE:
-        return ZERO, z * rates[0]
-    if link.motion == HELIX:
-        return z * rates[0], z * (link.pitch * rates[0])
-    back = place.turned.T  # type: ignore[union-attr]
-    if link.motion == BALL:
-        return back @ Vector(rates), ZERO
-    return back @ Vector(rates[3:]), back @ Vector(rates[:3])
+    """Return H* rate, (omega; v) of the hinge in the link's axes, for ``rate(dof)``."""
+    return link.hinge.velocity(place, [rate(dof) for dof in link.dofs])
 
 
 def in_hinge(link: Link, place: Placed, w: Vector, v: Vector) -> list[Value]:
-    """(n; f) or (omega'; v') of the link as the entries that belong to the link's dofs: H (w; v)."""
-    if link.motion == TURN:
-        return [w[2]]
-    if link.motion == SLIDE:
-        return [v[2]]
-    if link.motion == HELIX:
-        return [w[2] + link.pitch * v[2]]
-    w = place.turned @ w  # type: ignore[operator]
-    return list(w) if link.motion == BALL else [*(place.turned @ v), *w]  # type: ignore[operator]
+    """Return H (w; v), for (n; f) or (omega'; v') of the link: an entry for each of the link's dofs."""
+    return link.hinge.forces(place, w, v)
+
+
+def own_bias(link: Link, place: Placed, qd: Any) -> tuple[Vector, Vector] | None:
+    """Return (d H* / dt) qd in the link's axes; None where H is constant in the link or in its parent."""
+    return link.hinge.own_bias(place, [qd(dof) for dof in link.dofs])
 
 
 def moved(link: Link, place: Placed, parent: Motion | None, qd: Any) -> Motion:
-    """Motion of ``link`` on a parent that moves as ``parent`` (None: the inertial frame) with rates ``qd(dof)``."""
+    """Return the motion of ``link`` at rates ``qd(dof)`` on a parent that moves as ``parent``; None is at rest."""
     if qd is None:
         return STILL
-    return joined(place.pose, parent or STILL, *in_link(link, place, qd))
+    move = joined(place.pose, parent or STILL, *in_link(link, place, qd))
+    own = own_bias(link, place, qd)
+    return move if own is None else move._replace(bias_w=move.bias_w + own[0], bias_v=move.bias_v + own[1])
 
 
 def joined(pose: Pose, parent: Motion, w: Vector, v: Vector) -> Motion:

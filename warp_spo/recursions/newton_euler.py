@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Rigid, Vector, cross, skew
-from .links import FREE, Link, Placed
+from .links import Link, Placed
 from .motion import Motion, carried, in_hinge, in_link
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ def accelerated(
     link: Link, place: Placed, motion: Motion, acceleration: tuple[Vector, Vector], qdd: Any
 ) -> tuple[Vector, Vector]:
     """Acceleration of the link for that of its parent and ``qdd(dof)``."""
-    if link.motion == FREE and link.parent is None:
+    if link.hinge.unconstrained and link.parent is None:
         back = place.turned.T  # type: ignore[union-attr]
         w, v = at_root(link, acceleration, qdd)
         return back @ w, back @ v

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from ..trace.emission import Store
 from ..trace.scalars import Value
-from ..trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Pose, Vector, cross, dot
+from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Vector, cross, dot
 from . import articulated
-from .links import FREE, Link, Placed, placed
+from .links import Link, Placed, placed
 from .motion import in_hinge, in_link
 
 if TYPE_CHECKING:
@@ -380,9 +380,8 @@ class Operators:
         done, place, rates = self.factor(link), self.place(link), []
         self._at(link.node, "z")
         if done.turned:
-            back: Matrix = place.turned.T  # type: ignore[union-attr]
-            linear = list(back @ Vector(right[:3])) if link.motion == FREE else []
-            right = [*linear, *(back @ Vector(right[-3:]))]
+            triples = [link.hinge.in_link_axes(place, right[i : i + 3]) for i in range(0, len(right), 3)]
+            right = [x for triple in triples for x in triple]
         for pivot, b in zip(done.pivots, right[::-1], strict=True):
             rate, z = articulated.taken(pivot, z, b)
             rates.append(rate)

@@ -119,6 +119,6 @@ class Pieces:
     def alike(self) -> float:
         """Share of the limbs' dofs that is in limbs of which there is another with the same hinges: they share code."""
         limbs = [piece for piece in self.pieces if not piece.children]
-        kinds = [tuple(link.motion for link in piece.links) for piece in limbs]
+        kinds = [tuple(link.hinge.shape for link in piece.links) for piece in limbs]
         twice = sum(piece.weight for piece, kind in zip(limbs, kinds, strict=True) if kinds.count(kind) > 1)
         return twice / sum(piece.weight for piece in limbs)

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 from ..scene.scene import Scene
 from ..status import Status
@@ -23,14 +24,13 @@ from .articulated_sweeps import expand, reduce
 from .impedance import Impedance, Law, added, is_number
 from .integration import moved
 from .joint_space import JointSpace
-from .links import BALL, FREE, Link
+from .links import Link
 from .pieces import Piece, Pieces
 from .tracing import Trace
 
 GUESS, GAIN, MISSED = "guess", "gain", "missed"
 """Variables of the loop over passes, zero at first: guess of u, and u, by dof of a piece; number of wrong guesses."""
 LOOPED = (GUESS, GAIN, MISSED)
-WIDE = {BALL: 4, FREE: 7}  # coordinates of a hinge with a quaternion
 SHORT = 10  # dofs; up to so many, passes solve a system that is formed once
 FAINT = 1e-12  # resistance of a massless dof without active law, as a share of the resistances of its laws
 
@@ -232,7 +232,7 @@ class Step:
         """Return all inputs of the piece's links; for the first piece also those of bodies that do not move."""
         trace, inputs = self.trace, [self.h]
         dofs = sorted(dof for link in self.links for dof in link.dofs)
-        wide = ((link.coordinate, WIDE.get(link.motion, 1)) for link in self.links)
+        wide = ((link.coordinate, link.hinge.coordinates) for link in self.links)
         coordinates = sorted(first + c for first, count in wide for c in range(count))
         own = {*map(id, self.links)} | (set() if trace.piece and trace.piece.index else {id(None)})
         bodies = sorted(body for body, seat in trace.links.seats.items() if id(seat.link) in own)
@@ -246,9 +246,9 @@ class Step:
         return inputs
 
 
-def by_pieces(scene: Scene) -> bool:
-    """Return whether pieces can share the work of a step: sweeps, not a matrix, serve its passes."""
-    return scene.dof_count > SHORT
+def by_pieces(scene: Scene, given: Iterable[str], how: Any) -> bool:
+    """Whether pieces can share the work of a step: no loops are closed, and sweeps serve its passes."""
+    return how is None and "multipliers" not in given and scene.dof_count > SHORT
 
 
 def carries_nothing(link: Link) -> bool:

@@ -1,33 +1,37 @@
 """Bodies, hinges, loops and couplings: the parts of a scene, with units; their values are checked, never repaired.
 
-Every hinge is one of three kinds of motion from its parent anchor to its child anchor:
+Every hinge is a sequence of elementary hinges (:mod:`warp_spo.hinges`) from its parent anchor to its child anchor:
 
 * a chain of *screws*, ``exp(s_0 q_0) exp(s_1 q_1) ...``, each about or along an axis through the anchor: fixed (none),
   revolute, prismatic, helical, universal, cylindrical, planar and D6;
 * ``ball``: a unit quaternion (xyzw), its velocity the relative angular velocity in the parent anchor's axes;
 * ``free``: position and quaternion, its velocity the child's CoM velocity, then angular velocity, both relative to
-  the parent anchor and in its axes.
+  the parent anchor and in its axes;
+* ``custom``: scalar coordinates, and a function of the user's that places the child anchor in the parent anchor.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from ..errors import UnsupportedError, refuse_masked
+from ..errors import UnsupportedError, as_integer
+from ..hinges.custom import MOST, Custom, checked
+from ..hinges.kind import FREE as FREE
+from ..hinges.kind import SCREWS as SCREWS
+from ..hinges.kind import Element
+from ..hinges.sequences import elements
+from .axes import in_plane as in_plane
+from .axes import screws_of
+from .checks import SYMMETRY, checked_array, checked_unit, read_only
+from .checks import real as real
 
 IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 UNLIMITED = 1e10
-SYMMETRY = 1e-6  # relative: what a float32 file or importer leaves of a symmetric inertia, a unit axis or quaternion
 ALIASES = {"spherical": "ball", "distance": "free"}
-
-Screw = tuple[Any, float, float]  # axis [3], radians and metres per coordinate
-
-SCREWS, BALL, FREE = 0, 1, 2  # how a hinge's coordinates become a motion
-MOTION = {"ball": BALL, "free": FREE}
 
 # Per degree of freedom, with the value that a hinge has when nothing is said. Names and units are Newton's.
 DOF_VALUES = {
@@ -44,50 +48,6 @@ DOF_VALUES = {
     "joint_effort_limit": 1e6,
     "joint_velocity_limit": 1e6,
 }
-
-
-def checked_array(call: str, name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    refuse_masked(call, name, value)
-    try:
-        array = real(value)
-    except (TypeError, ValueError):
-        raise ValueError(f"{call}: {name} is {value!r}; expected numbers of shape {shape}") from None
-    if array.shape != shape:
-        raise ValueError(f"{call}: {name} has shape {array.shape}; expected {shape}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{call}: {name} is {array.tolist()}; expected finite numbers")
-    return read_only(array)
-
-
-def real(value: Any) -> np.ndarray:
-    """Return a copy of an array in float64, which later changes of the caller's array do not affect.
-
-    Raises:
-        TypeError: ``value`` is or contains text, None, complex numbers, integers beyond float64, or torch tensors that
-            require grad, because no derivative passes through a copy.
-    """
-    try:
-        array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
-        for one in (value, *array.flat) if array.dtype == object else (value,):
-            if one is None or isinstance(one, str | bytes) or getattr(one, "requires_grad", False):
-                raise TypeError
-        if array.dtype.kind not in "biufO":
-            raise TypeError
-        return array.astype(np.float64)
-    except (OverflowError, RuntimeError):  # what torch raises of tensors that NumPy cannot see
-        raise TypeError from None
-
-
-def read_only(array: np.ndarray) -> np.ndarray:
-    array.flags.writeable = False
-    return array
-
-
-def checked_unit(call: str, name: str, vector: np.ndarray) -> np.ndarray:
-    norm = np.linalg.norm(vector, axis=-1, keepdims=True)
-    if np.any(np.abs(norm - 1.0) > SYMMETRY):
-        raise ValueError(f"{call}: {name} is {vector.tolist()}; expected unit length, got {norm.ravel().tolist()}")
-    return vector / norm
 
 
 def _pose(call: str, name: str, value: Any) -> np.ndarray:
@@ -150,73 +110,6 @@ def checked_inertia(call: str, inertia: np.ndarray) -> np.ndarray:
     return symmetric
 
 
-def _axes(call: str, kind: str, axis: Any, linear: Any, angular: Any, pitch: float) -> list[Screw]:
-    """Return the screws of a hinge, inboard first."""
-
-    def rows(name: str, value: Any, counts: Sequence[int]) -> np.ndarray:
-        refuse_masked(call, name, value)
-        try:
-            array = np.atleast_2d(real(() if value is None else value))
-        except (TypeError, ValueError):
-            raise ValueError(f"{call}: {name} is {value!r}; expected vector(s) of 3 numbers") from None
-        if array.size == 0:
-            array = array.reshape(0, 3)
-        if array.shape[0] not in counts or array.shape[1:] != (3,):
-            wanted = " or ".join(str(count) for count in counts)
-            raise ValueError(f"{call}: {name} has shape {np.shape(value)}; expected {wanted} vector(s) of 3")
-        if array.size and not np.isfinite(array).all():
-            raise ValueError(f"{call}: {name} is {array.tolist()}; expected finite numbers")
-        return checked_unit(call, name, array) if len(array) else array
-
-    turn = lambda vector: (vector, 1.0, 0.0)  # noqa: E731
-    slide = lambda vector: (vector, 0.0, 1.0)  # noqa: E731
-    if kind != "d6" and (linear is not None or angular is not None):
-        raise ValueError(f"{call}: linear= and angular= belong to a d6; a {kind} hinge has axis=")
-    pitch = float(checked_array(call, "pitch [m/rad]", pitch, ()))
-    if kind != "helical" and pitch != 0.0:
-        raise ValueError(f"{call}: pitch= belongs to a helical hinge")
-    if kind in ("fixed", "ball", "free"):
-        if axis is not None:
-            raise ValueError(f"{call}: a {kind} hinge has no axis; got {axis!r}")
-        return []
-    if kind == "d6":
-        if axis is not None:
-            raise ValueError(f"{call}: a d6 has linear= and angular= instead of axis=")
-        return [slide(v) for v in rows("linear", linear, range(4))] + [
-            turn(v) for v in rows("angular", angular, range(4))
-        ]
-    if axis is None:
-        raise ValueError(f"{call}: a {kind} hinge needs axis=, unit vector(s) in the parent anchor frame")
-    if kind == "universal":
-        vectors = rows("axis", axis, [2])
-        if np.linalg.norm(np.cross(*vectors)) < SYMMETRY:
-            raise ValueError(f"{call}: the axes of a universal hinge are parallel; expected two directions")
-        return [turn(v) for v in vectors]
-    if kind == "planar":
-        vectors = rows("axis", axis, [1, 2])
-        if len(vectors) == 1:
-            vectors = np.concatenate([in_plane(vectors[0])])
-        normal = np.cross(vectors[0], vectors[1])
-        if abs(vectors[0] @ vectors[1]) > SYMMETRY:
-            raise ValueError(f"{call}: the directions of a planar hinge are oblique; expected a right angle")
-        return [slide(vectors[0]), slide(vectors[1]), turn(checked_unit(call, "axis[0] x axis[1]", normal))]
-    vector = rows("axis", axis, [1])[0]
-    return {
-        "revolute": [turn(vector)],
-        "prismatic": [slide(vector)],
-        "helical": [(vector, 1.0, pitch)],
-        "cylindrical": [slide(vector), turn(vector)],
-    }[kind]
-
-
-def in_plane(normal: np.ndarray) -> np.ndarray:
-    """Return two unit vectors (2, 3) whose cross product is the unit ``normal``; the first is nearest to x or y."""
-    seed = np.eye(3)[0] if abs(normal[0]) < 0.9 else np.eye(3)[1]
-    first = seed - normal * (seed @ normal)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(normal, first)])
-
-
 KINDS = (
     "fixed",
     "revolute",
@@ -229,6 +122,7 @@ KINDS = (
     "free",
     "d6",
 )
+"""What a hinge's kind may be, beside "custom": see :meth:`Hinge.custom`."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -252,6 +146,7 @@ class Hinge:
         target_ke, target_kd: gains of the drive. limit_lower, limit_upper: [rad or m]. limit_ke, limit_kd: stiffness
             and damping of the limits. effort_limit, velocity_limit: bounds of the drive's force and of the velocity.
         rest: coordinates at which the spring is relaxed, one per coordinate.
+        coordinates, pose: of a "custom" hinge, see :meth:`custom`.
         label: name in tables and errors.
 
     Raises:
@@ -283,7 +178,10 @@ class Hinge:
     rest: Any = None
     label: str = ""
     rotor: Any = None
+    coordinates: int | None = None
+    pose: Callable[[list], Any] | None = None
     screws: tuple = dataclasses.field(init=False, repr=False)
+    elements: tuple = dataclasses.field(init=False, repr=False)  # of warp_spo.hinges.kind.Element, inboard first
 
     def __post_init__(self) -> None:
         call = f"Hinge({self.label!r})" if self.label else f"Hinge({self.kind!r})"
@@ -292,9 +190,15 @@ class Hinge:
             raise UnsupportedError(call, "a rotor (rotor=)", "put its reflected inertia into armature")
         if isinstance(self.kind, str):
             put("kind", ALIASES.get(self.kind, self.kind))
-        if self.kind not in KINDS:
-            raise ValueError(f"{call}: unknown kind; expected one of {', '.join(KINDS)}")
-        put("screws", tuple(_axes(call, self.kind, self.axis, self.linear, self.angular, self.pitch)))
+        if self.kind not in (*KINDS, "custom"):
+            raise ValueError(f"{call}: unknown kind; expected one of {', '.join(KINDS)}, or Hinge.custom")
+        put("screws", tuple(screws_of(call, self.kind, self.axis, self.linear, self.angular, self.pitch)))
+        if self.kind == "custom":
+            put("elements", (Element(self._custom(call)),))
+        elif self.pose is not None or self.coordinates is not None:
+            raise ValueError(f"{call}: pose= and coordinates= belong to a custom hinge")
+        else:
+            put("elements", elements(self.kind, self.screws))
         put("parent_pose", _pose(call, "parent_pose", self.parent_pose))
         put("child_pose", _pose(call, "child_pose", self.child_pose))
         for name, default in DOF_VALUES.items():
@@ -303,29 +207,87 @@ class Hinge:
             value = default if value is None else value
             value = checked_array(call, field, value, () if np.ndim(value) == 0 else (self.dof_count,))
             put(field, np.broadcast_to(value, (self.dof_count,)))
-        rest = np.zeros(self.coord_count) if self.rest is None else self.rest
-        if self.rest is None and self.motion != SCREWS:
-            rest[-1] = 1.0  # the identity quaternion
+        rest = self.neutral if self.rest is None else self.rest
         rest = checked_array(call, "rest", rest, () if np.ndim(rest) == 0 else (self.coord_count,))
         rest = np.broadcast_to(rest, (self.coord_count,))
-        if self.motion != SCREWS:
-            checked_unit(call, "the quaternion (xyzw) of rest", rest[-4:])
+        for first in self.quaternions:
+            checked_unit(call, "the quaternion (xyzw) of rest", rest[first : first + 4])
         put("rest", rest)
+
+    def _custom(self, call: str) -> Custom:
+        if as_integer(self.coordinates) is None or not 1 <= self.coordinates <= MOST:  # type: ignore[operator]
+            raise ValueError(f"{call}: coordinates is {self.coordinates!r}; expected 1 to {MOST}")
+        count = int(self.coordinates)  # type: ignore[arg-type]
+        ends = []
+        for name, default in (("limit_lower", -UNLIMITED), ("limit_upper", UNLIMITED)):
+            value = default if getattr(self, name) is None else getattr(self, name)
+            value = checked_array(call, name, value, () if np.ndim(value) == 0 else (count,))
+            ends.append(np.where(np.abs(value) < UNLIMITED, np.broadcast_to(value, (count,)), np.nan))
+        return checked(call, self.pose, count, *ends)
+
+    @classmethod
+    def custom(cls, parent: int, child: int, *, coordinates: int, pose: Callable[[list], Any], **values: Any) -> Hinge:
+        """Return a hinge whose pose is a function of 1 to 6 scalar coordinates, whose rates are its entries of qd.
+
+        Args:
+            parent, child: body indices, as in :class:`Hinge`.
+            coordinates: how many, n.
+            pose: takes a list of n scalars [rad or m, as the function means them] and returns the position (3,) [m] and
+                the rotation matrix (3, 3) of the child anchor in the parent anchor. It is called with abstract scalars
+                and with numbers, and may use + - * / **, abs, NumPy's sin, cos, tan, exp, log, sqrt, arctan2 and
+                hypot, ``spo.where`` in place of branches, ``spo.clip`` and ``spo.spline``. It must be twice
+                differentiable.
+            values: other arguments of :class:`Hinge`: anchors, armature, springs, limits and so on, per coordinate.
+
+        Raises:
+            ValueError: not 1 to 6 coordinates, or a rotation that is not orthonormal at one of 64 samples between the
+                limits, or of -1 to 1 where a coordinate has none.
+            TypeError: ``pose`` does something else with a scalar, a branch included.
+
+        Where the columns of its Jacobian lose rank, accelerations are NaN and ``status`` is ``spo.Status.PIVOT``;
+        armature of its coordinates keeps them finite.
+        """
+        return cls("custom", parent, child, coordinates=coordinates, pose=pose, **values)
 
     @property
     def motion(self) -> int:
-        """SCREWS, BALL or FREE."""
-        return MOTION.get(self.kind, SCREWS)
+        """SCREWS, BALL or FREE: how work at node granularity places the child."""
+        return self.elements[0].kind.node_code if self.elements else SCREWS
 
     @property
     def dof_count(self) -> int:
         """Entries of ``qd`` that the hinge owns, the paper's r_k."""
-        return {BALL: 3, FREE: 6}.get(self.motion, len(self.screws))
+        return sum(element.kind.dofs for element in self.elements)
 
     @property
     def coord_count(self) -> int:
         """Entries of ``q`` that the hinge owns."""
-        return {BALL: 4, FREE: 7}.get(self.motion, len(self.screws))
+        return sum(element.kind.coordinates for element in self.elements)
+
+    @property
+    def neutral(self) -> np.ndarray:
+        """Coordinates at which the anchors coincide."""
+        return np.array([x for element in self.elements for x in element.kind.neutral], dtype=np.float64)
+
+    @property
+    def quaternions(self) -> list[int]:
+        """The first entry of each quaternion among the hinge's coordinates."""
+        found, first = [], 0
+        for kind, _ in self.elements:
+            if kind.quaternion is not None:
+                found.append(first + kind.quaternion)
+            first += kind.coordinates
+        return found
+
+    @property
+    def unconstrained(self) -> bool:
+        """Whether the child moves in all six directions, with the rates of a free hinge."""
+        return any(kind.unconstrained for kind, _ in self.elements)
+
+    @property
+    def depth(self) -> int:
+        """Dofs as which the hinge counts where errors grow along a chain."""
+        return sum(kind.depth for kind, _ in self.elements)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -348,6 +310,9 @@ class Loop:
     screws: tuple = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        if self.kind == "custom":
+            way_out = "make it a hinge of the tree and close the loop at another joint"
+            raise UnsupportedError("Loop", "a custom hinge that closes a loop", way_out)
         hinge = Hinge(
             self.kind,
             self.parent,

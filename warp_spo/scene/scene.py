@@ -15,8 +15,6 @@ import numpy as np
 from ..errors import refuse_masked
 from .parts import (
     DOF_VALUES,
-    FREE,
-    SCREWS,
     Body,
     Coupling,
     Hinge,
@@ -124,12 +122,9 @@ class Scene:
     @staticmethod
     def _screws_of(hinge: Hinge) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the axes [dof, 3], and radians and metres per unit of each coordinate [dof]."""
-        if hinge.motion == SCREWS:
-            axes, angular, linear = (np.array([screw[i] for screw in hinge.screws]) for i in range(3))
-            return axes.reshape(-1, 3), angular, linear
-        axes = np.tile(np.eye(3), (hinge.dof_count // 3, 1))  # free: CoM velocity, then angular velocity
-        angular = np.repeat([0.0, 1.0] if hinge.motion == FREE else [1.0], 3)
-        return axes, angular, 1.0 - angular
+        rows = [row for kind, axis in hinge.elements for row in kind.screws(axis)]
+        axes, angular, linear = (np.array([row[i] for row in rows], dtype=np.float64) for i in range(3))
+        return axes.reshape(-1, 3), angular, linear
 
     def _check_indices(self) -> None:
         """Raise an error if hinges, loops and couplings do not name the right bodies and hinges."""
@@ -234,11 +229,7 @@ class Scene:
     @property
     def neutral_q(self) -> np.ndarray:
         """The q at which the anchors of every hinge coincide [coordinate]: zeros and identity quaternions."""
-        q = np.zeros(self.coord_count)
-        for hinge, start in zip(self.hinges, self.q_start, strict=False):
-            if hinge.motion != SCREWS:
-                q[start + hinge.coord_count - 1] = 1.0
-        return q
+        return np.concatenate([hinge.neutral for hinge in self.hinges])
 
     def with_values(self, **values: Any) -> Scene:
         """Return a copy of the scene with other ``values``, [...] for all worlds or [worlds, ...] for each world.

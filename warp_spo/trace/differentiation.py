@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from .scalars import Scalar, Value, cos, is_constant, ordered, reciprocal, select, sin
+from .scalars import Scalar, Value, cos, is_constant, logarithm, ordered, power, reciprocal, select, sin
 
 UNIT_DERIVATIVE = ("add", "cut", "reduced", "guarded")  # by each argument, except the limit of "guarded"
 ZERO_DERIVATIVE = ("input", "lost", "less")  # piecewise constant; "lost" is 0 or NaN
@@ -89,8 +89,13 @@ def partial(scalar: Scalar, at: int) -> Value:
         y, x = args
         scale = reciprocal(x * x + y * y)
         return x * scale if at == 0 else -(y * scale)
-    if op == "sum_of_logarithms":
+    if op in ("sum_of_logarithms", "logarithm"):
         return reciprocal(args[at])
+    if op == "exponential":
+        return scalar
+    if op == "power":
+        x, y = args
+        return y * power(x, y - 1.0) if at == 0 else scalar * logarithm(x)
     raise AssertionError(f"partial: the operation {op!r} has no derivative rule; add one to this function")
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from .scalars import Scalar, Value, is_constant, ordered
 
 C_TYPE = {"float32": "float", "float64": "double"}
+LIBRARY = {"exponential": "exp", "logarithm": "log", "power": "pow"}  # functions of C, also on CUDA
 BINARY = {"add": "+", "sub": "-", "mul": "*", "quotient": "/"}
 COST = {  # floating-point operations of a statement
     "add": 1,
@@ -243,6 +244,9 @@ class Emitter:
             return [f"const {T} {name} = {texts[0]} - {texts[0]};"]
         if op == "sum_of_logarithms":
             return [f"const {T} {name} = ({T})({' + '.join(f'on::log((double){a})' for a in texts)});"]
+        if op in LIBRARY:
+            function = f"{LIBRARY[op]}f" if self.dtype == "float32" else f"::{LIBRARY[op]}"
+            return [f"const {T} {name} = {function}({', '.join(texts)});"]
         return [f"const {T} {name} = on::{op}({', '.join(texts)});"]
 
 

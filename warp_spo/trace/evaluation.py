@@ -26,6 +26,9 @@ FUNCTIONS: dict[str, Callable] = {
     "guarded": lambda a, least: np.where(a > least, a, np.nan),
     "less": lambda a, b: np.where(a < b, 1.0, 0.0),
     "arctangent": np.arctan2,
+    "exponential": np.exp,
+    "logarithm": np.log,
+    "power": np.power,
     "select": lambda mask, a, b: np.where(mask != 0.0, a, b),
     "sum_of_logarithms": lambda *terms: sum(np.log(term.astype(np.float64)) for term in terms),
 }

@@ -8,7 +8,7 @@ nothing. A structural zero removes every term that it multiplies; 0 times NaN is
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 FUNCTIONS = {"sin": math.sin, "cos": math.cos, "sqrt": math.sqrt, "reciprocal": lambda x: 1.0 / x if x else math.nan}
@@ -225,6 +225,37 @@ def arctangent(y: Value, x: Value) -> Value:
         return math.atan2(y, x)
     graph = x.graph if not is_constant(x) else y.graph
     return graph.make("arctangent", y, x)
+
+
+def exponential(x: Value) -> Value:
+    """e to the power of ``x``."""
+    if is_constant(x):
+        return _of_number(math.exp, x)
+    return x.graph.make("exponential", x)
+
+
+def logarithm(x: Value) -> Value:
+    """The natural logarithm; NaN below zero."""
+    if is_constant(x):
+        return _of_number(math.log, x)
+    return x.graph.make("logarithm", x)
+
+
+def power(x: Value, y: Value) -> Value:
+    """``x`` to the power of ``y``; NaN for ``x`` below zero and a ``y`` that is not whole."""
+    if is_constant(x) and is_constant(y):
+        return _of_number(math.pow, x, y)
+    graph = x.graph if not is_constant(x) else y.graph
+    return graph.make("power", x, y)
+
+
+def _of_number(rule: Callable[..., float], *numbers: float) -> float:
+    try:
+        return rule(*numbers)
+    except ValueError:
+        return math.nan
+    except OverflowError:
+        return math.inf
 
 
 def cut(x: Value) -> Value:

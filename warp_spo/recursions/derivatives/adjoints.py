@@ -22,15 +22,13 @@ from ..forward_dynamics import forward_dynamics
 from ..impedance import Impedance
 from ..integration import moved
 from ..kinematics import body_poses, body_velocities, jacobian
-from ..links import BALL, FREE, Link
+from ..links import Link
 from ..newton_euler import inverse_dynamics
 from .power import Entry, Power, Ways
 from .tangents import coordinate_directions, tangent_gradient
 
 if TYPE_CHECKING:
     from ..tracing import Trace
-
-COORDINATES = {BALL: 4, FREE: 7}  # of a hinge; of the others one each
 
 
 class TreeEquations:
@@ -218,7 +216,7 @@ def entries(trace: Trace, name: str, found: dict[tuple, Value]) -> Iterable[tupl
     elif name == "value":
         places = [(i,) for i in range(len(trace.links.tables["value"]))]
     elif name in ("q", "target_q"):
-        places = [(link.coordinate + c,) for link in trace.own_links for c in range(COORDINATES.get(link.motion, 1))]
+        places = [(link.coordinate + c,) for link in trace.own_links for c in range(link.hinge.coordinates)]
     else:
         places = [(dof,) for link in trace.own_links for dof in link.dofs]
     return [(place, found.get((name, *place), 0.0)) for place in places]

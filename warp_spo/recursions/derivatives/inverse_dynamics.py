@@ -13,7 +13,7 @@ from ...trace.emission import Store
 from ...trace.scalars import Value
 from ...trace.spatial import ZERO, Rigid, Vector, cross, dot
 from .. import composite, motion, newton_euler
-from ..links import BALL, FREE, Link
+from ..links import Link, Placed
 from ..motion import STILL, Motion
 from . import sensitivity
 from .sensitivity import Carried, Sensitivity
@@ -46,8 +46,8 @@ def inverse_dynamics_derivatives(trace: Trace) -> list[Store]:
             trace.label(link, "s")
             drifts[key] = sensitivity.drift(link, place, None if over is None else parent, rates)
             own[key] = (
-                sensitivity.of_coordinates(link, place, trace.motions[key], parent, above, alpha[key], rates),
-                sensitivity.of_rates(link, place, trace.motions[key], parent),
+                sensitivity.of_coordinates(link, place, trace.motions[key], parent, above, alpha[key], rates, qdd),
+                sensitivity.of_rates(link, place, trace.motions[key], parent, rates),
             )
             continue
         place = trace.places[key]
@@ -89,6 +89,7 @@ def _entries(
     """Entries of the three blocks in which a dof of the link meets one of its hinge or nearer to the root."""
     place, stores = trace.places[id(link)], []
     by_q, by_qd = own[id(link)]
+    changes = link.hinge.column_changes(place)
     for at, (dof, s, s_d, (w, v)) in enumerate(
         zip(link.dofs, by_q, by_qd, sensitivity.columns(link, place), strict=True)
     ):
@@ -97,8 +98,13 @@ def _entries(
         n, f = all_in.force(s)
         change = n + cross(s.turn, force[0]), f + cross(s.turn, force[1])
         blocks = [(Q, *change), (QD, *all_in.force(s_d)), (QDD, row.w, row.v)]
-        for block, n, f in blocks:
-            for i, value in zip(link.dofs, motion.in_hinge(link, place, n, f), strict=True):
+        for block, n_own, f_own in blocks:
+            tau = motion.in_hinge(link, place, n_own, f_own)
+            if block == Q and changes is not None:  # columns that stay with the link, but for their own change
+                tau = [
+                    a + _power(c, force) for a, c in zip(motion.in_hinge(link, place, n, f), changes[at], strict=True)
+                ]
+            for i, value in zip(link.dofs, tau, strict=True):
                 extra = link.armature[at] if block == QDD and i == dof else 0.0
                 stores.append(Store("out", (block, i, dof), value + extra))
         blocks[0] = Q, change[0] + cross(s.shift, force[1]), change[1]  # the parent feels the force elsewhere
@@ -150,7 +156,7 @@ def mass_matrix_derivative(trace: Trace) -> list[Store]:
         tails[key] = below | {dof: momenta[dof] for dof in link.dofs}
         for dof in link.dofs:
             trace.label(link, f"m{dof}_")
-            changes = _column_changes(link, heads[key], heads[key][dof])
+            changes = _column_changes(link, trace.places[key], heads[key], dof)
             met = {**below, **momenta}
             for i, change in changes.items():
                 for j, momentum in met.items():
@@ -163,14 +169,15 @@ def mass_matrix_derivative(trace: Trace) -> list[Store]:
     return stores
 
 
-def _column_changes(link: Link, heads: dict, moved: tuple[Vector, Vector]) -> dict[int, tuple[Vector, Vector]]:
+def _column_changes(link: Link, place: Placed, heads: dict, dof: int) -> dict[int, tuple[Vector, Vector]]:
     """How columns H* change as the link sees them when it moves by one of its own."""
-    theta, d = moved
-    found = {}
+    theta, d = heads[dof]
+    changes = link.hinge.column_changes(place)
+    found = {} if changes is None else dict(zip(link.dofs, changes[link.dofs.index(dof)], strict=True))
     for i, (w, v) in heads.items():
         if i not in link.dofs:
             found[i] = cross(w, theta), cross(w, d) + cross(v, theta)
-        elif link.motion in (BALL, FREE):  # they stay with the parent, and a free hinge's meet at the CoM
+        elif link.hinge.rates_in_parent:  # they stay with the parent, and a free hinge's meet at the CoM
             found[i] = cross(w, theta), cross(v, theta)
     return found
 

@@ -9,11 +9,11 @@ Coriolis matrix of S. Singh, R. Russo, P. Wensing 2022 without the part that suc
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ...trace.scalars import Value
 from ...trace.spatial import ZERO, Matrix, Rigid, Vector, cross, dot, skew, symmetric
-from ..links import BALL, FREE, Link, Placed
+from ..links import Link, Placed
 from ..motion import NONE, Motion, carried, in_link, whirl
 
 
@@ -143,20 +143,22 @@ def of_coordinates(
     parent: Motion,
     above: tuple[Vector, Vector],
     own: tuple[Vector, Vector],
-    rates: object,
+    rates: Any,
+    qdd: Any,
 ) -> list[Sensitivity]:
     """Per unit displacement along each dof of a link.
 
-    A screw's own velocity is constant in the link; that of a ball or free hinge is constant in its parent.
+    A screw's own velocity is constant in the link; that of a ball or free hinge is constant in its parent. Columns that
+    depend on q add how they change.
 
     Args:
         motion, own: of the link: velocities; acceleration (w; v). parent, above: of its parent.
-        rates: qd by dof, or None.
+        rates: qd by dof, or None. qdd: by dof.
     """
     pose = place.pose
     w_c = pose.to_child(above[0])
     spin_c = pose.to_child(parent.spin)
-    whole = link.motion in (BALL, FREE)
+    whole = link.hinge.rates_in_parent
     if whole:
         spin, (w, v) = motion.spin, own
         slide = ZERO
@@ -170,14 +172,30 @@ def of_coordinates(
         change = cross(spin, theta)
         v_d = cross(v, theta) + shifting @ d + cross(change, slide)
         found.append(Sensitivity(theta, d, change, turning @ theta, v_d))
-    return found
+    changes = link.hinge.own_changes(place, [rates(dof) if rates else 0.0 for dof in link.dofs], _each(link, qdd))
+    if changes is None:
+        return found
+    return [
+        s._replace(
+            spin=s.spin + w_d, w=s.w + cross(spin_c + motion.spin, w_d) + w_dd, v=s.v + cross(spin_c, v_d) * 2.0 + v_dd
+        )
+        for s, ((w_d, v_d), (w_dd, v_dd)) in zip(found, changes, strict=True)
+    ]
 
 
-def of_rates(link: Link, place: Placed, motion: Motion, parent: Motion) -> list[Sensitivity]:
-    """Per unit of each rate of a link."""
+def _each(link: Link, entry: Any) -> list[Value]:
+    return [entry(dof) for dof in link.dofs]
+
+
+def of_rates(link: Link, place: Placed, motion: Motion, parent: Motion, rates: Any) -> list[Sensitivity]:
+    """Per unit of each rate of a link; ``rates``: qd by dof, or None."""
     spin_c = place.pose.to_child(parent.spin)
     both = spin_c + motion.spin
-    return [Sensitivity(ZERO, ZERO, w, cross(both, w), cross(spin_c, v) * 2.0) for w, v in columns(link, place)]
+    found = [Sensitivity(ZERO, ZERO, w, cross(both, w), cross(spin_c, v) * 2.0) for w, v in columns(link, place)]
+    changes = None if rates is None else link.hinge.own_bias_changes(place, _each(link, rates))
+    if changes is None:
+        return found
+    return [s._replace(w=s.w + w, v=s.v + v) for s, (w, v) in zip(found, changes, strict=True)]
 
 
 def columns(link: Link, place: Placed) -> list[tuple[Vector, Vector]]:

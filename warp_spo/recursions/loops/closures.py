@@ -20,7 +20,7 @@ from ...trace.scalars import Value, less, reciprocal
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, dot, total
 from .. import articulated
 from ..links import Link, Links, Placed, Seat
-from ..motion import in_link
+from ..motion import in_link, own_bias
 
 PARALLEL = 1e-6  # sine of the angle between two axes of a loop joint, below which they are one
 OPEN = 1e-5  # [rad], or distance over arm; a larger error is an open closure. Float32 rounds a few turns by less
@@ -197,6 +197,9 @@ def _moved(link: Link, place: Placed, over: State, qd: Any, qdd: Any) -> State:
         w, v = (axes @ part for part in in_link(link, place, qd))
         rate = rate + cross(spin, w)
         acceleration = acceleration + 2.0 * cross(spin, v)
+        own = own_bias(link, place, qd)
+        if own is not None:
+            rate, acceleration = rate + axes @ own[0], acceleration + axes @ own[1]
         spin, velocity = spin + w, velocity + v
     if qdd is not None:
         w, v = (axes @ part for part in in_link(link, place, qdd))

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ...trace.emission import Store
-from ...trace.scalars import Value, is_constant, reciprocal, sqrt
-from ...trace.spatial import Vector, dot, total
-from .. import kinematics
-from ..links import FREE, HELIX, SLIDE, TURN, Link, quaternion_rotation
+from ...trace.scalars import Value
+from ...trace.spatial import total
+from ..links import Link
 from .closures import closures
 from .clusters import Columns
 from .embedded import ClosedLoops, Embedding
@@ -62,19 +61,7 @@ def move_all(trace: Trace, step: Columns) -> list[Store]:
 
 def move(trace: Trace, link: Link, step: list[Value]) -> list[Value]:
     """Return the coordinates of a link after a small step of its dofs."""
-    q, first = trace.vector("q"), link.coordinate
-    if link.motion in (TURN, SLIDE, HELIX):
-        return [q(first) + step[0]]
-    if all(is_constant(x) and x == 0.0 for x in step):
-        return [q(first + i) for i in range(7 if link.motion == FREE else 4)]
-    at = first + (3 if link.motion == FREE else 0)
-    old = Vector(q(at + i) for i in range(4))
-    turn = kinematics.multiplied(Vector((*(0.5 * x for x in step[-3:]), 1.0)), old)
-    turn = turn * reciprocal(sqrt(dot(turn, turn)))
-    if link.motion != FREE:
-        return list(turn)
-    arm = trace.places[id(link)].turned @ link.com - quaternion_rotation(*turn) @ link.com  # type: ignore
-    return [*(Vector(q(first + i) for i in range(3)) + Vector(step[:3]) + arm), *turn]
+    return link.hinge.nudged(link, trace.places[id(link)], trace.vector("q"), step)
 
 
 def project_velocity(trace: Trace, embedding: Embedding, fixed: tuple[int, ...] = ()) -> list[Store]:

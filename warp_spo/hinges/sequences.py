@@ -1,0 +1,34 @@
+"""Sequences of elementary hinges: what the hinges of a scene are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from .ball import Ball
+from .free import Free
+from .helix import Helix
+from .kind import Element
+from .slide import Slide
+from .turn import Turn
+
+BY_NAME = {kind.name: kind for kind in (Ball(), Free())}
+TURN, SLIDE = Turn(), Slide()
+
+
+def elements(name: str, screws: Iterable[tuple[Any, float, float]]) -> tuple[Element, ...]:
+    """Return the elementary hinges of a hinge, inboard first.
+
+    Args:
+        name: that of an elementary hinge which is all of it; any other name is a chain of screws.
+        screws: (axis, radians, metres per unit of the coordinate).
+    """
+    if name in BY_NAME:
+        return (Element(BY_NAME[name]),)
+    return tuple(_of_screw(axis, float(angular), float(linear)) for axis, angular, linear in screws)
+
+
+def _of_screw(axis: Any, angular: float, linear: float) -> Element:
+    if angular == 0.0:
+        return Element(SLIDE, axis)
+    return Element(TURN if linear == 0.0 else Helix(linear / angular), axis)

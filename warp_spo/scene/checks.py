@@ -1,0 +1,55 @@
+"""Checks of the numbers that a scene is made of, float64 copies that nobody changes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..errors import refuse_masked
+
+SYMMETRY = 1e-6  # relative: what a float32 file or importer leaves of a symmetric inertia, a unit axis or quaternion
+
+
+def checked_array(call: str, name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    refuse_masked(call, name, value)
+    try:
+        array = real(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{call}: {name} is {value!r}; expected numbers of shape {shape}") from None
+    if array.shape != shape:
+        raise ValueError(f"{call}: {name} has shape {array.shape}; expected {shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{call}: {name} is {array.tolist()}; expected finite numbers")
+    return read_only(array)
+
+
+def real(value: Any) -> np.ndarray:
+    """Return a copy of an array in float64, which later changes of the caller's array do not affect.
+
+    Raises:
+        TypeError: ``value`` is or contains text, None, complex numbers, integers beyond float64, or torch tensors that
+            require grad, because no derivative passes through a copy.
+    """
+    try:
+        array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
+        for one in (value, *array.flat) if array.dtype == object else (value,):
+            if one is None or isinstance(one, str | bytes) or getattr(one, "requires_grad", False):
+                raise TypeError
+        if array.dtype.kind not in "biufO":
+            raise TypeError
+        return array.astype(np.float64)
+    except (OverflowError, RuntimeError):  # what torch raises of tensors that NumPy cannot see
+        raise TypeError from None
+
+
+def read_only(array: np.ndarray) -> np.ndarray:
+    array.flags.writeable = False
+    return array
+
+
+def checked_unit(call: str, name: str, vector: np.ndarray) -> np.ndarray:
+    norm = np.linalg.norm(vector, axis=-1, keepdims=True)
+    if np.any(np.abs(norm - 1.0) > SYMMETRY):
+        raise ValueError(f"{call}: {name} is {vector.tolist()}; expected unit length, got {norm.ravel().tolist()}")
+    return vector / norm
