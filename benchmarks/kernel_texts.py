@@ -27,7 +27,6 @@ import warp as wp
 
 import warp_spo as spo
 from warp_spo.dynamics import dynamics
-from warp_spo.dynamics.preparation import PRODUCTS, TAKES
 from warp_spo.examples import biped, fivebar, fourbar, slider_crank, stewart
 from warp_spo.kernels import native
 
@@ -138,23 +137,25 @@ def subjects() -> Iterator[tuple[str, Callable[[], spo.Dynamics]]]:
 def calls(dyn: spo.Dynamics) -> Iterator[tuple[str, Callable[[], Any]]]:
     """Every call that generates kernels."""
     size = dyn.worlds * dyn.scene.dof_count**2
-    for operation, takes in TAKES.items():
-        more = {**takes.options, **({"frames": FRAMES["frames"]} if "frames" in takes.options else {})}
+    declared = {name: one for name, one in dynamics.OPERATIONS.items() if one.results}
+    for operation in (name for name, one in declared.items() if not one.product):
+        more = FRAMES if "frames" in (option.name for option in declared[operation].options) else {}
         if operation == "mass_matrix_derivative" and size * dyn.scene.dof_count > 1 << 28:
             continue
         yield operation, lambda operation=operation, more=more: dyn.prepare(operation, **more)
-        optional = {name: True for name in takes.if_asked.split()}
+        optional = {one.name: True for one in declared[operation].arrays if one.asked}
         if optional:
             yield f"{operation}+", lambda operation=operation, more=more | optional: dyn.prepare(operation, **more)
-    for product in PRODUCTS:
+    backwards = {f"{name}_vjp": one.derivative for name, one in declared.items() if one.derivative is not None}
+    for product in (*backwards, *(name for name, one in declared.items() if one.product)):
         yield product, lambda product=product: dyn.prepare(product)
-    values = dyn.differentiable_values
+    values = dyn._gradients.values
     if values:
         for product, own in (
             ("forward_dynamics_vjp", ("q", "qd", "tau")),
             ("inverse_dynamics_vjp", ("q", "qd", "qdd")),
         ):
-            wrt = (*own, *(name for name in values if name in dyn.entering(product[:-4])))
+            wrt = (*own, *(name for name in values if name in backwards[product].values))
             yield f"{product} {' '.join(wrt)}", lambda product=product, wrt=wrt: dyn.prepare(product, wrt=wrt)
     yield "forward_dynamics_vjp tangent", lambda: dyn.prepare("forward_dynamics_vjp", wrt=("tangent", "qd"))
     yield "step midpoint", lambda: dyn.prepare("step", integrator="midpoint")

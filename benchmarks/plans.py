@@ -49,7 +49,7 @@ def main(arguments: list[str] | None = None) -> int:
     beyond = []
     for which, scene in scenes.items():
         for worlds in options.worlds:
-            chosen = spo.Dynamics(scene, worlds, options.device).plan.of(OPERATION)
+            chosen = OPERATIONS[OPERATION].granularity(spo.Dynamics(scene, worlds, options.device))
             inputs = [Inputs(scene, worlds)]
             times = {}
             for name in ("tree", "segment", *(["node"] if worlds <= NODE_WORLDS else [])):
@@ -80,7 +80,9 @@ def trace_dynamics(scene: spo.Scene, counts: list[int], device: str | None) -> d
                 dyn.programs._programs = programs[key]
                 continue
             rate = (worlds, scene.dof_count)
-            dyn.programs.find(OPERATION, {"q": (worlds, scene.coord_count), "qd": rate, "tau": rate}, rate)
+            dyn.programs.find(
+                OPERATIONS[OPERATION].routine, {"q": (worlds, scene.coord_count), "qd": rate, "tau": rate}, rate
+            )
             programs[key] = dyn.programs._programs
     return made
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 import warp_spo as spo
+from warp_spo.trials.operations import OPERATIONS
 
 from .operation_counts import count
 
@@ -43,7 +44,7 @@ def operations(dyn: spo.Dynamics, name: str) -> float | None:
     own = dyn.operation_counts.get(name)
     if own is not None:
         return own
-    return count(dyn.scene, name) if dyn.plan.of(name) == "node" else None
+    return count(dyn.scene, name) if OPERATIONS[name].granularity(dyn) == "node" else None
 
 
 @functools.cache

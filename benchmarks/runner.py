@@ -20,7 +20,7 @@ import warp as wp
 
 import warp_spo as spo
 from warp_spo.reference import Dense
-from warp_spo.trials.operations import Inputs
+from warp_spo.trials.operations import OPERATIONS, Inputs
 from warp_spo.trials.trial import Trial
 
 from . import roofline
@@ -63,7 +63,7 @@ def run(
     * on CUDA ``memory_MiB``: memory in use, the workspaces of this scene's earlier cases included.
     """
     for case, subject, name in _subjects_of(cases, device, 1 if check else SETS):
-        granularity = subject.dyn.plan.of(case["op"])
+        granularity = OPERATIONS[case["op"]].granularity(subject.dyn)
         row = case | dict(granularity=granularity, chosen=case["granularity"] is None)
         yield row | dict(reference=name) | _measure(case, subject, name, check, roof)
 
@@ -93,7 +93,13 @@ def _subjects_of(cases: Iterable[dict], device: Any, sets: int) -> Iterator[tupl
                 subject = precision.subject(scene, case["worlds"], device, case["granularity"], inputs)
             if subject is None:  # this combination was refused before
                 continue
-            identity = (*key, case["op"], case["dtype"], subject.dyn.plan.of(case["op"]), case.get("sweep"))
+            identity = (
+                *key,
+                case["op"],
+                case["dtype"],
+                OPERATIONS[case["op"]].granularity(subject.dyn),
+                case.get("sweep"),
+            )
             if identity not in done:
                 done.add(identity)
                 yield case, subject, name

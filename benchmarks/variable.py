@@ -68,7 +68,7 @@ def measure(scene: spo.Scene, worlds: int, device: Any, granularity: str | None,
     timing, error = trial.measure(REPEATS, WARM_UP, BUDGET)
     row: dict = dict(us=1e6 * timing.median, error=error)
     registers = f", {found['registers']} registers, {found['local_bytes']} bytes" if "registers" in found else ""
-    row["text"] = f"{dyn.plan.of(OPERATION)}{registers}, error {error:.1e}"
+    row["text"] = f"{OPERATIONS[OPERATION].granularity(dyn)}{registers}, error {error:.1e}"
     if variable:
         dtype = dyn.dtype
         values = {name: wp.array(scene.values[name][0], dtype=dtype, device=dyn.device) for name in variable}

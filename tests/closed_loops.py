@@ -1,8 +1,8 @@
 """Forward dynamics of closed loops three ways: by traces of the embedding, of the multipliers, and by Lagrange."""
 
 import numpy as np
-import symbolic
 import pytest
+import symbolic
 from mechanisms import MECHANISMS, Closed
 
 import warp_spo as spo
@@ -30,9 +30,9 @@ def traced(scene, operation, arrays, given, shapes, dtype="float64", **options):
 
 
 def by_embedding(scene, how, s, given=LOADED, dtype="float64"):
-    return traced(scene, "embedded_forward_dynamics", s._asdict(), given, {"out": (scene.dof_count,)}, dtype, embedding=how)[
-        "out"
-    ]
+    return traced(
+        scene, "embedded_forward_dynamics", s._asdict(), given, {"out": (scene.dof_count,)}, dtype, embedding=how
+    )["out"]
 
 
 def by_multipliers(scene, s, given=LOADED):

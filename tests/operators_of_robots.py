@@ -9,8 +9,8 @@ from robots import ROBOTS
 
 import warp_spo as spo
 from warp_spo.recursions import operators as recursion
-from warp_spo.recursions.tracing import Trace
 from warp_spo.recursions.links import Links
+from warp_spo.recursions.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
 
 IDENTITY = {

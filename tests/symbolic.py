@@ -5,6 +5,7 @@ import sys
 import textwrap
 
 import numpy as np
+
 import warp_spo
 from warp_spo.recursions import (
     composite,
@@ -24,14 +25,12 @@ from warp_spo.recursions import (
     step,
 )
 from warp_spo.recursions.derivatives import adjoints, inverse_dynamics
-
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.loops import closed_step, embedded, embedded_adjoints, minimal, multipliers, projection
 from warp_spo.recursions.step import LOOPED, MISSED
 from warp_spo.recursions.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
 from warp_spo.trace.scalars import ordered as ordered
-
 
 TREE = (forward_dynamics, newton_euler, composite, inverse, determinant, kinematics, operational, momentum, hybrid,
         quasi_velocities, reactions, step, hinge_forces, coordinates, operators, inverse_dynamics, adjoints, projection,

@@ -10,6 +10,7 @@ import warp as wp
 import warp_machine
 import zoo
 from granularity_scenes import hand
+from routines import ROUTINES
 
 import warp_spo as spo
 from warp_spo.execution import plan
@@ -135,7 +136,8 @@ def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
     qdd = np.array([reference[w].forward_dynamics(a["qd"][w], a["tau"][w]) for w in range(WORLDS)])
     solved = np.array([np.linalg.solve(reference[w].mass_matrix, a["cotangent"][w]) for w in range(WORLDS)])
     state, find, further = {"q": wide, "qd": rate}, dyn.programs.find, {}
-    program = find("forward_dynamics_and_solve", state | {"tau": rate, "cotangent": rate}, rate, {"solved": rate})
+    both = ROUTINES["forward_dynamics_and_solve"]
+    program = find(both, state | {"tau": rate, "cotangent": rate}, rate, {"solved": rate})
     assert program.warps > 1 and texts[-1].frame.staged == texts[-1].frame.further_staged == staged
     for backwards in (False, True):
         assert laws.error(warp_machine.run(texts[-1], a, backwards, further), qdd) <= TOLERANCE["float64"]
@@ -143,7 +145,7 @@ def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
     a |= {"qdd": qdd, "solved": solved}
     by_q, by_qd = (-mul(J, solved) for J in dense(scene, a)[:2])
     state |= {"qdd": rate, "solved": rate}
-    program = find("forward_dynamics_vjp", state, rate, {"qd_bar": rate}, wrt=("tangent", "qd"))
+    program = find(ROUTINES["forward_dynamics_vjp"], state, rate, {"qd_bar": rate}, wrt=("tangent", "qd"))
     assert program.warps > 1
     for backwards in (False, True):
         assert laws.error(warp_machine.run(texts[-1], a, backwards, further), by_q) <= TOLERANCE["float64"]

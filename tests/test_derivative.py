@@ -5,10 +5,10 @@ import pytest
 import symbolic
 import zoo
 from robots import ROBOTS
-from warp_spo.recursions.composite import mass_matrix
-from warp_spo.recursions.tracing import Trace
 
+from warp_spo.recursions.composite import mass_matrix
 from warp_spo.recursions.links import Links
+from warp_spo.recursions.tracing import Trace
 from warp_spo.trace import scalars as g
 from warp_spo.trace.differentiation import forward, partial, reverse
 from warp_spo.trace.evaluation import FUNCTIONS, evaluate
@@ -25,7 +25,9 @@ FINITE_DIFFERENCE = 1e-6  # eps / h + h^2
 
 def traced(name, operation):
     links = Links(SCENES[name]())
-    stores = sorted(symbolic.function(operation)(Trace(links, "float64", ARRAYS[operation])), key=lambda item: item.index)
+    stores = sorted(
+        symbolic.function(operation)(Trace(links, "float64", ARRAYS[operation])), key=lambda item: item.index
+    )
     outputs = [item.value for item in stores]
     inputs = [x for x in g.ordered(outputs) if x.op == "input"]
     rng = np.random.default_rng(0)

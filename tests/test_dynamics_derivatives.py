@@ -11,12 +11,13 @@ import warp as wp
 import zoo
 from allocations import no_warp_allocation
 from robots import ROBOTS
+from routines import ROUTINES
 
 import warp_spo as spo
 from benchmarks import cases
 from warp_spo.execution.plan import MOST_DOFS
-from warp_spo.recursions.derivatives import sensitivity
 from warp_spo.recursions.derivatives import inverse_dynamics as dense
+from warp_spo.recursions.derivatives import sensitivity
 from warp_spo.reference import Dense
 
 STEP = 1e-5
@@ -124,9 +125,7 @@ def test_zeros_are_where_the_tree_has_no_path():
     """Two dofs meet only if one's body carries the other's; a floating base's position and velocity change nothing."""
     scene = scene_of("fork").with_values(gravity=np.zeros(3))
     n, a = scene.dof_count, laws.states(scene, 1)
-    trace = symbolic.run(
-        scene, "inverse_dynamics_derivatives", a, ("q", "qd", "qdd"), {"out": (3, n, n)}
-    )["out"][0]
+    trace = symbolic.run(scene, "inverse_dynamics_derivatives", a, ("q", "qd", "qdd"), {"out": (3, n, n)})["out"][0]
     mass = Dense(scene, a["q"][0]).mass_matrix
     for block in trace:
         np.testing.assert_array_equal(np.isnan(block), mass == 0.0)
@@ -273,8 +272,7 @@ def test_far_from_the_origin_and_fast():
     far["qd"][:, rate : rate + 3] = 1024.0
     given, shapes = ("q", "qd", "qdd"), {"out": (3, n, n)}
     results = [
-        symbolic.run(scene, "inverse_dynamics_derivatives", x, given, shapes, "float32")["out"]
-        for x in (a, far)
+        symbolic.run(scene, "inverse_dynamics_derivatives", x, given, shapes, "float32")["out"] for x in (a, far)
     ]
     np.testing.assert_array_equal(*results)
 
@@ -311,9 +309,9 @@ def test_operations_are_no_more_than_they_were(name):
     pulled = {"q": q, "qd": rate, "tau": rate, "cotangent": rate}
     bars = {"qd_bar": rate, "tau_bar": rate}
     found = (
-        find("inverse_dynamics_derivatives", state, (1, 3, n, n)),
-        find("mass_matrix_derivative", {"q": q}, (1, n, n, n)),
-        find("forward_dynamics_vjp", pulled, q, bars, wrt=("q", "qd", "tau")),
+        find(ROUTINES["inverse_dynamics_derivatives"], state, (1, 3, n, n)),
+        find(ROUTINES["mass_matrix_derivative"], {"q": q}, (1, n, n, n)),
+        find(ROUTINES["forward_dynamics_vjp"], pulled, q, bars, wrt=("q", "qd", "tau")),
     )
     counts = tuple(program.operations for program in found)
     assert all(a <= b for a, b in zip(counts, PINNED[name], strict=True)), counts

@@ -20,6 +20,7 @@ from granularity_scenes import (
     equals_reference,
     states,
 )
+from routines import ROUTINES
 
 import warp_spo as spo
 
@@ -42,7 +43,7 @@ def cases():
 @pytest.mark.parametrize("name, granularity, dtype, operation", cases())
 def test_equals_reference(name, granularity, dtype, operation, device):
     dyn = dynamics(name, granularity, MANY, dtype, device)
-    assert dyn.plan.of(operation) == granularity
+    assert dyn.plan.of(ROUTINES[operation]) == granularity
     arrays = states(dyn)
     equals_reference(dyn, operation, arrays, laws.TOLERANCE[dtype], worlds=(0, 1, MANY // 2, MANY - 1))
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import warp as wp
 import zoo
+from routines import ROUTINES
 
 import warp_spo as spo
 from benchmarks import cases
@@ -23,7 +24,7 @@ def program(scene, operation, given=None, granularity="tree", worlds=1, **option
     shapes = {name: rate for name in (GIVEN[operation] if given is None else given)}
     shapes |= {"body_f": (worlds, scene.body_count, 6)} if "body_f" in shapes else {}
     out = {"log_det_mass_matrix": (worlds,), "mass_matrix": (*rate, rate[1]), "mass_matrix_inverse": (*rate, rate[1])}
-    return dyn.programs.find(operation, {"q": (worlds, scene.coord_count)} | shapes, out.get(operation, rate))
+    return dyn.programs.find(ROUTINES[operation], {"q": (worlds, scene.coord_count)} | shapes, out.get(operation, rate))
 
 
 def count(scene, operation, *given, **options):

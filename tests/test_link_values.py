@@ -4,6 +4,7 @@ import laws
 import numpy as np
 import pytest
 import zoo
+from routines import ROUTINES
 
 import warp_spo as spo
 from warp_spo import reference
@@ -22,7 +23,7 @@ def gripper():
 def find(dyn, operation="forward_dynamics", names=("qd", "tau")):
     rate = (dyn.worlds, dyn.scene.dof_count)
     shapes = {"q": (dyn.worlds, dyn.scene.coord_count)} | dict.fromkeys(names, rate)
-    return dyn.programs.find(operation, shapes, rate)
+    return dyn.programs.find(ROUTINES[operation], shapes, rate)
 
 
 def entries_read(monkeypatch, scene, operation="forward_dynamics", **options):

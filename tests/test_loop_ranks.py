@@ -24,7 +24,9 @@ def test_change_point_s24(dtype):
     q = flat(angles).astype(dtype).astype(np.float64)
     s = mechanisms.States(q, *np.random.default_rng(0).normal(size=(3, 6, 3)), np.zeros((6, 3, 6)))
     shapes = {"out": (3,), "margin": (2,)}
-    got = traced(scene, "embedded_forward_dynamics", s._asdict(), ("q", "tau"), shapes, dtype, embedding=how, status=True)
+    got = traced(
+        scene, "embedded_forward_dynamics", s._asdict(), ("q", "tau"), shapes, dtype, embedding=how, status=True
+    )
     for w in range(5):
         closed = Closed(scene, q[w])
         right = closed.forward_dynamics(np.zeros(3), s.tau[w])
@@ -116,7 +118,9 @@ def test_near_parallel_loops(apart, dtype):
     s = mechanisms.States(q, *np.random.default_rng(0).normal(size=(3, 1, scene.dof_count)), np.zeros((1, 4, 6)))
     shapes = {"out": (scene.dof_count,), "margin": (len(how.rows),)}
     right = traced(scene, "embedded_forward_dynamics", s._asdict(), ("q", "tau"), shapes, embedding=how, status=True)
-    got = traced(scene, "embedded_forward_dynamics", s._asdict(), ("q", "tau"), shapes, dtype, embedding=how, status=True)
+    got = traced(
+        scene, "embedded_forward_dynamics", s._asdict(), ("q", "tau"), shapes, dtype, embedding=how, status=True
+    )
     eps, sine = np.finfo(dtype).eps, right["margin"].min() ** 0.5
     assert len(how.rows) == 5 and sine <= 10.0 * apart
     if np.isfinite(got["out"]).all():

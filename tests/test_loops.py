@@ -103,7 +103,11 @@ def test_jacobian_and_bias_are_derivatives_of_the_error(name):
         )
         trace = Trace(Links(scene), "float64", ("q", "qd"))
         place_links(trace, moves=True)
-        values = [v for c in closures.closures(trace.links) for v in c.acceleration(trace.places, trace.vector("qd"), lambda i: 0.0)]
+        values = [
+            v
+            for c in closures.closures(trace.links)
+            for v in c.acceleration(trace.places, trace.vector("qd"), lambda i: 0.0)
+        ]
         bias = evaluate(values, lambda name, index: getattr(s, name)[w : w + 1, index[0]])  # noqa: B023
         np.testing.assert_allclose([np.ravel(b)[0] for b in bias], (ahead + behind - 2 * error[w]) / 1e-8, atol=1e-5)
 

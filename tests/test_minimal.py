@@ -12,7 +12,7 @@ from closed_loops import traced
 from mechanisms import MECHANISMS, Closed
 
 import warp_spo as spo
-from warp_spo.dynamics import loops
+from warp_spo.dynamics import inertia
 from warp_spo.dynamics.embedding import Closing, embedding
 from warp_spo.recursions.loops import minimal
 
@@ -84,7 +84,13 @@ def traced_error(name, operation):
     takes, shape, reference = CLOSED[operation]
     options = {"frames": where(scene)} if "jacobian" in operation[:9] or "operational" in operation else {}
     got = traced(
-        scene, f"embedded_{operation}", arrays_of(s), ("q", *takes), {"out": shape(len(how.dofs))}, embedding=how, **options
+        scene,
+        f"embedded_{operation}",
+        arrays_of(s),
+        ("q", *takes),
+        {"out": shape(len(how.dofs))},
+        embedding=how,
+        **options,
     )["out"]
     states = [{key: array[w] for key, array in arrays_of(s).items()} for w in range(3)]
     return max(laws.error(got[w], np.asarray(reference(c, states[w], how.dofs))) for w, c in enumerate(closed))
@@ -225,7 +231,7 @@ def test_solve_mass_matrix_with_several_columns(dtype, device):
     scene, how, s, closed = mechanisms.case("far_loop")
     dyn, size = spo.Dynamics(scene, 3, device=device, dtype=dtype, loops="embed"), len(how.dofs)
     q = wp.array(s.q, dtype=dyn.dtype, device=device)
-    for columns in (0, 1, loops.COLUMNS, 2 * loops.COLUMNS + 1):
+    for columns in (0, 1, inertia.COLUMNS, 2 * inertia.COLUMNS + 1):
         b = np.random.default_rng(columns).normal(size=(3, size, columns)).astype(dtype)
         on, out = (wp.array(x, dtype=dyn.dtype, device=device) for x in (b, np.full_like(b, np.nan)))
         dyn.prepare("solve_mass_matrix", columns=columns)
@@ -292,7 +298,12 @@ def test_what_speaks_of_independent_dofs_fits_what_speaks_of_all(device):
 
 
 BUGS = [
-    ("operational_inertia_inverse", "_eliminate_cluster", "force = force + column * rate", "force = force - column * rate"),
+    (
+        "operational_inertia_inverse",
+        "_eliminate_cluster",
+        "force = force + column * rate",
+        "force = force - column * rate",
+    ),
     ("operational_inertia_inverse", "_eliminate_cluster", "{id(link): force}", "{id(cluster.links[0]): force}"),
     (
         "operational_inertia_inverse_product",

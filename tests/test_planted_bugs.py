@@ -8,6 +8,7 @@ import warp_machine
 import zoo
 from laws import TOLERANCE
 from mutants import mutant
+from routines import ROUTINES
 
 import warp_spo as spo
 from warp_spo.execution import node_functions, teams
@@ -170,7 +171,7 @@ def team_error(monkeypatch, operation="forward_dynamics", name="star"):
     given = {"forward_dynamics": ("q", "qd", "tau"), "mass_matrix_inverse": ("q",)}.get(operation, ("q", "qd", "qdd"))
     arrays["body_f"][:] = 0.0
     wanted = np.array([laws.expected(dyn, operation, arrays, w) for w in range(WORLDS)])
-    dyn.programs.find(operation, {name: arrays[name].shape for name in given}, wanted.shape)
+    dyn.programs.find(ROUTINES[operation], {name: arrays[name].shape for name in given}, wanted.shape)
     assert texts[-1].frame.warps > 1
     return laws.error(warp_machine.run(texts[-1], arrays).reshape(wanted.shape), wanted)
 

@@ -11,6 +11,7 @@ import warp as wp
 import warp_machine
 import zoo
 from granularity_scenes import MANY, hand
+from routines import ROUTINES
 from step_scenes import FORCES, TOLERANCE, H, furnished, states
 
 import warp_spo as spo
@@ -123,7 +124,7 @@ def texts_of(monkeypatch, name, staged=False, **options):
     shapes = {key: array.shape for key, array in a.items()} | {"dt": ()}
     more = {"q_out": wide} | ({"qdd_out": rate} if "qdd" in options else {})
     more |= {"status": (WORLDS,)} if "status" in options else {}
-    program = dyn.programs.find("step", shapes, rate, more, **options)
+    program = dyn.programs.find(ROUTINES["step"], shapes, rate, more, **options)
     assert program.warps > 1 and texts[-1].frame.staged == staged
     return texts[-1], a | {"dt": H}, symbolic.advance(scene, a, H)
 

@@ -11,6 +11,7 @@ from torch.autograd import forward_ad
 
 import warp_spo as spo
 from warp_spo import torch as spo_torch
+from warp_spo.dynamics.steps import INTEGRATE
 from warp_spo.execution.plan import MOST_DOFS
 from warp_spo.execution.staging import is_read_before_written
 from warp_spo.recursions.derivatives.adjoints import forward_dynamics_vjp
@@ -149,7 +150,7 @@ def test_what_has_no_gradient_says_so(tree):
         dyn.mass_matrix_inverse(q)
     with pytest.raises(ValueError, match=r"expected integrator='semi_implicit'"):
         dyn.step(q, qd, None, DT, integrator="rk4")
-    assert not dyn.integrate(q, qd, DT).requires_grad or "body_mass" in dyn.entering("integrate")
+    assert not dyn.integrate(q, qd, DT).requires_grad or "body_mass" in INTEGRATE.derivative.values
     with pytest.raises(ValueError, match=r"'joint_limit_lower' has no gradient"):
         spo_torch.Module(dyn, ["joint_limit_lower"])
     folded = spo.Dynamics(dyn.scene, WORLDS, device=dyn.device, dtype="float64", granularity="tree")

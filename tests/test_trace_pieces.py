@@ -8,6 +8,7 @@ import pytest
 import warp_machine
 import zoo
 from robots import ROBOTS
+from routines import ROUTINES
 
 import warp_spo as spo
 from warp_spo.execution import plan, teams
@@ -91,7 +92,7 @@ def built(texts, scene, operation, worlds=3, dtype="float64", given=None, **opti
     shapes = {name: arrays[name].shape for name in ("q", *names)}
     dofs = scene.dof_count
     out = (worlds, dofs, dofs) if operation.startswith("mass_matrix") else (worlds, dofs)
-    program = dyn.programs.find(operation, shapes, out)
+    program = dyn.programs.find(ROUTINES[operation], shapes, out)
     fields = {name: dyn.programs.field(name).numpy() for name in program.fields}
     state = {name: array if name in ("q", *names) else np.zeros_like(array) for name, array in arrays.items()}
     return texts[-1], state | fields, np.array([laws.expected(dyn, operation, state, w) for w in range(worlds)])
@@ -238,7 +239,7 @@ def test_steps_are_named_in_the_code(monkeypatch):
     scene = ROBOTS["arm"]()
     dyn = spo.Dynamics(scene, 1, device="cpu", dtype="float64", granularity="tree")
     rate = (1, scene.dof_count)
-    dyn.programs.find("forward_dynamics", {"q": (1, scene.coord_count), "qd": rate, "tau": rate}, rate)
+    dyn.programs.find(ROUTINES["forward_dynamics"], {"q": (1, scene.coord_count), "qd": rate, "tau": rate}, rate)
     for label in scene.body_labels[1:]:  # the pedestal does not move
         assert f"// {label}" in texts[-1].cpu
     names = re.findall(r"double (\w+) =", texts[-1].cpu)

@@ -161,7 +161,7 @@ def run(dyns: list[Dynamics]) -> Iterator[dict[str, Any]]:
                 dtype = subject.dyn.dtype.__name__
                 progress.step(f"{operation.name} {dtype}")
                 timing, error = Trial(subject, operation).measure(warm_up=WARM_UP, budget=BUDGET)
-                granularity = subject.dyn.plan.of(operation.name)
+                granularity = operation.granularity(subject.dyn)
                 row = dict(op=operation.name, granularity=granularity, dtype=dtype, worlds=worlds)
                 yield row | dict(error=error, seconds=timing.median)
 

@@ -1,4 +1,4 @@
-"""Analytic derivatives of the dynamics: methods of :class:`warp_spo.Dynamics`.
+"""Analytic derivatives of the dynamics as matrices.
 
 Along q they are taken in tangent coordinates: column i is the rate at which a result changes as ``integrate(q, e_i,
 t)`` moves q. For hinges made of screws that is q itself; a ball turns, a free hinge's body moves with its CoM and turns
@@ -8,16 +8,38 @@ about it, in the axes of the parent anchor.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import warp as wp
 
-from ..arrays import Call
-from ..execution.programs import Program, Programs
-from ..execution.sweeps import Sweeps
+from ..arrays import AnyArray, ArrayT
+from ..execution.programs import Program
+from ..execution.routine import Routine
 from ..kernels import tiles
 from ..kernels.straight import TILE
-from ..scene.scene import Scene
+from ..recursions.derivatives import inverse_dynamics as recursion
+from .forward_dynamics import FORWARD_DYNAMICS, known_accelerations
+from .inertia import MASS_MATRIX_INVERSE
+from .operation import (
+    AS_WRITTEN,
+    BODY_F,
+    EMBEDDED_DERIVATIVE,
+    NO_DERIVATIVE,
+    QD,
+    QDD,
+    TAU,
+    Operation,
+    Q,
+    Result,
+    Trial,
+    derivative_of,
+)
+from .traced_reference import forward_dynamics_by_q, inverse_dynamics_rates
+
+if TYPE_CHECKING:
+    from .dynamics import Dynamics
+
+SQUARE = "world, dof, dof"
 
 
 class InverseDynamicsDerivatives(NamedTuple):
@@ -36,150 +58,178 @@ class ForwardDynamicsDerivatives(NamedTuple):
     tau: Any
 
 
-class Derivatives:
-    """What Dynamics inherits. Arrays and coordinates are as there."""
+INVERSE_DYNAMICS_DERIVATIVES = Operation(
+    "inverse_dynamics_derivatives",
+    arguments=(Q, QD, QDD, BODY_F),
+    results=tuple(Result(name, SQUARE) for name in ("q", "qd", "qdd")),
+    routine=Routine("inverse_dynamics_derivatives", recursion.inverse_dynamics_derivatives, tiled=True),
+    embed=NO_DERIVATIVE,
+    multipliers=NO_DERIVATIVE,
+    trial=Trial(lambda dense, q, qd, qdd: inverse_dynamics_rates(dense, qd, qdd)[0]),
+)
 
-    scene: Scene
-    worlds: int
-    device: wp.Device
-    dtype: type
-    recursions: Sweeps
-    programs: Programs
 
-    def inverse_dynamics_derivatives(
-        self, q: Any, qd: Any = None, qdd: Any = None, body_f: Any = None, out: Any = (None, None, None)
-    ) -> InverseDynamicsDerivatives:
-        """Derivatives of :meth:`inverse_dynamics` by q, qd and qdd, analytic, O(dof depth).
+@INVERSE_DYNAMICS_DERIVATIVES.method
+def inverse_dynamics_derivatives(
+    self: Dynamics,
+    q: ArrayT,
+    qd: AnyArray | None = None,
+    qdd: AnyArray | None = None,
+    body_f: AnyArray | None = None,
+    out: tuple[ArrayT | None, ArrayT | None, ArrayT | None] = (None, None, None),
+) -> InverseDynamicsDerivatives:
+    """Compute the derivatives of :meth:`inverse_dynamics` by q, qd and qdd, analytically, in O(dof depth).
 
-        Singh, Russo, Wensing 2022, "Efficient analytical derivatives of rigid-body dynamics using spatial vector
-        algebra", in link frames and with classical accelerations: no velocity or position of the inertial frame enters.
+    Singh, Russo, Wensing 2022, "Efficient analytical derivatives of rigid-body dynamics using spatial vector algebra",
+    in link frames and with classical accelerations, so that no velocity or position of the inertial frame enters.
 
-        Args:
-            q, qd, qdd, body_f: as there. body_f stays fixed in inertial axes as the bodies move.
-            out: (q, qd, qdd), each an array or None.
+    Args:
+        q, qd, qdd, body_f: as there. body_f stays fixed in inertial axes as the bodies move.
+        out: (q, qd, qdd), each an array or None.
 
-        Returns:
-            q, qd, qdd [world, dof, dof]: column j is the derivative by entry j; q along tangent coordinates, see
-            :mod:`.derivatives`. qdd is the mass matrix.
+    Returns:
+        q, qd, qdd [world, dof, dof]: column j is the derivative by entry j. qdd is the mass matrix. Along q, column j
+        is the rate of change as ``integrate(q, e_j, t)`` moves q, in tangent coordinates: for hinges made of screws q
+        itself; a ball turns, and a free hinge's body moves with its CoM and turns about it, in the axes of the parent
+        anchor.
 
-        Raises:
-            UnsupportedError: more than 128 dof.
-        """
-        with self._call("inverse_dynamics_derivatives") as call:
-            arrays, outs = self._read_derivative(call, q, qd, "qdd", qdd, body_f, out)
-            program, found = self._tiled("inverse_dynamics_derivatives", (3, *self._square), **arrays)
-            for block, result in enumerate(outs):
-                self._spread(program, found, block, result)
-        return InverseDynamicsDerivatives(*call.result)
+    Raises:
+        UnsupportedError: more than 128 dof; closed loops.
+    """
+    engine = self._engine
+    with engine.call(INVERSE_DYNAMICS_DERIVATIVES) as call:
+        self._gradients.check_size(call)
+        outs = engine.outs(call, INVERSE_DYNAMICS_DERIVATIVES, out)
+        given = engine.read(call, INVERSE_DYNAMICS_DERIVATIVES, q=q, qd=qd, qdd=qdd, body_f=body_f)
+        results: list[wp.array] = engine.write(call, INVERSE_DYNAMICS_DERIVATIVES, outs, given)
+        program, found = _tiled(self, INVERSE_DYNAMICS_DERIVATIVES, (3, *results[0].shape[1:]), **given)
+        for block, result in enumerate(results):
+            _spread(self, program, found, block, result)
+    return InverseDynamicsDerivatives(*call.result)
 
-    def forward_dynamics_derivatives(
-        self, q: Any, qd: Any = None, tau: Any = None, body_f: Any = None, out: Any = (None, None, None)
-    ) -> ForwardDynamicsDerivatives:
-        """Derivatives of :meth:`forward_dynamics` by q, qd and tau: -Mass^-1 times those of inverse dynamics at qdd.
 
-        Args:
-            q, qd, tau, body_f: as there. body_f stays fixed in inertial axes as the bodies move.
-            out: (q, qd, tau), each an array or None.
+FORWARD_DYNAMICS_DERIVATIVES = Operation(
+    "forward_dynamics_derivatives",
+    arguments=(Q, QD, TAU, BODY_F),
+    results=tuple(Result(name, SQUARE) for name in ("q", "qd", "tau")),
+    embed=AS_WRITTEN,
+    multipliers=EMBEDDED_DERIVATIVE,
+    trial=Trial(forward_dynamics_by_q),
+)
 
-        Returns:
-            q, qd, tau [world, dof, dof]: column j is the derivative by entry j; q along tangent coordinates, see
-            :mod:`.derivatives`. tau is the inverse mass matrix, with loops embedded X (X* Mass X)^-1 X*. NaN in
-            worlds where that does not exist.
 
-        Loops that are embedded: row by row, a launch for each dof; see :meth:`forward_dynamics_vjp`.
+@FORWARD_DYNAMICS_DERIVATIVES.method
+def forward_dynamics_derivatives(
+    self: Dynamics,
+    q: ArrayT,
+    qd: AnyArray | None = None,
+    tau: AnyArray | None = None,
+    body_f: AnyArray | None = None,
+    out: tuple[ArrayT | None, ArrayT | None, ArrayT | None] = (None, None, None),
+) -> ForwardDynamicsDerivatives:
+    """Compute the derivatives of :meth:`forward_dynamics`: -Mass^-1 times those of inverse dynamics at qdd.
 
-        Raises:
-            UnsupportedError: more than 128 dof; loops by multipliers.
-        """
-        with self._call("forward_dynamics_derivatives") as call:
-            arrays, outs = self._read_derivative(call, q, qd, "tau", tau, body_f, out)
-            qdd = self._accelerations(None, arrays)
-            n, (by_q, by_qd, inverse) = self.scene.dof_count, outs
-            if self.embedding is not None:
-                self._row_by_row({**arrays, "qdd": qdd}, outs)
-            elif n:
-                arrays = {"q": arrays["q"], "qd": arrays["qd"], "qdd": qdd, "body_f": arrays["body_f"]}
-                program, rates = self._tiled("inverse_dynamics_derivatives", (3, *self._square), **arrays)
-                self._run("mass_matrix_inverse", inverse, q=arrays["q"])
-                inputs = [inverse, rates, program.entry.reshape((3, n, n))]
-                self.recursions.launch(tiles.negative_product, (len(rates), n, n), inputs, [by_q, by_qd])
-        return ForwardDynamicsDerivatives(*call.result)
+    Args:
+        q, qd, tau, body_f: as there. body_f stays fixed in inertial axes as the bodies move.
+        out: (q, qd, tau), each an array or None.
 
-    def mass_matrix_derivative(self, q: Any, out: Any = None) -> Any:
-        """d Mass / d q along tangent coordinates, see :mod:`.derivatives`; the last index is the coordinate.
+    Returns:
+        q, qd, tau [world, dof, dof]: column j is the derivative by entry j; q along tangent coordinates, see
+        :meth:`inverse_dynamics_derivatives`. tau is the inverse mass matrix, with embedded loops X (X* Mass X)^-1 X*.
+        NaN in worlds where that does not exist.
 
-        Returns:
-            [world, dof, dof, dof], symmetric in the first two of dof.
+    With embedded loops the matrices are computed row by row, by a launch for each dof; see
+    :meth:`forward_dynamics_vjp`.
 
-        Raises:
-            UnsupportedError: more than 128 dof.
-        """
-        with self._call("mass_matrix_derivative") as call:
-            self._check_size(call)
-            q, _ = self._read_state(call, q, None)
-            shape = (*self._square, self.scene.dof_count)
-            out = call.write(out, (self.worlds, *shape), "[world, dof, dof, dof]")
-            program, found = self._tiled("mass_matrix_derivative", shape, q=q)
-            self._spread(program, found, 0, out)
-        return call.result
+    Raises:
+        UnsupportedError: more than 128 dof; loops by multipliers.
+    """
+    engine = self._engine
+    with engine.call(FORWARD_DYNAMICS_DERIVATIVES) as call:
+        self._gradients.check_size(call)
+        outs = engine.outs(call, FORWARD_DYNAMICS_DERIVATIVES, out)
+        given = engine.read(call, FORWARD_DYNAMICS_DERIVATIVES, q=q, qd=qd, tau=tau, body_f=body_f)
+        results = engine.write(call, FORWARD_DYNAMICS_DERIVATIVES, outs, given)
+        qdd = known_accelerations(self, None, **given)
+        n, (by_q, by_qd, inverse) = self.scene.dof_count, results
+        if self.embedding is not None:
+            _differentiate_by_rows(self, {**given, "qdd": qdd}, results)
+        elif n:
+            given = {"q": given["q"], "qd": given["qd"], "qdd": qdd, "body_f": given["body_f"]}
+            program, rates = _tiled(self, INVERSE_DYNAMICS_DERIVATIVES, (3, n, n), **given)
+            assert program is not None and rates is not None
+            engine.launch(MASS_MATRIX_INVERSE, inverse, q=given["q"])
+            inputs = [inverse, rates, program.entry.reshape((3, n, n))]
+            self.recursions.launch(tiles.negative_product, (len(rates), n, n), inputs, [by_q, by_qd])
+    return ForwardDynamicsDerivatives(*call.result)
 
-    # -- steps -----------------------------------------------------------------------------------------------------
-    @property
-    def _square(self) -> tuple[int, int]:
-        return self.scene.dof_count, self.scene.dof_count
 
-    def _read_derivative(
-        self, call: Call, q: Any, qd: Any, name: str, third: Any, body_f: Any, out: Any
-    ) -> tuple[dict[str, Any], tuple[wp.array, ...]]:
-        """The arguments by name, and the three results."""
-        self._check_size(call, "forward_dynamics" if name == "tau" else "")
-        if not isinstance(out, tuple | list) or len(out) != 3:
-            raise TypeError(f"{call.name}: out is {out!r}; expected three arrays or None, (q, qd, {name})")
-        q, qd = self._read_state(call, q, qd)
-        third, body_f = self._read_rate(call, name, third), self._read_body_f(call, body_f)
-        shape = (self.worlds, *self._square)
-        outs = tuple(call.write(array, shape, "[world, dof, dof]", name=f"out[{i}]") for i, array in enumerate(out))
-        return {"q": q, "qd": qd, name: third, "body_f": body_f}, outs
+MASS_MATRIX_DERIVATIVE = Operation(
+    "mass_matrix_derivative",
+    arguments=(Q,),
+    results=(Result("derivative", "world, dof, dof, dof"),),
+    routine=Routine("mass_matrix_derivative", recursion.mass_matrix_derivative, tiled=True),
+    embed=NO_DERIVATIVE,
+    multipliers=NO_DERIVATIVE,
+)
 
-    def _row_by_row(self, given: dict[str, Any], outs: Sequence[wp.array]) -> None:
-        """Derivatives of forward dynamics by the way back from each of its results."""
-        shape = self.worlds, self.scene.dof_count
-        names = "tangent", "qd", "tau"
-        rows = [self.recursions.array(f"row by {name}", *shape) for name in names]
-        unit = self.recursions.array("unit cotangent", *shape)
-        for dof in range(self.scene.dof_count):
-            unit.zero_()
-            unit[:, dof].fill_(1.0)
-            self._pull("forward_dynamics", names, rows, {**given, "cotangent": unit})
-            for row, out in zip(rows, outs, strict=True):
-                wp.copy(out[:, dof], row)
 
-    def _tiled(self, operation: str, shape: tuple[int, ...], **given: Any) -> tuple[Any, Any]:
-        """Run a program whose result, of ``shape`` in a world, is left in tiles."""
-        if self.scene.dof_count == 0:
-            return None, None
-        arrays = {name: array for name, array in given.items() if array is not None}
-        shapes = {name: array.shape for name, array in arrays.items()}
-        program: Program = self.programs.find(operation, shapes, (self.worlds, *shape))
-        count = -(-self.worlds // TILE)
-        found = self.recursions.array(("tiles", operation, *shapes), count, max(program.slots, 1), TILE)
-        self.programs.launch(program, arrays, found)
-        return program, found
+@MASS_MATRIX_DERIVATIVE.method
+def mass_matrix_derivative(self: Dynamics, q: ArrayT, out: ArrayT | None = None) -> ArrayT:
+    """Compute d Mass / d q along tangent coordinates, see :meth:`inverse_dynamics_derivatives`.
 
-    def _spread(self, program: Program | None, found: wp.array, block: int, out: wp.array) -> None:
-        """Write one block of what is in tiles to [world, ...]."""
-        if program is None or out.size == 0:
-            return
-        rows = out.reshape((self.worlds, out.size // self.worlds))
-        inputs = [found, program.entry, block * rows.shape[1]]
-        self.recursions.launch(tiles.unpack, (len(found), rows.shape[1]), inputs, [rows])
+    Returns:
+        [world, dof, dof, dof], symmetric in the first two of dof; the last index is the tangent coordinate.
 
-    _call: Any
-    _read_state: Any
-    _read_rate: Any
-    _read_body_f: Any
-    _run: Any
-    _accelerations: Any
-    _check_size: Any
-    _pull: Any
-    embedding: Any
+    Raises:
+        UnsupportedError: more than 128 dof; closed loops.
+    """
+    engine = self._engine
+    with engine.call(MASS_MATRIX_DERIVATIVE) as call:
+        self._gradients.check_size(call)
+        given = engine.read(call, MASS_MATRIX_DERIVATIVE, q=q)
+        (result,) = engine.write(call, MASS_MATRIX_DERIVATIVE, (out,), given)
+        program, found = _tiled(self, MASS_MATRIX_DERIVATIVE, result.shape[1:], **given)
+        _spread(self, program, found, 0, result)
+    return call.result
+
+
+# -- steps -------------------------------------------------------------------------------------------------------------
+def _differentiate_by_rows(dyn: Dynamics, given: dict[str, Any], outs: Sequence[wp.array]) -> None:
+    """Compute derivatives of forward dynamics by the way back from each of its results."""
+    derivative, shape = derivative_of(FORWARD_DYNAMICS), (dyn.worlds, dyn.scene.dof_count)
+    names = "tangent", "qd", "tau"
+    rows = [dyn.recursions.array(f"row by {name}", *shape) for name in names]
+    unit = dyn.recursions.array("unit cotangent", *shape)
+    for dof in range(dyn.scene.dof_count):
+        unit.zero_()
+        unit[:, dof].fill_(1.0)
+        dyn._gradients.launch(derivative, names, rows, {**given, "cotangent": unit})
+        for row, out in zip(rows, outs, strict=True):
+            wp.copy(out[:, dof], row)
+
+
+def _tiled(
+    dyn: Dynamics, operation: Operation, shape: tuple[int, ...], **given: Any
+) -> tuple[Program | None, wp.array | None]:
+    """Run a kernel whose result, of ``shape`` in a world, is left in tiles; return its program and the tiles."""
+    if dyn.scene.dof_count == 0:
+        return None, None
+    assert operation.routine is not None
+    arrays = {name: array for name, array in given.items() if array is not None}
+    shapes = {name: array.shape for name, array in arrays.items()}
+    program = dyn.programs.find(operation.routine, shapes, (dyn.worlds, *shape))
+    assert program is not None
+    count = -(-dyn.worlds // TILE)
+    found = dyn.recursions.array(("tiles", operation.name, *shapes), count, max(program.slots, 1), TILE)
+    dyn.programs.launch(program, arrays, found)
+    return program, found
+
+
+def _spread(dyn: Dynamics, program: Program | None, found: wp.array | None, block: int, out: wp.array) -> None:
+    """Write one block of the tiles to [world, ...]."""
+    if program is None or found is None or out.size == 0:
+        return
+    rows = out.reshape((dyn.worlds, out.size // dyn.worlds))
+    inputs = [found, program.entry, block * rows.shape[1]]
+    dyn.recursions.launch(tiles.unpack, (len(found), rows.shape[1]), inputs, [rows])

@@ -7,12 +7,18 @@ A step multiplies the error by float32's own, about 1e-3 eps cond, down to float
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
 from ..execution import status_words as words
 from ..kernels import refinement as kernels
+from .forward_dynamics import FORWARD_DYNAMICS
+from .inertia import SOLVE_MASS_MATRIX
+from .inverse_dynamics import INVERSE_DYNAMICS
+
+if TYPE_CHECKING:
+    from .dynamics import Dynamics
 
 
 class Refinement:
@@ -23,7 +29,7 @@ class Refinement:
         steps: how many.
     """
 
-    def __init__(self, dyn: Any, steps: int):
+    def __init__(self, dyn: Dynamics, steps: int):
         self.steps = steps
         other = "float64" if dyn.dtype is wp.float32 else "float32"
         granularity = dyn.granularity if dyn.plan.forced else None
@@ -38,7 +44,7 @@ class Refinement:
         low, high = ({name: self._in(dyn, name, x) for name, x in (("q", q), ("qd", qd), ("body_f", body_f))}
                      for dyn in (narrow, self.wide))  # fmt: skip
         right, x = self._in(narrow, "tau", tau), self._array(narrow, "x")
-        swept = narrow._run("forward_dynamics", x, tau=right, **low)
+        swept = narrow._engine.launch(FORWARD_DYNAMICS, x, tau=right, **low)
         if status is not None:
             found = low["q"], low["qd"], right, low["body_f"], x, status
             words.write(narrow.recursions, *found, factored=swept)
@@ -55,7 +61,7 @@ class Refinement:
                 wp.copy(out[:, :, j], found)
             return
         low, x = self._in(self.narrow, "q", q), self._array(self.narrow, "x")
-        self.narrow._run("solve_mass_matrix", x, q=low, b=self._in(self.narrow, "b", b))
+        self.narrow._engine.launch(SOLVE_MASS_MATRIX, x, q=low, b=self._in(self.narrow, "b", b))
         self._refine(low, x, b, out, q=self._in(self.wide, "q", q), gravity=False)
 
     def _refine(self, at: wp.array, x: wp.array, right: Any, out: wp.array, **given: Any) -> None:
@@ -65,23 +71,24 @@ class Refinement:
         rest, step = self._array(self.narrow, "rest"), self._array(self.narrow, "step")
         self._launch(kernels.cast(wp.float32, wp.float64), [x], total)
         for _ in range(self.steps):
-            self.wide._run("inverse_dynamics", force, qdd=total, **given)
+            self.wide._engine.launch(INVERSE_DYNAMICS, force, qdd=total, **given)
             self._launch(kernels.residual(out.dtype), [right, force], rest)
-            self.narrow._run("solve_mass_matrix", step, q=at, b=rest)
+            self.narrow._engine.launch(SOLVE_MASS_MATRIX, step, q=at, b=rest)
             self._launch(kernels.add(), [step], total)
         if total is not out:
             self._launch(kernels.cast(wp.float64, wp.float32), [total], out)
 
-    def _in(self, dyn: Any, name: str, x: Any) -> Any:
+    def _in(self, dyn: Dynamics, name: str, x: Any) -> Any:
         """``x`` in the precision of ``dyn``."""
         if x is None or x.dtype is dyn.dtype:
             return x
         other = dyn.recursions.array(f"refined {name}", *x.shape)
         flat = x.shape[0], x.size // x.shape[0]
-        self._launch(kernels.cast(x.dtype, dyn.dtype), [x.reshape(flat)], other.reshape(flat))
+        types: tuple[Any, Any] = x.dtype, dyn.dtype
+        self._launch(kernels.cast(*types), [x.reshape(flat)], other.reshape(flat))
         return other
 
-    def _array(self, dyn: Any, name: str) -> wp.array:
+    def _array(self, dyn: Dynamics, name: str) -> wp.array:
         return dyn.recursions.array(f"refined {name}", *self._shape)
 
     @staticmethod

@@ -3,18 +3,33 @@
 from __future__ import annotations
 
 from itertools import accumulate
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..arrays import WARP, Call
+from ..arrays import WARP, AnyArray, Call
 from ..execution.programs import Programs
+from ..execution.routine import Routine
 from ..execution.sweeps import Sweeps
 from ..graph.algebra import LetterOwner
 from ..graph.blocks import Blocks, DeferredWeights, weights_array
 from ..graph.factorization import Factorization
 from ..graph.operators import BWA
 from ..kernels import kinematics, rigid_blocks
+from ..recursions import operators as recursion
+from .operation import AS_WRITTEN, Operation, Q, Refused
+
+if TYPE_CHECKING:
+    from .dynamics import Dynamics
+
+EXPRESSION = Routine(
+    "expression",
+    recursion.expression,
+    blocks=True,
+    suits=lambda links, shapes, expression: recursion.meet(expression),
+    variants=64,
+    title=lambda inputs, expression: recursion.written(expression),
+)
 
 
 class SpatialOperators(LetterOwner):
@@ -66,7 +81,7 @@ class SpatialOperators(LetterOwner):
             getattr(self, name).letter = self, name
         self._frames: Any = None
         self._kind: str | None = WARP
-        self._fused = recursions.plan.of("expression") != "node" and dofs > 0
+        self._fused = recursions.plan.of(EXPRESSION) != "node" and dofs > 0
         self._q: Any = wp.empty((worlds, scene.coord_count), dtype=dtype, device=device) if self._fused else None
         self._filled: int | None = None  # stamp of the values that the blocks were filled with
         self._captured = False
@@ -112,7 +127,7 @@ class SpatialOperators(LetterOwner):
             return False
         arrays = {"q": self._q, "x": x}
         shapes = {name: array.shape for name, array in arrays.items()}
-        program = self._programs.find("expression", shapes, out.shape, expression=expression)
+        program = self._programs.find(EXPRESSION, shapes, out.shape, expression=expression)
         if program is not None:
             self._programs.launch(program, arrays, out)
         return program is not None
@@ -126,3 +141,15 @@ class SpatialOperators(LetterOwner):
             self.fill()
             wp.copy(out, self._frames)
         return call.result
+
+
+OPERATORS = Operation("operators", arguments=(Q,), results=(), embed=Refused(), multipliers=AS_WRITTEN)
+
+
+@OPERATORS.method
+def operators(self: Dynamics, q: AnyArray) -> SpatialOperators:
+    """Return the paper's operators at ``q``: phi, psi, H, K, D, G, M, P, Delta ...; ``update(q)`` refills them."""
+    self._engine.refuse(OPERATORS.name, OPERATORS)
+    found = SpatialOperators(self.recursions, self.programs)
+    found.update(q)
+    return found

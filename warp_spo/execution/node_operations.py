@@ -77,6 +77,11 @@ def body_velocities(run: Sweeps, out: wp.array, q: wp.array, qd: wp.array) -> No
     run.launch_nodes(kinematics.body_velocities, run.nodes, inputs, [out])
 
 
+def body_states(run: Sweeps, out: wp.array, q: wp.array, qd: wp.array, velocities_out: wp.array) -> None:
+    body_poses(run, out, q)
+    body_velocities(run, velocities_out, q, qd)
+
+
 def jacobian(run: Sweeps, out: wp.array, q: wp.array, frames: tuple) -> None:
     run.hinges(q)
     run.jacobian(*run.frames(frames), out)

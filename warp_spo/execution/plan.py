@@ -8,6 +8,7 @@ from ..kernels.slots import WARP_SIZE
 from ..recursions.links import Links
 from ..recursions.pieces import Pieces
 from ..scene.scene import Scene
+from .routine import Routine
 
 GRANULARITIES = ("node", "segment", "tree")
 DEFAULT: str | None = None  # granularity of who asks for none; None: chosen by the rules below
@@ -26,74 +27,6 @@ FEW_RESULTS = 2  # short ones that a thread writes by itself
 MOST_WARPS = 16
 DEEPEST = 12  # dofs from a root to a leaf, a free hinge one, up to which velocity terms that come first are as accurate
 APART = {"chain": 2048, "tree": 4 * FEW_WORLDS, "segment": FEW_WORLDS}  # worlds beyond which they are faster
-SHORT = ("inverse_dynamics", "bias_force", "gravity_force")  # little code: a thread for the whole tree does not spill
-GATHERED = ("forward_dynamics", "forward_dynamics_apart")  # by limbs with short rows: work enough for a barrier more
-LONG_RESULTS = ("mass_matrix", "mass_matrix_inverse")  # writing them is most of the work, and goes faster by many warps
-
-SEGMENTED = ("forward_dynamics", "solve_mass_matrix", *LONG_RESULTS, *SHORT)
-"""Operations that a warp a limb can share; the others run with a thread a world where the plan says segment."""
-TREE_ONLY = (
-    "hybrid_dynamics",
-    "jacobian_bias",
-    "frame_accelerations",
-    "operational_inertia_inverse_product",
-    "com_jacobian",
-    "centroidal_momentum_matrix",
-    "centroidal_momentum_bias",
-    "quasi_velocities",
-    "log_det_mass_matrix_gradient",
-    "fixman_torque",
-    "mass_matrix_packed",
-    "mass_matrix_inverse_packed",
-    "inverse_dynamics_derivatives",
-    "mass_matrix_derivative",
-    "solve_mass_matrix_vjp",
-    "mass_matrix_vjp",
-    "jacobian_vjp",
-    "integrate_vjp",
-    "step_vjp",
-    "body_poses_vjp",
-    "body_velocities_vjp",
-    "forward_dynamics_jvp",
-    "inverse_dynamics_jvp",
-    "step_system",
-    "integrate",
-    "passive_force",
-    "hinge_force",
-    "coordinate_rates",
-    "body_accelerations",
-    "body_reactions",
-    "embedded_forward_dynamics",
-    "embedded_inverse_dynamics",
-    "embedded_mass_matrix",
-    "embedded_mass_matrix_inverse",
-    "embedded_solve_mass_matrix",
-    "embedded_log_det_mass_matrix",
-    "embedded_operational_inertia_inverse",
-    "embedded_operational_inertia_inverse_product",
-    "embedded_hybrid_dynamics",
-    "embedded_jacobian",
-    "embedded_jacobian_bias",
-    "embedded_com_jacobian",
-    "embedded_centroidal_momentum_matrix",
-    "embedded_centroidal_momentum_bias",
-    "embedded_forward_dynamics_vjp",
-    "embedded_forward_dynamics_jvp",
-    "embedded_inverse_dynamics_vjp",
-    "embedded_inverse_dynamics_jvp",
-    "embedded_step_vjp",
-    "closure_error",
-    "project_position",
-    "project_velocity",
-    "loop_system",
-    "loop_forward_dynamics",
-    "closure_system",
-    "closure_step",
-    "closures_open",
-)
-"""Operations that exist as traces alone: each is a kernel of its scene, a thread a world, whatever the plan."""
-SHARED = ("step", "forward_dynamics_and_solve", "forward_dynamics_vjp", "inverse_dynamics_vjp")
-"""Traces alone, too, that a warp a limb can share."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,37 +70,37 @@ class Plan:
         """The levels from the deepest to the roots."""
         return self.outward[::-1]
 
-    def of(self, operation: str) -> str:
-        """Granularity of one operation: the plan's own where the operation has that form."""
-        if operation in TREE_ONLY:
+    def of(self, routine: Routine) -> str:
+        """Return the granularity of one routine: the plan's own where the routine has that form."""
+        if not routine.letters and not routine.has_node_form:
             return "tree"
-        chosen = self.granularity if self.forced else self._rule(operation)
-        if operation in SHARED:
-            return "segment" if chosen == "segment" else "tree"
-        return "tree" if chosen == "segment" and operation not in SEGMENTED else chosen
+        chosen = self.granularity if self.forced else self._rule(routine)
+        if chosen == "segment":
+            return "segment" if routine.letters else "tree"
+        return chosen if routine.has_node_form else "tree"
 
-    def _rule(self, operation: str) -> str:
+    def _rule(self, routine: Routine) -> str:
         if self.granularity == "node" or self.limbs == 1 or self.limbs > MOST_WARPS:
             return self.granularity
-        if operation in (*LONG_RESULTS, "step"):  # of a step a thread holds too little even of a dozen dofs
+        if routine.long_result or routine.passes:  # in passes a thread holds too little even of a dozen dofs
             return "segment"
         if self.granularity == "segment" and not self.few:
-            if operation in SHORT or (operation == "solve_mass_matrix" and self.dofs <= SOLVES[self.dtype]):
+            if routine.short or (not routine.velocities and self.dofs <= SOLVES[self.dtype]):
                 return "tree"
         return self.granularity
 
-    def stages(self, operation: str, warps: int) -> bool:
-        """Whether rows come in through shared memory; ``warps`` share 32 worlds."""
-        return self.staged and (warps == 1 or self.worlds > FEW_WORLDS // 4 or operation == "step")
+    def stages(self, routine: Routine, warps: int) -> bool:
+        """Whether rows come in through shared memory, for kernels in which ``warps`` share 32 worlds."""
+        return self.staged and (warps == 1 or self.worlds > FEW_WORLDS // 4 or routine.passes)
 
-    def gathers(self, operation: str, warps: int, results: int) -> bool:
-        """Whether short results, so many, leave through shared memory, though rows do not come in so.
+    def gathers(self, routine: Routine, warps: int, results: int) -> bool:
+        """Whether short results leave through shared memory though rows do not come in through it.
 
-        ``warps`` share 32 worlds.
+        ``warps`` share 32 worlds; ``results`` is the number of results.
         """
         if warps > 1:
-            return self.worlds > WARP_SIZE if self.dofs > LONG_ROWS else operation in GATHERED
-        return results > FEW_RESULTS or (not self.few and (self.varies or operation in SHORT))
+            return self.worlds > WARP_SIZE if self.dofs > LONG_ROWS else routine.collects
+        return results > FEW_RESULTS or (not self.few and (self.varies or routine.short))
 
     def column_chunk(self, columns: int, bytes_per_column: int) -> int:
         """Right-hand sides that go through a solve at once."""
@@ -236,9 +169,10 @@ def _chosen(dofs: int, limbs: int, alike: bool, worlds: int, cuda: bool, dtype: 
 
 
 def describe(plan: Plan) -> str:
-    """One line: the choice, why, and what else there is."""
+    """Return one line: the granularity, the reason for it, and the other granularities."""
     others = ", ".join(name for name in GRANULARITIES if name != plan.granularity)
-    staged = plan.stages("forward_dynamics", plan.limbs if plan.granularity == "segment" else 1)
+    limbs = plan.limbs if plan.granularity == "segment" else 1
+    staged = plan.staged and (limbs == 1 or plan.worlds > FEW_WORLDS // 4)
     rows = "through shared memory" if staged else "each by its thread"
     first = "forward dynamics takes velocity terms first; " if plan.apart else ""
     return f"{plan.granularity}: {plan.reason}; rows are read {rows}; {first}granularity= can force {others}"

@@ -1,4 +1,4 @@
-"""Programs: an operation of one scene as one kernel, traced, emitted, compiled at its first use and launched.
+"""Programs: a routine of one scene as one kernel, traced, emitted, compiled at its first use and launched.
 
 At tree granularity a thread works on one world, in program order. At segment granularity a warp works on one serial
 chain of 32 worlds, a block on 32 worlds; limbs of equal structure run one text, in which what differs is read from a
@@ -15,93 +15,23 @@ from ..kernels import native, straight
 from ..kernels.native import INTEGERS
 from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout, Result
-from ..recursions import (
-    composite,
-    coordinates,
-    determinant,
-    forward_dynamics,
-    hinge_forces,
-    hybrid,
-    inverse,
-    kinematics,
-    messages,
-    momentum,
-    newton_euler,
-    operational,
-    operators,
-    quasi_velocities,
-    reactions,
-    step,
-)
-from ..recursions.derivatives import adjoints, inverse_dynamics
+from ..recursions import messages
 from ..recursions.links import TABLES, Links
-from ..recursions.loops import closed_step, embedded, embedded_adjoints, minimal, multipliers, projection
-from ..recursions.messages import INWARD, OUTWARD, SENDS
-from ..recursions.operators import meet, written
+from ..recursions.messages import INWARD, OUTWARD
 from ..recursions.pieces import Pieces
-from ..recursions.step import GAIN, GUESS, LOOPED, MISSED, by_pieces
+from ..recursions.step import GAIN, GUESS, LOOPED, MISSED
 from ..recursions.tracing import Trace
 from ..trace.emission import PREFIX, Emitter, RangeReduction, Store, render
 from . import link_values, staging
-from .plan import MOST_WARPS, SHARED, TREE_ONLY, Plan
+from .plan import MOST_WARPS, Plan
+from .routine import Routine
 from .staging import FIELDS
 from .sweeps import Sweeps
 from .teams import Passes, Team, Work
 
-TRACED = (
-    *SENDS,
-    "log_det_mass_matrix",
-    "body_poses",
-    "body_velocities",
-    "body_states",
-    "jacobian",
-    "operational_inertia_inverse",
-    "expression",
-    *TREE_ONLY,
-)
-TILES = ("inverse_dynamics_derivatives", "mass_matrix_derivative")
-"""Operations whose results are tiles, for the kernels of :mod:`.kernels.tiles` to finish."""
 REGISTERS, PARTS = 65536, 4  # of a multiprocessor
 MOST_REGISTERS = 255  # of a thread
-BLOCKS = {"forward_dynamics_apart": (3, 168), "solve_mass_matrix": (4, 128), "forward_dynamics_vjp": (4, 128)}
-"""Blocks of limbs for it, if they leave a thread so many registers, where there are many worlds."""
 PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
-FRAME_LISTS = 16  # different lists of frames that get a program of their own
-EXPRESSIONS = 64  # different expressions of operators that do
-
-
-def _functions() -> dict[str, Any]:
-    """The trace function of each operation, by name."""
-    tree = (
-        forward_dynamics, newton_euler, composite, inverse, determinant, kinematics, operational, momentum,
-        quasi_velocities, hybrid, reactions, step, hinge_forces, coordinates, operators, inverse_dynamics, adjoints,
-        projection, multipliers,
-    )  # fmt: skip
-    found = {
-        name: f for file in tree for name, f in vars(file).items() if getattr(f, "__module__", "") == file.__name__
-    }
-    found["forward_dynamics_apart"] = found.pop("forward_dynamics_bias_first")
-    found["step_system"] = closed_step.step_system
-    for file in (minimal, embedded, embedded_adjoints):
-        found |= {
-            f"embedded_{name}": f for name, f in vars(file).items() if getattr(f, "__module__", "") == file.__name__
-        }
-    return found
-
-
-FUNCTIONS = _functions()
-
-
-def run_trace(trace: Trace, operation: str, how: Any = None, held: Any = None, **options: Any) -> list[Store]:
-    """Call the trace function of an operation."""
-    if operation == "step":
-        if "multipliers" in trace.inputs:
-            return closed_step.step_with_multipliers(trace, **options)
-        return step.step(trace, **options) if how is None else closed_step.step(trace, how, **options)
-    options |= {} if how is None else {"embedding": how}
-    if held is not None:
-        options["mask" if "hybrid" in operation else "fixed"] = held
-    return FUNCTIONS[operation](trace, **options)
 
 
 class Program(NamedTuple):
@@ -140,7 +70,7 @@ class Programs:
     def __init__(self, run: Sweeps, plan: Plan):
         self.run, self.plan = run, plan
         self.relays = run.device.is_cuda
-        self._programs: dict[Any, Program | None] = {}
+        self._programs: dict[tuple, Program | None] = {}
         self._links: Links | None = None
 
     def forget(self) -> None:
@@ -150,30 +80,28 @@ class Programs:
 
     def find(
         self,
-        operation: str,
+        routine: Routine,
         shapes: dict[str, tuple[int, ...]],
         out: tuple[int, ...],
         more: dict[str, tuple[int, ...]] | None = None,
         **options: Any,
-    ) -> Any:
-        """The :class:`Program` for an operation on arrays of these shapes, or None if it has none.
+    ) -> Program | None:
+        """Return the program of a routine for arrays of these shapes; None where the routine's sweeps serve them.
 
         Args:
-            shapes: of the arrays that are given, [world, ...].
-            out: shape of the result, [world, ...]. more: of further results, by name.
-            options: of the operation.
+            shapes: of the arrays that the routine reads, [world, ...].
+            out: shape of the result, [world, ...]. more: shapes of further results, by name.
+            options: of the routine's trace.
         """
-        if self.plan.of(operation) == "node" or operation not in TRACED:
+        key = routine, (*shapes, *(more or ())), out[1:], *options.values()
+        if key in self._programs:
+            return self._programs[key]
+        if self.plan.of(routine) == "node":
             return None
-        if operation == "solve_mass_matrix" and len(out) > 2:
+        variants = sum(1 for other in self._programs if other[0] is routine)
+        if options and variants >= routine.variants and routine.has_node_form:
             return None
-        key = operation, (*shapes, *(more or ())), out[1:], *options.values()
-        if key not in self._programs:
-            lists = sum(1 for other in self._programs if other[0] == operation)
-            most = EXPRESSIONS if operation == "expression" else FRAME_LISTS
-            if options and lists >= most and operation not in (*TREE_ONLY, *SHARED):
-                return None
-            self._programs[key] = self._build(operation, shapes, out, more or {}, options)
+        self._programs[key] = self._build(routine, shapes, out, more or {}, options)
         return self._programs[key]
 
     def launch(self, program: Program, arrays: dict[str, Any], out: wp.array, *more: wp.array) -> None:
@@ -193,7 +121,7 @@ class Programs:
     @property
     def operation_counts(self) -> dict[str, int]:
         """Floating-point operations of one world, by operation."""
-        return {_called(key): program.operations for key, program in self._programs.items() if program is not None}
+        return {_title(key): program.operations for key, program in self._programs.items() if program is not None}
 
     def described(self) -> list[str]:
         """A line for each kernel: its granularity, its operations in one world, and on CUDA what it takes."""
@@ -202,7 +130,7 @@ class Programs:
             if program is None:
                 continue
             granularity = f"segment, {program.warps} warps" if program.warps > 1 else "tree"
-            line = f"{_called(key)}  {granularity}, {program.operations} operations a world"
+            line = f"{_title(key)}  {granularity}, {program.operations} operations a world"
             if self.run.device.is_cuda:
                 found = wp.get_cuda_kernel_properties(program.kernel, self.run.device, program.block)
                 line += f", {found['register_count']} registers, {found['local_memory_size']} bytes of stack a thread"
@@ -216,37 +144,32 @@ class Programs:
             self._links = Links(self.run.scene, self.run.parameters.variable)
         return self._links
 
-    def _build(self, operation: str, shapes: dict, out_shape: tuple, more: dict, options: dict) -> Program | None:
-        links = self.links.opened()
-        if (operation in ("body_poses", "body_states") and links.turns_vary) or not links.links:
+    def _build(self, routine: Routine, shapes: dict, out_shape: tuple, more: dict, options: dict) -> Program | None:
+        links, shapes = self.links.opened(), {**shapes, "out": out_shape}
+        if not links.links or not routine.suits(links, shapes, **options):
             return None
-        if operation == "expression" and not meet(options["expression"]):
-            return None
-        shapes = {**shapes, "out": out_shape}
-        shared = self.plan.of(operation) == "segment" and messages.shared(operation, shapes, options.get("wrt", ()))
-        if operation == "step":
-            shared = shared and by_pieces(self.run.scene, shapes, options.get("how"))
-        if operation == "forward_dynamics" and self.plan.apart and "qd" in shapes:
-            operation = "forward_dynamics_apart"
+        shared = self.plan.of(routine) == "segment" and routine.divides(self.run.scene, shapes, **options)
+        if routine.bias_first is not None and self.plan.apart and "qd" in shapes:
+            routine = routine.bias_first
         if shared:
             pieces = Pieces(links)
             several = 1 < pieces.warps <= MOST_WARPS
             both = {**shapes, **more}
-            program = self._segment_program(operation, both, pieces, tuple(more), options) if several else None
+            program = self._segment_program(routine, both, pieces, tuple(more), options) if several else None
             if program is not None:
                 return program
-        return self._tree_program(operation, links, {**shapes, **more}, tuple(more), options)
+        return self._tree_program(routine, links, {**shapes, **more}, tuple(more), options)
 
-    def _tree_program(self, operation: str, links: Links, shapes: dict, more: tuple, options: dict) -> Program:
+    def _tree_program(self, routine: Routine, links: Links, shapes: dict, more: tuple, options: dict) -> Program:
         trace = Trace(links, self.run.dtype.__name__, tuple(shapes))
-        stores = [self._flattened(item, shapes) for item in run_trace(trace, operation, **options)]
+        stores = [self._flattened(item, shapes) for item in routine.trace(trace, **options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         outs = [item for item in stores if item.array == "out"]
-        layout = self._layout(operation, outs, stores, shapes, more)
-        if operation in TILES:
+        layout = self._layout(routine, outs, stores, shapes, more)
+        if routine.tiled:
             result = Result(TILED, layout.result.array, slots=staging.count_slots(stores))
             layout = layout._replace(staged=self.plan.staged, result=result)
-        once = operation == "step" or any(item.array in LOOPED for item in stores)  # may write over what it reads
+        once = routine.passes or any(item.array in LOOPED for item in stores)  # may write over what it reads
         layout = layout._replace(
             retries=not once and not layout.staged and layout.result.way in (DIRECT, TILED, RELAYED)
         )
@@ -261,12 +184,12 @@ class Programs:
         block = PAIR * WARP_SIZE if self.plan.few and not layout.shared_scalars else WARP_SIZE
         layout = layout._replace(retries=layout.retries and "farthest" in body, block=block)
         tables = {} if table is None else {"place": table}
-        return self._finished(operation, layout, body, body, tables, emitter.operations)
+        return self._finished(routine, layout, body, body, tables, emitter.operations)
 
     def _segment_program(
-        self, operation: str, shapes: dict, pieces: Pieces, more: tuple, options: dict
+        self, routine: Routine, shapes: dict, pieces: Pieces, more: tuple, options: dict
     ) -> Program | None:
-        dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(operation, pieces)
+        dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(routine.letters, pieces)
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         everything: list[Store] = []
         traced: list[list[Store]] = []
@@ -274,16 +197,16 @@ class Programs:
         for index in range(len(pieces.pieces)):
             links = self.links.opened()  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
-            traced.append([self._flattened(item, shapes) for item in run_trace(trace, operation, **options)])
+            traced.append([self._flattened(item, shapes) for item in routine.trace(trace, **options)])
             rounds = [[self._flattened(item, shapes) for item in turn] for turn in trace.rounds]
             news = [self._flattened(item, shapes) for item in trace.news]
             apart.append((trace.checks, news, rounds))
             everything += traced[-1] + trace.checks + news + [item for turn in rounds for item in turn]
         bends = any(item.array == MISSED for item in everything)
-        passes = Passes((GUESS, GAIN), sent if bends else None) if operation == "step" else None
+        passes = Passes((GUESS, GAIN), sent if bends else None) if routine.passes else None
         sent += 2 * pieces.warps if bends else 0
         whole = [item for item in everything if item.array == "out"]
-        layout = self._layout(operation, whole, everything, shapes, more, sent, pieces.warps)
+        layout = self._layout(routine, whole, everything, shapes, more, sent, pieces.warps)
         if layout.result.way == DIRECT and layout.result.array.entries > staging.LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
         if not layout.fits(self.run.dtype):
@@ -298,7 +221,7 @@ class Programs:
             later = self._emitter(shapes, layout) if passes else emitter
             inward = [item for item in stores if item.array == INWARD]
             outward = [item for item in stores if item.array == OUTWARD]
-            last = outward if set(SENDS[operation]) & set(messages.OUTWARD_LETTERS) else inward
+            last = outward if set(routine.letters) & set(messages.OUTWARD_LETTERS) else inward
             last += by_slot(items)
             last += [item for item in stores if item.array in (*more, GAIN)]
             regions = emitter.region(inward), emitter.region(outward)
@@ -311,14 +234,14 @@ class Programs:
             )
         cuda = team.cuda()  # fills the tables
         registers = _registers(pieces.warps)
-        if operation in BLOCKS and dtype == "float32" and not self.plan.few:
-            blocks, enough = BLOCKS[operation]
+        if routine.occupancy is not None and dtype == "float32" and not self.plan.few:
+            blocks, enough = routine.occupancy
             fewer = _registers(blocks * pieces.warps)
             registers = fewer if fewer >= enough else registers
         lists = {"place": table, "table": team.table, "shifts": team.shifts}
         tables = {name: values for name, values in lists.items() if values}
         cap = registers if registers < MOST_REGISTERS else None
-        return self._finished(operation, layout, cuda, team.cpu(), tables, team.operations, cap)
+        return self._finished(routine, layout, cuda, team.cpu(), tables, team.operations, cap)
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
@@ -328,7 +251,7 @@ class Programs:
 
     def _finished(
         self,
-        operation: str,
+        routine: Routine,
         layout: KernelLayout,
         cuda: str,
         cpu: str,
@@ -353,14 +276,14 @@ class Programs:
         arrays += [("out", result.array.ndim if entry is None else 3)] + [
             (row.name, row.ndim) for row in layout.further
         ]
-        kernel = native.kernel(operation, text, arrays, self.run.dtype, registers)
+        kernel = native.kernel(routine.name, text, arrays, self.run.dtype, registers)
         return Program(
             kernel, rows, fields, tuple(held.values()), layout.warps, layout.block, operations, result.slots, entry
         )
 
     def _layout(
         self,
-        operation: str,
+        routine: Routine,
         stores: list[Store],
         everything: list[Store],
         shapes: dict,
@@ -368,7 +291,7 @@ class Programs:
         sent: int = 0,
         warps: int = 1,
     ) -> KernelLayout:
-        ways = self.plan.stages(operation, warps), self.plan.gathers(operation, warps, 1 + len(more))
+        ways = self.plan.stages(routine, warps), self.plan.gathers(routine, warps, 1 + len(more))
         return staging.choose_layout(stores, everything, shapes, more, sent, warps, self.run.dtype, *ways, self.relays)
 
     def _emitter(self, shapes: dict, layout: KernelLayout) -> Emitter:
@@ -419,9 +342,7 @@ def _registers(warps: int) -> int:
     return REGISTERS // PARTS // (WARP_SIZE * -(-warps // PARTS)) // 8 * 8
 
 
-def _called(key: tuple) -> str:
-    """What the user calls the operation of a program."""
-    if key[0] == "expression":
-        return written(key[-1])
-    without_qdd = {("q",): "gravity_force", ("q", "qd"): "bias_force", ("q", "qd", "body_f"): "bias_force"}
-    return without_qdd.get(key[1], key[0]) if key[0] == "inverse_dynamics" else key[0]
+def _title(key: tuple) -> str:
+    """Return what the user calls the computation of a program."""
+    routine, inputs, _, *options = key
+    return routine.name if routine.title is None else routine.title(inputs, *options)

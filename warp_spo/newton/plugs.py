@@ -35,7 +35,11 @@ class Plugs(CouplingInterface):
         """
         self._check_open("solve_inverse")
         q = self._q.read(state.joint_q, "q")
-        return lambda x, y: self.dynamics.solve_mass_matrix(q, y, out=x) and None
+
+        def solve(x: wp.array, y: wp.array) -> None:
+            self.dynamics.solve_mass_matrix(q, y, out=x)
+
+        return solve
 
     @property
     def dof_map(self) -> wp.array:

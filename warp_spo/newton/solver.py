@@ -215,7 +215,7 @@ class SolverSPO(Plugs, SolverBase):
         q, qd = self._q.read(state_in.joint_q, "joint_q"), self._qd.read(state_in.joint_qd, "joint_qd")
         body_f = None if state_in.body_f is None else self._wrenches.read(state_in.body_f, "body_f")
         tau = self._joint_forces.read(control.joint_f, q, self._arrays.used["joint_X_p"])
-        given = dict(tau=tau, body_f=body_f, **self._drives.targets(control, self._q, self._qd))
+        given: dict[str, Any] = dict(tau=tau, body_f=body_f, **self._drives.targets(control, self._q, self._qd))
         if observables is None or not observables.kinds:
             q_out, qd_out = self._q.target(state_out.joint_q, "q_out"), self._qd.target(state_out.joint_qd, "qd_out")
             self.dynamics.step(q, qd, dt=dt, integrator=self.integrator, out=(q_out, qd_out), **given)

@@ -8,36 +8,12 @@ further in. From all to the first piece, when all is done: S = a status word.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 from .pieces import Piece, Pieces
 
-SENDS = {
-    "forward_dynamics": "Pza",
-    "forward_dynamics_apart": "fPza",
-    "solve_mass_matrix": "Pza",
-    "inverse_dynamics": "z",
-    "forward_dynamics_and_solve": "Pzayb",
-    "step": "PzaS",
-    "forward_dynamics_vjp": "B",
-    "inverse_dynamics_vjp": "B",
-    "mass_matrix": "R",
-    "mass_matrix_inverse": "PNDVY",
-}
-"""Letters by operation."""
 INWARD, OUTWARD = "sent", "returned"
 """The array that messages go through, by either name."""
 OUTWARD_LETTERS = "abNDVY"
 SIZES = {"P": 21, "z": 6, "f": 6, "y": 6, "R": 10, "B": 24, "a": 6, "b": 6, "S": 1}
-SHORT_WAYS = ("q", "tangent", "qd", "qdd", "tau")  # arguments whose gradient a piece knows by itself
-
-
-def shared(operation: str, given: Iterable[str], wrt: Iterable[str] = ()) -> bool:
-    """Whether pieces can share the work: backwards only if qdd and lambda are known, and by what belongs to a piece."""
-    if not operation.endswith("_vjp"):
-        return operation in SENDS
-    known = operation == "inverse_dynamics_vjp" or {"qdd", "solved"} <= set(given)
-    return known and "body_f" not in given and set(wrt) <= set(SHORT_WAYS)
 
 
 def way(letter: str) -> str:
@@ -53,12 +29,13 @@ def size(letter: str, piece: Piece) -> int:
     return {"N": 6 * whole, "D": piece.weight, "V": whole * piece.weight, "Y": further * piece.weight}[letter]
 
 
-def slots(operation: str, pieces: Pieces) -> tuple[dict[tuple[str, int], int], int]:
-    """Where each message begins, by letter and piece, and the values of all together.
+def slots(letters: str, pieces: Pieces) -> tuple[dict[tuple[str, int], int], int]:
+    """Return where each message begins, by letter and piece, and the values of all messages together.
 
     Long messages outward take the place of what the same tree sent inward and has read by then.
     """
-    letters, places, end = SENDS[operation], {}, 0
+    places: dict[tuple[str, int], int] = {}
+    end = 0
     groups = ("P", letters[1:]) if "N" in letters else (letters,)
     for root in (piece for piece in pieces.pieces if piece.parent is None):
         tree = [piece for piece in pieces.pieces if root in (piece, *piece.ancestors)]

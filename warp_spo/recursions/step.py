@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable
 
 from ..scene.scene import Scene
 from ..status import Status
@@ -246,9 +245,9 @@ class Step:
         return inputs
 
 
-def by_pieces(scene: Scene, given: Iterable[str], how: Any) -> bool:
-    """Whether pieces can share the work of a step: no loops are closed, and sweeps serve its passes."""
-    return how is None and "multipliers" not in given and scene.dof_count > SHORT
+def by_pieces(scene: Scene) -> bool:
+    """Return whether pieces can share the work of a step: sweeps, not a matrix, serve its passes."""
+    return scene.dof_count > SHORT
 
 
 def carries_nothing(link: Link) -> bool:

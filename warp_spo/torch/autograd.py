@@ -1,6 +1,6 @@
 """Operations of Dynamics in torch's autograd, with analytic gradients."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -9,29 +9,27 @@ from .tensors import is_tensor, pointer, requires_grad
 
 if TYPE_CHECKING:
     from ..dynamics.dynamics import Dynamics
+    from ..dynamics.operation import Operation
 
 
-def call_with_gradient(
-    dyn: "Dynamics", operation: str, method: Callable[..., Any], arguments: dict[str, Any], by: tuple, values: tuple
-) -> Any:
-    """Return ``method(dyn, **arguments)`` as a result through which torch's backward pass can go.
+def call_with_gradient(dyn: "Dynamics", operation: "Operation", arguments: dict[str, Any]) -> Any:
+    """Return the result of an operation, through which torch's backward pass can go.
 
     Args:
         dyn: The Dynamics.
-        operation: Public name of the method.
-        method: The method without torch's autograd.
+        operation: The operation, which has a derivative.
         arguments: Its arguments by name.
-        by: Names of the arguments that the operation can be differentiated by.
-        values: Names of the values of the scene on which the operation depends.
     """
-    value_tensors = {name: tensor for name, tensor in dyn.values.tensors.items() if name in values}
-    inputs = {name: arguments.pop(name) for name in by if arguments.get(name) is not None}
+    assert operation.derivative is not None
+    method, derivative = operation.function, operation.derivative
+    value_tensors = {name: tensor for name, tensor in dyn.values.tensors.items() if name in derivative.values}
+    inputs = {name: arguments.pop(name) for name in derivative.by if arguments.get(name) is not None}
     tensors = {**inputs, **value_tensors}
     if not any(map(requires_grad, tensors.values())):
         # If another argument requires grad, the call refuses it.
         with torch.set_grad_enabled(any(map(requires_grad, arguments.values()))):
             return method(dyn, **inputs, **arguments)
-    call = f"Dynamics.{operation}"
+    call = f"Dynamics.{operation.name}"
     for name, x in tensors.items():
         if not is_tensor(x):
             other = next(n for n, y in tensors.items() if requires_grad(y))
@@ -51,9 +49,9 @@ def call_with_gradient(
             f"{call}: out is given and an input requires grad; expected no out=, because a result with gradients is a "
             f"new tensor; leave out=, or call inside torch.no_grad()"
         )
-    record = Record(dyn, operation, method, arguments, tuple(inputs), tuple(value_tensors))
+    record = Record(dyn, operation, arguments, tuple(inputs), tuple(value_tensors))
     with torch.no_grad():
-        dyn.check_gradient(operation)
+        dyn._gradients.check(operation)
     return _Differentiable.apply(record, *tensors.values())
 
 
@@ -62,26 +60,24 @@ class Record:
 
     Args:
         dyn: The Dynamics.
-        operation: Public name of the method.
-        method: The method without torch's autograd.
+        operation: The operation, which has a derivative.
         options: Arguments that are not differentiated.
         inputs: Names of the arguments that are tensors.
         values: Names of the values of the scene that are tensors.
     """
 
-    def __init__(
-        self, dyn: "Dynamics", operation: str, method: Callable[..., Any], options: dict, inputs: tuple, values: tuple
-    ):
-        self.dyn, self.operation, self.method, self.options = dyn, operation, method, options
+    def __init__(self, dyn: "Dynamics", operation: "Operation", options: dict, inputs: tuple, values: tuple):
+        assert operation.derivative is not None
+        self.dyn, self.operation, self.derivative, self.options = dyn, operation, operation.derivative, options
         self.inputs, self.values = inputs, values
         self.stamps = dict(dyn.values.stamps)
 
     def run(self, tensors: Sequence[torch.Tensor]) -> tuple[Any, tuple]:
         """Return the result, and all tensors that the backward pass needs of it."""
-        more = {}
-        if self.operation == "step":
-            more["qdd"] = torch.empty_like(tensors[self.inputs.index("qd")])
-        result = self.method(self.dyn, **dict(zip(self.inputs, tensors, strict=False)), **self.options, **more)
+        kept = {one.name: one.axes for one in self.operation.arrays if one.name in self.derivative.keeps}
+        more = {name: tensors[0].new_empty(self.dyn._engine.shape(axes)[0]) for name, axes in kept.items()}
+        inputs = dict(zip(self.inputs, tensors, strict=False))
+        result = self.operation.function(self.dyn, **inputs, **self.options, **more)
         return result, (*(result if isinstance(result, tuple) else (result,)), *more.values())
 
     def gradients(self, wanted: list[str], tensors: Sequence[torch.Tensor], results: tuple, cotangents: tuple) -> dict:
@@ -92,16 +88,16 @@ class Record:
         """
         by_name = dict(zip((*self.inputs, *self.values), tensors, strict=True))
         changed = [name for name, stamp in self.dyn.values.stamps.items() if self.stamps.get(name) != stamp]
-        entering = self.dyn.entering(self.operation)
-        lost = [name for name in changed if name not in self.values and name in entering]
+        lost = [name for name in changed if name not in self.values and name in self.derivative.values]
         if lost:
             raise RuntimeError(
-                f"Dynamics.{self.operation}: {', '.join(lost)} was set between this call and its backward pass; "
+                f"Dynamics.{self.operation.name}: {', '.join(lost)} was set between this call and its backward pass; "
                 f"expected the values of the call; call backward before Dynamics.set, or set tensors that require grad"
             )
         arrays = {name: by_name[name] for name in self.inputs}
-        with self.dyn.held({name: by_name[name] for name in changed if name in self.values}):
-            return self.dyn.pulled_back(self.operation, arrays, self.options, results, cotangents, wanted)
+        gradients = self.dyn._gradients
+        with gradients.at_values({name: by_name[name] for name in changed if name in self.values}):
+            return gradients.pull_back(self.operation, arrays, self.options, results, cotangents, wanted)
 
 
 class _Differentiable(torch.autograd.Function):
@@ -127,7 +123,7 @@ class _Differentiable(torch.autograd.Function):
                     found[name] = found[name].sum(0)
         if torch.is_grad_enabled():
             sources = [x for x in (*tensors, *cotangents) if x.requires_grad]
-            found = {name: _FirstOrder.apply(record.operation, value, *sources) for name, value in found.items()}
+            found = {name: _FirstOrder.apply(record.operation.name, value, *sources) for name, value in found.items()}
         return None, *(found.get(name) for name in names)
 
 

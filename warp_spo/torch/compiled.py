@@ -13,14 +13,15 @@ from .tensors import is_tensor, pointer
 
 if TYPE_CHECKING:
     from ..dynamics.dynamics import Dynamics
+    from ..dynamics.operation import Operation
 
 _numbers = itertools.count()  # of custom ops, which need names of their own
 RESULTS = ("out", "qdd", "status")  # arguments that a call writes, which a graph of torch would not know
 
 
-def _check_options(operation: str, method: Callable[..., Any], by: tuple[str, ...], options: dict[str, Any]) -> None:
+def _check_options(declared: "Operation", by: tuple[str, ...], options: dict[str, Any]) -> None:
     """Raise TypeError unless ``options`` are the arguments that the operation needs besides the tensors ``by``."""
-    parameters = inspect.signature(method).parameters
+    operation, parameters = declared.name, inspect.signature(declared.function).parameters
     rest = {n: p.default for n, p in parameters.items() if n not in (*by, *RESULTS, "self", "integrator")}
     expected = ", ".join(f"{n}=" for n in rest) or "none"
     for name in options:
@@ -54,14 +55,14 @@ def custom_op(dyn: "Dynamics", operation: str, **options: Any) -> Callable[..., 
         TypeError: ``dyn`` is no Dynamics, or the options are not those of the operation.
         ValueError: The operation has no gradient.
     """
-    known = getattr(dyn, "differentiable_by", None)
-    if known is None:
+    if not hasattr(dyn, "_operations"):
         raise TypeError(f"custom_op: dyn is of type {type(dyn).__name__}; expected a Dynamics")
+    known = {name: one.derivative for name, one in dyn._operations.items() if one.derivative is not None}
     if not isinstance(operation, str) or operation not in known:
         raise ValueError(f"custom_op: operation is {operation!r}; expected one of {', '.join(known)}")
-    by, method = known[operation], inspect.unwrap(getattr(type(dyn), operation))
-    _check_options(operation, method, by, options)
-    dyn.check_gradient(operation)
+    declared, by = dyn._operations[operation], known[operation].by
+    _check_options(declared, by, options)
+    dyn._gradients.check(declared)
     name = f"warp_spo::{operation}_{next(_numbers)}"
 
     def record(names: str) -> Record:
@@ -70,7 +71,7 @@ def custom_op(dyn: "Dynamics", operation: str, **options: Any) -> Callable[..., 
                 f"custom_op({operation!r}): {', '.join(dyn.values.tensors)} was set to a tensor that requires grad; "
                 f"expected detached values; call Dynamics.{operation} itself for gradients by them"
             )
-        return Record(dyn, operation, method, options, tuple(names.split()), ())
+        return Record(dyn, declared, options, tuple(names.split()), ())
 
     def forward(names: str, tensors: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         return list(record(names).run(tensors)[1])
@@ -86,13 +87,14 @@ def custom_op(dyn: "Dynamics", operation: str, **options: Any) -> Callable[..., 
         f"{name}_backward", backward, mutates_args=(),
         schema="(str names, str wanted, Tensor[] tensors, Tensor[] kept, Tensor[] cotangents) -> Tensor[]",
     )  # fmt: skip
-    shapes = dyn.result_shapes(operation, **options)
-    results = 2 if operation == "step" else 1  # further outputs are there for the backward pass
+    shapes = dyn._gradients.result_shapes(declared, **options)
+    like = by.index(declared.results[0].like) if declared.results[0].like else None
+    results = len(declared.results)  # further outputs are there for the backward pass
 
     @forward_op.register_fake
     def _(names: str, tensors: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-        if operation == "solve_mass_matrix":
-            return [torch.empty_like(tensors[1])]
+        if like is not None:
+            return [torch.empty_like(tensors[like])]
         return [tensors[0].new_empty(shape) for shape in shapes]
 
     @backward_op.register_fake

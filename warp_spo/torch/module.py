@@ -17,7 +17,7 @@ def _make_method(operation: str) -> Callable[..., Any]:
 
     def method(self: "Module", *args: Any, **more: Any) -> Any:
         self.dyn.set(**dict(self.named_parameters()))
-        return getattr(self.dyn, operation)(*args, **more)
+        return self.dyn._operations[operation].entry(self.dyn, *args, **more)
 
     method.__name__, method.__qualname__ = operation, f"Module.{operation}"
     method.__doc__ = f"Return :meth:`warp_spo.Dynamics.{operation}` at the parameters."
@@ -47,14 +47,15 @@ class Module(torch.nn.Module):
 
     def __init__(self, dyn: "Dynamics", names: Sequence[str] | None = None):
         super().__init__()
-        if not hasattr(dyn, "differentiable_values"):
+        if not hasattr(dyn, "_operations"):
             raise TypeError(f"Module: dyn is of type {type(dyn).__name__}; expected a Dynamics")
         self.dyn = dyn
-        names = as_names("Module", "names", dyn.differentiable_values if names is None else names, ("body_mass",))
+        known = dyn._gradients.values
+        names = as_names("Module", "names", known if names is None else names, ("body_mass",))
         for name in names:
-            if name not in dyn.differentiable_values:
+            if name not in known:
                 raise ValueError(
-                    f"Module: {name!r} has no gradient here; expected some of {', '.join(dyn.differentiable_values)}; "
+                    f"Module: {name!r} has no gradient here; expected some of {', '.join(known)}; "
                     f"build Dynamics with variable=({name!r},)"
                 )
             value = torch.as_tensor(dyn.scene.values[name].mean(0))

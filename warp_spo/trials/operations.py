@@ -1,6 +1,7 @@
-"""Every operation once: what it reads, how it is called, and what the dense float64 reference says about it.
+"""Operations on trial: the inputs of each, how it is called, and its result by the dense float64 reference.
 
-The main job, the benchmarks and their tests iterate over :data:`OPERATIONS`; a new operation is one line there.
+The main job, the benchmarks and their tests iterate over :data:`OPERATIONS`. Operations of Dynamics are listed by their
+declarations, see :mod:`warp_spo.dynamics.operation`; operators of a scene are listed here.
 """
 
 from __future__ import annotations
@@ -11,16 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from ..recursions.derivatives.adjoints import inverse_dynamics_jvp
-from ..recursions.links import Links
-from ..recursions.tracing import Trace
+from ..dynamics.dynamics import OPERATIONS as DECLARED
+from ..dynamics.dynamics import Dynamics
+from ..dynamics.operation import Operation as Declaration
+from ..dynamics.samples import DT, FRAME_POSE, every_other, rotations, two_frames
+from ..dynamics.spatial_operators import EXPRESSION
+from ..execution.routine import Routine
 from ..reference import Dense
 from ..scene.scene import Scene
-from ..trace.evaluation import evaluate
 
-DT = 0.01  # time step of integrate [s]
-FRAME_POSE = (0.1, -0.05, 0.2, 0.0, 0.0, 0.0, 1.0)  # of the second of the two frames, in its body [m]
-WEIGHT_FLOOR = 1e-2  # gravity cannot act on some hinges: compare with at least this share of the weight, at 1 m
+__all__ = ["APPLICATIONS", "DT", "FRAME_POSE", "INPUTS", "OPERATIONS", "TOLERANCE", "Inputs", "Operation"]
+__all__ += ["every_other", "rotations", "two_frames"]
 TOLERANCE = {
     # Largest error of an operation that counts as correct. Rounding grows with depth and with the condition of the mass
     # matrix; Newton's robots reach 3e-6 and 1e-14. What is wrong, and not rounded, is off by 1e-2 or more.
@@ -48,6 +50,7 @@ class Operation:
         scale: ``scale(dense, expected)``, what the error is divided by: the 2-norm of the expected result unless given.
         solves: ``solves(dense, *inputs)``, the matrix A and right-hand side b of the equation A x = b that the result
             solves, if it solves one.
+        routine: the kernel that it is about; None: it calls several.
     """
 
     name: str
@@ -60,6 +63,11 @@ class Operation:
     quaternions: Callable[[Scene], list[int]] = lambda scene: []
     scale: Callable[[Dense, np.ndarray], float] = lambda dense, expected: float(np.linalg.norm(expected))
     solves: Callable[..., tuple[np.ndarray, np.ndarray]] | None = None
+    routine: Routine | None = None
+
+    def granularity(self, dyn: Dynamics) -> str:
+        """Return the granularity at which a Dynamics runs it."""
+        return dyn.granularity if self.routine is None else dyn.plan.of(self.routine)
 
     def expected(self, dense: Dense, inputs: list[np.ndarray]) -> tuple[np.ndarray, float]:
         """The result in one world, flat, and what an error is divided by; NaN if the reference cannot compute it."""
@@ -153,44 +161,56 @@ class Inputs:
         return self._expected[key]
 
 
-def rotations(scene: Scene) -> list[int]:
-    """First entry in q of every quaternion."""
-    starts = zip(scene.hinges, scene.q_start, strict=False)
-    return [int(start) + first for hinge, start in starts for first in hinge.quaternions]
-
-
-def two_frames(scene: Any) -> list:
-    """Two frames for Jacobians: a tip's body frame, and one off the body frame of another tip, or of another body."""
-    parents = {hinge.parent for hinge in scene.hinges}
-    bodies = sorted(range(len(scene.hinges)), key=lambda body: (body in parents, body))[:2]
-    return [bodies[0], (bodies[-1], FRAME_POSE)]
-
-
 def _dof(scene: Scene) -> tuple[int, ...]:
     return (scene.dof_count,)
-
-
-def _square(scene: Scene) -> tuple[int, ...]:
-    return scene.dof_count, scene.dof_count
 
 
 def _nodes(scene: Scene) -> tuple[int, ...]:
     return (sum(scene.node_sizes),)
 
 
-def _weight_floor(dense: Dense, expected: np.ndarray) -> float:
-    weight = float(np.sum(dense.value("body_mass")) * np.linalg.norm(dense.value("gravity")))
-    return max(float(np.linalg.norm(expected)), WEIGHT_FLOOR * weight)
+def _size(axis: str, scene: Scene) -> int:
+    """Return the length of an axis of a result, for trials: of the open tree, with two frames."""
+    frames = len(two_frames(scene))
+    if axis.isdigit():
+        return int(axis)
+    if axis.endswith(" frames"):
+        return int(axis.split()[0]) * frames
+    dofs = scene.dof_count
+    sizes = {"coordinate": scene.coord_count, "dof": dofs, "independent dof": dofs, "body": scene.body_count}
+    return {**sizes, "frame": frames}[axis]
 
 
-def _method(name: str, reads: str, shape: Shape, reference: Callable[..., Any], *extra: Any, **more: Any) -> Operation:
-    """An operation of Dynamics; ``extra`` are further arguments, a function of the scene if callable."""
+def of_declaration(declaration: Declaration) -> Operation:
+    """Return a declared operation of Dynamics for trials."""
+    trial, first = declaration.trial, declaration.results[0] if declaration.results else None
+    assert trial is not None
+    arrays = [one for one in declaration.arrays if not (one.asked or one.direction)]
+    reads = trial.reads or tuple(one.sample or one.name for one in arrays)
+    samples = {one.name: one.sample for one in declaration.options if one.sample is not None}
+    others = len(declaration.results) - 1
 
     def call(subject: Any, *inputs: Any, out: Any) -> None:
-        given = [value(subject.dyn.scene) if callable(value) else value for value in extra]
-        getattr(subject.dyn, name)(*inputs, *given, out=out)
+        dyn = subject.dyn
+        if trial.call is not None:
+            trial.call(dyn, *inputs, out=out)
+            return
+        given = {one.name: array for one, array in zip(arrays, inputs, strict=True)}
+        given |= {name: sample(dyn.scene) for name, sample in samples.items()}
+        more = [dyn.recursions.array(f"trial of {declaration.name} {i}", *out.shape) for i in range(others)]
+        declaration.entry(dyn, **given, out=(out, *more) if more else out)
 
-    return Operation(name, tuple(reads.split()), shape, call, reference, **more)
+    def reference(dense: Dense, *inputs: Any) -> Any:
+        return trial.dense(dense, *inputs, *(sample(dense.scene) for sample in samples.values()))
+
+    def shape(scene: Scene) -> tuple[int, ...]:
+        axes = "world, dof" if first is None else first.axes
+        return tuple(_size(axis, scene) for axis in axes.split(", ")[1:])
+
+    more: dict[str, Any] = {} if trial.scale is None else {"scale": trial.scale}
+    more |= {} if first is None else {"quaternions": first.quaternions}
+    routine = declaration.routine
+    return Operation(declaration.name, reads, shape, call, reference, **more, solves=trial.solves, routine=routine)
 
 
 def _operator(
@@ -201,10 +221,10 @@ def _operator(
     def call(subject: Any, x: Any, out: Any) -> None:
         of(subject).apply(x, out=out)
 
-    return Operation(name, (reads,), shape, call, reference, at_first_q=True)
+    return Operation(name, (reads,), shape, call, reference, at_first_q=True, routine=EXPRESSION)
 
 
-_TABLE = (
+_OPERATORS = (
     _operator("phi", lambda subject: subject.operators.phi, lambda d, x: d.phi @ x),
     _operator("phi.T", lambda subject: subject.operators.phi.T, lambda d, x: d.phi.T @ x),
     _operator("psi", lambda subject: subject.operators.psi, lambda d, x: d.psi @ x),
@@ -216,184 +236,13 @@ _TABLE = (
         lambda subject, q, x, out: subject.operators.update(q),
         lambda d, q, x: d.psi @ x,
         reveal=lambda subject, q, x, out: subject.operators.psi.apply(x, out=out),
-    ),
-    _method(
-        "forward_dynamics",
-        "q qd tau",
-        _dof,
-        lambda d, q, qd, tau: d.forward_dynamics(qd, tau),
-        solves=lambda d, q, qd, tau: (d.mass_matrix, tau - d.bias_force(qd)),
-    ),
-    _method("inverse_dynamics", "q qd qdd", _dof, lambda d, q, qd, qdd: d.inverse_dynamics(qd, qdd)),
-    _method("mass_matrix", "q", _square, lambda d, q: d.mass_matrix),
-    _method(
-        "mass_matrix_inverse",
-        "q",
-        _square,
-        lambda d, q: np.linalg.inv(d.mass_matrix),
-        solves=lambda d, q: (d.mass_matrix, np.eye(len(d.mass_matrix))),
-    ),
-    _method(
-        "solve_mass_matrix",
-        "q b",
-        _dof,
-        lambda d, q, b: np.linalg.solve(d.mass_matrix, b),
-        solves=lambda d, q, b: (d.mass_matrix, b),
-    ),
-    _method("bias_force", "q qd", _dof, lambda d, q, qd: d.bias_force(qd), scale=_weight_floor),
-    _method("gravity_force", "q", _dof, lambda d, q: d.gravity_force, scale=_weight_floor),
-    _method("passive_force", "q qd", _dof, lambda d, q, qd: d.passive_force(qd)),
-    # absolute: the relative error of the determinant
-    _method("log_det_mass_matrix", "q", lambda scene: (), lambda d, q: d.log_det, scale=lambda d, expected: 1.0),
-    _method(
-        "body_poses",
-        "q",
-        lambda scene: (scene.body_count, 7),
-        lambda d, q: d.body_poses,
-        quaternions=lambda scene: [7 * body + 3 for body in range(len(scene.hinges))],
-    ),
-    _method("body_velocities", "q qd", lambda scene: (scene.body_count, 6), lambda d, q, qd: d.body_velocities(qd)),
-    _method(
-        "jacobian",
-        "q",
-        lambda scene: (2, 6, scene.dof_count),
-        lambda d, q: d.jacobian(two_frames(d.scene)),
-        two_frames,
-    ),
-    _method(
-        "operational_inertia_inverse",
-        "q",
-        lambda scene: (12, 12),
-        lambda d, q: d.operational_inertia_inverse(two_frames(d.scene)),
-        two_frames,
-    ),
-    _method(
-        "integrate",
-        "q qd",
-        lambda scene: (scene.coord_count,),
-        lambda d, q, qd: d.integrate(qd, DT),
-        DT,
-        quaternions=rotations,
+        routine=EXPRESSION,
     ),
 )
-OPERATIONS = {operation.name: operation for operation in _TABLE}
-"""Name -> operation, in the order of the tables that show them."""
-
-
-def every_other(scene: Scene) -> np.ndarray:
-    """The mask of hybrid_dynamics in trials: dofs 1, 3, 5 ... are prescribed."""
-    return np.arange(scene.dof_count) % 2 == 1
-
-
-def _hybrid(subject: Any, q: Any, qd: Any, tau: Any, qdd: Any, out: Any) -> None:
-    dyn = subject.dyn
-    forces = dyn.recursions.array("trial of hybrid_dynamics", dyn.worlds, dyn.scene.dof_count)
-    dyn.hybrid_dynamics(q, qd, tau, qdd, prescribed=every_other(dyn.scene), out=(out, forces))
-
-
-def _inverse_derivatives(dense: Dense, qd: np.ndarray, qdd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """d tau / d q along tangent coordinates and d tau / d qd: Newton-Euler's trace differentiated step by step.
-
-    Not the recursion that the operation runs, which takes the dense reference too long to difference.
-    """
-    scene, n = dense.scene, dense.scene.dof_count
-    one = scene.with_values(**{name: value[dense.world : dense.world + 1] for name, value in scene.values.items()
-                               if value.shape[0] > 1})  # fmt: skip
-    arrays = {"q": dense.q, "qd": qd, "qdd": qdd}
-    directions = {"q_dot": np.eye(2 * n, n), "qd_dot": np.eye(2 * n, n, -n)}  # [direction, dof]
-    stores = inverse_dynamics_jvp(Trace(Links(one), "float64", (*arrays, *directions)))
-    values = evaluate(
-        [item.value for item in stores],
-        lambda name, at: directions[name][:, at[0]] if name in directions else float(arrays[name][at[0]]),
-    )
-    J = np.zeros((n, 2 * n))
-    for item, value in zip(stores, values, strict=True):
-        J[item.index[0]] = value
-    return J[:, :n], J[:, n:]
-
-
-def _forward_derivative(dense: Dense, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
-    by_q, _ = _inverse_derivatives(dense, qd, dense.forward_dynamics(qd, tau))
-    return -np.linalg.solve(dense.mass_matrix, by_q)
-
-
-def _derivatives(name: str) -> Callable[..., None]:
-    """Call an operation with three results, of which the one by q is looked at."""
-
-    def call(subject: Any, *inputs: Any, out: Any) -> None:
-        dyn = subject.dyn
-        others = (dyn.recursions.array(f"trial of {name} {i}", *out.shape) for i in range(2))
-        getattr(dyn, name)(*inputs, out=(out, *others))
-
-    return call
-
-
-def _pulled_back(subject: Any, q: Any, qd: Any, tau: Any, b: Any, out: Any) -> None:
-    dyn = subject.dyn
-    others = {name: dyn.recursions.array(f"trial of vjp {name}", *tau.shape) for name in ("qd", "tau")}
-    dyn.forward_dynamics_vjp(q, qd, tau, cotangent=b, wrt=("tangent", *others), out={"tangent": out, **others})
-
-
-_APPLICATIONS = (
-    Operation(
-        "hybrid_dynamics",
-        ("q", "qd", "tau", "qdd"),
-        _dof,
-        _hybrid,
-        lambda d, q, qd, tau, qdd: d.hybrid_dynamics(qd, tau, qdd, every_other(d.scene))[0],
-    ),
-    _method(
-        "jacobian_bias",
-        "q qd",
-        lambda scene: (2, 6),
-        lambda d, q, qd: d.jacobian_bias(qd, two_frames(d.scene)),
-        two_frames,
-    ),
-    _method(
-        "frame_accelerations",
-        "q qd qdd",
-        lambda scene: (2, 6),
-        lambda d, q, qd, qdd: d.jacobian(two_frames(d.scene)) @ qdd + d.jacobian_bias(qd, two_frames(d.scene)),
-        two_frames,
-    ),
-    _method(
-        "operational_inertia_inverse_product",
-        "q wrenches",
-        lambda scene: (2, 6),
-        lambda d, q, x: d.operational_inertia_inverse(two_frames(d.scene)) @ x,
-        two_frames,
-    ),
-    _method("com_jacobian", "q", lambda scene: (3, scene.dof_count), lambda d, q: d.com_jacobian),
-    _method(
-        "centroidal_momentum_matrix",
-        "q",
-        lambda scene: (6, scene.dof_count),
-        lambda d, q: d.centroidal_momentum_matrix,
-    ),
-    _method("centroidal_momentum_bias", "q qd", lambda scene: (6,), lambda d, q, qd: d.centroidal_momentum_bias(qd)),
-    _method("quasi_velocities", "q qd", _dof, lambda d, q, qd: d.quasi_velocities(qd)),
-    Operation(
-        "inverse_dynamics_derivatives",
-        ("q", "qd", "qdd"),
-        _square,
-        _derivatives("inverse_dynamics_derivatives"),
-        lambda d, q, qd, qdd: _inverse_derivatives(d, qd, qdd)[0],
-    ),
-    Operation(
-        "forward_dynamics_derivatives",
-        ("q", "qd", "tau"),
-        _square,
-        _derivatives("forward_dynamics_derivatives"),
-        _forward_derivative,
-    ),
-    Operation(
-        "forward_dynamics_vjp",
-        ("q", "qd", "tau", "b"),
-        _dof,
-        _pulled_back,
-        lambda d, q, qd, tau, b: _forward_derivative(d, q, qd, tau).T @ b,
-    ),
-    _method("fixman_torque", "q", _dof, lambda d, q: d.fixman_torque, scale=lambda d, e: max(1.0, np.linalg.norm(e))),
-)
-APPLICATIONS = {operation.name: operation for operation in _APPLICATIONS}
-"""The operations of ``dynamics.applications`` that every scene has, for the same tables; each compiles a kernel."""
+_MAIN = {name: of_declaration(one) for name, one in DECLARED.items() if one.trial is not None and one.trial.main}
+OPERATIONS = {operation.name: operation for operation in _OPERATORS} | _MAIN
+"""Name -> operation, in the order of the tables that show them: operators of a scene, then calls of Dynamics."""
+APPLICATIONS = {
+    name: of_declaration(one) for name, one in DECLARED.items() if one.trial is not None and name not in _MAIN
+}
+"""The other operations of Dynamics that have a dense reference, for the same tables; each compiles a kernel."""

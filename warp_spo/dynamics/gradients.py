@@ -1,0 +1,216 @@
+"""The way back through operations: gradients by arguments and by values of the scene, from declared derivatives.
+
+Nothing is recorded. Forward dynamics is differentiated by its own solve and one Newton-Euler recursion in reverse, in
+one kernel, or in two where a warp works on a limb. With embedded loops see
+:mod:`warp_spo.recursions.loops.embedded_adjoints`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from ..arrays import Call
+from ..errors import UnsupportedError, as_names
+from ..execution import link_values
+from ..execution.plan import MOST_DOFS
+from ..recursions.links import LINK_VALUES
+from .operation import DIFFERENTIABLE, Derivative, Operation, derivative_of
+
+if TYPE_CHECKING:
+    from .dynamics import Dynamics
+
+Pull = Callable[..., dict[str, Any]]
+"""``pull(gradients, operation, given, options, results, cotangents, wrt)`` returns the gradients by name."""
+
+
+class Gradients:
+    """Gradients of the operations of one :class:`Dynamics`, which is ``dyn``."""
+
+    def __init__(self, dyn: Dynamics):
+        self.dyn = dyn
+
+    # -- for torch -------------------------------------------------------------------------------------------------
+    @property
+    def values(self) -> tuple[str, ...]:
+        """Names of the variable values by which results can be differentiated."""
+        return tuple(name for name in DIFFERENTIABLE if name in self.dyn.variable)
+
+    def check(self, operation: Operation) -> None:
+        """Raise UnsupportedError where an operation has no gradient on this scene."""
+        derivative, name = derivative_of(operation), f"{operation.name}, backwards"
+        self.dyn._engine.refuse(name, derivative)
+        call = self.dyn._engine.call_named(name)
+        self.check_size(call)
+        lacking = derivative.lacking(self.dyn.programs.links) if self.dyn.scene.dof_count else ""
+        if lacking:
+            what, _, way_out = lacking.partition("; ")
+            raise UnsupportedError(call.name, what, way_out)
+
+    def check_size(self, call: Call) -> None:
+        """Raise UnsupportedError where the scene has too many dofs for derivatives."""
+        dofs = self.dyn.scene.dof_count
+        if dofs > MOST_DOFS:
+            way = f"derivatives are straight-line code, of up to {MOST_DOFS} dof"
+            raise UnsupportedError(call.name, f"a scene of {dofs} dof", way)
+
+    def result_shapes(self, operation: Operation, frames: Sequence[Any] = (), **_: Any) -> list[tuple[int, ...]]:
+        """Return the shapes of the results, and of what the way back needs besides; a result like b has b's."""
+        derivative, shape = derivative_of(operation), self.dyn._engine.shape
+        kept = [argument.axes for argument in operation.arrays if argument.name in derivative.keeps]
+        return [shape(axes, len(frames))[0] for axes in (*(result.axes for result in operation.results), *kept)]
+
+    def pull_back(
+        self,
+        operation: Operation,
+        given: dict[str, Any],
+        options: dict[str, Any],
+        results: Sequence[Any],
+        cotangents: Sequence[Any],
+        wrt: Sequence[str],
+    ) -> dict[str, Any]:
+        """Return gradients by name of a call with the arguments ``given``, for the cotangents of its results.
+
+        Args:
+            options: arguments that are no arrays. results: of the call, and what else its derivative keeps.
+            wrt: names of arguments and of values.
+        """
+        derivative = derivative_of(operation)
+        self.dyn._engine.refuse(f"{operation.name}, backwards", derivative)
+        if derivative.pull is not None:
+            return derivative.pull(self, operation, given, options, results, cotangents, wrt)
+        (result,), (cotangent,) = results, cotangents
+        return self.pull_back_kernel(operation, given, options, result, cotangent, wrt)
+
+    def pull_back_kernel(
+        self,
+        operation: Operation,
+        given: dict[str, Any],
+        options: dict[str, Any],
+        result: Any,
+        cotangent: Any,
+        wrt: Sequence[str],
+    ) -> dict[str, Any]:
+        """Return gradients of an operation with one result by launching its declared kernel, as :meth:`pull_back`."""
+        derivative, shape, engine = derivative_of(operation), tuple(result.shape), self.dyn._engine
+        with engine.call_named(f"{operation.name}, backwards") as call:
+            state = {name: array for name, array in given.items() if name in ("q", "qd")}
+            arrays = engine.read(call, operation, **state)
+            arrays["cotangent"] = call.read("cotangent", cotangent, shape)
+            arrays |= engine.read(call, operation, **options)
+            if derivative.reads:
+                arrays[derivative.reads] = call.read("result", result, shape)
+            names, outs = self.outs(call, operation, {}, wrt, None)
+            self.launch(derivative, names, outs, arrays)
+        return by_name(names, call.result)
+
+    @contextlib.contextmanager
+    def at_values(self, values: dict[str, Any]) -> Iterator[None]:
+        """Set variable values of the scene inside the block, and what they were before after it."""
+        if not values:
+            yield
+            return
+        dyn = self.dyn
+        parameters = dyn.recursions.parameters
+        with Call("Dynamics.set", dyn.device, dyn.dtype) as call:
+            arrays, before = {}, {}
+            for name, value in values.items():
+                shape = dyn.scene.values[name].shape[1:]
+                arrays[name] = call.read(name, value, (dyn.worlds, *shape) if value.ndim > len(shape) else shape)
+            for name, array in arrays.items():  # on the stream that read has entered
+                before[name] = wp.clone(parameters.value(name))
+                parameters.copy_in(name, array)
+            parameters.refresh(values)
+            try:
+                yield
+            finally:
+                for name, value in before.items():
+                    wp.copy(parameters.value(name), value)
+                parameters.refresh(values)
+
+    # -- steps of the methods --------------------------------------------------------------------------------------
+    def outs(
+        self, call: Call, operation: Operation, given: dict[str, Any], wrt: Sequence[str], out: dict[str, Any] | None
+    ) -> tuple[tuple[str, ...], list[wp.array]]:
+        """Return the checked names of ``wrt``, and an array for the gradient by each.
+
+        Args:
+            given: arguments by name, None where one was left out. out: the caller's arrays by name.
+        """
+        self.check_size(call)
+        derivative = derivative_of(operation)
+        arguments, entering = derivative.by, derivative.values
+        names = as_names(call.name, "wrt", wrt, arguments[:2])
+        if not isinstance(out, Mapping | None):
+            raise TypeError(f"{call.name}: out is of type {type(out).__name__}; expected a dict, arrays by name of wrt")
+        out = out or {}
+        known = (*arguments[:1], "tangent", *arguments[1:], *(name for name in entering if self._varies(name)))
+        for name in names:
+            if name in entering and name not in known:
+                way = f"build Dynamics with variable=({name!r},)"
+                raise ValueError(f"{call.name}: wrt names {name!r}, which is folded into the kernels; {way}")
+            if name not in known:
+                raise ValueError(f"{call.name}: wrt names {name!r}; expected some of {', '.join(known)}")
+            if name in given and given[name] is None and name != "tau":
+                raise ValueError(f"{call.name}: wrt names {name!r}, which is None; pass zeros to differentiate by it")
+        if not names or len(set(names)) < len(names):
+            raise ValueError(f"{call.name}: wrt is {names!r}; expected one name or more, each once")
+        for name in out:
+            if name not in names:
+                raise ValueError(f"{call.name}: out has {name!r}; expected names out of wrt: {', '.join(names)}")
+        shapes = {name: self.shape_of(operation, name) for name in names}
+        return names, [call.write(out.get(n), shapes[n], f"[world, ...] like {n}", name=f"out[{n!r}]") for n in names]
+
+    def _varies(self, name: str) -> bool:
+        return name in self.dyn.variable or self.dyn.scene.values[name].shape[0] > 1
+
+    def shape_of(self, operation: Operation, name: str) -> tuple[int, ...]:
+        """Return the shape of the gradient by an argument, by a value of the scene, or along "tangent" coordinates."""
+        if name in DIFFERENTIABLE:
+            return self.dyn.worlds, *self.dyn.scene.values[name].shape[1:]
+        axes = {argument.name: argument.axes for argument in operation.arrays}
+        return self.dyn._engine.shape(axes.get(name, "world, dof"))[0]
+
+    def launch(
+        self, derivative: Derivative, names: tuple[str, ...], outs: Sequence[wp.array], given: dict[str, Any]
+    ) -> None:
+        """Launch a derivative; gradients by values of the scene follow from those by the values of its links."""
+        dyn, results = self.dyn, dict(zip(names, outs, strict=True))
+        values = {name: results.pop(name) for name in names if name in LINK_VALUES}
+        if dyn.scene.dof_count == 0:
+            for array in outs:
+                array.zero_()
+            return
+        if values:
+            dyn.programs.links.opened()  # fills the table
+            size = len(dyn.programs.links.tables["value"])
+            results["value"] = dyn.recursions.array("value of derivatives", dyn.worlds, size)
+        first, *more = results
+        further = {f"{name}_bar": results[name] for name in more}
+        dyn._engine.launch(derivative, results[first], further, wrt=tuple(results), **given)
+        if values:
+            flat = {name: array.reshape((dyn.worlds, math.prod(array.shape[1:]))) for name, array in values.items()}
+            link_values.pull_back(dyn.recursions.parameters, dyn.programs.links, results["value"], flat)
+
+    def push(self, call: Call, operation: Operation, given: dict[str, Any], along: dict[str, Any], out: Any) -> None:
+        """Launch a derivative along a direction.
+
+        Args:
+            operation: the product. given: its arrays by name. along: directions, "dq" and so on. out: the caller's.
+        """
+        arrays = given | {f"{name[1:]}_dot": rate for name, rate in along.items()}
+        for array in ("qd", "qdd", "body_f"):
+            if arrays.get(array) is None and arrays.get(f"{array}_dot") is not None:
+                raise ValueError(f"{call.name}: d{array} is given and {array} is None; expected both; pass zeros")
+        self.check_size(call)
+        (result,) = self.dyn._engine.write(call, operation, (out,), {})
+        self.dyn._engine.launch(operation, result, **arrays)
+
+
+def by_name(names: tuple[str, ...], results: Any) -> dict[str, Any]:
+    """Return the results of a call by name."""
+    return dict(zip(names, results if len(names) > 1 else (results,), strict=True))

@@ -1,0 +1,177 @@
+"""Integrators of one time step: the implicit step, implicit midpoint and Runge-Kutta, as launches on Warp arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from ..arrays import Call
+from ..errors import UnsupportedError
+from ..execution.routine import Routine
+from ..kernels import combination, loops
+from ..recursions import coordinates, hinge_forces
+from ..recursions import step as recursion
+from ..recursions.impedance import DEFAULT_BOUND
+from ..recursions.loops import closed_step, multipliers
+from ..recursions.loops.closed_step import NEWTON_STEPS
+from ..scene.scene import Scene
+from .forward_dynamics import accelerations
+
+if TYPE_CHECKING:
+    from .dynamics import Dynamics
+
+MIDPOINT_ITERATIONS = 6  # after the first guess; each gains an order in dt of the velocity terms
+RK4 = ((0.0, 1.0 / 6.0), (0.5, 1.0 / 3.0), (0.5, 1.0 / 3.0), (1.0, 1.0 / 6.0))
+"""Where each stage starts, in dt along the stage before it, and its weight."""
+
+
+def _divides(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
+    return recursion.by_pieces(scene)
+
+
+STEP = Routine("step", recursion.step, letters="PzaS", divides=_divides, passes=True)
+EMBEDDED_STEP = Routine("step", closed_step.step, passes=True)
+STEP_UNDER_MULTIPLIERS = Routine("step", closed_step.step_with_multipliers, passes=True)
+STEP_SYSTEM = Routine("step_system", closed_step.step_system)
+CLOSURES_OPEN = Routine("closures_open", multipliers.closures_open)
+INTEGRATE = Routine("integrate", coordinates.integrate)
+COORDINATE_RATES = Routine("coordinate_rates", coordinates.coordinate_rates)
+HINGE_FORCE = Routine("hinge_force", hinge_forces.hinge_force)
+
+
+def semi_implicit(
+    dyn: Dynamics,
+    call: Call,
+    q: wp.array,
+    qd: wp.array,
+    q_out: wp.array,
+    qd_out: wp.array,
+    dt: float,
+    qdd: wp.array | None = None,
+    status: wp.array | None = None,
+    **given: Any,
+) -> None:
+    """Launch the implicit step of order 1.
+
+    Args:
+        qdd, status: arrays to fill, see :meth:`Dynamics.step`.
+        given: forces and targets by name. With ``q_from``, ``qd_from`` the step starts from that state, while its sweep
+            and the laws of its joints are evaluated at q, qd.
+    """
+    asked = {name: array for name, array in (("qdd_out", qdd), ("status", status)) if array is not None}
+    option = {name.removesuffix("_out"): True for name in asked}
+    if dyn.scene.dof_count == 0 and status is not None:
+        status.zero_()
+    launch, more = dyn._engine.launch_routine, {"q_out": q_out, **asked}
+    if not dyn.closed:
+        launch(STEP, qd_out, more, q=q, qd=qd, dt=dt, **given, **option)
+    elif dyn.embedding is not None:
+        launch(EMBEDDED_STEP, qd_out, more, q=q, qd=qd, dt=dt, embedding=dyn.embedding, **given, **option)
+    else:
+        _step_under_multipliers(dyn, q_out, qd_out, asked, option, q=q, qd=qd, dt=dt, **given)
+
+
+def _step_under_multipliers(
+    dyn: Dynamics,
+    q_out: wp.array,
+    qd_out: wp.array,
+    asked: dict[str, wp.array],
+    option: dict[str, bool],
+    **given: Any,
+) -> None:
+    """Solve for the multipliers, step the open tree under them, and project its state onto the closures."""
+    closures, launch = dyn._closures, dyn._engine.launch_routine
+    system, more = closures.system()
+    launch(STEP_SYSTEM, system, more, **given)
+    found, _, resolved = closures.least_norm()
+    q, qd = _scratch(dyn, "open q", q_out), _scratch(dyn, "open qd", qd_out)
+    known = {"multipliers": found, **({"resolved": resolved} if "status" in option else {})}
+    launch(STEP_UNDER_MULTIPLIERS, qd, {"q_out": q, **asked}, **known, **given, **option)
+    closures.project(q, qd, False, NEWTON_STEPS, q_out, qd_out)
+    if "status" in asked:
+        left = dyn.recursions.array("closures open", dyn.worlds, 1)
+        launch(CLOSURES_OPEN, left, q=q_out, qd=qd_out)
+        dyn.recursions.launch(loops.mark_open, dyn.worlds, [left], [asked["status"]])
+
+
+def midpoint(
+    dyn: Dynamics,
+    call: Call,
+    q: wp.array,
+    qd: wp.array,
+    q_out: wp.array,
+    qd_out: wp.array,
+    dt: float,
+    **forces: Any,
+) -> None:
+    """Launch the implicit midpoint rule: half a step whose sweep and laws are evaluated at the midpoint itself."""
+    q_at, qd_at, q_next, qd_next = (_scratch(dyn, f"midpoint {i}", a) for i, a in enumerate((q, qd, q, qd)))
+    semi_implicit(dyn, call, q, qd, q_at, qd_at, 0.5 * dt, **forces)
+    for _ in range(MIDPOINT_ITERATIONS):
+        semi_implicit(dyn, call, q_at, qd_at, q_next, qd_next, 0.5 * dt, q_from=q, qd_from=qd, **forces)
+        q_at, qd_at, q_next, qd_next = q_next, qd_next, q_at, qd_at
+    dyn._engine.launch_routine(INTEGRATE, q_next, q=q, qd=qd_at, dt=dt)
+    _combine(dyn, 2.0, qd_at, -1.0, qd, qd_next)
+    _finish(dyn, q_next, qd_next, q_out, qd_out)
+
+
+def rk4(
+    dyn: Dynamics,
+    call: Call,
+    q: wp.array,
+    qd: wp.array,
+    q_out: wp.array,
+    qd_out: wp.array,
+    dt: float,
+    tau: wp.array | None,
+    body_f: wp.array | None,
+    **targets: Any,
+) -> None:
+    """Launch the classical Runge-Kutta rule in the coordinates; quaternions are normalised at the end."""
+    values = dyn.scene.values
+    if values["joint_friction"].any() or (abs(values["joint_velocity_limit"]) < DEFAULT_BOUND).any():
+        raise UnsupportedError(call.name, "integrator='rk4' with friction or velocity limits", "use 'midpoint'")
+    launch = dyn._engine.launch_routine
+    q_at, qd_at, q_sum, qd_sum = (_scratch(dyn, f"rk4 {i}", a) for i, a in enumerate((q, qd, q, qd)))
+    q_rate, qdd, force = (_scratch(dyn, f"rk4 rate {i}", a) for i, a in enumerate((q, qd, qd)))
+    for stage, (start, weight) in enumerate(RK4):
+        if stage == 0:
+            for array, at, total in ((q, q_at, q_sum), (qd, qd_at, qd_sum)):
+                wp.copy(at, array)
+                wp.copy(total, array)
+        else:
+            _combine(dyn, 1.0, q, start * dt, q_rate, q_at)
+            _combine(dyn, 1.0, qd, start * dt, qdd, qd_at)
+        launch(HINGE_FORCE, force, q=q_at, qd=qd_at, **targets)
+        if tau is not None:
+            _combine(dyn, 1.0, force, 1.0, tau, force)
+        accelerations(dyn, qdd, q=q_at, qd=qd_at, tau=force, body_f=body_f)
+        launch(COORDINATE_RATES, q_rate, q=q_at, qd=qd_at)
+        _combine(dyn, 1.0, q_sum, weight * dt, q_rate, q_sum)
+        _combine(dyn, 1.0, qd_sum, weight * dt, qdd, qd_sum)
+    qdd.zero_()
+    launch(INTEGRATE, q_at, q=q_sum, qd=qdd, dt=0.0)  # normalises
+    _finish(dyn, q_at, qd_sum, q_out, qd_out)
+
+
+INTEGRATORS: dict[str, Callable[..., None]] = {"semi_implicit": semi_implicit, "midpoint": midpoint, "rk4": rk4}
+"""By name."""
+
+
+def _finish(dyn: Dynamics, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array) -> None:
+    """Write q, qd as the state after the step, with its loops closed."""
+    if dyn.closed:
+        dyn._closures.project(q, qd, False, NEWTON_STEPS, q_out, qd_out)
+    else:
+        wp.copy(q_out, q)
+        wp.copy(qd_out, qd)
+
+
+def _scratch(dyn: Dynamics, name: str, like: wp.array) -> wp.array:
+    return dyn.recursions.array(name, *like.shape)
+
+
+def _combine(dyn: Dynamics, a: float, x: wp.array, b: float, y: wp.array, out: wp.array) -> None:
+    dyn.recursions.launch(combination.combine, out.shape, [a, x, b, y], [out])

@@ -1,0 +1,85 @@
+"""Momentum of a robot and the motion of its centre of mass. Orin, Goswami, Lee 2013.
+
+The centre of mass is that of all bodies that a hinge lets move, of every tree of the scene together.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..arrays import AnyArray, ArrayT
+from ..execution.routine import Routine
+from ..recursions import momentum as recursion
+from ..recursions.loops import minimal
+from .operation import AS_WRITTEN, QD, Operation, Q, Result, Trial, required
+
+if TYPE_CHECKING:
+    from .dynamics import Dynamics
+
+COM_JACOBIAN = Operation(
+    "com_jacobian",
+    arguments=(Q,),
+    results=(Result("jacobian", "world, 3, independent dof"),),
+    routine=Routine("com_jacobian", recursion.com_jacobian),
+    embed=Routine("embedded_com_jacobian", minimal.com_jacobian),
+    multipliers=AS_WRITTEN,
+    trial=Trial(lambda dense, q: dense.com_jacobian),
+)
+
+
+@COM_JACOBIAN.method
+def com_jacobian(self: Dynamics, q: ArrayT, out: ArrayT | None = None) -> ArrayT:
+    """Compute the velocity of the centre of mass per unit qd, inertial axes: sum of m(k) J(k) / sum of m(k).
+
+    The centre of mass is that of all bodies that a hinge lets move, of every tree of the scene together.
+
+    Returns:
+        [world, 3, dof], [m/s per unit qd]; with embedded loops [world, 3, independent dof].
+    """
+    return self._engine.run(COM_JACOBIAN, out, q=q)
+
+
+CENTROIDAL_MOMENTUM_MATRIX = Operation(
+    "centroidal_momentum_matrix",
+    arguments=(Q,),
+    results=(Result("matrix", "world, 6, independent dof"),),
+    routine=Routine("centroidal_momentum_matrix", recursion.centroidal_momentum_matrix),
+    embed=Routine("embedded_centroidal_momentum_matrix", minimal.centroidal_momentum_matrix),
+    multipliers=AS_WRITTEN,
+    trial=Trial(lambda dense, q: dense.centroidal_momentum_matrix),
+)
+
+
+@CENTROIDAL_MOMENTUM_MATRIX.method
+def centroidal_momentum_matrix(self: Dynamics, q: ArrayT, out: ArrayT | None = None) -> ArrayT:
+    """Compute A, the momentum per unit qd: linear [kg m/s], then angular about the centre of mass [kg m^2/s].
+
+    In inertial axes; linear comes first, as in :meth:`jacobian`. The centre of mass is that of :meth:`com_jacobian`.
+    Armature is not included. A column is R(k) H*, where R(k) is the composite inertia, moved to the centre of mass.
+    Orin, Goswami, Lee 2013.
+
+    Returns:
+        [world, 6, dof]; with embedded loops A X [world, 6, independent dof].
+    """
+    return self._engine.run(CENTROIDAL_MOMENTUM_MATRIX, out, q=q)
+
+
+CENTROIDAL_MOMENTUM_BIAS = Operation(
+    "centroidal_momentum_bias",
+    arguments=(Q, required(QD)),
+    results=(Result("bias", "world, 6"),),
+    routine=Routine("centroidal_momentum_bias", recursion.centroidal_momentum_bias),
+    embed=Routine("embedded_centroidal_momentum_bias", minimal.centroidal_momentum_bias),
+    multipliers=AS_WRITTEN,
+    trial=Trial(lambda dense, q, qd: dense.centroidal_momentum_bias(qd)),
+)
+
+
+@CENTROIDAL_MOMENTUM_BIAS.method
+def centroidal_momentum_bias(self: Dynamics, q: ArrayT, qd: AnyArray, out: ArrayT | None = None) -> ArrayT:
+    """Compute A' qd for A of :meth:`centroidal_momentum_matrix`: A qdd + A' qd is the rate of the momentum.
+
+    Returns:
+        [world, 6]: force [N], then moment about the centre of mass [N m], inertial axes.
+    """
+    return self._engine.run(CENTROIDAL_MOMENTUM_BIAS, out, q=q, qd=qd)

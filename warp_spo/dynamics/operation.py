@@ -1,0 +1,307 @@
+"""How an operation of :class:`warp_spo.Dynamics` is declared: one object, from which everything else derives.
+
+An :class:`Operation` stands right above the method that it declares::
+
+    MASS_MATRIX = Operation(
+        "mass_matrix",
+        arguments=(Q,),
+        results=(Result("mass", "world, independent dof, independent dof"),),
+        routine=Routine("mass_matrix", composite.mass_matrix, nodes.mass_matrix, letters="R", long_result=True),
+        embed=Routine("embedded_mass_matrix", minimal.mass_matrix),
+        multipliers=AS_WRITTEN,
+        trial=Trial(lambda dense, q: dense.mass_matrix),
+    )
+
+
+    @MASS_MATRIX.method
+    def mass_matrix(self: Dynamics, q: ArrayT, out: ArrayT | None = None) -> ArrayT:
+        return self._engine.run(MASS_MATRIX, out, q=q)
+
+and ``mass_matrix = inertia.mass_matrix`` is its line in the class. Checks of arguments, refusals with closed loops,
+``prepare``, gradients in torch, trials, the main job's table and the benchmarks read the declaration.
+
+Axes are written as words: "world, dof". The words are "world", "coordinate", "dof", "independent dof" (the dofs that
+move all others where loops are embedded, otherwise all dofs), "body", "frame", "6 frames" (six for each frame), "row"
+(of the closures of loops), "entry" (of a packed matrix), and numbers.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+import numpy as np
+import warp as wp
+
+from ..arrays import Call
+from ..execution.routine import Routine
+from ..gradients import call_with_gradient, records_gradient
+from ..recursions.links import LINK_VALUES, Links
+from ..scene.frames import check_frames
+from ..scene.scene import Scene
+from . import samples
+from .seconds import STAND_IN, seconds
+
+if TYPE_CHECKING:
+    from .gradients import Pull
+
+MethodT = TypeVar("MethodT", bound=Callable[..., Any])
+
+
+# -- arguments and results ---------------------------------------------------------------------------------------------
+@dataclasses.dataclass(frozen=True)
+class Argument:
+    """An array that an operation takes.
+
+    Attributes:
+        name: name of the argument. axes: its axes in words.
+        optional: None is allowed; it means zero and costs nothing.
+        asked: ``prepare`` passes the array only where it is asked for by name.
+        written: the call fills the array. dtype: scalar type; None is that of the Dynamics.
+        columns: a further axis may hold several right-hand sides.
+        direction: the argument is the direction of a derivative by the argument without the first letter, "dq" by "q".
+        sample: name of the random input that trials pass, see :class:`warp_spo.trials.operations.Inputs`.
+    """
+
+    name: str
+    axes: str
+    optional: bool = False
+    asked: bool = False
+    written: bool = False
+    dtype: type | None = None
+    columns: bool = False
+    direction: bool = False
+    sample: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """An argument that is not an array.
+
+    Attributes:
+        name: name of the argument.
+        read: ``read(scene, call, value)`` returns what the routine gets; None: the method reads the value itself.
+        default: ``default(scene)``, what ``prepare`` passes.
+        asked: it is an option of ``prepare``.
+        sample: ``sample(scene)``, what trials pass; None: nothing.
+    """
+
+    name: str
+    read: Callable[[Scene, Call, Any], Any] | None = None
+    default: Callable[[Scene], Any] = lambda scene: None
+    asked: bool = True
+    sample: Callable[[Scene], Any] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """An array that an operation returns.
+
+    Attributes:
+        name: name among the results. axes: its axes in words. dtype: scalar type; None is that of the Dynamics.
+        like: name of the argument whose shape the result has, where that is not settled by the scene.
+        over: name of the argument whose very array ``out=`` may be.
+        quaternions: ``quaternions(scene)``, first entry of each quaternion of a world's flat result; q and -q are the
+            same rotation.
+    """
+
+    name: str
+    axes: str
+    dtype: type | None = None
+    like: str = ""
+    over: str = ""
+    quaternions: Callable[[Scene], list[int]] = lambda scene: []
+
+
+def required(argument: Argument) -> Argument:
+    """Return the argument without the choice of None."""
+    return dataclasses.replace(argument, optional=False)
+
+
+def direction(argument: Argument) -> Argument:
+    """Return the argument for a direction of a derivative by another argument."""
+    return dataclasses.replace(argument, name=f"d{argument.name}", optional=True, direction=True)
+
+
+Q = Argument("q", "world, coordinate")
+QD = Argument("qd", "world, dof", optional=True)
+QDD = Argument("qdd", "world, dof", optional=True)
+TAU = Argument("tau", "world, dof", optional=True)
+BODY_F = Argument("body_f", "world, body, 6", optional=True, asked=True)
+STATUS = Argument("status", "world", optional=True, asked=True, written=True, dtype=wp.int32)
+FRAMES = Option(
+    "frames",
+    lambda scene, call, frames: check_frames(scene, call.name, frames),
+    lambda scene: [0],
+    sample=samples.two_frames,
+)
+DT = Option("dt", lambda scene, call, dt: seconds(call, dt), lambda scene: STAND_IN, False, lambda scene: samples.DT)
+
+
+# -- closed loops ------------------------------------------------------------------------------------------------------
+class AsWritten:
+    """The method is right with closed loops as it is written.
+
+    Either it speaks of bodies, or of all dofs whatever ties them, or it calls operations that know of loops.
+    """
+
+
+@dataclasses.dataclass(frozen=True)
+class Refused:
+    """The operation raises UnsupportedError with closed loops.
+
+    Attributes:
+        way_out: what a user can do instead, beside ``loops="cut"``.
+        what: what is not supported, for the error; "": the value of ``loops=``.
+    """
+
+    way_out: str = ""
+    what: str = ""
+
+
+AS_WRITTEN = AsWritten()
+USE_EMBED = Refused("use loops='embed'")
+NO_DERIVATIVE = Refused(what="a derivative with closed loops")
+EMBEDDED_DERIVATIVE = dataclasses.replace(NO_DERIVATIVE, way_out="use loops='embed'")
+Closed = Routine | AsWritten | Refused
+"""Closed-loop form of an operation. A Routine is its form in the independent dofs, where loops are embedded."""
+
+
+# -- derivatives -------------------------------------------------------------------------------------------------------
+ANCHORS = ("joint_X_p", "joint_X_c")
+GAINS = ("joint_damping", "joint_stiffness", "joint_friction", "joint_target_ke", "joint_target_kd")
+KINEMATIC = (*ANCHORS, "body_com")  # values that enter poses, velocities and Jacobians
+DIFFERENTIABLE = (*LINK_VALUES, *GAINS)
+"""All values of a scene by which some result can be differentiated."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Derivative:
+    """The way back through an operation: products of a cotangent with the Jacobian.
+
+    Attributes:
+        routine: kernel of the product. embed: its form where loops are embedded. multipliers: with multipliers.
+        by: arguments that have a gradient. values: names of the scene's values that enter the operation.
+        reads: result of the operation that the kernel reads, by this name; "": it reads no result.
+        keeps: arguments that the operation fills because the way back reads them.
+        recomputes: the kernel computes the result that it reads where the caller does not pass it.
+        pull: what is launched; None: the kernel alone.
+        lacking: ``lacking(links)``, "what; way out" where the derivative does not support the scene; otherwise "".
+    """
+
+    routine: Routine
+    by: tuple[str, ...]
+    values: tuple[str, ...] = LINK_VALUES
+    embed: Closed = NO_DERIVATIVE
+    multipliers: Closed = NO_DERIVATIVE
+    reads: str = ""
+    keeps: tuple[str, ...] = ()
+    recomputes: bool = False
+    pull: Pull | None = None
+    lacking: Callable[[Links], str] = lambda links: ""
+
+
+# -- trials ------------------------------------------------------------------------------------------------------------
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """How trials compare an operation with the dense float64 reference, in one world.
+
+    Attributes:
+        dense: ``dense(reference, *arguments)``, the first result from :class:`warp_spo.reference.Dense`.
+        scale: ``scale(reference, expected)``, the error is divided by it; None: the 2-norm of the expected result.
+        solves: ``solves(reference, *arguments)``, matrix A and right-hand side b of the equation A x = b that the
+            result solves, if it solves one.
+        main: ``python -m warp_spo`` and the benchmarks try it; otherwise it is an application.
+        call: ``call(dyn, *arguments, out=)`` where arguments do not follow from the declaration.
+        reads: names of the random inputs, where they do not follow from the declaration.
+    """
+
+    dense: Callable[..., Any]
+    scale: Callable[[Any, np.ndarray], float] | None = None
+    solves: Callable[..., tuple[np.ndarray, np.ndarray]] | None = None
+    main: bool = False
+    call: Callable[..., None] | None = None
+    reads: tuple[str, ...] = ()
+
+
+# -- operations --------------------------------------------------------------------------------------------------------
+@dataclasses.dataclass(frozen=True, eq=False)
+class Operation:
+    """A method of :class:`warp_spo.Dynamics`, declared.
+
+    Attributes:
+        name: name of the method.
+        arguments: arrays and options, in the order of the method. results: what it returns.
+        routine: kernel of the open tree; None: the method calls other operations.
+        embed: form with ``loops="embed"``. multipliers: form with ``loops="multipliers"``. An operation that declares
+            nothing is refused there.
+        derivative: its way back; None: torch gets no gradients.
+        trial: how it is compared with the dense reference.
+        product: it is itself a product with a Jacobian, of another operation.
+    """
+
+    name: str
+    arguments: tuple[Argument | Option, ...]
+    results: tuple[Result, ...]
+    routine: Routine | None = None
+    embed: Closed = Refused()
+    multipliers: Closed = Refused()
+    derivative: Derivative | None = None
+    trial: Trial | None = None
+    product: bool = False
+    _methods: list[Callable[..., Any]] = dataclasses.field(default_factory=list, repr=False)
+
+    def method(self, function: MethodT) -> MethodT:
+        """Declare ``function`` to be the method of this operation; torch then gets its gradients, if it has any."""
+        assert function.__name__ == self.name, f"{function.__name__} is declared as {self.name}"
+        vars(function)["operation"] = self
+        self._methods.append(function)
+        if self.derivative is None:
+            return function
+        signature = inspect.signature(function)
+
+        @functools.wraps(function)
+        def call(dyn: Any, *args: Any, **more: Any) -> Any:
+            if not records_gradient((*args, *more.values()), dyn.values):
+                return function(dyn, *args, **more)
+            arguments = signature.bind(dyn, *args, **more).arguments
+            del arguments["self"]
+            return call_with_gradient(dyn, self, arguments)
+
+        self._methods.append(call)
+        return cast(MethodT, call)
+
+    @property
+    def function(self) -> Callable[..., Any]:
+        """The method as it is written, without torch's gradients; its first argument is the Dynamics."""
+        return self._methods[0]
+
+    @property
+    def entry(self) -> Callable[..., Any]:
+        """The method as users call it; its first argument is the Dynamics."""
+        return self._methods[-1]
+
+    @functools.cached_property
+    def arrays(self) -> tuple[Argument, ...]:
+        """The arguments that are arrays."""
+        return tuple(argument for argument in self.arguments if isinstance(argument, Argument))
+
+    @functools.cached_property
+    def options(self) -> tuple[Option, ...]:
+        """The arguments that are no arrays."""
+        return tuple(argument for argument in self.arguments if isinstance(argument, Option))
+
+
+def derivative_of(operation: Operation) -> Derivative:
+    """Return the derivative of an operation that has one."""
+    assert operation.derivative is not None, f"{operation.name} has no derivative"
+    return operation.derivative
+
+
+def declared(methods: Mapping[str, Any]) -> dict[str, Operation]:
+    """Return the operations among the members of a class by name, in their order."""
+    found = [vars(member).get("operation") for member in methods.values() if inspect.isfunction(member)]
+    return {operation.name: operation for operation in found if isinstance(operation, Operation)}

@@ -1,0 +1,67 @@
+"""A routine: the computation of one kernel, and what decides how its work is divided among threads."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+from ..trace.emission import Store
+
+VARIANTS = 16  # different options, such as lists of frames, that get a kernel of their own
+
+
+def _always(*_: Any, **__: Any) -> bool:
+    return True
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Routine:
+    """What one kernel computes. Plan, programs and messages read these facts; they know no routine by its name.
+
+    Attributes:
+        name: name of the kernel.
+        trace: ``trace(trace, **options)`` returns the values that the kernel stores, see :mod:`warp_spo.recursions`.
+        sweeps: ``sweeps(run, out, **arrays)`` launches the same computation at node granularity; None: there is only
+            the traced kernel of the scene.
+        blocks: at node granularity the caller applies stored blocks instead of this routine.
+        letters: messages that limbs send each other, see :mod:`warp_spo.recursions.messages`. "": limbs cannot share
+            the work, and one thread works on a whole world.
+        divides: ``divides(scene, inputs, **options)``, whether limbs can share the work for these inputs and options.
+        suits: ``suits(links, shapes, **options)``, whether the traced kernel serves this scene; if not, the sweeps do.
+        short: the code is short, so that one thread holds a large tree without spilling registers.
+        velocities: the velocities of links are kept during the recursion, which takes registers.
+        long_result: writing the result is most of the work, and many warps write faster.
+        collects: by limbs, short rows of the result leave through shared memory.
+        passes: the recursion is repeated until the laws of the joints hold, and its results may overwrite its inputs.
+        tiled: the result is left in tiles for the kernels of :mod:`warp_spo.kernels.tiles` to finish.
+        bias_first: variant that computes velocity terms and loads first, for many worlds of shallow trees.
+        occupancy: (blocks, registers): by limbs in float32 with many worlds, a multiprocessor holds so many blocks if
+            a thread then still has so many registers.
+        variants: at most so many different options get a kernel of their own where sweeps serve the others.
+        title: ``title(inputs, **options)``, what a user calls this computation; None: the name.
+    """
+
+    name: str
+    trace: Callable[..., list[Store]]
+    sweeps: Callable[..., None] | None = None
+    blocks: bool = False
+    letters: str = ""
+    divides: Callable[..., bool] = _always
+    suits: Callable[..., bool] = _always
+    short: bool = False
+    velocities: bool = True
+    long_result: bool = False
+    collects: bool = False
+    passes: bool = False
+    tiled: bool = False
+    bias_first: Routine | None = None
+    occupancy: tuple[int, int] | None = None
+    variants: int = VARIANTS
+    title: Callable[..., str] | None = None
+
+    @functools.cached_property
+    def has_node_form(self) -> bool:
+        """Whether the computation exists at node granularity."""
+        return self.blocks or self.sweeps is not None
