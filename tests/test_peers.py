@@ -212,7 +212,7 @@ def test_a_peer_that_fails_leaves_the_others(capsys, monkeypatch):
 
 def test_a_robot_that_is_not_installed_says_how_to_get_it(monkeypatch, tmp_path):
     monkeypatch.setenv(robots.FOLDER, str(tmp_path))
-    with pytest.raises(FileNotFoundError, match=r"expects go2\.urdf"):
+    with pytest.raises(FileNotFoundError, match=r"expected go2\.urdf"):
         cases.SCENES["go2"]()
     monkeypatch.delenv(robots.FOLDER)
     monkeypatch.setattr(robots, "PACKAGE", "no-such-package")
