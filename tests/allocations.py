@@ -1,4 +1,4 @@
-"""What Warp allocates while a block runs."""
+"""A check that Warp allocates no memory while a block runs."""
 
 import contextlib
 

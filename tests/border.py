@@ -1,4 +1,4 @@
-"""What both sides of the border are tested with: one scene, its arrays in every kind, errors that explain."""
+"""One scene, its arrays as torch, Warp and NumPy arrays, and the errors that must explain: for tests of the border."""
 
 import functools
 import re
@@ -9,7 +9,7 @@ import pytest
 import torch
 import warp as wp
 import zoo
-from laws import TOLERANCE
+from laws import TOLERANCE, numbers
 
 import warp_spo as spo
 
@@ -24,12 +24,12 @@ def scene():
 
 
 @functools.cache
-def _dynamics(device, dtype):
-    return spo.Dynamics(scene(), WORLDS, device=device, dtype=dtype)
+def _dynamics(device, dtype, granularity):
+    return spo.Dynamics(scene(), WORLDS, device=device, dtype=dtype, granularity=granularity)
 
 
-def dynamics(device, dtype="float64"):
-    return _dynamics(device.alias, dtype)
+def dynamics(device, dtype="float64", granularity=None):
+    return _dynamics(device.alias, dtype, granularity)
 
 
 def made(kind, values, dyn):
@@ -40,11 +40,6 @@ def made(kind, values, dyn):
     if kind == "warp":
         return wp.array(values, dtype=dyn.dtype, device=dyn.device)
     return np.array(values, dtype)
-
-
-def numbers(array):
-    array = array.detach().cpu() if isinstance(array, torch.Tensor) else array
-    return np.asarray(array.numpy() if hasattr(array, "numpy") else array, dtype=np.float64)
 
 
 def given(kind, dyn):

@@ -9,6 +9,7 @@ import pytest
 import warp as wp
 
 from warp_spo.execution import plan
+from warp_spo.kernels import native
 
 wp.config.log_level = wp.LOG_WARNING
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
@@ -18,15 +19,39 @@ def pytest_addoption(parser):
     parser.addoption("--device", default="cpu", help="Warp device that the kernels run on")
     parser.addoption(
         "--granularity",
-        default="node",
+        default="plan",
         choices=["node", "segment", "tree", "plan"],
-        help="of tests that do not say; node needs no compilation for a scene, plan is what users get",
+        help="of Dynamics whose tests name none; plan is what users get",
+    )
+    parser.addoption(
+        "--optimized",
+        action="store_true",
+        help="compile straight-line kernels for the CPU as users do: to the same bits, in three times the time",
     )
 
 
 def pytest_configure(config):
     asked = config.getoption("--granularity")
     plan.DEFAULT = None if asked == "plan" else asked
+    if not config.getoption("--optimized"):
+        native.kernel = without_optimization(native.kernel)
+
+
+def without_optimization(make):
+    """Return ``make`` with kernels that the CPU's compiler does not optimize; a GPU's compiler does.
+
+    Most of the time of a run without a kernel cache would go into optimizing straight-line kernels. Each of their
+    statements is one operation, so that results keep their bits. Kernels at node granularity, whose functions are fused
+    when they are inlined, are compiled as users compile them.
+    """
+
+    def make_unoptimized(*arguments, **options):
+        kernel = make(*arguments, **options)
+        if not wp.is_cuda_available():
+            kernel.module.options["optimization_level"] = 0
+        return kernel
+
+    return make_unoptimized
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,8 @@
 An operation is a name in OPERATIONS: which arrays it takes, and how the dense reference computes it for one world.
 """
 
+import functools
+
 import numpy as np
 import warp as wp
 import zoo
@@ -56,6 +58,12 @@ def to_device(dyn, arrays):
     return {name: wp.array(array, dtype=dyn.dtype, device=dyn.device) for name, array in arrays.items()}
 
 
+def numbers(array):
+    """Return an array of any kind and device as NumPy float64."""
+    array = array.detach().cpu() if hasattr(array, "detach") else array
+    return np.asarray(array.numpy() if hasattr(array, "numpy") else array, dtype=np.float64)
+
+
 def call(dyn, name, arrays, out=None):
     """The operation's result for ``arrays``, a dictionary as :func:`states` makes it, of any kind."""
     fixed = {"frames": frames_of(dyn.scene), "dt": STEP}
@@ -67,10 +75,20 @@ def numpy_call(dyn, name, arrays):
     return np.asarray(call(dyn, name, to_device(dyn, arrays)).numpy(), dtype=np.float64)
 
 
+@functools.lru_cache(maxsize=64)
+def _dense(scene, q, world):
+    return reference.Dense(scene, np.frombuffer(q), world=world)
+
+
+def dense(scene, q, world):
+    """Return the dense reference of one world; operations of one state share it, for it is slow."""
+    return _dense(scene, np.asarray(q, np.float64).tobytes(), world)
+
+
 def expected(dyn, name, arrays, world):
     """The dense reference's result for one world."""
     state = {key: array[world] for key, array in arrays.items()} | {"frames": frames_of(dyn.scene)}
-    return OPERATIONS[name][1](reference.Dense(dyn.scene, state["q"], world=world), state)
+    return OPERATIONS[name][1](dense(dyn.scene, state["q"], world), state)
 
 
 def same_quaternion_sign(name, scene, got, wanted):

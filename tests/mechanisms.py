@@ -24,7 +24,7 @@ STEP = 0.02
 
 
 def closure(scene, dense):
-    """What must vanish, redundant rows and all, from poses: loops, then couplings."""
+    """Return the closure errors, redundant rows included, from body poses: of the loops, then of the couplings."""
     rows = []
     for loop in scene.loops:
         A, B = (

@@ -5,6 +5,7 @@ import functools
 import laws
 import numpy as np
 import zoo
+from granularities import of_random_scenes
 from robots import ROBOTS
 
 import warp_spo as spo
@@ -32,7 +33,8 @@ def scene_of(name):
 
 @functools.cache
 def _operators(name, worlds, dtype, device):
-    dyn = spo.Dynamics(zoo.varied(scene_of(name), worlds), worlds, device=device, dtype=dtype)
+    granularity = of_random_scenes()  # at tree each operator of each scene is a kernel: test_expressions takes some
+    dyn = spo.Dynamics(zoo.varied(scene_of(name), worlds), worlds, device=device, dtype=dtype, granularity=granularity)
     q = laws.states(dyn.scene, worlds, dtype=dtype)["q"]
     return dyn, dyn.operators(q), q
 
@@ -42,7 +44,7 @@ def operators(name, worlds, dtype, device):
 
 
 def close(got, wanted, tolerance):
-    got, wanted = (x.dense() if isinstance(x, spo.Operator) else np.asarray(x) for x in (got, wanted))
+    got, wanted = (laws.numbers(x.dense() if isinstance(x, spo.Operator) else x) for x in (got, wanted))
     assert laws.error(got, np.broadcast_to(wanted, got.shape)) <= tolerance
 
 

@@ -45,7 +45,7 @@ def depth_first(scene):
 
 
 class Oracle:
-    """What the two share: one world's values, the maps between velocities, and the algebra that follows from them.
+    """Base of both oracles: one world's values, the maps between velocities, and the algebra that follows from them.
 
     A subclass gives ``q_of(q)``, and ``_mass(q)``, ``_bias(q, v)``, ``_forward(q, v, tau)``, ``_inverse(q, v, a)`` and
     ``_free_map`` in its own velocities, of which ``self.v_of[dof]`` is the entry that belongs to the scene's dof.

@@ -69,7 +69,7 @@ def test_everything_goes_on_where_it_stopped(tmp_path, capsys, device, monkeypat
 
 
 def test_a_part_whose_file_was_cut_off_is_measured_again(tmp_path, device, monkeypatch):
-    """What another part measured is kept, what is no run is left out or made anew."""
+    """Results of other parts are kept; a file that is no run is left out or measured anew."""
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     text = json.dumps(RUN | dict(rows=[dict(zip(evidence.MEASURED, "abcde", strict=True))]))
     (tmp_path / "one_part.py").write_text(f"import sys\nopen(sys.argv[-1], 'w').write({text!r})\n")

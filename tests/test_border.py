@@ -7,19 +7,22 @@ import numpy as np
 import pytest
 import warp as wp
 import zoo
-from border import SAME, WORLDS, assert_right, dynamics, explained, given, made, numbers
-from laws import OPERATIONS, TOLERANCE
+from border import SAME, WORLDS, assert_right, dynamics, explained, given, made
+from granularities import of_random_scenes
+from laws import OPERATIONS, TOLERANCE, numbers
 
 import warp_spo as spo
 
+AS_PLANNED = ("inverse_dynamics", "body_poses", "integrate")  # others read the same quaternions, at node granularity
 KINDS = ["torch", "warp", "numpy"]
 
 
+@pytest.mark.parametrize("granularity", [None, "node"])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("operation", OPERATIONS)
-def test_result_is_the_reference_in_the_kind_and_dtype_of_the_input(operation, kind, dtype, device):
-    dyn = dynamics(device, dtype)
+def test_result_is_the_reference_in_the_kind_and_dtype_of_the_input(operation, kind, dtype, granularity, device):
+    dyn = dynamics(device, dtype, granularity)
     arrays = given(kind, dyn)
     result = laws.call(dyn, operation, arrays)
     assert type(result) is type(arrays["q"]) and result.dtype == arrays["q"].dtype
@@ -138,7 +141,7 @@ def turned_scene():
 @pytest.mark.parametrize("operation", OPERATIONS)
 def test_quaternions_of_any_length_are_normalised_when_read(operation, device):
     for dtype in ("float32", "float64"):
-        dyn = _turned(device.alias, dtype)
+        dyn = _turned(operation, device.alias, dtype)
         arrays = laws.states(dyn.scene, WORLDS, dtype=dtype)
         wanted = laws.numpy_call(dyn, operation, arrays)
         for scale in (3.0, -0.5, 1e12, 1e-12):
@@ -153,7 +156,7 @@ def test_quaternions_of_any_length_are_normalised_when_read(operation, device):
 
 @pytest.mark.parametrize("operation", OPERATIONS)
 def test_a_zero_quaternion_is_nan_in_its_world(operation, device):
-    dyn = _turned(device.alias, "float32")
+    dyn = _turned(operation, device.alias, "float32")
     arrays = laws.states(dyn.scene, WORLDS, dtype="float32")
     clean = laws.numpy_call(dyn, operation, arrays)
     for entries in _quaternions(dyn.scene):
@@ -169,8 +172,9 @@ def test_a_zero_quaternion_is_nan_in_its_world(operation, device):
 
 
 @functools.cache
-def _turned(device, dtype):
-    return spo.Dynamics(turned_scene(), WORLDS, device=device, dtype=dtype)
+def _turned(operation, device, dtype):
+    granularity = None if operation in AS_PLANNED else of_random_scenes()
+    return spo.Dynamics(turned_scene(), WORLDS, device=device, dtype=dtype, granularity=granularity)
 
 
 def _quaternions(scene):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from border import POSE, SAME, WORLDS, assert_right, dynamics, explained, given, made, numbers, scene
-from laws import OPERATIONS, TOLERANCE
+from border import POSE, SAME, WORLDS, assert_right, dynamics, explained, given, made, scene
+from laws import OPERATIONS, TOLERANCE, numbers
 from torch.autograd import forward_ad
 
 import warp_spo as spo
@@ -247,7 +247,7 @@ def test_dt_is_a_number_that_the_dtype_holds(operation, device):
 
 
 def test_a_masked_array_is_refused_wherever_an_array_goes(device):
-    """What is under its mask would be taken for numbers."""
+    """Entries under the mask would be read as numbers."""
     dyn = spo.Dynamics(scene(), WORLDS, device=device, dtype="float64", variable=("body_mass",))
     hide = lambda x: np.ma.masked_array(x, mask=np.arange(np.size(x)).reshape(np.shape(x)) == 0)  # noqa: E731
     q, mass = laws.states(dyn.scene, WORLDS)["q"], dyn.scene.values["body_mass"][0]

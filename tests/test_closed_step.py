@@ -24,7 +24,7 @@ ROUNDING = {"float64": 1e-12, "float32": 1e-6}  # of closures [m, rad]; angles o
 
 
 def given(scene, s):
-    """What acts on consistent states, drives included."""
+    """Return the arguments of a step for consistent states, drives included."""
     rng = np.random.default_rng(7)
     targets = dict(target_q=s.q[::-1].copy(), target_qd=rng.normal(size=s.qd.shape))
     return dict(q=s.q, qd=s.qd, tau=s.tau, body_f=s.body_f) | targets
@@ -78,7 +78,7 @@ def test_a_planted_bug_is_seen(monkeypatch, owner, name, old, new):
 
 @pytest.mark.parametrize("name", ["fourbar", "cassie_leg"])
 def test_multipliers_step_as_embedded_loops_do(name, device):
-    """What does not bend: one answer, also of qdd; what bends is refused."""
+    """Laws without kinks: both formulations agree, also in qdd; multipliers refuse laws with kinks."""
     _, _, s, _ = mechanisms.case(name)
     scene = smooth(MECHANISMS[name]())
     a = given(scene, s)
@@ -139,7 +139,7 @@ def test_closure_is_rounding(dtype, device):
 
 
 def test_without_the_way_back_it_opens(monkeypatch, device):
-    """What the bound of the test before catches."""
+    """A planted bug exceeds the bound of the test before."""
     monkeypatch.setattr(closed_step, "NEWTON_STEPS", 0)
     with pytest.raises(AssertionError):
         test_closure_is_rounding("float64", device)

@@ -1,4 +1,4 @@
-"""Dynamics at node granularity: laws x operations x scenes."""
+"""Dynamics: laws x operations x scenes at node granularity; robots at the granularity of the plan, too."""
 
 import functools
 
@@ -8,12 +8,14 @@ import pytest
 import warp as wp
 import zoo
 from allocations import no_warp_allocation
+from granularities import of_random_scenes
 from laws import OPERATIONS, TOLERANCE
 from robots import ROBOTS
 
 import warp_spo as spo
 
 SCENES = zoo.SCENES | ROBOTS
+QUICK = ("humanoid", "cartpole", "arm")  # robots that a quick run compiles at the plan's granularity
 SOME = ["tree20", "forest", "humanoid"]  # every hinge kind; several roots; a robot
 FINITE_DIFFERENCE = 1e-6  # central differences with h = 1e-5: eps / h + h^2
 
@@ -24,13 +26,14 @@ def scene_of(name):
 
 
 def twin(name, worlds, dtype, device, varied=True):
+    """Dynamics of a scene, at node granularity unless ``--granularity`` names another."""
     return _twin(name, worlds, dtype, device.alias, varied)
 
 
 @functools.cache
 def _twin(name, worlds, dtype, device, varied):
     scene = zoo.varied(scene_of(name), worlds) if varied else scene_of(name)
-    return spo.Dynamics(scene, worlds, device=device, dtype=dtype)
+    return spo.Dynamics(scene, worlds, device=device, dtype=dtype, granularity=of_random_scenes())
 
 
 # -- against the dense reference ---------------------------------------------------------------------------------------
@@ -40,6 +43,23 @@ def test_equals_reference(name, dtype, device):
     """Masses, CoMs, inertias, anchors, armature and gravity differ in every world."""
     dyn = twin(name, 3, dtype, device)
     arrays = laws.states(dyn.scene, 3, dtype=dtype)
+    for operation in OPERATIONS:
+        laws.equals_reference(dyn, operation, arrays, TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [
+        pytest.param(name, dtype, marks=() if name in QUICK and dtype == "float32" else pytest.mark.slow)
+        for name in ROBOTS
+        for dtype in ("float32", "float64")
+    ],
+)
+def test_robots_equal_the_reference_as_users_run_them(name, dtype, device):
+    """At the granularity of the plan, which compiles a kernel for each operation of each robot."""
+    scene = zoo.varied(scene_of(name), 3)
+    dyn = spo.Dynamics(scene, 3, device=device, dtype=dtype)
+    arrays = laws.states(scene, 3, dtype=dtype)
     for operation in OPERATIONS:
         laws.equals_reference(dyn, operation, arrays, TOLERANCE[dtype])
 

@@ -213,7 +213,7 @@ def test_forward_dynamics_is_pinocchios(device):
 
 @pytest.mark.parametrize("name", ["forest", "tree10"])
 def test_forward_dynamics_by_minus_the_inverse(name):
-    """What the kernels multiply, on more scenes, without compiling one: against Pinocchio's own recursion."""
+    """The traces, evaluated without compiling a kernel, against Pinocchio's own recursion, on more scenes."""
     scene = without_outer_armature(scene_of(name))
     a, oracle = laws.states(scene, 2), oracles.PinocchioModel(scene)
     for w in range(2):

@@ -67,7 +67,7 @@ def test_values_that_differ_between_worlds(granularity, name, dtype, device):
         equals_reference(dyn, operation, states(dyn), laws.TOLERANCE[dtype])
 
 
-@pytest.mark.parametrize("granularity", GRANULARITIES)
+@pytest.mark.parametrize("granularity", ["node", *GRANULARITIES])
 def test_what_is_not_given_is_zero(granularity, device):
     dyn = dynamics("two arms", granularity, 3, "float64", device)
     arrays = states(dyn)
@@ -82,7 +82,7 @@ def test_what_is_not_given_is_zero(granularity, device):
                     assert laws.error(got[world], laws.expected(dyn, operation, given, world)) <= 1e-12, takes
 
 
-@pytest.mark.parametrize("granularity", GRANULARITIES)
+@pytest.mark.parametrize("granularity", ["node", *GRANULARITIES])
 @pytest.mark.parametrize("kind", ["torch", "numpy"])
 def test_arrays_of_every_kind(kind, granularity, device):
     """The same numbers as with Warp arrays, in ``out`` full of NaN."""
@@ -143,7 +143,7 @@ def test_body_states_are_poses_and_velocities(name, granularity, device):
 
 
 @pytest.mark.parametrize("granularity", GRANULARITIES)
-@pytest.mark.parametrize("name", ["every kind", "fixed", "hand", "massless"])
+@pytest.mark.parametrize("name", [pytest.param("every kind", marks=pytest.mark.slow), "fixed", "hand", "massless"])
 def test_velocity_terms_first(name, granularity, device):
     """Forward dynamics as the plan has it for many worlds on a GPU: bias forces, then the solution; with loads."""
     scene = SCENES[name]()

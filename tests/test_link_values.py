@@ -1,4 +1,4 @@
-"""What links are made of where values vary: computed once a setting, read by every operation, no more than it needs."""
+"""Links with variable values: computed once a setting, and an operation reads no more of them than it needs."""
 
 import laws
 import numpy as np
@@ -106,7 +106,7 @@ def test_what_no_graph_knew_of_is_derived_at_each_request(device):
 
 
 def test_a_turning_link_keeps_seven_numbers():
-    """What lies on the axis of a hinge counts as its parent's; the base carries it for nothing."""
+    """A mass on the axis of a hinge counts as its parent's, and on the base it costs nothing."""
     for link in Links(zoo.chain(5)).links:
         mass, h_x, h_y, h_z, _, J_yy, *_ = link.grouped.packed
         assert mass == h_z == J_yy == 0.0 and h_x != 0.0 != h_y

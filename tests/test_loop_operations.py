@@ -20,7 +20,7 @@ OF_ALL_DOFS = {
     "closure_error",
     "project",
 }
-"""What speaks of all dofs, or of bodies, whatever ties them."""
+"""Operations of all dofs, or of bodies, whether loops tie them or not."""
 OF_OTHERS = {"operational_inertia", "forward_dynamics_derivatives", "loop_multipliers"}
 """Call operations that know of embedded loops, or raise by themselves."""
 OF_MULTIPLIERS = {
@@ -42,7 +42,7 @@ OF_MULTIPLIERS = {
     "quasi_velocities",
     "loop_multipliers",
 }
-"""What multipliers are about is Mass qdd + bias_force = tau + Y* lambda of all dofs: these are its terms."""
+"""Terms of the equation that multipliers solve, Mass qdd + bias_force = tau + Y* lambda of all dofs."""
 
 
 BACKWARDS_OF_ALL_DOFS = {"body_poses", "body_velocities", "integrate"}

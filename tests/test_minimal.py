@@ -209,7 +209,7 @@ def test_kernels_do_what_traces_do(dtype, device):
     ("name", "frames"), [("cassie_leg", [11]), pytest.param("biped", [3, 10], marks=pytest.mark.slow)]
 )
 def test_operational_inertia_of_feet_that_rods_drive(name, frames, dtype, device):
-    """What a push on the foot meets, through the loops: with multipliers in float64; more than the open leg's."""
+    """Operational inertia of feet equals the one by multipliers in float64, and exceeds the open leg's."""
     scene, _, s, closed = mechanisms.case(name)
     dyn, cut = (spo.Dynamics(scene, 3, device=device, dtype=dtype, loops=loops) for loops in ("embed", "cut"))
     got, mobility = dyn.operational_inertia(s.q, frames), dyn.operational_inertia_inverse(s.q, frames)

@@ -13,6 +13,7 @@ import oracles
 import pinocchio as pin
 import pytest
 import zoo
+from granularities import of_random_scenes
 from robots import ROBOTS
 
 import warp_spo as spo
@@ -106,7 +107,8 @@ def test_algorithms_agree(oracle, name, armature, device):
     """Without armature every number is the oracle's own; with it, see oracles.py for ball and free hinges."""
     scene = scene_of(name)
     scene = scene.with_values(joint_armature=np.full(scene.dof_count, 0.05 if armature else 0.0))
-    dyn = spo.Dynamics(scene, WORLDS, device=device, dtype="float64")
+    granularity = of_random_scenes()  # robots have the plan's in the next test
+    dyn = spo.Dynamics(scene, WORLDS, device=device, dtype="float64", granularity=granularity)
     agrees(dyn, [ORACLES[oracle](scene)] * WORLDS, BUILT, seed=11)
 
 

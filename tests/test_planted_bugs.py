@@ -190,7 +190,7 @@ TEAM_MUTANTS = {
 
 @pytest.mark.parametrize("bug", TEAM_MUTANTS)
 def test_a_wrong_team(bug, monkeypatch):
-    """What warps send each other, when, and which numbers each of them takes."""
+    """Bugs in what warps exchange: the wrong value, the wrong time, the wrong limb's numbers."""
     for name in ("star", "fork"):
         assert team_error(monkeypatch, name=name) <= TOLERANCE["float64"]
     symbolic.plant(monkeypatch, *TEAM_MUTANTS[bug])

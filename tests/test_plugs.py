@@ -104,7 +104,7 @@ def test_effective_mass_of_coupled_points(made):
 
 
 class StandInManager:
-    """What Isaac Lab's documentation says of NewtonManager: four slots, filled by ``_build_solver``. A stand-in."""
+    """A stand-in for Isaac Lab's NewtonManager, as it is documented: ``_build_solver`` fills four slots."""
 
     _solver = _use_single_state = _needs_collision_pipeline = _supports_rigid_body_force_input = None
 

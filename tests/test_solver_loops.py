@@ -92,7 +92,7 @@ def total_energy(model, state):
 
 
 def test_a_loop_that_is_cut_does_not_hold():
-    """What the test above would see if nothing closed it."""
+    """Loops that are cut open: the bound of the test above would see it."""
     model = replicated(fourbar(), 2)
     with pytest.raises(ValueError, match=r"1 loop joint.*'embed'"):
         SolverSPO(model)

@@ -1,4 +1,4 @@
-"""What torch cannot differentiate, or not twice, raises an error that explains; nothing compiles late."""
+"""Calls that torch cannot differentiate, or not twice, raise an error that explains; nothing compiles late."""
 
 import laws
 import numpy as np
@@ -30,7 +30,7 @@ def values_restored(tree):
 
 
 def test_prepared_ahead_nothing_is_compiled(device, monkeypatch):
-    """What prepare makes is what products, and torch on its way back, look for."""
+    """``prepare`` compiles every kernel that products and torch's backward pass use."""
     scene = zoo.from_parents([-1, 0, 1], ["ball", "revolute", "revolute"], 3)
     dyn = spo.Dynamics(scene, WORLDS, device=device, dtype="float64", granularity="tree", variable=("body_mass",))
     for operation, arguments in OPERATIONS.items():
@@ -99,7 +99,7 @@ def test_a_change_in_place_is_seen(tree):
 
 
 def test_values_set_since(tree):
-    """What was on record is put back for the backward pass, and back again; anything else is an error."""
+    """Values that were recorded are restored for the backward pass, and set back after it; other changes raise."""
     dyn, a = tree
     q, qd, tau = on(dyn, a, "q", "qd", "tau", grad=False)
     (mass,) = on(dyn, {"m": dyn.scene.values["body_mass"][0]}, "m")

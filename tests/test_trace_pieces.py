@@ -54,6 +54,9 @@ TREES = {
 }
 
 
+LARGE = ("tree20", "three roots", "humanoid")  # trees of which a quick run takes one operation
+
+
 @pytest.mark.parametrize("name", TREES)
 def test_pieces_are_segments(name):
     """Every link is in one piece; a piece is a chain that ends where the tree branches; a leaf has its own warp."""
@@ -71,7 +74,7 @@ def test_pieces_are_segments(name):
 
 @pytest.mark.parametrize("name", TREES)
 def test_pieces_wait_for_each_other(name):
-    """What another warp gives has been given in an earlier stage; within a warp, inward before outward."""
+    """A warp reads results of other warps only from earlier stages; within a warp, inward comes before outward."""
     for piece in (pieces := Pieces(Links(TREES[name]()))).pieces:
         assert 0 <= piece.inward <= piece.outward < pieces.stages
         for child in piece.children:
@@ -98,8 +101,17 @@ def built(texts, scene, operation, worlds=3, dtype="float64", given=None, **opti
     return texts[-1], state | fields, np.array([laws.expected(dyn, operation, state, w) for w in range(worlds)])
 
 
-@pytest.mark.parametrize("operation", SEGMENTED)
-@pytest.mark.parametrize("name", [name for name in TREES if name != "chain"])
+@pytest.mark.parametrize(
+    ("name", "operation"),
+    [
+        pytest.param(
+            name, operation, marks=pytest.mark.slow if name in LARGE and operation != "forward_dynamics" else ()
+        )
+        for name in TREES
+        for operation in SEGMENTED
+        if name != "chain"
+    ],
+)
 def test_warps_meet_at_barriers_alone(name, operation, monkeypatch):
     """The CUDA text, warp by warp in either order: nothing is read before it is sent, and the result is right."""
     texts = warp_machine.recorded(monkeypatch)

@@ -10,6 +10,7 @@ import torch
 import warp as wp
 from allocations import no_warp_allocation
 from border import made
+from granularities import of_random_scenes
 from laws import OPERATIONS, TOLERANCE
 from value_scenes import FLOAT32_VALUES, KINDS, NAMES, TELLING, WORLDS, assert_equals, drawn, no_warning, scene
 
@@ -20,7 +21,8 @@ from warp_spo import reference
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_variable_value_is_the_reference_of_each_world(name, kind, device):
-    dyn = spo.Dynamics(scene(), WORLDS, device=device, dtype="float64", variable=(name,))
+    more = {"granularity": of_random_scenes()}  # test_granularity_values sets each at the others
+    dyn = spo.Dynamics(scene(), WORLDS, device=device, dtype="float64", variable=(name,), **more)
     assert_equals(dyn, scene(), TELLING)  # before anything is set, and made by then
     for values in (drawn(name, 1, seed=1)[0], drawn(name, WORLDS)):
         with no_warning():
@@ -91,7 +93,8 @@ def test_setting_a_variable_value_allocates_nothing(name, kind, device):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_folded_value_rebuilds_says_so_and_keeps_variable_ones(name, kind, device):
     other = "gravity" if name != "gravity" else "body_mass"
-    dyn = spo.Dynamics(scene(), WORLDS, device=device, dtype="float64", variable=(other,))
+    more = {"granularity": of_random_scenes()}
+    dyn = spo.Dynamics(scene(), WORLDS, device=device, dtype="float64", variable=(other,), **more)
     kept = drawn(other, WORLDS, seed=3)
     dyn.set(**{other: kept})
     for values in (drawn(name, WORLDS), drawn(name, 1, seed=1)[0]):

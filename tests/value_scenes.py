@@ -52,13 +52,13 @@ def drawn(name, worlds, seed=0):
 def assert_equals(dyn, expected_scene, operations=OPERATIONS, tolerance=None):
     """Every operation of ``dyn`` is the reference of ``expected_scene``, world by world."""
     arrays = laws.states(expected_scene, dyn.worlds, dtype=dyn.dtype.__name__)
+    results = {operation: laws.numpy_call(dyn, operation, arrays) for operation in operations}
     for world in range(dyn.worlds):
         state = {name: array[world] for name, array in arrays.items()} | {"frames": laws.frames_of(expected_scene)}
         dense = reference.Dense(expected_scene, state["q"], world=world)
         for operation in operations:
-            got = laws.numpy_call(dyn, operation, arrays)
             wanted = np.asarray(OPERATIONS[operation][1](dense, state))
-            value = laws.same_quaternion_sign(operation, expected_scene, got[world], wanted)
+            value = laws.same_quaternion_sign(operation, expected_scene, results[operation][world], wanted)
             error = laws.error(value, wanted)
             assert error <= (tolerance or TOLERANCE[dyn.dtype.__name__]), f"{operation}, world {world}: {error:.1e}"
 
