@@ -383,10 +383,10 @@ def test_singular_operational_inertia_is_nan(dtype, device):
 def test_a_planted_bug_in_the_inverse_is_seen(monkeypatch, tmp_path, device):
     from mutants import mutant
 
-    from warp_spo.dynamics import applications
+    from warp_spo.dynamics import operational
 
     old = "weight -= A[world, k, i] * out[world, i, j]"
-    monkeypatch.setattr(applications, "cholesky", mutant(tmp_path, "cholesky", old, old.replace("-=", "+=")))
+    monkeypatch.setattr(operational, "cholesky", mutant(tmp_path, "cholesky", old, old.replace("-=", "+=")))
     dyn = spo.Dynamics(zoo.SCENES["fork"](), 1, device=device, dtype="float64", granularity="node")
     q = laws.states(dyn.scene, 1)["q"]
     assert laws.error(dyn.operational_inertia(q, [0])[0], Dense(dyn.scene, q[0]).operational_inertia([0])) > 1e-4
