@@ -12,7 +12,7 @@ Neither imports torch at run time.
 
 import functools
 import sys
-from typing import TYPE_CHECKING, Any, TypeVar, Union
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, Union
 
 import numpy as np
 import warp as wp
@@ -40,7 +40,7 @@ def broadcast_worlds(array: wp.array, axis: int, worlds: int) -> wp.array:
     return view
 
 
-def parse_dtype(dtype, call: str = "dtype") -> type:
+def parse_dtype(dtype: Any, call: str = "dtype") -> type:
     """Return ``wp.float32`` or ``wp.float64`` for the name or the NumPy, Warp or torch type of that name.
 
     Raises:
@@ -56,7 +56,7 @@ def parse_dtype(dtype, call: str = "dtype") -> type:
     return _DTYPES[name]
 
 
-def parse_device(device=None, call: str = "device") -> wp.Device:
+def parse_device(device: Any = None, call: str = "device") -> wp.Device:
     """Return the Warp device for a name, a Warp device or a torch device. None is Warp's current device.
 
     Raises:
@@ -71,7 +71,7 @@ def parse_device(device=None, call: str = "device") -> wp.Device:
         raise ValueError(f"{call}: device is {device!r}; expected one of this machine's devices: {known}") from None
 
 
-def kind_of(array, call: str, name: str) -> str:
+def kind_of(array: object, call: str, name: str) -> str:
     """Return ``NUMPY``, ``WARP`` or ``TORCH``.
 
     Raises:
@@ -90,7 +90,7 @@ def kind_of(array, call: str, name: str) -> str:
     )
 
 
-def shape_of(array) -> tuple:
+def shape_of(array: Any) -> tuple[int, ...]:
     """Return the shape counted in scalars: the entries of Warp's vectors, matrices and transforms are trailing axes."""
     return tuple(array.shape) + tuple(getattr(array.dtype, "_shape_", ()) if isinstance(array, wp.array) else ())
 
@@ -144,12 +144,12 @@ class Call:
         self._outputs: list[tuple] = []
         self._results: list[tuple] = []  # (caller's array or None, Warp array)
         self._staged: list[tuple] = []  # (NumPy array to fill, Warp array)
-        self._saved_stream = None
+        self._saved_stream: wp.Stream | None = None
 
-    def __enter__(self):
+    def __enter__(self) -> "Call":
         return self
 
-    def __exit__(self, kind, error, traceback):
+    def __exit__(self, kind: object, error: object, traceback: object) -> None:
         try:
             if error is None:
                 self._finish()
@@ -157,7 +157,9 @@ class Call:
             if self._saved_stream is not None:
                 wp.set_stream(self._saved_stream, self.device, sync=False)
 
-    def read(self, name: str, array, shape: tuple, meaning: str = "", *, dtype=None, optional: bool = False):
+    def read(
+        self, name: str, array: Any, shape: tuple, meaning: str = "", *, dtype: Any = None, optional: bool = False
+    ) -> Any:
         """Return an input as a Warp array of scalars on the device. None stays None if ``optional``.
 
         Args:
@@ -180,7 +182,9 @@ class Call:
         self._inputs.append((name, array, warp_array))
         return warp_array
 
-    def update(self, name: str, array, shape: tuple, meaning: str = "", *, dtype=None, optional: bool = True):
+    def update(
+        self, name: str, array: Any, shape: tuple, meaning: str = "", *, dtype: Any = None, optional: bool = True
+    ) -> Any:
         """Return an array that the call changes in place. Arguments and errors are those of :meth:`read`."""
         if array is None and optional:
             return None
@@ -190,7 +194,9 @@ class Call:
             self._staged.append((array, warp_array))
         return warp_array
 
-    def write(self, out, shape: tuple, meaning: str = "", *, name: str = "out", dtype=None, over: str = ""):
+    def write(
+        self, out: Any, shape: tuple, meaning: str = "", *, name: str = "out", dtype: Any = None, over: str = ""
+    ) -> wp.array:
         """Return the Warp array for a result, of undefined content: that of ``out``, or a new one if ``out`` is None.
 
         A new one has the kind of the first array of the call. ``out`` must not overlap an input, but it may be the very
@@ -221,13 +227,14 @@ class Call:
         self._results.append((out, warp_array))
         return warp_array
 
-    def _new(self, shape, dtype):
+    def _new(self, shape: tuple, dtype: type) -> tuple[Any, wp.array]:
+        """Return (the caller's new array, None for NumPy; its Warp array)."""
         if self.kind == TORCH and self.device.is_cuda:
             self._enter_stream()
         owner, array = new(self.kind, shape, dtype, self.device)
         return (None if self.kind in (None, NUMPY) else owner), array
 
-    def _as_warp(self, name, array, shape, meaning, dtype, change=False):
+    def _as_warp(self, name: str, array: Any, shape: tuple, meaning: str, dtype: Any, change: bool = False) -> wp.array:
         """Return a Warp array of scalars over the caller's memory, or over a copy of a NumPy array."""
         kind = kind_of(array, self.name, name)
         if self.kind is None:
@@ -244,7 +251,7 @@ class Call:
             self._check(name, array, kind, came, shape, meaning, dtype, same)
             if array.device != self.device or not array.is_contiguous:
                 self._refuse_place(name, array, kind, array.is_contiguous, change)
-            if array.requires_grad and wp._src.context.runtime.tape is not None:
+            if array.requires_grad and getattr(wp._src.context.runtime, "tape", None) is not None:
                 self._refuse_grad(name, "is recorded by wp.Tape", "leave the tape's block")
             return array if array.dtype is dtype else view(array.ptr, came, dtype, self.device.alias)
         torch = torch_border()
@@ -269,7 +276,9 @@ class Call:
             torch.mark_changed(array)
         return view(pointer, tuple(array.shape), dtype, self.device.alias)
 
-    def _copy_numpy(self, name, array, shape, meaning, dtype, change):
+    def _copy_numpy(
+        self, name: str, array: np.ndarray, shape: tuple, meaning: str, dtype: Any, change: bool
+    ) -> wp.array:
         kinds = {wp.float32: "biuf", wp.float64: "biuf", wp.bool: "b"}.get(dtype, "iu")
         fits = array.dtype.name == dtype.__name__ if change else array.dtype.kind in kinds
         self._check(name, array, NUMPY, array.shape, shape, meaning, dtype, fits)
@@ -281,14 +290,17 @@ class Call:
                 f"{self.device}; copy it there before the capture"
             )
         host = np.array(array, dtype=wp.dtype_to_numpy(dtype), order="C", ndmin=1)
-        staged = wp.array(host, dtype=dtype, device="cpu", copy=False) if host.size else None
+        staged: wp.array | None = wp.array(host, dtype=dtype, device="cpu", copy=False) if host.size else None
         if staged is None or self.device.is_cpu:
             return staged if staged is not None else wp.empty(array.shape, dtype=dtype, device=self.device)
         warp_array = wp.empty(array.shape, dtype=dtype, device=self.device)
         wp.copy(warp_array, staged)  # on the current stream; wp.array(host, device=...) would use the null stream
         return warp_array
 
-    def _check(self, name, array, kind, came, shape, meaning, dtype, dtype_fits):
+    def _check(
+        self, name: str, array: Any, kind: str, came: Any, shape: tuple, meaning: str, dtype: Any, dtype_fits: bool
+    ) -> None:
+        """Raise ValueError unless the shape that ``came`` is ``shape``, and the dtype fits."""
         if came == shape or (len(came) == len(shape) and all(e in (-1, c) for c, e in zip(came, shape, strict=True))):
             if dtype_fits:
                 return
@@ -301,7 +313,7 @@ class Call:
         expected = f"{dtype.__name__} ({sizes}) {meaning}".rstrip()
         raise ValueError(f"{self.name}: {name} is {_describe(array, kind)}; expected {expected}; {way}")
 
-    def _refuse_place(self, name, array, kind, contiguous, change):
+    def _refuse_place(self, name: str, array: Any, kind: str, contiguous: bool, change: bool) -> NoReturn:
         if kind == TORCH and not torch_border().is_dense(array):
             raise ValueError(
                 f"{self.name}: {name} is {_describe(array, kind)}, {array.layout}; expected a dense one; "
@@ -317,10 +329,10 @@ class Call:
             f"{self.name}: {name} is {_describe(array, kind)} with strides; expected a C-contiguous array; {way}"
         )
 
-    def _refuse_grad(self, name, what, way_out):
+    def _refuse_grad(self, name: str, what: str, way_out: str) -> NoReturn:
         raise ValueError(f"{self.name}: {name} {what}; derivatives are not available through this call; {way_out}")
 
-    def _check_writeable(self, name, array):
+    def _check_writeable(self, name: str, array: np.ndarray) -> None:
         if not array.flags.writeable:
             raise ValueError(
                 f"{self.name}: {name} is a read-only NumPy array; expected one that can be written; pass a copy"
@@ -332,26 +344,28 @@ class Call:
                 f"expected one entry for each number of the result; pass a fresh array"
             )
 
-    def _add_output(self, name, array, warp_array, over=""):
+    def _add_output(self, name: str, array: Any, warp_array: wp.array, over: str = "") -> None:
         same = [one for one in self._inputs if one[0] == over
                 and (_same_memory(warp_array, one[2]) or _same_numpy(array, one[1]))]  # fmt: skip
         self._check_apart(name, array, warp_array, [other for other in self._inputs if other not in same])
         self._check_apart(name, array, warp_array, self._outputs)
         self._outputs.append((name, array, warp_array))
 
-    def _check_apart(self, name, array, warp_array, others):
+    def _check_apart(self, name: str, array: Any, warp_array: wp.array, others: list[tuple]) -> None:
+        """Raise ValueError if the memory of an array overlaps that of ``others``."""
         for other_name, other, other_warp in others:
             if isinstance(array, np.ndarray):
                 overlap = isinstance(other, np.ndarray) and np.shares_memory(array, other)
             else:
-                overlap = warp_array.size and other_warp.size and _share_memory(warp_array, other_warp)
+                overlap = bool(warp_array.size and other_warp.size) and _share_memory(warp_array, other_warp)
             if overlap:
                 raise ValueError(
                     f"{self.name}: {name} overlaps {other_name} in memory; expected memory that is apart from that of "
                     f"every other array, because the call writes it; pass a fresh array for one of them"
                 )
 
-    def _enter_stream(self):
+    def _enter_stream(self) -> None:
+        """Make torch's current stream Warp's, until the block ends."""
         if self._saved_stream is None:
             current = self.device.stream
             wanted = torch_border().stream(self.device)
@@ -362,7 +376,8 @@ class Call:
                 numpy_came = any(isinstance(array, np.ndarray) for _, array, _ in self._inputs + self._outputs)
                 wp.set_stream(wanted, self.device, sync=numpy_came)
 
-    def _finish(self):
+    def _finish(self) -> None:
+        """Fill NumPy arrays and set the result."""
         numpy_came = any(isinstance(array, np.ndarray) for _, array, _ in self._inputs)
         if self.device.is_cuda and (numpy_came or self._staged or self.kind in (None, NUMPY)):
             wp.synchronize_stream(self.device.stream)  # copies made here are freed without regard to streams
@@ -390,30 +405,30 @@ def view(pointer: int, shape: tuple, dtype: type, device: str) -> wp.array:
     return wp.array(ptr=pointer, shape=shape, dtype=dtype, device=device)
 
 
-def _same_memory(a, b) -> bool:
+def _same_memory(a: wp.array, b: wp.array) -> bool:
     """Whether two Warp arrays have the same memory and shape."""
     return a.ptr == b.ptr and a.shape == b.shape
 
 
-def _same_numpy(a, b) -> bool:
+def _same_numpy(a: Any, b: Any) -> bool:
     """Whether a and b are the same NumPy array. A call may read and write it: it is copied first and filled last."""
     if not (isinstance(a, np.ndarray) and isinstance(b, np.ndarray)):
         return False
     return a.ctypes.data == b.ctypes.data and a.shape == b.shape and a.strides == b.strides and a.dtype == b.dtype
 
 
-def _share_memory(a, b) -> bool:
+def _share_memory(a: wp.array, b: wp.array) -> bool:
     """Whether two Warp arrays have a byte in common."""
     return a.ptr < b.ptr + b.size * wp.types.type_size_in_bytes(b.dtype) and b.ptr < a.ptr + a.size * (
         wp.types.type_size_in_bytes(a.dtype)
     )
 
 
-def _dtype_name(array) -> str:
+def _dtype_name(array: Any) -> str:
     return getattr(array.dtype, "__name__", None) or str(array.dtype).removeprefix("torch.")
 
 
-def _describe(array, kind) -> str:
+def _describe(array: Any, kind: str) -> str:
     place = "" if kind == NUMPY else f" on {array.device}"
     return f"a {kind} array {_dtype_name(array)} {tuple(array.shape)}{place}"
 
