@@ -23,7 +23,6 @@ def check(file, folder):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="methods of Dynamics return Any until they say ArrayT")
 def test_a_user_with_torch_tensors_type_checks(tmp_path):
     found = check(USER, tmp_path)
     assert found.startswith("Success"), found
