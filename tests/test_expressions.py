@@ -33,7 +33,13 @@ EXPRESSIONS = {
 """Name -> the operator, and the reference's matrix."""
 
 
-@pytest.mark.parametrize("name", [*SCENES, "chain_helical", "chain_ball", "trees25"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in ("trees25", "tree20", "tall_humanoid") else ())
+        for name in (*SCENES, "chain_helical", "chain_ball", "trees25")
+    ],
+)
 def test_traces_equal_the_reference(name, device):
     """Every letter and its kin, and every transpose, in scenes with every kind of hinge."""
     scene = scene_of(name)

@@ -98,7 +98,16 @@ def test_mujoco_has_the_same_robot(robot, op):
         assert wrong.error(op, 0, [0], peer.result([0])) > 1e-3
 
 
-@pytest.mark.parametrize("name", [name for name in peers.PEERS if name not in ("mujoco", "pinocchio", "grid")])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(
+            name, marks=pytest.mark.slow if name == "newton" else ()
+        )  # its own kernels take a minute to compile
+        for name in peers.PEERS
+        if name not in ("mujoco", "pinocchio", "grid")
+    ],
+)
 def test_peers_compute_what_the_reference_says(small_robot, name, device):
     kind = installed(name)
     for dtype in kind.dtypes:

@@ -18,7 +18,13 @@ from warp_spo.recursions import impedance, joint_space, step
 
 
 @pytest.mark.parametrize(
-    ("name", "dtype"), [("chain7", "float64"), ("fork", "float64"), ("fork", "float32"), ("forest", "float64")]
+    ("name", "dtype"),
+    [
+        ("chain7", "float64"),
+        ("fork", "float64"),
+        ("fork", "float32"),
+        pytest.param("forest", "float64", marks=pytest.mark.slow),
+    ],
 )
 def test_equals_the_dense_nonlinear_equation(name, dtype, device):
     scene, worlds = furnished(zoo.SCENES[name]()), 4

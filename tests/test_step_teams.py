@@ -49,7 +49,13 @@ def step(dyn, a, **more):
 
 
 @pytest.mark.parametrize(
-    ("name", "dtype"), [("hand", "float64"), ("forest", "float64"), ("fork", "float32"), ("still", "float32")]
+    ("name", "dtype"),
+    [
+        ("hand", "float64"),
+        pytest.param("forest", "float64", marks=pytest.mark.slow),
+        ("fork", "float32"),
+        ("still", "float32"),
+    ],
 )
 def test_equals_the_dense_nonlinear_equation(name, dtype, device):
     """With a status and accelerations, in arrays that were full of NaN, and over the state itself."""

@@ -17,9 +17,16 @@ from value_scenes import FLOAT32_VALUES, KINDS, NAMES, TELLING, WORLDS, assert_e
 import warp_spo as spo
 from warp_spo import reference
 
+NAMES_IN_KINDS = [  # a quick run sets every name from Warp arrays, and three names from all kinds
+    pytest.param(
+        name, kind, marks=() if kind == "warp" or name in ("body_mass", "joint_X_p", "gravity") else pytest.mark.slow
+    )
+    for name in NAMES
+    for kind in KINDS
+]
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", NAMES)
+
+@pytest.mark.parametrize(("name", "kind"), NAMES_IN_KINDS)
 def test_a_variable_value_is_the_reference_of_each_world(name, kind, device):
     more = {"granularity": of_random_scenes()}  # test_granularity_values sets each at the others
     dyn = spo.Dynamics(scene(), WORLDS, device=device, dtype="float64", variable=(name,), **more)
@@ -89,8 +96,7 @@ def test_setting_a_variable_value_allocates_nothing(name, kind, device):
     assert_equals(dyn, scene().with_values(**{name: drawn(name, 1, seed=1)}), ("forward_dynamics",), FLOAT32_VALUES)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("name", "kind"), NAMES_IN_KINDS)
 def test_a_folded_value_rebuilds_says_so_and_keeps_variable_ones(name, kind, device):
     other = "gravity" if name != "gravity" else "body_mass"
     more = {"granularity": of_random_scenes()}
