@@ -1,5 +1,6 @@
 """Traces evaluated by NumPy: what an operation's kernel computes, without compiling it; and bugs planted in them."""
 
+import gc
 import inspect
 import sys
 import textwrap
@@ -7,6 +8,7 @@ import textwrap
 import numpy as np
 
 import warp_spo
+from warp_spo.execution.routine import Routine
 from warp_spo.recursions import (
     composite,
     coordinates,
@@ -109,11 +111,15 @@ def plant(monkeypatch, owner, name, old, new):
     original = getattr(owner, name)
     source = textwrap.dedent(inspect.getsource(original))
     assert source.count(old) == 1, f"{name} holds {source.count(old)} times: {old}"
+    if inspect.isclass(owner):  # compiled by itself, a method does not know its class
+        source = source.replace("super()", f"super({owner.__name__}, self)")
     space = dict(original.__globals__)
     exec("from __future__ import annotations\n" + source.replace(old, new), space)
     holders = [owner]
     if inspect.ismodule(owner):  # and every module that imports the function by name
         modules = [module for key, module in sys.modules.items() if key.startswith(warp_spo.__name__)]
         holders = [module for module in modules if getattr(module, name, None) is original]
+        for routine in (one for one in gc.get_objects() if isinstance(one, Routine) and one.trace is original):
+            monkeypatch.setitem(routine.__dict__, "trace", space[name])
     for holder in holders:
         monkeypatch.setattr(holder, name, space[name])

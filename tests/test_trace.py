@@ -57,7 +57,7 @@ def test_no_constant_of_a_symbol_is_nan_or_zero_by_accident(xs):
 
 
 def test_a_scalar_has_no_truth_value(xs):
-    with pytest.raises(TypeError, match="may depend on the scene"):
+    with pytest.raises(TypeError, match="may branch on the scene, not on the state"):
         bool(xs[0])
     with pytest.raises(TypeError):
         max(xs[0], xs[1])
