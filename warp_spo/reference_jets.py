@@ -93,16 +93,16 @@ class Jet:
         return (self * self + other * other) ** 0.5
 
     def __lt__(self, other):
-        return self.x < jet(other).x
+        return np.bool_(self.x < jet(other).x)
 
     def __gt__(self, other):
-        return self.x > jet(other).x
+        return np.bool_(self.x > jet(other).x)
 
     def __le__(self, other):
-        return self.x <= jet(other).x
+        return np.bool_(self.x <= jet(other).x)
 
     def __ge__(self, other):
-        return self.x >= jet(other).x
+        return np.bool_(self.x >= jet(other).x)
 
     def __array_ufunc__(self, ufunc, method, *inputs, **_):
         boxes = []
@@ -111,13 +111,17 @@ class Jet:
             if not isinstance(entry, np.ndarray):
                 boxes[-1][()] = entry
         names = {"add": "__add__", "subtract": "__sub__", "multiply": "__mul__", "divide": "__truediv__"}
-        names |= {"power": "__pow__", "negative": "__neg__", "absolute": "__abs__", "square": "_square"}
+        names |= {"power": "__pow__", "negative": "__neg__", "positive": "__pos__", "absolute": "__abs__"}
+        names |= {"fabs": "__abs__", "square": "_square", "reciprocal": "_reciprocal", "float_power": "__pow__"}
         names |= {"less": "__lt__", "greater": "__gt__", "less_equal": "__le__", "greater_equal": "__ge__"}
         name = names.get(ufunc.__name__, ufunc.__name__)
         return np.frompyfunc(lambda first, *rest: getattr(jet(first), name)(*rest), ufunc.nin, 1)(*boxes)
 
     def _square(self):
         return self * self
+
+    def _reciprocal(self):
+        return 1.0 / self
 
 
 def jet(x):
