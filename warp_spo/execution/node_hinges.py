@@ -1,7 +1,7 @@
 """The nodes that the kernel of all scenes cannot place, at node granularity: one kernel more, generated for the scene.
 
-That kernel knows screws, balls and free hinges. A hinge whose columns depend on its coordinates is traced, a thread a
-world for all of them, and writes what the other kernel writes.
+That kernel knows screws, balls and free hinges. A hinge of another kind is traced, a thread a world for all of them,
+and writes what the other kernel writes.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ MACROS = """\
 
 
 def links(scene: Scene) -> list[Link]:
-    """Return the links of all hinges whose columns depend on their coordinates, each by itself."""
+    """Return the links of all hinges of other kinds, each by itself."""
     found = []
     for node, index in enumerate(scene.hinge_of):
         elements = scene.hinges[index].elements
-        if any(kind.columns_vary for kind, _ in elements):
-            assert len(elements) == 1, "a hinge whose columns vary is not part of a sequence"
-            first, kind = int(scene.qd_start[index]), elements[0].kind
+        if any(kind.node_code is None for kind, _ in elements):
+            first, (kind, axis) = int(scene.qd_start[index]), elements[0]
+            assert len(elements) == 1 and axis is None and not kind.at_com, "placed by itself, about its anchor"
             dofs, label = tuple(range(first, first + kind.dofs)), scene.body_labels[node]
             found.append(Link(None, kind, None, ZERO, None, dofs, int(scene.q_start[index]), (), node, label))
     return found

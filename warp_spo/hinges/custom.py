@@ -55,10 +55,6 @@ class Custom(Kind):
     def shape(self) -> Hashable:
         return self.name, self.pose
 
-    def screws(self, axis: np.ndarray | None) -> list[tuple[Any, float, float]]:
-        """None that turns or slides: work at node granularity is generated."""
-        return [(np.zeros(3), 0.0, 0.0)] * self.dofs
-
     # -- position --------------------------------------------------------------------------------------------------
     def evaluated(self, x: list[Any]) -> tuple[Vector, Matrix]:
         """Return p and R for coordinates that are numbers or traced.

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..trace.scalars import Value, cos, reduced, sin
 from ..trace.spatial import IDENTITY, Matrix, Pose, Vector, cross
-from .kind import Carrier, Entry, Kind, Placed, Twist
+from .kind import SCREWS, Carrier, Entry, Kind, Placed, Twist
 from .quaternions import Quaternion
 from .turn import turned_about_z
 
@@ -17,6 +17,7 @@ Z = IDENTITY[2]
 
 class Helix(Kind):
     name = "helix"
+    node_code = SCREWS
 
     def __init__(self, pitch: float):
         self.pitch = pitch

@@ -69,7 +69,7 @@ class Kind:
         at_com: the link's frame sits at its body's centre of mass.
         columns_vary: the columns of H* depend on q, in the link's axes and in its parent's.
         depth: dofs as which it counts where errors grow along a chain.
-        node_code: how work at node granularity places its node.
+        node_code: how work at node granularity places its node; None: by code that is generated for the scene.
     """
 
     name = ""
@@ -82,7 +82,7 @@ class Kind:
     unconstrained = False
     at_com = False
     columns_vary = False
-    node_code = SCREWS
+    node_code: int | None = None
 
     @property
     def shape(self) -> Hashable:
@@ -98,8 +98,11 @@ class Kind:
         return (0.0,) * self.coordinates
 
     def screws(self, axis: np.ndarray | None) -> list[tuple[Any, float, float]]:
-        """(axis, radians, metres per unit of the coordinate) of each dof, as work at node granularity reads them."""
-        raise NotImplementedError
+        """Return (axis, radians, metres per unit of the coordinate) of each dof, for work at node granularity.
+
+        Without a ``node_code``, none that moves anything.
+        """
+        return [(np.zeros(3), 0.0, 0.0)] * self.dofs
 
     # -- position --------------------------------------------------------------------------------------------------
     def placed(self, link: Carrier, q: Entry) -> Placed:

@@ -13,6 +13,7 @@ from .slide import Slide
 from .turn import Turn
 
 BY_NAME = {kind.name: kind for kind in (Ball(), Free())}
+"""Hinges of one elementary hinge without an axis, by the name that users give; a new kind is one line here."""
 TURN, SLIDE = Turn(), Slide()
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
-from .kind import Carrier, Entry, Kind, Placed, Twist
+from .kind import SCREWS, Carrier, Entry, Kind, Placed, Twist
 from .quaternions import Quaternion
 
 Z = IDENTITY[2]
@@ -16,6 +16,7 @@ Z = IDENTITY[2]
 
 class Slide(Kind):
     name = "slide"
+    node_code = SCREWS
     units = (5,)
 
     def screws(self, axis: np.ndarray | None) -> list[tuple[Any, float, float]]:

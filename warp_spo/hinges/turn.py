@@ -8,7 +8,7 @@ import numpy as np
 
 from ..trace.scalars import Value, cos, sin
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, cross, symmetric
-from .kind import Carrier, Entry, Kind, Placed, Twist
+from .kind import SCREWS, Carrier, Entry, Kind, Placed, Twist
 from .quaternions import Quaternion, multiplied
 
 Z = IDENTITY[2]
@@ -17,6 +17,7 @@ ROUNDING = 1e-14  # moments of inertia that differ by this share of themselves a
 
 class Turn(Kind):
     name = "turn"
+    node_code = SCREWS
     units = (2,)
 
     def screws(self, axis: np.ndarray | None) -> list[tuple[Any, float, float]]:

@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from ..hinges.quaternions import Quaternion
-from ..hinges.quaternions import constant_quaternion as constant_quaternion
-from ..hinges.quaternions import multiplied as multiplied
-from ..hinges.quaternions import turned as turned
+from ..hinges.quaternions import Quaternion, constant_quaternion, multiplied, turned
 from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross

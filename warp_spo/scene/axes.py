@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import refuse_masked
+from ..hinges.sequences import BY_NAME
 from .checks import SYMMETRY, checked_array, checked_unit, real
 
 Screw = tuple[Any, float, float]  # axis [3], radians and metres per coordinate
@@ -38,7 +39,7 @@ def screws_of(call: str, kind: str, axis: Any, linear: Any, angular: Any, pitch:
     pitch = float(checked_array(call, "pitch [m/rad]", pitch, ()))
     if kind != "helical" and pitch != 0.0:
         raise ValueError(f"{call}: pitch= belongs to a helical hinge")
-    if kind in ("fixed", "ball", "free", "custom"):
+    if kind in ("fixed", "custom", *BY_NAME):
         if axis is not None:
             raise ValueError(f"{call}: a {kind} hinge has no axis; got {axis!r}")
         return []

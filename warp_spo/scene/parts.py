@@ -23,7 +23,7 @@ from ..hinges.custom import MOST, Custom, checked
 from ..hinges.kind import FREE as FREE
 from ..hinges.kind import SCREWS as SCREWS
 from ..hinges.kind import Element
-from ..hinges.sequences import elements
+from ..hinges.sequences import BY_NAME, elements
 from .axes import in_plane as in_plane
 from .axes import screws_of
 from .checks import SYMMETRY, checked_array, checked_unit, read_only
@@ -110,7 +110,7 @@ def checked_inertia(call: str, inertia: np.ndarray) -> np.ndarray:
     return symmetric
 
 
-KINDS = (
+CLOSING = (
     "fixed",
     "revolute",
     "prismatic",
@@ -122,6 +122,8 @@ KINDS = (
     "free",
     "d6",
 )
+"""Kinds of hinges that a loop can close with."""
+KINDS = (*CLOSING, *(name for name in BY_NAME if name not in CLOSING))
 """What a hinge's kind may be, beside "custom": see :meth:`Hinge.custom`."""
 
 
@@ -251,8 +253,9 @@ class Hinge:
 
     @property
     def motion(self) -> int:
-        """SCREWS, BALL or FREE: how work at node granularity places the child."""
-        return self.elements[0].kind.node_code if self.elements else SCREWS
+        """SCREWS, BALL or FREE: which coordinates the hinge has; SCREWS of all that are scalars."""
+        code = self.elements[0].kind.node_code if self.elements else None
+        return SCREWS if code is None else code
 
     @property
     def dof_count(self) -> int:
@@ -310,9 +313,9 @@ class Loop:
     screws: tuple = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if self.kind == "custom":
+        if self.kind in ("custom", *KINDS[len(CLOSING) :]):
             way_out = "make it a hinge of the tree and close the loop at another joint"
-            raise UnsupportedError("Loop", "a custom hinge that closes a loop", way_out)
+            raise UnsupportedError("Loop", f"a {self.kind} hinge that closes a loop", way_out)
         hinge = Hinge(
             self.kind,
             self.parent,
