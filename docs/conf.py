@@ -16,6 +16,7 @@ myst_heading_anchors = 3
 autosummary_generate = False  # tables alone; every call has its entry on the page below them
 autodoc_typehints = "none"  # docstrings give kinds, shapes and units
 autodoc_member_order = "bysource"
+smartquotes = False  # primes are derivatives
 napoleon_use_rtype = False
 napoleon_custom_sections = [
     ("Attributes", "params_style")
