@@ -32,7 +32,7 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": [],
 }
-html_sidebars = {page: [] for page in ("index", "start", "concepts", "closed_loops", "theory", "results")}
+html_sidebars = {page: [] for page in ("index", "start", "concepts", "joints", "closed_loops", "theory", "results")}
 html_static_path = ["_static"]
 html_css_files = ["page.css"]
 html_show_sourcelink = False

@@ -236,7 +236,7 @@ class Hinge:
             coordinates: how many, n.
             pose: takes a list of n scalars [rad or m, as the function means them] and returns the position (3,) [m] and
                 the rotation matrix (3, 3) of the child anchor in the parent anchor. It is called with abstract scalars
-                and with numbers, and may use + - * / **, abs, NumPy's sin, cos, tan, exp, log, sqrt, arctan2 and
+                and with numbers, and may use ``+ - * / **``, abs, NumPy's sin, cos, tan, exp, log, sqrt, arctan2 and
                 hypot, ``spo.where`` in place of branches, ``spo.clip`` and ``spo.spline``. It must be twice
                 differentiable.
             values: other arguments of :class:`Hinge`: anchors, armature, springs, limits and so on, per coordinate.
