@@ -167,7 +167,8 @@ def checked(call: str, pose: Any, coordinates: Any, low: np.ndarray, high: np.nd
     bounded = np.isfinite(low) & np.isfinite(high) & (low < high)
     low, high = np.where(bounded, low, RANGE[0]), np.where(bounded, high, RANGE[1])
     for q in np.random.default_rng(0).uniform(low, high, (SAMPLES, coordinates)):
-        position, rotation = (np.array(x, dtype=np.float64) for x in kind.evaluated(list(q)))
+        with np.errstate(all="ignore"):
+            position, rotation = (np.array(x, dtype=np.float64) for x in kind.evaluated(list(q)))
         error = np.abs(rotation.T @ rotation - np.eye(3)).max()
         if not (np.isfinite(position).all() and error < ORTHONORMAL and np.linalg.det(rotation) > 0.0):
             raise ValueError(
