@@ -61,6 +61,7 @@ class Kind:
         name: in messages. shape: equal for hinges whose generated code is equal but for constants.
         dofs, coordinates: entries of qd and of q.
         quaternion: the first of the four coordinates that are a quaternion, or None.
+        angle: which coordinate is the angle of the pose's ``turn``, if the pose has one.
         units: the entry of (omega; v) that each dof moves, if each column of H* is a unit vector; else None.
         rates_in_parent: rates are in the axes of the parent anchor, where the columns are constant; the link's own
             axes, to which :meth:`in_link_axes` takes them, have unit columns.
@@ -76,6 +77,7 @@ class Kind:
     dofs = 1
     coordinates = 1
     quaternion: int | None = None
+    angle = 0
     units: tuple[int, ...] | None = None
     rates_in_parent = False
     cancels = False

@@ -150,7 +150,7 @@ class Power:
 
         turn = self.trace.places[id(link)].pose.turn or ()
         for at, x in enumerate(carried.apart if turn else ()):  # each turns backwards, about the link's z axis
-            self._add(("q", link.coordinate), x[1] * bars[3 * at] - x[0] * bars[3 * at + 1])
+            self._add(("q", link.coordinate + link.hinge.angle), x[1] * bars[3 * at] - x[0] * bars[3 * at + 1])
         ends = [] if link.parent is None else parent.all
         return self._back(_flat(carried.raw), bars, [*ends, *turn])[: len(ends)]
 
