@@ -164,7 +164,7 @@ def test_a_limit_on_a_dependent_dof_holds(device):
 
 
 WAYS = [
-    (clusters, "expanded", "k.get(dof, 0.0) + ", "", "energy"),
+    (clusters, "expand_cluster", "k.get(dof, 0.0) + ", "", "energy"),
     (closed_step.ClosedStep, "_close", "qd[dof] + change", "qd[dof] + 1.001 * change", "closure"),
     (impedance.Impedance, "_limits", "depth = inward *", "depth = -1.0 * inward *", "limit"),
 ]

@@ -85,9 +85,9 @@ def test_equals_pinocchio(name):
 
 
 BUGS = [
-    (hybrid, "reduced", "z = z + pivot.U * rates[-1]", "z = z + pivot.U * select(held, 0.0, rates[-1])"),
-    (hybrid, "expanded", "pivot.D * qdd[-1]", "dot(pivot.column, pivot.U) * qdd[-1]"),  # no armature
-    (hybrid, "expanded", "+ head, b)", ", b)"),
+    (hybrid, "reduce_link", "z = z + pivot.U * rates[-1]", "z = z + pivot.U * select(held, 0.0, rates[-1])"),
+    (hybrid, "expand_link", "pivot.D * qdd[-1]", "dot(pivot.column, pivot.U) * qdd[-1]"),  # no armature
+    (hybrid, "expand_link", "+ head, b)", ", b)"),
     (hybrid, "factor", "select(held, P.entry(i, j), rest.entry(i, j))", "rest.entry(i, j)"),
 ]
 
@@ -104,7 +104,7 @@ def test_a_planted_bug_is_seen(monkeypatch, owner, name, old, new):
 def test_a_planted_bug_in_what_is_shared_is_seen(monkeypatch):
     scene = zoo.fork()
     a = states(scene)
-    symbolic.plant(monkeypatch, articulated, "handed_to_parent", "z = z + Vector", "z = z - Vector")
+    symbolic.plant(monkeypatch, articulated, "force_on_parent", "z = z + Vector", "z = z - Vector")
     assert traced_error(scene, a, a["mask"][0]) > 1e-3
 
 

@@ -153,7 +153,7 @@ def test_equals_pinocchio():
 BUGS = [
     (clusters, "factor", "force + (armature if row == dof else 0.0)", "force"),
     (clusters, "hinge_forces", "force = loads[key] + ", "force = "),
-    (clusters, "expanded", "k.get(dof, 0.0) + ", ""),
+    (clusters, "expand_cluster", "k.get(dof, 0.0) + ", ""),
     (closures.Closure, "acceleration", "+ dot(row.w_rate, w)", ""),
     (closures.Closure, "acceleration", "+ 2.0 * v)", ")"),
     (closures, "_moved", "2.0 * cross(spin, v)", "cross(spin, v)"),

@@ -148,7 +148,7 @@ MUTANTS = {
     "turn the wrong way": (spatial.Pose, "to_child", "c * v[1] - s * v[0]", "c * v[1] + s * v[0]",
                            "inverse_dynamics", ("qdd",)),
     "a sign lost in folding": (graph, "multiply", "!= (y.op", "and (y.op", "inverse_dynamics", ("qd", "qdd")),
-    "a pivot out of order": (articulated, "reduced", "given[::-1]", "given", "forward_dynamics", ("tau",)),
+    "a pivot out of order": (articulated, "reduce_link", "given[::-1]", "given", "forward_dynamics", ("tau",)),
 }  # fmt: skip
 
 

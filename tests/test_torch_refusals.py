@@ -134,7 +134,7 @@ def test_a_result_is_not_written_over_what_is_read_later():
     rate = (1, scene.dof_count)
     dyn = spo.Dynamics(scene, 1, device="cpu", granularity="tree")
     shapes = {"q": (1, scene.coord_count), "qd": rate, "qdd": rate, "cotangent": rate, "out": rate}
-    trace = Trace(dyn.programs.links.opened(), "float32", tuple(shapes))
+    trace = Trace(dyn.programs.links.with_tables(), "float32", tuple(shapes))
     stores = forward_dynamics_vjp(trace, ("tau", "q"))
     first = [item for item in stores if item.array == "out"]
     free = {name: is_read_before_written(first, stores, name) for name in ("cotangent", "qd", "qdd")}

@@ -138,8 +138,8 @@ def lump(scene: spo.Scene) -> Robot:
         stack += children[body][::-1]
         h = scene.hinge_of[body]
         hinge = scene.hinges[h]
-        parent, in_link = carrier[hinge.parent]
-        joint, body_in_joint = _times(in_link, X_p[h]), _inverse(X_c[h])
+        parent, hinge_motion = carrier[hinge.parent]
+        joint, body_in_joint = _times(hinge_motion, X_p[h]), _inverse(X_c[h])
         if hinge.kind == "fixed":
             carrier[body] = parent, _times(joint, body_in_joint)
         else:

@@ -186,7 +186,7 @@ class Gradients:
                 array.zero_()
             return
         if values:
-            dyn.programs.links.opened()  # fills the table
+            dyn.programs.links.with_tables()  # fills the table
             size = len(dyn.programs.links.tables["value"])
             results["value"] = dyn.recursions.array("value of derivatives", dyn.worlds, size)
         first, *more = results

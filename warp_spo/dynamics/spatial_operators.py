@@ -26,9 +26,9 @@ EXPRESSION = Routine(
     "expression",
     recursion.expression,
     blocks=True,
-    suits=lambda links, shapes, expression: recursion.meet(expression),
+    suits=lambda links, shapes, expression: recursion.spaces_agree(expression),
     variants=64,
-    title=lambda inputs, expression: recursion.written(expression),
+    title=lambda inputs, expression: recursion.format_expression(expression),
 )
 
 

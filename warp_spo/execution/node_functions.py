@@ -47,8 +47,8 @@ MOVING = ArgumentKind(6, lambda x: STILL._replace(spin=Vector(x[:3]), whirl=moti
 
 
 def _node_acceleration(pose: Pose, above: Motion, alpha: tuple, own: tuple, bias: Vector) -> Vector:
-    move = motion.joined(pose, above, *own)
-    w, v = motion.carried(Placed(pose, None), move, alpha)
+    move = motion.compose_motions(pose, above, *own)
+    w, v = motion.carry_acceleration(Placed(pose, None), move, alpha)
     return Vector((*(w + move.bias_w), *(v + move.bias_v))) + bias
 
 
@@ -114,14 +114,14 @@ NODE_FUNCTIONS: dict[str, tuple[Callable, dict[str, ArgumentKind]]] = {
     # P+, U, D; P - U D^-1 U*; bound of the cancellation that an eliminated pivot causes in a later one of its hinge;
     # D^-1 eps and z + G eps; qdd and alpha + H* qdd
     "eliminate": (_eliminate, {"P": INERTIA, "h": COLUMN, "armature": NUMBER, "least": NUMBER}),
-    "downdate": (articulated.without, {"P": INERTIA, "U": COLUMN, "D": NUMBER}),
-    "cancellation": (articulated.brought, {"coupling": NUMBER, "share": NUMBER, "size": NUMBER}),
+    "downdate": (articulated.downdate, {"P": INERTIA, "U": COLUMN, "D": NUMBER}),
+    "cancellation": (articulated.cancellation, {"coupling": NUMBER, "share": NUMBER, "size": NUMBER}),
     "eliminate_force": (
-        lambda h, U, D, z, b: articulated.taken(_pivot(h, U, D), z, b),
+        lambda h, U, D, z, b: articulated.reduce_pivot(_pivot(h, U, D), z, b),
         {"h": COLUMN, "U": COLUMN, "D": NUMBER, "z": COLUMN, "b": NUMBER},
     ),
     "back_substitute": (
-        lambda h, U, D, alpha, rate: articulated.released(_pivot(h, U, D), alpha, rate),
+        lambda h, U, D, alpha, rate: articulated.expand_pivot(_pivot(h, U, D), alpha, rate),
         {"h": COLUMN, "U": COLUMN, "D": NUMBER, "alpha": COLUMN, "rate": NUMBER},
     ),
 }

@@ -145,7 +145,7 @@ class Programs:
         return self._links
 
     def _build(self, routine: Routine, shapes: dict, out_shape: tuple, more: dict, options: dict) -> Program | None:
-        links, shapes = self.links.opened(), {**shapes, "out": out_shape}
+        links, shapes = self.links.with_tables(), {**shapes, "out": out_shape}
         if not links.links or not routine.suits(links, shapes, **options):
             return None
         shared = self.plan.of(routine) == "segment" and routine.divides(self.run.scene, shapes, **options)
@@ -195,7 +195,7 @@ class Programs:
         traced: list[list[Store]] = []
         apart: list[tuple[list[Store], list[Store], list[list[Store]]]] = []
         for index in range(len(pieces.pieces)):
-            links = self.links.opened()  # its own: pieces of equal structure then give equal text
+            links = self.links.with_tables()  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             traced.append([self._flattened(item, shapes) for item in routine.trace(trace, **options)])
             rounds = [[self._flattened(item, shapes) for item in turn] for turn in trace.rounds]

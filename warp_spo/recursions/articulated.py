@@ -16,10 +16,10 @@ import numpy as np
 from ..trace.scalars import Value, absolute, guarded, is_constant, quotient, reciprocal
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Rigid, Vector, cross, dot, magnitude, symmetric, total
 from .links import Link, Placed
-from .motion import NONE, Motion, carried, in_hinge, in_link
+from .motion import NONE, Motion, carry_acceleration, hinge_entries, hinge_motion
 
-LEAST = 4.0  # pivots of less than this many roundings of what cancels in them may be rounding alone
-SOLID = 1e-2  # share of what it carries, and of itself, that a body's inertia must reach to vouch for its pivots
+LEAST = 4.0  # roundings of the terms that cancel in a pivot; a smaller pivot may be rounding alone
+SOLID = 1e-2  # least share of the carried mass, and of its own moments, at which a body's inertia bounds its pivots
 NO_INERTIA = Articulated(NONE, NONE, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 
 
@@ -39,14 +39,14 @@ class Pivot(NamedTuple):
 
 @dataclasses.dataclass
 class Factor:
-    """What a link leaves behind going in.
+    """Results of eliminating the dofs of a link.
 
     Attributes:
         pivots: in the order of elimination, the reverse of the hinge's dofs.
         P: P+ in the link's frame. in_parent: phi P+ phi*.
-        whole: the hinge is free and has no armature: D = P, and the parent feels nothing.
+        whole: the hinge is free and has no armature: D = P, and no inertia acts on the parent.
         turned: the hinge's dofs are eliminated in the link's axes, not in the hinge's.
-        nothing: zero, or NaN where the link moves no inertia and has no armature: it takes its whole world with it.
+        nothing: zero, or NaN where the link moves no inertia and has no armature; added to the world's results.
     """
 
     pivots: list[Pivot]
@@ -64,7 +64,7 @@ def factor(
     through: list[tuple[Pose, Articulated]],
     epsilon: float,
 ) -> Factor:
-    """Eliminate the dofs of a link from its articulated inertia.
+    """Eliminate the dofs of a link from its articulated inertia; return its factor.
 
     Args:
         carried_on: P+ of its children, in its own frame.
@@ -82,13 +82,13 @@ def factor(
     pivots = []
     if hinge.units is not None and (turned or not hinge.rates_in_parent):
         units = list(hinge.units[::-1])
-        sizes = cancelling(link, P, units, through)
+        sizes = cancellation_sizes(link, P, units, through)
         for at, (unit, armature) in enumerate(zip(units, link.armature[::-1], strict=True)):
             pivot, P = eliminate_unit(P, unit, armature, LEAST * epsilon * sizes[at])
             pivots.append(pivot)
             for later in range(at + 1, len(units) if hinge.cancels else 0):
                 U = pivot.U[units[later]]
-                sizes[later] = sizes[later] + brought(U, U * pivot.inverse, sizes[at])
+                sizes[later] = sizes[later] + cancellation(U, U * pivot.inverse, sizes[at])
     else:
         H, whole_P = columns(link, place)[::-1], P
         sizes = [magnitude(h, P, h) + absolute(a) for h, a in zip(H, link.armature[::-1], strict=True)]
@@ -97,29 +97,31 @@ def factor(
             pivots.append(pivot)
             for later in range(at + 1, len(H)):
                 share = absolute(dot(H[later], pivot.U)) * pivot.inverse
-                sizes[later] = sizes[later] + brought(magnitude(H[later], whole_P, column), share, sizes[at])
+                sizes[later] = sizes[later] + cancellation(magnitude(H[later], whole_P, column), share, sizes[at])
     nothing: Value = 0.0
     if link.inertia is None and not link.children:  # it moves no inertia, so nobody would notice a lost pivot
-        nothing = total(lost(pivot.D) for pivot in pivots)
+        nothing = total(zero_or_nan(pivot.D) for pivot in pivots)
         P = P + Articulated.build(lambda i, j: nothing if i == j else 0.0)
     in_parent = NO_INERTIA if link.parent is None or whole else place.pose.articulated_to_parent(P)
     return Factor(pivots, P, in_parent, whole, turned, nothing)
 
 
 def columns(link: Link, place: Placed) -> list[Vector]:
-    """Columns of H*, (omega; v) in the link's axes."""
+    """Return the columns of H*, (omega; v) in the link's axes."""
     found = []
     for dof in link.dofs:
-        w, v = in_link(link, place, lambda other, dof=dof: 1.0 if other == dof else 0.0)
+        w, v = hinge_motion(link, place, lambda other, dof=dof: 1.0 if other == dof else 0.0)
         found.append(Vector((*w, *v)))
     return found
 
 
-def cancelling(link: Link, P: Articulated, units: list[int], through: list[tuple[Pose, Articulated]]) -> list[Value]:
-    """What may cancel in each pivot; nothing does in the first one of a link with an inertia of its own.
+def cancellation_sizes(
+    link: Link, P: Articulated, units: list[int], through: list[tuple[Pose, Articulated]]
+) -> list[Value]:
+    """Return the size of the terms that may cancel in each pivot; zero for the first pivot of a link with inertia.
 
-    The later pivots of a hinge are what the earlier ones leave of an entry of P. A link without inertia has only what
-    its children hand on, which vanishes along their own hinges: there it is the sum of what is turned into its axes.
+    Later pivots of a hinge are the remainders of entries of P after the earlier ones. A link without inertia has only
+    its children's articulated inertias, which vanish along their own hinges: the size is the sum of their magnitudes.
     """
     if link.inertia is not None:
         solid = len(units) == 1 or _is_solid(link, units)
@@ -136,7 +138,7 @@ def cancelling(link: Link, P: Articulated, units: list[int], through: list[tuple
 
 
 def _is_solid(link: Link, units: list[int]) -> bool:
-    """The link's own constant inertia bounds every pivot from below: it is not small, nor nearly singular."""
+    """Return whether the link's own constant inertia bounds every pivot from below: neither small nor singular."""
     own, carried = link.inertia, [link]
     if own is None or not all(map(is_constant, own.packed)):
         return False
@@ -156,8 +158,8 @@ def _is_solid(link: Link, units: list[int]) -> bool:
     return True
 
 
-def lost(D: Value) -> Value:
-    """Nothing, or NaN if D is not positive."""
+def zero_or_nan(D: Value) -> Value:
+    """Return zero, or NaN if D is not positive."""
     D = guarded(D, 0.0)
     return D - D if is_constant(D) else D.graph.make("lost", D)
 
@@ -181,56 +183,56 @@ def eliminate(P: Articulated, column: Vector, armature: Value, least: Value) -> 
     n, f = P.apply(Vector(column[:3]), Vector(column[3:]))
     U = Vector((*n, *f))
     D = guarded(guarded(dot(column, U) + armature, least), 0.0)
-    return Pivot(None, column, U, D, reciprocal(D)), without(P, U, D)
+    return Pivot(None, column, U, D, reciprocal(D)), downdate(P, U, D)
 
 
-def without(P: Articulated, U: Vector, D: Value) -> Articulated:
-    """P - U D^-1 U*; along an axis its row and column vanish without a rest."""
+def downdate(P: Articulated, U: Vector, D: Value) -> Articulated:
+    """Return P - U D^-1 U*; along a coordinate axis its row and column vanish exactly."""
     return P.less(U, Vector(quotient(u, D) for u in U))
 
 
-def brought(coupling: Value, share: Value, size: Value) -> Value:
-    """What an eliminated pivot brings to what may cancel in a later one: that loses again what D lost.
+def cancellation(coupling: Value, share: Value, size: Value) -> Value:
+    """Return an upper bound of the cancellation that an eliminated pivot causes in a later pivot of the same hinge.
 
     Args:
-        coupling: what D's column and the other one have in common. share: the same as a part of D.
-        size: of what cancels in D.
+        coupling: magnitude of the entry that couples the two columns. share: the entry over D.
+        size: of the terms that cancel in D.
     """
     return share * (2.0 * coupling + share * size)
 
 
-def reduced(
+def reduce_link(
     link: Link, place: Placed, done: Factor, motion: Motion, force: Vector, tau: Any
 ) -> tuple[list[Value], Vector]:
-    """eps = tau - H z of each pivot, and z+ in the parent's frame; ``force`` is z: (n; f) in the link's frame."""
+    """Return D^-1 eps of each pivot, and z+ in the parent's frame; ``force`` is z: (n; f) in the link's frame."""
     eps, z = [], force
     given = list(tau)
     for first in range(len(given) - 3, -1, -3) if done.turned else ():
         given[first : first + 3] = link.hinge.in_link_axes(place, given[first : first + 3])
     for pivot, b in zip(done.pivots, given[::-1], strict=True):
-        rate, z = taken(pivot, z, b)
+        rate, z = reduce_pivot(pivot, z, b)
         eps.append(rate)
     if link.parent is not None and done.whole:  # nothing but the force that the hinge itself transmits
         z = Vector((*given[3:], *given[:3]))
-    return eps, handed_to_parent(link, place, done, motion, z)
+    return eps, force_on_parent(link, place, done, motion, z)
 
 
-def taken(pivot: Pivot, z: Vector, b: Value) -> tuple[Value, Vector]:
-    """D^-1 eps of a pivot, eps = b - H z, and z + G eps."""
+def reduce_pivot(pivot: Pivot, z: Vector, b: Value) -> tuple[Value, Vector]:
+    """Return D^-1 eps of a pivot, eps = b - H z, and z + G eps."""
     rate = pivot.share(b - (z[pivot.unit] if pivot.unit is not None else dot(pivot.column, z)))
     return rate, z + pivot.U * rate
 
 
-def released(pivot: Pivot, alpha: Sequence[Value], rate: Value) -> tuple[Value, list[Value]]:
-    """qdd of a pivot, D^-1 eps - G* alpha, and alpha + H* qdd."""
+def expand_pivot(pivot: Pivot, alpha: Sequence[Value], rate: Value) -> tuple[Value, list[Value]]:
+    """Return qdd of a pivot, D^-1 eps - G* alpha, and alpha + H* qdd."""
     qdd = rate - pivot.share(dot(pivot.U, alpha))
     if pivot.unit is None:
         return qdd, [a + h * qdd for a, h in zip(alpha, pivot.column, strict=True)]
     return qdd, [a + qdd if i == pivot.unit else a for i, a in enumerate(alpha)]
 
 
-def handed_to_parent(link: Link, place: Placed, done: Factor, motion: Motion, z: Vector) -> Vector:
-    """z+ of a link, its bias added, in the parent's frame; nothing at a root."""
+def force_on_parent(link: Link, place: Placed, done: Factor, motion: Motion, z: Vector) -> Vector:
+    """Return z+ of a link with its bias added, in the parent's frame; zero at a root."""
     if link.parent is None:
         return ZERO
     if not done.whole:
@@ -243,31 +245,31 @@ def handed_to_parent(link: Link, place: Placed, done: Factor, motion: Motion, z:
     return Vector((*n, *f))
 
 
-def expanded(
+def expand_link(
     link: Link, place: Placed, done: Factor, rates: list[Value], motion: Motion, acceleration: tuple[Vector, Vector]
 ) -> tuple[list[Value], tuple[Vector, Vector]]:
-    """qdd of the link's dofs and its acceleration, for D^-1 eps and the ``acceleration`` of its parent."""
-    w, v = carried(place, motion, acceleration)
+    """Return qdd of the link's dofs and its acceleration, for D^-1 eps and the ``acceleration`` of its parent."""
+    w, v = carry_acceleration(place, motion, acceleration)
     bias = (*motion.bias_w, *motion.bias_v)
     alpha = [0.0] * 6 if done.whole else [a + b for a, b in zip((*w, *v), bias, strict=True)]
     qdd = []
     for pivot, rate in zip(done.pivots[::-1], rates[::-1], strict=True):
-        one, alpha = released(pivot, alpha, rate)
+        one, alpha = expand_pivot(pivot, alpha, rate)
         qdd.append(one)
     w, v = Vector(alpha[:3]), Vector(alpha[3:])
     if done.whole:  # the body's acceleration less its parent's, in the hinge's axes
         matrix = IDENTITY if link.matrix is None else link.matrix
         w_p, v_p = acceleration
         v_p = v_p + cross(w_p, place.pose.l) + motion.bias_l
-        relative = in_hinge(link, place, w - motion.bias_w, v - motion.bias_v)
+        relative = hinge_entries(link, place, w - motion.bias_w, v - motion.bias_v)
         qdd = [a - b for a, b in zip(relative, (*matrix.T @ v_p, *matrix.T @ w_p), strict=True)]
     elif done.turned:
-        qdd = in_hinge(link, place, Vector(qdd[-3:]), Vector(qdd[:3]))
+        qdd = hinge_entries(link, place, Vector(qdd[-3:]), Vector(qdd[:3]))
     return qdd, (w, v)
 
 
 def gyroscopic(inertia: Rigid | None, motion: Motion) -> Vector:
-    """(n; f) that keeps a body on its way at omega' = 0 and a = 0: omega x J omega; omega~ omega~ h."""
+    """Return the (n; f) of a body at omega' = 0 and a = 0: omega x J omega; omega~ omega~ h."""
     if inertia is None:
         return Vector((*ZERO, *ZERO))
     return Vector((*cross(motion.spin, inertia.inertia @ motion.spin), *(motion.whirl @ inertia.moment)))

@@ -73,7 +73,7 @@ def reduce(
         for force in trace.from_children(link, letters[-1], forces, Vector):
             z = z + force
         right = [tau(dof) for dof in link.dofs]
-        rates[key], forces[key] = articulated.reduced(link, place, factor, move, z, right)
+        rates[key], forces[key] = articulated.reduce_link(link, place, factor, move, z, right)
         stores += trace.send_to_parent("P", link, inner[key].packed) if "P" in letters else []
         stores += trace.send_to_parent(letters[-1], link, forces[key])
     return done, rates, stores
@@ -95,7 +95,7 @@ def expand(
         else:
             received = trace.receive(letter, trace.piece.parent)  # type: ignore[union-attr, arg-type]
             above = Vector(received[:3]), Vector(received[3:])
-        qdd, alpha[key] = articulated.expanded(
+        qdd, alpha[key] = articulated.expand_link(
             link, trace.places[key], done[key], rates[key], trace.motions[key], above
         )
         stores += [Store(name, (dof,), value) for dof, value in zip(link.dofs, qdd, strict=True)]
@@ -109,7 +109,7 @@ def propagate_inward(trace: Trace, done: dict, link: Link, force: Vector, right:
     rates, over = {}, link
     while True:
         key = id(over)
-        rates[key], force = articulated.reduced(over, trace.places[key], done[key], STILL, force, right)
+        rates[key], force = articulated.reduce_link(over, trace.places[key], done[key], STILL, force, right)
         if over.parent is None:
             return rates
         over = over.parent

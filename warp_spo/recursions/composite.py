@@ -11,7 +11,7 @@ from .articulated import columns
 from .articulated_sweeps import mirror, pack
 from .links import NOTHING as NOTHING
 from .links import Link, Placed
-from .motion import in_hinge
+from .motion import hinge_entries
 
 if TYPE_CHECKING:
     from .tracing import Trace
@@ -26,7 +26,7 @@ def entries(link: Link, places: dict[int, Placed], body: Rigid) -> dict[tuple[in
         while over.parent is not None:
             n, f = places[id(over)].pose.force_to_parent(n, f)
             over = over.parent
-            for row, force in zip(over.dofs, in_hinge(over, places[id(over)], n, f), strict=True):
+            for row, force in zip(over.dofs, hinge_entries(over, places[id(over)], n, f), strict=True):
                 found[row, column] = force
     return found
 
@@ -42,7 +42,7 @@ def own_entries(link: Link, place: Placed, body: Rigid) -> dict[tuple[int, int],
         place = place._replace(turned=IDENTITY)
     found: dict[tuple[int, int], Value] = {}
     for column, armature, H in zip(link.dofs, link.armature, columns(link, place), strict=True):
-        forces = in_hinge(link, place, *body.apply(Vector(H[:3]), Vector(H[3:])))
+        forces = hinge_entries(link, place, *body.apply(Vector(H[:3]), Vector(H[3:])))
         for row, force in zip(link.dofs, forces, strict=True):
             if row <= column:
                 found[row, column] = force + armature if row == column else force

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def integrate(trace: Trace) -> list[Store]:
     """out = q moved along qd for dt"""
     q, qd, h = trace.vector("q"), trace.vector("qd"), trace.graph.input("dt", 0)
-    return _coordinates(trace, lambda link: integration.moved(link, q, qd, h))
+    return _coordinates(trace, lambda link: integration.integrate_link(link, q, qd, h))
 
 
 def coordinate_rates(trace: Trace) -> list[Store]:

@@ -93,7 +93,7 @@ def log_det_mass_matrix_gradient(trace: Trace, scale: float = 1.0) -> list[Store
             for child in link.children:
                 P = P + done[id(child)].in_parent
             w, _ = generators(carried[key], P)
-        values = motion.in_hinge(link, place, w, v)
+        values = motion.hinge_entries(link, place, w, v)
         stores += [Store("out", (dof,), 2.0 * scale * x) for dof, x in zip(link.dofs, values, strict=True)]
     return stores
 

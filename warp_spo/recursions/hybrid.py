@@ -15,7 +15,7 @@ from ..trace.spatial import Articulated, Pose, Vector, dot, total
 from . import articulated
 from .articulated import LEAST, NO_INERTIA, Factor, Pivot
 from .links import Link, Placed
-from .motion import Motion, carried
+from .motion import Motion, carry_acceleration
 
 if TYPE_CHECKING:
     from .tracing import Trace
@@ -59,7 +59,7 @@ def factor(
             pivots.append(Pivot(unit, column, U, dot(column, U) + armature, 0.0))
             continue
         if unit is not None:
-            (size,) = articulated.cancelling(link, P, [unit], through)
+            (size,) = articulated.cancellation_sizes(link, P, [unit], through)
             pivot, rest = articulated.eliminate_unit(P, unit, armature, LEAST * epsilon * size)
         else:
             pivot, rest = articulated.eliminate(P, column, armature, LEAST * epsilon)
@@ -67,13 +67,13 @@ def factor(
         P = Articulated.build(lambda i, j, P=P, rest=rest, held=held: select(held, P.entry(i, j), rest.entry(i, j)))
     nothing: Value = 0.0
     if link.inertia is None and not link.children:  # it moves no inertia, so nobody would notice a lost pivot
-        nothing = total(select(m, 0.0, articulated.lost(p.D)) for m, p in zip(mask[::-1], pivots, strict=True))
+        nothing = total(select(m, 0.0, articulated.zero_or_nan(p.D)) for m, p in zip(mask[::-1], pivots, strict=True))
         P = P + Articulated.build(lambda i, j: nothing if i == j else 0.0)
     in_parent = NO_INERTIA if link.parent is None else place.pose.articulated_to_parent(P)
     return Factor(pivots, P, in_parent, whole=False, turned=False, nothing=nothing)
 
 
-def reduced(
+def reduce_link(
     link: Link, place: Placed, done: Factor, motion: Motion, force: Vector, given: Given
 ) -> tuple[list[Value], list[Value], Vector]:
     """Of each pivot D^-1 (tau - H z), or qdd if it is prescribed; H z; and z+ in the parent's frame."""
@@ -82,10 +82,10 @@ def reduced(
         heads.append(dot(pivot.column, z))
         rates.append(select(held, qdd, (tau - heads[-1]) * pivot.inverse))
         z = z + pivot.U * rates[-1]
-    return rates, heads, articulated.handed_to_parent(link, place, done, motion, z)
+    return rates, heads, articulated.force_on_parent(link, place, done, motion, z)
 
 
-def expanded(
+def expand_link(
     link: Link,
     place: Placed,
     done: Factor,
@@ -96,7 +96,7 @@ def expanded(
     given: Given,
 ) -> tuple[list[Value], list[Value], tuple[Vector, Vector]]:
     """qdd and tau of the link's dofs and its acceleration, for the ``acceleration`` of its parent."""
-    w, v = carried(place, motion, acceleration)
+    w, v = carry_acceleration(place, motion, acceleration)
     alpha = Vector((*(w + motion.bias_w), *(v + motion.bias_v)))
     qdd, tau = [], []
     for pivot, rate, head, held, b in zip(
@@ -143,9 +143,9 @@ def hybrid_dynamics(trace: Trace, mask: tuple[bool, ...] | None = None) -> list[
         for child in link.children:
             z = z + forces[id(child)]
         if known.free:
-            rates[key], forces[key] = articulated.reduced(link, place, done[key], move, z, known.tau)
+            rates[key], forces[key] = articulated.reduce_link(link, place, done[key], move, z, known.tau)
         else:
-            rates[key], heads[key], forces[key] = reduced(link, place, done[key], move, z, known)
+            rates[key], heads[key], forces[key] = reduce_link(link, place, done[key], move, z, known)
     alpha: dict[int, tuple[Vector, Vector]] = {}
     stores: list[Store] = []
     for link in trace.links.links:
@@ -154,10 +154,12 @@ def hybrid_dynamics(trace: Trace, mask: tuple[bool, ...] | None = None) -> list[
         above = trace.base_acceleration if link.parent is None else alpha[id(link.parent)]
         known, place, move = given[key], trace.places[key], trace.motions[key]
         if known.free:
-            forward, alpha[key] = articulated.expanded(link, place, done[key], rates[key], move, above)
+            forward, alpha[key] = articulated.expand_link(link, place, done[key], rates[key], move, above)
             inverse = known.tau
         else:
-            forward, inverse, alpha[key] = expanded(link, place, done[key], rates[key], heads[key], move, above, known)
+            forward, inverse, alpha[key] = expand_link(
+                link, place, done[key], rates[key], heads[key], move, above, known
+            )
         for dof, a, force in zip(link.dofs, forward, inverse, strict=True):
             stores += [Store("out", (dof,), a), Store("tau_out", (dof,), force)]
     return stores

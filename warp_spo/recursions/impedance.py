@@ -109,7 +109,7 @@ class Law(NamedTuple):
         return self.force * reciprocal(self.resistance)
 
 
-def added(laws: list[Law]) -> Law:
+def add_laws(laws: list[Law]) -> Law:
     """Return the sum of laws without bounds."""
     return Law(total(law.force for law in laws), total(law.resistance for law in laws))
 
@@ -148,13 +148,13 @@ class Impedance:
             found = [*self._drive(link, i), *self._limits(link, i), *self._friction(dof)]
             found += self._rate_limit(dof, straight + found)
             straight += [law for law in found if not law.bends]
-            every.append([added(straight)] * bool(straight) + [law for law in found if law.bends])
+            every.append([add_laws(straight)] * bool(straight) + [law for law in found if law.bends])
         return every
 
     def passive(self, link: Link) -> list[Law]:
         """Return damper and spring of each dof of a link, added up."""
         return [
-            added([*self._damper(dof), *self._spring(link, i, "joint_stiffness", self._rest)])
+            add_laws([*self._damper(dof), *self._spring(link, i, "joint_stiffness", self._rest)])
             for i, dof in enumerate(link.dofs)
         ]
 
@@ -210,7 +210,7 @@ class Impedance:
         laws += [] if is_number(kd, 0.0) else [Law(kd * (self.target_qd(dof) - self.qd(dof)), kd)]
         if not laws:
             return []
-        effort, law = self._bound("joint_effort_limit", dof, DEFAULT_BOUND), added(laws)
+        effort, law = self._bound("joint_effort_limit", dof, DEFAULT_BOUND), add_laws(laws)
         if effort is not None and is_number(effort, 0.0):
             return []
         return [law] if effort is None else [law._replace(least=-effort, most=effort)]

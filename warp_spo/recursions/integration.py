@@ -8,7 +8,7 @@ from ..trace.scalars import Value
 from .links import Link
 
 
-def moved(link: Link, q: Callable[[int], Value], rate: Callable[[int], Value], h: Value) -> list[Value]:
+def integrate_link(link: Link, q: Callable[[int], Value], rate: Callable[[int], Value], h: Value) -> list[Value]:
     """Return the link's coordinates after ``rate(dof)`` has been constant for ``h`` [s]; quaternions come out
     normalised."""
     return link.hinge.moved(link, q, [rate(dof) for dof in link.dofs], h)

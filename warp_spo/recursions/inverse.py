@@ -63,7 +63,7 @@ class Inverse:
         rates: list[Value] = []
         for link in reversed(links):
             key = id(link)
-            found, force = articulated.reduced(link, self.trace.places[key], self.done[key], STILL, force, right)
+            found, force = articulated.reduce_link(link, self.trace.places[key], self.done[key], STILL, force, right)
             rates = found + rates
             inner = link.parent
             right = [0.0] * (0 if inner is None else len(inner.dofs))

@@ -9,9 +9,9 @@ from ..hinges.quaternions import Quaternion, constant_quaternion, multiplied, tu
 from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross
-from .links import Link, Placed, placed
-from .motion import in_link
-from .newton_euler import accelerated
+from .links import Link, Placed, place_link
+from .motion import hinge_motion
+from .newton_euler import link_acceleration
 
 if TYPE_CHECKING:
     from .tracing import Trace
@@ -86,7 +86,7 @@ def body_poses(trace: Trace) -> list[Store]:
     for link in trace.links.links:
         trace.label(link, "p")
         over = None if link.parent is None else id(link.parent)
-        trace.places[id(link)] = place = placed(link, q)
+        trace.places[id(link)] = place = place_link(link, q)
         at[id(link)] = at[over] + turned(turns[over], place.pose.l)
         turns[id(link)] = multiplied(turns[over], relative_quaternion(link, q))
     stores = []
@@ -107,7 +107,7 @@ def body_velocities(trace: Trace) -> list[Store]:
         place_axes(trace, link)
         trace.label(link, "v")
         place, over = trace.places[id(link)], None if link.parent is None else id(link.parent)
-        hinge = in_link(link, place, trace.vector("qd"))
+        hinge = hinge_motion(link, place, trace.vector("qd"))
         velocities[id(link)] = carried_velocity(place, velocities[over], hinge)
     stores = []
     for body, seat in trace.links.seats.items():
@@ -150,7 +150,7 @@ def link_accelerations(trace: Trace, qdd: Callable[[int], Value]) -> dict[int, t
         trace.label(link, "a")
         above = (ZERO, ZERO) if link.parent is None else alpha[id(link.parent)]
         place, move = trace.places[id(link)], trace.motions[id(link)]
-        alpha[id(link)] = accelerated(link, place, move, above, qdd)
+        alpha[id(link)] = link_acceleration(link, place, move, above, qdd)
     return alpha
 
 

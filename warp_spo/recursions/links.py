@@ -4,8 +4,8 @@ A hinge that is a sequence of elementary ones becomes a chain of links without i
 each has one elementary hinge, an object of :mod:`warp_spo.hinges`, and its axis along its own z axis. What a fixed
 hinge carries belongs to the link under it, so that a body that does not move costs nothing.
 
-Values that vary are symbols here, Newton's own. An operation works on an opened copy, in which what came out of them is
-read from tables: what depends on the scene alone is computed once, not in every call.
+Variable values are symbols here. An operation works on a copy whose quantities are read from tables: what depends on
+the scene's values alone is computed once when they are set, not in every call.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Links:
         links: the links. seats, nodes: by body.
         gravity: Vector.
         turns_vary: some joint's anchor is turned by what is no constant.
-        tables: the scalars that an :meth:`opened` copy reads, by name, in order.
+        tables: the scalars that an :meth:`with_tables` copy reads, by name, in order.
         reverses: what takes gradients by the tables back to the values, see :mod:`warp_spo.execution.link_values`.
     """
 
@@ -128,8 +128,8 @@ class Links:
             self._visit(root)
         self._group()
 
-    def opened(self) -> Links:
-        """A copy with a graph of its own; what is no constant is an entry of a table: its key there says which."""
+    def with_tables(self) -> Links:
+        """Return a copy with a graph of its own, in which quantities that are not constant are entries of a table."""
         other = copy.copy(self)
         other.graph = Graph()
         if self.graph.empty:
@@ -175,8 +175,8 @@ class Links:
                 stack.append((link, False))
                 stack.extend((child, True) for child in reversed(link.children))
 
-    def thrown(self, link: Link) -> float | None:
-        """Mass that a free link on the inertial frame carries, itself included; None of others, and if it varies."""
+    def carried_mass(self, link: Link) -> float | None:
+        """Return the mass that a free root link carries, itself included; None for other links, or if it varies."""
         if not link.hinge.unconstrained or link.parent is not None:
             return None
         mass, carried = 0.0, [link]
@@ -315,7 +315,7 @@ class Links:
                 link.grouped, parent.grouped = kept, after
 
 
-def placed(link: Link, q: Any) -> Placed:
+def place_link(link: Link, q: Any) -> Placed:
     """Return ``link`` where the coordinates put it; ``q(i)`` is entry i."""
     return link.hinge.placed(link, q)
 

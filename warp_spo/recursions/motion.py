@@ -1,4 +1,4 @@
-"""Velocities and accelerations, outward: omega(k) = omega(p) + H* qd, and what each hinge adds.
+"""Velocities and accelerations, outward: omega(k) = omega(p) + H* qd, and the bias of each hinge.
 
 Accelerations are classical, those of a material point: a(k) = a(p) + (omega'~ + omega~ omega~) l. Linear velocities
 then enter nowhere, and float32 does not lose what a fast chain's large velocities would cancel (eq. 20 with the
@@ -17,7 +17,7 @@ NONE = Matrix.of([[0.0] * 3] * 3)
 
 
 class Motion(NamedTuple):
-    """How a link moves, in its own axes.
+    """Velocity terms of a link, in its own axes.
 
     Attributes:
         spin: omega. whirl: omega~ omega~.
@@ -41,12 +41,12 @@ def whirl(w: Vector) -> Matrix:
     return symmetric(-(yy + zz), -(xx + zz), -(xx + yy), w[0] * w[1], w[0] * w[2], w[1] * w[2])
 
 
-def in_link(link: Link, place: Placed, rate: Any) -> tuple[Vector, Vector]:
+def hinge_motion(link: Link, place: Placed, rate: Any) -> tuple[Vector, Vector]:
     """Return H* rate, (omega; v) of the hinge in the link's axes, for ``rate(dof)``."""
     return link.hinge.velocity(place, [rate(dof) for dof in link.dofs])
 
 
-def in_hinge(link: Link, place: Placed, w: Vector, v: Vector) -> list[Value]:
+def hinge_entries(link: Link, place: Placed, w: Vector, v: Vector) -> list[Value]:
     """Return H (w; v), for (n; f) or (omega'; v') of the link: an entry for each of the link's dofs."""
     return link.hinge.forces(place, w, v)
 
@@ -56,23 +56,23 @@ def own_bias(link: Link, place: Placed, qd: Any) -> tuple[Vector, Vector] | None
     return link.hinge.own_bias(place, [qd(dof) for dof in link.dofs])
 
 
-def moved(link: Link, place: Placed, parent: Motion | None, qd: Any) -> Motion:
+def link_motion(link: Link, place: Placed, parent: Motion | None, qd: Any) -> Motion:
     """Return the motion of ``link`` at rates ``qd(dof)`` on a parent that moves as ``parent``; None is at rest."""
     if qd is None:
         return STILL
-    move = joined(place.pose, parent or STILL, *in_link(link, place, qd))
+    move = compose_motions(place.pose, parent or STILL, *hinge_motion(link, place, qd))
     own = own_bias(link, place, qd)
     return move if own is None else move._replace(bias_w=move.bias_w + own[0], bias_v=move.bias_v + own[1])
 
 
-def joined(pose: Pose, parent: Motion, w: Vector, v: Vector) -> Motion:
-    """Motion of a frame at ``pose`` on its parent, relative to which it moves with (w; v) in its own axes."""
+def compose_motions(pose: Pose, parent: Motion, w: Vector, v: Vector) -> Motion:
+    """Return the velocity terms of a frame at ``pose`` that moves with (w; v), in its own axes, on its parent."""
     carried = pose.to_child(parent.spin)
     spin = carried + w
     return Motion(spin, whirl(spin), cross(carried, w), 2.0 * cross(carried, v), parent.whirl @ pose.l)
 
 
-def carried(place: Placed, motion: Motion, acceleration: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
-    """What the parent's ``acceleration`` makes of the link's, without its own bias and qdd."""
+def carry_acceleration(place: Placed, motion: Motion, acceleration: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    """Return the link's acceleration from that of its parent, without its own bias and qdd."""
     w, v = acceleration
     return place.pose.to_child(w), place.pose.to_child(v + cross(w, place.pose.l) + motion.bias_l)

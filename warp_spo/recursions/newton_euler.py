@@ -9,48 +9,48 @@ from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Rigid, Vector, cross, skew
 from .links import Link, Placed
-from .motion import Motion, carried, in_hinge, in_link
+from .motion import Motion, carry_acceleration, hinge_entries, hinge_motion
 
 if TYPE_CHECKING:
     from .tracing import Trace
 
 
-def accelerated(
+def link_acceleration(
     link: Link, place: Placed, motion: Motion, acceleration: tuple[Vector, Vector], qdd: Any
 ) -> tuple[Vector, Vector]:
-    """Acceleration of the link for that of its parent and ``qdd(dof)``."""
+    """Return the acceleration of the link for that of its parent and ``qdd(dof)``."""
     if link.hinge.unconstrained and link.parent is None:
         back = place.turned.T  # type: ignore[union-attr]
-        w, v = at_root(link, acceleration, qdd)
+        w, v = root_acceleration(link, acceleration, qdd)
         return back @ w, back @ v
-    w, v = carried(place, motion, acceleration)
-    w_j, v_j = in_link(link, place, qdd)
+    w, v = carry_acceleration(place, motion, acceleration)
+    w_j, v_j = hinge_motion(link, place, qdd)
     return w + motion.bias_w + w_j, v + motion.bias_v + v_j
 
 
-def at_root(link: Link, base: tuple[Vector, Vector], qdd: Any) -> tuple[Vector, Vector]:
-    """Acceleration of a free link on the inertial frame in the axes of its rates, ``base`` that of the frame."""
+def root_acceleration(link: Link, base: tuple[Vector, Vector], qdd: Any) -> tuple[Vector, Vector]:
+    """Return the acceleration of a free root link in the axes of its rates; ``base`` is that of the inertial frame."""
     back = (link.matrix or IDENTITY).T
     rates = [qdd(dof) for dof in link.dofs]
     return back @ base[0] + Vector(rates[3:]), back @ base[1] + Vector(rates[:3])
 
 
 def body_force(inertia: Rigid, motion: Motion, w: Vector, v: Vector) -> Vector:
-    """(n; f) that gives a body the acceleration (w; v): classical, at its frame's origin."""
+    """Return the (n; f) that gives a body the classical acceleration (w; v) at its frame's origin."""
     rotation: Matrix = skew(w) + motion.whirl
     n = inertia.inertia @ w + cross(inertia.moment, v) + cross(motion.spin, inertia.inertia @ motion.spin)
     return Vector((*n, *(inertia.mass * v + rotation @ inertia.moment)))
 
 
 def wrench(axes: Matrix, com: Vector, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
-    """(n; f) about the frame's origin, in its ``axes``, of a force at ``com`` and a torque, both in inertial axes."""
+    """Return (n; f) about the frame's origin, in its ``axes``, for a force at ``com`` and a torque in inertial axes."""
     f, n = axes.T @ force, axes.T @ torque
     return n + cross(com, f), f
 
 
 def hinge_force(link: Link, place: Placed, n: Vector, f: Vector, qdd: Any) -> list[Value]:
-    """tau of the link's dofs for the force (n; f) that its hinge transmits."""
-    forces = in_hinge(link, place, n, f)
+    """Return tau of the link's dofs for the force (n; f) that its hinge transmits."""
+    forces = hinge_entries(link, place, n, f)
     return [force + a * qdd(dof) for force, a, dof in zip(forces, link.armature, link.dofs, strict=True)]
 
 
@@ -63,7 +63,7 @@ def root_force(
     off by 1e-7 from its inverse, and f would be so too.
     """
     forces = hinge_force(link, place, n, f - v * mass, qdd)
-    return [*(Vector(forces[:3]) + at_root(link, base, qdd)[1] * mass), *forces[3:]]
+    return [*(Vector(forces[:3]) + root_acceleration(link, base, qdd)[1] * mass), *forces[3:]]
 
 
 def inverse_dynamics(
@@ -81,7 +81,7 @@ def inverse_dynamics(
             trace.place(link, moves)
             trace.label(link, "a")
             above = base if link.parent is None else alpha[id(link.parent)]
-            alpha[key] = accelerated(link, trace.places[key], trace.motions[key], above, qdd)
+            alpha[key] = link_acceleration(link, trace.places[key], trace.motions[key], above, qdd)
             continue
         trace.label(link, "f")
         f = -trace.external_wrench(link)
@@ -90,7 +90,7 @@ def inverse_dynamics(
         for other in trace.from_children(link, letter, forces, Vector):
             f = f + other
         n, f = Vector(f[:3]), Vector(f[3:])
-        mass = trace.links.thrown(link)
+        mass = trace.links.carried_mass(link)
         if mass is None:
             tau = hinge_force(link, trace.places[key], n, f, qdd)
         else:

@@ -53,14 +53,14 @@ def operational_inertia_inverse_product(trace: Trace, frames: tuple) -> list[Sto
     for link in reversed(trace.links.links):
         trace.label(link, "z")
         key, still = id(link), [0.0] * len(link.dofs)
-        rates[key], force = articulated.reduced(link, trace.places[key], done[key], STILL, forces[key], still)
+        rates[key], force = articulated.reduce_link(link, trace.places[key], done[key], STILL, forces[key], still)
         if link.parent is not None:
             forces[id(link.parent)] = forces[id(link.parent)] + force
     alpha: dict[int, tuple[Vector, Vector]] = {}
     for link in trace.links.links:
         trace.label(link, "a")
         above = (ZERO, ZERO) if link.parent is None else alpha[id(link.parent)]
-        _, alpha[id(link)] = articulated.expanded(
+        _, alpha[id(link)] = articulated.expand_link(
             link, trace.places[id(link)], done[id(link)], rates[id(link)], STILL, above
         )
     return accelerations_of_frames(trace, frames, alpha)

@@ -18,8 +18,8 @@ from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Vector, cross, dot
 from . import articulated
-from .links import Link, Placed, placed
-from .motion import in_hinge, in_link
+from .links import Link, Placed, place_link
+from .motion import hinge_entries, hinge_motion
 
 if TYPE_CHECKING:
     from .tracing import Trace
@@ -62,14 +62,14 @@ def spaces(expression: Expression) -> tuple[str | None, str | None]:
     found = [pair for pair in map(spaces, operands) if pair != NONE]
     if form == "product":
         if any(left[1] != right[0] for left, right in itertools.pairwise(found)):
-            raise ValueError(f"{written(expression)}: nodes meet hinges")
+            raise ValueError(f"{format_expression(expression)}: nodes meet hinges")
         return (found[0][0], found[-1][1]) if found else NONE
     if len(set(found)) > 1 or (len(found) < len(operands) and found and found[0][0] != found[0][1]):
-        raise ValueError(f"{written(expression)}: nodes meet hinges")
+        raise ValueError(f"{format_expression(expression)}: nodes meet hinges")
     return found[0] if found else NONE
 
 
-def meet(expression: Expression) -> bool:
+def spaces_agree(expression: Expression) -> bool:
     """Return whether the spaces of an expression's factors and terms agree."""
     try:
         spaces(expression)
@@ -78,7 +78,7 @@ def meet(expression: Expression) -> bool:
     return True
 
 
-def written(expression: Expression) -> str:
+def format_expression(expression: Expression) -> str:
     """Return the expression as a user writes it."""
     if isinstance(expression, str):
         return expression
@@ -86,18 +86,18 @@ def written(expression: Expression) -> str:
     if form == "identity":
         return "1"
     if form == "resolvent":
-        return RESOLVENTS.get(operands[0], f"resolvent({written(operands[0])})")
+        return RESOLVENTS.get(operands[0], f"resolvent({format_expression(operands[0])})")
     if form == "scaled":
         return f"{operands[0]:g} {_bracketed(operands[1])}"
     if form == "transpose":
         return f"{_bracketed(operands[0])}.T"
     if form == "product":
         return " @ ".join(map(_bracketed, operands))
-    return " + ".join(map(written, operands))
+    return " + ".join(map(format_expression, operands))
 
 
 def _bracketed(expression: Expression) -> str:
-    text = written(expression)
+    text = format_expression(expression)
     return f"({text})" if " " in text else text
 
 
@@ -299,7 +299,7 @@ class Operators:
         tau: list[Value] = []
         for link, pose, first in self._inner(node):
             if link is not None:
-                tau = [*in_hinge(link, self.place(link), *_parts(z)), *tau]
+                tau = [*hinge_entries(link, self.place(link), *_parts(z)), *tau]
             if not first:
                 z = _joined(pose.force_to_parent(*_parts(z)))
         return Vector(tau)
@@ -315,7 +315,7 @@ class Operators:
                 own = list(rates[at : at + len(link.dofs)])
                 at += len(own)
                 entries = dict(zip(link.dofs, own, strict=True))
-                v = v + _joined(in_link(link, self.place(link), lambda dof, entries=entries: entries[dof]))
+                v = v + _joined(hinge_motion(link, self.place(link), lambda dof, entries=entries: entries[dof]))
         return v
 
     def _armature(self, node: int, x: Vector) -> Vector:
@@ -383,7 +383,7 @@ class Operators:
             triples = [link.hinge.in_link_axes(place, right[i : i + 3]) for i in range(0, len(right), 3)]
             right = [x for triple in triples for x in triple]
         for pivot, b in zip(done.pivots, right[::-1], strict=True):
-            rate, z = articulated.taken(pivot, z, b)
+            rate, z = articulated.reduce_pivot(pivot, z, b)
             rates.append(rate)
         return rates, z
 
@@ -396,7 +396,7 @@ class Operators:
             rates.append(pivot.inverse * dot(pivot.U, v) - own)
             v = v - pivot.column * rates[-1]
         if done.turned:
-            rates = in_hinge(link, place, Vector(rates[-3:]), Vector(rates[:3]))
+            rates = hinge_entries(link, place, Vector(rates[-3:]), Vector(rates[:3]))
         return rates, v
 
     # -- bodies ----------------------------------------------------------------------------------------------------
@@ -431,7 +431,7 @@ class Operators:
         """Return the placement of a link."""
         if id(link) not in self._places:
             self.graph.step = f"{link.label}|x"
-            self._places[id(link)] = placed(link, self.q)
+            self._places[id(link)] = place_link(link, self.q)
         return self._places[id(link)]
 
     def hops(self, node: int) -> list[tuple[Link | None, Pose]]:
@@ -441,7 +441,7 @@ class Operators:
             found: list[tuple[Link | None, Pose]] = []
             if chain:
                 self.graph.step = f"{chain[0].label}|x"
-                found.append((chain[0], placed(self.links.on_parent_node(chain[0]), self.q).pose))
+                found.append((chain[0], place_link(self.links.on_parent_node(chain[0]), self.q).pose))
                 found += [(link, self.place(link).pose) for link in chain[1:]]
                 if seat.matrix != IDENTITY or not seat.offset.vanishes:
                     found.append((None, Pose(None, None if seat.matrix == IDENTITY else seat.matrix, seat.offset)))

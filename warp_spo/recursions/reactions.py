@@ -74,5 +74,5 @@ def _moving(trace: Trace) -> tuple[dict[int, Vector], dict[int, tuple[Vector, Ve
         trace.label(link, "a")
         above = trace.base_acceleration if link.parent is None else alpha[id(link.parent)]
         place, move = trace.places[id(link)], trace.motions[id(link)]
-        alpha[id(link)] = newton_euler.accelerated(link, place, move, above, qdd)
+        alpha[id(link)] = newton_euler.link_acceleration(link, place, move, above, qdd)
     return origins, alpha

@@ -20,8 +20,8 @@ from ..trace.emission import Store
 from ..trace.scalars import Value, less, reciprocal, select
 from ..trace.spatial import total
 from .articulated_sweeps import expand, reduce
-from .impedance import Impedance, Law, added, is_number
-from .integration import moved
+from .impedance import Impedance, Law, add_laws, is_number
+from .integration import integrate_link
 from .joint_space import JointSpace
 from .links import Link
 from .pieces import Piece, Pieces
@@ -80,7 +80,7 @@ class Step:
         for link in self.links:
             trace.label(link, "q")
             stores += [Store("out", (dof,), rates_after[dof]) for dof in link.dofs]
-            coordinates = moved(link, self.q, rates_after.__getitem__, self.h)
+            coordinates = integrate_link(link, self.q, rates_after.__getitem__, self.h)
             stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
             if qdd:
                 stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
@@ -139,7 +139,7 @@ class Step:
     def _pieces(self, link: Link) -> list[Law]:
         """Return the active pieces of each dof, added up; a massless dof without one gets a faint resistance."""
         self.laws |= dict(zip(link.dofs, self.impedance.laws(link), strict=True))
-        pieces = [added([law.piece(self._guess(dof)) for law in self.laws[dof]]) for dof in link.dofs]
+        pieces = [add_laws([law.piece(self._guess(dof)) for law in self.laws[dof]]) for dof in link.dofs]
         if self._weightless(link):
             faint = FAINT * total(law.scale * law.resistance for law in self.laws[link.dofs[0]])
             held = pieces[0].resistance

@@ -13,7 +13,7 @@ from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector
 from . import messages, motion, newton_euler
-from .links import Link, Links, Placed, placed
+from .links import Link, Links, Placed, place_link
 from .motion import STILL, Motion
 from .pieces import Piece
 
@@ -85,11 +85,11 @@ class Trace:
     def place(self, link: Link, moves: bool = False) -> None:
         """Place a link by its coordinates; with ``moves`` compute its velocity terms too."""
         self.label(link, "x")
-        self.places[id(link)] = place = placed(link, self.vector("q"))
+        self.places[id(link)] = place = place_link(link, self.vector("q"))
         self.label(link, "w")
         parent = None if link.parent is None else self.motions[id(link.parent)]
         qd = self.vector("qd") if moves else None
-        self.motions[id(link)] = motion.moved(link, place, parent, qd) if moves else STILL
+        self.motions[id(link)] = motion.link_motion(link, place, parent, qd) if moves else STILL
         if "body_f" in self.inputs:
             R = IDENTITY if link.parent is None else self.axes[id(link.parent)]
             self.axes[id(link)] = R @ place.pose.rotation

@@ -20,7 +20,7 @@ from ..composite import mass_matrix
 from ..coordinates import integrate
 from ..forward_dynamics import forward_dynamics
 from ..impedance import Impedance
-from ..integration import moved
+from ..integration import integrate_link
 from ..kinematics import body_poses, body_velocities, jacobian
 from ..links import Link
 from ..newton_euler import inverse_dynamics
@@ -134,7 +134,7 @@ def step_vjp(trace: Trace, wrt: tuple[str, ...], equations: TreeEquations | None
     state = [Store("out", (dof,), rate) for dof, rate in after.items()]
     for link in links:
         trace.label(link, "q")
-        values = moved(link, trace.vector("q"), after.__getitem__, h)
+        values = integrate_link(link, trace.vector("q"), after.__getitem__, h)
         state += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(values)]
     state = equations.put_back(state)
     seeds = [pushed[item.array == "out"](item.index[0]) for item in state]

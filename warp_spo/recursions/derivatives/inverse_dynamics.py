@@ -42,7 +42,7 @@ def inverse_dynamics_derivatives(trace: Trace) -> list[Store]:
             place = trace.places[key]
             trace.label(link, "a")
             above = trace.base_acceleration if over is None else alpha[id(over)]
-            alpha[key] = newton_euler.accelerated(link, place, trace.motions[key], above, qdd)
+            alpha[key] = newton_euler.link_acceleration(link, place, trace.motions[key], above, qdd)
             trace.label(link, "s")
             drifts[key] = sensitivity.drift(link, place, None if over is None else parent, rates)
             own[key] = (
@@ -99,10 +99,11 @@ def _entries(
         change = n + cross(s.turn, force[0]), f + cross(s.turn, force[1])
         blocks = [(Q, *change), (QD, *all_in.force(s_d)), (QDD, row.w, row.v)]
         for block, n_own, f_own in blocks:
-            tau = motion.in_hinge(link, place, n_own, f_own)
+            tau = motion.hinge_entries(link, place, n_own, f_own)
             if block == Q and changes is not None:  # columns that stay with the link, but for their own change
                 tau = [
-                    a + _power(c, force) for a, c in zip(motion.in_hinge(link, place, n, f), changes[at], strict=True)
+                    a + _power(c, force)
+                    for a, c in zip(motion.hinge_entries(link, place, n, f), changes[at], strict=True)
                 ]
             for i, value in zip(link.dofs, tau, strict=True):
                 extra = link.armature[at] if block == QDD and i == dof else 0.0
@@ -115,7 +116,7 @@ def _entries(
             blocks = [*((block, *pose.force_to_parent(n, f)) for block, n, f in blocks[:2]), (QDD, row.w, row.v)]
             over = over.parent
             for block, n, f in blocks:
-                for i, value in zip(over.dofs, motion.in_hinge(over, trace.places[id(over)], n, f), strict=True):
+                for i, value in zip(over.dofs, motion.hinge_entries(over, trace.places[id(over)], n, f), strict=True):
                     stores.append(Store("out", (block, i, dof), value))
                     if block == QDD:
                         stores.append(Store("out", (block, dof, i), value))

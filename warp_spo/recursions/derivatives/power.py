@@ -16,7 +16,7 @@ from ...trace.emission import Store
 from ...trace.scalars import Value, cut, is_constant, ordered
 from ...trace.spatial import ZERO, Matrix, Rigid, Vector, cross, dot, skew
 from ..links import Link, Placed
-from ..motion import in_link, own_bias, whirl
+from ..motion import hinge_motion, own_bias, whirl
 
 if TYPE_CHECKING:
     from ..tracing import Trace
@@ -120,7 +120,7 @@ class Power:
         """Return the motion of a link with its own rates added."""
         place, (spin, w, v, mu_w, mu_v, *_) = self.trace.places[id(link)], carried
         rates = self.trace.vector("qd"), self.qdd, self.multiplier
-        (w_d, v_d), (w_dd, v_dd), (w_l, v_l) = (in_link(link, place, rate) for rate in rates)
+        (w_d, v_d), (w_dd, v_dd), (w_l, v_l) = (hinge_motion(link, place, rate) for rate in rates)
         moved = Moving(
             spin + w_d, w + cross(spin, w_d) + w_dd, v + 2.0 * cross(spin, v_d) + v_dd, mu_w + w_l, mu_v + v_l
         )

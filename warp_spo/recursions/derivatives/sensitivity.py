@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from ...trace.scalars import Value
 from ...trace.spatial import ZERO, Matrix, Rigid, Vector, cross, dot, skew, symmetric
 from ..links import Link, Placed
-from ..motion import NONE, Motion, carried, in_link, whirl
+from ..motion import NONE, Motion, carry_acceleration, hinge_motion, whirl
 
 
 class Sensitivity(NamedTuple):
@@ -97,7 +97,7 @@ def drift(link: Link, place: Placed, parent: Motion | None, qd: object) -> Vecto
     """Velocity of the link's origin relative to its parent's, in the parent's axes."""
     if qd is None:
         return ZERO
-    own = place.pose.to_parent(in_link(link, place, qd)[1])
+    own = place.pose.to_parent(hinge_motion(link, place, qd)[1])
     return own if parent is None else own + cross(parent.spin, place.pose.l)
 
 
@@ -163,8 +163,8 @@ def of_coordinates(
         spin, (w, v) = motion.spin, own
         slide = ZERO
     else:
-        spin, (w, v) = spin_c, carried(place, motion, above)
-        slide = ZERO if rates is None else in_link(link, place, rates)[1] * 2.0
+        spin, (w, v) = spin_c, carry_acceleration(place, motion, above)
+        slide = ZERO if rates is None else hinge_motion(link, place, rates)[1] * 2.0
     turning = skew(w) + (motion.whirl if whole else whirl(spin))
     shifting = skew(w_c) + whirl(spin_c)
     found = []
@@ -201,6 +201,6 @@ def of_rates(link: Link, place: Placed, motion: Motion, parent: Motion, rates: A
 def columns(link: Link, place: Placed) -> list[tuple[Vector, Vector]]:
     """(w; v) of H* for each dof."""
     return [
-        in_link(link, place, lambda other, dof=dof: 1.0 if other == dof else 0.0)  # type: ignore[misc]
+        hinge_motion(link, place, lambda other, dof=dof: 1.0 if other == dof else 0.0)  # type: ignore[misc]
         for dof in link.dofs
     ]

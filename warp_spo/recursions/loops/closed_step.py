@@ -19,11 +19,11 @@ from ...trace.emission import Store
 from ...trace.scalars import Value, less
 from ...trace.spatial import total
 from ..articulated_sweeps import expand, reduce
-from ..integration import moved
-from ..links import Link, placed
+from ..integration import integrate_link
+from ..links import Link, place_link
 from ..step import Step
 from . import clusters
-from .closures import Ratio, opened
+from .closures import Ratio, count_open_rows
 from .clusters import Cluster, Columns
 from .embedded import ClosedLoops, Embedding
 from .multipliers import combine_rows, loop_system
@@ -66,14 +66,14 @@ class ClosedStep(Step):
 
     def _close(self, cluster: Cluster, q: Columns, qd: Columns) -> None:
         count = 1 if all(isinstance(tie, Ratio) for _, tie in cluster.constraints) else NEWTON_STEPS
-        place = lambda: {id(link): placed(link, q.__getitem__) for link in cluster.links}  # noqa: E731
+        place = lambda: {id(link): place_link(link, q.__getitem__) for link in cluster.links}  # noqa: E731
         places = place()
-        tied = clusters.tied(cluster, places, self.loops.embedding.rows, self.trace.epsilon)
+        tied = clusters.tie_rows(cluster, places, self.loops.embedding.rows, self.trace.epsilon)
         self.margins += tied.space.margins
         for _ in range(count):
             step = tied.space.particular([-g for g in tied.errors(places, q.__getitem__)])
             for link in cluster.links:
-                new = moved(link, q.__getitem__, lambda dof: step.get(dof, 0.0), 1.0)  # noqa: B023
+                new = integrate_link(link, q.__getitem__, lambda dof: step.get(dof, 0.0), 1.0)  # noqa: B023
                 q |= {link.coordinate + c: value for c, value in enumerate(new)}
             places = place()
         rows = [row for _, tie in cluster.constraints for row in tie.jacobian(places)]
@@ -92,8 +92,10 @@ class ClosedStep(Step):
 
     def _open(self) -> Value:
         q, qd = self.after
-        places = {id(link): placed(link, q.__getitem__) for cluster in self.loops.clusters for link in cluster.links}
-        return opened(self.loops.constraints, places, q.__getitem__, qd.__getitem__)
+        places = {
+            id(link): place_link(link, q.__getitem__) for cluster in self.loops.clusters for link in cluster.links
+        }
+        return count_open_rows(self.loops.constraints, places, q.__getitem__, qd.__getitem__)
 
 
 class MultiplierStep(Step):

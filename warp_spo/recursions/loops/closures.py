@@ -20,7 +20,7 @@ from ...trace.scalars import Value, less, reciprocal
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, dot, total
 from .. import articulated
 from ..links import Link, Links, Placed, Seat
-from ..motion import in_link, own_bias
+from ..motion import hinge_motion, own_bias
 
 PARALLEL = 1e-6  # sine of the angle between two axes of a loop joint, below which they are one
 OPEN = 1e-5  # [rad], or distance over arm; a larger error is an open closure. Float32 rounds a few turns by less
@@ -194,7 +194,7 @@ def _moved(link: Link, place: Placed, over: State, qd: Any, qdd: Any) -> State:
     acceleration = acceleration + cross(rate, d) + cross(spin, cross(spin, d))
     velocity = velocity + cross(spin, d)
     if qd is not None:
-        w, v = (axes @ part for part in in_link(link, place, qd))
+        w, v = (axes @ part for part in hinge_motion(link, place, qd))
         rate = rate + cross(spin, w)
         acceleration = acceleration + 2.0 * cross(spin, v)
         own = own_bias(link, place, qd)
@@ -202,7 +202,7 @@ def _moved(link: Link, place: Placed, over: State, qd: Any, qdd: Any) -> State:
             rate, acceleration = rate + axes @ own[0], acceleration + axes @ own[1]
         spin, velocity = spin + w, velocity + v
     if qdd is not None:
-        w, v = (axes @ part for part in in_link(link, place, qdd))
+        w, v = (axes @ part for part in hinge_motion(link, place, qdd))
         rate, acceleration = rate + w, acceleration + v
     return State(axes, over.origin + d, spin, velocity, rate, acceleration)
 
@@ -274,8 +274,11 @@ def closures(links: Links) -> list[Closure | Ratio]:
     return found
 
 
-def opened(
-    constraints: list[Closure | Ratio], places: dict[int, Placed], q: Callable[[int], Value], qd: Callable[[int], Value]
+def count_open_rows(
+    constraints: list[Closure | Ratio],
+    places: dict[int, Placed],
+    q: Callable[[int], Value],
+    qd: Callable[[int], Value],
 ) -> Value:
     """Return how many rows are open by more than OPEN: in g relative to its size, or in Y qd relative to the rates."""
     found = []

@@ -24,7 +24,7 @@ from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from .. import articulated, newton_euler
 from ..articulated import NO_INERTIA
 from ..links import Link, Links, Placed
-from ..motion import Motion, in_hinge
+from ..motion import Motion, hinge_entries
 from .closures import Closure, Ratio
 from .nullspace import Basis, NullSpace
 
@@ -104,7 +104,7 @@ class Tied:
         return [values[i] for i in self.numbers]
 
 
-def tied(
+def tie_rows(
     cluster: Cluster, places: dict[int, Placed], kept: Any, epsilon: float, held: frozenset[int] = frozenset()
 ) -> Tied:
     """Return a cluster with the rows ``kept``, by number in the scene; dofs in ``held`` do not move."""
@@ -177,7 +177,7 @@ def factor(
             n, f = P.apply(Vector(H[:3]), Vector(H[3:]))
             over: Link | None = link
             while over is not None and id(over) in inside:
-                for row, force in zip(over.dofs, in_hinge(over, places[id(over)], n, f), strict=True):
+                for row, force in zip(over.dofs, hinge_entries(over, places[id(over)], n, f), strict=True):
                     M[row, dof] = M[dof, row] = force + (armature if row == dof else 0.0)
                 n, f = places[id(over)].pose.force_to_parent(n, f)
                 over = over.parent
@@ -232,7 +232,7 @@ def hinge_forces(
     alpha: dict[int, tuple[Vector, Vector]] = {}
     for link in cluster.links:
         above = alpha.get(id(link.parent), (ZERO, ZERO))
-        alpha[id(link)] = newton_euler.accelerated(link, places[id(link)], motions[id(link)], above, qdd)
+        alpha[id(link)] = newton_euler.link_acceleration(link, places[id(link)], motions[id(link)], above, qdd)
     tau: Columns = {}
     passed: dict[int, Vector] = {}
     handed = Vector((*ZERO, *ZERO))
@@ -254,7 +254,9 @@ def hinge_forces(
     return tau, handed
 
 
-def expanded(cluster: Cluster, done: Factor, rates: list[Value], k: Columns, above: tuple[Vector, Vector]) -> Columns:
+def expand_cluster(
+    cluster: Cluster, done: Factor, rates: list[Value], k: Columns, above: tuple[Vector, Vector]
+) -> Columns:
     """Return qdd by dof, for rates = D^-1 eps and the acceleration ``above`` of the parent."""
     alpha = (*above[0], *above[1])
     y = [a - b for a, b in zip(rates, done.solve([dot(column, alpha) for column in done.U]), strict=True)]

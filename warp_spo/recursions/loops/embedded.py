@@ -93,7 +93,7 @@ class ClosedLoops:
         """Return the factored constraints of a cluster; ``fixed`` dofs do not move."""
         self.label(cluster, "y")
         rows = self.embedding.rows
-        return aggregates.tied(cluster, self.trace.places, rows, self.trace.epsilon, frozenset(fixed))
+        return aggregates.tie_rows(cluster, self.trace.places, rows, self.trace.epsilon, frozenset(fixed))
 
     def sweep(
         self,
@@ -145,7 +145,7 @@ class ClosedLoops:
                 self.trace.label(link, "z")
                 right = [tau(dof) for dof in link.dofs]
                 inner[key] = done.in_parent
-                swept.link_rates[key], forces[key] = articulated.reduced(
+                swept.link_rates[key], forces[key] = articulated.reduce_link(
                     link, place, done, self.trace.motions[key], force, right
                 )
                 continue
@@ -204,17 +204,17 @@ class ClosedLoops:
             place, move = self.trace.places[key], self.trace.motions[key]
             cluster = self.cluster_of.get(key)
             if cluster is None:
-                found, alpha[key] = articulated.expanded(
+                found, alpha[key] = articulated.expand_link(
                     link, place, swept.links[key], swept.link_rates[key], move, above
                 )
                 qdd |= zip(link.dofs, found, strict=True)
                 continue
             if link is cluster.links[0]:
                 at = id(cluster)
-                qdd |= aggregates.expanded(
+                qdd |= aggregates.expand_cluster(
                     cluster, swept.clusters[at], swept.cluster_rates[at], swept.demanded[at], above
                 )
-            alpha[key] = newton_euler.accelerated(link, place, move, above, qdd.__getitem__)
+            alpha[key] = newton_euler.link_acceleration(link, place, move, above, qdd.__getitem__)
         return qdd, alpha
 
 

@@ -187,7 +187,7 @@ def _propagate_inward(
         key, cluster = id(over), loops.cluster_of.get(id(over))
         if cluster is None:
             right = [tau.get(dof, 0.0) for dof in over.dofs]
-            rates[key], force = articulated.reduced(
+            rates[key], force = articulated.reduce_link(
                 over, loops.trace.places[key], swept.links[key], STILL, force, right
             )
             inner = over.parent

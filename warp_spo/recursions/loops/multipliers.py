@@ -15,7 +15,7 @@ from ...trace.spatial import ZERO, Vector, total
 from .. import articulated
 from ..articulated_sweeps import expand, mirror, pivots, reduce, weighted_products
 from ..motion import STILL
-from .closures import closures, opened
+from .closures import closures, count_open_rows
 from .clusters import Columns
 from .projection import move_all, place_links
 
@@ -63,7 +63,7 @@ def _loaded(trace: Trace, done: dict[int, articulated.Factor], tau: Columns) -> 
             continue
         force = Vector(total(other[c] for other in below) for c in range(6)) if below else Vector((*ZERO, *ZERO))
         key = id(link)
-        rates[key], forces[key] = articulated.reduced(link, trace.places[key], done[key], STILL, force, right)
+        rates[key], forces[key] = articulated.reduce_link(link, trace.places[key], done[key], STILL, force, right)
     return rates
 
 
@@ -115,4 +115,6 @@ def closure_step(trace: Trace, rates: bool = False) -> list[Store]:
 def closures_open(trace: Trace) -> list[Store]:
     """out [1] = how many rows are open"""
     place_links(trace)
-    return [Store("out", (0,), opened(closures(trace.links), trace.places, trace.vector("q"), trace.vector("qd")))]
+    return [
+        Store("out", (0,), count_open_rows(closures(trace.links), trace.places, trace.vector("q"), trace.vector("qd")))
+    ]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from ...trace.scalars import Value, absolute, guarded, is_constant, reciprocal, select, sqrt
 from ...trace.spatial import total
-from ..articulated import lost
+from ..articulated import zero_or_nan
 
 LEAST = 64.0  # roundings of a row's size; a smaller remainder may be rounding alone
 
@@ -50,7 +50,7 @@ class NullSpace:
     Attributes:
         basis: orthonormal vectors that Y makes zero, by column.
         margins: of each row, the square of its remainder after the rows before it, over its size.
-        nothing: zero, or NaN where a row is lost; the basis alone need not show that.
+        nothing: zero, or NaN where a row is zero_or_nan; the basis alone need not show that.
     """
 
     def __init__(self, rows: list[dict[int, Value]], sizes: list[Value], columns: list[int], epsilon: float):
@@ -70,7 +70,7 @@ class NullSpace:
     def _reflect(self, row: int, left: dict, size: Value, waiting: list, live: list, epsilon: float) -> tuple:
         square = guarded(total(x * x for x in left.values()), (LEAST * epsilon) ** 2 * size)
         self.margins.append(square * reciprocal(size))
-        self.nothing = self.nothing + lost(square)
+        self.nothing = self.nothing + zero_or_nan(square)
         if not left:
             pivot = live.pop(0)
             return row, pivot, square, None  # NaN: nothing is left of the row
