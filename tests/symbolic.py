@@ -119,7 +119,7 @@ def plant(monkeypatch, owner, name, old, new):
     if inspect.ismodule(owner):  # and every module that imports the function by name
         modules = [module for key, module in sys.modules.items() if key.startswith(warp_spo.__name__)]
         holders = [module for module in modules if getattr(module, name, None) is original]
-        for routine in (one for one in gc.get_objects() if isinstance(one, Routine) and one.trace is original):
+        for routine in (one for one in gc.get_objects() if type(one) is Routine and one.trace is original):
             monkeypatch.setitem(routine.__dict__, "trace", space[name])
     for holder in holders:
         monkeypatch.setattr(holder, name, space[name])
