@@ -7,6 +7,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # many small matrices: threa
 import numpy as np
 import pytest
 import warp as wp
+from slow_cases import SLOW_CASES
 
 from warp_spo.execution import plan
 from warp_spo.kernels import native
@@ -35,6 +36,12 @@ def pytest_configure(config):
     plan.DEFAULT = None if asked == "plan" else asked
     if not config.getoption("--optimized"):
         native.kernel = without_optimization(native.kernel)
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if item.nodeid.rpartition("/")[2] in SLOW_CASES:
+            item.add_marker(pytest.mark.slow)
 
 
 def without_optimization(make):
