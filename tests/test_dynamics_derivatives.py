@@ -320,14 +320,14 @@ def test_operations_are_no_more_than_they_were(name):
 
 # -- planted bugs ------------------------------------------------------------------------------------------------------
 BUGS = {
-    "sign of the Coriolis force": (sensitivity.Carried, "force", "+ cross(s.spin, self", "- cross(s.spin, self"),
+    "sign of the Coriolis force": (sensitivity.CarriedSums, "force", "+ cross(s.spin, self", "- cross(s.spin, self"),
     "S' of a ball": (sensitivity, "of_coordinates", "motion.spin, own", "spin_c, own"),
     "the whirl": (sensitivity, "of_coordinates", "skew(w) + (", "skew(w) - ("),
     "the joint's own slide": (sensitivity, "of_coordinates", " + cross(change, slide)", ""),
     "the parent's spin in a rate": (sensitivity, "of_rates", "spin_c + motion.spin", "motion.spin"),
     "drift of the origins": (sensitivity.Row, "to_parent", " + cross(drift, v) * 2.0", ""),
     "moments of a load": (sensitivity, "to_parent", " + _lever(l, pull)", ""),
-    "a row's pull": (sensitivity.Carried, "row", " + cross(self.pull, v)", ""),
+    "a row's pull": (sensitivity.CarriedSums, "row", " + cross(self.pull, v)", ""),
     "the force elsewhere": (dense, "_entries", " + cross(s.shift, force[1])", ""),
     "the force turned": (dense, "_entries", "n + cross(s.turn, force[0])", "n"),
 }

@@ -16,7 +16,7 @@ from .. import composite, motion, newton_euler
 from ..links import Link, Placed
 from ..motion import STILL, Motion
 from . import sensitivity
-from .sensitivity import Carried, Sensitivity
+from .sensitivity import CarriedSums, Sensitivity
 
 if TYPE_CHECKING:
     from ..tracing import Trace
@@ -30,7 +30,7 @@ def inverse_dynamics_derivatives(trace: Trace) -> list[Store]:
     rates = trace.vector("qd") if moves else None
     alpha: dict[int, tuple[Vector, Vector]] = {}
     own: dict[int, tuple[list[Sensitivity], list[Sensitivity]]] = {}
-    carried: dict[int, Carried] = {}
+    carried: dict[int, CarriedSums] = {}
     forces: dict[int, tuple[Vector, Vector]] = {}
     drifts: dict[int, Vector] = {}
     stores: list[Store] = []
@@ -84,7 +84,7 @@ def _wrenches(trace: Trace, link: Link) -> list[tuple[Vector, Vector, Vector]]:
 
 
 def _entries(
-    trace: Trace, link: Link, all_in: Carried, force: tuple[Vector, Vector], own: dict, drifts: dict[int, Vector]
+    trace: Trace, link: Link, all_in: CarriedSums, force: tuple[Vector, Vector], own: dict, drifts: dict[int, Vector]
 ) -> list[Store]:
     """Entries of the three blocks in which a dof of the link meets one of its hinge or nearer to the root."""
     place, stores = trace.places[id(link)], []

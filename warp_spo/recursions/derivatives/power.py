@@ -61,7 +61,7 @@ class Seen(NamedTuple):
         return _flat([*self.moving, *self.axes, *self.turning])
 
 
-class Carried(NamedTuple):
+class FromParent(NamedTuple):
     """Vectors that a link receives from its parent, in its own axes: motion without its own rates, and axes.
 
     Attributes:
@@ -72,7 +72,7 @@ class Carried(NamedTuple):
     apart: list[Vector]
 
     @classmethod
-    def of(cls, place: Placed, parent: Seen, axes: Matrix) -> Carried:
+    def of(cls, place: Placed, parent: Seen, axes: Matrix) -> FromParent:
         pose, (spin, w, v, mu_w, mu_v) = place.pose, parent.moving
         mu = pose.motion_to_child(mu_w, mu_v)
         raw = [pose.to_child(spin), pose.to_child(w), pose.to_child(v + parent.turning @ pose.l), *mu, *axes]
@@ -98,7 +98,7 @@ class Power:
         w, v = trace.base_acceleration if base is None else base
         inertial = Moving(ZERO, w, v, ZERO, ZERO)
         seen: dict[int | None, Seen] = {None: Seen(inertial, Matrix(), turning_of(inertial))}
-        carried: dict[int, Carried] = {}
+        carried: dict[int, FromParent] = {}
         moved: dict[int, Moving] = {}
         bars: dict[int, list[Value]] = {}
         for link, outward in trace.traversal():
@@ -106,7 +106,7 @@ class Power:
             if outward:
                 trace.place(link)
                 trace.label(link, "m")
-                carried[key] = Carried.of(trace.places[key], seen[over], trace.axes.get(key, Matrix()))
+                carried[key] = FromParent.of(trace.places[key], seen[over], trace.axes.get(key, Matrix()))
                 moved[key] = self._moved(link, carried[key].apart)
                 seen[key] = Seen.of(moved[key], carried[key].apart[5:])
                 trace.axes[key] = seen[key].axes
@@ -128,7 +128,7 @@ class Power:
         return moved if own is None else moved._replace(w=moved.w + own[0], v=moved.v + own[1])
 
     def _handed(
-        self, link: Link, mine: Seen, moved: Moving, carried: Carried, parent: Seen, others: list[list[Value]]
+        self, link: Link, mine: Seen, moved: Moving, carried: FromParent, parent: Seen, others: list[list[Value]]
     ) -> list[Value]:
         """Return the gradient by what the link's parent exposes; ``others``: the same from the link's children."""
         bars = self._back([_power(link.grouped, self.trace.external_wrench(link), mine)], [1.0], mine.all)

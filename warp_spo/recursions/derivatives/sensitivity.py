@@ -34,7 +34,7 @@ class Sensitivity(NamedTuple):
     v: Vector
 
 
-class Carried(NamedTuple):
+class CarriedSums(NamedTuple):
     """Sums over all that a link carries: rho from its origin, u the velocity relative to it, in its axes.
 
     Attributes:
@@ -49,8 +49,8 @@ class Carried(NamedTuple):
     load: Matrix
     pull: Vector
 
-    def __add__(self, other: tuple) -> Carried:
-        return Carried(*(a + b for a, b in zip(self, other, strict=True)))
+    def __add__(self, other: tuple) -> CarriedSums:
+        return CarriedSums(*(a + b for a, b in zip(self, other, strict=True)))
 
     @property
     def coriolis(self) -> Matrix:
@@ -90,7 +90,7 @@ class Row(NamedTuple):
         return Row(w, v, pose.to_parent(self.spin) + cross(drift, v) * 2.0, pose.to_parent(self.turn))
 
 
-EMPTY = Carried(Rigid(0.0, ZERO, NONE), NONE, ZERO, NONE, ZERO)
+EMPTY = CarriedSums(Rigid(0.0, ZERO, NONE), NONE, ZERO, NONE, ZERO)
 
 
 def drift(link: Link, place: Placed, parent: Motion | None, qd: object) -> Vector:
@@ -101,29 +101,29 @@ def drift(link: Link, place: Placed, parent: Motion | None, qd: object) -> Vecto
     return own if parent is None else own + cross(parent.spin, place.pose.l)
 
 
-def of_body(inertia: Rigid | None, motion: Motion) -> Carried:
+def of_body(inertia: Rigid | None, motion: Motion) -> CarriedSums:
     """A body that turns about its link's origin: u = omega x rho."""
     if inertia is None:
         return EMPTY
     J = inertia.inertia
     half = 0.5 * (J[0][0] + J[1][1] + J[2][2])
     second = symmetric(half - J[0][0], half - J[1][1], half - J[2][2], -J[0][1], -J[0][2], -J[1][2])  # sum m rho rho*
-    return Carried(inertia, skew(motion.spin) @ second, cross(motion.spin, inertia.moment), NONE, ZERO)
+    return CarriedSums(inertia, skew(motion.spin) @ second, cross(motion.spin, inertia.moment), NONE, ZERO)
 
 
-def under_load(moment_arm: Vector, force: Vector, torque: Vector) -> Carried:
+def under_load(moment_arm: Vector, force: Vector, torque: Vector) -> CarriedSums:
     """A wrench on a body."""
     return EMPTY._replace(load=_lever(moment_arm, force) - skew(torque), pull=force)
 
 
-def to_parent(place: Placed, drifting: Vector, own: Carried) -> Carried:
+def to_parent(place: Placed, drifting: Vector, own: CarriedSums) -> CarriedSums:
     """What a link carries, about its parent's origin and in its axes."""
     pose, l = place.pose, place.pose.l
     body = pose.rigid_to_parent(own.body)
     momentum = pose.to_parent(own.momentum)
     pull = pose.to_parent(own.pull)
     flow = pose.turned(own.flow) + _outer(momentum, l) + _outer(drifting, body.moment)
-    return Carried(body, flow, momentum + drifting * own.body.mass, pose.turned(own.load) + _lever(l, pull), pull)
+    return CarriedSums(body, flow, momentum + drifting * own.body.mass, pose.turned(own.load) + _lever(l, pull), pull)
 
 
 def _outer(a: Vector, b: Vector) -> Matrix:
