@@ -16,7 +16,7 @@ import warp_spo as spo
 from warp_spo.execution import plan
 from warp_spo.kernels import straight
 from warp_spo.recursions.derivatives import power
-from warp_spo.recursions.derivatives.power import CarriedSums, Power
+from warp_spo.recursions.derivatives.power import FromParent, Power
 from warp_spo.reference import Dense
 
 WORLDS = 3
@@ -159,7 +159,7 @@ BUGS = {
     "the sense of a turn": (Power, "_handed", "x[1] * bars[3 * at] - x[0]", "x[1] * bars[3 * at] + x[0]"),
     "lambda and the armature": (Power, "_handed", "a * x for a, x", "0.0 * x for a, x"),
     "the Coriolis acceleration": (Power, "_moved", "2.0 * cross(spin, v_d)", "cross(spin, v_d)"),
-    "what is met by the arm": (CarriedSums, "of", "parent.turning @ pose.l", "parent.turning @ pose.l * 0.0"),
+    "what is met by the arm": (FromParent, "of", "parent.turning @ pose.l", "parent.turning @ pose.l * 0.0"),
     "omega'": (power, "turning_of", "skew(moving.w) + ", ""),
 }
 
