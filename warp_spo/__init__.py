@@ -11,6 +11,7 @@ from .errors import DirectedLoopError, UnsupportedError
 from .graph.factorization import Factorization
 from .graph.operators import BWA, Blocks, Identity, Operator
 from .hinges.functions import clip, spline, where
+from .scene.actuators import Actuator, Keyframe
 from .scene.parts import Body, Coupling, Hinge, Loop
 from .scene.scene import Scene
 from .scene.tree import Digraph, Tree
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BWA",
+    "Actuator",
     "Blocks",
     "Body",
     "Coupling",
@@ -34,6 +36,7 @@ __all__ = [
     "Factorization",
     "Hinge",
     "Identity",
+    "Keyframe",
     "Loop",
     "Operator",
     "Scene",

@@ -12,7 +12,7 @@ from ..gradients import check_plain
 from .parts import IDENTITY_POSE, real
 from .scene import Scene
 
-Frame = Any  # a body (its index, its label, or the part of its label after the last slash), or (body, pose in the body)
+Frame = Any  # a body (its index, label, or the label's part after the last slash), (body, pose in it), or a site's name
 
 
 def check_frames(scene: Scene, call: str, frames: Sequence[Frame]) -> tuple[tuple[int, tuple[float, ...]], ...]:
@@ -28,8 +28,10 @@ def check_frames(scene: Scene, call: str, frames: Sequence[Frame]) -> tuple[tupl
 
 def _check_frame(scene: Scene, call: str, frame: Frame) -> tuple[int, tuple[float, ...]]:
     """Return the body of one frame, and the frame's origin in the body frame."""
-    body, pose = frame if isinstance(frame, tuple | list) and len(frame) == 2 else (frame, IDENTITY_POSE)
     labels = scene.body_labels
+    if isinstance(frame, str) and frame in scene.sites and frame not in labels:
+        frame = scene.sites[frame]
+    body, pose = frame if isinstance(frame, tuple | list) and len(frame) == 2 else (frame, IDENTITY_POSE)
     if isinstance(body, str):
         matches = [at for at, label in enumerate(labels) if label == body]
         matches = matches or [at for at, label in enumerate(labels) if label.rpartition("/")[2] == body]

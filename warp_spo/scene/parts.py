@@ -50,7 +50,8 @@ DOF_VALUES = {
 }
 
 
-def _pose(call: str, name: str, value: Any) -> np.ndarray:
+def checked_pose(call: str, name: str, value: Any) -> np.ndarray:
+    """Return a checked pose (x, y, z, qx, qy, qz, qw), its quaternion normalised; ValueError if it is none."""
     pose = checked_array(call, name, value, (7,))
     return read_only(np.concatenate([pose[:3], checked_unit(call, f"the quaternion (xyzw) of {name}", pose[3:])]))
 
@@ -201,8 +202,8 @@ class Hinge:
             raise ValueError(f"{call}: pose= and coordinates= belong to a custom hinge")
         else:
             put("elements", elements(self.kind, self.screws))
-        put("parent_pose", _pose(call, "parent_pose", self.parent_pose))
-        put("child_pose", _pose(call, "child_pose", self.child_pose))
+        put("parent_pose", checked_pose(call, "parent_pose", self.parent_pose))
+        put("child_pose", checked_pose(call, "child_pose", self.child_pose))
         for name, default in DOF_VALUES.items():
             field = name.removeprefix("joint_")
             value = getattr(self, field)

@@ -6,13 +6,14 @@ frame is the child anchor of the hinge that carries the body, and the columns of
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from ..errors import refuse_masked
+from .actuators import Actuator, Keyframe
 from .parts import (
     DOF_VALUES,
     Body,
@@ -21,6 +22,7 @@ from .parts import (
     Loop,
     checked_array,
     checked_inertia,
+    checked_pose,
     checked_unit,
     read_only,
     real,
@@ -57,9 +59,13 @@ class Scene:
         gravity: acceleration of a falling body [m/s^2], inertial axes, shape (3,).
         loops: hinges that close loops of the tree; ``loops=`` of :class:`Dynamics` says what to do with them.
         couplings: linear relations between two coordinates.
+        actuators: forces that control values command.
+        sites: named frames, (body index, pose in the body (x, y, z, qx, qy, qz, qw)) by name.
+        keyframes: named states.
 
     Attributes:
-        bodies, hinges, loops, couplings: the arguments; :meth:`with_values` changes only ``values``.
+        bodies, hinges, loops, couplings, actuators, sites, keyframes: the arguments; :meth:`with_values` changes only
+            ``values``.
         tree: the :class:`Tree` over the bodies.
         hinge_of: index of the hinge that carries each body [body].
         q_start, qd_start: first entry of q and qd of each hinge, and the total at the end [hinge + 1].
@@ -84,9 +90,13 @@ class Scene:
         gravity: Any = (0.0, 0.0, -9.81),
         loops: Sequence[Loop] = (),
         couplings: Sequence[Coupling] = (),
+        actuators: Sequence[Actuator] = (),
+        sites: Mapping[str, tuple[int, Any]] = MappingProxyType({}),
+        keyframes: Mapping[str, Keyframe] = MappingProxyType({}),
     ):
         self.bodies, self.hinges = _parts("bodies", bodies, Body), _parts("hinges", hinges, Hinge)
         self.loops, self.couplings = _parts("loops", loops, Loop), _parts("couplings", couplings, Coupling)
+        self.actuators = _parts("actuators", actuators, Actuator)
         self._check_indices()
         self.hinge_of = np.empty(len(self.bodies), dtype=np.int32)
         for index, hinge in enumerate(self.hinges):
@@ -118,6 +128,25 @@ class Scene:
         self.dof_linear = np.concatenate([linear for _, _, linear in screws])
         self.q_index = np.arange(self.coord_count)[None]
         self.dof_index = np.arange(self.dof_count)[None]
+        self.sites = MappingProxyType({name: self._site(name, *site) for name, site in sites.items()})
+        self.keyframes = MappingProxyType({name: self._keyframe(name, key) for name, key in keyframes.items()})
+
+    def _site(self, name: str, body: int, pose: Any) -> tuple[int, tuple[float, ...]]:
+        """Return the body and the checked pose of a site."""
+        call = f"Scene: site {name!r}"
+        if not isinstance(body, int | np.integer) or not -1 <= body < len(self.bodies):
+            raise ValueError(f"{call} is on body {body!r}; expected 0 to {len(self.bodies) - 1}, or -1")
+        return int(body), tuple(checked_pose(call, "its pose", pose).tolist())
+
+    def _keyframe(self, name: str, key: Keyframe) -> Keyframe:
+        """Return a keyframe whose arrays are checked."""
+        sizes = (self.coord_count, self.dof_count, len(self.actuators))
+        return Keyframe(
+            *(
+                read_only(checked_array(f"Scene: keyframe {name!r}", field, array, (size,)))
+                for field, array, size in zip(Keyframe._fields, key, sizes, strict=True)
+            )
+        )
 
     @staticmethod
     def _screws_of(hinge: Hinge) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -127,7 +156,7 @@ class Scene:
         return axes.reshape(-1, 3), angular, linear
 
     def _check_indices(self) -> None:
-        """Raise an error if hinges, loops and couplings do not name the right bodies and hinges."""
+        """Raise an error if hinges, loops, couplings and actuators do not name the right bodies and hinges."""
         count = len(self.bodies)
         if count == 0:
             raise ValueError("Scene: no bodies; expected one or more")
@@ -165,6 +194,13 @@ class Scene:
                     raise ValueError(
                         f"Scene: a coupling names hinge {index}; expected one of {len(self.hinges)} "
                         f"hinges with one coordinate"
+                    )
+        for number, actuator in enumerate(self.actuators):
+            for index in actuator.hinges:
+                if not 0 <= index < len(self.hinges) or self.hinges[index].coord_count != 1:
+                    raise ValueError(
+                        f"Scene: actuator {number} {actuator.label!r} names hinge {index}; expected one of "
+                        f"{len(self.hinges)} hinges with one coordinate"
                     )
 
     # -- sizes and names -------------------------------------------------------------------------------------------
