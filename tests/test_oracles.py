@@ -373,7 +373,7 @@ def test_what_newton_misreads_is_refused(name, tmp_path):
 def test_newton_misreads(name, tmp_path, monkeypatch, device):
     """Without the refusal the scene is another robot. A failure says that Newton has learnt it: the refusal can go."""
     path = changed_probe(tmp_path, *MISREAD[name][0])
-    monkeypatch.setattr("warp_spo.newton.files.find_misread", lambda root, floating: {})
+    monkeypatch.setattr("warp_spo.newton.mjcf.find_misread", lambda root, floating: {})
     scene = spo.load(path)
     with pytest.raises(AssertionError):
         file_agrees(scene, ParsedMjcf(scene, path), device)

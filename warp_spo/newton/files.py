@@ -1,34 +1,21 @@
-"""Scenes from URDF, MJCF and USD files, read by Newton's importers.
-
-Features that an importer reads wrongly are corrected before the import, or raise UnsupportedError.
-"""
+"""Scenes from robot files, by their format, and the files that come with Newton."""
 
 from __future__ import annotations
 
 import os
-import warnings
 from pathlib import Path
 from xml.etree.ElementTree import ParseError
 
 import newton
-import numpy as np
 
-from ..errors import UnsupportedError
 from ..scene.scene import Scene
-from .model import from_newton
-from .robot_files import (
-    MISREAD,
-    find_misread,
-    mjcf_gravity,
-    mjcf_needs_meshes,
-    mjcf_source,
-    mjcf_tree,
-    robot_format,
-    urdf_source,
-)
-from .worlds import quote_labels, to_numpy
+from .mjcf import read_mjcf
+from .urdf import read_urdf
+from .usd import read_usd
 
-REPAIR = 1e-5  # relative change of a mass or inertia above which finalize() repaired it; float32 rounds by less
+FORMATS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf"} | dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "usd")
+"""Format by suffix in lower case."""
+
 
 SHIPPED = {
     "humanoid": "nv_humanoid.xml",
@@ -78,7 +65,7 @@ def load(path: str | os.PathLike[str], floating: bool | None = None) -> Scene:
     file = Path(path)
     importer = robot_format(file)
     try:
-        builder = {"urdf": _read_urdf, "mjcf": _read_mjcf, "usd": _read_usd}[importer](file, floating)
+        return {"urdf": read_urdf, "mjcf": read_mjcf, "usd": read_usd}[importer](file, floating)
     except ParseError as error:
         raise ValueError(f"load: {str(file)!r} is not XML: {error}; expected {importer.upper()}") from None
     except ImportError as error:
@@ -88,83 +75,21 @@ def load(path: str | os.PathLike[str], floating: bool | None = None) -> Scene:
             f"load: {str(file)!r} needs a package that is missing ({error}) to read {need}; "
             f"pip install warp_spo[{extra}]"
         ) from error
-    return from_newton(_finalize(builder))
 
 
-def _finalize(builder: newton.ModelBuilder) -> newton.Model:
-    """Return the model on the CPU, and name the bodies that were repaired in a warning; Newton's only counts them."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Inertia validation corrected", category=newton.NewtonWarning)
-        # from_newton checks the topology itself, and it accepts joints outside articulations, which USD files have.
-        model = builder.finalize(device="cpu", skip_validation_joints=True)
-    if builder.body_count == 0:
-        return model
-    before, after = np.array(builder.body_inertia, dtype=np.float64).reshape(-1, 3, 3), to_numpy(model, "body_inertia")
-    scale = np.maximum(np.abs(before).max(axis=(1, 2)), np.finfo(np.float32).tiny)
-    moved = np.abs(after - before).max(axis=(1, 2)) > REPAIR * scale
-    moved |= ~np.isclose(builder.body_mass, to_numpy(model, "body_mass"), rtol=REPAIR, atol=0.0)
-    if moved.any():
-        names = quote_labels([builder.body_label[body] for body in np.flatnonzero(moved)])
-        warnings.warn(
-            f"load: Newton replaced the mass or inertia of {names}: the file's values are those of no rigid body "
-            "(negative, or one principal moment exceeds the sum of the others); correct the file",
-            UserWarning,
-            stacklevel=3,
+def robot_format(file: Path) -> str:
+    """Return the format of an existing robot file by its suffix: "urdf", "mjcf" or "usd".
+
+    Raises:
+        ValueError: The suffix is none of a robot file.
+        FileNotFoundError: There is no such file.
+    """
+    name = FORMATS.get(file.suffix.lower())
+    if name is None:
+        raise ValueError(f"load: {str(file)!r} ends in {file.suffix!r}; expected one of {', '.join(FORMATS)}")
+    if not file.is_file():
+        raise FileNotFoundError(
+            f"load: no file {str(file)!r} (from {os.getcwd()!r}); expected the path of a "
+            f"{name.upper()} file; call shipped(name) for a robot that comes with Newton"
         )
-    return model
-
-
-def _read_urdf(file: Path, floating: bool | None) -> newton.ModelBuilder:
-    builder = newton.ModelBuilder()
-    builder.add_urdf(urdf_source(file, floating), floating=floating)
-    return builder
-
-
-def _read_mjcf(file: Path, floating: bool | None) -> newton.ModelBuilder:
-    root = mjcf_tree(file)
-    misread = find_misread(root, floating)
-    if misread:
-        features = [
-            f"{feature} ({'class' if '<default>' in feature else 'body'} {quote_labels(where)})"
-            for feature, where in misread.items()
-        ]
-        ways_out = dict.fromkeys(MISREAD[feature] for feature in misread)
-        raise UnsupportedError("load", f"{str(file)!r} with {', '.join(features)}", "; ".join(ways_out))
-
-    source, needs_meshes = mjcf_source(file, root), mjcf_needs_meshes(root)
-    if needs_meshes and source != str(file):
-        raise UnsupportedError(
-            "load",
-            f"{str(file)!r} with a default class 'main' beside masses from meshes",
-            "remove class='main', which the outermost <default> has anyway, or write the <inertial> of each body",
-        )
-
-    def import_with(parse_mujoco_options: bool) -> newton.ModelBuilder:
-        builder = newton.ModelBuilder()
-        builder.add_mjcf(
-            source,
-            floating=floating,
-            parse_visuals=False,
-            parse_meshes=needs_meshes,
-            parse_mujoco_options=parse_mujoco_options,
-        )
-        return builder
-
-    try:
-        builder = import_with(parse_mujoco_options=True)
-    except ValueError as error:
-        # Newton 1.8 cannot read some of MuJoCo's options, such as gymnasium's solver="pgs"; a scene needs none of them.
-        try:
-            builder = import_with(parse_mujoco_options=False)
-        except ValueError:
-            raise error from None
-    gravity = mjcf_gravity(root)  # Newton 1.8 does not read it
-    if gravity is not None:
-        builder.gravity = gravity
-    return builder
-
-
-def _read_usd(file: Path, floating: bool | None) -> newton.ModelBuilder:
-    builder = newton.ModelBuilder()
-    builder.add_usd(str(file), floating=floating, load_visual_shapes=False, skip_mesh_approximation=True)
-    return builder
+    return name

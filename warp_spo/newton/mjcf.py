@@ -1,0 +1,140 @@
+"""Scenes from MJCF files, read by Newton's importer.
+
+An MJCF tree is searched, includes pasted in, for masses that come from meshes, for gravity, which Newton's importer
+does not read, and for features that it misreads. It is written anew where the importer would lose the default class
+"main".
+"""
+
+from __future__ import annotations
+
+import copy
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import newton
+
+from ..errors import UnsupportedError
+from ..scene.scene import Scene
+from .imported import scene_of
+from .mjcf_differences import MISREAD, find_misread
+from .worlds import quote_labels
+
+
+def mjcf_tree(file: Path) -> ET.Element:
+    """Return the XML tree of an MJCF file with the files that it includes pasted in.
+
+    Raises:
+        ET.ParseError: The file, or a file that it includes, is not XML.
+        ValueError: The file is XML but not MJCF.
+    """
+    root = _read_with_includes(file, file.parent)
+    if root.tag not in ("mujoco", "mujocoinclude"):
+        raise ValueError(
+            f"load: {str(file)!r} holds <{root.tag}>; expected <mujoco>; if it is URDF, let its name end in .urdf"
+        )
+    return root
+
+
+def _read_with_includes(file: Path, folder: Path, above: tuple[Path, ...] = ()) -> ET.Element:
+    """Return the tree of ``file``. Paths in it are relative to ``folder``; the files ``above`` include this one."""
+    root = ET.parse(file).getroot()
+    for parent in list(root.iter()):
+        for index, child in reversed(list(enumerate(parent))):
+            included = folder / child.get("file", "") if child.tag == "include" else None
+            if included is not None and included.is_file() and included not in above:
+                parent[index : index + 1] = list(_read_with_includes(included, folder, (*above, included)))
+    return root
+
+
+def mjcf_needs_meshes(root: ET.Element) -> bool:
+    """Whether a body of the MJCF tree takes its mass from meshes: it has a mesh and no <inertial>."""
+
+    def shapes(element: ET.Element) -> list[ET.Element]:
+        frames = [shape for frame in element.findall("frame") for shape in shapes(frame)]
+        return element.findall("geom") + frames
+
+    always = any(compiler.get("inertiafromgeom") == "true" for compiler in root.findall("compiler"))
+    return any(
+        (always or body.find("inertial") is None) and any(shape.get("mesh") for shape in shapes(body))
+        for body in root.iter("body")
+    )
+
+
+def mjcf_gravity(root: ET.Element) -> list[float] | None:
+    """Return the gravity [m/s^2] that the MJCF tree sets, the last one if there are several, None if there is none."""
+    if root.find("option/flag[@gravity='disable']") is not None:
+        return [0.0, 0.0, 0.0]
+    options = root.findall("option[@gravity]")
+    return [float(g) for g in options[-1].get("gravity", "").split()] if options else None
+
+
+def mjcf_source(file: Path, root: ET.Element) -> str:
+    """Return the source for an MJCF importer: the path of the file, or text in which "main" is a class like others.
+
+    Newton 1.8 applies the outermost <default> to all elements only if it has no class, and then it has no class "main"
+    by which an element could opt out of its childclass. The text has one outermost <default> without a class, which
+    holds the elements of all those in the file, and an empty class "main" inside it. An importer that reads text has no
+    folder in which to look for meshes.
+    """
+    named = any(default.get("class") == "main" for default in root.findall("default"))
+    asked = any("main" in (element.get("class"), element.get("childclass")) for element in root.iter())
+    if not named and not (asked and root.findall("default")):
+        return str(file)
+    root = copy.deepcopy(root)
+    outermost = ET.Element("default")
+    for default in root.findall("default"):
+        root.remove(default)
+        for element in default:
+            earlier = None if element.tag == "default" else outermost.find(element.tag)
+            if earlier is None:
+                outermost.append(element)
+            else:
+                earlier.attrib.update(element.attrib)
+    ET.SubElement(outermost, "default", {"class": "main"})
+    root.insert(0, outermost)
+    return ET.tostring(root, encoding="unicode")
+
+
+def read_mjcf(file: Path, floating: bool | None) -> Scene:
+    """Return the scene of an MJCF file; UnsupportedError if it uses a feature that Newton misreads."""
+    root = mjcf_tree(file)
+    misread = find_misread(root, floating)
+    if misread:
+        features = [
+            f"{feature} ({'class' if '<default>' in feature else 'body'} {quote_labels(where)})"
+            for feature, where in misread.items()
+        ]
+        ways_out = dict.fromkeys(MISREAD[feature] for feature in misread)
+        raise UnsupportedError("load", f"{str(file)!r} with {', '.join(features)}", "; ".join(ways_out))
+
+    source, needs_meshes = mjcf_source(file, root), mjcf_needs_meshes(root)
+    if needs_meshes and source != str(file):
+        raise UnsupportedError(
+            "load",
+            f"{str(file)!r} with a default class 'main' beside masses from meshes",
+            "remove class='main', which the outermost <default> has anyway, or write the <inertial> of each body",
+        )
+
+    def import_with(parse_mujoco_options: bool) -> newton.ModelBuilder:
+        builder = newton.ModelBuilder()
+        builder.add_mjcf(
+            source,
+            floating=floating,
+            parse_visuals=False,
+            parse_meshes=needs_meshes,
+            parse_mujoco_options=parse_mujoco_options,
+        )
+        return builder
+
+    try:
+        builder = import_with(parse_mujoco_options=True)
+    except ValueError as error:
+        # Newton 1.8 cannot read some of MuJoCo's options, such as gymnasium's solver="pgs"; a scene needs none of them.
+        try:
+            builder = import_with(parse_mujoco_options=False)
+        except ValueError:
+            raise error from None
+    gravity = mjcf_gravity(root)  # Newton 1.8 does not read it
+    if gravity is not None:
+        builder.gravity = gravity
+    return scene_of(builder)
