@@ -10,6 +10,7 @@ import torch
 import warp as wp
 import zoo
 from border import POSE, WORLDS, assert_right, dynamics, explained, given, scene
+from granularities import of_random_scenes
 from laws import OPERATIONS, TOLERANCE
 
 import warp_spo as spo
@@ -337,6 +338,6 @@ def test_tensors_are_numbers(recwarn):
 def test_hinges_listed_child_first_and_forests(device):
     """Any numbering: the reference reads the same scene by its own walk."""
     for built in (zoo.from_parents([1, 2, -1], ["revolute", "ball", "free"], 5), zoo.forest()):
-        dyn = spo.Dynamics(built, WORLDS, device=device, dtype="float64")
+        dyn = spo.Dynamics(built, WORLDS, device=device, dtype="float64", granularity=of_random_scenes())
         for operation in OPERATIONS:
             laws.equals_reference(dyn, operation, laws.states(built, WORLDS), TOLERANCE["float64"])

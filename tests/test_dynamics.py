@@ -83,7 +83,8 @@ def test_renumbering_moves_entries_only(device):
     arrays = laws.states(scene, 3)
     moved = {"q": arrays["q"][:, new.q]} | {key: arrays[key][:, new.qd] for key in ("qd", "tau", "qdd", "b")}
     moved["body_f"] = arrays["body_f"][:, new.body]
-    before, after = (spo.Dynamics(s, 3, device=device, dtype="float64") for s in (scene, new.scene))
+    more = {"dtype": "float64", "granularity": of_random_scenes()}
+    before, after = (spo.Dynamics(s, 3, device=device, **more) for s in (scene, new.scene))
     for name in ("forward_dynamics", "inverse_dynamics", "gravity_force", "passive_force"):
         wanted = laws.numpy_call(before, name, arrays)[:, new.qd]
         assert laws.error(laws.numpy_call(after, name, moved), wanted) <= TOLERANCE["float64"], name

@@ -58,10 +58,11 @@ def test_traces_equal_the_reference(name, device):
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("worlds", [1, 3, 33])
-def test_kernels_equal_the_reference_and_node_granularity(worlds, dtype, device):
-    scene = scene_of("tree20")
-    dyn, ops, q = fused("tree20", worlds, device, dtype)
-    _, sweeps, _ = fused("tree20", worlds, device, dtype, granularity="node")
+@pytest.mark.parametrize("name", ["tree10", pytest.param("tree20", marks=pytest.mark.slow)])
+def test_kernels_equal_the_reference_and_node_granularity(name, worlds, dtype, device):
+    scene = scene_of(name)
+    dyn, ops, q = fused(name, worlds, device, dtype)
+    _, sweeps, _ = fused(name, worlds, device, dtype, granularity="node")
     dense = [reference.Dense(scene, q[world]) for world in range(worlds)]
     for expression in ("phi", "psi", "phi.strict", "mass"):
         build, wanted = EXPRESSIONS[expression]

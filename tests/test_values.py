@@ -40,7 +40,8 @@ def test_a_variable_value_is_the_reference_of_each_world(name, kind, device):
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_all_variable_values_together(dtype, device):
-    dyn = spo.Dynamics(scene(), WORLDS, device=device, dtype=dtype, variable=NAMES)
+    more = {"granularity": of_random_scenes()}  # test_granularity_values has the others
+    dyn = spo.Dynamics(scene(), WORLDS, device=device, dtype=dtype, variable=NAMES, **more)
     values = {name: drawn(name, WORLDS) for name in NAMES}
     dyn.set(**{name: made(KINDS[i % 3], value, dyn) for i, (name, value) in enumerate(values.items())})
     assert_equals(dyn, scene().with_values(**values), tolerance=FLOAT32_VALUES if dtype == "float32" else None)
@@ -68,7 +69,7 @@ def test_operators_follow_set_after_update(device):
 
 def test_newtons_types_are_taken_as_they_are(device):
     """wp.mat33, wp.vec3 and wp.transform arrays, as a model holds them."""
-    dyn = spo.Dynamics(scene(), WORLDS, device=device, variable=NAMES)
+    dyn = spo.Dynamics(scene(), WORLDS, device=device, variable=NAMES, granularity=of_random_scenes())
     values = {name: drawn(name, WORLDS) for name in ("body_inertia", "body_com", "gravity", "joint_X_p")}
     types = {"body_inertia": wp.mat33, "body_com": wp.vec3, "gravity": wp.vec3, "joint_X_p": wp.transform}
     dyn.set(**{name: wp.array(values[name], dtype=types[name], device=device) for name in values})
@@ -143,7 +144,8 @@ def test_refused_in_words_and_nothing_is_set(case, device):
     values, error, words = REFUSED[case]
     if device.is_cuda and case in ("dtype", "grad", "strides"):  # a mistake other than the place
         values = {name: tensor.to(wp.device_to_torch(device)) for name, tensor in values.items()}
-    dyn = spo.Dynamics(scene(), WORLDS, device=device, variable=("joint_armature",))
+    more = {"granularity": of_random_scenes()}
+    dyn = spo.Dynamics(scene(), WORLDS, device=device, variable=("joint_armature",), **more)
     with pytest.raises(error, match="(?s)" + words):
         dyn.set(joint_armature=drawn("joint_armature", WORLDS), **values)
     assert_equals(dyn, scene(), ("mass_matrix", "forward_dynamics"))
@@ -152,7 +154,8 @@ def test_refused_in_words_and_nothing_is_set(case, device):
 def test_worlds_of_a_scene_with_values_of_its_own(device):
     """Values of the scene that differ between worlds stay, whatever else is variable."""
     varied = scene().with_values(body_mass=drawn("body_mass", WORLDS))
-    dyn = spo.Dynamics(varied, device=device, dtype="float64", variable="joint_armature")
+    more = {"granularity": of_random_scenes()}
+    dyn = spo.Dynamics(varied, device=device, dtype="float64", variable="joint_armature", **more)
     armature = drawn("joint_armature", WORLDS)
     dyn.set(joint_armature=armature)
     assert_equals(dyn, varied.with_values(joint_armature=armature))
