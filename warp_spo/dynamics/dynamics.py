@@ -35,6 +35,7 @@ from . import (
     scene_values,
     spatial_operators,
     steps,
+    storage,
 )
 from . import forward_dynamics as forward
 from . import hybrid_dynamics as hybrid
@@ -57,7 +58,8 @@ class Dynamics:
     Arrays are torch tensors, Warp arrays or NumPy arrays, [world, ...] and C-contiguous; the kind of the first one is
     the kind of the result, and ``out=`` is filled and returned. torch and Warp arrays must have this object's dtype and
     device; NumPy arrays are cast and copied. Coordinates, velocities and forces are those of the scene, see
-    :mod:`warp_spo.scene.parts`. One object serves one stream at a time.
+    :mod:`warp_spo.scene.parts`. One object serves one stream at a time. pickle and
+    ``copy.deepcopy`` build an equal object anew, with the values that :meth:`set` gave this one.
 
     Args:
         scene: the scene to compute.
@@ -155,6 +157,7 @@ class Dynamics:
     operators = spatial_operators.operators
     set = scene_values.set_values
     prepare = preparation.prepare
+    __reduce__ = storage.reduce
 
     _operations: ClassVar[dict[str, Operation]]
 
@@ -196,6 +199,16 @@ class Dynamics:
             raise UnsupportedError("Dynamics", f"refine={count} with loops={loops!r}", "dtype='float64'")
         self.refine = count
         self._refinement = Refinement(self, count) if count else None
+        self._options = {
+            "worlds": self.worlds,
+            "device": self.device.alias,
+            "dtype": self.dtype.__name__,
+            "variable": self.variable,
+            "granularity": granularity,
+            "loops": loops,
+            "independent": independent,
+            "refine": count,
+        }
 
     # -- loops -----------------------------------------------------------------------------------------------------
     @property

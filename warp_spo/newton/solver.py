@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
 import newton
 import numpy as np
@@ -172,6 +172,12 @@ class SolverSPO(Plugs, SolverBase):
         self.step(state, state, control, None, 1e-3)
         self.reset(state)
         self._arrays.set(self.dynamics, self.dynamics.variable)
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "SolverSPO: it cannot be pickled or copied, because it reads the arrays of a newton.Model; build "
+            "SolverSPO(model) anew, or store solver.dynamics, which can be pickled"
+        )
 
     @property
     def supported_observables(self) -> frozenset[str]:

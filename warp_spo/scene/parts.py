@@ -28,6 +28,7 @@ from .axes import in_plane as in_plane
 from .axes import screws_of
 from .checks import SYMMETRY, checked_array, checked_unit, read_only
 from .checks import real as real
+from .storage import StoredPart, check_function
 
 IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 UNLIMITED = 1e10
@@ -57,7 +58,7 @@ def checked_pose(call: str, name: str, value: Any) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Body:
+class Body(StoredPart):
     """A rigid body.
 
     The largest principal moment of inertia may exceed the sum of the others, although no distribution of positive mass
@@ -129,7 +130,7 @@ KINDS = (*CLOSING, *(name for name in BY_NAME if name not in CLOSING))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Hinge:
+class Hinge(StoredPart):
     """The edge of the tree that carries body ``child`` on body ``parent``.
 
     The child's pose in the parent is ``parent_pose * X(q) * child_pose^-1``; poses are (x, y, z, qx, qy, qz, qw).
@@ -239,7 +240,7 @@ class Hinge:
                 the rotation matrix (3, 3) of the child anchor in the parent anchor. It is called with abstract scalars
                 and with numbers, and may use ``+ - * / **``, abs, NumPy's sin, cos, tan, exp, log, sqrt, arctan2 and
                 hypot, ``spo.where`` in place of branches, ``spo.clip`` and ``spo.spline``. It must be twice
-                differentiable.
+                differentiable. To pickle the hinge, define the function at the top level of a module.
             values: other arguments of :class:`Hinge`: anchors, armature, springs, limits and so on, per coordinate.
 
         Raises:
@@ -251,6 +252,11 @@ class Hinge:
         armature of its coordinates keeps them finite.
         """
         return cls("custom", parent, child, coordinates=coordinates, pose=pose, **values)
+
+    def __getstate__(self) -> dict[str, Any]:
+        if self.pose is not None:
+            check_function(f"Hinge({self.label!r})" if self.label else "Hinge.custom", "pose", self.pose)
+        return super().__getstate__()
 
     @property
     def motion(self) -> int:
@@ -295,7 +301,7 @@ class Hinge:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Loop:
+class Loop(StoredPart):
     """A hinge that closes a loop: it constrains two bodies and owns no entry of ``q`` and ``qd``.
 
     The arguments are those of :class:`Hinge`; ``parent`` may be -1, the inertial frame.

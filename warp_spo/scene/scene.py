@@ -27,6 +27,7 @@ from .parts import (
     read_only,
     real,
 )
+from .storage import Stored
 from .tree import Tree
 
 NOT_NEGATIVE = ("body_mass", "joint_friction", "joint_effort_limit", "joint_velocity_limit")
@@ -47,7 +48,7 @@ def _parts(name: str, value: Any, kind: type) -> tuple:
     return parts
 
 
-class Scene:
+class Scene(Stored):
     """A multibody system: a forest of bodies, and the values that kernels read.
 
     The constructor checks values and never repairs them. Masses and principal moments may be zero, may have any ratio,
