@@ -14,16 +14,18 @@ import warp_spo as spo
 WORLDS = 2
 DT = 0.01
 INERTIAL = ("body_mass", "body_com", "body_inertia", "joint_armature", "gravity", "joint_X_p", "joint_X_c")
-GAINS = ("joint_damping", "joint_stiffness", "joint_friction", "joint_target_ke", "joint_target_kd")
+GAINS = ("joint_damping", "joint_stiffness", "joint_friction", "joint_target_ke", "joint_target_kd",
+         "body_gravcomp")  # fmt: skip
 VARIABLE = INERTIAL + GAINS
 check = functools.partial(gradcheck, atol=1e-5, rtol=1e-4)  # of torch: central differences with a step of 1e-6
 
 
 def furnished(scene):
-    """Drives, and friction that is nowhere zero, where its force has a kink."""
+    """Drives, gravity compensation, and friction that is nowhere zero, where its force has a kink."""
     n = scene.dof_count
     return scene.with_values(joint_friction=np.linspace(0.2, 1.0, n), joint_target_ke=np.linspace(2.0, 30.0, n),
-                             joint_target_kd=np.linspace(2.0, 3.0, n))  # fmt: skip
+                             joint_target_kd=np.linspace(2.0, 3.0, n),
+                             body_gravcomp=np.linspace(-0.5, 1.5, scene.body_count))  # fmt: skip
 
 
 def on(dyn, arrays, *names, grad=True):

@@ -20,7 +20,7 @@ def hinge_force(d, h, qd, target_q, target_qd):
     scene = d.scene
     one = scene.with_values(
         **{name: array[min(d.world, len(array) - 1)] for name, array in scene.values.items()}
-    ).with_values(joint_stiffness=ke, joint_rest_q=target_q)
+    ).with_values(joint_stiffness=ke, joint_rest_q=target_q, body_gravcomp=np.zeros(len(scene.bodies)))
     turn["drive"] = Dense(one, d.q).passive_force(np.zeros(d.dof_count))
     position = np.full(d.dof_count, np.nan)
     for hinge, q, v in zip(scene.hinges, scene.q_start, scene.qd_start, strict=False):

@@ -33,6 +33,12 @@ def furnished(scene, seed=0):
     )
 
 
+def held(scene, seed=0):
+    """The scene with gravity compensation of any size on every body but the first."""
+    share = np.random.default_rng(seed).uniform(-0.5, 1.5, scene.body_count)
+    return scene.with_values(body_gravcomp=np.where(np.arange(scene.body_count) > 0, share, 0.0))
+
+
 def smooth(scene, seed=0):
     """The scene with the laws whose forces have no kink, on every dof."""
     rng, n = np.random.default_rng(seed), scene.dof_count

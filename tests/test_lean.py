@@ -10,7 +10,7 @@ from routines import ROUTINES
 import warp_spo as spo
 from benchmarks import cases
 from warp_spo.execution.parameters import VARIABLE
-from warp_spo.recursions.links import LINK_VALUES
+from warp_spo.recursions.links import MOTION_VALUES
 
 GIVEN = {"forward_dynamics": ("qd", "tau"), "inverse_dynamics": ("qd", "qdd"), "solve_mass_matrix": ("b",),
          "mass_matrix": (), "mass_matrix_inverse": (), "log_det_mass_matrix": ()}  # fmt: skip
@@ -135,7 +135,7 @@ def test_bodies_that_do_not_move_cost_nothing():
 @pytest.mark.parametrize("name", VARIABLE)
 def test_what_varies_is_an_argument_and_nothing_else(name):
     found = program(arm(), "forward_dynamics", variable=(name,))
-    assert found.fields == (("value",) if name in LINK_VALUES else ())
+    assert found.fields == (("value",) if name in MOTION_VALUES else ())
     arguments = [argument.label for argument in found.kernel.adj.args]
     assert set(arguments) == {"worlds", "q", "qd", "tau", "out", *found.fields}
     assert program(arm(), "forward_dynamics").fields == ()

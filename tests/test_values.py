@@ -19,7 +19,11 @@ from warp_spo import reference
 
 NAMES_IN_KINDS = [  # a quick run sets every name from Warp arrays, and three names from all kinds
     pytest.param(
-        name, kind, marks=() if kind == "warp" or name in ("body_mass", "joint_X_p", "gravity") else pytest.mark.slow
+        name,
+        kind,
+        marks=()
+        if (kind == "warp" and name != "body_gravcomp") or name in ("body_mass", "joint_X_p", "gravity")
+        else pytest.mark.slow,
     )
     for name in NAMES
     for kind in KINDS

@@ -17,6 +17,7 @@ NAMES = (
     "body_mass",
     "body_com",
     "body_inertia",
+    "body_gravcomp",
     "joint_armature",
     "joint_damping",
     "joint_stiffness",

@@ -509,7 +509,7 @@ class Dense:
 
     # -- what belongs to a step --------------------------------------------------------------------------------------
     def passive_force(self, qd=None):
-        """Return -damping qd - stiffness deviation [dof].
+        """Return -damping qd - stiffness deviation + the sum of J* (-gravcomp mass gravity) at the bodies' CoMs [dof].
 
         The deviation of a screw's coordinate and of a free hinge's position is q - rest. That of a rotation (ball,
         free) is the rotation vector of R(q) R(rest)^T, no longer than pi, in the parent anchor's axes, those of qd.
@@ -522,7 +522,12 @@ class Dense:
                 deviation[self.dofs[k]] = np.concatenate([q[:-4] - r[:-4], turn])
             else:
                 deviation[self.dofs[k]] = q - r
-        return -self.value("joint_damping") * self._qd(qd) - self.value("joint_stiffness") * deviation
+        force = -self.value("joint_damping") * self._qd(qd) - self.value("joint_stiffness") * deviation
+        for k, share in enumerate(self.value("body_gravcomp")):
+            if share:
+                lift = -share * self.value("body_mass")[k] * self.value("gravity")
+                force += self.jacobian([(k, (*self.value("body_com")[k], 0, 0, 0, 1))])[0, :3].T @ lift
+        return force
 
     def integrate(self, qd, dt):
         """Return q after dt [s] at constant qd, with quaternions of unit length.

@@ -252,8 +252,8 @@ PASSIVE_FORCE = Operation(
 def passive_force(self: Dynamics, q: ArrayT, qd: AnyArray | None = None, out: ArrayT | None = None) -> ArrayT:
     """Compute the forces of the hinges' dampers and springs: -damping qd - stiffness (q - rest) [world, dof].
 
-    For ball and free hinges, q - rest of the rotation is the rotation vector of R(q) R(rest)^T in the parent anchor's
-    axes.
+    Bodies with ``gravcomp`` add J* (-gravcomp mass gravity), J the Jacobian of their centres of mass. For ball and free
+    hinges, q - rest of the rotation is the rotation vector of R(q) R(rest)^T in the parent anchor's axes.
     """
     return self._engine.run(PASSIVE_FORCE, out, q=q, qd=qd)
 

@@ -39,7 +39,7 @@ import warp as wp
 from ..arrays import Call
 from ..execution.routine import Routine
 from ..gradients import call_with_gradient, records_gradient
-from ..recursions.links import LINK_VALUES, Links
+from ..recursions.links import LINK_VALUES, MOTION_VALUES, Links
 from ..scene.frames import check_frames
 from ..scene.scene import Scene
 from . import samples
@@ -194,7 +194,7 @@ class Derivative:
 
     routine: Routine
     by: tuple[str, ...]
-    values: tuple[str, ...] = LINK_VALUES
+    values: tuple[str, ...] = MOTION_VALUES
     embed: Closed = NO_DERIVATIVE
     multipliers: Closed = NO_DERIVATIVE
     reads: str = ""

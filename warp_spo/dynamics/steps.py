@@ -108,6 +108,7 @@ def step(
 
     * damping: -damping qd'. Spring: -stiffness (q' - rest), as in :meth:`passive_force`.
     * drive: target_ke (target_q - q') + target_kd (target_qd - qd'), not beyond the effort limit.
+    * gravity compensation: -gravcomp mass gravity at the bodies' centres of mass, where they are before the step.
     * limits: limit_ke (limit - q') where q' is outside, and -limit_kd qd' where q is outside; they never pull inward.
       Limits of ball and free hinges: UnsupportedError.
     * dry friction: at most joint_friction against the motion. A hinge that sticks creeps by up to 1e-4 rad/s or m/s. In

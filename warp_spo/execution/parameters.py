@@ -23,6 +23,7 @@ VARIABLE = (
     "body_mass",
     "body_com",
     "body_inertia",
+    "body_gravcomp",
     "joint_armature",
     "joint_damping",
     "joint_stiffness",

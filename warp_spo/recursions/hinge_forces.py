@@ -1,19 +1,21 @@
-"""Forces of springs, dampers, drives, limits and friction at a state, by themselves."""
+"""Forces of springs, dampers, drives, limits, friction and gravity compensation at a state, by themselves."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from ..trace.emission import Store
-from ..trace.spatial import total
+from ..trace.scalars import Value
+from ..trace.spatial import Vector, total
 from .impedance import Impedance
+from .motion import hinge_entries
 
 if TYPE_CHECKING:
     from .tracing import Trace
 
 
 def hinge_force(trace: Trace) -> list[Store]:
-    """out = the forces of all laws at q, qd: springs, dampers, drives, limits and friction"""
+    """out = the forces of all laws at q, qd: springs, dampers, drives, limits, friction, and gravity compensation"""
     impedance = Impedance(
         trace.links,
         0.0,
@@ -24,18 +26,42 @@ def hinge_force(trace: Trace) -> list[Store]:
         trace.vector("target_qd"),
     )
     stores = []
+    held = compensation(trace)
     for link in trace.links.links:
         trace.label(link, "f")
         for dof, laws in zip(link.dofs, impedance.laws(link), strict=True):
-            stores.append(Store("out", (dof,), total(law.at(0.0) for law in laws)))
+            stores.append(Store("out", (dof,), total(law.at(0.0) for law in laws) + held.get(dof, 0.0)))
     return stores
 
 
 def passive_force(trace: Trace) -> list[Store]:
-    """out = -damping qd - stiffness (q - rest)"""
+    """out = -damping qd - stiffness (q - rest) + the forces that hold up the bodies' gravcomp"""
     impedance = Impedance(trace.links, 0.0, trace.vector("q"), trace.vector("qd"))
     stores = []
+    held = compensation(trace)
     for link in trace.links.links:
         trace.label(link, "f")
-        stores += [Store("out", (dof,), law.force) for dof, law in zip(link.dofs, impedance.passive(link), strict=True)]
+        for dof, law in zip(link.dofs, impedance.passive(link), strict=True):
+            stores.append(Store("out", (dof,), law.force + held.get(dof, 0.0)))
     return stores
+
+
+def compensation(trace: Trace) -> dict[int, Value]:
+    """Return the forces of the hinges that -gravcomp mass gravity at the bodies' CoMs amounts to, by dof."""
+    found: dict[int, Value] = {}
+    if not trace.compensate_gravity():
+        return found
+    forces: dict[int, Vector] = {}
+    for link, outward in trace.traversal():
+        if outward:
+            trace.place(link)
+            continue
+        trace.label(link, "g")
+        place, wrench = trace.places[id(link)], trace.external_wrench(link)
+        for child in link.children:
+            wrench = wrench + forces[id(child)]
+        n, f = Vector(wrench[:3]), Vector(wrench[3:])
+        found |= zip(link.dofs, hinge_entries(link, place, n, f), strict=True)
+        n, f = place.pose.force_to_parent(n, f)
+        forces[id(link)] = Vector((*n, *f))
+    return found

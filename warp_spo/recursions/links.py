@@ -24,11 +24,22 @@ from ..scene.scene import Scene
 from ..trace.scalars import Graph, Scalar, Value, is_constant
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
 
-LINK_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c", "joint_armature", "gravity")
+MOTION_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c", "joint_armature", "gravity")
+LINK_VALUES = (*MOTION_VALUES, "body_gravcomp")
 TABLES = ("value", "node_value")  # what links are made of; what bodies by themselves are, for the operators
 NOTHING = Rigid(0.0, ZERO, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 PRICES = (6, 10, 10, 10, 4, 4, 4, 8, 8, 8)  # of mass, first moment, moments and products of inertia
 ROUNDING = 1e-14  # a rotation's entry that is this close to 0 or 1 is meant to be
+
+
+class Lift(NamedTuple):
+    """The part of a link's bodies that gravity compensation holds up: sum of gravcomp mass, and its first moment."""
+
+    mass: Value
+    moment: Vector
+
+    def __add__(self, other: tuple) -> Lift:
+        return Lift(*(a + b for a, b in zip(self, other, strict=True)))
 
 
 @dataclasses.dataclass(eq=False)
@@ -46,6 +57,7 @@ class Link:
         inertia: of the bodies it carries, in its frame; None where it carries none.
         grouped: the same for sums of forces and composite inertias, where it may be counted elsewhere: what turns about
             its own axis, or does not turn, belongs to the parent as well as to the link. It need not be positive.
+        lift: the part of its bodies whose weight is compensated, in its frame; None where nothing is.
         node: the body whose hinge it belongs to; label: its name.
         com: the link's origin from the child anchor, in the link's axes: the body's centre of mass, if the hinge moves
             that.
@@ -65,12 +77,19 @@ class Link:
     com: Vector = ZERO
     inertia: Rigid | None = None
     grouped: Rigid | None = None
+    lift: Lift | None = None
     children: list = dataclasses.field(default_factory=list)
 
     def add(self, inertia: Rigid) -> None:
         if all(is_constant(x) and x == 0.0 for x in inertia.packed):
             return
         self.inertia = inertia if self.inertia is None else self.inertia + inertia
+
+    def hold_up(self, mass: Value, com: Vector) -> None:
+        """Compensate the weight of ``mass`` at ``com``, in the link's frame."""
+        if not (is_constant(mass) and mass == 0.0):
+            lift = Lift(mass, com * mass)
+            self.lift = lift if self.lift is None else self.lift + lift
 
 
 class Seat(NamedTuple):
@@ -148,6 +167,7 @@ class Links:
                 parent=twin[link.parent],
                 inertia=value(link.inertia),
                 grouped=value(link.grouped),
+                lift=value(link.lift),
                 matrix=value(link.matrix),
                 offset=value(link.offset),
                 com=value(link.com),
@@ -281,6 +301,8 @@ class Links:
         self.seats[node] = rest
         if rest.link is not None:
             rest.link.add(Pose(None, rest.matrix, rest.offset).rigid_to_parent(body.rigid))
+            share = self._values["body_gravcomp"].tolist()[node]
+            rest.link.hold_up(share * body.rigid.mass, rest.offset + rest.matrix @ body.com)
 
     def _append(self, link: Link) -> None:
         self.links.append(link)

@@ -43,6 +43,7 @@ class Step:
 
     def __init__(self, trace: Trace):
         self.trace, self.links = trace, trace.own_links
+        trace.compensate_gravity()
         vector, given = trace.vector, trace.inputs
         self.h = trace.graph.input("dt", 0)
         apart = "q_from" in given

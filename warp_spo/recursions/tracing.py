@@ -11,7 +11,7 @@ from typing import Any
 
 from ..trace.emission import Store
 from ..trace.scalars import Value
-from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector
+from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross
 from . import messages, motion, newton_euler
 from .links import Link, Links, Placed, place_link
 from .motion import STILL, Motion
@@ -34,6 +34,7 @@ class Trace:
 
     Attributes:
         places: by id of the link: its placement. motions: its velocity terms. axes: its axes in the inertial frame.
+        compensates: external wrenches hold up the bodies' ``gravcomp``, as forces of the hinges do.
         stiffened: returns a link with what a time step adds to its armature.
         news: messages that a piece sends apart from the others, because pieces of equal structure do not all send them.
         rounds: what a piece stores after it has received all news, in turns of which many may be alike.
@@ -65,6 +66,7 @@ class Trace:
         self.places: dict[int, Placed] = {}
         self.motions: dict[int, Motion] = {}
         self.axes: dict[int, Matrix] = {}
+        self.compensates = False
         self.stiffened: Callable[[Link], Link] = lambda link: link
         self.bodies: dict[int, list[int]] = {}  # by link: the bodies that sit on it
         for body, seat in links.seats.items():
@@ -90,13 +92,21 @@ class Trace:
         parent = None if link.parent is None else self.motions[id(link.parent)]
         qd = self.vector("qd") if moves else None
         self.motions[id(link)] = motion.link_motion(link, place, parent, qd) if moves else STILL
-        if "body_f" in self.inputs:
+        if "body_f" in self.inputs or self.compensates:
             R = IDENTITY if link.parent is None else self.axes[id(link.parent)]
             self.axes[id(link)] = R @ place.pose.rotation
+
+    def compensate_gravity(self) -> bool:
+        """Let external wrenches hold up the bodies' ``gravcomp`` from now on; return whether a body has any."""
+        self.compensates = any(link.lift is not None for link in self.links.links)
+        return self.compensates
 
     def external_wrench(self, link: Link) -> Vector:
         """Return (n; f) of the external wrenches on the bodies of a link, in its frame."""
         n, f = ZERO, ZERO
+        if self.compensates and link.lift is not None:
+            up = -(self.axes[id(link)].T @ self.links.gravity)
+            n, f = cross(link.lift.moment, up), up * link.lift.mass
         if "body_f" not in self.inputs:
             return Vector((*n, *f))
         axes = self.axes[id(link)]

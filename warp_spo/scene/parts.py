@@ -71,6 +71,9 @@ class Body(StoredPart):
         com: centre of mass in the body frame [m], shape (3,).
         inertia: about the centre of mass, body axes [kg m^2], shape (3, 3), symmetric, no negative eigenvalue.
         label: name in tables and errors.
+        gravcomp: share of the body's weight that a force at its centre of mass holds up, -gravcomp mass gravity, as
+            MuJoCo's attribute of that name. The force belongs to :meth:`Dynamics.passive_force` and to
+            :meth:`Dynamics.step`; other calls leave it out.
 
     Raises:
         ValueError: a value is invalid; the message names it.
@@ -82,12 +85,14 @@ class Body(StoredPart):
     inertia: Any = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     label: str = ""
     modes: Any = None
+    gravcomp: float = 0.0
 
     def __post_init__(self) -> None:
         call = f"Body({self.label!r})" if self.label else "Body"
         if self.modes is not None:
             raise UnsupportedError(call, "a flexible body (modes=)", "leave modes out for a rigid body")
         object.__setattr__(self, "mass", float(checked_array(call, "mass [kg]", self.mass, ())))
+        object.__setattr__(self, "gravcomp", float(checked_array(call, "gravcomp", self.gravcomp, ())))
         object.__setattr__(self, "com", checked_array(call, "com [m]", self.com, (3,)))
         inertia = checked_array(call, "inertia [kg m^2]", self.inertia, (3, 3))
         if self.mass < 0.0:

@@ -71,9 +71,9 @@ class Scene(Stored):
         hinge_of: index of the hinge that carries each body [body].
         q_start, qd_start: first entry of q and qd of each hinge, and the total at the end [hinge + 1].
         values: float64 arrays by Newton's names, [1 or worlds, ...]: body_mass [kg], body_com [m], body_inertia
-            [kg m^2], joint_X_p, joint_X_c (poses [hinge, 7]), gravity [m/s^2], joint_rest_q [coordinate], and per dof
-            joint_armature, joint_damping, joint_friction, joint_stiffness, joint_target_ke, joint_target_kd,
-            joint_limit_lower, joint_limit_upper, joint_limit_ke, joint_limit_kd, joint_effort_limit,
+            [kg m^2], body_gravcomp, joint_X_p, joint_X_c (poses [hinge, 7]), gravity [m/s^2], joint_rest_q
+            [coordinate], and per dof joint_armature, joint_damping, joint_friction, joint_stiffness, joint_target_ke,
+            joint_target_kd, joint_limit_lower, joint_limit_upper, joint_limit_ke, joint_limit_kd, joint_effort_limit,
             joint_velocity_limit.
         dof_axis [dof, 3], dof_angular [dof], dof_linear [dof]: the screws, in the parent anchor frame.
         q_index, dof_index: entries [worlds, n] of the source model's flat joint_q and joint_qd.
@@ -110,6 +110,7 @@ class Scene(Stored):
             "body_mass": np.array([[body.mass for body in self.bodies]]),
             "body_com": np.array([[body.com for body in self.bodies]]),
             "body_inertia": np.array([[body.inertia for body in self.bodies]]),
+            "body_gravcomp": np.array([[body.gravcomp for body in self.bodies]]),
             "joint_X_p": np.array([[hinge.parent_pose for hinge in self.hinges]]),
             "joint_X_c": np.array([[hinge.child_pose for hinge in self.hinges]]),
             "joint_rest_q": np.concatenate([hinge.rest for hinge in self.hinges])[None],

@@ -126,6 +126,7 @@ def step_vjp(trace: Trace, wrt: tuple[str, ...], equations: TreeEquations | None
         equations: what the accelerations solve; those of the open tree unless given.
     """
     equations = equations or TreeEquations(trace)
+    trace.compensate_gravity()
     qdd, qd, h = trace.vector("qdd"), trace.vector("qd"), trace.graph.input("dt", 0)
     pushed = trace.vector("q_cotangent"), trace.vector("qd_cotangent")
     links = trace.links.links
