@@ -17,14 +17,10 @@ from value_scenes import FLOAT32_VALUES, KINDS, NAMES, TELLING, WORLDS, assert_e
 import warp_spo as spo
 from warp_spo import reference
 
-NAMES_IN_KINDS = [  # a quick run sets every name from Warp arrays, and three names from all kinds
-    pytest.param(
-        name,
-        kind,
-        marks=()
-        if (kind == "warp" and name != "body_gravcomp") or name in ("body_mass", "joint_X_p", "gravity")
-        else pytest.mark.slow,
-    )
+QUICK = {*((name, "warp") for name in NAMES if name != "body_gravcomp")}  # that has tests of its own
+QUICK |= {(name, kind) for name in ("body_mass", "joint_X_p", "gravity") for kind in KINDS}
+NAMES_IN_KINDS = [  # a quick run sets names from Warp arrays, and three names from all kinds
+    pytest.param(name, kind, marks=() if (name, kind) in QUICK else pytest.mark.slow)
     for name in NAMES
     for kind in KINDS
 ]
