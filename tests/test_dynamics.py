@@ -47,6 +47,7 @@ def test_equals_reference(name, dtype, device):
         laws.equals_reference(dyn, operation, arrays, TOLERANCE[dtype])
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize(
     ("name", "dtype"),
     [
