@@ -22,6 +22,7 @@ ROOMS = (
     "errors",
     "status",
     "torch",
+    "dlpack",
     "arrays",
     "gradients",
     "kernels",

@@ -1,8 +1,9 @@
 """Checks and converts the arrays of every public call: :class:`Call`.
 
-The caller's arrays are torch tensors, Warp arrays or NumPy arrays, ``[world, ...]`` and C-contiguous. Kernels read and
-write torch and Warp arrays in place, so these must have the object's dtype and device; nothing is copied silently.
-NumPy arrays are cast and copied. The kind of the first array is the kind of the result.
+The caller's arrays are torch tensors, Warp arrays, NumPy arrays or arrays of a library that speaks DLPack, such as JAX
+and CuPy, ``[world, ...]`` and C-contiguous. Kernels read and write them in place, so they must have the object's dtype
+and device; nothing is copied silently. NumPy arrays alone are cast and copied. The kind of the first array is the kind
+of the result.
 
 :data:`ArrayT` says so to editors and type checkers: ``def f(self, q: ArrayT, out: ArrayT | None = None) -> ArrayT``
 returns a ``torch.Tensor`` for a ``torch.Tensor`` (or a ``torch.nn.Parameter``), a ``wp.array`` for a ``wp.array``, and
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, Union
 import numpy as np
 import warp as wp
 
+from . import dlpack
 from .errors import refuse_masked
 
 if TYPE_CHECKING:
@@ -72,10 +74,10 @@ def parse_device(device: Any = None, call: str = "device") -> wp.Device:
 
 
 def kind_of(array: object, call: str, name: str) -> str:
-    """Return ``NUMPY``, ``WARP`` or ``TORCH``.
+    """Return ``NUMPY``, ``WARP`` or ``TORCH``, or the :class:`warp_spo.dlpack.Library` of another array.
 
     Raises:
-        TypeError: ``array`` is none of the three, or it is a NumPy masked array.
+        TypeError: ``array`` is no array, it is a NumPy masked array, or JAX traces it.
     """
     if isinstance(array, wp.array):
         return WARP
@@ -84,10 +86,23 @@ def kind_of(array: object, call: str, name: str) -> str:
         return NUMPY
     if "torch" in sys.modules and torch_border().is_tensor(array):
         return TORCH
-    raise TypeError(
-        f"{call}: {name} is of type {type(array).__name__}; expected a torch tensor, a Warp array or a NumPy array; "
-        f"wrap numbers in numpy.array(...)"
-    )
+    if dlpack.is_traced(array):
+        raise TypeError(
+            f"{call}: {name} is traced by JAX (jit, grad or vmap), so it holds no numbers yet; expected an array with "
+            f"numbers; call warp_spo.jax.function(dyn, {call.rpartition('.')[2]!r}) there"
+        )
+    library = dlpack.library_of(array)
+    if library is None:
+        raise TypeError(
+            f"{call}: {name} is of type {type(array).__name__}; expected a torch tensor, a Warp array, a NumPy array, "
+            f"or an array with __dlpack__; wrap numbers in numpy.array(...)"
+        )
+    return library
+
+
+def device_of(array: Any, kind: str) -> Any:
+    """Return the device of an array of this kind, not NumPy's, as :func:`parse_device` takes it."""
+    return dlpack.device_of(array) if isinstance(kind, dlpack.Library) else array.device
 
 
 def shape_of(array: Any) -> tuple[int, ...]:
@@ -127,6 +142,7 @@ class Call:
         "_results",
         "_saved_stream",
         "_staged",
+        "_waits",
         "device",
         "dtype",
         "kind",
@@ -145,6 +161,7 @@ class Call:
         self._results: list[tuple] = []  # (caller's array or None, Warp array)
         self._staged: list[tuple] = []  # (NumPy array to fill, Warp array)
         self._saved_stream: wp.Stream | None = None
+        self._waits = False  # for kernels that a library does not know of
 
     def __enter__(self) -> "Call":
         return self
@@ -229,6 +246,8 @@ class Call:
 
     def _new(self, shape: tuple, dtype: type) -> tuple[Any, wp.array]:
         """Return (the caller's new array, None for NumPy; its Warp array)."""
+        if isinstance(self.kind, dlpack.Library):
+            return dlpack.new(self.name, self.kind, shape, dtype, self.device)
         if self.kind == TORCH and self.device.is_cuda:
             self._enter_stream()
         owner, array = new(self.kind, shape, dtype, self.device)
@@ -254,6 +273,14 @@ class Call:
             if array.requires_grad and getattr(wp._src.context.runtime, "tape", None) is not None:
                 self._refuse_grad(name, "is recorded by wp.Tape", "leave the tape's block")
             return array if array.dtype is dtype else view(array.ptr, came, dtype, self.device.alias)
+        if isinstance(kind, dlpack.Library):
+            if self.device.is_cuda:
+                self._order(name, kind)
+            came = dlpack.read(self.name, name, array, kind, self.device, change)
+            if came is None or not came.is_contiguous:
+                self._refuse_place(name, array, kind, came is None, change)
+            self._check(name, array, kind, came.shape, shape, meaning, dtype, came.dtype is dtype)
+            return came
         torch = torch_border()
         pointer = torch.pointer(self.name, name, array)
         self._check(name, array, kind, array.shape, shape, meaning, dtype, torch.has_dtype(array, dtype))
@@ -275,6 +302,18 @@ class Call:
         if change:
             torch.mark_changed(array)
         return view(pointer, tuple(array.shape), dtype, self.device.alias)
+
+    def _order(self, name: str, kind: dlpack.Library) -> None:
+        """Make the library's stream Warp's until the block ends; or else wait for the kernels when the block ends."""
+        if kind.has_stream and self._saved_stream is None:
+            self._enter_stream(dlpack.stream(self.device))
+        elif not kind.has_stream or self.device.stream != dlpack.stream(self.device):
+            self._waits = True
+            if self.device.is_capturing:
+                raise ValueError(
+                    f"{self.name}: {name} is a {kind} array inside a graph capture; expected Warp arrays, or tensors "
+                    f"of one library; pass warp.from_dlpack({name}), made before the capture"
+                )
 
     def _copy_numpy(
         self, name: str, array: np.ndarray, shape: tuple, meaning: str, dtype: Any, change: bool
@@ -320,9 +359,9 @@ class Call:
                 f"pass {name}.to_dense()"
             )
         if contiguous:
-            way = f"move it there, or build the object with device={str(array.device)!r}"
+            way = f"move it there, or build the object with device={str(device_of(array, kind))!r}"
             raise ValueError(f"{self.name}: {name} is {_describe(array, kind)}; expected it on {self.device}; {way}")
-        way = f"pass {name}.contiguous()"
+        way = f"pass {name}.contiguous()" if kind in (TORCH, WARP) else "pass a contiguous copy"
         if change:
             way = f"pass a contiguous array, then copy it into {name}: {name}.contiguous() is not {name}"
         raise ValueError(
@@ -364,11 +403,11 @@ class Call:
                     f"every other array, because the call writes it; pass a fresh array for one of them"
                 )
 
-    def _enter_stream(self) -> None:
-        """Make torch's current stream Warp's, until the block ends."""
+    def _enter_stream(self, wanted: wp.Stream | None = None) -> None:
+        """Make ``wanted``, by default torch's current stream, Warp's, until the block ends."""
         if self._saved_stream is None:
             current = self.device.stream
-            wanted = torch_border().stream(self.device)
+            wanted = wanted or torch_border().stream(self.device)
             self._saved_stream = current
             if wanted.cuda_stream != current.cuda_stream:
                 # Copies of this call's NumPy arrays may still run on the other stream. Without NumPy arrays nothing may
@@ -379,12 +418,16 @@ class Call:
     def _finish(self) -> None:
         """Fill NumPy arrays and set the result."""
         numpy_came = any(isinstance(array, np.ndarray) for _, array, _ in self._inputs)
-        if self.device.is_cuda and (numpy_came or self._staged or self.kind in (None, NUMPY)):
+        if self.device.is_cuda and (numpy_came or self._waits or self._staged or self.kind in (None, NUMPY)):
             wp.synchronize_stream(self.device.stream)  # copies made here are freed without regard to streams
         for array, warp_array in self._staged:
             array[...] = warp_array.numpy()
-        results = tuple(warp_array.numpy() if out is None else out for out, warp_array in self._results)
+        results = tuple(self._returned(warp_array) if out is None else out for out, warp_array in self._results)
         self.result = results[0] if len(results) == 1 else results or None
+
+    def _returned(self, array: wp.array) -> Any:
+        """Return a result that the call made, in its kind."""
+        return dlpack.share(array, self.kind) if isinstance(self.kind, dlpack.Library) else array.numpy()
 
 
 def new(kind: str | None, shape: tuple, dtype: type, device: wp.Device) -> tuple:
@@ -429,7 +472,7 @@ def _dtype_name(array: Any) -> str:
 
 
 def _describe(array: Any, kind: str) -> str:
-    place = "" if kind == NUMPY else f" on {array.device}"
+    place = "" if kind == NUMPY else f" on {device_of(array, kind)}"
     return f"a {kind} array {_dtype_name(array)} {tuple(array.shape)}{place}"
 
 

@@ -55,11 +55,12 @@ MOST_WORLDS = 2**31 - 1  # of an axis of a Warp array
 class Dynamics:
     """Dynamics of one scene in many worlds.
 
-    Arrays are torch tensors, Warp arrays or NumPy arrays, [world, ...] and C-contiguous; the kind of the first one is
-    the kind of the result, and ``out=`` is filled and returned. torch and Warp arrays must have this object's dtype and
-    device; NumPy arrays are cast and copied. Coordinates, velocities and forces are those of the scene, see
-    :mod:`warp_spo.scene.parts`. One object serves one stream at a time. pickle and
-    ``copy.deepcopy`` build an equal object anew, with the values that :meth:`set` gave this one.
+    Arrays are torch tensors, Warp arrays, NumPy arrays, or those of a library that speaks DLPack, such as JAX and CuPy,
+    [world, ...] and C-contiguous; the kind of the first one is the kind of the result, and ``out=`` is filled and
+    returned. All but NumPy arrays must have this object's dtype and device; NumPy arrays are cast and copied.
+    Coordinates, velocities and forces are those of the scene, see :mod:`warp_spo.scene.parts`. One object serves one
+    stream at a time. pickle and ``copy.deepcopy`` build an equal object anew, with the values that :meth:`set` gave
+    this one.
 
     Args:
         scene: the scene to compute.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..arrays import NUMPY, WARP, Call, kind_of, parse_device, parse_dtype
+from ..arrays import NUMPY, WARP, Call, device_of, kind_of, parse_device, parse_dtype
 from ..kernels import block_sparse
 from .algebra import Operator, Workspace
 
@@ -178,13 +178,13 @@ def matrix_size(call: str, name: str, array) -> tuple[int, int]:
 def choose_memory(call: str, arrays: Sequence, device, dtype) -> tuple:
     """Return device, dtype and kind for operators made of these arrays.
 
-    Unless given, device and dtype are those of the first torch or Warp array. If all arrays are NumPy, they are the CPU
-    and the dtype of the first array (float64 for integers). The kind is that of the first array.
+    Unless given, device and dtype are those of the first array that is not NumPy's. If all arrays are NumPy, they are
+    the CPU and the dtype of the first array (float64 for integers). The kind is that of the first array.
     """
     kinds = [kind_of(array, call, f"array {index}") for index, array in enumerate(arrays)]
-    first = next((array for array, kind in zip(arrays, kinds, strict=True) if kind != NUMPY), None)
+    first, kind = next((one for one in zip(arrays, kinds, strict=True) if one[1] != NUMPY), (None, NUMPY))
     if device is None:
-        device = "cpu" if first is None else first.device
+        device = "cpu" if first is None else device_of(first, kind)
     if dtype is None:
         dtype = first.dtype if first is not None else arrays[0].dtype if arrays else "float64"
         if isinstance(dtype, np.dtype) and dtype.kind in "biu":
