@@ -196,6 +196,68 @@ def body_velocities(s) -> wp.Kernel:
 
 
 @functools.cache
+def frame_poses(s) -> wp.Kernel:
+    """Write the position and quaternion (xyzw) of every frame in the inertial frame.
+
+    One thread for each (frame, world). A frame is given by its body and its pose in the body frame; ``anchor`` is
+    the pose of the node frame in the body.
+    """
+    T, vec3 = s.T, s.vec3
+
+    @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
+    def kernel(
+        frame_node: wp.array[int],
+        frame_pose: wp.array2d[T],  # [frame, (x, y, z, quaternion)]
+        anchor: wp.array3d[T],
+        world_pose: wp.array3d[T],
+        out: wp.array3d[T],
+    ):
+        frame, world = wp.tid()
+        node = frame_node[frame]
+        body = s.compose_inverse(s.load_pose(world_pose, node, world), s.load_pose(anchor, node, world))
+        R = s.quaternion_rotation(
+            frame_pose[frame, 3], frame_pose[frame, 4], frame_pose[frame, 5], frame_pose[frame, 6]
+        )
+        within = s.pose(R, vec3(frame_pose[frame, 0], frame_pose[frame, 1], frame_pose[frame, 2]))
+        pose = s.compose(body, within)
+        quaternion = wp.quat_from_matrix(s.rotation_of(pose))
+        for c in range(3):
+            out[world, frame, c] = pose[9 + c]
+        for c in range(4):
+            out[world, frame, 3 + c] = quaternion[c]
+
+    return kernel
+
+
+@functools.cache
+def frame_velocities(s) -> wp.Kernel:
+    """Write the velocity of every frame's origin, then its angular velocity, in inertial axes.
+
+    One thread for each (frame, world).
+    """
+    T, vec3 = s.T, s.vec3
+
+    @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
+    def kernel(
+        frame_node: wp.array[int],
+        frame_offset: wp.array2d[T],  # [frame, 3], origin of the frame in the body frame
+        anchor: wp.array3d[T],
+        world_pose: wp.array3d[T],
+        velocity: wp.array3d[T],
+        out: wp.array3d[T],
+    ):
+        frame, world = wp.tid()
+        node = frame_node[frame]
+        arm = vec3(frame_offset[frame, 0], frame_offset[frame, 1], frame_offset[frame, 2])
+        arm = s.point_to_child(s.load_pose(anchor, node, world), arm)
+        v = s.point_velocity(s.load_pose(world_pose, node, world), s.load_motion(velocity, node, world), arm)
+        for c in range(6):
+            out[world, frame, c] = v[c]
+
+    return kernel
+
+
+@functools.cache
 def jacobian(s) -> wp.Kernel:
     """Write the velocity of a frame's origin, then its angular velocity, in inertial axes, for unit qd of every dof.
 
@@ -235,4 +297,13 @@ def jacobian(s) -> wp.Kernel:
     return kernel
 
 
-KERNELS = (hinge, node_motion, world_poses, body_poses, body_velocities, jacobian)
+KERNELS = (
+    hinge,
+    node_motion,
+    world_poses,
+    body_poses,
+    body_velocities,
+    frame_poses,
+    frame_velocities,
+    jacobian,
+)

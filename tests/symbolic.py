@@ -13,6 +13,7 @@ from warp_spo.recursions import (
     composite,
     coordinates,
     determinant,
+    energy,
     forward_dynamics,
     hinge_forces,
     hybrid,
@@ -24,6 +25,7 @@ from warp_spo.recursions import (
     operators,
     quasi_velocities,
     reactions,
+    regressor,
     step,
 )
 from warp_spo.recursions.derivatives import adjoints, inverse_dynamics
@@ -36,7 +38,7 @@ from warp_spo.trace.scalars import ordered as ordered
 
 TREE = (forward_dynamics, newton_euler, composite, inverse, determinant, kinematics, operational, momentum, hybrid,
         quasi_velocities, reactions, step, hinge_forces, coordinates, operators, inverse_dynamics, adjoints, projection,
-        multipliers)  # fmt: skip
+        multipliers, energy, regressor)  # fmt: skip
 EMBEDDED = (minimal, embedded, embedded_adjoints)
 
 

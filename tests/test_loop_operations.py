@@ -15,8 +15,16 @@ OF_ALL_DOFS = {
     "body_velocities",
     "body_states",
     "integrate",
+    "frame_poses",
+    "frame_velocities",
     "frame_accelerations",
     "body_accelerations",
+    "com",
+    "com_velocity",
+    "kinetic_energy",
+    "potential_energy",
+    "difference",
+    "interpolate",
     "closure_error",
     "project",
 }
@@ -41,11 +49,27 @@ OF_MULTIPLIERS = {
     "centroidal_momentum_bias",
     "quasi_velocities",
     "loop_multipliers",
+    "inverse_dynamics_regressor",
+    "inverse_dynamics_regressor_product",
+    "inverse_dynamics_regressor_transposed_product",
 }
 """Terms of the equation that multipliers solve, Mass qdd + bias_force = tau + Y* lambda of all dofs."""
 
 
-BACKWARDS_OF_ALL_DOFS = {"body_poses", "body_velocities", "integrate"}
+BACKWARDS_OF_ALL_DOFS = {
+    "body_poses",
+    "body_velocities",
+    "frame_poses",
+    "frame_velocities",
+    "frame_accelerations",
+    "com",
+    "com_velocity",
+    "kinetic_energy",
+    "potential_energy",
+    "difference",
+    "interpolate",
+    "integrate",
+}
 
 
 def test_declared_as_written_is_what_this_file_knows():

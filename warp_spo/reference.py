@@ -15,59 +15,16 @@ from functools import cached_property
 import numpy as np
 
 from .reference_jets import curve
-
-
-def skew(vector):
-    """Return the matrix a~ with a~ b = a x b, shape (3, 3)."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-def rotation_about(axis, angle):
-    """Return the rotation matrix (3, 3) by an angle [rad] of any size about a unit vector."""
-    k = skew(axis)
-    return np.eye(3) + np.sin(angle) * k + 2.0 * np.sin(0.5 * angle) ** 2 * k @ k
-
-
-def rotation(quaternion):
-    """Return the rotation matrix (3, 3) of a quaternion xyzw of any length except zero."""
-    x, y, z, w = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(quaternion)
-    k = skew((x, y, z))
-    return np.eye(3) + 2.0 * w * k + 2.0 * k @ k
-
-
-def quaternion(matrix):
-    """Return a unit quaternion xyzw, of either sign, of a rotation matrix: the eigenvector of Bar-Itzhack's matrix."""
-    b = np.empty((4, 4))
-    b[:3, :3] = matrix + matrix.T - np.trace(matrix) * np.eye(3)
-    b[:3, 3] = b[3, :3] = matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]
-    b[3, 3] = np.trace(matrix)
-    return np.linalg.eigh(b)[1][:, -1]
-
-
-def quaternion_product(a, b):
-    """Return the quaternion xyzw of the rotation b followed by a."""
-    return np.array([*(a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3])), a[3] * b[3] - a[:3] @ b[:3]])
-
-
-def rotation_vector(matrix):
-    """Return the rotation vector [rad], no longer than pi, of a rotation matrix."""
-    q = quaternion(matrix)
-    q = q if q[3] >= 0.0 else -q
-    length = np.linalg.norm(q[:3])
-    return q[:3] * (2.0 * np.arctan2(length, q[3]) / length if length > 0.0 else 2.0)
-
-
-def homogeneous(pose):
-    """Return the 4 x 4 matrix of a pose (x, y, z, qx, qy, qz, qw)."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation(pose[3:]), pose[:3]
-    return matrix
-
-
-def pose7(matrix):
-    """Return the pose (x, y, z, qx, qy, qz, qw) of a 4 x 4 matrix; the unit quaternion has either sign."""
-    return np.concatenate([matrix[:3, 3], quaternion(matrix[:3, :3])])
+from .reference_rotations import (
+    homogeneous,
+    pose7,
+    quaternion,  # noqa: F401  for those who import it from here
+    quaternion_product,
+    rotation,
+    rotation_about,
+    rotation_vector,
+    skew,
+)
 
 
 class Dense:
@@ -336,6 +293,42 @@ class Dense:
         J[:3] -= skew(point - self.node_matrix[body][:3, 3]) @ J[3:]
         return J
 
+    def frame_poses(self, frames):
+        """Return the world pose of frames [frame, 7], [m, unit quaternion xyzw of either sign]; as :meth:`jacobian`."""
+        matrices = []
+        for frame in frames:
+            body, pose = frame if isinstance(frame, (tuple, list)) else (frame, (0, 0, 0, 0, 0, 0, 1))
+            matrices.append(self.body_matrix[body] @ homogeneous(np.asarray(pose, dtype=np.float64)))
+        return np.array([pose7(matrix) for matrix in matrices])
+
+    @property
+    def potential_energy(self):
+        """-m g . c of all bodies, zero at the origin, and stiffness (q - rest)^2 / 2 of all dofs [J]."""
+        springs = 0.5 * self.value("joint_stiffness") @ self._deviation**2
+        return springs - self.value("body_mass") @ self.com @ self.value("gravity")
+
+    def inverse_dynamics_regressor(self, qd, qdd):
+        """Return Y [dof, 10 bodies] of tau = Y parameters + armature qdd, for each body m, m c and
+        Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the body frame's origin, in its axes.
+
+        A column is Newton's and Euler's equations of a body with one parameter, about that origin in world axes.
+        """
+        W, _, A, AL = self._motion(self._qd(qd), self._vector("qdd", qdd, self.dof_count))
+        Y = np.zeros((self.dof_count, 10 * self.body_count))
+        for k, matrix in enumerate(self.body_matrix):
+            R, origin, w, al = matrix[:3, :3], matrix[:3, 3], W[k], AL[k]
+            r = origin - self.node_matrix[k][:3, 3]
+            a = A[k] + np.cross(al, r) + np.cross(w, np.cross(w, r)) - self.value("gravity")
+            J = self._jacobian_at(k, origin)
+            for i, unit in enumerate(np.eye(10)):
+                m, h, I = unit[0], R @ unit[1:4], np.zeros((3, 3))
+                I[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]] = I[[0, 1, 1, 2, 2, 2], [0, 0, 1, 0, 1, 2]] = unit[4:]
+                I = R @ I @ R.T
+                force = m * a + np.cross(al, h) + np.cross(w, np.cross(w, h))
+                moment = np.cross(h, a) + I @ al + np.cross(w, I @ w)
+                Y[:, 10 * k + i] = J.T @ np.concatenate([force, moment])
+        return Y
+
     def jacobian(self, frames):
         """Return the Jacobian of frames: velocity of the origin, then angular velocity, world axes [frame, 6, dof].
 
@@ -514,6 +507,16 @@ class Dense:
         The deviation of a screw's coordinate and of a free hinge's position is q - rest. That of a rotation (ball,
         free) is the rotation vector of R(q) R(rest)^T, no longer than pi, in the parent anchor's axes, those of qd.
         """
+        force = -self.value("joint_damping") * self._qd(qd) - self.value("joint_stiffness") * self._deviation
+        for k, share in enumerate(self.value("body_gravcomp")):
+            if share:
+                lift = -share * self.value("body_mass")[k] * self.value("gravity")
+                force += self.jacobian([(k, (*self.value("body_com")[k], 0, 0, 0, 1))])[0, :3].T @ lift
+        return force
+
+    @property
+    def _deviation(self):
+        """How far each dof is from rest [dof], see :meth:`passive_force`."""
         rest, deviation = self.value("joint_rest_q"), np.zeros(self.dof_count)
         for k, h in enumerate(self.scene.hinge_of):
             q, r = (array[self.scene.q_start[h] : self.scene.q_start[h + 1]] for array in (self.q, rest))
@@ -522,12 +525,23 @@ class Dense:
                 deviation[self.dofs[k]] = np.concatenate([q[:-4] - r[:-4], turn])
             else:
                 deviation[self.dofs[k]] = q - r
-        force = -self.value("joint_damping") * self._qd(qd) - self.value("joint_stiffness") * deviation
-        for k, share in enumerate(self.value("body_gravcomp")):
-            if share:
-                lift = -share * self.value("body_mass")[k] * self.value("gravity")
-                force += self.jacobian([(k, (*self.value("body_com")[k], 0, 0, 0, 1))])[0, :3].T @ lift
-        return force
+        return deviation
+
+    def difference(self, q1):
+        """Return the velocity [dof] that :meth:`integrate` takes from q to ``q1`` in 1 s, rotations the short way."""
+        q1 = self._vector("q1", q1, len(self.q))
+        velocity = np.zeros(self.dof_count)
+        for k, h in enumerate(self.scene.hinge_of):
+            a, b = (array[self.scene.q_start[h] : self.scene.q_start[h + 1]] for array in (self.q, q1))
+            if self.hinge[k].kind not in ("ball", "free"):
+                velocity[self.dofs[k]] = b - a
+                continue
+            velocity[self.dofs[k][-3:]] = rotation_vector(rotation(b[-4:]) @ rotation(a[-4:]).T)
+            if self.hinge[k].kind == "free":
+                to_node = np.linalg.inv(homogeneous(self.value("joint_X_c")[h]))
+                c = to_node[:3, :3] @ self.value("body_com")[k] + to_node[:3, 3]
+                velocity[self.dofs[k][:3]] = (b[:3] + rotation(b[3:]) @ c) - (a[:3] + rotation(a[3:]) @ c)
+        return velocity
 
     def integrate(self, qd, dt):
         """Return q after dt [s] at constant qd, with quaternions of unit length.

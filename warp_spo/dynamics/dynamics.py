@@ -26,12 +26,15 @@ from ..gradients import TensorValues
 from ..scene.scene import Scene
 from . import (
     closed_loops,
+    configurations,
     derivatives,
+    energy,
     inertia,
     kinematics,
     momentum,
     operational,
     preparation,
+    regressor,
     scene_values,
     spatial_operators,
     steps,
@@ -124,6 +127,8 @@ class Dynamics:
     body_accelerations = kinematics.body_accelerations
     jacobian = kinematics.jacobian
     jacobian_bias = kinematics.jacobian_bias
+    frame_poses = kinematics.frame_poses
+    frame_velocities = kinematics.frame_velocities
     frame_accelerations = kinematics.frame_accelerations
 
     # -- operational space -----------------------------------------------------------------------------------------
@@ -132,13 +137,23 @@ class Dynamics:
     operational_inertia = operational.operational_inertia
 
     # -- momentum --------------------------------------------------------------------------------------------------
+    com = momentum.com
+    com_velocity = momentum.com_velocity
     com_jacobian = momentum.com_jacobian
     centroidal_momentum_matrix = momentum.centroidal_momentum_matrix
     centroidal_momentum_bias = momentum.centroidal_momentum_bias
 
+    # -- energy ----------------------------------------------------------------------------------------------------
+    kinetic_energy = energy.kinetic_energy
+    potential_energy = energy.potential_energy
+
     # -- steps -----------------------------------------------------------------------------------------------------
     integrate = steps.integrate
     step = steps.step
+
+    # -- configurations --------------------------------------------------------------------------------------------
+    difference = configurations.difference
+    interpolate = configurations.interpolate
 
     # -- derivatives -----------------------------------------------------------------------------------------------
     inverse_dynamics_derivatives = derivatives.inverse_dynamics_derivatives
@@ -148,6 +163,11 @@ class Dynamics:
     inverse_dynamics_vjp = inverse.inverse_dynamics_vjp
     forward_dynamics_jvp = forward.forward_dynamics_jvp
     inverse_dynamics_jvp = inverse.inverse_dynamics_jvp
+
+    # -- identification --------------------------------------------------------------------------------------------
+    inverse_dynamics_regressor = regressor.inverse_dynamics_regressor
+    inverse_dynamics_regressor_product = regressor.inverse_dynamics_regressor_product
+    inverse_dynamics_regressor_transposed_product = regressor.inverse_dynamics_regressor_transposed_product
 
     # -- closed loops ----------------------------------------------------------------------------------------------
     closure_error = closed_loops.closure_error

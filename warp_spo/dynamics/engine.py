@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import warp as wp
 
 from ..arrays import Call
@@ -98,8 +99,10 @@ class Engine:
         found.update(options)
         return found
 
-    def _read(self, call: Call, argument: Argument, array: Any, frames: int) -> wp.array:
-        """Return one array argument."""
+    def _read(self, call: Call, argument: Argument, array: Any, frames: int) -> wp.array | float:
+        """Return one array argument, or the number that is given in its place."""
+        if argument.number and isinstance(array, int | float | np.number) and not isinstance(array, bool):
+            return float(array)
         shape, meaning = self.shape(argument.axes, frames)
         if argument.written:
             return call.update(argument.name, array, shape, meaning, dtype=argument.dtype)
@@ -166,6 +169,8 @@ class Engine:
             return int(axis)
         if axis.endswith(" frames"):
             return int(axis.split()[0]) * frames
+        if axis.endswith(" bodies"):
+            return int(axis.split()[0]) * dyn.scene.body_count
         return {
             "world": dyn.worlds,
             "coordinate": dyn.scene.coord_count,

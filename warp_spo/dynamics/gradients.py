@@ -98,7 +98,7 @@ class Gradients:
         """Return gradients of an operation with one result by launching its declared kernel, as :meth:`pull_back`."""
         derivative, shape, engine = derivative_of(operation), tuple(result.shape), self.dyn._engine
         with engine.call_named(f"{operation.name}, backwards") as call:
-            state = {name: array for name, array in given.items() if name in ("q", "qd")}
+            state = {name: array for name, array in given.items() if name in derivative.state}
             arrays = engine.read(call, operation, **state)
             arrays["cotangent"] = call.read("cotangent", cotangent, shape)
             arrays |= engine.read(call, operation, **options)

@@ -15,9 +15,11 @@ from ..recursions.links import Links
 from ..recursions.loops import minimal
 from ..scene.frames import Frame
 from .operation import (
+    ANCHORS,
     AS_WRITTEN,
     FRAMES,
     KINEMATIC,
+    ORIENTED_FRAMES,
     QD,
     QDD,
     Derivative,
@@ -35,7 +37,7 @@ POSES = Result("poses", "world, body, 7", quaternions=lambda scene: [7 * b + 3 f
 VELOCITIES = Result("velocities", "world, body, 6")
 
 
-def _anchors_fixed(links: Links, *_: object) -> bool:
+def _anchors_fixed(links: Links, *_: object, **__: object) -> bool:
     return not links.turns_vary
 
 
@@ -127,6 +129,81 @@ def body_states(
     return self._engine.run(BODY_STATES, out, q=q, qd=qd)
 
 
+FRAME_POSES = Operation(
+    "frame_poses",
+    arguments=(Q, ORIENTED_FRAMES),
+    results=(Result("poses", "world, frame, 7", quaternions=lambda scene: [3, 10]),),  # of the two frames of trials
+    routine=Routine("frame_poses", recursion.frame_poses, nodes.frame_poses, suits=_anchors_fixed),
+    embed=AS_WRITTEN,
+    multipliers=AS_WRITTEN,
+    derivative=Derivative(
+        Routine("frame_poses_vjp", adjoints.frame_poses_vjp),
+        by=("q",),
+        values=ANCHORS,
+        embed=AS_WRITTEN,
+        multipliers=AS_WRITTEN,
+        lacking=_lacks_fixed_anchors,
+    ),
+    trial=Trial(lambda dense, q, frames: dense.frame_poses(frames)),
+)
+
+
+@FRAME_POSES.method
+def frame_poses(self: Dynamics, q: ArrayT, frames: Sequence[Frame], out: ArrayT | None = None) -> ArrayT:
+    """Compute the pose of every frame in the inertial frame.
+
+    The quaternion of a frame that is a body is that of :meth:`body_poses`; otherwise it is the body's times the
+    frame's own.
+
+    Args:
+        q: coordinates [world, coordinate].
+        frames: bodies (index or label), pairs (body, pose of the frame in the body), or names of sites.
+        out: array for the result.
+
+    Returns:
+        [world, frame, 7]: x, y, z [m], quaternion xyzw.
+    """
+    return self._engine.run(FRAME_POSES, out, q=q, frames=frames)
+
+
+FRAME_VELOCITIES = Operation(
+    "frame_velocities",
+    arguments=(Q, required(QD), FRAMES),
+    results=(Result("velocities", "world, frame, 6"),),
+    routine=Routine("frame_velocities", recursion.frame_velocities, nodes.frame_velocities),
+    embed=AS_WRITTEN,
+    multipliers=AS_WRITTEN,
+    derivative=Derivative(
+        Routine("frame_velocities_vjp", adjoints.frame_velocities_vjp),
+        by=("q", "qd"),
+        values=KINEMATIC,
+        embed=AS_WRITTEN,
+        multipliers=AS_WRITTEN,
+    ),
+    trial=Trial(lambda dense, q, qd, frames: dense.jacobian(frames) @ qd),
+)
+
+
+@FRAME_VELOCITIES.method
+def frame_velocities(
+    self: Dynamics, q: ArrayT, qd: AnyArray, frames: Sequence[Frame], out: ArrayT | None = None
+) -> ArrayT:
+    """Compute the velocity of every frame, J qd, in one outward sweep.
+
+    Velocity of each frame's origin [m/s], then angular velocity [rad/s], inertial axes. qd is that of all dofs,
+    whatever ties them.
+
+    Args:
+        q, qd: the state [world, coordinate], [world, dof].
+        frames: as :meth:`frame_poses`.
+        out: array for the result.
+
+    Returns:
+        [world, frame, 6]
+    """
+    return self._engine.run(FRAME_VELOCITIES, out, q=q, qd=qd, frames=frames)
+
+
 JACOBIAN = Operation(
     "jacobian",
     arguments=(Q, FRAMES),
@@ -190,6 +267,14 @@ FRAME_ACCELERATIONS = Operation(
     routine=Routine("frame_accelerations", recursion.frame_accelerations),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,
+    derivative=Derivative(
+        Routine("frame_accelerations_vjp", adjoints.frame_accelerations_vjp),
+        by=("q", "qd", "qdd"),
+        values=KINEMATIC,
+        embed=AS_WRITTEN,
+        multipliers=AS_WRITTEN,
+        state=("q", "qd", "qdd"),
+    ),
     trial=Trial(
         lambda dense, q, qd, qdd, frames: dense.jacobian(frames) @ qdd + dense.jacobian_bias(qd, frames),
     ),

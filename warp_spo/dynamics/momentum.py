@@ -10,11 +10,62 @@ from typing import TYPE_CHECKING
 from ..arrays import AnyArray, ArrayT
 from ..execution.routine import Routine
 from ..recursions import momentum as recursion
+from ..recursions.derivatives import adjoints
 from ..recursions.loops import minimal
-from .operation import AS_WRITTEN, QD, Operation, Q, Result, Trial, required
+from .operation import AS_WRITTEN, KINEMATIC, QD, Derivative, Operation, Q, Result, Trial, required
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
+
+COM_VALUES = ("body_mass", *KINEMATIC)
+
+COM = Operation(
+    "com",
+    arguments=(Q,),
+    results=(Result("com", "world, 3"),),
+    routine=Routine("com", recursion.com),
+    embed=AS_WRITTEN,
+    multipliers=AS_WRITTEN,
+    derivative=Derivative(
+        Routine("com_vjp", adjoints.com_vjp), by=("q",), values=COM_VALUES, embed=AS_WRITTEN, multipliers=AS_WRITTEN
+    ),
+    trial=Trial(lambda dense, q: dense.center_of_mass),
+)
+
+
+@COM.method
+def com(self: Dynamics, q: ArrayT, out: ArrayT | None = None) -> ArrayT:
+    """Compute the centre of mass of all bodies that a hinge lets move, in the inertial frame [world, 3] [m].
+
+    It is that of :meth:`com_jacobian`: bodies that are fixed to the inertial frame do not count. NaN where all moving
+    bodies are massless, and zero where nothing moves.
+    """
+    return self._engine.run(COM, out, q=q)
+
+
+COM_VELOCITY = Operation(
+    "com_velocity",
+    arguments=(Q, required(QD)),
+    results=(Result("velocity", "world, 3"),),
+    routine=Routine("com_velocity", recursion.com_velocity),
+    embed=AS_WRITTEN,
+    multipliers=AS_WRITTEN,
+    derivative=Derivative(
+        Routine("com_velocity_vjp", adjoints.com_velocity_vjp),
+        by=("q", "qd"),
+        values=COM_VALUES,
+        embed=AS_WRITTEN,
+        multipliers=AS_WRITTEN,
+    ),
+    trial=Trial(lambda dense, q, qd: dense.com_jacobian @ qd),
+)
+
+
+@COM_VELOCITY.method
+def com_velocity(self: Dynamics, q: ArrayT, qd: AnyArray, out: ArrayT | None = None) -> ArrayT:
+    """Compute the velocity of :meth:`com`, inertial axes [world, 3] [m/s]: :meth:`com_jacobian` @ qd of all dofs."""
+    return self._engine.run(COM_VELOCITY, out, q=q, qd=qd)
+
 
 COM_JACOBIAN = Operation(
     "com_jacobian",

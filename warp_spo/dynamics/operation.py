@@ -21,8 +21,8 @@ and ``mass_matrix = inertia.mass_matrix`` is its line in the class. Checks of ar
 ``prepare``, gradients in torch, trials, the main job's table and the benchmarks read the declaration.
 
 Axes are written as words: "world, dof". The words are "world", "coordinate", "dof", "independent dof" (the dofs that
-move all others where loops are embedded, otherwise all dofs), "body", "frame", "6 frames" (six for each frame), "row"
-(of the closures of loops), "entry" (of a packed matrix), and numbers.
+move all others where loops are embedded, otherwise all dofs), "body", "frame", "6 frames" (six for each frame), "10
+bodies", "row" (of the closures of loops), "entry" (of a packed matrix), and numbers.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from ..arrays import Call
 from ..execution.routine import Routine
 from ..gradients import call_with_gradient, records_gradient
 from ..recursions.links import LINK_VALUES, MOTION_VALUES, Links
-from ..scene.frames import check_frames
+from ..scene.frames import check_frames, origins
 from ..scene.scene import Scene
 from . import samples
 from .seconds import STAND_IN, seconds
@@ -62,6 +62,7 @@ class Argument:
         asked: ``prepare`` passes the array only where it is asked for by name.
         written: the call fills the array. dtype: scalar type; None is that of the Dynamics.
         columns: a further axis may hold several right-hand sides.
+        number: a number is allowed, too, the same in all worlds.
         direction: the argument is the direction of a derivative by the argument without the first letter, "dq" by "q".
         sample: name of the random input that trials pass, see :class:`warp_spo.trials.operations.Inputs`.
     """
@@ -73,6 +74,7 @@ class Argument:
     written: bool = False
     dtype: type | None = None
     columns: bool = False
+    number: bool = False
     direction: bool = False
     sample: str = ""
 
@@ -132,11 +134,15 @@ QDD = Argument("qdd", "world, dof", optional=True)
 TAU = Argument("tau", "world, dof", optional=True)
 BODY_F = Argument("body_f", "world, body, 6", optional=True, asked=True)
 STATUS = Argument("status", "world", optional=True, asked=True, written=True, dtype=wp.int32)
-FRAMES = Option(
+ORIENTED_FRAMES = Option(
     "frames",
     lambda scene, call, frames: check_frames(scene, call.name, frames),
     lambda scene: [0],
     sample=samples.two_frames,
+)
+FRAMES = dataclasses.replace(
+    ORIENTED_FRAMES,
+    read=lambda scene, call, frames: origins(check_frames(scene, call.name, frames)),  # their axes do not enter
 )
 DT = Option("dt", lambda scene, call, dt: seconds(call, dt), lambda scene: STAND_IN, False, lambda scene: samples.DT)
 
@@ -185,7 +191,7 @@ class Derivative:
     Attributes:
         routine: kernel of the product. embed: its form where loops are embedded. multipliers: with multipliers.
         by: arguments that have a gradient. values: names of the scene's values that enter the operation.
-        reads: result of the operation that the kernel reads, by this name; "": it reads no result.
+        state: arguments that the kernel reads. reads: result of the operation that it reads, by this name; "": none.
         keeps: arguments that the operation fills because the way back reads them.
         recomputes: the kernel computes the result that it reads where the caller does not pass it.
         pull: what is launched; None: the kernel alone.
@@ -197,6 +203,7 @@ class Derivative:
     values: tuple[str, ...] = MOTION_VALUES
     embed: Closed = NO_DERIVATIVE
     multipliers: Closed = NO_DERIVATIVE
+    state: tuple[str, ...] = ("q", "qd")
     reads: str = ""
     keeps: tuple[str, ...] = ()
     recomputes: bool = False

@@ -61,6 +61,8 @@ def _prepare_backwards(dyn: Dynamics, operation: Operation, options: dict[str, A
     chosen = [one for one in map(arrays.__getitem__, derivative.by) if _is_given(one, options, wrt)]
     given = {one.name: _stand_in(dyn, one) for one in chosen}
     more = _options(dyn, tuple(option for option in operation.options if option.read is not None), options)
+    others = [arrays[name] for name in derivative.state if name in arrays and name not in derivative.by]
+    more |= {one.name: _stand_in(dyn, one) for one in others}
     _refuse_rest(f"{operation.name}_vjp", options)
     shapes = dyn._gradients.result_shapes(operation, **more)
     results: list[Any] = [wp.zeros(shape, dtype=dyn.dtype, device=dyn.device) for shape in shapes]

@@ -7,7 +7,7 @@ import numpy as np
 from ..scene.scene import Scene
 
 DT = 0.01  # time step of integrate [s]
-FRAME_POSE = (0.1, -0.05, 0.2, 0.0, 0.0, 0.0, 1.0)  # of the second of the two frames, in its body [m]
+FRAME_POSE = (0.1, -0.05, 0.2, 0.0, 0.6, 0.0, 0.8)  # of the second of the two frames, in its body [m]
 
 
 def two_frames(scene: Scene) -> list:

@@ -82,6 +82,18 @@ def body_states(run: Sweeps, out: wp.array, q: wp.array, qd: wp.array, velocitie
     body_velocities(run, velocities_out, q, qd)
 
 
+def frame_poses(run: Sweeps, out: wp.array, q: wp.array, frames: tuple) -> None:
+    run.hinges(q)
+    inputs = [*run.frames(frames), run.parameters.anchor, run.world_poses()]
+    run.launch_nodes(kinematics.frame_poses, out.shape[1::-1], inputs, [out])
+
+
+def frame_velocities(run: Sweeps, out: wp.array, q: wp.array, qd: wp.array, frames: tuple) -> None:
+    run.hinges(q, qd)
+    inputs = [*run.frames(frames), run.parameters.anchor, run.world_poses(), run.velocities()]
+    run.launch_nodes(kinematics.frame_velocities, out.shape[1::-1], inputs, [out])
+
+
 def jacobian(run: Sweeps, out: wp.array, q: wp.array, frames: tuple) -> None:
     run.hinges(q)
     run.jacobian(*run.frames(frames), out)

@@ -93,7 +93,8 @@ class Programs:
             out: shape of the result, [world, ...]. more: shapes of further results, by name.
             options: of the routine's trace.
         """
-        key = routine, (*shapes, *(more or ())), out[1:], *options.values()
+        names = (name if shape else f"{name}, a number" for name, shape in shapes.items())
+        key = routine, (*names, *(more or ())), out[1:], *options.values()
         if key in self._programs:
             return self._programs[key]
         if self.plan.of(routine) == "node":

@@ -151,11 +151,14 @@ class Sweeps:
         return world_pose
 
     def frames(self, frames: tuple) -> tuple[wp.array, wp.array]:
-        """Return bodies [frame] and origins in the body frame [frame, 3]; equal frames give the same arrays."""
+        """Return bodies [frame], and origins [frame, 3] or poses [frame, 7] in the body frame, whichever are given.
+
+        Equal frames give the same arrays.
+        """
         if frames not in self._frames:
             bodies: Any = wp.array([body for body, _ in frames], dtype=int, device=self.device)
-            origins: Any = wp.array(np.array([origin for _, origin in frames]), dtype=self.dtype, device=self.device)
-            self._frames[frames] = (bodies, origins)
+            places: Any = wp.array(np.array([place for _, place in frames]), dtype=self.dtype, device=self.device)
+            self._frames[frames] = (bodies, places)
         return self._frames[frames]
 
     def jacobian(self, frame_nodes: wp.array, frame_offsets: wp.array, out: wp.array) -> None:

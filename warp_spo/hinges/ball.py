@@ -71,6 +71,9 @@ class Ball(Kind):
     def moved(self, link: Carrier, q: Entry, rates: list[Value], h: Value) -> list[Value]:
         return list(rotated_by(self.turn(link, q), Vector(rates) * h))
 
+    def difference(self, link: Carrier, before: Entry, after: Entry) -> list[Value]:
+        return list(rotation_vector(self.turn(link, after), self.turn(link, before)))
+
     def nudged(self, link: Carrier, place: Placed, q: Entry, step: list[Value]) -> list[Value]:
         if all(is_constant(x) and x == 0.0 for x in step):
             return [q(link.coordinate + i) for i in range(self.coordinates)]

@@ -65,6 +65,12 @@ class Free(Ball):
         shift = quaternion_rotation(*before) @ link.com - quaternion_rotation(*after) @ link.com
         return [*(q(link.coordinate + i) + h * rates[i] + shift[i] for i in range(3)), *after]
 
+    def difference(self, link: Carrier, before: Entry, after: Entry) -> list[Value]:
+        """The centre of mass goes straight from where the body is to where it will be."""
+        turns = [quaternion_rotation(*self.turn(link, q)) @ link.com for q in (before, after)]
+        places = [Vector(q(link.coordinate + i) for i in range(3)) for q in (before, after)]
+        return [*(places[1] - places[0] + (turns[1] - turns[0])), *super().difference(link, before, after)]
+
     def _nudged(self, link: Carrier, place: Placed, q: Entry, step: list[Value]) -> list[Value]:
         turn = super()._nudged(link, place, q, step)
         arm = self._arm(link, place) - quaternion_rotation(*turn) @ link.com

@@ -169,6 +169,13 @@ class Kind:
         """Return the coordinates after ``rates`` have been constant for ``h`` [s]; quaternions come out normalised."""
         return [q(link.coordinate + i) + h * rate for i, rate in enumerate(rates)]
 
+    def difference(self, link: Carrier, before: Entry, after: Entry) -> list[Value]:
+        """Return the rates that take the coordinates from ``before`` to ``after`` in 1 s: :meth:`moved`, inverted.
+
+        A rotation goes the short way round. The entries are asked for by index, as those of q.
+        """
+        return [after(link.coordinate + i) - before(link.coordinate + i) for i in range(self.coordinates)]
+
     def nudged(self, link: Carrier, place: Placed, q: Entry, step: list[Value]) -> list[Value]:
         """Return the coordinates after a small step of the dofs, exact to first order."""
         return [q(link.coordinate + i) + x for i, x in enumerate(step)]

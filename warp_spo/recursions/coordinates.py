@@ -1,4 +1,4 @@
-"""Coordinates moved along velocities, and their time derivatives, of all hinges."""
+"""Coordinates moved along velocities, velocities between two configurations, and time derivatives, of all hinges."""
 
 from __future__ import annotations
 
@@ -18,6 +18,24 @@ def integrate(trace: Trace) -> list[Store]:
     """out = q moved along qd for dt"""
     q, qd, h = trace.vector("q"), trace.vector("qd"), trace.graph.input("dt", 0)
     return _coordinates(trace, lambda link: integration.integrate_link(link, q, qd, h))
+
+
+def difference(trace: Trace) -> list[Store]:
+    """out [dof] = the velocity that moves q0 to q1 in 1 s"""
+    stores = []
+    for link in trace.links.links:
+        trace.label(link, "d")
+        rates = link.hinge.difference(link, trace.vector("q0"), trace.vector("q1"))
+        stores += [Store("out", (dof,), value) for dof, value in zip(link.dofs, rates, strict=True)]
+    return stores
+
+
+def interpolate(trace: Trace) -> list[Store]:
+    """out = q0 moved along the difference to q1 for s seconds"""
+    before, after, s = trace.vector("q0"), trace.vector("q1"), trace.graph.input("s", 0)
+    return _coordinates(
+        trace, lambda link: link.hinge.moved(link, before, link.hinge.difference(link, before, after), s)
+    )
 
 
 def coordinate_rates(trace: Trace) -> list[Store]:

@@ -158,6 +158,15 @@ class Impedance:
             for i, dof in enumerate(link.dofs)
         ]
 
+    def spring_energies(self, link: Link) -> list[Value]:
+        """Return stiffness (q - rest)^2 / 2 of each dof of a link."""
+        found = []
+        for i, dof in enumerate(link.dofs):
+            k = self.value("joint_stiffness", dof)
+            stretch = 0.0 if is_number(k, 0.0) else self._stretch(link, i, self._rest)
+            found.append(0.5 * k * (stretch * stretch))
+        return found
+
     # -- values ----------------------------------------------------------------------------------------------------
     def value(self, name: str, index: int) -> Value:
         """Return a value of the scene by dof, or by coordinate for joint_rest_q."""

@@ -78,17 +78,23 @@ def jacobian(trace: Trace, frames: tuple) -> list[Store]:
     return stores
 
 
-def body_poses(trace: Trace) -> list[Store]:
-    """out [body, 7] = position, quaternion xyzw"""
+def link_poses(trace: Trace) -> tuple[dict[int | None, Vector], dict[int | None, Quaternion]]:
+    """Return the origin and the quaternion of every link in the inertial frame, by id; None is that frame itself."""
     q = trace.vector("q")
     at: dict[int | None, Vector] = {None: ZERO}
-    turns: dict[int | None, Vector] = {None: Vector((0.0, 0.0, 0.0, 1.0))}
+    turns: dict[int | None, Quaternion] = {None: Vector((0.0, 0.0, 0.0, 1.0))}
     for link in trace.links.links:
         trace.label(link, "p")
         over = None if link.parent is None else id(link.parent)
         trace.places[id(link)] = place = place_link(link, q)
         at[id(link)] = at[over] + turned(turns[over], place.pose.l)
         turns[id(link)] = multiplied(turns[over], relative_quaternion(link, q))
+    return at, turns
+
+
+def body_poses(trace: Trace) -> list[Store]:
+    """out [body, 7] = position, quaternion xyzw"""
+    at, turns = link_poses(trace)
     stores = []
     for body, seat in trace.links.seats.items():
         R, p = trace.links.nodes[body].anchor
@@ -100,8 +106,23 @@ def body_poses(trace: Trace) -> list[Store]:
     return stores
 
 
-def body_velocities(trace: Trace) -> list[Store]:
-    """out [body, 6] = velocity of the CoM, angular velocity, in inertial axes"""
+def frame_poses(trace: Trace, frames: tuple) -> list[Store]:
+    """out [frame, 7] = position, quaternion xyzw: that of the body, then that of the frame in it"""
+    (at, turns), stores = link_poses(trace), []
+    for index, (body, pose) in enumerate(frames):
+        trace.graph.step = f"frame {index}|f"
+        seat, (R, p) = trace.links.seats[body], trace.links.nodes[body].anchor
+        key = None if seat.link is None else id(seat.link)
+        axes = seat.matrix @ R.T
+        position = at[key] + turned(turns[key], seat.offset + axes @ (Vector(pose[:3]) - p))
+        within = multiplied(constant_quaternion(axes), Vector(pose[3:]))
+        values = (*position, *multiplied(turns[key], within))
+        stores += [Store("out", (index, c), value) for c, value in enumerate(values)]
+    return stores
+
+
+def link_velocities(trace: Trace) -> dict[int | None, tuple[Vector, Vector]]:
+    """Place every link, and return its (omega; v) in its axes, by id; None is the inertial frame."""
     velocities: dict[int | None, tuple[Vector, Vector]] = {None: (ZERO, ZERO)}
     for link in trace.links.links:
         place_axes(trace, link)
@@ -109,7 +130,26 @@ def body_velocities(trace: Trace) -> list[Store]:
         place, over = trace.places[id(link)], None if link.parent is None else id(link.parent)
         hinge = hinge_motion(link, place, trace.vector("qd"))
         velocities[id(link)] = carried_velocity(place, velocities[over], hinge)
-    stores = []
+    return velocities
+
+
+def frame_velocities(trace: Trace, frames: tuple) -> list[Store]:
+    """out [frame, 6] = velocity of each frame's origin, angular velocity, in inertial axes"""
+    velocities, stores = link_velocities(trace), []
+    for index, (body, origin) in enumerate(frames):
+        link, arm = frame_on_link(trace, body, origin)
+        values = (*ZERO, *ZERO)
+        if link is not None:
+            trace.label(link, f"j{index}_")
+            (w, v), R = velocities[id(link)], trace.axes[id(link)]
+            values = (*velocity(R, w, v, arm), *(R @ w))
+        stores += [Store("out", (index, c), value) for c, value in enumerate(values)]
+    return stores
+
+
+def body_velocities(trace: Trace) -> list[Store]:
+    """out [body, 6] = velocity of the CoM, angular velocity, in inertial axes"""
+    velocities, stores = link_velocities(trace), []
     for body, seat in trace.links.seats.items():
         key = None if seat.link is None else id(seat.link)
         w, v = velocities[key]

@@ -9,7 +9,7 @@ from ..trace.emission import Store
 from ..trace.scalars import Value, reciprocal
 from ..trace.spatial import ZERO, Rigid, Vector, cross
 from . import articulated, composite, newton_euler
-from .kinematics import link_accelerations, place_all, zero
+from .kinematics import link_accelerations, link_velocities, place_all, zero
 from .links import Link
 
 if TYPE_CHECKING:
@@ -49,6 +49,31 @@ def momenta(trace: Trace, link: Link, body: Rigid) -> list[tuple[Vector, Vector]
         n, f = body.apply(Vector(H[:3]), Vector(H[3:]))
         found.append((R @ n, R @ f))
     return found
+
+
+def com(trace: Trace) -> list[Store]:
+    """out [3] = centre of mass of all moving bodies in the inertial frame"""
+    origins, bodies = place_all(trace), composite_inertias(trace)
+    _, c = center_of_mass(trace, bodies, origins)
+    first = trace.places[id(trace.links.links[0])].pose.l
+    return [Store("out", (i,), value) for i, value in enumerate(c + first)]
+
+
+def com_velocity(trace: Trace) -> list[Store]:
+    """out [3] = linear momentum, added up inward, over the mass"""
+    velocities, momenta_of = link_velocities(trace), dict[int, Vector]()
+    mass, momentum = 0.0, ZERO
+    for link in reversed(trace.links.links):
+        trace.label(link, "h")
+        key, own = id(link), ZERO
+        if link.inertia is not None:
+            mass, (_, own) = mass + link.inertia.mass, link.inertia.apply(*velocities[key])
+        for child in link.children:
+            own = own + trace.places[id(child)].pose.to_parent(momenta_of[id(child)])
+        momenta_of[key] = own
+        if link.parent is None:
+            momentum = momentum + trace.axes[key] @ own
+    return [Store("out", (i,), value) for i, value in enumerate(momentum * reciprocal(mass))]
 
 
 def com_jacobian(trace: Trace) -> list[Store]:

@@ -1,4 +1,4 @@
-"""Frames on bodies: the argument ``frames`` of :meth:`Dynamics.jacobian` and related calls."""
+"""Frames on bodies: the argument ``frames`` of :meth:`Dynamics.frame_poses`, :meth:`Dynamics.jacobian` and others."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Frame = Any  # a body (its index, label, or the label's part after the last slas
 
 
 def check_frames(scene: Scene, call: str, frames: Sequence[Frame]) -> tuple[tuple[int, tuple[float, ...]], ...]:
-    """Return the body of every frame, and the frame's origin in the body frame [m].
+    """Return the body of every frame, and the frame's pose in the body frame: x, y, z [m], quaternion xyzw.
 
     Raises:
         ValueError, TypeError: the list is empty, or an entry is not a frame of the scene.
@@ -27,7 +27,7 @@ def check_frames(scene: Scene, call: str, frames: Sequence[Frame]) -> tuple[tupl
 
 
 def _check_frame(scene: Scene, call: str, frame: Frame) -> tuple[int, tuple[float, ...]]:
-    """Return the body of one frame, and the frame's origin in the body frame."""
+    """Return the body of one frame, and the frame's pose in the body frame."""
     labels = scene.body_labels
     if isinstance(frame, str) and frame in scene.sites and frame not in labels:
         frame = scene.sites[frame]
@@ -49,11 +49,16 @@ def _check_frame(scene: Scene, call: str, frame: Frame) -> tuple[int, tuple[floa
         raise _wrong_frame(call, frame)
     if not 0 <= index < len(labels):
         raise ValueError(f"{call}: a frame's body is {index}; expected 0 to {len(labels) - 1}")
-    return index, IDENTITY_POSE[:3] if pose is IDENTITY_POSE else _origin(call, frame, pose)
+    return index, IDENTITY_POSE if pose is IDENTITY_POSE else _pose(call, frame, pose)
 
 
-def _origin(call: str, frame: Frame, pose: Any) -> tuple[float, ...]:
-    """Return the position of a checked pose."""
+def origins(frames: Sequence[tuple[int, tuple[float, ...]]]) -> tuple[tuple[int, tuple[float, ...]], ...]:
+    """Return the body and the origin in the body frame [m] of every checked frame, for what depends on no more."""
+    return tuple((body, pose[:3]) for body, pose in frames)
+
+
+def _pose(call: str, frame: Frame, pose: Any) -> tuple[float, ...]:
+    """Return the numbers of a checked pose, its quaternion of unit length."""
     refuse_masked(call, "a frame's pose", pose)
     check_plain(call, "a frame's pose", pose)
     if getattr(pose, "requires_grad", False):
@@ -70,7 +75,7 @@ def _origin(call: str, frame: Frame, pose: Any) -> tuple[float, ...]:
     unit = len(numbers) == 7 and abs(math.hypot(*numbers[3:]) - 1.0) < 1e-5  # float32 poses are unit to 1e-7
     if not unit or not all(map(math.isfinite, numbers)):
         raise ValueError(f"{call}: a frame's pose is {numbers}; expected x, y, z and a unit quaternion xyzw")
-    return numbers[:3]
+    return *numbers[:3], *(x / math.hypot(*numbers[3:]) for x in numbers[3:])
 
 
 def _wrong_frame(call: str, frame: Frame) -> TypeError:

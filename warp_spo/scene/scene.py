@@ -269,6 +269,21 @@ class Scene(Stored):
         """The q at which the anchors of every hinge coincide [coordinate]: zeros and identity quaternions."""
         return np.concatenate([hinge.neutral for hinge in self.hinges])
 
+    @property
+    def inertial_parameters(self) -> np.ndarray:
+        """Ten numbers for each body: m, m c (3), Ixx, Ixy, Iyy, Ixz, Iyz, Izz [worlds, 10 bodies].
+
+        The moments of inertia are about the origin of the body frame, in its axes; c is the centre of mass there
+        [kg, kg m, kg m^2]. They are what :meth:`Dynamics.inverse_dynamics_regressor` multiplies.
+        """
+        mass, com = self.values["body_mass"][..., None], self.values["body_com"]
+        squares = np.eye(3) * (com * com).sum(-1)[..., None, None] - com[..., :, None] * com[..., None, :]
+        inertia = self.values["body_inertia"] + mass[..., None] * squares
+        entries = [inertia[..., i, j, None] for i, j in ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))]
+        worlds = max(part.shape[0] for part in (mass, com, inertia))
+        parts = [np.broadcast_to(x, (worlds, *x.shape[1:])) for x in (mass, mass * com, *entries)]
+        return np.concatenate(parts, axis=-1).reshape(worlds, -1)
+
     def with_values(self, **values: Any) -> Scene:
         """Return a copy of the scene with other ``values``, [...] for all worlds or [worlds, ...] for each world.
 

@@ -29,7 +29,7 @@ TOLERANCE = {
     "float32": 1e-4,
     "float64": 1e-10,
 }
-INPUTS = ("q", "qd", "qdd", "tau", "b", "x", "wrenches")
+INPUTS = ("q", "qd", "qdd", "tau", "b", "x", "wrenches", "q_after", "share", "parameters")
 
 Shape = Callable[[Scene], tuple[int, ...]]
 
@@ -114,7 +114,8 @@ class Operation:
 class Inputs:
     """Random inputs in all worlds, and the reference at them. They are float32 numbers: exact in either precision.
 
-    q: angles and lengths U(-1, 1) [rad, m], rotations uniform; qd, qdd, b, x, wrenches: N(0, 1); tau: 10 N(0, 1).
+    q: angles and lengths U(-1, 1) [rad, m], rotations uniform; q_after: as q;
+    qd, qdd, b, x, wrenches, share, parameters: N(0, 1); tau: 10 N(0, 1).
 
     Args:
         scene: whose inputs.
@@ -134,14 +135,20 @@ class Inputs:
         if name not in self._arrays:
             scene, rng = self.scene, np.random.default_rng([self.seed, INPUTS.index(name)])
             array: np.ndarray
-            if name == "q":
+            if name in ("q", "q_after"):
                 array = rng.uniform(-1.0, 1.0, (self.worlds, scene.coord_count))
                 for first in rotations(scene):
                     turn = rng.standard_normal((self.worlds, 4))
                     array[:, first : first + 4] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
             else:
-                size = {"x": sum(scene.node_sizes), "wrenches": 12}.get(name, scene.dof_count)
-                array = rng.standard_normal((self.worlds, size), dtype=np.float32)
+                size = {
+                    "x": sum(scene.node_sizes),
+                    "wrenches": 12,
+                    "share": 0,
+                    "parameters": 10 * scene.body_count,
+                }.get(name, scene.dof_count)
+                shape = (self.worlds, size) if size else (self.worlds,)
+                array = rng.standard_normal(shape, dtype=np.float32)
                 array *= 10.0 if name == "tau" else 1.0
             self._arrays[name] = array.astype(np.float32)
         return self._arrays[name]
@@ -177,6 +184,8 @@ def _size(axis: str, scene: Scene) -> int:
     if axis.endswith(" frames"):
         return int(axis.split()[0]) * frames
     dofs = scene.dof_count
+    if axis.endswith(" bodies"):
+        return int(axis.split()[0]) * scene.body_count
     sizes = {"coordinate": scene.coord_count, "dof": dofs, "independent dof": dofs, "body": scene.body_count}
     return {**sizes, "frame": frames}[axis]
 

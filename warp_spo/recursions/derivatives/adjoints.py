@@ -17,18 +17,30 @@ from ...trace.scalars import Scalar, Value, ordered
 from ...trace.spatial import ZERO, total
 from ..articulated_sweeps import expand, reduce
 from ..composite import mass_matrix
-from ..coordinates import integrate
+from ..coordinates import difference, integrate, interpolate
+from ..energy import kinetic_energy, potential_energy
 from ..forward_dynamics import forward_dynamics
 from ..impedance import Impedance
 from ..integration import integrate_link
-from ..kinematics import body_poses, body_velocities, jacobian
+from ..kinematics import (
+    body_poses,
+    body_velocities,
+    frame_accelerations,
+    frame_poses,
+    frame_velocities,
+    jacobian,
+)
 from ..links import Link
+from ..momentum import com, com_velocity
 from ..newton_euler import inverse_dynamics
 from .power import Entry, Power, Ways
 from .tangents import coordinate_directions, tangent_gradient
 
 if TYPE_CHECKING:
     from ..tracing import Trace
+
+
+COORDINATES = ("q", "target_q", "q0", "q1")  # arguments that are laid out as q
 
 
 class TreeEquations:
@@ -100,9 +112,54 @@ def body_velocities_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
     return pull_back(trace, body_velocities(trace), wrt)
 
 
+def com_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
+    """J* cotangent of com"""
+    return pull_back(trace, com(trace), wrt)
+
+
+def com_velocity_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
+    """J* cotangent of com_velocity"""
+    return pull_back(trace, com_velocity(trace), wrt)
+
+
+def kinetic_energy_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
+    """J* cotangent of kinetic_energy"""
+    return pull_back(trace, kinetic_energy(trace), wrt)
+
+
+def potential_energy_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
+    """J* cotangent of potential_energy"""
+    return pull_back(trace, potential_energy(trace), wrt)
+
+
+def difference_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
+    """J* cotangent of difference"""
+    return pull_back(trace, difference(trace), wrt)
+
+
+def interpolate_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
+    """J* cotangent of interpolate"""
+    return pull_back(trace, interpolate(trace), wrt)
+
+
 def mass_matrix_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
     """J* cotangent of mass_matrix, both triangles"""
     return pull_back(trace, mass_matrix(trace), wrt)
+
+
+def frame_poses_vjp(trace: Trace, frames: tuple, wrt: tuple[str, ...]) -> list[Store]:
+    """J* cotangent of frame_poses"""
+    return pull_back(trace, frame_poses(trace, frames), wrt)
+
+
+def frame_velocities_vjp(trace: Trace, frames: tuple, wrt: tuple[str, ...]) -> list[Store]:
+    """J* cotangent of frame_velocities"""
+    return pull_back(trace, frame_velocities(trace, frames), wrt)
+
+
+def frame_accelerations_vjp(trace: Trace, frames: tuple, wrt: tuple[str, ...]) -> list[Store]:
+    """J* cotangent of frame_accelerations"""
+    return pull_back(trace, frame_accelerations(trace, frames), wrt)
 
 
 def jacobian_vjp(trace: Trace, frames: tuple, wrt: tuple[str, ...]) -> list[Store]:
@@ -216,7 +273,7 @@ def entries(trace: Trace, name: str, found: dict[tuple, Value]) -> Iterable[tupl
         places: list[tuple] = [(body, c) for body in range(trace.links.scene.body_count) for c in range(6)]
     elif name == "value":
         places = [(i,) for i in range(len(trace.links.tables["value"]))]
-    elif name in ("q", "target_q"):
+    elif name in COORDINATES:
         places = [(link.coordinate + c,) for link in trace.own_links for c in range(link.hinge.coordinates)]
     else:
         places = [(dof,) for link in trace.own_links for dof in link.dofs]
@@ -225,7 +282,7 @@ def entries(trace: Trace, name: str, found: dict[tuple, Value]) -> Iterable[tupl
 
 def pull_back(trace: Trace, results: list[Store], wrt: tuple[str, ...]) -> list[Store]:
     """J* cotangent of what ``results`` store, for the arguments ``wrt``, by the reverse of their whole graph"""
-    seeds = [trace.graph.input("cotangent", *item.index) for item in results]
+    seeds = [trace.graph.input("cotangent", *(item.index or (0,))) for item in results]
     outputs = [item.value for item in results]
     inputs = [x for x in ordered(outputs) if x.op == "input"]
     gradients = dict(zip((x.args for x in inputs), reverse(outputs, inputs, seeds), strict=True))
