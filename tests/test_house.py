@@ -36,6 +36,7 @@ ROOMS = (
     "recursions",
     "execution",
     "dynamics",
+    "mujoco",
     "newton",
     "trials",
     "examples",
@@ -84,6 +85,7 @@ def test_host_code_launches(path):
     assert "@wp.kernel" not in path.read_text() and "@wp.func" not in path.read_text()
     assert "torch" not in imports(path) or path.parent.name in ("torch", "env", "examples")
     assert "newton" not in imports(path) or path.parent == PACKAGE / "newton"
+    assert "mujoco" not in imports(path) or path.parent == PACKAGE / "mujoco"
 
 
 @pytest.mark.parametrize("path", SYMBOLIC, ids=named)
@@ -143,6 +145,7 @@ def test_the_reference_imports_numpy_alone():
 
 
 def test_import_is_light():
-    script = "import sys, warp_spo.examples.parts; print(sorted({'torch', 'newton', 'matplotlib'} & set(sys.modules)))"
+    heavy = {"torch", "newton", "mujoco", "matplotlib"}
+    script = f"import sys, warp_spo.examples.parts; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

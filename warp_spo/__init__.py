@@ -1,7 +1,7 @@
 """Spatial operators of multibody dynamics for thousands of worlds at once.
 
 The graph layer: :class:`Tree`, :class:`Digraph`, :class:`BWA` and its resolvent. Scenes: :class:`Scene` by hand,
-:func:`load` from a robot file, :func:`from_newton`. Dynamics: :class:`Dynamics`.
+:func:`load` from a robot file, :func:`from_newton`, :func:`from_mujoco`. Dynamics: :class:`Dynamics`.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -18,8 +18,10 @@ from .scene.tree import Digraph, Tree
 from .status import Status
 
 if TYPE_CHECKING:
+    from . import mujoco as mujoco
     from . import newton as newton
     from . import torch as torch
+    from .mujoco import from_mujoco
     from .newton import from_newton, load
 
     __version__: str
@@ -45,6 +47,7 @@ __all__ = [
     "UnsupportedError",
     "__version__",
     "clip",
+    "from_mujoco",
     "from_newton",
     "load",
     "spline",
@@ -59,7 +62,9 @@ if not TYPE_CHECKING:  # or every misspelled name would pass a type checker
 
         if name in ("load", "from_newton"):  # these import newton
             return getattr(importlib.import_module(".newton", __name__), name)
-        if name in ("torch", "newton"):
+        if name == "from_mujoco":
+            return importlib.import_module(".mujoco", __name__).from_mujoco
+        if name in ("torch", "newton", "mujoco"):
             return importlib.import_module(f".{name}", __name__)
         if name == "__version__":
             from importlib.metadata import PackageNotFoundError, version

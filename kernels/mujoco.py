@@ -1,0 +1,94 @@
+"""States of MuJoCo and of a scene, each from the other.
+
+qpos and q differ in the order of quaternions, w x y z and x y z w. Angular velocities of ball and free joints are in
+the body's axes in qvel, and in those of the parent anchor in qd: ``w_qd = R w_qvel``, R being the rotation of the
+joint's quaternion, normalised. The first three rates of a free joint are the velocity of the body frame's origin in
+qvel, and that of the centre of mass c (in the body frame) in qd: ``v_qd = v_qvel + w_qd x R c``. Sources: MuJoCo's
+documentation, "Computation: Floating objects"; Newton's conventions for joint_q and joint_qd.
+"""
+
+import functools
+
+import warp as wp
+
+
+@functools.cache
+def gather(T) -> wp.Kernel:
+    """Compute ``out[world, i] = x[world, source[i]]``."""
+
+    @wp.kernel(module=f"warp_spo_mujoco_{T.__name__}", enable_backward=False)
+    def kernel(source: wp.array[int], x: wp.array2d[T], out: wp.array2d[T]):
+        world, i = wp.tid()
+        out[world, i] = x[world, source[i]]
+
+    return kernel
+
+
+@functools.cache
+def rates(T) -> wp.Kernel:
+    """Compute qd from qpos and qvel if ``to_scene``, else qvel from q and qd; a thread for each (world, joint).
+
+    Arguments of the kernel:
+        kind: 0 for a joint of one coordinate, 1 for a ball, 2 for a free joint.
+        dof: first entry of the joint in qvel and qd.
+        vector, real: entries of its quaternion in ``coordinates``: the first of x, y, z, and w.
+        com: centre of mass of the body that the joint carries, in the body frame [m].
+    """
+    Vector, Matrix = wp.types.vector(3, T), wp.types.matrix((3, 3), T)
+
+    @wp.func
+    def rotation(q: wp.array2d[T], world: int, vector: int, real: int) -> Matrix:
+        x, y, z, w = q[world, vector], q[world, vector + 1], q[world, vector + 2], q[world, real]
+        s = T(2.0) / ((x * x + y * y) + (z * z + w * w))
+        one = T(1.0)
+        return Matrix(
+            one - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
+            s * (x * y + w * z), one - s * (x * x + z * z), s * (y * z - w * x),
+            s * (x * z - w * y), s * (y * z + w * x), one - s * (x * x + y * y),
+        )  # fmt: skip
+
+    @wp.kernel(module=f"warp_spo_mujoco_{T.__name__}", enable_backward=False)
+    def kernel(
+        to_scene: bool,
+        kind: wp.array[int],
+        dof: wp.array[int],
+        vector: wp.array[int],
+        real: wp.array[int],
+        com: wp.array3d[T],
+        coordinates: wp.array2d[T],
+        x: wp.array2d[T],
+        out: wp.array2d[T],
+    ):
+        world, joint = wp.tid()
+        first = dof[joint]
+        if kind[joint] == 0:
+            out[world, first] = x[world, first]
+            return
+        R = rotation(coordinates, world, vector[joint], real[joint])
+        turn = first
+        if kind[joint] == 2:
+            turn = first + 3
+        given = Vector(x[world, turn], x[world, turn + 1], x[world, turn + 2])
+        if to_scene:
+            w = R * given
+            axes = w  # the angular velocity in the parent's axes
+        else:
+            w = wp.transpose(R) * given
+            axes = given
+        for i in range(3):
+            out[world, turn + i] = w[i]
+        if kind[joint] == 2:
+            v = Vector(x[world, first], x[world, first + 1], x[world, first + 2])
+            c = Vector(com[world, joint, 0], com[world, joint, 1], com[world, joint, 2])
+            shift = wp.cross(axes, R * c)
+            if to_scene:
+                v += shift
+            else:
+                v -= shift
+            for i in range(3):
+                out[world, first + i] = v[i]
+
+    return kernel
+
+
+KERNELS = (gather, rates)

@@ -1,0 +1,89 @@
+"""Scenes from MJCF files, compiled by MuJoCo."""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+from ..scene.scene import Scene
+from .model import scene_of
+from .source import Source
+
+
+def read_mjcf(file: Path, floating: bool | None) -> Scene:
+    """Return the scene of an MJCF file; see :func:`warp_spo.load`.
+
+    Raises:
+        ET.ParseError: the file is not XML.
+        ValueError: the file is not MJCF, or MuJoCo refuses it; the message holds MuJoCo's.
+        UnsupportedError: as :func:`from_mujoco`; the message names the file, too.
+    """
+    tag = ET.parse(file).getroot().tag
+    if tag != "mujoco":
+        raise ValueError(
+            f"load: {str(file)!r} holds <{tag}>; expected <mujoco>; if it is URDF, let its name end in .urdf"
+        )
+    model, dropped = compiled(file)
+    source = Source(model, "load", str(file))
+    source.left_out += dropped
+    return scene_of(source, floating)
+
+
+def compiled(file: Path) -> tuple[mujoco.MjModel, list[str]]:
+    """Return MuJoCo's model of a file, and in words what had to be dropped from it.
+
+    A file that MuJoCo refuses is compiled again without sensors, contact pairs, skins and textures, and without the
+    meshes and height fields that give no body its mass: a scene needs none of them, and files are often without them.
+    """
+    try:
+        return mujoco.MjModel.from_xml_path(os.fspath(file)), []
+    except ValueError as error:
+        refusal = _one_line(error)
+    try:
+        spec = mujoco.MjSpec.from_file(os.fspath(file))
+        dropped = _drop_unneeded(spec)
+        return spec.compile(), [f"{', '.join(dropped)}, with which MuJoCo refuses the file ({refusal})"]
+    except ValueError:
+        raise ValueError(f"load: {str(file)!r}: MuJoCo refuses it: {refusal}; correct the file") from None
+
+
+def _drop_unneeded(spec: Any) -> list[str]:
+    """Take from a specification what changes no mass and no joint; return in words what it was."""
+    dropped = []
+    for name in ("sensors", "pairs", "excludes", "skins", "tuples"):
+        elements = list(getattr(spec, name))
+        for element in elements:
+            spec.delete(element)
+        dropped += [f"{len(elements)} {name}"] if elements else []
+    for texture in spec.textures:
+        texture.file, texture.cubefiles = "", [""] * 6
+        texture.builtin, texture.width, texture.height = mujoco.mjtBuiltin.mjBUILTIN_FLAT, 1, 1
+        texture.nchannel = 3
+    shapes = [geom for geom in spec.geoms if (geom.meshname or geom.hfieldname) and _gives_no_mass(spec, geom)]
+    for geom in shapes:
+        geom.type, geom.size = mujoco.mjtGeom.mjGEOM_SPHERE, [1e-3, 0.0, 0.0]
+        geom.meshname = geom.hfieldname = ""
+        geom.mass = 0.0
+    dropped += [f"the meshes and height fields of {len(shapes)} geoms"] if shapes else []
+    used = {name for geom in spec.geoms for name in (geom.meshname, geom.hfieldname)}
+    for asset in [*spec.meshes, *spec.hfields]:
+        if asset.name not in used:
+            spec.delete(asset)
+    return dropped
+
+
+def _gives_no_mass(spec: Any, geom: Any) -> bool:
+    """Whether a geom changes no body that can move: it is on the world, or its body has an <inertial> that counts."""
+    body = geom.parent
+    if body is spec.worldbody or body.name == "world":
+        return True
+    always = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    return bool(body.explicitinertial) and not always
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

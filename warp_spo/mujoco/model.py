@@ -1,0 +1,145 @@
+"""Scenes from MuJoCo's models, in float64."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from ..scene.actuators import Keyframe
+from ..scene.scene import Scene
+from .actuators import read_actuators
+from .mechanism import BALL, FREE, SIZES, Mechanism, rotation, scene_entries, xyzw
+from .refusals import refuse_unsupported
+from .source import Source
+from .ties import read_ties
+
+
+def from_mujoco(model: Any) -> Scene:
+    """Return the scene of a compiled MuJoCo model, its numbers in float64.
+
+    Every joint becomes a hinge of its own, in the model's order and with the model's name; a body without a joint has a
+    fixed hinge. Body k of the scene is body k + 1 of the model. Where a body has several joints, all but the last carry
+    a body without mass, which follows the model's bodies and costs nothing. So does a free joint with armature,
+    damping, friction or a spring on a body whose centre of mass is beside its origin, because they act at the origin
+    in MuJoCo. Entries of q and qd keep their places; :class:`warp_spo.mujoco.Coordinates` converts states.
+
+    Mass matrix, bias force and accelerations are MuJoCo's. ``ref`` is part of the anchors, so that q is qpos;
+    ``joint_rest_q`` is ``qpos_spring``. Active equality constraints, soft in MuJoCo, become exact: connect and weld are
+    loops, a joint or tendon equality of first order between two joints is a coupling. A limited joint has limits; their
+    stiffness and damping give the joint's effective inertia at qpos0 the time constant and damping ratio of
+    ``solreflimit``. Actuators on scalar joints and fixed tendons are :class:`Actuator` in the model's order; their
+    armature and damping belong to the joint. Named sites and keyframes keep their names, a keyframe without one is
+    ``key_0``, ``key_1`` and so on by its place. ``gravcomp`` is part of ``passive_force`` and ``step``.
+
+    Args:
+        model: a ``mujoco.MjModel``, of MuJoCo 3.11 or newer.
+
+    Raises:
+        TypeError: the argument is not a ``mujoco.MjModel``.
+        UnsupportedError: the model uses a feature that no scene represents: polynomial stiffness or damping,
+            plasticity, ranges and friction of ball and free joints, spatial tendons, springs, dampers, armature,
+            friction and ranges of tendons, actuators with states, delays, or other transmissions, muscles, distance
+            equalities, equalities of higher degree or of more than two joints, fluid forces, deformable bodies,
+            plugins. The message names the element and a way out.
+        ValueError: the model has no bodies, or a value is out of a scene's range.
+
+    Warns:
+        UserWarning: once, with all that the scene leaves out: contacts, constraints that are not active, the motion of
+            mocap bodies, cameras and sensors.
+    """
+    if not isinstance(model, mujoco.MjModel):
+        raise TypeError(
+            f"from_mujoco: got {type(model).__name__}; expected mujoco.MjModel, which "
+            "mujoco.MjModel.from_xml_path(path) and mujoco.MjSpec.compile() return"
+        )
+    return scene_of(Source(model), None)
+
+
+def scene_of(source: Source, floating: bool | None) -> Scene:
+    """Return the scene of a source, its base as ``floating`` says; warn once of what it leaves out."""
+    model = source.model
+    refuse_unsupported(source)
+    if model.nbody == 1:
+        raise ValueError(f"{source.call}: {source.file or 'the model'} has no bodies; expected one or more")
+    mechanism = Mechanism(source, floating)
+    loops, couplings = read_ties(source, mechanism)
+    scene = Scene(
+        mechanism.bodies,
+        mechanism.hinges,
+        gravity=np.zeros(3) if source.disabled("GRAVITY") else model.opt.gravity,
+        loops=loops,
+        couplings=couplings,
+        actuators=read_actuators(source, mechanism),
+        sites=_sites(source),
+        keyframes=_keyframes(source, mechanism),
+    )
+    _warn(source)
+    return scene
+
+
+def _sites(source: Source) -> dict[str, tuple[int, np.ndarray]]:
+    """Return the sites that have names: the body, and the pose in it."""
+    m = source.model
+    names = [(site, source.name("site", site)) for site in range(m.nsite)]
+    return {
+        name: (int(m.site_bodyid[site]) - 1, np.concatenate([m.site_pos[site], xyzw(m.site_quat[site])]))
+        for site, name in names
+        if name
+    }
+
+
+def _keyframes(source: Source, mechanism: Mechanism) -> dict[str, Keyframe]:
+    """Return the keyframes by name; those without a name are ``key_0``, ``key_1`` by their place."""
+    m = source.model
+    return {
+        source.name("key", key) or f"key_{key}": Keyframe(
+            *_state(source, mechanism, m.key_qpos[key], m.key_qvel[key]), np.array(m.key_ctrl[key])
+        )
+        for key in range(m.nkey)
+    }
+
+
+def _state(source: Source, mechanism: Mechanism, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return q and qd of a state; see :class:`Coordinates`, which does the same in kernels."""
+    m, joint_of = source.model, {hinge: joint for joint, hinge in mechanism.hinge_of.items()}
+    q, qd = [np.zeros(0)], [np.zeros(0)]
+    for index, hinge in enumerate(mechanism.hinges):
+        if index not in joint_of:
+            start = mechanism.starts.get(index, np.zeros(0))
+            q, qd = [*q, start], [*qd, np.zeros(hinge.dof_count)]
+            continue
+        joint = joint_of[index]
+        kind, adr, dof = int(m.jnt_type[joint]), int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])
+        rates = np.array(qvel[dof : dof + SIZES[kind][1]])
+        if kind in (FREE, BALL):
+            last = adr + SIZES[kind][0]
+            axes = rotation(qpos[last - 4 : last] / np.linalg.norm(qpos[last - 4 : last]))
+            rates[-3:] = axes @ rates[-3:]
+            if kind == FREE:
+                rates[:3] += np.cross(rates[3:], axes @ mechanism.bodies[hinge.child].com)
+        q, qd = [*q, scene_entries(kind, qpos, adr)], [*qd, rates]
+    return np.concatenate(q), np.concatenate(qd)
+
+
+def _warn(source: Source) -> None:
+    """Warn of what the scene does not hold, all of it in one message."""
+    m = source.model
+    found = list(source.left_out)
+    solid = np.flatnonzero(m.geom_contype | m.geom_conaffinity)
+    if solid.size:
+        planes = [source.words("geom", int(geom)) for geom in solid if m.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE]
+        among = f", {', '.join(planes)} among them" if planes else ""
+        found.append(f"contacts of {solid.size} geom(s){among} (pass contact forces as body_f)")
+    for mocap in np.flatnonzero(m.body_mocapid >= 0):
+        found.append(f"the motion of mocap {source.words('body', int(mocap))}, which stands where the file puts it")
+    for name in ("camera", "sensor"):
+        count = source.count({"camera": "ncam", "sensor": "nsensor"}[name])
+        if count:
+            found.append(f"{count} {name}(s) (read them from the MjModel)")
+    if found:
+        who = f"{source.call}: {source.file!r}" if source.file else source.call
+        caller = 6 if source.file else 4  # the line that called load or from_mujoco
+        warnings.warn(f"{who}: left out: {'; '.join(found)}", UserWarning, stacklevel=caller)
