@@ -19,8 +19,9 @@ def solve_least_norm(T: type) -> wp.Kernel:
     The kernel scales rows by their ``size`` s and decomposes s^-1/2 A s^-1/2 = V E V* by cyclic Jacobi rotations in a
     fixed order. Of all least-squares solutions of A x = -right, out is the one with the least sum of s x^2, which does
     not depend on the choice of units. ``resolved`` is the ratio of the smallest nonzero eigenvalue to the largest. A
-    rank below ``expected`` makes out NaN and resolved 0. Where all pivots of a Cholesky factorisation are far above
-    rounding, the kernel uses that factorisation instead, which is many times faster.
+    rank below ``expected`` makes out NaN and resolved 0. An equation that is not finite, because Mass has no inverse,
+    makes out NaN and resolved 1: its rank is not what is lost. Where all pivots of a Cholesky factorisation are far
+    above rounding, the kernel uses that factorisation instead, which is many times faster.
     """
     eps = T(EPSILON[T])
 
@@ -131,8 +132,8 @@ def solve_least_norm(T: type) -> wp.Kernel:
                 for k in range(n):
                     out[world, k] = out[world, k] - V_out[world, k, i] * scale_out[world, k] * (along / value)
         rank_out[world] = rank
-        resolved_out[world] = wp.where(largest > T(0.0), smallest / largest, T(1.0))
-        if rank < expected:
+        resolved_out[world] = wp.where(healthy and largest > T(0.0), smallest / largest, T(1.0))
+        if healthy and rank < expected:
             resolved_out[world] = T(0.0)
             for i in range(n):
                 out[world, i] = T(wp.nan)

@@ -282,6 +282,26 @@ def states(scene, worlds=3, seed=1, q=None):
     return States(q, qd, tau, qdd, rng.normal(size=(worlds, scene.body_count, 6)))
 
 
+def random_truss(seed, first=-1):
+    """Return unit bars in a plane that lies askew, and a configuration that closes them.
+
+    The first loop makes a truss of two bars, which cannot move; the second ties two of the four bars that follow to
+    each other, to the truss or to the ground. ``first``: the body that the truss stands on, the ground or a bar.
+    """
+    rng, turn, count = np.random.default_rng(seed), dict(axis=(0, 0, 1)), 7 + first
+    poses = [zoo.random_pose(rng), *[at(1.0)] * (count - 1)]
+    hinges = [spo.Hinge("revolute", k - 1, k, parent_pose=pose, **turn) for k, pose in enumerate(poses)]
+    bodies = [bar(1.0) for _ in range(count)]
+    q = rng.uniform(-2.0, 2.0, count)
+    places = [*Dense(spo.Scene(bodies, hinges), q).body_matrix, np.eye(4)]  # the last: body -1
+    loops = []
+    for parent, child in ((first, first + 2), (rng.integers(-1, first + 4), rng.integers(first + 5, count))):
+        meets = np.linalg.inv(places[parent]) @ places[child] @ homogeneous(np.array(at(1.0)))
+        ends = dict(parent_pose=pose7(meets), child_pose=at(1.0))
+        loops.append(spo.Loop("revolute", int(parent), int(child), **ends, **turn))
+    return spo.Scene(bodies, hinges, loops=loops), q
+
+
 def random_closed(
     n, seed, kinds, hinge_kinds=("revolute", "prismatic", "universal", "ball"), couplings=0, roots=1, root_kind="free"
 ):

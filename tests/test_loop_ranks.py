@@ -14,6 +14,8 @@ from warp_spo.examples.parts import at, bar
 from warp_spo.recursions.loops.embedded import Embedding
 from warp_spo.reference import homogeneous, pose7
 
+TRUSS = 1e-8  # differences of order 8, over a margin of the loops of 0.1 and more
+
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_change_point_s24(dtype):
@@ -158,6 +160,37 @@ def test_a_locked_loop_stands_still():
     assert np.abs(by_multipliers(scene, s)).max() <= 1e-12
 
 
+@pytest.mark.parametrize("first", [-1, 0])
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 20))])
+def test_what_a_truss_cannot_move_is_not_independent(seed, first):
+    """Chains on a truss: as many independent dofs as Lagrange's equations leave, and finite results in them."""
+    scene, q = mechanisms.random_truss(seed, first)
+    closed, how = Closed(scene, q), embedding(scene)
+    space = closed.null_space(closed.jacobian)
+    moves = np.abs(space).max(axis=1) > 1e-9
+    assert not moves[first + 1 : first + 3].any() and moves.any()
+    assert moves[list(how.dofs)].all() and len(how.dofs) == space.shape[1]
+    s, size = mechanisms.states(scene, q=q[None], worlds=1), len(how.dofs)
+    frames = (scene.body_count - 1, 3)
+    shapes = {"mass_matrix": (size, size), "inverse_dynamics": (size,), "jacobian": (len(frames), 6, size)}
+    options = {"jacobian": dict(frames=tuple((body, (0.0, 0.0, 0.0)) for body in frames))}
+    got = {
+        name: traced(scene, f"embedded_{name}", s._asdict(), ("q", "qd", "qdd"), {"out": shape}, embedding=how,
+                     **options.get(name, {}))["out"][0]
+        for name, shape in shapes.items()
+    }  # fmt: skip
+    wanted = {
+        "mass_matrix": closed.mass_matrix(how.dofs),
+        "inverse_dynamics": closed.inverse_dynamics(s.qd[0], s.qdd[0], how.dofs),
+        "jacobian": closed.dense.jacobian(frames) @ closed.columns(how.dofs),
+    }
+    for name, right in wanted.items():
+        assert laws.error(got[name], right) <= TRUSS, name
+    for dof in np.flatnonzero(~moves):
+        with pytest.raises(ValueError, match=rf"closures do not let .*'joint_{dof}'.* move"):
+            embedding(scene, asked=[*how.dofs[1:], int(dof)])
+
+
 def test_change_points_have_a_word(device):
     """The parallelogram open, nearly flat, and flat: fine; few digits; none, which is NaN in that world alone."""
     scene = MECHANISMS["parallelogram"]()
@@ -169,6 +202,23 @@ def test_change_points_have_a_word(device):
         assert np.isfinite(qdd[:2]).all()
         assert status[2] == 6 and np.isnan(qdd[2]).all()
     assert np.isnan(dyn.forward_dynamics(q, None, np.full((3, 3), np.nan))).all()
+
+
+def test_a_massless_leaf_has_one_word(device):
+    """PIVOT, by embedding and by multipliers, in forward dynamics and in the step, in the world that lacks the mass."""
+    four = MECHANISMS["fourbar"]()
+    leaf = spo.Hinge("revolute", 2, 3, axis=(0, 1, 0), parent_pose=at(0.2))
+    scene = spo.Scene([*four.bodies, bar(0.1)], [*four.hinges, leaf], loops=four.loops)
+    values = {name: np.repeat(scene.values[name], 2, axis=0) for name in ("body_mass", "body_inertia")}
+    for value in values.values():
+        value[1, 3] = 0.0
+    q = np.tile([*mechanisms.states(four, 1).q[0], 0.3], (2, 1))
+    for dyn in both(scene.with_values(**values), 2, device):
+        for call in (dyn.forward_dynamics, lambda *given, **more: dyn.step(*given, 1e-3, **more)[1]):  # noqa: B023
+            status = np.full(2, -1, dtype=np.int32)
+            found = call(q, np.zeros((2, 4)), np.ones((2, 4)), status=status)
+            np.testing.assert_array_equal(status, [0, spo.Status.PIVOT])
+            assert np.isfinite(found[0]).all() and np.isnan(found[1]).any()
 
 
 def test_loops_that_move_no_inertia_are_lost(device):

@@ -160,9 +160,11 @@ def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str 
             independent = [i for i, dof in enumerate(dofs.tolist()) if dof in wanted]
             if len(independent) != X.shape[2] or not (_hold(X, independent) > RANK).any():
                 labels = [scene.dof_labels[dof] for dof in dofs]
+                still = [label for label, size in zip(labels, _mobility(X), strict=True) if size == 0.0]
                 raise ValueError(
                     f"{call}: independent names {[labels[i] for i in independent]} of the dofs that move "
                     f"together, {labels}; expected {X.shape[2]} that move all of them"
+                    + (f"; the closures do not let {still} move" if still else "")
                 )
         free -= set(dofs.tolist()) - set(dofs[independent].tolist())
     if wanted is not None and free != wanted:
@@ -201,12 +203,18 @@ def _spanning(Y: np.ndarray) -> tuple[list[int], np.ndarray]:
 
 def _hold(X: np.ndarray, dofs: list[int]) -> np.ndarray:
     """How well some dofs hold the others, by draw: nothing where they do not; whatever the units of a dof are."""
-    scale = np.sqrt((X**2).sum(axis=2).mean(axis=0))
     if not dofs:
         return np.ones(len(X))
+    scale = _mobility(X)
     if not scale[dofs].all():
         return np.zeros(len(X))
     return np.linalg.svd(X[:, dofs] / scale[dofs][:, None], compute_uv=False)[:, -1]
+
+
+def _mobility(X: np.ndarray) -> np.ndarray:
+    """How far each dof moves, over all draws [column]: zero where only rounding does, as in a truss."""
+    size = np.sqrt((X**2).sum(axis=2).mean(axis=0))
+    return np.where(size > RANK * size.max(initial=0.0), size, 0.0)
 
 
 def _independent(X: np.ndarray) -> list[int]:

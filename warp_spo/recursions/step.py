@@ -211,14 +211,14 @@ class Step:
         """Return the most severe status of the world."""
         settled = less(self.trace.graph.input(MISSED, 0), 0.5) if looped else 1.0
         word = select(self._open(), Status.OPEN, select(settled, 0.0, Status.NOT_SETTLED))
-        word = select(_finite(results), word, Status.PIVOT)
-        return select(_finite(self._inputs()), select(self._unresolved(), Status.LOOPS, word), Status.NOT_FINITE)
+        word = select(all_finite(results), word, Status.PIVOT)
+        return select(all_finite(self._inputs()), select(self._unresolved(), Status.LOOPS, word), Status.NOT_FINITE)
 
     def _words(self, own: Piece, results: list[Value]) -> list[Store]:
         """Return the stores that send a piece's status to the first piece, which stores the most severe of all."""
         trace, graph = self.trace, self.trace.graph
         graph.step = "status|s"
-        finite = select(_finite(self._inputs()), select(_finite(results), 0.0, Status.PIVOT), Status.NOT_FINITE)
+        finite = select(all_finite(self._inputs()), select(all_finite(results), 0.0, Status.PIVOT), Status.NOT_FINITE)
         if own.index == 0:
             worst: Value = 0.0
             for piece in Pieces(trace.links).pieces:
@@ -256,7 +256,7 @@ def carries_nothing(link: Link) -> bool:
     return link.inertia is None and all(map(carries_nothing, link.children))
 
 
-def _finite(values: list[Value]) -> Value:
+def all_finite(values: list[Value]) -> Value:
     """Return 1 if all are finite, else 0."""
     return less(-1.0, total(v.graph.make("lost", v) for v in values if not isinstance(v, float)))
 

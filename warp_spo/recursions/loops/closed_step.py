@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING
 
 from ...errors import UnsupportedError
 from ...trace.emission import Store
-from ...trace.scalars import Value, less
+from ...trace.scalars import Value, less, select
 from ...trace.spatial import total
 from ..articulated_sweeps import expand, reduce
 from ..integration import integrate_link
 from ..links import Link, place_link
-from ..step import Step
+from ..step import Step, all_finite
 from . import clusters
 from .closures import Ratio, count_open_rows
 from .clusters import Cluster, Columns
@@ -46,7 +46,9 @@ class ClosedStep(Step):
     def __init__(self, trace: Trace, embedding: Embedding):
         super().__init__(trace)
         self.loops = ClosedLoops(trace, embedding)
-        self.margins: list[Value] = []
+        self.margins: list[Value] = []  # before the step
+        self.margins_after: list[Value] = []
+        self.rates: list[Value] = []  # after the step, before the projection
         self.after: tuple[Columns, Columns] = {}, {}  # q', qd'
 
     def _accelerations(self, tau: Callable[[int], Value]) -> Columns:
@@ -57,6 +59,7 @@ class ClosedStep(Step):
     def put_back(self, stores: list[Store]) -> list[Store]:
         """Return the stores with q' and qd' projected onto the closures."""
         q, qd = ({s.index[0]: s.value for s in stores if s.array == array} for array in ("q_out", "out"))
+        self.rates = [*qd.values()]
         for cluster in self.loops.clusters:
             self.loops.label(cluster, "c")
             self._close(cluster, q, qd)
@@ -69,7 +72,7 @@ class ClosedStep(Step):
         place = lambda: {id(link): place_link(link, q.__getitem__) for link in cluster.links}  # noqa: E731
         places = place()
         tied = clusters.tie_rows(cluster, places, self.loops.embedding.rows, self.trace.epsilon)
-        self.margins += tied.space.margins
+        self.margins_after += tied.space.margins
         for _ in range(count):
             step = tied.space.particular([-g for g in tied.errors(places, q.__getitem__)])
             for link in cluster.links:
@@ -88,7 +91,10 @@ class ClosedStep(Step):
 
     def _unresolved(self) -> Value:
         least = RESOLVED * self.trace.epsilon
-        return total(1.0 - less(least, margin) for margin in self.margins)
+        before, after = (
+            total(1.0 - less(least, margin) for margin in margins) for margins in (self.margins, self.margins_after)
+        )
+        return before + select(all_finite(self.rates), after, 0.0)
 
     def _open(self) -> Value:
         q, qd = self.after
