@@ -23,6 +23,9 @@ ROOMS = (
     "status",
     "torch",
     "dlpack",
+    "memory",
+    "launches",
+    "turns",
     "arrays",
     "gradients",
     "kernels",
@@ -86,6 +89,14 @@ def test_host_code_launches(path):
     assert "torch" not in imports(path) or path.parent.name in ("torch", "env", "examples")
     assert "newton" not in imports(path) or path.parent == PACKAGE / "newton"
     assert "mujoco" not in imports(path) or path.parent == PACKAGE / "mujoco"
+
+
+@pytest.mark.parametrize("room", ["graph", "execution", "dynamics"])
+def test_device_work_goes_through_one_file(room):
+    """What ``launches.py`` does not see is missing when a recorded call is repeated."""
+    for path in sorted((PACKAGE / room).rglob("*.py")):
+        for work in ("wp.launch(", "wp.copy(", ".zero_()", ".fill_(", ".assign("):
+            assert work not in path.read_text(), f"{path.name}: {work}; use launch, copy or fill of launches.py"
 
 
 @pytest.mark.parametrize("path", SYMBOLIC, ids=named)

@@ -18,8 +18,10 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, Union
 import numpy as np
 import warp as wp
 
-from . import dlpack
+from . import dlpack, launches
 from .errors import refuse_masked
+from .memory import is_same, overlap, view
+from .turns import Turn
 
 if TYPE_CHECKING:
     import torch
@@ -27,19 +29,9 @@ if TYPE_CHECKING:
 ArrayT = TypeVar("ArrayT", "torch.Tensor", "wp.array[Any, Any]", "np.ndarray[Any, Any]")
 AnyArray = Union["torch.Tensor", "wp.array[Any, Any]", "np.ndarray[Any, Any]"]
 NUMPY, WARP, TORCH = "NumPy", "Warp", "torch"
+CLASSES: dict[type, str] = {wp.array: WARP}
+"""Kinds by class of array, of arrays that lie in a device's memory; torch's join when the first tensor comes."""
 _DTYPES = {"float32": wp.float32, "float64": wp.float64}
-
-
-def broadcast_worlds(array: wp.array, axis: int, worlds: int) -> wp.array:
-    """Return ``array`` seen with ``worlds`` entries along its world axis, where it has 1 or ``worlds``; no copy."""
-    if array.shape[axis] == worlds:
-        return array
-    shape, strides = list(array.shape), list(array.strides)
-    shape[axis], strides[axis] = worlds, 0
-    place = {"ptr": array.ptr, "shape": tuple(shape), "strides": tuple(strides)}
-    view: Any = wp.array(**place, dtype=array.dtype, device=array.device)
-    view._ref = array  # keeps the memory
-    return view
 
 
 def parse_dtype(dtype: Any, call: str = "dtype") -> type:
@@ -130,6 +122,7 @@ class Call:
         device: The device on which the kernels run.
         dtype: ``wp.float32`` or ``wp.float64``.
         kind: Kind of the result if the call reads no array.
+        turn: What the call has to wait for.
 
     Attributes:
         result: The array of :meth:`write` in the caller's kind, or a tuple of them if :meth:`write` was called more
@@ -142,6 +135,7 @@ class Call:
         "_results",
         "_saved_stream",
         "_staged",
+        "_turn",
         "_waits",
         "device",
         "dtype",
@@ -150,8 +144,9 @@ class Call:
         "result",
     )
 
-    def __init__(self, name: str, device: wp.Device, dtype: type, kind: str | None = None):
+    def __init__(self, name: str, device: wp.Device, dtype: type, kind: str | None = None, turn: Turn | None = None):
         self.name = name
+        self._turn = turn
         self.device = device
         self.dtype = dtype
         self.kind = kind
@@ -164,7 +159,14 @@ class Call:
         self._waits = False  # for kernels that a library does not know of
 
     def __enter__(self) -> "Call":
+        if self._turn is not None:
+            self._turn.lock.acquire()
         return self
+
+    def order(self) -> None:
+        """Let the current stream wait for the call before. Kernels are launched after it; :meth:`write` does it too."""
+        if self._turn is not None and self.device.is_cuda:
+            self._turn.order(self.device.stream)
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
         try:
@@ -173,6 +175,8 @@ class Call:
         finally:
             if self._saved_stream is not None:
                 wp.set_stream(self._saved_stream, self.device, sync=False)
+            if self._turn is not None:
+                self._turn.lock.release()
 
     def read(
         self, name: str, array: Any, shape: tuple, meaning: str = "", *, dtype: Any = None, optional: bool = False
@@ -242,6 +246,7 @@ class Call:
                 warp_array = self._as_warp(name, out, shape, meaning, dtype, change=True)
             self._add_output(name, out, warp_array, over)
         self._results.append((out, warp_array))
+        self.order()
         return warp_array
 
     def _new(self, shape: tuple, dtype: type) -> tuple[Any, wp.array]:
@@ -251,6 +256,8 @@ class Call:
         if self.kind == TORCH and self.device.is_cuda:
             self._enter_stream()
         owner, array = new(self.kind, shape, dtype, self.device)
+        if (recording := launches.recording()) is not None:
+            recording.add_result(owner, array, shape, dtype)
         return (None if self.kind in (None, NUMPY) else owner), array
 
     def _as_warp(self, name: str, array: Any, shape: tuple, meaning: str, dtype: Any, change: bool = False) -> wp.array:
@@ -384,20 +391,17 @@ class Call:
             )
 
     def _add_output(self, name: str, array: Any, warp_array: wp.array, over: str = "") -> None:
-        same = [one for one in self._inputs if one[0] == over
-                and (_same_memory(warp_array, one[2]) or _same_numpy(array, one[1]))]  # fmt: skip
+        same = [one for one in self._inputs if one[0] == over and is_same(array, warp_array, *one[1:])]
         self._check_apart(name, array, warp_array, [other for other in self._inputs if other not in same])
         self._check_apart(name, array, warp_array, self._outputs)
         self._outputs.append((name, array, warp_array))
+        if (recording := launches.recording()) is not None:
+            recording.written.append(array)
 
     def _check_apart(self, name: str, array: Any, warp_array: wp.array, others: list[tuple]) -> None:
         """Raise ValueError if the memory of an array overlaps that of ``others``."""
-        for other_name, other, other_warp in others:
-            if isinstance(array, np.ndarray):
-                overlap = isinstance(other, np.ndarray) and np.shares_memory(array, other)
-            else:
-                overlap = bool(warp_array.size and other_warp.size) and _share_memory(warp_array, other_warp)
-            if overlap:
+        for other_name, *other in others:
+            if overlap(array, warp_array, *other):
                 raise ValueError(
                     f"{self.name}: {name} overlaps {other_name} in memory; expected memory that is apart from that of "
                     f"every other array, because the call writes it; pass a fresh array for one of them"
@@ -442,31 +446,6 @@ def new(kind: str | None, shape: tuple, dtype: type, device: wp.Device) -> tuple
     return array, array
 
 
-@functools.lru_cache(maxsize=4096)
-def view(pointer: int, shape: tuple, dtype: type, device: str) -> wp.array:
-    """Return a Warp array over memory that another object owns. Cached, because making one takes 4 us."""
-    return wp.array(ptr=pointer, shape=shape, dtype=dtype, device=device)
-
-
-def _same_memory(a: wp.array, b: wp.array) -> bool:
-    """Whether two Warp arrays have the same memory and shape."""
-    return a.ptr == b.ptr and a.shape == b.shape
-
-
-def _same_numpy(a: Any, b: Any) -> bool:
-    """Whether a and b are the same NumPy array. A call may read and write it: it is copied first and filled last."""
-    if not (isinstance(a, np.ndarray) and isinstance(b, np.ndarray)):
-        return False
-    return a.ctypes.data == b.ctypes.data and a.shape == b.shape and a.strides == b.strides and a.dtype == b.dtype
-
-
-def _share_memory(a: wp.array, b: wp.array) -> bool:
-    """Whether two Warp arrays have a byte in common."""
-    return a.ptr < b.ptr + b.size * wp.types.type_size_in_bytes(b.dtype) and b.ptr < a.ptr + a.size * (
-        wp.types.type_size_in_bytes(a.dtype)
-    )
-
-
 def _dtype_name(array: Any) -> str:
     return getattr(array.dtype, "__name__", None) or str(array.dtype).removeprefix("torch.")
 
@@ -481,4 +460,5 @@ def torch_border() -> Any:
     """Return the module :mod:`warp_spo.torch`."""
     from . import torch  # the only file that imports torch, used only if the caller has imported torch
 
+    CLASSES.update(dict.fromkeys(torch.CLASSES, TORCH))
     return torch

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 import warp as wp
 
+from .. import launches
 from ..arrays import AnyArray, ArrayT
 from ..errors import UnsupportedError, as_integer
 from ..execution.routine import Routine
@@ -151,6 +152,6 @@ def loop_multipliers(
         multipliers_out, rank_out = engine.write(call, LOOP_MULTIPLIERS, outs, given)
         closures.find_multipliers(**given)
         multipliers, rank, _ = closures.solution()
-        wp.copy(multipliers_out, multipliers)
-        wp.copy(rank_out, rank)
+        launches.copy(multipliers_out, multipliers)
+        launches.copy(rank_out, rank)
     return call.result

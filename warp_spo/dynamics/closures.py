@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from .. import launches
 from ..arrays import Call
 from ..errors import UnsupportedError
 from ..execution.routine import Routine
@@ -123,7 +124,7 @@ class Closures:
             self._correct(new, hold, rates=False, q=q)
             q = new
         if iterations == 0:
-            wp.copy(q_out, q)
+            launches.copy(q_out, q)
         if qd_out is not None:
             self._correct(qd_out, hold, rates=True, q=q_out, qd=qd)
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import warp as wp
 
+from .. import launches
 from ..arrays import AnyArray, ArrayT
 from ..execution.programs import Program
 from ..execution.routine import Routine
@@ -202,11 +203,11 @@ def _differentiate_by_rows(dyn: Dynamics, given: dict[str, Any], outs: Sequence[
     rows = [dyn.recursions.array(f"row by {name}", *shape) for name in names]
     unit = dyn.recursions.array("unit cotangent", *shape)
     for dof in range(dyn.scene.dof_count):
-        unit.zero_()
-        unit[:, dof].fill_(1.0)
+        launches.fill(unit, 0)
+        launches.fill(unit[:, dof], 1.0)
         dyn._gradients.launch(derivative, names, rows, {**given, "cotangent": unit})
         for row, out in zip(rows, outs, strict=True):
-            wp.copy(out[:, dof], row)
+            launches.copy(out[:, dof], row)
 
 
 def _tiled(

@@ -48,6 +48,7 @@ from .engine import Engine
 from .gradients import Gradients
 from .operation import Operation, declared
 from .refinement import Refinement
+from .replays import Replays
 
 if TYPE_CHECKING:
     pass
@@ -61,9 +62,10 @@ class Dynamics:
     Arrays are torch tensors, Warp arrays, NumPy arrays, or those of a library that speaks DLPack, such as JAX and CuPy,
     [world, ...] and C-contiguous; the kind of the first one is the kind of the result, and ``out=`` is filled and
     returned. All but NumPy arrays must have this object's dtype and device; NumPy arrays are cast and copied.
-    Coordinates, velocities and forces are those of the scene, see :mod:`warp_spo.scene.parts`. One object serves one
-    stream at a time. pickle and ``copy.deepcopy`` build an equal object anew, with the values that :meth:`set` gave
-    this one.
+    Coordinates, velocities and forces are those of the scene, see :mod:`warp_spo.scene.parts`. Threads may
+    share an object: its calls run one at a time, and on CUDA the stream of a call waits for that of the call before it,
+    except in a graph capture, where nothing may wait. pickle and ``copy.deepcopy`` build an equal object anew, with the
+    values that :meth:`set` gave this one.
 
     Args:
         scene: the scene to compute.
@@ -210,6 +212,7 @@ class Dynamics:
         self.recursions = Sweeps(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)
         self.values = TensorValues()
+        self._replays = Replays(self.device, self.recursions.turn)
         self._engine, self._gradients = Engine(self), Gradients(self)
         self._closures = Closures(self, loops, independent)
         self.closed, self.embedding = self._closures.closed, self._closures.embedding

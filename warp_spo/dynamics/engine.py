@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from .. import launches
 from ..arrays import Call
 from ..errors import UnsupportedError
 from ..execution.routine import Routine
@@ -64,7 +65,7 @@ class Engine:
                 f"Dynamics.{name}: {names} was set to a tensor that requires grad; derivatives are not available "
                 f"through this call; call inside torch.no_grad(), or set {names} to detached tensors"
             )
-        return Call(f"Dynamics.{name}", self._dyn.device, self._dyn.dtype)
+        return Call(f"Dynamics.{name}", self._dyn.device, self._dyn.dtype, turn=self._dyn.recursions.turn)
 
     def refuse(self, name: str, form: Operation | Derivative) -> None:
         """Raise UnsupportedError if an operation, or a derivative, has no form for the loops of this Dynamics."""
@@ -211,7 +212,7 @@ class Engine:
             if out.size == 0:
                 return False
             if dyn.scene.dof_count == 0:
-                out.zero_()
+                launches.fill(out, 0)
                 return False
         arrays = {name: value for name, value in given.items() if isinstance(value, wp.array | float)}
         options = {name: value for name, value in given.items() if value is not None and name not in arrays}

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from .. import launches
 from ..arrays import Call
 from ..errors import UnsupportedError, as_names
 from ..execution import link_values
@@ -116,11 +117,12 @@ class Gradients:
             return
         dyn = self.dyn
         parameters = dyn.recursions.parameters
-        with Call("Dynamics.set", dyn.device, dyn.dtype) as call:
+        with Call("Dynamics.set", dyn.device, dyn.dtype, turn=dyn.recursions.turn) as call:
             arrays, before = {}, {}
             for name, value in values.items():
                 shape = dyn.scene.values[name].shape[1:]
                 arrays[name] = call.read(name, value, (dyn.worlds, *shape) if value.ndim > len(shape) else shape)
+            call.order()
             for name, array in arrays.items():  # on the stream that read has entered
                 before[name] = wp.clone(parameters.value(name))
                 parameters.copy_in(name, array)
@@ -129,7 +131,7 @@ class Gradients:
                 yield
             finally:
                 for name, value in before.items():
-                    wp.copy(parameters.value(name), value)
+                    launches.copy(parameters.value(name), value)
                 parameters.refresh(values)
 
     # -- steps of the methods --------------------------------------------------------------------------------------
@@ -183,7 +185,7 @@ class Gradients:
         values = {name: results.pop(name) for name in names if name in LINK_VALUES}
         if dyn.scene.dof_count == 0:
             for array in outs:
-                array.zero_()
+                launches.fill(array, 0)
             return
         if values:
             dyn.programs.links.with_tables()  # fills the table

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..arrays import AnyArray, ArrayT, Call, broadcast_worlds, shape_of
+from .. import launches
+from ..arrays import AnyArray, ArrayT, Call, shape_of
 from ..errors import UnsupportedError, refuse_masked
 from ..execution.routine import Routine
+from ..memory import broadcast_worlds
 from ..recursions import hybrid
 from ..recursions.loops import minimal
 from . import samples
@@ -104,7 +106,7 @@ def _read_mask(dyn: Dynamics, call: Call, mask: Any) -> tuple[wp.array | None, t
     shared = call.read("prescribed", mask, (dofs,), "[world, dof] or [dof]", dtype=wp.bool)
     spread_mask = dyn._mask
     if shared.size:
-        wp.copy(spread_mask, broadcast_worlds(shared.reshape((1, dofs)), 0, dyn.worlds))
+        launches.copy(spread_mask, broadcast_worlds(shared.reshape((1, dofs)), 0, dyn.worlds))
     return spread_mask, None
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from .. import launches
 from ..arrays import AnyArray, ArrayT
 from ..execution import node_operations as nodes
 from ..execution.routine import Routine
@@ -155,9 +156,9 @@ def _solve_columns(dyn: Dynamics, q: wp.array, b: wp.array, out: wp.array) -> No
         turn = slice(first, min(first + COLUMNS, columns))
         size = *b.shape[:2], turn.stop - turn.start
         right, x = (dyn.recursions.array((name, size), *size) for name in ("columns of b", "columns of Mass^-1 b"))
-        wp.copy(right, b[:, :, turn])
+        launches.copy(right, b[:, :, turn])
         launch(SOLVE_MASS_MATRIX, x, q=q, b=right, columns=size[2])
-        wp.copy(out[:, :, turn], x)
+        launches.copy(out[:, :, turn], x)
 
 
 # -- packed ------------------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from .. import launches
 from ..arrays import Call
 from ..errors import UnsupportedError
 from ..execution.routine import Routine
@@ -63,7 +64,7 @@ def semi_implicit(
     asked = {name: array for name, array in (("qdd_out", qdd), ("status", status)) if array is not None}
     option = {name.removesuffix("_out"): True for name in asked}
     if dyn.scene.dof_count == 0 and status is not None:
-        status.zero_()
+        launches.fill(status, 0)
     launch, more = dyn._engine.launch_routine, {"q_out": q_out, **asked}
     if not dyn.closed:
         launch(STEP, qd_out, more, q=q, qd=qd, dt=dt, **given, **option)
@@ -139,8 +140,8 @@ def rk4(
     for stage, (start, weight) in enumerate(RK4):
         if stage == 0:
             for array, at, total in ((q, q_at, q_sum), (qd, qd_at, qd_sum)):
-                wp.copy(at, array)
-                wp.copy(total, array)
+                launches.copy(at, array)
+                launches.copy(total, array)
         else:
             _combine(dyn, 1.0, q, start * dt, q_rate, q_at)
             _combine(dyn, 1.0, qd, start * dt, qdd, qd_at)
@@ -151,7 +152,7 @@ def rk4(
         launch(COORDINATE_RATES, q_rate, q=q_at, qd=qd_at)
         _combine(dyn, 1.0, q_sum, weight * dt, q_rate, q_sum)
         _combine(dyn, 1.0, qd_sum, weight * dt, qdd, qd_sum)
-    qdd.zero_()
+    launches.fill(qdd, 0)
     launch(INTEGRATE, q_at, q=q_sum, qd=qdd, dt=0.0)  # normalises
     _finish(dyn, q_at, qd_sum, q_out, qd_out)
 
@@ -165,8 +166,8 @@ def _finish(dyn: Dynamics, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: w
     if dyn.closed:
         dyn._closures.project(q, qd, False, NEWTON_STEPS, q_out, qd_out)
     else:
-        wp.copy(q_out, q)
-        wp.copy(qd_out, qd)
+        launches.copy(q_out, q)
+        launches.copy(qd_out, qd)
 
 
 def _scratch(dyn: Dynamics, name: str, like: wp.array) -> wp.array:

@@ -43,6 +43,7 @@ from ..recursions.links import LINK_VALUES, MOTION_VALUES, Links
 from ..scene.frames import check_frames, origins
 from ..scene.scene import Scene
 from . import samples
+from .replays import MISS
 from .seconds import STAND_IN, seconds
 
 if TYPE_CHECKING:
@@ -262,24 +263,36 @@ class Operation:
     _methods: list[Callable[..., Any]] = dataclasses.field(default_factory=list, repr=False)
 
     def method(self, function: MethodT) -> MethodT:
-        """Declare ``function`` to be the method of this operation; torch then gets its gradients, if it has any."""
+        """Declare ``function`` to be the method of this operation.
+
+        Calls are recorded and repeated, see :mod:`.replays`, and torch gets the operation's gradients if it has any.
+        """
         assert function.__name__ == self.name, f"{function.__name__} is declared as {self.name}"
         vars(function)["operation"] = self
         self._methods.append(function)
-        if self.derivative is None:
-            return function
-        signature = inspect.signature(function)
+        signature, name = inspect.signature(function), self.name
 
         @functools.wraps(function)
         def call(dyn: Any, *args: Any, **more: Any) -> Any:
-            if not records_gradient((*args, *more.values()), dyn.values):
-                return function(dyn, *args, **more)
-            arguments = signature.bind(dyn, *args, **more).arguments
-            del arguments["self"]
-            return call_with_gradient(dyn, self, arguments)
+            recorded = not dyn.values.tensors or not records_gradient((), dyn.values)
+            result, *kind = dyn._replays.replay(name, args, more) if recorded else (MISS, None, [])
+            if result is not MISS:
+                return result
+            if self.derivative is not None and records_gradient((*args, *more.values()), dyn.values):
+                arguments = signature.bind(dyn, *args, **more).arguments
+                del arguments["self"]
+                return call_with_gradient(dyn, self, arguments)
+            return dyn._replays.run(*kind, lambda: function(dyn, *args, **more))
 
         self._methods.append(call)
         return cast(MethodT, call)
+
+    def run(self, dyn: Any, *args: Any, **more: Any) -> Any:
+        """Return the result without torch's gradients."""
+        result, *kind = dyn._replays.replay(self.name, args, more)
+        if result is not MISS:
+            return result
+        return dyn._replays.run(*kind, lambda: self.function(dyn, *args, **more))
 
     @property
     def function(self) -> Callable[..., Any]:

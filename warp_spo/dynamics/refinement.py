@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from .. import launches
 from ..execution import status_words as words
 from ..kernels import refinement as kernels
 from .forward_dynamics import FORWARD_DYNAMICS
@@ -56,9 +57,9 @@ class Refinement:
             column, found = (self._array(self.narrow if b.dtype is wp.float32 else self.wide, name)
                              for name in ("column", "found"))  # fmt: skip
             for j in range(b.shape[2]):
-                wp.copy(column, b[:, :, j])
+                launches.copy(column, b[:, :, j])
                 self.solve_mass_matrix(q, column, found)
-                wp.copy(out[:, :, j], found)
+                launches.copy(out[:, :, j], found)
             return
         low, x = self._in(self.narrow, "q", q), self._array(self.narrow, "x")
         self.narrow._engine.launch(SOLVE_MASS_MATRIX, x, q=low, b=self._in(self.narrow, "b", b))
@@ -93,4 +94,4 @@ class Refinement:
 
     @staticmethod
     def _launch(kernel: wp.Kernel, inputs: list, out: wp.array) -> None:
-        wp.launch(kernel, out.shape, inputs, [out], device=out.device)
+        launches.launch(kernel, out.shape, inputs, [out], device=out.device)

@@ -27,7 +27,7 @@ def set_values(self: Dynamics, **values: Any) -> None:
         ValueError: unknown name, wrong shape, dtype or device; a name that is not variable inside a graph capture.
     """
     folded: dict[str, Any] = {}
-    with Call("Dynamics.set", self.device, self.dtype) as call:
+    with Call("Dynamics.set", self.device, self.dtype, turn=self.recursions.turn) as call:
         variable: dict[str, Any] = {}
         for name, value in values.items():
             if name not in VARIABLE:
@@ -55,6 +55,7 @@ def set_values(self: Dynamics, **values: Any) -> None:
         host = {name: value if isinstance(value, np.ndarray) else value.numpy() for name, value in folded.items()}
         checked = {name: self.scene.check_value("Dynamics.set", name, value) for name, value in host.items()}
         parameters = self.recursions.parameters
+        call.order()
         for name, array in variable.items():
             parameters.copy_in(name, array)
             self.values.set(name, values[name])
@@ -74,4 +75,5 @@ def _rebuild(dyn: Dynamics, folded: dict[str, np.ndarray]) -> None:
     dyn.scene = dyn.scene.with_values(**folded)
     dyn.recursions.replace_values(dyn.scene)
     dyn.programs.forget()
+    dyn._replays.forget()
     dyn._refinement = Refinement(dyn, dyn.refine) if dyn.refine else None

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from .. import launches
 from ..arrays import WARP, AnyArray, Call
 from ..execution.programs import Programs
 from ..execution.routine import Routine
@@ -89,11 +90,12 @@ class SpatialOperators(LetterOwner):
     def update(self, q: Any) -> None:
         """Take the coordinates ``q`` [world, coordinate]; launches only."""
         run = self._recursions
-        with Call("operators.update", run.device, run.dtype) as call:
+        with Call("operators.update", run.device, run.dtype, turn=run.turn) as call:
             q = call.read("q", q, (run.worlds, run.scene.coord_count), "[world, coordinate]")
             self._kind = call.kind
+            call.order()
             if self._fused:
-                wp.copy(self._q, q)
+                launches.copy(self._q, q)
                 self._filled = None
                 # A graph with this launch may be replayed at any time: the host no longer knows what is up to date.
                 self._captured = self._captured or run.device.is_capturing
@@ -136,10 +138,10 @@ class SpatialOperators(LetterOwner):
     def frames(self) -> Any:
         """Pose of every node frame in the inertial frame, x, y, z, quaternion xyzw [world, node, 7]; the kind of q."""
         run = self._recursions
-        with Call("operators.frames", run.device, run.dtype, kind=self._kind) as call:
+        with Call("operators.frames", run.device, run.dtype, kind=self._kind, turn=run.turn) as call:
             out = call.write(None, (run.worlds, run.scene.body_count, 7))
             self.fill()
-            wp.copy(out, self._frames)
+            launches.copy(out, self._frames)
         return call.result
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from .. import launches
 from ..scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def build(
     dyn = kind(scene, **options)
     parameters = dyn.recursions.parameters
     for name, value in values.items():
-        wp.copy(parameters.value(name), wp.array(value, dtype=wp.float64, device=dyn.device))
+        launches.copy(parameters.value(name), wp.array(value, dtype=wp.float64, device=dyn.device))
     parameters.refresh(values)
     for name, tensor in tensors.items():
         dyn.values.set(name, tensor)

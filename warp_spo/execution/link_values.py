@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from ..arrays import broadcast_worlds
+from .. import launches
 from ..kernels import native, straight
+from ..memory import broadcast_worlds
 from ..recursions.links import Links
 from ..trace.differentiation import reverse
 from ..trace.emission import Emitter, Store, render
@@ -26,7 +27,7 @@ def table(parameters: Parameters, links: Links, name: str) -> wp.array:
         own = wp.empty((len(values), worlds), dtype=T, device=device)
         inputs = [worlds, *(parameters.entries(source, worlds) for source in sources)]
         kernel = _kernel(name, values, sources, T)
-        fill = lambda: wp.launch(kernel, worlds, inputs, [own], device=device)  # noqa: E731
+        fill = lambda: launches.launch(kernel, worlds, inputs, [own], device=device)  # noqa: E731
         return DerivedArrays([broadcast_worlds(own, 1, parameters.worlds)], sources, fill)
 
     return parameters.derived_arrays(name, build)[0]
@@ -60,7 +61,7 @@ def pull_back(parameters: Parameters, links: Links, cotangent: wp.array, gradien
     """
     kernel, sources = _reverse(parameters, links, tuple(gradients))
     inputs = [parameters.worlds, *(parameters.entries(source, parameters.worlds) for source in sources), cotangent]
-    wp.launch(kernel, parameters.worlds, inputs, list(gradients.values()), device=parameters.device)
+    launches.launch(kernel, parameters.worlds, inputs, list(gradients.values()), device=parameters.device)
 
 
 def _reverse(parameters: Parameters, links: Links, names: tuple[str, ...]) -> tuple[wp.Kernel, list[str]]:

@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from ..arrays import broadcast_worlds
+from .. import launches
 from ..kernels import parameters as kernels
 from ..kernels.spatial import POSE, RIGID
 from ..kernels.topology import Topology
+from ..memory import broadcast_worlds
 from ..scene.scene import Scene
 from .node_functions import node_functions
 
@@ -73,7 +74,7 @@ class Parameters:
             own: Any = wp.array(value, dtype=wp.float64, device=device)
             if name in variable:
                 shared, own = own, wp.empty((worlds, *value.shape[1:]), dtype=wp.float64, device=device)
-                wp.copy(own, broadcast_worlds(shared, 0, worlds))
+                launches.copy(own, broadcast_worlds(shared, 0, worlds))
             self._values[name] = own
 
     @property
@@ -112,7 +113,8 @@ class Parameters:
                 for components in (POSE, POSE, 3, RIGID)
             ]
             inputs, dim = [self._topology, self._hinge_of, *values], (scene.body_count, worlds)
-            fill = lambda: wp.launch(kernels.derive(node_functions(self.dtype)), dim, inputs, own, device=self.device)  # noqa: E731
+            kernel = kernels.derive(node_functions(self.dtype))
+            fill = lambda: launches.launch(kernel, dim, inputs, own, device=self.device)  # noqa: E731
             return DerivedArrays([broadcast_worlds(array, 2, self.worlds) for array in own], RIGID_VALUES, fill)
 
         return self.derived_arrays("bodies", build)
@@ -144,7 +146,7 @@ class Parameters:
             value = self._values[name]
             own: Any = wp.empty(value.shape[::-1], dtype=self.dtype, device=self.device)
             kernel = kernels.transpose(node_functions(self.dtype))
-            fill = lambda: wp.launch(kernel, own.shape, [value], [own], device=self.device)  # noqa: E731
+            fill = lambda: launches.launch(kernel, own.shape, [value], [own], device=self.device)  # noqa: E731
             return DerivedArrays([broadcast_worlds(own, 1, self.worlds)], (name,), fill)
 
         return self.derived_arrays(name, build)[0]
@@ -168,7 +170,7 @@ class Parameters:
             flat = value.reshape((self.worlds, size))
         else:
             flat = broadcast_worlds(value.reshape((1, size)), 0, self.worlds)
-        wp.launch(
+        launches.launch(
             kernels.widen(node_functions(self.dtype)),
             dim=(self.worlds, size),
             inputs=[flat],
@@ -179,7 +181,7 @@ class Parameters:
     def adopt_variable(self, other: Parameters) -> None:
         """Copy the variable values of ``other``."""
         for name in self.variable:
-            wp.copy(self._values[name], other._values[name])
+            launches.copy(self._values[name], other._values[name])
         self._version = other._version
         self.refresh(self.variable)
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from .. import launches
 from ..kernels import native, straight
 from ..kernels.native import INTEGERS
 from ..kernels.slots import WARP_SIZE
@@ -111,7 +112,9 @@ class Programs:
         inputs, worlds, block = [*rows, *fields, *program.tables], self.run.worlds, program.block
         of_block = block // program.warps
         threads = -(-worlds // of_block) * block if self.run.device.is_cuda else worlds
-        wp.launch(program.kernel, threads, [worlds, *inputs], [out, *more], device=self.run.device, block_dim=block)
+        launches.launch(
+            program.kernel, threads, [worlds, *inputs], [out, *more], device=self.run.device, block_dim=block
+        )
 
     def field(self, name: str) -> wp.array:
         """One of FIELDS."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from .. import launches
 from ..kernels import declare
 from ..kernels import status as kernels
 from ..kernels.spatial import ARTICULATED
@@ -39,6 +40,6 @@ def write(
     kernel = kernels.lost_digits(run.functions)
     for first, count in run.plan.inward:
         arguments = [run.topology, first, *inputs]
-        wp.launch(kernel, (count, run.worlds), arguments, [rounding, lost], device=run.device)
+        launches.launch(kernel, (count, run.worlds), arguments, [rounding, lost], device=run.device)
     values = [p.tree, p.com, p.rigid, armature, p.gravity]
     run.launch_nodes(kernels.status_word, run.worlds, [q, qd, tau, body_f, *values, lost, qdd], [status])

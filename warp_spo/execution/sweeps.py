@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .. import launches
 from ..kernels import articulated, composite, declare, kinematics, newton_euler, parameters, rigid_blocks, tiles
 from ..kernels.spatial import ARTICULATED, MOTION, POSE, RIGID
 from ..kernels.topology import Topology
 from ..scene.scene import Scene
+from ..turns import Turn
 from . import node_hinges
 from .node_functions import node_functions
 from .parameters import Parameters
@@ -30,6 +32,7 @@ class Sweeps:
         topology: the tree's tables on the device.
         parameters: the scene's values on the device.
         functions: the functions that kernels at node granularity call at a node.
+        turn: of calls that use the workspace.
     """
 
     def __init__(self, scene: Scene, plan: Plan, device: wp.Device, dtype: type, variable: tuple[str, ...]):
@@ -43,6 +46,7 @@ class Sweeps:
         screw = np.column_stack([scene.dof_axis, scene.dof_angular, scene.dof_linear])
         self._screw: Any = wp.array(screw, dtype=dtype, device=device)
         self.parameters = Parameters(scene, self.topology, self.worlds, device, dtype, variable)
+        self.turn = Turn(device)
         self._workspace: dict[Hashable, wp.array] = {}
         self._frames: dict[tuple, tuple[wp.array, wp.array]] = {}
         self._hinge_kernels: dict[bool, wp.Kernel | None] = {}  # with velocities or not
@@ -77,18 +81,18 @@ class Sweeps:
 
     def launch(self, factory: Callable, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
         """Launch a kernel whose factory takes the scalar type."""
-        wp.launch(factory(self.dtype), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+        launches.launch(factory(self.dtype), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def launch_nodes(self, factory: Callable, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
         """Launch a kernel whose factory takes the node functions."""
-        wp.launch(factory(self.functions), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+        launches.launch(factory(self.functions), dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def _sweep(self, factory: Callable, levels: Sequence[tuple[int, int]], inputs: list, outputs: list) -> None:
         """Launch a kernel once a level, with one thread for each (node, world)."""
         kernel = factory(self.functions)
         for first, count in levels:
             arguments = [self.topology, first, *inputs]
-            wp.launch(kernel, (count, self.worlds), arguments, outputs, device=self.device)
+            launches.launch(kernel, (count, self.worlds), arguments, outputs, device=self.device)
 
     def _sweep_columns(
         self, factory: Callable, levels: Sequence, columns: tuple[int, int], inputs: list, outputs: list
@@ -97,7 +101,7 @@ class Sweeps:
         kernel = factory(self.functions)
         for first, count in levels:
             arguments = [self.topology, first, columns[0], *inputs]
-            wp.launch(kernel, (count, columns[1], self.worlds), arguments, outputs, device=self.device)
+            launches.launch(kernel, (count, columns[1], self.worlds), arguments, outputs, device=self.device)
 
     # -- kinematics ------------------------------------------------------------------------------------------------
     def hinges(self, q: wp.array, qd: wp.array | None = None) -> None:
@@ -120,7 +124,7 @@ class Sweeps:
         kernel = self._hinge_kernels[moves]
         if kernel is not None:
             found = [array for array in outputs if array is not None]
-            wp.launch(kernel, self.worlds, [self.worlds, *inputs], found, device=self.device)
+            launches.launch(kernel, self.worlds, [self.worlds, *inputs], found, device=self.device)
 
     def velocities(self) -> wp.array:
         """Return V = phi* H* qd of every node; after :meth:`hinges` with qd."""
@@ -188,7 +192,7 @@ class Sweeps:
         """Write the mass matrix into ``out`` [world, dof, dof] by composite bodies; after :meth:`hinges`."""
         pose, axis, bodies = self.array("pose"), self.array("axis"), self._per_node("composite", RIGID)
         self._sweep(composite.composite, self.plan.inward, [pose, self.parameters.rigid], [bodies])
-        out.zero_()
+        launches.fill(out, 0)
         inputs = [self.topology, pose, axis, self.parameters.field("joint_armature"), bodies]
         self.launch_nodes(composite.mass_matrix, (self.scene.dof_count, self.worlds), inputs, [out])
 

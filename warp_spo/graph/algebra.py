@@ -14,8 +14,10 @@ from typing import Any, NoReturn, overload
 
 import warp as wp
 
-from ..arrays import ArrayT, Call, kind_of, new, parse_device, parse_dtype, view
+from .. import launches
+from ..arrays import ArrayT, Call, kind_of, new, parse_device, parse_dtype
 from ..kernels import block_sparse, declare
+from ..memory import view
 
 
 class Workspace:
@@ -159,10 +161,10 @@ class Operator(abc.ABC):
                 if rows != self.shape[0]:
                     whole = space.take(self, self.shape[0], "y")
                 self._fill()
-                wp.launch(block_sparse.unit(self.dtype), x.shape, [first], [x], device=self.device)
+                launches.launch(block_sparse.unit(self.dtype), x.shape, [first], [x], device=self.device)
                 self._apply(x, whole, 1.0, False, space)
                 if whole is not y:
-                    wp.copy(y, whole[:, first_row : first_row + rows])
+                    launches.copy(y, whole[:, first_row : first_row + rows])
         return call.result
 
     @functools.cached_property
@@ -325,7 +327,7 @@ class Product(Operator):
 
 def add_scaled(x: wp.array, out: wp.array, alpha: float, accumulate: bool) -> None:
     """Launch ``out = alpha x``, or with ``accumulate`` ``out += alpha x``; both are [world, row, column]."""
-    wp.launch(block_sparse.scale(x.dtype), x.shape, [alpha, accumulate, x], [out], device=x.device)
+    launches.launch(block_sparse.scale(x.dtype), x.shape, [alpha, accumulate, x], [out], device=x.device)
 
 
 def _with_columns(array: wp.array) -> wp.array:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .. import launches
 from ..arrays import NUMPY, WARP, Call, device_of, kind_of, parse_device, parse_dtype
 from ..kernels import block_sparse
 from .algebra import Operator, Workspace
@@ -72,7 +73,7 @@ class Table:
 
     def gather(self, weights: wp.array, x: wp.array, out: wp.array, alpha: float, add: bool) -> None:
         """Launch ``out = alpha B x``, or with ``add`` ``out += alpha B x``."""
-        wp.launch(
+        launches.launch(
             block_sparse.gather(x.dtype),
             dim=(out.shape[1], out.shape[2], out.shape[0]),
             inputs=[weights, self.rows, self.entries, alpha, add, x],
@@ -83,7 +84,7 @@ class Table:
     def sweep(self, weights: wp.array, x: wp.array, out: wp.array, alpha: float) -> None:
         """Launch ``out = alpha (I - B)^-1 x``."""
         for first, count in self.levels:
-            wp.launch(
+            launches.launch(
                 block_sparse.sweep(x.dtype),
                 dim=(count, out.shape[2], out.shape[0]),
                 inputs=[weights, self.rows, self.entries, first, alpha, x],
@@ -227,7 +228,9 @@ def pack(
                     device=device,
                 )
                 strides = (step, columns * scalar, scalar)
-                wp.copy(block, wp.array(ptr=source.ptr, shape=block.shape, strides=strides, dtype=dtype, device=device))
+                launches.copy(
+                    block, wp.array(ptr=source.ptr, shape=block.shape, strides=strides, dtype=dtype, device=device)
+                )
             offset += rows * columns
         if device.is_cuda and not device.is_capturing:
             wp.synchronize_stream(device.stream)  # later calls may come on another stream

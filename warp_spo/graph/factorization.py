@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..arrays import broadcast_worlds
+from .. import launches
 from ..kernels import factorization as kernels
+from ..memory import broadcast_worlds
 from ..scene.tree import Tree
 from .blocks import Blocks, new_weights, weights_array
 from .operators import BWA
@@ -111,7 +112,7 @@ class Factorization:
         first = self.E_phi.graph.node_count
         for level in reversed(self.E_phi.graph.levels):
             first -= len(level)
-            wp.launch(
+            launches.launch(
                 kernels.factorize(self.dtype),
                 dim=(len(level), self.worlds),
                 inputs=[self.tables, first, *inputs],

@@ -8,10 +8,11 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ..arrays import AnyArray, ArrayT, Call, broadcast_worlds, parse_device, parse_dtype
+from ..arrays import AnyArray, ArrayT, Call, parse_device, parse_dtype
 from ..errors import as_integer
 from ..kernels import declare
 from ..kernels import mujoco as kernels
+from ..memory import broadcast_worlds
 from ..scene.scene import Scene
 from .mechanism import BALL, FREE, KINDS
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..arrays import view
 from ..kernels import exchange
+from ..memory import view
 
 
 class Layout:

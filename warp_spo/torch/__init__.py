@@ -8,6 +8,8 @@ from .autograd import call_with_gradient
 from .compiled import custom_op
 from .module import Module
 from .tensors import (
+    CLASSES,
+    addresses,
     device_name,
     empty,
     has_dtype,
@@ -15,6 +17,7 @@ from .tensors import (
     is_grad_enabled,
     is_on,
     is_tensor,
+    maker,
     mark_changed,
     pointer,
     requires_grad,
@@ -22,7 +25,9 @@ from .tensors import (
 )
 
 __all__ = [
+    "CLASSES",
     "Module",
+    "addresses",
     "call_with_gradient",
     "custom_op",
     "device_name",
@@ -32,6 +37,7 @@ __all__ = [
     "is_grad_enabled",
     "is_on",
     "is_tensor",
+    "maker",
     "mark_changed",
     "pointer",
     "requires_grad",

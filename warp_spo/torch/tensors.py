@@ -1,6 +1,7 @@
 """Tensors at the border: what :mod:`warp_spo.arrays` needs to know of a torch tensor."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -20,6 +21,10 @@ DTYPES: dict[Any, torch.dtype] = {
 is_grad_enabled = torch.is_grad_enabled
 mark_changed = torch.autograd.graph.increment_version  # a backward pass that saved the tensor then raises an error
 _streams: dict[tuple[int, int], wp.Stream] = {}
+
+
+CLASSES = (torch.Tensor, torch.nn.Parameter)
+"""Classes of tensors that are nothing but memory; others may be anything."""
 
 
 def is_tensor(array: object) -> bool:
@@ -67,6 +72,35 @@ def pointer(call: str, name: str, tensor: torch.Tensor) -> int:
     return found
 
 
+def addresses(tensors: list[torch.Tensor], like: tuple[tuple[Any, Any, Any], ...]) -> list[int] | None:
+    """Return the addresses of tensors; None if one is not (shape, dtype, device), or no plain contiguous memory."""
+    if forward_ad._current_level >= 0:
+        return None
+    found = []
+    try:
+        for x, (shape, dtype, device) in zip(tensors, like, strict=True):
+            address = x.data_ptr()
+            if x.shape != shape or x.dtype is not dtype or x.device != device or not x.is_contiguous() or x.is_neg():
+                return None
+            if not address or (x.requires_grad and torch.is_grad_enabled()):
+                return None
+            found.append(address)
+    except RuntimeError:  # sparse, or wrapped by a transform
+        return None
+    return found
+
+
+def maker(shape: tuple[int, ...], dtype: type, device: wp.Device) -> Callable[[], tuple[torch.Tensor, int]]:
+    """Return a function that returns a new tensor and its address."""
+    found, place = DTYPES[dtype], torch_device(device.alias)
+
+    def make() -> tuple[torch.Tensor, int]:
+        tensor = torch.empty(shape, dtype=found, device=place)
+        return tensor, tensor.data_ptr()
+
+    return make
+
+
 def empty(shape: tuple, dtype: type, device: wp.Device) -> torch.Tensor:
     """Return a tensor with undefined content."""
     return torch.empty(shape, dtype=DTYPES[dtype], device=torch_device(device.alias))
@@ -79,11 +113,13 @@ def device_name(device: torch.device) -> str:
 
 def stream(device: wp.Device) -> wp.Stream:
     """Return torch's current stream of a CUDA device as a Warp stream."""
-    current = torch.cuda.current_stream(torch_device(device.alias))
-    key = (device.ordinal, current.cuda_stream)
-    if key not in _streams:
-        _streams[key] = wp.stream_from_torch(current)  # keeps torch's stream alive, so its handle is not reused
-    return _streams[key]
+    index = device.ordinal
+    found = _streams.get((index, torch._C._cuda_getCurrentRawStream(index)))
+    if found is None:
+        current = torch.cuda.current_stream(torch_device(device.alias))
+        found = wp.stream_from_torch(current)  # keeps torch's stream alive, so its handle is not reused
+        _streams[index, current.cuda_stream] = found
+    return found
 
 
 @functools.cache

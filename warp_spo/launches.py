@@ -1,0 +1,180 @@
+"""Launches kernels, copies and fills arrays; and records what a call does, so that a later call repeats it.
+
+All device work between a public call and its result goes through :func:`launch`, :func:`copy` and :func:`fill`. While a
+:class:`Recording` is open in the thread, they also keep what they do. A repetition sets the addresses of the callers'
+arrays in the packed arguments of the kernels and packs nothing else, which takes a fraction of the time.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import warp as wp
+
+from .memory import size_in_bytes, view
+
+
+class _Thread(threading.local):
+    recording: Recording | None = None
+
+
+_thread = _Thread()
+
+
+def launch(
+    kernel: wp.Kernel, dim: Any, inputs: Sequence[Any], outputs: Sequence[Any], *, device: Any, block_dim: int = 256
+) -> None:
+    """Launch a kernel, as ``wp.launch``."""
+    command = wp.launch(
+        kernel, dim, inputs, outputs, device=device, block_dim=block_dim, record_cmd=_thread.recording is not None
+    )
+    if _thread.recording is not None and command is not None:  # None: no thread has work
+        command.launch()
+        _thread.recording.keep_launch(command, [*inputs, *outputs])
+
+
+def copy(out: wp.array, array: wp.array) -> None:
+    """Copy one array to another, as ``wp.copy``."""
+    wp.copy(out, array)
+    if _thread.recording is not None:
+        _thread.recording.keep(_Copy, out, array)
+
+
+def fill(array: wp.array, value: float) -> None:
+    """Set all entries of an array."""
+    _set_all(array, value)
+    if _thread.recording is not None:
+        _thread.recording.keep(_Fill, array, value)
+
+
+def _set_all(array: wp.array, value: float) -> None:
+    if value == 0:
+        array.zero_()
+    else:
+        array.fill_(value)
+
+
+def recording() -> Recording | None:
+    """Return the recording that is open in this thread."""
+    return _thread.recording
+
+
+class _Place:
+    """An array that a copy or fill touches, at the address ``data``. It may be the caller's: then it moves."""
+
+    def __init__(self, array: wp.array, moves: bool):
+        self.data = array.ptr
+        self._like: tuple[Any, ...] = (tuple(array.shape), array.dtype, str(array.device))
+        self._array = None if moves else array
+
+    def array(self) -> wp.array:
+        return view(self.data, *self._like) if self._array is None else self._array
+
+
+class _Copy:
+    def __init__(self, out: _Place, array: _Place):
+        self._out, self._array = out, array
+
+    def launch(self, stream: wp.Stream | None) -> None:
+        wp.copy(self._out.array(), self._array.array(), stream=stream)
+
+
+class _Fill:
+    def __init__(self, place: _Place, value: float):
+        self._place, self._value = place, value
+
+    def launch(self, stream: wp.Stream | None) -> None:
+        with wp.ScopedStream(stream, sync_enter=False):
+            _set_all(self._place.array(), self._value)
+
+
+class Recording:
+    """The device work of one call, done inside ``with Recording(arrays) as recording:``.
+
+    Args:
+        arrays: address and size in bytes of each of the caller's arrays; sizes are positive, arrays lie apart or are
+            the very same.
+
+    Attributes:
+        steps: what was done, in order; ``step.launch(stream)`` does it again.
+        places: for each array, the packed arguments that hold its address in ``data``.
+        shifted: (array, packed argument, bytes from the array's start) of views that start inside an array.
+        written: the caller's arrays that the call writes.
+        results: (array, shape, dtype) of each array that the call makes for its caller, after those of the caller.
+        complete: the steps are all of the work; otherwise the call cannot be repeated.
+    """
+
+    def __init__(self, arrays: Sequence[tuple[int, int]]):
+        self._arrays = list(arrays)
+        self.steps: list[Any] = []
+        self.places: list[list[Any]] = [[] for _ in arrays]
+        self.shifted: list[tuple[int, Any, int]] = []
+        self.written: list[Any] = []
+        self.results: list[tuple[Any, tuple[int, ...], type]] = []
+        self.complete = True
+        self._kept: list[Any] = []  # arrays that packed arguments point to
+        self._outer: Recording | None = None
+
+    def __enter__(self) -> Recording:
+        self._outer, _thread.recording = _thread.recording, self
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        _thread.recording, self._outer = self._outer, None
+
+    def add_result(self, owner: Any, array: wp.array, shape: tuple[int, ...], dtype: type) -> None:
+        """Add an array that the call makes for its caller."""
+        self.results.append((owner, shape, dtype))
+        self._arrays.append((array.ptr or 0, size_in_bytes(array)))
+        self.places.append([])
+
+    def keep_launch(self, command: Any, arguments: list[Any]) -> None:
+        """Keep a launch that was done."""
+        self.complete &= isinstance(command, wp.Launch)  # Warp's deterministic mode has another class
+        if not self.complete:
+            return
+        for at, argument in enumerate(arguments, 1):
+            if not isinstance(argument, wp.array) or self._find(argument) is None:
+                self._kept.append(argument)
+                continue
+            packed = type(command.params[at]).from_buffer_copy(command.params[at])  # the array shares its own
+            command.params[at] = packed
+            if command.params_addr:
+                command.params_addr[at] = ctypes.c_void_p(ctypes.addressof(packed))
+            self._follow(argument, packed)
+        command.fwd_args = None  # would keep the caller's memory
+        self.steps.append(command)
+
+    def keep(self, step: type, *arguments: Any) -> None:
+        """Keep a copy or fill that was done."""
+        places: list[Any] = []
+        for argument in arguments:
+            if not isinstance(argument, wp.array):
+                places.append(argument)
+                continue
+            moves = self._find(argument) is not None
+            places.append(_Place(argument, moves))
+            if moves:
+                self.complete &= bool(argument.is_contiguous)
+                self._follow(argument, places[-1])
+        self.steps.append(step(*places))
+
+    def _find(self, array: wp.array) -> int | None:
+        """Return the number of the caller's array in whose memory an array starts."""
+        pointer = array.ptr or 0
+        for number, (start, size) in enumerate(self._arrays):
+            if start <= pointer < start + size:
+                return number
+        return None
+
+    def _follow(self, array: wp.array, place: Any) -> None:
+        number = self._find(array)
+        assert number is not None
+        shift = array.ptr - self._arrays[number][0]
+        if shift:
+            self.shifted.append((number, place, shift))
+        else:
+            self.places[number].append(place)
