@@ -39,20 +39,28 @@ def shipped(name: str) -> Path:
     return Path(newton.__file__).parent / "examples" / "assets" / SHIPPED[name]
 
 
-def load(path: str | os.PathLike[str], floating: bool | None = None) -> Scene:
+def load(path: str | os.PathLike[str], floating: bool | None = None, repair: bool = True) -> Scene:
     """Return the scene of a robot file: URDF (.urdf), MJCF (.xml, .mjcf) or USD (.usd, .usda, .usdc, .usdz).
 
-    Visual and collision shapes are skipped. A mesh file is read only if a body that can move takes its mass from it.
+    A URDF is read in float64, and the scene has its numbers; MJCF and USD are read by Newton's importers, in float32.
+    Order, labels and coordinates are those of Newton's model of the file. Visual and collision shapes are skipped. A
+    mesh file is read only if a body that can move takes its mass from it.
 
     Args:
         path: The robot file.
         floating: Whether the root body floats (True) or is fixed to the world (False). None keeps the format's own
             rule: a URDF root is fixed, an MJCF root has the joints that the file gives it, and a USD root floats unless
             a joint fixes it.
+        repair: Whether to replace masses and inertias that no rigid body can have, by Newton's rule: negative ones, an
+            inertia that is zero beside a mass, and one whose largest principal moment exceeds the sum of the others.
+            In a URDF, links that move as one and have no mass then take it from their collision shapes, 1000 kg/m^3.
+            False keeps the file's numbers; where they make the mass matrix singular, results are NaN and ``status=``
+            says so.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: No importer reads files with this suffix, or the file's contents.
+        ValueError: No importer reads files with this suffix, or the file's contents. Of a URDF, the message names the
+            line and the element.
         ImportError: A package for meshes or USD is missing. The message names the extra that installs it.
         UnsupportedError, DirectedLoopError: As :func:`from_newton`.
         UnsupportedError: The MJCF file uses a feature that Newton 1.8 misreads, such as a slide after a hinge in one
@@ -60,12 +68,13 @@ def load(path: str | os.PathLike[str], floating: bool | None = None) -> Scene:
             mass, or ``settotalmass``. The message says what to write instead.
 
     Warns:
-        UserWarning: Newton replaced a mass or an inertia that no rigid body can have. The message names the bodies.
+        UserWarning: A mass or an inertia was replaced, or taken from shapes. The message names the bodies. A mimic in a
+            URDF names no joint of the file and was left out.
     """
     file = Path(path)
     importer = robot_format(file)
     try:
-        return {"urdf": read_urdf, "mjcf": read_mjcf, "usd": read_usd}[importer](file, floating)
+        return {"urdf": read_urdf, "mjcf": read_mjcf, "usd": read_usd}[importer](file, floating, repair)
     except ParseError as error:
         raise ValueError(f"load: {str(file)!r} is not XML: {error}; expected {importer.upper()}") from None
     except ImportError as error:

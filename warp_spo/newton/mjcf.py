@@ -95,7 +95,7 @@ def mjcf_source(file: Path, root: ET.Element) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-def read_mjcf(file: Path, floating: bool | None) -> Scene:
+def read_mjcf(file: Path, floating: bool | None, repair: bool) -> Scene:
     """Return the scene of an MJCF file; UnsupportedError if it uses a feature that Newton misreads."""
     root = mjcf_tree(file)
     misread = find_misread(root, floating)
@@ -137,4 +137,4 @@ def read_mjcf(file: Path, floating: bool | None) -> Scene:
     gravity = mjcf_gravity(root)  # Newton 1.8 does not read it
     if gravity is not None:
         builder.gravity = gravity
-    return scene_of(builder)
+    return scene_of(builder, repair)

@@ -15,7 +15,7 @@ import numpy as np
 from newton import JointType
 
 from ..errors import DirectedLoopError, UnsupportedError
-from ..scene.parts import DOF_VALUES, UNLIMITED, Body, Coupling, Hinge, Loop
+from ..scene.parts import DOF_VALUES, UNLIMITED, Body, Coupling, Hinge, Loop, checked_inertia
 from ..scene.scene import Scene
 from .worlds import KINDS, Worlds, flat_entries, quote_labels, to_numpy, unit_pose
 
@@ -59,7 +59,8 @@ def from_newton(model: newton.Model) -> Scene:
 
     read = lambda name, rows: to_numpy(model, name)[rows].astype(np.float64)  # noqa: E731
     values = {name: read(name, worlds.bodies) for name in ("body_mass", "body_com", "body_inertia")}
-    values["body_inertia"] = _symmetric(values["body_inertia"])
+    # finalize() has checked the inertias, with a tolerance of its own, unless the caller did without.
+    values["body_inertia"] = checked_inertia("from_newton", _symmetric(values["body_inertia"]))
     values |= {name: unit_pose(read(name, worlds.hinges)) for name in ("joint_X_p", "joint_X_c")}
     values |= {name: read(name, dof_index) for name in DOF_VALUES}
     for name in ("joint_limit_lower", "joint_limit_upper", "joint_effort_limit", "joint_velocity_limit"):
@@ -72,7 +73,13 @@ def from_newton(model: newton.Model) -> Scene:
 
     body_labels = worlds.labels(model.body_label, worlds.bodies)
     bodies = [
-        Body(values["body_mass"][0, k], values["body_com"][0, k], values["body_inertia"][0, k], label=label)
+        Body(
+            values["body_mass"][0, k],
+            values["body_com"][0, k],
+            values["body_inertia"][0, k],
+            label,
+            any_inertia=True,
+        )
         for k, label in enumerate(body_labels)
     ]
     hinges, q, dof = [], slice(0, 0), slice(0, 0)

@@ -61,19 +61,20 @@ def checked_pose(call: str, name: str, value: Any) -> np.ndarray:
 class Body(StoredPart):
     """A rigid body.
 
-    The largest principal moment of inertia may exceed the sum of the others, although no distribution of positive mass
-    has such an inertia: it is common in robot files, and the mass matrix stays positive definite. Values that would
-    make a kinetic energy negative are refused. ``spo.load`` reads files through Newton, which repairs such inertias,
-    and names the bodies.
+    No distribution of positive mass has a largest principal moment that exceeds the sum of the others, or a negative
+    one. Robot files have both. ``any_inertia=True`` accepts them; results can be trusted as long as the mass matrix is
+    positive definite, and ``status=`` says where it is not.
 
     Args:
         mass: [kg], not negative.
         com: centre of mass in the body frame [m], shape (3,).
-        inertia: about the centre of mass, body axes [kg m^2], shape (3, 3), symmetric, no negative eigenvalue.
+        inertia: about the centre of mass, body axes [kg m^2], shape (3, 3), symmetric, no negative eigenvalue, none
+            that exceeds the sum of the others; the last is checked by :class:`Scene`.
         label: name in tables and errors.
         gravcomp: share of the body's weight that a force at its centre of mass holds up, -gravcomp mass gravity, as
             MuJoCo's attribute of that name. The force belongs to :meth:`Dynamics.passive_force` and to
             :meth:`Dynamics.step`; other calls leave it out.
+        any_inertia: whether to accept every symmetric inertia.
 
     Raises:
         ValueError: a value is invalid; the message names it.
@@ -86,6 +87,7 @@ class Body(StoredPart):
     label: str = ""
     modes: Any = None
     gravcomp: float = 0.0
+    any_inertia: bool = False
 
     def __post_init__(self) -> None:
         call = f"Body({self.label!r})" if self.label else "Body"
@@ -97,11 +99,13 @@ class Body(StoredPart):
         inertia = checked_array(call, "inertia [kg m^2]", self.inertia, (3, 3))
         if self.mass < 0.0:
             raise ValueError(f"{call}: mass is {self.mass} kg; expected zero or more")
-        object.__setattr__(self, "inertia", read_only(checked_inertia(call, inertia)))
+        object.__setattr__(self, "inertia", read_only(checked_inertia(call, inertia, self.any_inertia)))
 
 
-def checked_inertia(call: str, inertia: np.ndarray) -> np.ndarray:
+def checked_inertia(call: str, inertia: np.ndarray, any_inertia: Any = False) -> np.ndarray:
     """Return ``inertia`` [..., 3, 3] made exactly symmetric; see :class:`Body` for the values that it may have.
+
+    ``any_inertia``, [...] or one bool, says whose eigenvalues may be negative.
 
     Raises:
         ValueError: the inertia is not symmetric up to rounding, or has a negative eigenvalue.
@@ -112,8 +116,12 @@ def checked_inertia(call: str, inertia: np.ndarray) -> np.ndarray:
         raise ValueError(f"{call}: inertia is not symmetric, by {skew.max():.3g} kg m^2; expected I = I.T")
     symmetric = 0.5 * (inertia + np.swapaxes(inertia, -1, -2))
     lowest = np.linalg.eigvalsh(symmetric)[..., 0]
-    if np.any(lowest < -SYMMETRY * scale):
-        raise ValueError(f"{call}: inertia has the eigenvalue {lowest.min():.3g} kg m^2; expected none below zero")
+    negative = (lowest < -SYMMETRY * scale) & ~np.asarray(any_inertia)
+    if np.any(negative):
+        raise ValueError(
+            f"{call}: inertia has the eigenvalue {lowest[negative].min():.3g} kg m^2; expected none below zero; "
+            "correct it, or accept it with Body(..., any_inertia=True)"
+        )
     return symmetric
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..errors import refuse_masked
 from .actuators import Actuator, Keyframe
+from .checks import SYMMETRY
 from .parts import (
     DOF_VALUES,
     Body,
@@ -30,7 +31,17 @@ from .parts import (
 from .storage import Stored
 from .tree import Tree
 
-NOT_NEGATIVE = ("body_mass", "joint_friction", "joint_effort_limit", "joint_velocity_limit")
+NOT_NEGATIVE = (
+    "body_mass",
+    "joint_damping",
+    "joint_friction",
+    "joint_target_ke",
+    "joint_target_kd",
+    "joint_limit_ke",
+    "joint_limit_kd",
+    "joint_effort_limit",
+    "joint_velocity_limit",
+)
 
 
 def _refuse_negative(call: str, name: str, array: np.ndarray) -> None:
@@ -51,8 +62,10 @@ def _parts(name: str, value: Any, kind: type) -> tuple:
 class Scene(Stored):
     """A multibody system: a forest of bodies, and the values that kernels read.
 
-    The constructor checks values and never repairs them. Masses and principal moments may be zero, may have any ratio,
-    and need not satisfy the triangle inequality (see :class:`Body`), but may not be negative.
+    The constructor checks values and never repairs them. Masses and principal moments may be zero and may have any
+    ratio, but may not be negative, and no principal moment may exceed the sum of the others unless the body has
+    ``any_inertia=True``. Damping, friction, gains and bounds may not be negative, and no lower limit may exceed the
+    upper one.
 
     Args:
         bodies: the bodies; body k is node k.
@@ -120,6 +133,8 @@ class Scene(Stored):
             field = name.removeprefix("joint_")
             values[name] = np.concatenate([getattr(hinge, field) for hinge in self.hinges])[None]
             _refuse_negative("Scene", name, values[name])
+        self._refuse_impossible_inertias("Scene", values["body_inertia"])
+        self._refuse_crossed_limits("Scene", values)
         for array in values.values():
             read_only(array)
         self.values = MappingProxyType(values)
@@ -294,6 +309,7 @@ class Scene(Stored):
         scene.__dict__.update(self.__dict__)
         checked = {name: self.check_value("Scene.with_values", name, value) for name, value in values.items()}
         scene.values = MappingProxyType({**self.values, **checked})
+        scene._refuse_crossed_limits("Scene.with_values", scene.values)
         counts = {array.shape[0] for array in (scene.q_index, *scene.values.values())} - {1}
         if len(counts) > 1:
             raise ValueError(f"Scene.with_values: values for {sorted(counts)} worlds; expected one world count")
@@ -325,9 +341,34 @@ class Scene(Stored):
         if name in ("joint_X_p", "joint_X_c"):
             array[..., 3:] = checked_unit(call, f"the quaternions of {name}", array[..., 3:])
         if name == "body_inertia":
-            array = checked_inertia(call, array)
+            array = checked_inertia(call, array, [body.any_inertia for body in self.bodies])
+            self._refuse_impossible_inertias(call, array)
         _refuse_negative(call, name, array)
         return read_only(array)
+
+    def _refuse_impossible_inertias(self, call: str, inertias: np.ndarray) -> None:
+        """Raise ValueError if a principal moment of ``inertias`` [worlds, body, 3, 3] exceeds the sum of the others."""
+        moments = np.linalg.eigvalsh(inertias)
+        excess = moments[..., 2] - moments[..., 1] - moments[..., 0] - SYMMETRY * moments[..., 2]
+        refused = (excess > 0.0) & ~np.array([body.any_inertia for body in self.bodies])
+        if refused.any():
+            world, body = np.argwhere(refused)[0]
+            raise ValueError(
+                f"{call}: body {body} {self.bodies[body].label!r} has the principal moments of inertia "
+                f"{', '.join(f'{moment:.3g}' for moment in moments[world, body])} kg m^2, and the last exceeds the sum "
+                "of the others, which no rigid body has; correct its inertia, or accept it with "
+                "Body(..., any_inertia=True)"
+            )
+
+    def _refuse_crossed_limits(self, call: str, values: Mapping[str, np.ndarray]) -> None:
+        """Raise ValueError if a lower limit is above the upper one."""
+        lower, upper = np.broadcast_arrays(values["joint_limit_lower"], values["joint_limit_upper"])
+        if (lower > upper).any():
+            world, dof = np.argwhere(lower > upper)[0]
+            raise ValueError(
+                f"{call}: joint_limit_lower of dof {dof} {self.dof_labels[dof]!r} is {lower[world, dof]:g}, above "
+                f"joint_limit_upper {upper[world, dof]:g}; expected lower <= upper; swap them"
+            )
 
     def __repr__(self) -> str:
         return (

@@ -1,0 +1,241 @@
+"""URDF: what is read is what Pinocchio reads, to rounding; all else is an error that names file, line and element."""
+
+import re
+import warnings
+
+import mujoco
+import numpy as np
+import pinocchio
+import pytest
+
+import warp_spo as spo
+from benchmarks.robot_files import compare_urdf, urdf_files
+from warp_spo.newton import load
+from warp_spo.reference import Dense, homogeneous
+
+FILES = {file.name: file for file in urdf_files()}
+QUICK = ("go2.urdf", "tiago_pro.urdf", "talos_left_arm.urdf", "double_pendulum_continuous.urdf", "panda.urdf")
+"""Robots with branches, turned inertias, mimics on fixed joints, continuous joints and prismatic ones."""
+
+
+def check(name):
+    row = compare_urdf(FILES[name])
+    assert row.agrees, row
+    return row
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_equals_pinocchios_parser(name):
+    """Mass matrix, bias force and forward dynamics to 1e-9."""
+    assert np.isfinite(check(name).acceleration)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in FILES if name not in (*QUICK, "ur3.urdf")])
+def test_every_urdf_equals_pinocchios_parser(name):
+    check(name)
+
+
+LINK = '<link name="{0}"><inertial><mass value="2"/><inertia ixx=".2" iyy=".3" izz=".4" ixy="0" ixz="0" iyz="0"/>'
+LINK += "</inertial></link>"
+JOINT = '<joint name="{0}" type="{1}"><parent link="{2}"/><child link="{3}"/>{4}</joint>'
+LIMIT = '<limit lower="-1" upper="2" effort="5" velocity="6"/>'
+
+
+def robot(*parts, name="r", root="robot", **attributes):
+    head = " ".join(f'{key}="{value}"' for key, value in {"name": name, **attributes}.items())
+    return f"<{root} {head}>\n" + "\n".join(parts) + f"\n</{root}>"
+
+
+def pair(kind, more="", child="b"):
+    return [LINK.format("a"), LINK.format("b"), JOINT.format("j", kind, "a", child, more)]
+
+
+def written(folder, text):
+    path = folder / "robot.urdf"
+    path.write_text(text)
+    return path
+
+
+FINGERS = [LINK.format(k) for k in "abc"]
+REFUSED = {
+    "not_xml": ("<robot><link", r"is not XML: .*line 1"),
+    "foreign_root": (robot(LINK.format("a"), root="mujoco"), r"line 1, <mujoco name='r'>: .*expected <robot>"),
+    "no_link": (robot("<joint/>"), r"line 1, <robot name='r'>: no <link>"),
+    "no_name": (robot("<link/>"), r"line 2, <link>: no attribute 'name'"),
+    "two_links": (robot(LINK.format("a"), LINK.format("a")), r"line 3, <link name='a'>: the name is that of line 2"),
+    "two_joints": (robot(*pair("fixed"), JOINT.format("j", "fixed", "b", "c", "")), r"line 5, <joint name='j'>: the n"),
+    "unattached": (robot(LINK.format("a"), LINK.format("b")), r"line 3, <link name='b'>: links 'a', 'b' are the child"),
+    "two_trees": (
+        robot(*pair("fixed"), LINK.format("c"), LINK.format("d"), JOINT.format("k", "fixed", "c", "d", "")),
+        r"line 5, <link name='c'>: links 'a', 'c' are the child of no joint",
+    ),
+    "lost_link": (robot(*pair("fixed", child="x")), r"line 4, <joint name='j'>: there is no link 'x'"),
+    "two_parents": (
+        robot(*pair("fixed"), JOINT.format("k", "fixed", "a", "b", "")),
+        r"line 5, <joint name='k'>: link 'b' is the child of joint 'j', too",
+    ),
+    "directed_loop": (
+        robot(*FINGERS, JOINT.format("j", "fixed", "b", "c", ""), JOINT.format("k", "fixed", "c", "b", "")),
+        r"line 5, <joint name='j'>: the joint is part of a directed loop",
+    ),
+    "type": (robot(*pair("spheric")), r"line 4, <joint name='j'>: the type is 'spheric'; expected one of fixed, rev"),
+    "no_child": (robot(LINK.format("a"), '<joint name="j" type="fixed"><parent link="a"/></joint>'), r"no <child>"),
+    "axis": (robot(*pair("continuous", '<axis xyz="0 0 0"/>')), r"line 4, <axis>: xyz is the zero vector"),
+    "numbers": (robot(*pair("fixed", '<origin xyz="0 0"/>')), r"line 4, <origin>: xyz is '0 0'; expected 3 finite num"),
+    "limits": (robot(*pair("revolute", '<limit upper="-1"/>')), r"line 4, <limit>: of joint 'j': lower is 0, above u"),
+    "damping": (robot(*pair("revolute", '<dynamics damping="-1"/>')), r"line 4, <dynamics>: damping is -1; expected 0"),
+    "two_axes": (robot(*pair("revolute", "<axis xyz='1 0 0'/>" * 2)), r"line 4, <axis>: a second one in <joint> 'j'"),
+    "mass": (robot('<link name="a"><inertial/></link>'), r"line 2, <inertial>: of link 'a': no <mass>"),
+    "moment": (robot(LINK.format("a").replace("ixz", "xz")), r"line 2, <inertia>: no attribute 'ixz'"),
+    "xacro": (robot("<xacro:robot/>", **{"xmlns:xacro": "x"}), r"line 2: <xacro:robot> is not supported; expand"),
+    "mimic_circle": (
+        robot(*FINGERS, JOINT.format("j", "revolute", "a", "b", '<mimic joint="k"/>'),
+              JOINT.format("k", "revolute", "b", "c", '<mimic joint="j"/>')),
+        r"line 6, <mimic>: joints 'j', 'k' mimic each other in a circle",
+    ),
+    "mimic_of_fixed": (
+        robot(*FINGERS, JOINT.format("j", "revolute", "a", "b", '<mimic joint="k"/>'),
+              JOINT.format("k", "fixed", "b", "c", "")),
+        r"line 5, <mimic>: ties 'j' to 'k'; joint 'k' is fixed",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_damage_is_named_by_file_line_and_element(name, tmp_path):
+    text, words = REFUSED[name]
+    path = written(tmp_path, text)
+    with pytest.raises(ValueError, match=f"^load: {re.escape(repr(str(path)))}.*{words}"):
+        load(path)
+
+
+def test_ur3_of_the_data_set_is_empty():
+    """xacro wrote it without the robot."""
+    with pytest.raises(ValueError, match=r"ur3.urdf', line 6, <robot>: no <link>"):
+        load(FILES["ur3.urdf"])
+
+
+def test_a_namespace_changes_nothing(tmp_path):
+    scene = load(written(tmp_path, robot(*pair("revolute", LIMIT), xmlns="http://ros.org/urdf")))
+    assert scene.body_labels == ["r/a", "r/b"] and scene.dof_count == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "limit", "expected"),
+    [
+        ("revolute", LIMIT, (-1, 2)),
+        ("revolute", '<limit upper="2"/>', (0, 2)),
+        ("prismatic", '<limit lower="-inf" upper="2"/>', (-1e10, 2)),
+        ("continuous", LIMIT, (-1e10, 1e10)),
+        ("revolute", '<limit effort="5"/>', (-1e10, 1e10)),
+        ("revolute", "", (-1e10, 1e10)),
+    ],
+)
+def test_limits(kind, limit, expected, tmp_path):
+    scene = load(written(tmp_path, robot(*pair(kind, limit))))
+    values = scene.values["joint_limit_lower"].item(), scene.values["joint_limit_upper"].item()
+    np.testing.assert_allclose(values, expected)
+    assert scene.values["joint_effort_limit"].item() == (5.0 if "effort" in limit else 1e6)
+
+
+@pytest.mark.parametrize("kind", ["spherical", "planar", "floating"])
+def test_joints_of_several_coordinates(kind, tmp_path, rng):
+    """The pose is MuJoCo's, which has no free joint inside a tree: Pinocchio's there. Newton's planar cannot turn."""
+    text = robot(*pair(kind, '<origin xyz=".1 .2 .3" rpy=".4 .5 -.6"/><axis xyz="0 .6 .8"/>'))
+    scene = load(written(tmp_path, text))
+    q = rng.normal(size=scene.coord_count)
+    if kind != "planar":
+        q[-4:] /= np.linalg.norm(q[-4:])
+    pose = homogeneous(Dense(scene, q).body_poses[1])
+    expected = np.eye(4)
+    if kind == "floating":
+        model = pinocchio.buildModelFromXML(text)
+        data = model.createData()
+        pinocchio.forwardKinematics(model, data, q)
+        expected = data.oMi[1].homogeneous
+    else:
+        model = mujoco.MjModel.from_xml_string(text)
+        data = mujoco.MjData(model)
+        data.qpos[:] = q if kind == "planar" else np.roll(q, 1)
+        mujoco.mj_forward(model, data)
+        expected[:3, :3], expected[:3, 3] = data.xmat[-1].reshape(3, 3), data.xpos[-1]
+    np.testing.assert_allclose(pose, expected, atol=1e-14)
+
+
+def test_a_mimic_of_a_mimic_follows_the_joint_that_moves(tmp_path):
+    links = [LINK.format(k) for k in "abcde"]
+    joints = [
+        JOINT.format("j", "revolute", "a", "b", '<mimic joint="k" multiplier="2" offset=".5"/>'),
+        JOINT.format("k", "revolute", "b", "c", '<mimic joint="l" multiplier="-3" offset=".25"/>'),
+        JOINT.format("l", "continuous", "c", "d", ""),
+        JOINT.format("m", "fixed", "d", "e", '<mimic joint="k"/>'),
+    ]
+    scene = load(written(tmp_path, robot(*links, *joints)))
+    found = [(c.hinge, c.reference, c.ratio, c.offset) for c in scene.couplings]
+    assert found == [(1, 3, -6.0, 1.0), (2, 3, -3.0, 0.25)]  # j = 0.5 + 2 (0.25 - 3 l)
+
+
+def test_a_mimic_of_no_joint_is_left_out_with_a_warning(tmp_path):
+    path = written(tmp_path, robot(*pair("revolute", '<mimic joint="x"/>')))
+    with pytest.warns(UserWarning, match="line 4: joint 'j' mimics 'x', which is no joint of the file"):
+        assert not load(path).couplings
+
+
+def test_order_and_labels_are_newtons(tmp_path):
+    """Depth first from the root, children in the order of the file, whatever the order of links and joints."""
+    newton = pytest.importorskip("newton")
+    edges = [("j", "b", "c"), ("k", "a", "b"), ("l", "b", "d"), ("m", "a", "e"), ("n", "d", "f")]
+    text = robot(*(LINK.format(k) for k in "fbcade"), *(JOINT.format(n, "continuous", p, c, "") for n, p, c in edges))
+    for name in ("r", ""):
+        path = written(tmp_path, text.replace('name="r"', f'name="{name}"' if name else ""))
+        builder = newton.ModelBuilder()
+        builder.add_urdf(str(path), floating=True)
+        scene = load(path, floating=True)
+        assert scene.body_labels == builder.body_label and scene.joint_labels == builder.joint_label
+        assert [(hinge.parent, hinge.child) for hinge in scene.hinges] == list(
+            zip(builder.joint_parent, builder.joint_child, strict=True)
+        )
+
+
+def test_replaced_inertias_are_named_and_kept_on_request():
+    """iCub has 14 links whose inertia is zero, or no body's. The file's numbers are singular, and status says so."""
+    with pytest.warns(
+        UserWarning, match=r"replaced the mass or inertia of 'iCub/root_link', .* and 6 more: .*repair=F"
+    ):
+        repaired = load(FILES["icub.urdf"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        kept = load(FILES["icub.urdf"], repair=False)
+    changed = np.abs(repaired.values["body_inertia"] - kept.values["body_inertia"]).max(axis=(0, 2, 3)) > 0
+    assert changed.sum() == 14
+
+
+def test_status_speaks_of_a_massless_robot(tmp_path, device):
+    path = written(tmp_path, robot('<link name="a"/><link name="b"/>', JOINT.format("j", "continuous", "a", "b", "")))
+    dyn = spo.Dynamics(load(path, repair=False), 2, device=device, dtype="float64", granularity="node")
+    status = np.zeros(2, np.int32)
+    dyn.forward_dynamics(np.zeros((2, 1)), np.zeros((2, 1)), np.ones((2, 1)), status=status)
+    assert (status == spo.Status.PIVOT).all()
+
+
+def test_a_link_without_inertial_has_no_mass_beside_one_that_has(tmp_path):
+    """As in URDF; Newton weighs its shapes."""
+    box = '<link name="b"><collision><geometry><box size="1 1 1"/></geometry></collision></link>'
+    parts = [LINK.format("a"), box, JOINT.format("j", "{}", "a", "b", "")]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = load(written(tmp_path, robot(*parts).format("fixed")), floating=True)
+    np.testing.assert_array_equal(scene.values["body_mass"], [[2.0, 0.0]])
+    path = written(tmp_path, robot(*parts).format("continuous"))
+    with pytest.warns(UserWarning, match="line 3: links 'b' move and have no mass; .* 1000 kg/m"):
+        np.testing.assert_allclose(load(path).values["body_mass"], [[2.0, 1000.0]])
+    np.testing.assert_array_equal(load(path, repair=False).values["body_mass"], [[2.0, 0.0]])
+
+
+def test_no_file_of_a_mesh_that_gives_a_mass(tmp_path):
+    mesh = '<link name="b"><collision><geometry><mesh filename="no.stl"/></geometry></collision></link>'
+    path = written(tmp_path, robot(LINK.format("a"), mesh, JOINT.format("j", "continuous", "a", "b", "")))
+    with pytest.raises(ValueError, match=r"line 3, <mesh>: there is no file 'no.stl'; .*write <inertial>"):
+        load(path)
+    assert load(path, repair=False).dof_count == 1
