@@ -98,6 +98,20 @@ def test_a_change_in_place_is_seen(tree):
         y.backward()
 
 
+def test_data_that_was_replaced_is_seen(tree):
+    """torch does not count it. Numbers that are changed in place through ``.data`` nobody can see."""
+    dyn, a = tree
+    (q,) = on(dyn, a, "q")
+    y = dyn.gravity_force(q).sum()
+    q.data = q.data + 1.0
+    with pytest.raises(RuntimeError, match=r"Dynamics.gravity_force: q.data was replaced between this call and its"):
+        y.backward()
+    with torch.autograd.graph.saved_tensors_hooks(lambda x: x.clone(), lambda x: x):  # memory of its own
+        y = dyn.gravity_force(q).sum()
+    q.data = q.data + 1.0
+    y.backward()
+
+
 def test_values_set_since(tree):
     """Values that were recorded are restored for the backward pass, and set back after it; other changes raise."""
     dyn, a = tree

@@ -21,6 +21,7 @@ from ..execution import link_values
 from ..execution.plan import MOST_DOFS
 from ..recursions.links import LINK_VALUES
 from .operation import DIFFERENTIABLE, Derivative, Operation, derivative_of
+from .replays import MISS
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
@@ -34,6 +35,7 @@ class Gradients:
 
     def __init__(self, dyn: Dynamics):
         self.dyn = dyn
+        self._checked: set[str] = set()  # names of operations that have gradients on this scene
 
     # -- for torch -------------------------------------------------------------------------------------------------
     @property
@@ -43,14 +45,21 @@ class Gradients:
 
     def check(self, operation: Operation) -> None:
         """Raise UnsupportedError where an operation has no gradient on this scene."""
+        if operation.name in self._checked:
+            return
         derivative, name = derivative_of(operation), f"{operation.name}, backwards"
         self.dyn._engine.refuse(name, derivative)
-        call = self.dyn._engine.call_named(name)
+        call = Call(f"Dynamics.{name}", self.dyn.device, self.dyn.dtype)
         self.check_size(call)
         lacking = derivative.lacking(self.dyn.programs.links) if self.dyn.scene.dof_count else ""
         if lacking:
             what, _, way_out = lacking.partition("; ")
             raise UnsupportedError(call.name, what, way_out)
+        self._checked.add(operation.name)
+
+    def forget(self) -> None:
+        """Forget what was checked: values that kernels fold have changed."""
+        self._checked.clear()
 
     def check_size(self, call: Call) -> None:
         """Raise UnsupportedError where the scene has too many dofs for derivatives."""
@@ -80,6 +89,13 @@ class Gradients:
             options: arguments that are no arrays. results: of the call, and what else its derivative keeps.
             wrt: names of arguments and of values.
         """
+        replays, arguments = self.dyn._replays, (given, options, results, cotangents, wrt)
+        found, *kind = replays.replay(f"{operation.name}, backwards", arguments, {})
+        return found if found is not MISS else replays.run(*kind, lambda: self._pull_back(operation, *arguments))
+
+    def _pull_back(
+        self, operation: Operation, given: dict, options: dict, results: Any, cotangents: Any, wrt: Any
+    ) -> dict[str, Any]:
         derivative = derivative_of(operation)
         self.dyn._engine.refuse(f"{operation.name}, backwards", derivative)
         if derivative.pull is not None:

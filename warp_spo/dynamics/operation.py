@@ -271,6 +271,7 @@ class Operation:
         vars(function)["operation"] = self
         self._methods.append(function)
         signature, name = inspect.signature(function), self.name
+        names = dict(list(signature.parameters.items())[1:])
 
         @functools.wraps(function)
         def call(dyn: Any, *args: Any, **more: Any) -> Any:
@@ -279,8 +280,9 @@ class Operation:
             if result is not MISS:
                 return result
             if self.derivative is not None and records_gradient((*args, *more.values()), dyn.values):
-                arguments = signature.bind(dyn, *args, **more).arguments
-                del arguments["self"]
+                arguments = dict(zip(names, args, strict=False)) | more
+                if len(arguments) < len(args) + len(more) or not arguments.keys() <= names.keys():
+                    signature.bind(dyn, *args, **more)  # raises TypeError
                 return call_with_gradient(dyn, self, arguments)
             return dyn._replays.run(*kind, lambda: function(dyn, *args, **more))
 

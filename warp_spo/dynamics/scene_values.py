@@ -76,4 +76,5 @@ def _rebuild(dyn: Dynamics, folded: dict[str, np.ndarray]) -> None:
     dyn.recursions.replace_values(dyn.scene)
     dyn.programs.forget()
     dyn._replays.forget()
+    dyn._gradients.forget()
     dyn._refinement = Refinement(dyn, dyn.refine) if dyn.refine else None

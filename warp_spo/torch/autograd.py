@@ -1,5 +1,6 @@
 """Operations of Dynamics in torch's autograd, with analytic gradients."""
 
+import weakref
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -21,14 +22,14 @@ def call_with_gradient(dyn: "Dynamics", operation: "Operation", arguments: dict[
         arguments: Its arguments by name.
     """
     assert operation.derivative is not None
-    method, derivative = operation.function, operation.derivative
+    derivative = operation.derivative
     value_tensors = {name: tensor for name, tensor in dyn.values.tensors.items() if name in derivative.values}
     inputs = {name: arguments.pop(name) for name in derivative.by if arguments.get(name) is not None}
     tensors = {**inputs, **value_tensors}
     if not any(map(requires_grad, tensors.values())):
         # If another argument requires grad, the call refuses it.
         with torch.set_grad_enabled(any(map(requires_grad, arguments.values()))):
-            return method(dyn, **inputs, **arguments)
+            return operation.run(dyn, **inputs, **arguments)
     call = f"Dynamics.{operation.name}"
     for name, x in tensors.items():
         if not is_tensor(x):
@@ -50,8 +51,7 @@ def call_with_gradient(dyn: "Dynamics", operation: "Operation", arguments: dict[
             f"new tensor; leave out=, or call inside torch.no_grad()"
         )
     record = Record(dyn, operation, arguments, tuple(inputs), tuple(value_tensors))
-    with torch.no_grad():
-        dyn._gradients.check(operation)
+    dyn._gradients.check(operation)
     return _Differentiable.apply(record, *tensors.values())
 
 
@@ -73,11 +73,13 @@ class Record:
         self.stamps = dict(dyn.values.stamps)
 
     def run(self, tensors: Sequence[torch.Tensor]) -> tuple[Any, tuple]:
-        """Return the result, and all tensors that the backward pass needs of it."""
-        kept = {one.name: one.axes for one in self.operation.arrays if one.name in self.derivative.keeps}
-        more = {name: tensors[0].new_empty(self.dyn._engine.shape(axes)[0]) for name, axes in kept.items()}
+        """Return the result, and all tensors that the backward pass needs of it; torch must not record it."""
+        more = {}
+        for one in self.operation.arrays if self.derivative.keeps else ():
+            if one.name in self.derivative.keeps:
+                more[one.name] = tensors[0].new_empty(self.dyn._engine.shape(one.axes)[0])
         inputs = dict(zip(self.inputs, tensors, strict=False))
-        result = self.operation.function(self.dyn, **inputs, **self.options, **more)
+        result = self.operation.run(self.dyn, **inputs, **self.options, **more)
         return result, (*(result if isinstance(result, tuple) else (result,)), *more.values())
 
     def gradients(self, wanted: list[str], tensors: Sequence[torch.Tensor], results: tuple, cotangents: tuple) -> dict:
@@ -87,16 +89,19 @@ class Record:
             RuntimeError: A value was set since the call, and the tensors do not hold its old numbers.
         """
         by_name = dict(zip((*self.inputs, *self.values), tensors, strict=True))
-        changed = [name for name, stamp in self.dyn.values.stamps.items() if self.stamps.get(name) != stamp]
+        arrays = {name: by_name[name] for name in self.inputs}
+        gradients, values = self.dyn._gradients, self.dyn.values
+        if self.stamps == values.stamps:
+            return gradients.pull_back(self.operation, arrays, self.options, results, cotangents, wanted)
+        changed = [name for name, stamp in values.stamps.items() if self.stamps.get(name) != stamp]
         lost = [name for name in changed if name not in self.values and name in self.derivative.values]
         if lost:
             raise RuntimeError(
                 f"Dynamics.{self.operation.name}: {', '.join(lost)} was set between this call and its backward pass; "
                 f"expected the values of the call; call backward before Dynamics.set, or set tensors that require grad"
             )
-        arrays = {name: by_name[name] for name in self.inputs}
-        gradients = self.dyn._gradients
-        with gradients.at_values({name: by_name[name] for name in changed if name in self.values}):
+        before = {name: by_name[name] for name in changed if name in self.values}
+        with self.dyn.recursions.turn.lock, gradients.at_values(before):
             return gradients.pull_back(self.operation, arrays, self.options, results, cotangents, wanted)
 
 
@@ -106,25 +111,36 @@ class _Differentiable(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, record: Record, *tensors: torch.Tensor) -> Any:
         ctx.record = record
-        result, kept = record.run([x.detach() for x in tensors])
+        result, kept = record.run(tensors)
         ctx.save_for_backward(*tensors, *kept)
+        ctx.places = [(weakref.ref(x), x.data_ptr()) for x in tensors]
         return result
 
     @staticmethod
     def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple:
-        record, names = ctx.record, (*ctx.record.inputs, *ctx.record.values)
-        tensors, results = ctx.saved_tensors[: len(names)], ctx.saved_tensors[len(names) :]
+        record, saved = ctx.record, ctx.saved_tensors
+        names = (*record.inputs, *record.values)
+        tensors, results = saved[: len(names)], saved[len(names) :]
+        for name, tensor, (before, place) in zip(names, tensors, ctx.places, strict=True):
+            if tensor.data_ptr() != place and tensor is before():
+                raise RuntimeError(
+                    f"Dynamics.{record.operation.name}: {name}.data was replaced between this call and its backward "
+                    f"pass; expected the numbers of the call; pass {name}.clone(), or call backward before"
+                )
         wanted = [name for name, needed in zip(names, ctx.needs_input_grad[1:], strict=True) if needed]
-        with torch.no_grad():
-            detached = [x.detach() for x in tensors], tuple(y.detach() for y in results)
-            found = record.gradients(wanted, *detached, tuple(c.contiguous() for c in cotangents))
-            for name, tensor in zip(names, tensors, strict=True):
-                if name in found and found[name].dim() > tensor.dim():  # all worlds share the value
-                    found[name] = found[name].sum(0)
+        given = tuple([c.contiguous() for c in cotangents])
+        if not torch.is_grad_enabled():
+            found = record.gradients(wanted, tensors, results, given)
+        else:
+            with torch.no_grad():
+                found = record.gradients(wanted, tensors, results, given)
+        for name, tensor in zip(record.values, tensors[len(record.inputs) :], strict=True):
+            if name in found and found[name].dim() > tensor.dim():  # all worlds share the value
+                found[name] = found[name].sum(0)
         if torch.is_grad_enabled():
             sources = [x for x in (*tensors, *cotangents) if x.requires_grad]
             found = {name: _FirstOrder.apply(record.operation.name, value, *sources) for name, value in found.items()}
-        return None, *(found.get(name) for name in names)
+        return None, *[found.get(name) for name in names]
 
 
 class _FirstOrder(torch.autograd.Function):
