@@ -1,4 +1,4 @@
-"""Linear combinations of states, for integrators."""
+"""Combinations of what several launches of a step computed: states, linearly, and status words."""
 
 import functools
 
@@ -17,4 +17,25 @@ def combine(T) -> wp.Kernel:
     return kernel
 
 
-KERNELS = (combine,)
+@functools.cache
+def worst(T) -> wp.Kernel:
+    """Set ``status`` to the more severe of ``status`` and of ``later``, the word of a later substep.
+
+    Inputs are the same in all substeps, so that a later NOT_FINITE, 2, means that an earlier substep lost the state.
+    The word of that substep stays.
+
+    ``severity``: of each word.
+    """
+    words = wp.types.vector(length=11, dtype=wp.int32)
+
+    @wp.kernel(module=f"warp_spo_combination_{T.__name__}", enable_backward=False)
+    def kernel(severity: words, later: wp.array[int], status: wp.array[int]):
+        world = wp.tid()
+        word = later[world]
+        if severity[word] > severity[status[world]] and (word != 2 or status[world] == 0):
+            status[world] = word
+
+    return kernel
+
+
+KERNELS = (combine, worst)

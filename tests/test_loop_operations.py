@@ -27,6 +27,7 @@ OF_ALL_DOFS = {
     "interpolate",
     "closure_error",
     "project",
+    "actuator_force",
 }
 """Operations of all dofs, or of bodies, whether loops tie them or not."""
 OF_OTHERS = {"operational_inertia", "forward_dynamics_derivatives", "loop_multipliers"}
@@ -69,6 +70,7 @@ BACKWARDS_OF_ALL_DOFS = {
     "difference",
     "interpolate",
     "integrate",
+    "actuator_force",
 }
 
 

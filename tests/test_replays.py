@@ -3,6 +3,7 @@
 import functools
 import threading
 
+import actuated
 import laws
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ STRIDED = ("forward_dynamics_derivatives", "embed")  # copies rows into the call
 
 @functools.cache
 def dynamics(device, name="fork", granularity=None, loops="raise", refine=0):
-    scene = zoo.fork() if name == "fork" else MECHANISMS[name]()
+    scene = actuated.driven(zoo.fork() if name == "fork" else MECHANISMS[name]())
     return spo.Dynamics(scene, WORLDS, device, "float64", ("body_mass",), granularity, loops, refine=refine)
 
 

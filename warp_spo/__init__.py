@@ -6,6 +6,7 @@ The graph layer: :class:`Tree`, :class:`Digraph`, :class:`BWA` and its resolvent
 
 from typing import TYPE_CHECKING, Any
 
+from .dynamics.actuators import ActuatorState
 from .dynamics.dynamics import Dynamics
 from .errors import DirectedLoopError, UnsupportedError
 from .graph.factorization import Factorization
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = [
     "BWA",
     "Actuator",
+    "ActuatorState",
     "Blocks",
     "Body",
     "Coupling",

@@ -543,6 +543,28 @@ class Dense:
                 velocity[self.dofs[k][:3]] = (b[:3] + rotation(b[3:]) @ c) - (a[:3] + rotation(a[3:]) @ c)
         return velocity
 
+    def actuator_force(self, qd, ctrl):
+        """Return the forces of the scene's actuators for the controls ``ctrl`` [dof]."""
+        qd, tau, first = self._qd(qd), np.zeros(self.dof_count), 0
+        of = {name: self.value(f"actuator_{name}") for name in ("gain", "bias", "gear", "strength")}
+        ends = {name: self.value(f"actuator_{name}_range") for name in ("ctrl", "force")}
+        for a, actuator in enumerate(self.scene.actuators):
+            gear = of["gear"][first : first + len(actuator.hinges)]
+            first += len(gear)
+            dofs, entries = (
+                np.asarray(start)[list(actuator.hinges)] for start in (self.scene.qd_start, self.scene.q_start)
+            )
+            state = np.array([1.0, gear @ self.q[entries], gear @ qd[dofs]])
+            force = np.clip(
+                of["gain"][a] * np.clip(ctrl[a], *ends["ctrl"][a]) + of["bias"][a] @ state, *ends["force"][a]
+            )
+            if actuator.torque_speed is not None:
+                stall, no_load = actuator.torque_speed
+                slip = state[2] / no_load
+                force = np.clip(force, min(-stall * (1.0 + slip), 0.0), max(stall * (1.0 - slip), 0.0))
+            tau[dofs] += of["strength"][a] * gear * force
+        return tau
+
     def integrate(self, qd, dt):
         """Return q after dt [s] at constant qd, with quaternions of unit length.
 

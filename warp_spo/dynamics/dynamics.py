@@ -25,6 +25,7 @@ from ..execution.sweeps import Sweeps
 from ..gradients import TensorValues
 from ..scene.scene import Scene
 from . import (
+    actuators,
     closed_loops,
     configurations,
     derivatives,
@@ -157,6 +158,11 @@ class Dynamics:
     difference = configurations.difference
     interpolate = configurations.interpolate
 
+    # -- actuators -------------------------------------------------------------------------------------------------
+    actuator_force = actuators.actuator_force
+    actuator_state = actuators.actuator_state
+    reset_actuator_state = actuators.reset_actuator_state
+
     # -- derivatives -----------------------------------------------------------------------------------------------
     inverse_dynamics_derivatives = derivatives.inverse_dynamics_derivatives
     forward_dynamics_derivatives = derivatives.forward_dynamics_derivatives
@@ -271,6 +277,7 @@ class Dynamics:
             f"variable     {', '.join(self.variable) or 'nothing'}",
             f"gravity      {'none' if gravity is None else 'acceleration of the inertial frame'}",
             f"loops        {self._closures.explain()}",
+            f"actuators    {actuators.explain(self)}",
             f"workspace    {memory:.1f} MiB so far",
         ]
         return "\n".join(lines + self.programs.described())
@@ -279,6 +286,11 @@ class Dynamics:
     def operation_counts(self) -> dict[str, int]:
         """Floating-point operations of one world, of the operations that have a kernel of their own so far."""
         return self.programs.operation_counts
+
+    @functools.cached_property
+    def _later_status(self) -> wp.array:
+        """Where a step writes the status of all substeps but the first [world]."""
+        return wp.empty(self.worlds, dtype=wp.int32, device=self.device)
 
     @functools.cached_property
     def _mask(self) -> wp.array:

@@ -177,6 +177,7 @@ class Engine:
             "coordinate": dyn.scene.coord_count,
             "dof": dyn.scene.dof_count,
             "body": dyn.scene.body_count,
+            "actuator": len(dyn.scene.actuators),
             "frame": frames,
             "entry": entries,
         }[axis]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import warp as wp
 
@@ -42,14 +42,20 @@ COORDINATE_RATES = Routine("coordinate_rates", coordinates.coordinate_rates)
 HINGE_FORCE = Routine("hinge_force", hinge_forces.hinge_force)
 
 
+class Interval(NamedTuple):
+    """The state before a step, arrays for the state after it, and its length [s]."""
+
+    q: wp.array
+    qd: wp.array
+    q_out: wp.array
+    qd_out: wp.array
+    dt: float
+
+
 def semi_implicit(
     dyn: Dynamics,
     call: Call,
-    q: wp.array,
-    qd: wp.array,
-    q_out: wp.array,
-    qd_out: wp.array,
-    dt: float,
+    interval: Interval,
     qdd: wp.array | None = None,
     status: wp.array | None = None,
     **given: Any,
@@ -61,6 +67,7 @@ def semi_implicit(
         given: forces and targets by name. With ``q_from``, ``qd_from`` the step starts from that state, while its sweep
             and the laws of its joints are evaluated at q, qd.
     """
+    q, qd, q_out, qd_out, dt = interval
     asked = {name: array for name, array in (("qdd_out", qdd), ("status", status)) if array is not None}
     option = {name.removesuffix("_out"): True for name in asked}
     if dyn.scene.dof_count == 0 and status is not None:
@@ -97,21 +104,14 @@ def _step_under_multipliers(
         dyn.recursions.launch(loops.mark_open, dyn.worlds, [left], [asked["status"]])
 
 
-def midpoint(
-    dyn: Dynamics,
-    call: Call,
-    q: wp.array,
-    qd: wp.array,
-    q_out: wp.array,
-    qd_out: wp.array,
-    dt: float,
-    **forces: Any,
-) -> None:
+def midpoint(dyn: Dynamics, call: Call, interval: Interval, **forces: Any) -> None:
     """Launch the implicit midpoint rule: half a step whose sweep and laws are evaluated at the midpoint itself."""
+    q, qd, q_out, qd_out, dt = interval
     q_at, qd_at, q_next, qd_next = (_scratch(dyn, f"midpoint {i}", a) for i, a in enumerate((q, qd, q, qd)))
-    semi_implicit(dyn, call, q, qd, q_at, qd_at, 0.5 * dt, **forces)
+    semi_implicit(dyn, call, Interval(q, qd, q_at, qd_at, 0.5 * dt), **forces)
     for _ in range(MIDPOINT_ITERATIONS):
-        semi_implicit(dyn, call, q_at, qd_at, q_next, qd_next, 0.5 * dt, q_from=q, qd_from=qd, **forces)
+        half = Interval(q_at, qd_at, q_next, qd_next, 0.5 * dt)
+        semi_implicit(dyn, call, half, q_from=q, qd_from=qd, **forces)
         q_at, qd_at, q_next, qd_next = q_next, qd_next, q_at, qd_at
     dyn._engine.launch_routine(INTEGRATE, q_next, q=q, qd=qd_at, dt=dt)
     _combine(dyn, 2.0, qd_at, -1.0, qd, qd_next)
@@ -121,16 +121,13 @@ def midpoint(
 def rk4(
     dyn: Dynamics,
     call: Call,
-    q: wp.array,
-    qd: wp.array,
-    q_out: wp.array,
-    qd_out: wp.array,
-    dt: float,
+    interval: Interval,
     tau: wp.array | None,
     body_f: wp.array | None,
     **targets: Any,
 ) -> None:
     """Launch the classical Runge-Kutta rule in the coordinates; quaternions are normalised at the end."""
+    q, qd, q_out, qd_out, dt = interval
     values = dyn.scene.values
     if values["joint_friction"].any() or (abs(values["joint_velocity_limit"]) < DEFAULT_BOUND).any():
         raise UnsupportedError(call.name, "integrator='rk4' with friction or velocity limits", "use 'midpoint'")

@@ -22,7 +22,7 @@ and ``mass_matrix = inertia.mass_matrix`` is its line in the class. Checks of ar
 
 Axes are written as words: "world, dof". The words are "world", "coordinate", "dof", "independent dof" (the dofs that
 move all others where loops are embedded, otherwise all dofs), "body", "frame", "6 frames" (six for each frame), "10
-bodies", "row" (of the closures of loops), "entry" (of a packed matrix), and numbers.
+bodies", "row" (of the closures of loops), "actuator", "entry" (of a packed matrix), and numbers.
 """
 
 from __future__ import annotations
@@ -89,6 +89,7 @@ class Option:
         read: ``read(scene, call, value)`` returns what the routine gets; None: the method reads the value itself.
         default: ``default(scene)``, what ``prepare`` passes.
         asked: it is an option of ``prepare``.
+        stand_in: ``stand_in(dyn, given)``, what ``prepare`` passes beside the arguments ``given``; None: the default.
         sample: ``sample(scene)``, what trials pass; None: nothing.
     """
 
@@ -97,6 +98,7 @@ class Option:
     default: Callable[[Scene], Any] = lambda scene: None
     asked: bool = True
     sample: Callable[[Scene], Any] | None = None
+    stand_in: Callable[[Any, dict[str, Any]], Any] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,6 +136,7 @@ QD = Argument("qd", "world, dof", optional=True)
 QDD = Argument("qdd", "world, dof", optional=True)
 TAU = Argument("tau", "world, dof", optional=True)
 BODY_F = Argument("body_f", "world, body, 6", optional=True, asked=True)
+CTRL = Argument("ctrl", "world, actuator", optional=True, asked=True)
 STATUS = Argument("status", "world", optional=True, asked=True, written=True, dtype=wp.int32)
 ORIENTED_FRAMES = Option(
     "frames",
@@ -181,7 +184,8 @@ Closed = Routine | AsWritten | Refused
 ANCHORS = ("joint_X_p", "joint_X_c")
 GAINS = ("joint_damping", "joint_stiffness", "joint_friction", "joint_target_ke", "joint_target_kd")
 KINEMATIC = (*ANCHORS, "body_com")  # values that enter poses, velocities and Jacobians
-DIFFERENTIABLE = (*LINK_VALUES, *GAINS)
+ACTUATION = ("actuator_gain", "actuator_bias", "actuator_gear", "actuator_strength")
+DIFFERENTIABLE = (*LINK_VALUES, *GAINS, *ACTUATION)
 """All values of a scene by which some result can be differentiated."""
 
 
@@ -196,6 +200,10 @@ class Derivative:
         keeps: arguments that the operation fills because the way back reads them.
         recomputes: the kernel computes the result that it reads where the caller does not pass it.
         pull: what is launched; None: the kernel alone.
+        refuses: ``refuses(dyn, arguments)``, "what came; what is expected" of arguments with which a call has no
+            gradient; otherwise "".
+        repeats: ``repeats(call, arguments)`` takes out of the arguments how often the operation runs on its own
+            results, and returns it; the results have the names of the arguments that they replace.
         lacking: ``lacking(links)``, "what; way out" where the derivative does not support the scene; otherwise "".
     """
 
@@ -209,6 +217,8 @@ class Derivative:
     keeps: tuple[str, ...] = ()
     recomputes: bool = False
     pull: Pull | None = None
+    refuses: Callable[[Any, dict[str, Any]], str] = lambda dyn, arguments: ""
+    repeats: Callable[[str, dict[str, Any]], int] = lambda call, arguments: 1
     lacking: Callable[[Links], str] = lambda links: ""
 
 

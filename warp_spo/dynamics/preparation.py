@@ -26,7 +26,7 @@ def prepare(self: Dynamics, operation: str, **options: Any) -> None:
         operation: name of a method, such as "forward_dynamics".
         options: ``frames=`` for operations that take frames, ``columns=`` for solve_mass_matrix, ``prescribed=`` for
             hybrid_dynamics, ``integrator=`` for step, ``hold=`` for project, and ``body_f=True``, ``status=True``,
-            ``qdd=True``, ``target_q=True``, ``target_qd=True`` if they will be passed.
+            ``qdd=True``, ``target_q=True``, ``target_qd=True``, ``ctrl=True`` if they will be passed.
 
     Raises:
         ValueError: no such operation or option.
@@ -51,6 +51,7 @@ def _prepare_operation(dyn: Dynamics, operation: Operation, options: dict[str, A
     columns = options.pop("columns", None) if any(one.columns for one in arguments) else None
     _refuse_rest(operation.name, options)
     given |= {one.name: _stand_in(dyn, one, given.get("frames", ()), columns) for one in arguments}
+    given |= {one.name: one.stand_in(dyn, given) for one in operation.options if one.stand_in is not None}
     operation.entry(dyn, **given)
 
 

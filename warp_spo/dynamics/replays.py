@@ -185,7 +185,7 @@ def _add(value: Any, kind: type, key: list, arrays: list) -> bool:
     if kind is dict:
         key.append(tuple(value))
         value = value.values()
-    elif kind is not tuple and kind is not list:
+    elif not issubclass(kind, tuple | list):
         return False
     key.append(len(value))
     for item in value:

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ..arrays import AnyArray, ArrayT
+import warp as wp
+
+from ..arrays import AnyArray, ArrayT, Call
+from ..errors import as_integer
 from ..execution.routine import Routine
+from ..kernels import combination
 from ..recursions.derivatives import adjoints
 from ..recursions.loops import embedded_adjoints
-from . import integrators
+from ..status import Status
+from . import actuators, integrators
 from .gradients import by_name
-from .integrators import INTEGRATORS
+from .integrators import INTEGRATORS, Interval
 from .operation import (
     AS_WRITTEN,
     BODY_F,
+    CTRL,
     DIFFERENTIABLE,
     DT,
     EMBEDDED_DERIVATIVE,
@@ -32,6 +38,8 @@ from .operation import (
     required,
 )
 from .samples import rotations
+
+SEVERITY = [Status(word).severity for word in range(len(Status))]
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
@@ -56,6 +64,28 @@ def _pull_step(
     return by_name(names, call.result)
 
 
+def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
+    """Return what a call of a step asks for that has no gradient, and what is expected; "" if nothing."""
+    if arguments.get("integrator", "semi_implicit") != "semi_implicit":
+        return f"integrator is {arguments['integrator']!r}; expected integrator='semi_implicit', which has gradients"
+    if arguments.get("qdd") is not None:
+        return "qdd is given; expected no qdd=, which the way back uses itself"
+    if arguments.pop("actuator_state", None) is not None and actuators.delays_controls(dyn):
+        return "actuators delay ctrl; expected a scene without delays, whose buffers have no gradients"
+    if arguments.get("status") is not None and arguments.get("substeps", 1) != 1:
+        return "status is given with substeps; expected one of the two"
+    return ""
+
+
+def _take_substeps(call: str, arguments: dict[str, Any]) -> int:
+    """Return the checked number of substeps, taken out of the arguments."""
+    given = arguments.pop("substeps", 1)
+    count = as_integer(given)
+    if count is None or count < 1:
+        raise ValueError(f"{call}: substeps is {given!r}; expected how many steps, 1 or more")
+    return count
+
+
 STEP = Operation(
     "step",
     arguments=(
@@ -69,6 +99,9 @@ STEP = Operation(
         Option("integrator", default=lambda scene: "semi_implicit"),
         Argument("qdd", "world, dof", optional=True, asked=True, written=True),
         STATUS,
+        CTRL,
+        Option("actuator_state", asked=False, stand_in=actuators.stand_in),
+        Option("substeps", default=lambda scene: 1),
     ),
     results=(Result("q", "world, coordinate", over="q"), Result("qd", "world, dof", over="qd")),
     routine=integrators.STEP,
@@ -76,12 +109,14 @@ STEP = Operation(
     multipliers=AS_WRITTEN,
     derivative=Derivative(
         Routine("step_vjp", adjoints.step_vjp),
-        by=("q", "qd", "tau", "body_f", "target_q", "target_qd"),
+        by=("q", "qd", "tau", "body_f", "target_q", "target_qd", "ctrl"),
         values=DIFFERENTIABLE,
         embed=Routine("embedded_step_vjp", embedded_adjoints.step_vjp),
         multipliers=EMBEDDED_DERIVATIVE,
         keeps=("qdd",),
         pull=_pull_step,
+        refuses=_without_gradient,
+        repeats=_take_substeps,
     ),
 )
 
@@ -99,6 +134,9 @@ def step(
     integrator: str = "semi_implicit",
     qdd: AnyArray | None = None,
     status: AnyArray | None = None,
+    ctrl: AnyArray | None = None,
+    actuator_state: actuators.ActuatorState | None = None,
+    substeps: int = 1,
     out: tuple[ArrayT | None, ArrayT | None] = (None, None),
 ) -> tuple[ArrayT, ArrayT]:
     """Compute the state after ``dt``: forward dynamics with the forces of all hinges, and q moved along the new qd.
@@ -118,6 +156,11 @@ def step(
       neutral q of world 0 with all other hinges free. There it shrinks the excess about three hundredfold in one step,
       less where the hinge carries more. For a hinge that feels no inertia it is 300 times the resistance of its other
       laws.
+    * actuators: the forces of :meth:`actuator_force` at ``ctrl``. On one hinge, bias[1] and bias[2] below zero are a
+      spring and a damper, at q' and qd' as a drive's, within the force range; the bounds of a torque-speed curve are
+      those at qd. All else is taken at qd and at q + dt qd, with a resistance to changes of qd that keeps the step
+      stable: of the curve's slope where the curve limits a motor, and of gear_i sum_j gear_j (-bias[2] - dt bias[1])
+      on each of several hinges, all gears positive. bias[1] and bias[2] above zero act at q, qd.
 
     Effort and velocity limits of 1e6 and more, Newton's default, have no effect; nor do position limits of 1e10 and
     more. Laws that are zero or unbounded in the scene generate no code. The forces are implicit, which takes one
@@ -133,17 +176,18 @@ def step(
     Args:
         q, qd: the state [world, coordinate], [world, dof].
         tau: forces dual to qd [world, dof]; None means zero.
-        dt: length of the step [s], the same in all worlds. It does not fold: changing it compiles nothing.
+        dt: length of the step [s], of each substep where there are several, the same in all worlds. It does not fold:
+            changing it compiles nothing.
         body_f: as :meth:`forward_dynamics`.
         target_q, target_qd: targets of the drives, laid out as q and qd; None means the neutral q, and zero.
         integrator: "semi_implicit": order 1. "midpoint": implicit midpoint, order 2; the forces above are implicit, and
             the velocity terms take six fixed-point iterations, which diverge where a link turns by much of a radian in
             a step. "rk4": order 4, all explicit: stable only while (damping dt + stiffness dt^2) / inertia stays below
             2, and only for scenes without friction and velocity limits.
-        qdd: [world, dof], written with (qd' - qd) / dt of the semi-implicit step, before it is rounded into qd' and
-            before the projection onto the closures.
+        qdd: [world, dof], written with (qd' - qd) / dt of the semi-implicit step, the last substep, before it is
+            rounded into qd' and before the projection onto the closures.
         status: int32 [world], written with one :class:`warp_spo.Status` for each world, of the semi-implicit step, the
-            worst that applies:
+            worst that applies in any substep:
 
             * 2, NOT_FINITE: an input is NaN or infinite.
             * 1, PIVOT: the result is not finite though the inputs are, as 1 and 4 in :meth:`forward_dynamics`. A
@@ -158,6 +202,13 @@ def step(
             * 5, NOT_SETTLED: the last pass still found a law in another part than it had assumed. The step stands, with
               a force that a shorter dt would correct.
             * 0, OK: none of these.
+
+        ctrl: controls of the scene's actuators [world, actuator]. None: the actuators do not act, servos neither.
+        actuator_state: the buffers of :meth:`actuator_state`, which the step changes. Needed where actuators delay
+            their controls; a scene without delays leaves them alone.
+        substeps: how many steps of ``dt`` to take, with the same forces, targets and controls: to the bit what as many
+            calls compute, each on the state that the one before returned. The time that passes is substeps dt. Delays
+            count substeps. With a tensor that requires grad, every substep is recorded.
         out: (q, qd) after the step, each an array or None. They may be the arrays of the state itself.
 
     Returns:
@@ -171,14 +222,45 @@ def step(
         for name, array in (("status", status), ("qdd", qdd)):
             if array is not None and integrator != "semi_implicit":
                 raise ValueError(f"{call.name}: {name} with integrator={integrator!r}; expected 'semi_implicit'")
-        forces = {"tau": tau, "body_f": body_f, "target_q": target_q, "target_qd": target_qd}
+        count = _take_substeps(call.name, {"substeps": substeps})
+        actuators.check_state(self, call, ctrl, actuator_state)
+        forces = {"tau": tau, "body_f": body_f, "target_q": target_q, "target_qd": target_qd, "ctrl": ctrl}
         written = {} if integrator != "semi_implicit" else {"qdd": qdd, "status": status}
         given = engine.read(call, STEP, q=q, qd=qd, dt=dt, **forces, **written)
         if not given["dt"] > 0.0:
             raise ValueError(f"{call.name}: dt is {given['dt']} s; expected more than zero")
+        buffers = actuators.read_state(self, call, actuator_state)
         q_out, qd_out = engine.write(call, STEP, outs, given)
-        INTEGRATORS[integrator](self, call, **given, q_out=q_out, qd_out=qd_out)
+        interval = Interval(given["q"], given["qd"], q_out, qd_out, given["dt"])
+        given = {name: value for name, value in given.items() if name not in Interval._fields}
+        _launch(self, call, integrator, count, interval, given, buffers)
     return call.result
+
+
+def _launch(
+    dyn: Dynamics,
+    call: Call,
+    integrator: str,
+    count: int,
+    interval: Interval,
+    given: dict[str, Any],
+    buffers: tuple[wp.array, wp.array] | None,
+) -> None:
+    """Launch ``count`` steps, each on the state after the one before.
+
+    Args:
+        given: forces, targets, controls, and arrays to fill, by name. buffers: of delayed controls; None: no delays.
+    """
+    ctrl, status = given.pop("ctrl"), given.get("status")
+    ctrl = ctrl if dyn.scene.actuators else None
+    for substep in range(count):
+        now = ctrl if ctrl is None or buffers is None else actuators.delayed(dyn, ctrl, buffers)
+        if substep and status is not None:
+            given["status"] = dyn._later_status
+        INTEGRATORS[integrator](dyn, call, interval, **given, ctrl=now)
+        if substep and status is not None:
+            dyn.recursions.launch(combination.worst, dyn.worlds, [SEVERITY, dyn._later_status], [status])
+        interval = interval._replace(q=interval.q_out, qd=interval.qd_out)
 
 
 INTEGRATE = Operation(

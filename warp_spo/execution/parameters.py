@@ -17,6 +17,7 @@ from ..kernels import parameters as kernels
 from ..kernels.spatial import POSE, RIGID
 from ..kernels.topology import Topology
 from ..memory import broadcast_worlds
+from ..scene.actuators import ACTUATOR_VALUES
 from ..scene.scene import Scene
 from .node_functions import node_functions
 
@@ -34,6 +35,7 @@ VARIABLE = (
     "joint_X_p",
     "joint_X_c",
     "gravity",
+    *ACTUATOR_VALUES,
 )
 RIGID_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c")
 
@@ -140,13 +142,17 @@ class Parameters:
         return self._bodies()[3]
 
     def field(self, name: str) -> wp.array:
-        """Return the value of this name, rounded, with the world axis last: [dof, coordinate or component, world]."""
+        """Return the value of this name, rounded, with the world axis last: [dof, coordinate or component, world].
+
+        Values of several entries for each actuator are flat.
+        """
 
         def build() -> DerivedArrays:
             value = self._values[name]
-            own: Any = wp.empty(value.shape[::-1], dtype=self.dtype, device=self.device)
+            flat = value.reshape((value.shape[0], math.prod(value.shape[1:])))
+            own: Any = wp.empty(flat.shape[::-1], dtype=self.dtype, device=self.device)
             kernel = kernels.transpose(node_functions(self.dtype))
-            fill = lambda: launches.launch(kernel, own.shape, [value], [own], device=self.device)  # noqa: E731
+            fill = lambda: launches.launch(kernel, own.shape, [flat], [own], device=self.device)  # noqa: E731
             return DerivedArrays([broadcast_worlds(own, 1, self.worlds)], (name,), fill)
 
         return self.derived_arrays(name, build)[0]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import Vector, total
+from .actuation import hinge_laws
 from .impedance import Impedance
 from .motion import hinge_entries
 
@@ -15,16 +16,11 @@ if TYPE_CHECKING:
 
 
 def hinge_force(trace: Trace) -> list[Store]:
-    """out = the forces of all laws at q, qd: springs, dampers, drives, limits, friction, and gravity compensation"""
-    impedance = Impedance(
-        trace.links,
-        0.0,
-        trace.vector("q"),
-        trace.vector("qd"),
-        None,
-        trace.vector("target_q") if "target_q" in trace.inputs else None,
-        trace.vector("target_qd"),
-    )
+    """out = the forces of all laws at q, qd: springs, dampers, drives, limits, friction, actuators under "ctrl"
+
+    Gravity compensation is a part of it.
+    """
+    impedance = hinge_laws(trace, 0.0)
     stores = []
     held = compensation(trace)
     for link in trace.links.links:

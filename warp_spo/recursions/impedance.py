@@ -123,6 +123,7 @@ class Impedance:
         q, qd: entries of the state that the laws start from; ``qd`` None is zero.
         ahead: entries of what a step adds to q if u = 0; None is h qd.
         target_q, target_qd: entries of the drives' targets, laid out as q and qd; None: the neutral ones, zero.
+        actuators: returns the laws of a dof's actuators; None: they do not act.
     """
 
     def __init__(
@@ -134,10 +135,12 @@ class Impedance:
         ahead: Callable[[int], Value] | None = None,
         target_q: Callable[[int], Value] | None = None,
         target_qd: Callable[[int], Value] = lambda dof: 0.0,
+        actuators: Callable[[int], list[Law]] | None = None,
     ):
         self.links, self.scene, self.h, self.q, self.qd = links, links.scene, h, q, qd
         self.ahead = ahead or (lambda dof: h * qd(dof))
         self.target_q, self.target_qd = target_q or self._neutral, target_qd
+        self.actuators = actuators or (lambda dof: [])
         self._inertias: np.ndarray | None = None
 
     def laws(self, link: Link) -> list[list[Law]]:
@@ -146,6 +149,7 @@ class Impedance:
         for i, dof in enumerate(link.dofs):
             straight = [*self._damper(dof), *self._spring(link, i, "joint_stiffness", self._rest)]
             found = [*self._drive(link, i), *self._limits(link, i), *self._friction(dof)]
+            found += self.actuators(dof)
             found += self._rate_limit(dof, straight + found)
             straight += [law for law in found if not law.bends]
             every.append([add_laws(straight)] * bool(straight) + [law for law in found if law.bends])

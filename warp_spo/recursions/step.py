@@ -19,8 +19,9 @@ from ..status import Status
 from ..trace.emission import Store
 from ..trace.scalars import Value, less, reciprocal, select
 from ..trace.spatial import total
+from .actuation import hinge_laws
 from .articulated_sweeps import expand, reduce
-from .impedance import Impedance, Law, add_laws, is_number
+from .impedance import Law, add_laws, is_number
 from .integration import integrate_link
 from .joint_space import JointSpace
 from .links import Link
@@ -48,16 +49,7 @@ class Step:
         self.h = trace.graph.input("dt", 0)
         apart = "q_from" in given
         self.q, self.qd = (vector("q_from"), vector("qd_from")) if apart else (vector("q"), vector("qd"))
-        at = vector("qd")
-        self.impedance = Impedance(
-            trace.links,
-            self.h,
-            vector("q"),
-            self.qd,
-            (lambda dof: self.h * (self.qd(dof) - at(dof))) if apart else None,
-            vector("target_q") if "target_q" in given else None,
-            vector("target_qd"),
-        )
+        self.impedance = hinge_laws(trace, self.h)
         self.laws: dict[int, list[Law]] = {}  # by dof
         self.forces: dict[int, Value] = {}
         self.messages: list[Store] = []  # to other pieces
@@ -241,9 +233,17 @@ class Step:
                 inputs += map(trace.vector(name), coordinates)
             if name in ("qd", "tau", "target_qd", "qd_from"):
                 inputs += map(trace.vector(name), dofs)
+            if name == "ctrl":
+                inputs += map(trace.vector(name), self._controls(dofs))
             if name == "body_f":
                 inputs += [trace.graph.input(name, body, c) for body in bodies for c in range(6)]
         return inputs
+
+    def _controls(self, dofs: list[int]) -> list[int]:
+        """Return the actuators with a hinge among these dofs."""
+        scene = self.trace.links.scene
+        own = [{int(scene.qd_start[hinge]) for hinge in actuator.hinges} for actuator in scene.actuators]
+        return [number for number, moved in enumerate(own) if moved.intersection(dofs)]
 
 
 def by_pieces(scene: Scene) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +12,16 @@ from ..errors import as_integer
 from .checks import checked_array
 
 UNBOUNDED = (-float("inf"), float("inf"))
+RANGES = ("actuator_ctrl_range", "actuator_force_range")
+ACTUATOR_VALUES = (
+    "actuator_gain",
+    "actuator_bias",
+    "actuator_gear",
+    "actuator_strength",
+    "actuator_delay",
+    *RANGES,
+)
+"""Names of a scene's values that come from its actuators."""
 
 
 class Keyframe(NamedTuple):
@@ -45,12 +56,15 @@ class Actuator:
         bias: force that does not depend on the control [f], for each unit of length, and for each unit of its rate.
         ctrl_range: lowest and highest control; others are clipped.
         force_range: lowest and highest force [N or N m, before the gear].
-        torque_speed: None, or (stall, no_load) of a direct-current motor, force and rate of length: its force is at
-            most ``stall (1 - l' / no_load)`` and at least ``-stall (1 + l' / no_load)``; where a bound would change
-            sign it is zero.
-        strength: factor on the force.
-        delay: steps between a control and its force.
+        torque_speed: None, or (stall, no_load) of a direct-current motor, force and rate of length: after the force
+            range, its force is at most ``stall (1 - l' / no_load)`` and at least ``-stall (1 + l' / no_load)``; where a
+            bound would change sign it is zero.
+        strength: factor on the force, zero or more.
+        delay: steps between a control and its force; substeps count one by one. See :meth:`Dynamics.actuator_state`.
         label: name in tables and errors.
+
+    A motor of which the terminal voltage is controlled, with torque constant K and resistance R, has gain K / R and
+    bias (0, 0, -K^2 / R).
 
     Raises:
         ValueError: a value is invalid; the message names it.
@@ -79,6 +93,8 @@ class Actuator:
         put("gear", tuple(np.broadcast_to(gear, (len(indices),)).tolist()))
         for name in ("gain", "strength"):
             put(name, float(checked_array(call, name, getattr(self, name), ())))
+        if self.strength < 0.0:
+            raise ValueError(f"{call}: strength is {self.strength}; expected zero or more")
         put("bias", tuple(checked_array(call, "bias", self.bias, (3,)).tolist()))
         for name in ("ctrl_range", "force_range"):
             low, high = ends = tuple(float(end) for end in getattr(self, name))
@@ -94,3 +110,23 @@ class Actuator:
         if delay is None or delay < 0:
             raise ValueError(f"{call}: delay is {self.delay!r}; expected a number of steps, zero or more")
         put("delay", delay)
+
+
+def actuator_values(actuators: Sequence[Actuator]) -> dict[str, np.ndarray]:
+    """Return the values of a scene that come from its actuators, [1, ...] by name; gears one after the other."""
+    count = len(actuators)
+    shapes = {"actuator_bias": (count, 3), "actuator_gear": (-1,)} | dict.fromkeys(RANGES, (count, 2))
+    values = {}
+    for name in ACTUATOR_VALUES:
+        fields = [getattr(actuator, name.removeprefix("actuator_")) for actuator in actuators]
+        entries = np.concatenate([np.zeros(0), *(np.ravel(field) for field in fields)]).astype(np.float64)
+        values[name] = entries.reshape(shapes.get(name, (count,)))[None]
+    return values
+
+
+def check_actuator_value(call: str, name: str, array: np.ndarray) -> None:
+    """Raise ValueError if a value of actuators that a scene or ``Dynamics.set`` is given is not possible."""
+    if name in RANGES and not (array[..., 0] <= array[..., 1]).all():
+        raise ValueError(f"{call}: {name} holds a lower end above the upper end, or NaN; expected (lower, upper)")
+    if name == "actuator_delay" and (array != np.round(array)).any():
+        raise ValueError(f"{call}: actuator_delay holds {array[array != np.round(array)][0]}; expected whole steps")

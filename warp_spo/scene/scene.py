@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import refuse_masked
-from .actuators import Actuator, Keyframe
+from .actuators import RANGES, Actuator, Keyframe, actuator_values, check_actuator_value
 from .checks import SYMMETRY
 from .parts import (
     DOF_VALUES,
@@ -41,6 +41,8 @@ NOT_NEGATIVE = (
     "joint_limit_kd",
     "joint_effort_limit",
     "joint_velocity_limit",
+    "actuator_strength",
+    "actuator_delay",
 )
 
 
@@ -87,7 +89,9 @@ class Scene(Stored):
             [kg m^2], body_gravcomp, joint_X_p, joint_X_c (poses [hinge, 7]), gravity [m/s^2], joint_rest_q
             [coordinate], and per dof joint_armature, joint_damping, joint_friction, joint_stiffness, joint_target_ke,
             joint_target_kd, joint_limit_lower, joint_limit_upper, joint_limit_ke, joint_limit_kd, joint_effort_limit,
-            joint_velocity_limit.
+            joint_velocity_limit. Of actuators: actuator_gain, actuator_strength, actuator_delay [actuator],
+            actuator_bias [actuator, 3], actuator_ctrl_range, actuator_force_range [actuator, 2], and actuator_gear, of
+            the hinges of the first actuator, of the second, and so on.
         dof_axis [dof, 3], dof_angular [dof], dof_linear [dof]: the screws, in the parent anchor frame.
         q_index, dof_index: entries [worlds, n] of the source model's flat joint_q and joint_qd.
 
@@ -135,6 +139,7 @@ class Scene(Stored):
             _refuse_negative("Scene", name, values[name])
         self._refuse_impossible_inertias("Scene", values["body_inertia"])
         self._refuse_crossed_limits("Scene", values)
+        values |= actuator_values(self.actuators)
         for array in values.values():
             read_only(array)
         self.values = MappingProxyType(values)
@@ -336,7 +341,8 @@ class Scene(Stored):
                 f"{call}: {name} has shape {np.shape(value)}; expected {shape} or (worlds, "
                 f"{', '.join(map(str, shape))})"
             )
-        if not np.isfinite(array).all():
+        check_actuator_value(call, name, array)
+        if name not in RANGES and not np.isfinite(array).all():
             raise ValueError(f"{call}: {name} holds NaN or infinity; expected finite numbers")
         if name in ("joint_X_p", "joint_X_c"):
             array[..., 3:] = checked_unit(call, f"the quaternions of {name}", array[..., 3:])

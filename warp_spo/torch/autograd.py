@@ -39,11 +39,11 @@ def call_with_gradient(dyn: "Dynamics", operation: "Operation", arguments: dict[
                 f"pass torch.as_tensor({name}), or call inside torch.no_grad()"
             )
         pointer(call, name, x)
-    if arguments.get("integrator", "semi_implicit") != "semi_implicit" or arguments.get("qdd") is not None:
-        raise ValueError(
-            f"{call}: an input requires grad; expected integrator='semi_implicit' and no qdd=, because only this step "
-            f"has gradients; call inside torch.no_grad()"
-        )
+    refused = derivative.refuses(dyn, arguments)
+    if refused:
+        came, expected = refused.split("; ", 1)
+        raise ValueError(f"{call}: {came} and an input requires grad; {expected}; call inside torch.no_grad()")
+    times = derivative.repeats(call, arguments)
     out = arguments.pop("out", None)
     if any(x is not None for x in (out if isinstance(out, tuple | list) else (out,))):
         raise ValueError(
@@ -52,6 +52,9 @@ def call_with_gradient(dyn: "Dynamics", operation: "Operation", arguments: dict[
         )
     record = Record(dyn, operation, arguments, tuple(inputs), tuple(value_tensors))
     dyn._gradients.check(operation)
+    for _ in range(times - 1):
+        results = _Differentiable.apply(record, *tensors.values())
+        tensors |= {one.name: result for one, result in zip(operation.results, results, strict=True)}
     return _Differentiable.apply(record, *tensors.values())
 
 

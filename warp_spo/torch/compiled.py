@@ -16,16 +16,23 @@ if TYPE_CHECKING:
     from ..dynamics.operation import Operation
 
 _numbers = itertools.count()  # of custom ops, which need names of their own
-RESULTS = ("out", "qdd", "status")  # arguments that a call writes, which a graph of torch would not know
+RESULTS = (
+    "out",
+    "qdd",
+    "status",
+    "actuator_state",
+)  # arguments that a call writes, which a graph of torch would not know
+
+ONLY = {"integrator": "semi_implicit", "substeps": 1}  # options of which gradients know one value
 
 
 def _check_options(declared: "Operation", by: tuple[str, ...], options: dict[str, Any]) -> None:
     """Raise TypeError unless ``options`` are the arguments that the operation needs besides the tensors ``by``."""
     operation, parameters = declared.name, inspect.signature(declared.function).parameters
-    rest = {n: p.default for n, p in parameters.items() if n not in (*by, *RESULTS, "self", "integrator")}
+    rest = {n: p.default for n, p in parameters.items() if n not in (*by, *RESULTS, *ONLY, "self")}
     expected = ", ".join(f"{n}=" for n in rest) or "none"
     for name in options:
-        if name not in rest and (name, options[name]) != ("integrator", "semi_implicit"):
+        if name not in rest and (name not in ONLY or options[name] != ONLY[name]):
             raise TypeError(f"custom_op({operation!r}): {name}={options[name]!r} is no option; expected {expected}")
     for name, default in rest.items():
         if default is inspect.Parameter.empty and name not in options:

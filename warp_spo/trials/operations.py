@@ -29,7 +29,7 @@ TOLERANCE = {
     "float32": 1e-4,
     "float64": 1e-10,
 }
-INPUTS = ("q", "qd", "qdd", "tau", "b", "x", "wrenches", "q_after", "share", "parameters")
+INPUTS = ("q", "qd", "qdd", "tau", "b", "x", "wrenches", "q_after", "share", "parameters", "ctrl")
 
 Shape = Callable[[Scene], tuple[int, ...]]
 
@@ -115,7 +115,7 @@ class Inputs:
     """Random inputs in all worlds, and the reference at them. They are float32 numbers: exact in either precision.
 
     q: angles and lengths U(-1, 1) [rad, m], rotations uniform; q_after: as q;
-    qd, qdd, b, x, wrenches, share, parameters: N(0, 1); tau: 10 N(0, 1).
+    qd, qdd, b, x, wrenches, share, parameters, ctrl: N(0, 1); tau: 10 N(0, 1).
 
     Args:
         scene: whose inputs.
@@ -145,9 +145,10 @@ class Inputs:
                     "x": sum(scene.node_sizes),
                     "wrenches": 12,
                     "share": 0,
+                    "ctrl": len(scene.actuators),
                     "parameters": 10 * scene.body_count,
                 }.get(name, scene.dof_count)
-                shape = (self.worlds, size) if size else (self.worlds,)
+                shape = (self.worlds,) if name == "share" else (self.worlds, size)
                 array = rng.standard_normal(shape, dtype=np.float32)
                 array *= 10.0 if name == "tau" else 1.0
             self._arrays[name] = array.astype(np.float32)

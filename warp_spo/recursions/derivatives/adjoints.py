@@ -11,16 +11,19 @@ import dataclasses
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from ...scene.actuators import ACTUATOR_VALUES
 from ...trace.differentiation import forward, reverse
 from ...trace.emission import Store
 from ...trace.scalars import Scalar, Value, ordered
 from ...trace.spatial import ZERO, total
+from ..actuation import actuator_force, hinge_laws
 from ..articulated_sweeps import expand, reduce
 from ..composite import mass_matrix
 from ..coordinates import difference, integrate, interpolate
 from ..energy import kinetic_energy, potential_energy
 from ..forward_dynamics import forward_dynamics
-from ..impedance import Impedance
 from ..integration import integrate_link
 from ..kinematics import (
     body_poses,
@@ -172,6 +175,11 @@ def integrate_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
     return pull_back(trace, integrate(trace), wrt)
 
 
+def actuator_force_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
+    """J* cotangent of actuator_force; a control or a force beyond its range has derivative zero"""
+    return pull_back(trace, actuator_force(trace), wrt)
+
+
 def step_vjp(trace: Trace, wrt: tuple[str, ...], equations: TreeEquations | None = None) -> list[Store]:
     """J* (q_cotangent; qd_cotangent) of a step whose accelerations are "qdd".
 
@@ -201,15 +209,7 @@ def step_vjp(trace: Trace, wrt: tuple[str, ...], equations: TreeEquations | None
     back = reverse(results, [*after.values(), *ends], seeds)
     found = dict(zip((x.args for x in ends), back[len(dofs) :], strict=True))
     rates = dict(zip(dofs, back, strict=False))
-    impedance = Impedance(
-        trace.links,
-        h,
-        trace.vector("q"),
-        qd,
-        None,
-        trace.vector("target_q") if "target_q" in trace.inputs else None,
-        trace.vector("target_qd"),
-    )
+    impedance = hinge_laws(trace, h)
     forces: dict[int, Value] = {}
     stiff: dict[int, Value] = {}
 
@@ -273,11 +273,21 @@ def entries(trace: Trace, name: str, found: dict[tuple, Value]) -> Iterable[tupl
         places: list[tuple] = [(body, c) for body in range(trace.links.scene.body_count) for c in range(6)]
     elif name == "value":
         places = [(i,) for i in range(len(trace.links.tables["value"]))]
+    elif name == "ctrl":
+        places = [(number,) for number in range(len(trace.links.scene.actuators))]
+    elif name in ACTUATOR_VALUES:
+        return _value_entries(trace, name, found)
     elif name in COORDINATES:
         places = [(link.coordinate + c,) for link in trace.own_links for c in range(link.hinge.coordinates)]
     else:
         places = [(dof,) for link in trace.own_links for dof in link.dofs]
     return [(place, found.get((name, *place), 0.0)) for place in places]
+
+
+def _value_entries(trace: Trace, name: str, found: dict[tuple, Value]) -> list[tuple[tuple[int, ...], Value]]:
+    """Return (index, gradient) of every entry of a value that is read by its flat index."""
+    places = np.ndindex(trace.links.scene.values[name].shape[1:])
+    return [(place, found.get((name, flat), 0.0)) for flat, place in enumerate(places)]
 
 
 def pull_back(trace: Trace, results: list[Store], wrt: tuple[str, ...]) -> list[Store]:

@@ -1,0 +1,187 @@
+"""Actuators: their forces, and the buffers that delay their controls."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import warp as wp
+
+from .. import launches
+from ..arrays import WARP, AnyArray, ArrayT, Call, kind_of
+from ..errors import as_integer
+from ..execution.routine import Routine
+from ..kernels import delays
+from ..recursions.actuation import actuator_force as trace_of_force
+from ..recursions.derivatives import adjoints
+from .operation import ACTUATION, AS_WRITTEN, CTRL, QD, Derivative, Operation, Q, Result, Trial, required
+
+if TYPE_CHECKING:
+    from .dynamics import Dynamics
+
+ACTUATOR_FORCE = Operation(
+    "actuator_force",
+    arguments=(Q, QD, required(CTRL)),
+    results=(Result("force", "world, dof"),),
+    routine=Routine("actuator_force", trace_of_force),
+    embed=AS_WRITTEN,
+    multipliers=AS_WRITTEN,
+    derivative=Derivative(
+        Routine("actuator_force_vjp", adjoints.actuator_force_vjp),
+        by=("q", "qd", "ctrl"),
+        state=("q", "qd", "ctrl"),
+        values=ACTUATION,
+        embed=AS_WRITTEN,
+        multipliers=AS_WRITTEN,
+    ),
+    trial=Trial(lambda dense, q, qd, ctrl: dense.actuator_force(qd, ctrl), reads=("q", "qd", "ctrl")),
+)
+
+
+@ACTUATOR_FORCE.method
+def actuator_force(self: Dynamics, q: ArrayT, qd: AnyArray | None, ctrl: AnyArray, out: ArrayT | None = None) -> ArrayT:
+    """Compute the forces of the scene's actuators, see :class:`Actuator`: tau for other calls [world, dof].
+
+    Delays have no part in it: ``ctrl`` acts at once. Derivatives by a control or a force beyond its range are zero.
+
+    Args:
+        q, qd: the state [world, coordinate], [world, dof]; qd=None means zero.
+        ctrl: controls, in the order of ``scene.actuators`` [world, actuator].
+    """
+    return self._engine.run(ACTUATOR_FORCE, out, q=q, qd=qd, ctrl=ctrl)
+
+
+class ActuatorState(NamedTuple):
+    """The buffers that delay controls; they are the caller's, and :meth:`Dynamics.step` changes them.
+
+    Attributes:
+        ring: the last controls [world, slot, actuator], by step modulo the number of slots.
+        count: int32 [world, actuator], steps since the last reset; it stays below twice the number of slots.
+    """
+
+    ring: Any
+    count: Any
+
+
+def actuator_state(self: Dynamics, like: Any = None, longest: int | None = None) -> ActuatorState:
+    """Return new buffers for delayed controls, for ``step(..., ctrl=, actuator_state=)``.
+
+    A step uses the control that was passed ``delay`` steps before, of each actuator and world; a substep counts as a
+    step. Before that many steps since the buffers were made or reset, it uses the first control since then. A scene
+    without delays has buffers without slots, which steps leave alone.
+
+    Args:
+        like: an array of the kind that the buffers are to have, such as q. None: Warp arrays.
+        longest: the longest delay, in steps, that actuator_delay will be set to. None: the longest of the scene's
+            values. A longer delay makes that control NaN in its world.
+
+    Returns:
+        :class:`warp_spo.ActuatorState`: (ring [world, longest + 1, actuator], count [world,
+        actuator]). To copy or save a state, copy both arrays.
+    """
+    least = most_delay(self)
+    steps = least if longest is None else as_integer(longest)
+    if steps is None or steps < least:
+        raise ValueError(
+            f"Dynamics.actuator_state: longest is {longest!r}; expected {least} or more, the steps of the longest "
+            f"delay in the scene"
+        )
+    actuators = len(self.scene.actuators)
+    slots = steps + 1 if delays_controls(self) else 0
+    name = "Dynamics.actuator_state"
+    kind = WARP if like is None else kind_of(like, name, "like")
+    with Call(name, self.device, self.dtype, kind=kind, turn=self.recursions.turn) as call:
+        ring = call.write(None, (self.worlds, slots, actuators))
+        count = call.write(None, (self.worlds, actuators), dtype=wp.int32)
+        for array in (ring, count):
+            launches.fill(array, 0)
+    return ActuatorState(*call.result)
+
+
+def reset_actuator_state(self: Dynamics, mask: AnyArray | None, state: ActuatorState) -> None:
+    """Forget the controls of the worlds under the mask [world], bool; None: of all worlds. A graph may capture it."""
+    with Call("Dynamics.reset_actuator_state", self.device, self.dtype, turn=self.recursions.turn) as call:
+        where = None if mask is None else call.read("mask", mask, (self.worlds,), "[world]", dtype=wp.bool)
+        forget_controls(self, call, where, state)
+
+
+def forget_controls(dyn: Dynamics, call: Call, mask: wp.array | None, state: Any) -> None:
+    """Launch the reset of the buffers of the worlds under the mask, for a call that has read the mask."""
+    _, count = _read(dyn, call, state)
+    if mask is None:
+        launches.fill(count, 0)
+    elif count.size:
+        dyn.recursions.launch(delays.forget, count.shape, [mask], [count])
+
+
+def most_delay(dyn: Dynamics) -> int:
+    """Return the longest delay in the scene's values, in steps."""
+    return int(dyn.scene.values["actuator_delay"].max(initial=0.0))
+
+
+def delays_controls(dyn: Dynamics) -> bool:
+    """Return whether some control is delayed, or may be set to be."""
+    return bool(dyn.scene.actuators) and ("actuator_delay" in dyn.variable or most_delay(dyn) > 0)
+
+
+def check_state(dyn: Dynamics, call: Call, ctrl: Any, state: Any) -> None:
+    """Raise ValueError unless a step has the buffers that its delays need, and no others."""
+    if ctrl is None and state is not None:
+        raise ValueError(f"{call.name}: actuator_state is given and ctrl is None; expected both, or neither")
+    if ctrl is not None and state is None and delays_controls(dyn):
+        raise ValueError(
+            f"{call.name}: actuators of the scene delay ctrl, and actuator_state is None; expected the buffers of "
+            f"Dynamics.actuator_state(), the same ones at every step"
+        )
+
+
+def delayed(dyn: Dynamics, ctrl: wp.array, state: tuple[wp.array, wp.array]) -> wp.array:
+    """Launch one step of the delays, and return the controls that act in this step."""
+    ring, count = state
+    out = dyn.recursions.array("delayed controls", *ctrl.shape)
+    field = dyn.recursions.parameters.field("actuator_delay")
+    dyn.recursions.launch(delays.delay, ctrl.shape, [ctrl, field], [ring, count, out])
+    return out
+
+
+def read_state(dyn: Dynamics, call: Call, state: Any) -> tuple[wp.array, wp.array] | None:
+    """Return the Warp arrays of the buffers; None where nothing is delayed."""
+    return _read(dyn, call, state) if state is not None and delays_controls(dyn) else None
+
+
+def _read(dyn: Dynamics, call: Call, state: Any) -> tuple[wp.array, wp.array]:
+    """Return the Warp arrays of the buffers, to be changed."""
+    if not isinstance(state, tuple | list) or len(state) != 2:
+        raise TypeError(
+            f"{call.name}: actuator_state is of type {type(state).__name__}; expected what Dynamics.actuator_state() "
+            f"returned"
+        )
+    ring, count = state
+    actuators = len(dyn.scene.actuators)
+    slots = tuple(getattr(ring, "shape", ()))[1:2]
+    least = most_delay(dyn) + 1 if delays_controls(dyn) else 0
+    if not slots or slots[0] < least:
+        raise ValueError(
+            f"{call.name}: actuator_state has {slots[0] if slots else 'no'} slots; expected {least} or more, as "
+            f"Dynamics.actuator_state() makes them; longest= makes more"
+        )
+    shape = (dyn.worlds, slots[0], actuators)
+    return (
+        call.update("actuator_state.ring", ring, shape, "[world, slot, actuator]"),
+        call.update("actuator_state.count", count, (dyn.worlds, actuators), "[world, actuator]", dtype=wp.int32),
+    )
+
+
+def stand_in(dyn: Dynamics, given: dict[str, Any]) -> ActuatorState | None:
+    """Return what ``prepare`` passes for the buffers of a call with these arguments."""
+    return actuator_state(dyn) if "ctrl" in given and delays_controls(dyn) else None
+
+
+def explain(dyn: Dynamics) -> str:
+    """Return a line on the scene's actuators."""
+    actuators = dyn.scene.actuators
+    if not actuators:
+        return "none"
+    dofs = {hinge for actuator in actuators for hinge in actuator.hinges}
+    longest = f"up to {most_delay(dyn)} steps{', variable' if 'actuator_delay' in dyn.variable else ''}"
+    late = f"delays of {longest}, in a launch before each step" if delays_controls(dyn) else "no delays"
+    return f"{len(actuators)} on {len(dofs)} hinges, in the kernel of a step that is given ctrl; {late}"
