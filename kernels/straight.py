@@ -181,7 +181,7 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
         text += [f"{c}* sent = stage + {at} + lane;", "#define SENT(i) sent[(i) * 32]"]
     if layout.retries:
         cuda = f"for (int again = 0;; ++again) {{\n{cuda}\nif (again || !(farthest > on::reach())) break;\n}}"
-    text += [*([] if layout.cached else _define_fields(layout.fields, c)), cuda]
+    text += [*([] if layout.cached else define_fields(layout.fields, c)), cuda]
     if result.way in (IN_PLACE, STAGED):
         text += [sync, _copy_rows_out(out, start, width, c, team)]
         text += [_copy_rows_out(row, offset[row.name], pitch(row.entries), c, team) for row in layout.staged_further]
@@ -202,7 +202,7 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
         text += [f"{c} sent[{layout.messages}];", "#define SENT(i) sent[i]"]
     text += [
         *(_cached_entries(layout) if layout.cached else []),
-        *_define_fields(layout.fields, c, bool(layout.cached)),
+        *define_fields(layout.fields, c, bool(layout.cached)),
         cpu,
     ]
     if result.way in BY_TABLE:
@@ -215,7 +215,7 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
 def assemble_per_world(fields: list[str], statements: str) -> str:
     """Return the native code of a thread that works on one world with statements in float64, on CUDA and the CPU."""
     c = C_TYPE[wp.float64]
-    text = [NATIVE[c], "const long long world = thread;", *_define_fields(fields, c), statements, "#undef FIELD", ""]
+    text = [NATIVE[c], "const long long world = thread;", *define_fields(fields, c), statements, "#undef FIELD", ""]
     return "\n".join(text)
 
 
@@ -244,7 +244,7 @@ def _cached_entries(layout: KernelLayout) -> list[str]:
     ]
 
 
-def _define_fields(names: list[str], c: str, by_place: bool = False) -> list[str]:
+def define_fields(names: list[str], c: str, by_place: bool = False) -> list[str]:
     """Return the definition of FIELD for fields in global memory.
 
     FIELD takes an entry, or with ``by_place`` the place of an entry in the tables of :func:`_cached_entries`.

@@ -31,6 +31,7 @@ from . import (
     derivatives,
     energy,
     inertia,
+    inverse_kinematics,
     kinematics,
     momentum,
     operational,
@@ -133,6 +134,9 @@ class Dynamics:
     frame_poses = kinematics.frame_poses
     frame_velocities = kinematics.frame_velocities
     frame_accelerations = kinematics.frame_accelerations
+
+    # -- inverse kinematics ----------------------------------------------------------------------------------------
+    inverse_kinematics = inverse_kinematics.inverse_kinematics
 
     # -- operational space -----------------------------------------------------------------------------------------
     operational_inertia_inverse = operational.operational_inertia_inverse
@@ -296,6 +300,11 @@ class Dynamics:
     def _mask(self) -> wp.array:
         """Where hybrid_dynamics spreads a mask that all worlds share [world, dof]."""
         return wp.empty((self.worlds, self.scene.dof_count), dtype=wp.bool, device=self.device)
+
+    @functools.cached_property
+    def _starts(self) -> dict[int, wp.array]:
+        """Where inverse_kinematics starts [seed, coordinate], by the number of seeds."""
+        return {}
 
 
 OPERATIONS = Dynamics._operations = declared(vars(Dynamics))

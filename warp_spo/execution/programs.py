@@ -23,7 +23,7 @@ from ..recursions.pieces import Pieces
 from ..recursions.step import GAIN, GUESS, LOOPED, MISSED
 from ..recursions.tracing import Trace
 from ..trace.emission import PREFIX, Emitter, RangeReduction, Store, render
-from . import link_values, staging
+from . import link_values, searches, staging
 from .plan import MOST_WARPS, Plan
 from .routine import Routine
 from .staging import FIELDS
@@ -152,6 +152,8 @@ class Programs:
         links, shapes = self.links.with_tables(), {**shapes, "out": out_shape}
         if not links.links or not routine.suits(links, shapes, **options):
             return None
+        if routine.start is not None:
+            return searches.build(self, routine, links, "given" in shapes, options)
         shared = self.plan.of(routine) == "segment" and routine.divides(self.run.scene, shapes, **options)
         if routine.bias_first is not None and self.plan.apart and "qd" in shapes:
             routine = routine.bias_first

@@ -40,6 +40,8 @@ class Routine:
         occupancy: (blocks, registers): by limbs in float32 with many worlds, a multiprocessor holds so many blocks if
             a thread then still has so many registers.
         variants: at most so many different options get a kernel of their own where sweeps serve the others.
+        start: ``start(trace, **options)`` returns what a search starts from; None: the kernel is no search, see
+            :mod:`.searches`.
         title: ``title(inputs, **options)``, what a user calls this computation; None: the name.
     """
 
@@ -59,6 +61,7 @@ class Routine:
     bias_first: Routine | None = None
     occupancy: tuple[int, int] | None = None
     variants: int = VARIANTS
+    start: Callable[..., list[Store]] | None = None
     title: Callable[..., str] | None = None
 
     @functools.cached_property

@@ -59,7 +59,7 @@ def choose_layout(
         gathered: short results are written through shared memory even if rows are not read through it.
         relays: a result without room in shared memory may wait in its own rows, see :mod:`warp_spo.kernels.slots`.
     """
-    used = _read_entries(everything)
+    used = read_entries(everything)
     rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used and shape]
     numbers = tuple(name for name, shape in shapes.items() if name in used and not shape)
     out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
@@ -180,7 +180,7 @@ def flat_index(index: tuple[int, ...], shape: tuple[int, ...]) -> int:
     return at
 
 
-def _read_entries(stores: list[Store]) -> dict[str, set[int]]:
+def read_entries(stores: list[Store]) -> dict[str, set[int]]:
     """Return the first indices that are read of each array, by the array's name."""
     graphs: dict[int, list[Value]] = {}
     for item in stores:

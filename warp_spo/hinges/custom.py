@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..trace.differentiation import forward
-from ..trace.scalars import Graph, Value, cut, is_constant, less, reciprocal, select, sqrt
+from ..trace.scalars import Graph, Value, cut, is_constant
 from ..trace.spatial import ZERO, Matrix, Pose, Vector, dot
 from .functions import AbstractScalar
 from .kind import Carrier, Entry, Kind, Placed, Twist
-from .quaternions import Quaternion, multiplied
+from .quaternions import Quaternion, matrix_quaternion, multiplied
 
 MOST = 6
 SAMPLES = 64  # configurations at which a rotation is checked
@@ -101,7 +101,7 @@ class Custom(Kind):
 
     def relative_quaternion(self, link: Carrier, q: Entry) -> Quaternion:
         place = self.placed(link, q)
-        return multiplied(self.quaternion_at_rest(link), _quaternion(place.own.rotation))
+        return multiplied(self.quaternion_at_rest(link), matrix_quaternion(place.own.rotation))
 
     # -- velocity, force, acceleration -----------------------------------------------------------------------------
     def velocity(self, place: Placed, rates: list[Value]) -> Twist:
@@ -192,20 +192,3 @@ def _along(columns: list[Twist], rates: list[Value]) -> Twist:
     for (w_i, v_i), rate in zip(columns, rates, strict=True):
         w, v = w + w_i * rate, v + v_i * rate
     return w, v
-
-
-def _quaternion(m: Matrix) -> Quaternion:
-    """Of a traced rotation, by its largest entry: the row of 4 q q* that has it; S. W. Shepperd 1978."""
-    (a, ab, ac), (ba, b, bc), (ca, cb, c) = m
-    rows = [
-        [1.0 + a - b - c, ab + ba, ac + ca, cb - bc],
-        [ab + ba, 1.0 - a + b - c, bc + cb, ac - ca],
-        [ac + ca, bc + cb, 1.0 - a - b + c, ba - ab],
-        [cb - bc, ac - ca, ba - ab, 1.0 + a + b + c],
-    ]
-    best, square = rows[3], rows[3][3]
-    for k in range(3):
-        larger = less(square, rows[k][k])
-        best = [select(larger, x, y) for x, y in zip(rows[k], best, strict=True)]
-        square = select(larger, rows[k][k], square)
-    return Vector(best) * (0.5 * reciprocal(sqrt(square)))

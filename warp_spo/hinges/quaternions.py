@@ -60,6 +60,23 @@ def _quaternion_form(m: np.ndarray) -> np.ndarray:
     return K
 
 
+def matrix_quaternion(m: Matrix) -> Quaternion:
+    """The quaternion of a traced rotation, by its largest entry: the row of 4 q q* that has it; S. W. Shepperd 1978."""
+    (a, ab, ac), (ba, b, bc), (ca, cb, c) = m
+    rows = [
+        [1.0 + a - b - c, ab + ba, ac + ca, cb - bc],
+        [ab + ba, 1.0 - a + b - c, bc + cb, ac - ca],
+        [ac + ca, bc + cb, 1.0 - a - b + c, ba - ab],
+        [cb - bc, ac - ca, ba - ab, 1.0 + a + b + c],
+    ]
+    best, square = rows[3], rows[3][3]
+    for k in range(3):
+        larger = less(square, rows[k][k])
+        best = [select(larger, x, y) for x, y in zip(rows[k], best, strict=True)]
+        square = select(larger, rows[k][k], square)
+    return Vector(best) * (0.5 * reciprocal(sqrt(square)))
+
+
 def rotated_by(q: Quaternion, turn: Vector) -> Quaternion:
     """exp(turn) q, of unit length."""
     half = turn * 0.5

@@ -185,6 +185,11 @@ class Impedance:
             return None
         return self.value(name, dof)
 
+    def range(self, dof: int) -> tuple[Value | None, Value | None]:
+        """Return the lower and the upper limit of a dof, None where it has none."""
+        low, high = (self._bound(f"joint_limit_{side}", dof, UNLIMITED) for side in ("lower", "upper"))
+        return low, high
+
     def _rest(self, coordinate: int) -> Value:
         return self.value("joint_rest_q", coordinate)
 
