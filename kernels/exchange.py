@@ -45,6 +45,18 @@ def scale(T) -> wp.Kernel:
 
 
 @functools.cache
+def add(T) -> wp.Kernel:
+    """Add: ``flat[index[world, i]] += array[world, i]``; no two threads have the same entry of ``flat``."""
+
+    @wp.kernel(module=f"warp_spo_exchange_{T.__name__}", enable_backward=False)
+    def kernel(index: wp.array2d[int], array: wp.array2d[T], flat_out: wp.array[T]):
+        world, i = wp.tid()
+        flat_out[index[world, i]] += array[world, i]
+
+    return kernel
+
+
+@functools.cache
 def turn_wrenches(T) -> wp.Kernel:
     """Rotate wrenches on free hinges, in place, from world axes into the axes of the hinges' parent anchors.
 
@@ -74,4 +86,54 @@ def turn_wrenches(T) -> wp.Kernel:
     return kernel
 
 
-KERNELS = (gather, scatter, scale, turn_wrenches)
+@functools.cache
+def turn_gradients(T) -> wp.Kernel:
+    """Take gradients back through :func:`turn_wrenches`; one thread a world, which adds in the order of the hinges.
+
+    With w a force or a torque in world axes, R the axes of the parent anchor and g the gradient by R* w, the gradient
+    by w is R g. If R turns with the parent body by the small angle t about world axes, R* w grows by R* (w x t), so
+    that the gradient by t is (R g) x w. In the four numbers of the unit quaternion Q of the body it is 2 ((R g) x w) Q.
+
+    ``tau_grad`` [world, dof] is changed in place, from R* w to w. ``poses_grad`` [world, body, 7], where it is given,
+    is added to. The other arguments are those of :func:`turn_wrenches`.
+    """
+    quat = wp.types.quaternion(T)
+    vec3 = wp.types.vector(3, T)
+
+    @wp.func
+    def rotation(pose: wp.array3d[T], world: int, i: int):
+        return quat(pose[world, i, 3], pose[world, i, 4], pose[world, i, 5], pose[world, i, 6])
+
+    @wp.kernel(module=f"warp_spo_exchange_{T.__name__}", enable_backward=False)
+    def kernel(
+        hinge: wp.array2d[int],
+        anchor: wp.array3d[T],
+        poses: wp.array3d[T],
+        wrenches: wp.array2d[T],
+        tau_grad: wp.array2d[T],
+        poses_grad: wp.array3d[T],
+    ):
+        world = wp.tid()
+        for i in range(hinge.shape[0]):
+            dof, parent = hinge[i, 0], hinge[i, 2]
+            turn = wp.normalize(rotation(anchor, world, hinge[i, 1]))
+            if parent >= 0:
+                turn = rotation(poses, world, parent) * turn
+            about = vec3()
+            for half in range(2):
+                at = dof + 3 * half
+                w = vec3(wrenches[world, at], wrenches[world, at + 1], wrenches[world, at + 2])
+                g = wp.quat_rotate(turn, vec3(tau_grad[world, at], tau_grad[world, at + 1], tau_grad[world, at + 2]))
+                about += wp.cross(g, w)
+                for c in range(3):
+                    tau_grad[world, at + c] = g[c]
+            if parent >= 0 and poses_grad:
+                two = T(2.0)
+                four = quat(two * about[0], two * about[1], two * about[2], T(0.0)) * rotation(poses, world, parent)
+                for c in range(4):
+                    poses_grad[world, parent, 3 + c] += four[c]
+
+    return kernel
+
+
+KERNELS = (gather, scatter, scale, add, turn_wrenches, turn_gradients)

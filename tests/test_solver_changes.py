@@ -103,16 +103,11 @@ def test_a_capture_refuses_what_is_folded(monkeypatch):
     solver.notify_model_changed(ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES)
     with pytest.raises(ValueError, match=r"JOINT_PROPERTIES inside a graph capture.*variable=.'joint_X_p'"):
         solver.notify_model_changed(ModelFlags.JOINT_PROPERTIES)
-    full = types.SimpleNamespace(rigid_contact_max=4, soft_contact_max=0)
-    with pytest.raises(UnsupportedError, match="contacts inside a graph capture"):
-        solver.step(model.state(), model.state(), None, full, H)
     monkeypatch.undo()
     solver.check_model()
 
 
 def test_a_graph_of_steps_is_the_same(device):
-    if not device.is_cuda:
-        pytest.skip("graphs are captured on CUDA")
     builder = arm(joints=3, axis=(0, 1, 0))
     both = newton.ModelBuilder()
     both.replicate(builder, 2)
@@ -134,20 +129,6 @@ def test_a_graph_of_steps_is_the_same(device):
         wp.capture_launch(capture.graph)
         three(eager)
     np.testing.assert_array_equal(state.joint_q.numpy(), eager.joint_q.numpy())
-
-
-def test_contacts_are_refused(turned):
-    model, solver = turned
-    state = moving(model)
-    count = lambda n: wp.array([n], dtype=wp.int32, device="cpu")  # noqa: E731
-    contacts = types.SimpleNamespace(
-        rigid_contact_max=4, soft_contact_max=0, rigid_contact_count=count(3), soft_contact_count=count(0)
-    )
-    with pytest.raises(UnsupportedError, match=r"SolverSPO.step: 3 contacts"):
-        solver.step(state, state, None, contacts, H)
-    contacts.rigid_contact_count.zero_()
-    solver.step(state, state, None, contacts, H)
-    solver.step(state, state, None, model.contacts(), H)
 
 
 def test_models_that_are_refused():

@@ -69,6 +69,7 @@ def log_det_mass_matrix(run: Sweeps, out: wp.array, q: wp.array) -> None:
 def body_poses(run: Sweeps, out: wp.array, q: wp.array) -> None:
     run.hinges(q)
     run.launch_nodes(kinematics.body_poses, run.nodes, [run.world_poses(), run.parameters.anchor], [out])
+    run.quaternion_signs(q, out)
 
 
 def body_velocities(run: Sweeps, out: wp.array, q: wp.array, qd: wp.array) -> None:

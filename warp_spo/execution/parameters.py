@@ -58,7 +58,11 @@ class DerivedArrays(NamedTuple):
 
 
 class Parameters:
-    """The values of ``scene`` for ``worlds`` worlds, and arrays derived from them, computed at the first request."""
+    """The values of ``scene`` for ``worlds`` worlds, and arrays derived from them, computed at the first request.
+
+    Attributes:
+        hinge_of: the hinge of each node [node].
+    """
 
     def __init__(
         self, scene: Scene, topology: Topology, worlds: int, device: wp.Device, dtype: type, variable: tuple[str, ...]
@@ -66,7 +70,7 @@ class Parameters:
         self.scene, self.worlds, self.device, self.dtype = scene, worlds, device, dtype
         self.variable = variable
         self._topology = topology
-        self._hinge_of: Any = wp.array(scene.hinge_of, dtype=int, device=device)
+        self.hinge_of: Any = wp.array(scene.hinge_of, dtype=int, device=device)
         self._derived: dict[str, DerivedArrays] = {}
         self._captured = False
         self._version = 0
@@ -114,7 +118,7 @@ class Parameters:
                 wp.empty((scene.body_count, components, worlds), dtype=self.dtype, device=self.device)
                 for components in (POSE, POSE, 3, RIGID)
             ]
-            inputs, dim = [self._topology, self._hinge_of, *values], (scene.body_count, worlds)
+            inputs, dim = [self._topology, self.hinge_of, *values], (scene.body_count, worlds)
             kernel = kernels.derive(node_functions(self.dtype))
             fill = lambda: launches.launch(kernel, dim, inputs, own, device=self.device)  # noqa: E731
             return DerivedArrays([broadcast_worlds(array, 2, self.worlds) for array in own], RIGID_VALUES, fill)

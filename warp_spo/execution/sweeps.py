@@ -17,6 +17,7 @@ from .. import launches
 from ..kernels import articulated, composite, declare, kinematics, newton_euler, parameters, rigid_blocks, tiles
 from ..kernels.spatial import ARTICULATED, MOTION, POSE, RIGID
 from ..kernels.topology import Topology
+from ..memory import broadcast_worlds
 from ..scene.scene import Scene
 from ..turns import Turn
 from . import node_hinges
@@ -153,6 +154,15 @@ class Sweeps:
         world_pose = self._per_node("world_pose", POSE)
         self._sweep(kinematics.world_poses, self.plan.outward, [self.array("pose")], [world_pose])
         return world_pose
+
+    def quaternion_signs(self, q: wp.array, out: wp.array) -> None:
+        """Give the quaternions of body poses ``out`` [world, body, 7] the signs of eval_fk; after them."""
+        run, pose, sign = self.parameters, self.array("world_pose"), self.array("sign", *self.nodes)
+        outer, inner = (broadcast_worlds(run.value(name), 0, self.worlds) for name in ("joint_X_p", "joint_X_c"))
+        inputs = [self.topology, run.hinge_of, self._screw, outer, inner, q, pose]
+        self.launch_nodes(kinematics.quaternion_signs, self.nodes, inputs, [sign])
+        inputs = [self.topology, run.hinge_of, inner, pose, sign]
+        self.launch_nodes(kinematics.apply_quaternion_signs, self.nodes, inputs, [out])
 
     def frames(self, frames: tuple) -> tuple[wp.array, wp.array]:
         """Return bodies [frame], and origins [frame, 3] or poses [frame, 7] in the body frame, whichever are given.

@@ -44,10 +44,11 @@ def quaternion_rotation(x: Value, y: Value, z: Value, w: Value) -> Matrix:
 
 
 def constant_quaternion(R: Matrix) -> Quaternion:
-    """The quaternion of a constant rotation."""
+    """The quaternion of a constant rotation, whose last entry that is not zero is positive."""
     m = np.array(R, dtype=float)
     _, vectors = np.linalg.eigh(_quaternion_form(m))
-    return Vector(np.where(np.abs(vectors[:, -1]) < 1e-15, 0.0, vectors[:, -1]).tolist())
+    found = np.where(np.abs(vectors[:, -1]) < 1e-15, 0.0, vectors[:, -1])
+    return Vector((found * np.sign(found[np.flatnonzero(found)[-1]])).tolist())
 
 
 def _quaternion_form(m: np.ndarray) -> np.ndarray:

@@ -29,6 +29,7 @@ class Drives:
 
     Attributes:
         any: Whether a dof has a drive.
+        tracks_rates: Whether a drive has a target velocity.
         factors: 1 or 0 for each dof, by name of a gain or target, for those that count only in some modes.
 
     Raises:
@@ -46,7 +47,7 @@ class Drives:
         self._position = np.isin(modes[0], (JointTargetMode.POSITION, JointTargetMode.POSITION_VELOCITY))
         rate = np.isin(modes[0], (JointTargetMode.VELOCITY, JointTargetMode.POSITION_VELOCITY))
         self._driven = self._position | rate
-        self.any, self._tracks_rates = bool(self._driven.any()), bool(rate.any())
+        self.any, self.tracks_rates = bool(self._driven.any()), bool(rate.any())
         masks = {"joint_target_ke": self._position, "joint_target_kd": self._driven, "joint_target_qd": rate}
         self.factors: dict[str, Any] = {
             name: wp.array(mask, dtype=wp.float32, device=model.device) for name, mask in masks.items()
@@ -74,8 +75,12 @@ class Drives:
         """
         if not self.any:
             return {}
-        found = {"target_q": q.read(control.joint_target_q, "joint_target_q")}
-        if self._tracks_rates:
-            rates = qd.read(control.joint_target_qd, "joint_target_qd")
+        return self.read(control.joint_target_q, control.joint_target_qd if self.tracks_rates else None, q, qd)
+
+    def read(self, target_q: Any, target_qd: Any, q: Layout, qd: Layout) -> dict[str, wp.array]:
+        """Return Newton's targets as arguments of ``Dynamics.step``; None leaves the target velocities out."""
+        found = {"target_q": q.read(target_q, "joint_target_q")}
+        if target_qd is not None:
+            rates = qd.read(target_qd, "joint_target_qd")
             found["target_qd"] = qd.scale(rates, self.factors["joint_target_qd"], "target_qd")
         return found

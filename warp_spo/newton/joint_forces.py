@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -10,16 +9,7 @@ import warp as wp
 
 from ..dynamics.dynamics import Dynamics
 from ..kernels import exchange
-from .layout import Layout
-
-
-@dataclasses.dataclass(frozen=True)
-class Layouts:
-    """How Newton's arrays of a kind are laid out: entries of joint_qd, bodies' poses and joints' anchors."""
-
-    qd: Layout
-    poses: Layout
-    anchors: Layout
+from .layout import Layouts
 
 
 class JointForces:
@@ -31,6 +21,9 @@ class JointForces:
     Args:
         dynamics: The dynamics whose tau is wanted.
         layouts: How Newton's arrays are laid out.
+
+    Attributes:
+        turns_with_bodies: Whether a free joint has a parent body, so that tau depends on q.
     """
 
     def __init__(self, dynamics: Dynamics, layouts: Layouts):
@@ -44,7 +37,7 @@ class JointForces:
             for h, hinge in enumerate(scene.hinges)
             if hinge.unconstrained and (hinge.parent >= 0 or not level[h])
         ]
-        self._on_bodies = any(parent >= 0 for *_, parent in rows)
+        self.turns_with_bodies = any(parent >= 0 for *_, parent in rows)
         self._rows: Any = wp.array(np.array(rows), dtype=wp.int32, device=dynamics.device) if rows else None
 
     def read(self, joint_f: wp.array | None, q: wp.array, anchors: wp.array) -> wp.array | None:
@@ -57,14 +50,38 @@ class JointForces:
         """
         if joint_f is None:
             return None
-        layouts, tau = self._layouts, self._layouts.qd.read(joint_f, "joint_f")
+        tau = self._layouts.qd.read(joint_f, "joint_f")
         if self._rows is None:
             return tau
-        out, poses = layouts.qd.buffer("tau"), layouts.poses.buffer("before")
+        out = self._layouts.qd.buffer("tau")
         wp.copy(out, tau)
-        if self._on_bodies:
-            self._dynamics.body_poses(q, out=poses)
-        inputs = [self._rows, layouts.anchors.read(anchors, "anchors"), poses]
         dim = (self._dynamics.worlds, len(self._rows))
+        inputs = [self._rows, *self._axes(q, anchors)]
         wp.launch(exchange.turn_wrenches(wp.float32), dim, inputs, [out], device=self._dynamics.device)
         return out
+
+    def pull_back(
+        self, tau_grad: wp.array, joint_f: wp.array, q: wp.array, anchors: wp.array, poses_grad: wp.array | None
+    ) -> None:
+        """Turn a gradient by tau [world, dof] into the gradient by joint_f, in place.
+
+        Args:
+            tau_grad: The gradient, changed.
+            joint_f, q, anchors: As of :meth:`read`.
+            poses_grad: The gradient by the poses of the bodies [world, body, 7], on which tau depends where
+                ``turns_with_bodies``; it is added to. None leaves it out.
+        """
+        if self._rows is None:
+            return
+        wrenches = self._layouts.qd.read(joint_f, "joint_f")
+        inputs = [self._rows, *self._axes(q, anchors), wrenches]
+        dynamics = self._dynamics
+        kernel = exchange.turn_gradients(wp.float32)
+        wp.launch(kernel, dynamics.worlds, inputs, [tau_grad, poses_grad], device=dynamics.device)
+
+    def _axes(self, q: wp.array, anchors: wp.array) -> tuple[wp.array, wp.array]:
+        """Return the anchors, and the poses of the bodies, which are computed where a free joint's parent is a body."""
+        poses = self._layouts.poses.buffer("before")
+        if self.turns_with_bodies:
+            self._dynamics.body_poses(q, out=poses)
+        return self._layouts.anchors.read(anchors, "anchors"), poses

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -30,6 +31,9 @@ class Layout:
         self.plain = bool(np.array_equal(flat.ravel(), np.arange(flat.size)))
         self._index: Any = wp.array(flat, dtype=wp.int32, device=device)
         self._buffers: dict[str, wp.array] = {}
+        self._own: Any = None
+        others = np.setdiff1d(np.arange(self._count), flat.ravel())
+        self._others: Any = wp.array(others[None, :], dtype=wp.int32, device=device)
 
     def buffer(self, name: str) -> wp.array:
         """Return the solver's own array [world, ...] of that name, allocated at the first call."""
@@ -56,6 +60,27 @@ class Layout:
         if array.ptr != flat.ptr:
             self._launch(exchange.scatter, [self._index, mask, array.reshape(self._flat_shape)], _scalars(flat))
 
+    def add(self, array: wp.array, flat: Any) -> None:
+        """Add ``array`` [world, ...] to the entries of ``flat``."""
+        self._launch(exchange.add, [self._index, array.reshape(self._flat_shape)], _scalars(flat))
+
+    def add_rows(self, array: wp.array, total: wp.array) -> None:
+        """Add ``array`` to ``total``, both [world, ...] of the scene."""
+        if self._own is None:
+            count = int(np.prod(self._flat_shape))
+            entries = np.arange(count).reshape(self._flat_shape)
+            self._own = self._index if self.plain else wp.array(entries, dtype=wp.int32, device=self.device)
+        self._launch(exchange.add, [self._own, array.reshape(self._flat_shape)], total.flatten())
+
+    def add_others(self, source: Any, flat: Any) -> None:
+        """Add to ``flat`` those entries of ``source`` that no world of the scene has, such as those of loop joints."""
+        if not self._others.size:
+            return
+        index, dim = self._others, self._others.shape
+        found = wp.empty(dim, dtype=wp.float32, device=self.device)
+        wp.launch(exchange.gather(wp.float32), dim, [index, _scalars(source)], [found], device=self.device)
+        wp.launch(exchange.add(wp.float32), dim, [index, found], [_scalars(flat)], device=self.device)
+
     def scale(self, array: wp.array, factor: wp.array, name: str) -> wp.array:
         """Return ``array`` [world, n] times ``factor`` [n], in the buffer ``name``."""
         out = self.buffer(name)
@@ -76,6 +101,17 @@ class Layout:
     def _launch(self, factory: Any, inputs: list, out: wp.array) -> None:
         if self._index.size:
             wp.launch(factory(wp.float32), self._flat_shape, inputs, [out], device=self.device)
+
+
+@dataclasses.dataclass(frozen=True)
+class Layouts:
+    """How Newton's state is laid out: joint_q, joint_qd, body_q, body_qd (as body_f), and the joints' anchors."""
+
+    q: Layout
+    qd: Layout
+    poses: Layout
+    wrenches: Layout
+    anchors: Layout
 
 
 def _scalars(flat: Any) -> wp.array:

@@ -35,14 +35,20 @@ class ModelArrays:
         model: The Newton model.
         layouts: How the model's array is laid out, for each name that Dynamics may have as a variable value.
         factors: 1 or 0 for each dof [dof], for the gains that count only in some modes of a drive.
+
+    Attributes:
+        used: The copies by name.
+        stamp: A number that changes when copies are renewed.
     """
 
     def __init__(self, model: newton.Model, layouts: Mapping[str, Layout], factors: Mapping[str, wp.array]):
         self.model, self._layouts, self._factors = model, layouts, factors
         self.used = {name: wp.clone(getattr(model, name)) for name in WATCHED}
+        self.stamp = 0
 
     def copy(self, names: Iterable[str]) -> None:
         """Copy arrays of the model; launches only."""
+        self.stamp += 1
         for name in names:
             wp.copy(self.used[name], getattr(self.model, name))
 
@@ -54,6 +60,17 @@ class ModelArrays:
             if name in self._factors:
                 value = layout.scale(value, self._factors[name], "driven")
             dynamics.set(**{name: value})
+
+    def gradient(self, name: str) -> wp.array:
+        """Return an array [world, ...] for the gradient by a value, see :meth:`add`."""
+        return self._layouts[name].buffer(f"{name} gradient")
+
+    def add(self, name: str, gradient: wp.array, flat: wp.array) -> None:
+        """Add a gradient by a value of the scene [world, ...] to ``flat``, the gradient by the model's array."""
+        layout = self._layouts[name]
+        if name in self._factors:
+            gradient = layout.scale(gradient, self._factors[name], "driven gradient")
+        layout.add(gradient, flat)
 
     def differences(self, names: Iterable[str]) -> dict[str, str]:
         """Return by name a sentence about the first entry in which the model differs from its copy; reads back."""

@@ -15,6 +15,7 @@ from ..dynamics.dynamics import Dynamics
 from ..errors import UnsupportedError
 from ..scene.frames import Frame
 from .layout import Layout
+from .tape import refuse_tape
 from .worlds import to_numpy
 
 
@@ -34,6 +35,7 @@ class Plugs(CouplingInterface):
             response.refresh_from_solve(solver.solve_inverse(state), dof_map=solver.dof_map)
         """
         self._check_open("solve_inverse")
+        refuse_tape("SolverSPO.solve_inverse", state)
         q = self._q.read(state.joint_q, "q")
 
         def solve(x: wp.array, y: wp.array) -> None:
@@ -58,6 +60,7 @@ class Plugs(CouplingInterface):
             inputs: The controller's inputs. A ``mass_matrix`` or ``gravity_force`` that is None stays None.
         """
         self._check_open("operational_space")
+        refuse_tape("SolverSPO.operational_space", state)
         dyn, q = self.dynamics, self._q.read(state.joint_q, "q")
         worlds, dofs = dyn.worlds, dyn.scene.dof_count
         dyn.jacobian(q, [frame], out=inputs.jacobian_tool_world.reshape((worlds, 1, 6, dofs)))

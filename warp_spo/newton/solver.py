@@ -15,16 +15,19 @@ from newton.solvers import SolverBase
 
 from ..dynamics.dynamics import Dynamics
 from ..dynamics.steps import INTEGRATORS
-from ..errors import UnsupportedError, as_integer, as_names
+from ..errors import UnsupportedError, as_names
 from ..kernels import declare, exchange
 from ..scene.parts import DOF_VALUES
+from .checks import check_state, read_flags
+from .contacts import StatusWords
 from .drives import GAINS, Drives
-from .joint_forces import JointForces, Layouts
-from .layout import Layout
+from .joint_forces import JointForces
+from .layout import Layout, Layouts
 from .loop_joints import check_loop_joints
 from .model import from_newton
 from .model_arrays import ModelArrays, check_flags_in_capture, flag_of_name, names_of_flags
 from .plugs import Plugs
+from .tape import StepGradients, paused_tape, refuse_tape
 from .worlds import Worlds, to_numpy
 
 DEFAULT_VARIABLE = (
@@ -74,8 +77,14 @@ class SolverSPO(Plugs, SolverBase):
     ``solver.dynamics.project``; a step moves an open state to the nearest closed one. The observable ``status`` is
     ``Status.OPEN`` in worlds whose loops are still open after the step.
 
+    Inside ``wp.Tape`` a step records its own backward pass: gradients by joint_q, joint_qd and body_f of the first
+    state, by joint_f and the targets of the control, and by those arrays of the model that are ``variable`` and enter
+    the equations of motion (masses, centres of mass, inertias, armature, damping, stiffness, gains, gravity), from
+    gradients by joint_q, joint_qd, body_q and body_qd of the second state. Each step of a tape needs a state of its
+    own.
+
     Args:
-        model: A finalized model whose worlds all have the same topology. ``model.requires_grad`` is ignored.
+        model: A finalized model whose worlds all have the same topology.
         variable: Names of arrays of the model that :meth:`notify_model_changed` updates by launches alone. The values
             of all other arrays are compiled into the kernels.
         loops: "raise" raises an error if there are loop joints or mimics, because they need a choice. "embed" holds
@@ -118,7 +127,8 @@ class SolverSPO(Plugs, SolverBase):
             )
         self.integrator = integrator
         self._options: dict[str, Any] = {"loops": loops, "granularity": granularity}
-        self._build()
+        with paused_tape():
+            self._build()
 
     def _build(self) -> None:
         """Compile and allocate everything for the model as it is now."""
@@ -148,11 +158,12 @@ class SolverSPO(Plugs, SolverBase):
 
         self._q, self._qd = layout("joint_q", scene.q_index), layout("joint_qd", scene.dof_index)
         self._poses, self._wrenches = layout("body_q", bodies, 7), layout("body_qd", bodies, 6)
-        self._anchors = layout("joint_X_p", hinges, 7)
+        anchors = layout("joint_X_p", hinges, 7)
+        state = Layouts(self._q, self._qd, self._poses, self._wrenches, anchors)
         layouts = {name: self._qd for name in DOF_VALUES} | {
             "joint_rest_q": self._q,
-            "joint_X_p": self._anchors,
-            "joint_X_c": self._anchors,
+            "joint_X_p": anchors,
+            "joint_X_c": anchors,
             "body_mass": layout("body_mass", bodies),
             "body_com": layout("body_com", bodies, 3),
             "body_inertia": layout("body_inertia", bodies, 3, 3),
@@ -161,7 +172,9 @@ class SolverSPO(Plugs, SolverBase):
         self._arrays = ModelArrays(model, layouts, self._drives.factors)
         # Steps with observables write status here if the caller does not ask for it: one kernel serves both.
         self._status = wp.zeros(W, dtype=wp.int32, device=device)
-        self._joint_forces = JointForces(self.dynamics, Layouts(self._qd, self._poses, self._anchors))
+        self._words = StatusWords(model, W)
+        self._joint_forces = JointForces(self.dynamics, state)
+        self._gradients = StepGradients(model, self.dynamics, state, self._joint_forces, self._drives, self._arrays)
         self._prepare()
 
     def _prepare(self) -> None:
@@ -185,6 +198,16 @@ class SolverSPO(Plugs, SolverBase):
         unknown = self.dynamics.closed or not self.dynamics.scene.dof_count
         return self.SUPPORTED_OBSERVABLES - ({SolverBase.ObservableKind.BODY_PARENT_F} if unknown else set())
 
+    @property
+    def status(self) -> wp.array:
+        """The most severe :class:`warp_spo.Status` of each world since its last :meth:`reset`, int32 [world].
+
+        Steps with observables contribute the word that they compute. A step inside a graph capture contributes
+        UNSUPPORTED in worlds that have contacts, which the step leaves out. Other steps contribute nothing: ask for the
+        observable ``status`` to know about them.
+        """
+        return self._words.kept
+
     # -- steps -----------------------------------------------------------------------------------------------------
     def step(
         self,
@@ -200,36 +223,62 @@ class SolverSPO(Plugs, SolverBase):
 
         ``control.joint_f`` of FREE and DISTANCE joints is a wrench in world axes at the child's CoM. The forces
         ``state_in.body_f`` act on all bodies. ``contacts`` must be None or empty. Outside of a graph capture their
-        count is read back; in a capture only contacts without capacity are accepted.
+        count is read back. In a capture the device looks at it at every replay: contacts are left out, and
+        :attr:`status` is ``Status.UNSUPPORTED`` in worlds that have some, as is the observable.
 
         Raises:
-            UnsupportedError: There are contacts, or, inside a capture, there could be some at replay.
-            ValueError: The observables belong to another solver, or the integrator has none.
+            UnsupportedError: There are contacts; or wp.Tape records a step that has no gradient.
+            ValueError: The observables belong to another solver, or the integrator has none; or wp.Tape records a step
+                that writes a state which the tape still needs.
         """
         self.validate_observables(observables)
         for name, state in (("state_in", state_in), ("state_out", state_out)):
-            _check_state("SolverSPO.step", name, state)
+            check_state("SolverSPO.step", name, state)
         if control is not None and not hasattr(control, "joint_f"):
             raise TypeError(f"SolverSPO.step: control is of type {type(control).__name__}; expected a newton.Control")
-        self._refuse_contacts(contacts)
+        left_out = self._words.find(contacts)
         if observables is not None and observables.kinds and self.integrator != "semi_implicit":
             raise ValueError(
                 f"SolverSPO.step: observables with integrator={self.integrator!r}; expected 'semi_implicit'"
             )
         if control is None:
             control = self.model.control(clone_variables=False)
+        with paused_tape() as tape:
+            given = state_in, state_out, control, dt, observables
+            record = None if tape is None else self._gradients.record(tape, self.integrator, *given)
+            self._step(*given, None if record is None else record.qdd, left_out)
+            if record is not None:
+                record.append_to_tape()
+
+    def _step(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control,
+        dt: float,
+        observables: Any,
+        qdd: wp.array | None,
+        contacts: newton.Contacts | None,
+    ) -> None:
+        """Launch a step; ``qdd`` is filled, and worlds with ``contacts`` get a status word."""
         q, qd = self._q.read(state_in.joint_q, "joint_q"), self._qd.read(state_in.joint_qd, "joint_qd")
         body_f = None if state_in.body_f is None else self._wrenches.read(state_in.body_f, "body_f")
         tau = self._joint_forces.read(control.joint_f, q, self._arrays.used["joint_X_p"])
         given: dict[str, Any] = dict(tau=tau, body_f=body_f, **self._drives.targets(control, self._q, self._qd))
         if observables is None or not observables.kinds:
             q_out, qd_out = self._q.target(state_out.joint_q, "q_out"), self._qd.target(state_out.joint_qd, "qd_out")
-            self.dynamics.step(q, qd, dt=dt, integrator=self.integrator, out=(q_out, qd_out), **given)
+            more = {} if qdd is None else {"qdd": qdd, "status": self._status}  # the kernel of steps with observables
+            self.dynamics.step(q, qd, dt=dt, integrator=self.integrator, out=(q_out, qd_out), **more, **given)
+            if contacts is not None:
+                self._words.mark(contacts, self._words.kept)
         else:  # observables are computed from the state before the step, which state_out must not overwrite yet
-            q_out, qd_out, qdd = self._q.buffer("q_out"), self._qd.buffer("qd_out"), self._qd.buffer("qdd")
-            asked: Any = observables
-            status = self._status if asked.status is None else asked.status
+            q_out, qd_out = self._q.buffer("q_out"), self._qd.buffer("qd_out")
+            qdd = self._qd.buffer("qdd") if qdd is None else qdd
+            status = self._status if observables.status is None else observables.status
             self.dynamics.step(q, qd, dt=dt, out=(q_out, qd_out), qdd=qdd, status=status, **given)
+            if contacts is not None:
+                self._words.mark(contacts, status)
+            self._words.keep(status)
             self._observe(observables, q, qd, qdd, body_f)
         if state_out is not state_in and not self._q.plain:  # entries of loop joints keep their values
             for name in ("joint_q", "joint_qd"):
@@ -257,25 +306,6 @@ class SolverSPO(Plugs, SolverBase):
             self.dynamics.body_reactions(q, qd, qdd, body_f, out=out)
             self._wrenches.write(out, observables.body_parent_f)
 
-    def _refuse_contacts(self, contacts: Any) -> None:
-        if contacts is not None and not hasattr(contacts, "rigid_contact_max"):
-            raise TypeError(
-                f"SolverSPO.step: contacts is of type {type(contacts).__name__}; expected newton.Contacts or None"
-            )
-        if contacts is None or not (contacts.rigid_contact_max or contacts.soft_contact_max):
-            return
-        if self.device.is_capturing:
-            raise UnsupportedError(
-                "SolverSPO.step",
-                "contacts inside a graph capture, where their count cannot be read,",
-                "pass contacts=None",
-            )
-        count = int(contacts.rigid_contact_count.numpy()[0]) + int(contacts.soft_contact_count.numpy()[0])
-        if count:
-            raise UnsupportedError(
-                "SolverSPO.step", f"{count} contacts", "pass contacts=None; bodies then pass through each other"
-            )
-
     # -- resets ----------------------------------------------------------------------------------------------------
     def reset(self, state: newton.State, world_mask: Any = None, flags: Any = None) -> None:
         """Reset worlds to the model's ``joint_q`` and ``joint_qd``, and their bodies to the poses that follow.
@@ -289,13 +319,16 @@ class SolverSPO(Plugs, SolverBase):
             world_mask: The worlds to reset, bool [world_count + 1], with a last entry for bodies outside worlds. None
                 resets all worlds.
             flags: The arrays to reset: JOINT_Q, JOINT_QD, BODY_Q or BODY_QD (each resets both), BODY_F. None resets
-                all; 0 resets nothing, because the solver itself keeps no state between steps.
+                all, and :attr:`status`; 0 resets nothing, because the solver keeps nothing else between steps.
         """
-        _check_state("SolverSPO.reset", "state", state)
-        flags = _flags("SolverSPO.reset", StateFlags, StateFlags.ALL if flags is None else flags)
+        check_state("SolverSPO.reset", "state", state)
+        refuse_tape("SolverSPO.reset", state)
+        flags = read_flags("SolverSPO.reset", StateFlags, StateFlags.ALL if flags is None else flags)
         mask = self._normalize_reset_world_mask(world_mask)
         if mask is not None:
             mask = mask[self._mask_from :]
+        if flags:
+            self._words.clear(mask)
         if flags & StateFlags.JOINT_Q:
             wp.copy(self._q.buffer("first"), self._q.read(self.model.joint_q, "first"))
             self._q.write(self._q.buffer("first"), state.joint_q, mask)
@@ -334,7 +367,7 @@ class SolverSPO(Plugs, SolverBase):
         Raises:
             ValueError: Inside a capture, a flag names no variable array.
         """
-        names = names_of_flags(_flags("SolverSPO.notify_model_changed", ModelFlags, flags))
+        names = names_of_flags(read_flags("SolverSPO.notify_model_changed", ModelFlags, flags))
         variable = [name for name in names if name in self.dynamics.variable]
         if self.device.is_capturing:
             check_flags_in_capture(int(flags), variable)
@@ -372,17 +405,3 @@ class SolverSPO(Plugs, SolverBase):
                 f"SolverSPO.check_model: model.{name} {difference}; "
                 f"call notify_model_changed(ModelFlags.{flag_of_name(name).name})"
             )
-
-
-def _check_state(call: str, name: str, state: Any) -> None:
-    """Raise TypeError unless ``state`` is a state."""
-    if not hasattr(state, "joint_q"):
-        raise TypeError(f"{call}: {name} is of type {type(state).__name__}; expected a newton.State")
-
-
-def _flags(call: str, kind: type, flags: Any) -> int:
-    """Return ``flags`` as an int, or raise TypeError."""
-    bits = as_integer(flags)
-    if bits is None:
-        raise TypeError(f"{call}: flags is {flags!r}; expected newton.{kind.__name__}, or an integer of their bits")
-    return bits

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from ..hinges.quaternions import Quaternion, constant_quaternion, multiplied, turned
 from ..trace.emission import Store
 from ..trace.scalars import Value
-from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross
-from .links import Link, Placed, place_link
+from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, dot
+from .links import Link, Links, Placed, place_link
 from .motion import hinge_motion
 from .newton_euler import link_acceleration
 
@@ -92,30 +92,54 @@ def link_poses(trace: Trace) -> tuple[dict[int | None, Vector], dict[int | None,
     return at, turns
 
 
+def quaternions_in_links(links: Links) -> dict[int, Quaternion]:
+    """Return the quaternion of each body's axes in its link.
+
+    Its sign makes the quaternion of the body the product of those of the anchors and hinges from the root on, as
+    Newton's eval_fk computes it. Signs of constants decide this, so that it costs no operation.
+    """
+    scene = links.scene
+    by_anchors = {-1: Vector((0.0, 0.0, 0.0, 1.0))}
+    by_links: dict[int | None, Quaternion] = {None: by_anchors[-1]}
+    for link in links.links:
+        over = None if link.parent is None else id(link.parent)
+        by_links[id(link)] = multiplied(by_links[over], link.hinge.quaternion_at_rest(link))
+    found = {}
+    for body, seat in links.seats.items():  # parents first; all at neutral coordinates
+        hinge = scene.hinge_of[body]
+        outer, inner = (Vector(scene.values[name][0, hinge, 3:].tolist()) for name in ("joint_X_p", "joint_X_c"))
+        back = Vector((-inner[0], -inner[1], -inner[2], inner[3]))
+        by_anchors[body] = multiplied(by_anchors[scene.tree.parent[body]], multiplied(outer, back))
+        own = constant_quaternion(seat.matrix @ links.nodes[body].anchor[0].T)
+        carried = multiplied(by_links[None if seat.link is None else id(seat.link)], own)
+        found[body] = own * (-1.0 if dot(carried, by_anchors[body]) < 0.0 else 1.0)
+    return found
+
+
 def body_poses(trace: Trace) -> list[Store]:
     """out [body, 7] = position, quaternion xyzw"""
-    at, turns = link_poses(trace)
+    (at, turns), within = link_poses(trace), quaternions_in_links(trace.links)
     stores = []
     for body, seat in trace.links.seats.items():
         R, p = trace.links.nodes[body].anchor
         key = None if seat.link is None else id(seat.link)
         axes = seat.matrix @ R.T
         position = at[key] + turned(turns[key], seat.offset - axes @ p)
-        pose = (*position, *multiplied(turns[key], constant_quaternion(axes)))
+        pose = (*position, *multiplied(turns[key], within[body]))
         stores += [Store("out", (body, c), value) for c, value in enumerate(pose)]
     return stores
 
 
 def frame_poses(trace: Trace, frames: tuple) -> list[Store]:
     """out [frame, 7] = position, quaternion xyzw: that of the body, then that of the frame in it"""
-    (at, turns), stores = link_poses(trace), []
+    (at, turns), of_bodies, stores = link_poses(trace), quaternions_in_links(trace.links), []
     for index, (body, pose) in enumerate(frames):
         trace.graph.step = f"frame {index}|f"
         seat, (R, p) = trace.links.seats[body], trace.links.nodes[body].anchor
         key = None if seat.link is None else id(seat.link)
         axes = seat.matrix @ R.T
         position = at[key] + turned(turns[key], seat.offset + axes @ (Vector(pose[:3]) - p))
-        within = multiplied(constant_quaternion(axes), Vector(pose[3:]))
+        within = multiplied(of_bodies[body], Vector(pose[3:]))
         values = (*position, *multiplied(turns[key], within))
         stores += [Store("out", (index, c), value) for c, value in enumerate(values)]
     return stores
