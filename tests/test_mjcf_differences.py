@@ -53,6 +53,20 @@ SLIDE = '<joint type="slide"/>'
         ),
         ({"compiler": ' settotalmass="2"'}, "<compiler settotalmass> (body 'root', 'tip')"),
         ({"compiler": ' settotalmass="-1"'}, None),
+        ({"geom": ' type="box" fromto="0 0 0 0 0 1"'}, "a box or ellipsoid with fromto (body 'tip')"),
+        (
+            {"c_geom": ' type="ellipsoid"', "geom": ' fromto="0 0 0 0 0 1"'},
+            "a box or ellipsoid with fromto (body 'tip')",
+        ),
+        ({"geom": ' type="capsule" fromto="0 0 0 0 0 1"'}, None),
+        ({"geom": ' type="box" fromto="0 0 0 0 0 1"', "more": INERTIA}, None),
+        ({"tip": ' type="ball" range="0 1"'}, "a ball's range (body 'tip')"),
+        ({"tip": ' type="ball" range="0 1" limited="false"'}, None),
+        ({"c": ' springdamper="1 1"'}, "a joint's springdamper (body 'tip')"),
+        ({"more": '<body name="hand" gravcomp="1"/>'}, "gravcomp (body 'hand')"),
+        ({"main": ' armature="1"', "root": ' type="free"'}, "armature or damping of a free joint (body 'root')"),
+        ({"more": '<flexcomp name="f" type="grid"/>'}, "a <composite>, <flexcomp> or <flex> (body 'tip')"),
+        ({"more": '<frame><attach model="m" body="b" prefix="p"/></frame>'}, "an <attach> (body 'tip')"),
     ],
 )
 def test_mjcf_that_newton_misreads(text, found, tmp_path):
@@ -106,6 +120,45 @@ def test_mjcf_that_newton_loses(text, floating, found, tmp_path):
             load(file, floating=floating)
 
 
+SERVO = """<mujoco><default><position{default}/></default><worldbody><body><joint name="j"/><geom size=".1"/></body>
+  </worldbody><actuator><position name="servo" joint="j" kp="30"{own}/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("default", "own", "refused"),
+    [
+        ("", ' gear="5"', True),
+        (' forcerange="-2 2"', "", True),
+        ("", ' dampratio="1"', True),
+        ("", ' kv="2" gear="1"', False),
+        ("", ' forcerange="-2 2" forcelimited="false"', False),
+    ],
+)
+def test_servos_of_which_newton_reads_the_gains_alone(default, own, refused, tmp_path):
+    file = tmp_path / "robot.xml"
+    file.write_text(SERVO.format(default=default, own=own))
+    if refused:
+        with pytest.raises(UnsupportedError, match=r"actuator with gear, .* \(actuator 'servo'\).*package mujoco"):
+            load(file)
+    else:
+        np.testing.assert_array_equal(load(file).values["joint_target_ke"], [[30.0]])
+
+
+def test_parts_that_newton_leaves_out_are_counted(tmp_path):
+    file = tmp_path / "robot.xml"
+    more = '</worldbody><actuator><motor joint="j"/></actuator><keyframe><key/><key/></keyframe><worldbody>'
+    file.write_text(LOST.format(**PLAIN | {"root": '<site name="s"/>'}).replace("</worldbody>", more + "</worldbody>"))
+    with pytest.warns(UserWarning, match="1 actuator, 2 keyframes, 1 site left out; install the package mujoco"):
+        load(file)
+
+
+def test_numbers_that_are_none(tmp_path):
+    file = tmp_path / "robot.xml"
+    file.write_text(LOST.format(**PLAIN | {"pos": ' armature="much" pos="a b c"'}))
+    with pytest.raises(ValueError, match=r"^load: '.*robot.xml': .*'a'"):
+        load(file)
+
+
 ELEMENTS = '<joint armature="2"/><geom density="10"/>'
 INNER = '<default class="c"><joint armature="7"/></default>'
 
@@ -117,6 +170,7 @@ INNER = '<default class="c"><joint armature="7"/></default>'
         f'<default class="main">{ELEMENTS}{INNER}</default>',
         f'<default class="main"><joint armature="2"/></default><default><geom density="10"/>{INNER}</default>',
         f'<default><joint armature="1" damping="3"/></default><default class="main">{ELEMENTS}{INNER}</default>',
+        f'<default><geom density="10"/></default><default><geom size=".2"/><joint armature="2"/>{INNER}</default>',
     ],
 )
 def test_mjcf_default_class_main(default, tmp_path):

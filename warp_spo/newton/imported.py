@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import newton
 import numpy as np
 
@@ -22,3 +24,10 @@ def scene_of(builder: newton.ModelBuilder, repair: bool) -> Scene:
         builder.body_inertia[:] = inertias  # type: ignore[assignment]  # matrices, as Newton's own
     # from_newton checks the topology itself, and it accepts joints outside articulations, which USD files have.
     return from_newton(builder.finalize(device="cpu", skip_validation_joints=True, skip_validation_inertia=True))
+
+
+def unreadable(file: Path, error: Exception) -> ValueError:
+    """Return the error for a file on which an importer failed; importers raise errors of any type for a damaged one."""
+    return ValueError(
+        f"load: {str(file)!r}: Newton's importer cannot read it ({type(error).__name__}: {error}); correct the file"
+    )

@@ -8,6 +8,7 @@ does not read, and for features that it misreads. It is written anew where the i
 from __future__ import annotations
 
 import copy
+import warnings
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -15,8 +16,8 @@ import newton
 
 from ..errors import UnsupportedError
 from ..scene.scene import Scene
-from .imported import scene_of
-from .mjcf_differences import MISREAD, find_misread
+from .imported import scene_of, unreadable
+from .mjcf_differences import MISREAD, find_misread, left_out
 from .worlds import quote_labels
 
 
@@ -72,13 +73,14 @@ def mjcf_source(file: Path, root: ET.Element) -> str:
     """Return the source for an MJCF importer: the path of the file, or text in which "main" is a class like others.
 
     Newton 1.8 applies the outermost <default> to all elements only if it has no class, and then it has no class "main"
-    by which an element could opt out of its childclass. The text has one outermost <default> without a class, which
-    holds the elements of all those in the file, and an empty class "main" inside it. An importer that reads text has no
-    folder in which to look for meshes.
+    by which an element could opt out of its childclass. Of several outermost <default> it forgets elements that a later
+    one has, too. The text has one outermost <default> without a class, which holds the elements of all those in the
+    file, and an empty class "main" inside it. An importer that reads text has no folder in which to look for meshes.
     """
     named = any(default.get("class") == "main" for default in root.findall("default"))
     asked = any("main" in (element.get("class"), element.get("childclass")) for element in root.iter())
-    if not named and not (asked and root.findall("default")):
+    outermost_defaults = root.findall("default")
+    if not named and not (asked and outermost_defaults) and len(outermost_defaults) < 2:
         return str(file)
     root = copy.deepcopy(root)
     outermost = ET.Element("default")
@@ -98,12 +100,13 @@ def mjcf_source(file: Path, root: ET.Element) -> str:
 def read_mjcf(file: Path, floating: bool | None, repair: bool) -> Scene:
     """Return the scene of an MJCF file; UnsupportedError if it uses a feature that Newton misreads."""
     root = mjcf_tree(file)
-    misread = find_misread(root, floating)
+    try:
+        misread = find_misread(root, floating)
+        gravity = mjcf_gravity(root)  # Newton 1.8 does not read it
+    except ValueError as error:
+        raise ValueError(f"load: {str(file)!r}: {error}; expected numbers; correct them") from error
     if misread:
-        features = [
-            f"{feature} ({'class' if '<default>' in feature else 'body'} {quote_labels(where)})"
-            for feature, where in misread.items()
-        ]
+        features = [f"{feature} ({_holder(feature)} {quote_labels(where)})" for feature, where in misread.items()]
         ways_out = dict.fromkeys(MISREAD[feature] for feature in misread)
         raise UnsupportedError("load", f"{str(file)!r} with {', '.join(features)}", "; ".join(ways_out))
 
@@ -111,8 +114,9 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool) -> Scene:
     if needs_meshes and source != str(file):
         raise UnsupportedError(
             "load",
-            f"{str(file)!r} with a default class 'main' beside masses from meshes",
-            "remove class='main', which the outermost <default> has anyway, or write the <inertial> of each body",
+            f"{str(file)!r} with a default class 'main' beside masses from meshes, or two outermost <default>,",
+            "remove class='main', which the outermost <default> has anyway, put all into one <default>, or write the "
+            "<inertial> of each body",
         )
 
     def import_with(parse_mujoco_options: bool) -> newton.ModelBuilder:
@@ -133,8 +137,24 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool) -> Scene:
         try:
             builder = import_with(parse_mujoco_options=False)
         except ValueError:
-            raise error from None
-    gravity = mjcf_gravity(root)  # Newton 1.8 does not read it
+            raise unreadable(file, error) from error
+    except (ImportError, ET.ParseError):
+        raise
+    except Exception as error:
+        raise unreadable(file, error) from error
     if gravity is not None:
         builder.gravity = gravity
+    lost = left_out(root)
+    if lost:
+        warnings.warn(
+            f"load: {str(file)!r}: {', '.join(lost)} left out; install the package mujoco, with which load reads "
+            "actuators, keyframes and sites; scenes of robot files have no contacts",
+            UserWarning,
+            stacklevel=3,
+        )
     return scene_of(builder, repair)
+
+
+def _holder(feature: str) -> str:
+    """Return what the names stand for that :func:`find_misread` gives for a feature."""
+    return "class" if "<default>" in feature else "actuator" if "actuator" in feature else "body"
