@@ -31,6 +31,12 @@ def pytest_addoption(parser):
     )
 
 
+@pytest.fixture
+def newtons_importer(monkeypatch):
+    """MJCF files are read by Newton's importer, as without the package mujoco."""
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+
+
 def pytest_configure(config):
     asked = config.getoption("--granularity")
     plan.DEFAULT = None if asked == "plan" else asked

@@ -7,6 +7,7 @@ import zoo
 
 import warp_spo as spo
 from warp_spo.newton import shipped
+from warp_spo.newton.mjcf import read_mjcf
 
 
 def tall_humanoid():
@@ -59,7 +60,9 @@ def arm():
 
 
 ROBOTS = {
-    "humanoid": functools.partial(spo.load, shipped("humanoid")),
+    "humanoid": functools.partial(
+        read_mjcf, shipped("humanoid"), None, True
+    ),  # by Newton: a D6 for all joints of a body
     "ant": functools.partial(spo.load, shipped("ant")),
     "quadruped": functools.partial(spo.load, shipped("quadruped"), floating=True),
     "cartpole": functools.partial(spo.load, shipped("cartpole")),

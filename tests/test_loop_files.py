@@ -17,8 +17,9 @@ import warp_spo as spo
 FOURBAR = """<mujoco><option gravity="0 0 -9.81"/><default><geom type="capsule" size=".02" density="1000"/></default>
 <worldbody>
  <body name="crank"><joint name="a" axis="0 1 0"/><geom fromto="0 0 0 .4 0 0"/>
-  <body name="coupler" pos=".4 0 0"><joint name="b" axis="0 1 0"/><geom fromto="0 0 0 .9 0 0"/>
-   <body name="rocker" pos=".9 0 0"><joint name="c" axis="0 1 0"/><geom fromto="0 0 0 .7 0 0"/></body></body></body>
+  <body name="coupler" pos=".4 0 0" euler="0 40 0"><joint name="b" axis="0 1 0"/><geom fromto="0 0 0 .9 0 0"/>
+   <body name="rocker" pos=".9 0 0" euler="0 50 0">
+   <joint name="c" axis="0 1 0"/><geom fromto="0 0 0 .7 0 0"/></body></body></body>
  <body name="follower" pos="0 1 0"><joint name="d" axis="0 1 0"/><geom fromto="0 0 0 .3 0 0"/></body>
 </worldbody><equality>
  <connect name="pin" body1="rocker" anchor=".7 0 0"{second}/><joint joint1="d" joint2="a" polycoef="0.1 -0.5 0 0 0"/>

@@ -1,4 +1,7 @@
-"""MJCF that Newton's importer reads differently from MuJoCo: each case raises an error that names the element."""
+"""MJCF that Newton's importer, which reads it without the package mujoco, reads differently from MuJoCo.
+
+Each case raises an error that names the element.
+"""
 
 import re
 
@@ -8,6 +11,9 @@ from newton_models import FLOAT32, MJCF
 
 from warp_spo.errors import UnsupportedError
 from warp_spo.newton import load
+
+mujoco = pytest.importorskip("mujoco")
+pytestmark = pytest.mark.usefixtures("newtons_importer")
 
 MISREAD = """<mujoco><compiler{compiler}/>
   <default><joint{main}/><default class="c"><joint{c}/><geom{c_geom}/></default></default>
@@ -175,7 +181,6 @@ INNER = '<default class="c"><joint armature="7"/></default>'
 )
 def test_mjcf_default_class_main(default, tmp_path):
     """Outermost defaults are everybody's, and an element steps out of its childclass by "main", as in MuJoCo."""
-    mujoco = pytest.importorskip("mujoco")
     file = tmp_path / "robot.xml"
     text = {"default": default, "tip": ' class="main"', "more": '<joint axis="1 0 0"/>'}
     file.write_text(LOST.format(**PLAIN | text))

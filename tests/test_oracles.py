@@ -277,6 +277,7 @@ def file_agrees(scene, model, device):
     agrees(dyn, [model] * WORLDS, PARSED, seed=13)
 
 
+@pytest.mark.usefixtures("newtons_importer")
 @pytest.mark.parametrize("name", ["humanoid", "ant", "probe.xml"])
 def test_mjcf_is_read_as_mujoco_reads_it(name, tmp_path, device):
     """Masses from shapes and densities, inertias, frames, axes, armature and gravity; Newton's two engines aside."""
@@ -358,6 +359,7 @@ def changed_probe(folder, old, new):
     return path
 
 
+@pytest.mark.usefixtures("newtons_importer")
 @pytest.mark.parametrize("name", MISREAD)
 def test_what_newton_misreads_is_refused(name, tmp_path):
     change, feature, way_out = MISREAD[name]
@@ -368,6 +370,7 @@ def test_what_newton_misreads_is_refused(name, tmp_path):
     assert way_out in str(caught.value)
 
 
+@pytest.mark.usefixtures("newtons_importer")
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
 @pytest.mark.parametrize("name", MISREAD)
 def test_newton_misreads(name, tmp_path, monkeypatch, device):
@@ -379,6 +382,7 @@ def test_newton_misreads(name, tmp_path, monkeypatch, device):
         file_agrees(scene, ParsedMjcf(scene, path), device)
 
 
+@pytest.mark.usefixtures("newtons_importer")
 def test_a_hinge_on_a_body_of_its_own_before_a_slide(tmp_path, device):
     """The way out. MuJoCo wants a mass of every body that moves."""
     weight = '<inertial pos="0 0 0" mass="1e-6" diaginertia="1e-6 1e-6 1e-6"/>'
@@ -389,6 +393,7 @@ def test_a_hinge_on_a_body_of_its_own_before_a_slide(tmp_path, device):
     file_agrees(scene, ParsedMjcf(scene, path), device)
 
 
+@pytest.mark.usefixtures("newtons_importer")
 def test_oblique_hinges_of_a_file_are_refused(tmp_path):
     """MuJoCo turns about oblique axes; Newton's D6 does not."""
     path = tmp_path / "probe.xml"

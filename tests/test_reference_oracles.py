@@ -82,6 +82,7 @@ def test_quaternions_are_normalised_when_read():
     same_poses(Dense(scene, q).body_poses, d.body_poses, ORACLE)
 
 
+@pytest.mark.usefixtures("newtons_importer")
 @pytest.mark.parametrize("oracle", [oracles.PinocchioModel, oracles.MujocoModel])
 @pytest.mark.parametrize("name", ["ant", "humanoid", "quadruped", "cartpole"])
 def test_oracle_robot(name, oracle):

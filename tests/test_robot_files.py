@@ -14,6 +14,7 @@ from warp_spo.newton import SHIPPED, from_newton, load, shipped
 BUILDERS = {".xml": "add_mjcf", ".urdf": "add_urdf"}
 
 
+@pytest.mark.usefixtures("newtons_importer")
 @pytest.mark.parametrize("floating", [None, True, False])
 @pytest.mark.parametrize("name", SHIPPED)
 @pytest.mark.filterwarnings("ignore:load. .*links 'slider' move and have no mass")
@@ -89,6 +90,7 @@ def test_repaired_inertia_is_warned_about_by_name(tmp_path):
     assert moments[2] <= (moments[0] + moments[1]) * (1 + FLOAT32)
 
 
+@pytest.mark.usefixtures("newtons_importer")
 def test_mjcf_options_that_newton_cannot_read(tmp_path):
     file = tmp_path / "robot.xml"
     file.write_text(MJCF.format(asset="", tip='<geom size=".1"/>'))
@@ -98,6 +100,7 @@ def test_mjcf_options_that_newton_cannot_read(tmp_path):
     np.testing.assert_allclose(scene.values["body_mass"], np.full((1, 2), 1000 * 4 / 3 * np.pi * 1e-3), rtol=FLOAT32)
 
 
+@pytest.mark.usefixtures("newtons_importer")
 def test_mjcf_reads_meshes_only_for_masses(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     file, asset = tmp_path / "robot.xml", '<asset><mesh name="m" file="no.stl"/></asset>'
@@ -113,6 +116,7 @@ def test_mjcf_reads_meshes_only_for_masses(tmp_path, monkeypatch):
             load(file)
 
 
+@pytest.mark.usefixtures("newtons_importer")
 @pytest.mark.filterwarnings("ignore::newton.NewtonWarning")
 def test_mjcf_equalities_become_loops_and_couplings(monkeypatch):
     """Two connects and two welds, half of them between sites, and a polynomial between joints.
@@ -136,6 +140,7 @@ def test_mjcf_equalities_become_loops_and_couplings(monkeypatch):
         np.testing.assert_allclose(loop.child_pose, builder.joint_X_c[joint], atol=FLOAT32)
 
 
+@pytest.mark.usefixtures("newtons_importer")
 def test_mjcf_gravity_that_is_switched_off(tmp_path):
     file = tmp_path / "robot.xml"
     file.write_text("""<mujoco><option gravity="0 1 0"><flag gravity="disable"/></option><worldbody><body><freejoint/>
@@ -143,6 +148,7 @@ def test_mjcf_gravity_that_is_switched_off(tmp_path):
     np.testing.assert_array_equal(load(file).values["gravity"], [[0, 0, 0]])
 
 
+@pytest.mark.usefixtures("newtons_importer")
 @pytest.mark.filterwarnings("ignore::newton.NewtonWarning")
 @pytest.mark.parametrize(
     "name",

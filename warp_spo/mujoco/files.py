@@ -14,8 +14,8 @@ from .model import scene_of
 from .source import Source
 
 
-def read_mjcf(file: Path, floating: bool | None) -> Scene:
-    """Return the scene of an MJCF file; see :func:`warp_spo.load`.
+def read_mjcf(file: Path, floating: bool | None, repair: bool = True) -> Scene:
+    """Return the scene of an MJCF file; see :func:`warp_spo.load`. ``repair`` changes nothing: MuJoCo repairs nothing.
 
     Raises:
         ET.ParseError: the file is not XML.

@@ -20,6 +20,8 @@ FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{n}")) for n in
 KINDS = {FREE: "free", BALL: "ball", SLIDE: "prismatic", HINGE: "revolute"}
 SIZES = {FREE: (7, 6), BALL: (4, 3), SLIDE: (1, 1), HINGE: (1, 1)}
 """Entries of qpos and of qvel by joint type."""
+ROUNDING = 8 * np.finfo(np.float64).eps
+"""Share of an inertia's largest entry below which an entry is what is left of zero after MuJoCo turned its axes."""
 UPRIGHT = IDENTITY_POSE[3:]
 
 
@@ -64,6 +66,7 @@ class Mechanism:
         m = self.source.model
         axes = rotation(m.body_iquat[body])
         inertia = (axes * m.body_inertia[body]) @ axes.T
+        inertia[np.abs(inertia) <= ROUNDING * np.abs(inertia).max()] = 0.0
         passive = not (self.source.disabled("SPRING") and self.source.disabled("DAMPER"))  # MuJoCo skips all, then
         return Body(
             m.body_mass[body],

@@ -63,19 +63,23 @@ def scene_of(source: Source, floating: bool | None) -> Scene:
     model = source.model
     refuse_unsupported(source)
     if model.nbody == 1:
-        raise ValueError(f"{source.call}: {source.file or 'the model'} has no bodies; expected one or more")
+        raise ValueError(f"{source.title}: the model has no bodies; expected one or more")
     mechanism = Mechanism(source, floating)
     loops, couplings = read_ties(source, mechanism)
-    scene = Scene(
-        mechanism.bodies,
-        mechanism.hinges,
-        gravity=np.zeros(3) if source.disabled("GRAVITY") else model.opt.gravity,
-        loops=loops,
-        couplings=couplings,
-        actuators=read_actuators(source, mechanism),
-        sites=_sites(source),
-        keyframes=_keyframes(source, mechanism),
-    )
+    actuators, keyframes = read_actuators(source, mechanism), _keyframes(source, mechanism)
+    try:
+        scene = Scene(
+            mechanism.bodies,
+            mechanism.hinges,
+            gravity=np.zeros(3) if source.disabled("GRAVITY") else model.opt.gravity,
+            loops=loops,
+            couplings=couplings,
+            actuators=actuators,
+            sites=_sites(source),
+            keyframes=keyframes,
+        )
+    except ValueError as error:
+        raise ValueError(f"{source.title}: {error}; correct the model") from None
     _warn(source)
     return scene
 
@@ -140,6 +144,5 @@ def _warn(source: Source) -> None:
         if count:
             found.append(f"{count} {name}(s) (read them from the MjModel)")
     if found:
-        who = f"{source.call}: {source.file!r}" if source.file else source.call
-        caller = 6 if source.file else 4  # the line that called load or from_mujoco
-        warnings.warn(f"{who}: left out: {'; '.join(found)}", UserWarning, stacklevel=caller)
+        caller = 5 if source.file else 4  # the line that called load or from_mujoco
+        warnings.warn(f"{source.title}: left out: {'; '.join(found)}", UserWarning, stacklevel=caller)

@@ -27,6 +27,11 @@ class Source:
         self.model, self.call, self.file = model, call, file
         self.left_out: list[str] = []
 
+    @property
+    def title(self) -> str:
+        """The call, and the file if there is one, with which a message begins."""
+        return f"{self.call}: {self.file!r}" if self.file else self.call
+
     def name(self, kind: str, index: int) -> str:
         """Return the name of an element, "" if it has none; ``kind`` is "body", "joint", "actuator" and so on."""
         return mujoco.mj_id2name(self.model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), index) or ""

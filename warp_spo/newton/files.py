@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from xml.etree.ElementTree import ParseError
 
@@ -42,9 +44,11 @@ def shipped(name: str) -> Path:
 def load(path: str | os.PathLike[str], floating: bool | None = None, repair: bool = True) -> Scene:
     """Return the scene of a robot file: URDF (.urdf), MJCF (.xml, .mjcf) or USD (.usd, .usda, .usdc, .usdz).
 
-    A URDF is read in float64, and the scene has its numbers; MJCF and USD are read by Newton's importers, in float32.
-    Order, labels and coordinates are those of Newton's model of the file. Visual and collision shapes are skipped. A
-    mesh file is read only if a body that can move takes its mass from it.
+    MJCF is compiled by MuJoCo if the package is installed (extra ``mujoco``), and becomes a scene as by
+    :func:`from_mujoco`, in float64. A URDF is read in float64, and the scene has its numbers; order, labels and
+    coordinates are those of Newton's model of the file. USD, and MJCF without the package mujoco, are read by Newton's
+    importers, in float32. Visual and collision shapes are skipped. A mesh file is needed only if a body that can move
+    takes its mass from it.
 
     Args:
         path: The robot file.
@@ -54,27 +58,29 @@ def load(path: str | os.PathLike[str], floating: bool | None = None, repair: boo
         repair: Whether to replace masses and inertias that no rigid body can have, by Newton's rule: negative ones, an
             inertia that is zero beside a mass, and one whose largest principal moment exceeds the sum of the others.
             In a URDF, links that move as one and have no mass then take it from their collision shapes, 1000 kg/m^3.
-            False keeps the file's numbers; where they make the mass matrix singular, results are NaN and ``status=``
-            says so.
+            MuJoCo refuses an MJCF file that has such. False keeps the file's numbers; where they make the mass matrix
+            singular, results are NaN and ``status=`` says so.
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: No importer reads files with this suffix, or the file's contents. Of a URDF, the message names the
             line and the element.
         ImportError: A package for meshes or USD is missing. The message names the extra that installs it.
-        UnsupportedError, DirectedLoopError: As :func:`from_newton`.
-        UnsupportedError: The MJCF file uses a feature that Newton 1.8 misreads, such as a slide after a hinge in one
-            body, joints of one body with different ``pos``, a joint's ``ref``, ``shellinertia`` where shapes give the
-            mass, or ``settotalmass``. The message says what to write instead.
+        UnsupportedError, DirectedLoopError: As :func:`from_newton` and :func:`from_mujoco`.
+        UnsupportedError: Without the package mujoco, an MJCF file uses a feature that Newton 1.8 misreads, such as a
+            slide after a hinge in one body, joints of one body with different ``pos``, a joint's ``ref``,
+            ``shellinertia`` where shapes give the mass, or ``settotalmass``. The message says what to write instead.
 
     Warns:
         UserWarning: A mass or an inertia was replaced, or taken from shapes. The message names the bodies. A mimic in a
-            URDF names no joint of the file and was left out.
+            URDF names no joint of the file and was left out. An MJCF file holds contacts, sensors or other things that
+            a scene leaves out.
     """
     file = Path(path)
     importer = robot_format(file)
+    read = _mjcf_reader() if importer == "mjcf" else {"urdf": read_urdf, "usd": read_usd}[importer]
     try:
-        return {"urdf": read_urdf, "mjcf": read_mjcf, "usd": read_usd}[importer](file, floating, repair)
+        return read(file, floating, repair)
     except ParseError as error:
         raise ValueError(f"load: {str(file)!r} is not XML: {error}; expected {importer.upper()}") from None
     except ImportError as error:
@@ -84,6 +90,15 @@ def load(path: str | os.PathLike[str], floating: bool | None = None, repair: boo
             f"load: {str(file)!r} needs a package that is missing ({error}) to read {need}; "
             f"pip install warp_spo[{extra}]"
         ) from error
+
+
+def _mjcf_reader() -> Callable[[Path, bool | None, bool], Scene]:
+    """Return the function that reads MJCF files: through MuJoCo or, without that package, through Newton's importer."""
+    if find_spec("mujoco") is None:
+        return read_mjcf
+    from ..mujoco.files import read_mjcf as read_through_mujoco  # imports the package mujoco
+
+    return read_through_mujoco
 
 
 def robot_format(file: Path) -> str:
