@@ -12,8 +12,8 @@ from .model import from_newton
 from .repair import repair_bodies
 
 
-def scene_of(builder: newton.ModelBuilder, repair: bool) -> Scene:
-    """Return the scene of a builder that read a file.
+def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool) -> Scene:
+    """Return the scene of a builder that read a file; errors name the file.
 
     With ``repair``, masses and inertias that no rigid body can have are replaced, and a warning names the bodies.
     """
@@ -23,7 +23,12 @@ def scene_of(builder: newton.ModelBuilder, repair: bool) -> Scene:
         builder.body_mass[:] = masses
         builder.body_inertia[:] = inertias  # type: ignore[assignment]  # matrices, as Newton's own
     # from_newton checks the topology itself, and it accepts joints outside articulations, which USD files have.
-    return from_newton(builder.finalize(device="cpu", skip_validation_joints=True, skip_validation_inertia=True))
+    model = builder.finalize(device="cpu", skip_validation_joints=True, skip_validation_inertia=True)
+    try:
+        return from_newton(model)
+    except ValueError as error:
+        error.args = (f"load: {str(file)!r}: {error}",)
+        raise
 
 
 def unreadable(file: Path, error: Exception) -> ValueError:

@@ -152,7 +152,7 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool) -> Scene:
             UserWarning,
             stacklevel=3,
         )
-    return scene_of(builder, repair)
+    return scene_of(file, builder, repair)
 
 
 def _holder(feature: str) -> str:
