@@ -38,6 +38,8 @@ def newtons_importer(monkeypatch):
 
 
 def pytest_configure(config):
+    if config.getoption("--device") == "cpu":
+        os.environ.setdefault("JAX_PLATFORMS", "cpu")
     asked = config.getoption("--granularity")
     plan.DEFAULT = None if asked == "plan" else asked
     if not config.getoption("--optimized"):

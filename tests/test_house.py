@@ -39,6 +39,7 @@ ROOMS = (
     "recursions",
     "execution",
     "dynamics",
+    "jax",
     "mujoco",
     "newton",
     "trials",
@@ -87,6 +88,7 @@ def test_device_code_computes(path):
 def test_host_code_launches(path):
     assert "@wp.kernel" not in path.read_text() and "@wp.func" not in path.read_text()
     assert "torch" not in imports(path) or path.parent.name in ("torch", "env", "examples")
+    assert "jax" not in imports(path) or path.parent == PACKAGE / "jax"
     assert "newton" not in imports(path) or path.parent == PACKAGE / "newton"
     assert "mujoco" not in imports(path) or path.parent == PACKAGE / "mujoco"
 
@@ -156,7 +158,7 @@ def test_the_reference_imports_numpy_alone():
 
 
 def test_import_is_light():
-    heavy = {"torch", "newton", "mujoco", "matplotlib"}
+    heavy = {"torch", "jax", "newton", "mujoco", "matplotlib"}
     script = f"import sys, warp_spo.examples.parts; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -19,6 +19,7 @@ from .scene.tree import Digraph, Tree
 from .status import Status
 
 if TYPE_CHECKING:
+    from . import jax as jax
     from . import mujoco as mujoco
     from . import newton as newton
     from . import torch as torch
@@ -66,7 +67,7 @@ if not TYPE_CHECKING:  # or every misspelled name would pass a type checker
             return getattr(importlib.import_module(".newton", __name__), name)
         if name == "from_mujoco":
             return importlib.import_module(".mujoco", __name__).from_mujoco
-        if name in ("torch", "newton", "mujoco"):
+        if name in ("jax", "mujoco", "newton", "torch"):
             return importlib.import_module(f".{name}", __name__)
         if name == "__version__":
             from importlib.metadata import PackageNotFoundError, version

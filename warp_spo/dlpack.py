@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import importlib
 import sys
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,19 @@ def is_traced(array: object) -> bool:
     return "jax" in sys.modules and isinstance(array, sys.modules["jax"].core.Tracer)
 
 
+def settle(arguments: Iterable[Any]) -> None:
+    """Wait until JAX has computed the arrays among some arguments.
+
+    A caller does so before it takes a turn (:mod:`warp_spo.turns`). JAX computes in threads of its own, and what it has
+    not computed yet may be a call of ours that waits for the same turn.
+    """
+    if "jax" in sys.modules:
+        kind = sys.modules["jax"].Array
+        for array in arguments:
+            if isinstance(array, kind) and not is_traced(array) and not array.is_deleted():
+                array.block_until_ready()
+
+
 def device_of(array: Any) -> str:
     """Return Warp's name of the device whose memory an array is in.
 
@@ -97,7 +111,6 @@ def read(call: str, name: str, array: Any, library: Library, device: wp.Device, 
         if device.is_cuda:
             found: Any = wp.from_dlpack(array)
             return found
-        getattr(array, "block_until_ready", bool)()  # JAX may still compute it
         host = np.from_dlpack(array)  # tells also whether somebody may write it
         strides = None if host.flags.c_contiguous else host.strides
         memory: dict[str, Any] = {"ptr": host.ctypes.data, "shape": host.shape, "strides": strides}
@@ -119,9 +132,14 @@ def new(call: str, library: Library, shape: tuple, dtype: type, device: wp.Devic
     """Return (the library's array, None if :func:`share` will make it; Warp array) of undefined content.
 
     Raises:
-        TypeError: the library cannot take arrays.
+        TypeError: the library cannot take arrays. ValueError: it would round them.
     """
     module: Any = importlib.import_module(library.module)
+    if library == "JAX" and dtype is wp.float64 and not sys.modules["jax"].config.jax_enable_x64:
+        raise ValueError(
+            f"{call}: the result is float64, which JAX would make float32, because its float64 is turned off; expected "
+            f"it on; call jax.config.update('jax_enable_x64', True) at the start of the program"
+        )
     if library.has_stream and device.is_cuda:  # the memory is freed in the order of the library's stream
         with module.cuda.Device(device.ordinal):
             owner = module.empty(shape, dtype=wp.dtype_to_numpy(dtype))

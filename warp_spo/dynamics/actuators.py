@@ -8,6 +8,7 @@ import warp as wp
 
 from .. import launches
 from ..arrays import WARP, AnyArray, ArrayT, Call, kind_of
+from ..dlpack import settle
 from ..errors import as_integer
 from ..execution.routine import Routine
 from ..kernels import delays
@@ -99,6 +100,7 @@ def actuator_state(self: Dynamics, like: Any = None, longest: int | None = None)
 
 def reset_actuator_state(self: Dynamics, mask: AnyArray | None, state: ActuatorState) -> None:
     """Forget the controls of the worlds under the mask [world], bool; None: of all worlds. A graph may capture it."""
+    settle((mask,))
     with Call("Dynamics.reset_actuator_state", self.device, self.dtype, turn=self.recursions.turn) as call:
         where = None if mask is None else call.read("mask", mask, (self.worlds,), "[world]", dtype=wp.bool)
         forget_controls(self, call, where, state)

@@ -37,6 +37,7 @@ import numpy as np
 import warp as wp
 
 from ..arrays import Call
+from ..dlpack import settle
 from ..execution.routine import Routine
 from ..gradients import call_with_gradient, records_gradient
 from ..recursions.links import LINK_VALUES, MOTION_VALUES, Links
@@ -294,6 +295,7 @@ class Operation:
                 if len(arguments) < len(args) + len(more) or not arguments.keys() <= names.keys():
                     signature.bind(dyn, *args, **more)  # raises TypeError
                 return call_with_gradient(dyn, self, arguments)
+            settle((*args, *more.values()))
             return dyn._replays.run(*kind, lambda: function(dyn, *args, **more))
 
         self._methods.append(call)
@@ -304,6 +306,7 @@ class Operation:
         result, *kind = dyn._replays.replay(self.name, args, more)
         if result is not MISS:
             return result
+        settle((*args, *more.values()))
         return dyn._replays.run(*kind, lambda: self.function(dyn, *args, **more))
 
     @property

@@ -50,7 +50,7 @@ def _prepare_operation(dyn: Dynamics, operation: Operation, options: dict[str, A
     arguments = [one for one in operation.arrays if not one.asked or options.pop(one.name, False)]
     columns = options.pop("columns", None) if any(one.columns for one in arguments) else None
     _refuse_rest(operation.name, options)
-    given |= {one.name: _stand_in(dyn, one, given.get("frames", ()), columns) for one in arguments}
+    given |= {one.name: stand_in(dyn, one, given.get("frames", ()), columns) for one in arguments}
     given |= {one.name: one.stand_in(dyn, given) for one in operation.options if one.stand_in is not None}
     operation.entry(dyn, **given)
 
@@ -60,10 +60,10 @@ def _prepare_backwards(dyn: Dynamics, operation: Operation, options: dict[str, A
     wrt = as_names("Dynamics.prepare", "wrt", options.pop("wrt", ()), ("q", "qd"))
     arrays = {one.name: one for one in operation.arrays}
     chosen = [one for one in map(arrays.__getitem__, derivative.by) if _is_given(one, options, wrt)]
-    given = {one.name: _stand_in(dyn, one) for one in chosen}
+    given = {one.name: stand_in(dyn, one) for one in chosen}
     more = _options(dyn, tuple(option for option in operation.options if option.read is not None), options)
     others = [arrays[name] for name in derivative.state if name in arrays and name not in derivative.by]
-    more |= {one.name: _stand_in(dyn, one) for one in others}
+    more |= {one.name: stand_in(dyn, one) for one in others}
     _refuse_rest(f"{operation.name}_vjp", options)
     shapes = dyn._gradients.result_shapes(operation, **more)
     results: list[Any] = [wp.zeros(shape, dtype=dyn.dtype, device=dyn.device) for shape in shapes]
@@ -85,7 +85,7 @@ def _prepare_product(dyn: Dynamics, product: Operation, options: dict[str, Any])
     arguments = [one for one in product.arrays if not one.direction and _is_given(one, options, named)]
     _refuse_rest(product.name, options)
     chosen = [*arguments, *map(directions.__getitem__, along)]
-    product.entry(dyn, **{one.name: _stand_in(dyn, one) for one in chosen})
+    product.entry(dyn, **{one.name: stand_in(dyn, one) for one in chosen})
 
 
 def _is_given(argument: Argument, options: dict[str, Any], named: tuple[str, ...]) -> bool:
@@ -103,7 +103,7 @@ def _options(dyn: Dynamics, declared: tuple[Option, ...], options: dict[str, Any
     return found
 
 
-def _stand_in(dyn: Dynamics, argument: Argument, frames: Sequence[Any] = (), columns: Any = None) -> wp.array:
+def stand_in(dyn: Dynamics, argument: Argument, frames: Sequence[Any] = (), columns: Any = None) -> wp.array:
     """Return zeros, or the neutral coordinates, for an argument."""
     if argument.axes == "world, coordinate":
         return wp.array(np.tile(dyn.scene.neutral_q, (dyn.worlds, 1)), dtype=dyn.dtype, device=dyn.device)

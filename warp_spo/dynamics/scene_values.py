@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..arrays import Call, shape_of
+from ..dlpack import settle
 from ..execution.parameters import VARIABLE
 from ..gradients import records_gradient
 from ..scene.parts import real
@@ -27,6 +28,7 @@ def set_values(self: Dynamics, **values: Any) -> None:
         ValueError: unknown name, wrong shape, dtype or device; a name that is not variable inside a graph capture.
     """
     folded: dict[str, Any] = {}
+    settle(values.values())
     with Call("Dynamics.set", self.device, self.dtype, turn=self.recursions.turn) as call:
         variable: dict[str, Any] = {}
         for name, value in values.items():

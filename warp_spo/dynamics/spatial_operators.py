@@ -9,6 +9,7 @@ import warp as wp
 
 from .. import launches
 from ..arrays import WARP, AnyArray, Call
+from ..dlpack import settle
 from ..execution.programs import Programs
 from ..execution.routine import Routine
 from ..execution.sweeps import Sweeps
@@ -90,6 +91,7 @@ class SpatialOperators(LetterOwner):
     def update(self, q: Any) -> None:
         """Take the coordinates ``q`` [world, coordinate]; launches only."""
         run = self._recursions
+        settle((q,))
         with Call("operators.update", run.device, run.dtype, turn=run.turn) as call:
             q = call.read("q", q, (run.worlds, run.scene.coord_count), "[world, coordinate]")
             self._kind = call.kind

@@ -1,0 +1,204 @@
+"""Operations of a Dynamics as functions for ``jit``, ``grad`` and ``vmap``, with the declared derivatives."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import warp as wp
+
+from .programs import Program
+
+if TYPE_CHECKING:
+    from ..dynamics.dynamics import Dynamics
+    from ..dynamics.operation import Argument, Operation
+
+
+def function(dyn: Dynamics, operation: str, *, capture: bool = False, **options: Any) -> Function:
+    """Return an operation of ``dyn`` as a function of JAX arrays, which ``jit``, ``grad`` and ``vmap`` transform.
+
+    ::
+
+        step = warp_spo.jax.function(dyn, "step", dt=2e-3)
+
+        @jax.jit
+        def height(q, qd, tau):                     # [world, ...], for all worlds of dyn
+            q, qd = step(q, qd, tau)
+            return q[:, 2].sum()
+
+        jax.grad(height, argnums=2)(q, qd, tau)
+        jax.vmap(step)(q, qd, tau)                  # the same as step(q, qd, tau): vmap's axis is the world
+
+    The function takes the operation's arrays by position or by name; they are ``[world, ...]``, or ``[...]`` of one
+    world where ``vmap`` makes the batch. A batch of several times as many rows as ``dyn`` has worlds is computed that
+    many rows at a time. Kernels run on XLA's device and stream, at the values of the scene that ``dyn`` has then.
+    Gradients are those that torch gets, of first order; ``jvp`` and ``jacfwd`` are refused by JAX.
+
+    Args:
+        dyn: The Dynamics. It lives as long as the process, because XLA never forgets a function.
+        operation: Name of a method, such as "forward_dynamics", "inverse_dynamics" or "step".
+        capture: Let XLA capture the launches of the operation (not of its gradient) in its CUDA graphs, which saves the
+            way through Python. After :meth:`Dynamics.set` of a value that is not ``variable``, such graphs are out of
+            date.
+        options: The operation's arguments that are not arrays, such as ``dt`` and ``frames``.
+
+    Raises:
+        TypeError: ``dyn`` is no Dynamics, or the options are not those of the operation.
+        ValueError: No such operation; or float64, while JAX's ``jax_enable_x64`` is off.
+    """
+    if not hasattr(dyn, "_operations"):
+        raise TypeError(f"warp_spo.jax.function: dyn is of type {type(dyn).__name__}; expected a Dynamics")
+    known = {name: one for name, one in dyn._operations.items() if one.results and not one.product}
+    if not isinstance(operation, str) or operation not in known:
+        raise ValueError(f"warp_spo.jax.function: operation is {operation!r}; expected one of {', '.join(known)}")
+    return Function(dyn, known[operation], options, capture)
+
+
+class Function:
+    """What :func:`function` returns."""
+
+    def __init__(self, dyn: Dynamics, operation: Operation, options: dict[str, Any], capture: bool):
+        self.name = f"warp_spo.jax.function({operation.name!r})"
+        self.dyn, self.operation, self.options, self.capture = dyn, operation, options, capture
+        self.arguments = {one.name: one for one in operation.arrays if not one.written}
+        self._programs: dict[tuple, Program] = {}
+        self._check_options()
+        self._check_precision()
+
+    def __repr__(self) -> str:
+        return f"{self.name} of {self.dyn.scene!r}"
+
+    def __call__(self, *arrays: Any, **more: Any) -> Any:
+        self._check_precision()
+        given = {name: self._as_array(name, array) for name, array in self._bind(arrays, more).items()}
+        first = next(iter(given))
+        alone = given[first].ndim == len(self._shape(self.arguments[first])) - 1
+        for name, array in given.items():
+            self._check_shape(name, array, alone)
+        if alone:
+            if not any(isinstance(array, jax.core.Tracer) for array in given.values()):
+                self.check_rows(1, alone)
+            given = {name: array[None] for name, array in given.items()}
+        columns = {name: array.shape[-1] if self._has_columns(name, array) else None for name, array in given.items()}
+        key = alone, tuple(columns.items())
+        if key not in self._programs:
+            self._programs[key] = Program(self, columns, alone)
+        found = self._programs[key](*given.values())
+        return jax.tree.map(lambda x: x[0], found) if alone else found
+
+    @functools.cached_property
+    def single(self) -> Function | None:
+        """The function of one of several repetitions, which has the gradient; None where there are none."""
+        options = dict(self.options)
+        derivative = self.operation.derivative
+        self.times = 1 if derivative is None else derivative.repeats(self.name, options)
+        return None if self.times == 1 else Function(self.dyn, self.operation, options, self.capture)
+
+    def _has_columns(self, name: str, array: Any) -> bool:
+        """Whether an argument [row, ...] has an axis of right-hand sides."""
+        return array.ndim > len(self._shape(self.arguments[name]))
+
+    # -- checks ----------------------------------------------------------------------------------------------------
+    def _check_options(self) -> None:
+        parameters = inspect.signature(self.operation.function).parameters
+        expected = {one.name: parameters[one.name].default for one in self.operation.options if one.name in parameters}
+        written = [one.name for one in self.operation.options if one.stand_in is not None]
+        for name in self.options:
+            if name in written:
+                raise TypeError(f"{self.name}: {name}= holds memory that the call writes, which JAX would not know")
+            if name not in expected:
+                words = ", ".join(f"{one}=" for one in expected) or "none"
+                raise TypeError(
+                    f"{self.name}: {name}= is no option; expected {words}; arrays go to the function itself"
+                )
+        for name, default in expected.items():
+            if default is inspect.Parameter.empty and name not in self.options:
+                raise TypeError(f"{self.name}: {name} is missing; expected {name}=")
+
+    def _check_precision(self) -> None:
+        settings: Any = jax.config
+        if self.dyn.dtype is wp.float64 and not settings.jax_enable_x64:
+            raise ValueError(
+                f"{self.name}: the Dynamics is float64 and JAX has float64 turned off; expected the same precision; "
+                f"call jax.config.update('jax_enable_x64', True) at the start of the program, or build the Dynamics "
+                f"with dtype='float32'"
+            )
+
+    def _bind(self, arrays: tuple, more: dict[str, Any]) -> dict[str, Any]:
+        """Return the arrays that were given by name."""
+        named = (*zip(self.arguments, arrays, strict=False), *more.items())
+        needed = inspect.signature(self.operation.function).parameters
+        found = {name: array for name, array in named if array is not None}
+        lacking = [n for n in self.arguments if needed[n].default is inspect.Parameter.empty and n not in dict(named)]
+        written = [
+            name for name in ("out", *(one.name for one in self.operation.arrays if one.written)) if name in more
+        ]
+        if written:
+            raise TypeError(f"{self.name}: {written[0]}= is given; JAX arrays cannot be written; use what it returns")
+        wrong = (
+            len(arrays) > len(self.arguments) or len(named) > len(dict(named)) or not set(more) <= set(self.arguments)
+        )
+        if wrong or lacking or not found:
+            raise TypeError(
+                f"{self.name}: {len(arrays)} arrays by position and {', '.join(more) or 'none'} by name; expected "
+                f"{', '.join(self.arguments)}, each once at most{f'; {lacking[0]} is missing' if lacking else ''}"
+            )
+        return {name: found[name] for name in self.arguments if name in found}
+
+    def _as_array(self, name: str, array: Any) -> Any:
+        """Return an argument as a JAX array; NumPy arrays are cast."""
+        dtype = wp.dtype_to_jax(self.arguments[name].dtype or self.dyn.dtype)
+        if isinstance(array, np.ndarray):
+            return jnp.asarray(array, dtype)
+        if not isinstance(array, jax.Array):
+            raise TypeError(f"{self.name}: {name} is of type {type(array).__name__}; expected a JAX or a NumPy array")
+        if array.dtype != dtype:
+            raise ValueError(
+                f"{self.name}: {name} is {array.dtype} {array.shape}; expected {np.dtype(dtype).name}; pass "
+                f"{name}.astype({np.dtype(dtype).name!r}), or build the Dynamics with dtype={array.dtype.name!r}"
+            )
+        return array
+
+    def _shape(self, argument: Argument) -> tuple[int, ...]:
+        """Return the shape of an argument, [world, ...]."""
+        return self.dyn._engine.shape(argument.axes, len(self.options.get("frames", ())))[0]
+
+    def _check_shape(self, name: str, array: Any, alone: bool) -> None:
+        """Raise ValueError unless an argument has its shape, without the world where the first one has none."""
+        argument = self.arguments[name]
+        whole = self._shape(argument)
+        expected = whole[1:] if alone else whole
+        if argument.columns and array.ndim == len(expected) + 1:
+            expected = (*expected, array.shape[-1])
+        if array.shape != expected:
+            axes = argument.axes.removeprefix("world, ") if alone else argument.axes
+            also = "because the first array is of one world" if alone else f"or {whole[1:]} of one world under vmap"
+            raise ValueError(
+                f"{self.name}: {name} has shape {array.shape}; expected {expected} [{axes}], {also}; reshape {name}, "
+                f"or build the Dynamics for this many worlds"
+            )
+
+    def check_rows(self, rows: int, alone: bool) -> None:
+        """Raise ValueError unless the Dynamics can compute so many rows.
+
+        Args:
+            rows: number of worlds times what ``vmap`` makes of them.
+            alone: whether ``vmap`` made the worlds, too.
+        """
+        worlds = self.dyn.worlds
+        if rows % worlds:
+            raise ValueError(
+                f"{self.name}: the arrays have {rows} rows; expected {worlds}, the worlds of the Dynamics, or a "
+                f"multiple of it; build the Dynamics with worlds={rows}, or map over {worlds}"
+            )
+        differ = worlds > 1 and (self.dyn.variable or self.dyn.scene.worlds > 1)
+        if alone and rows != worlds and differ:
+            raise ValueError(
+                f"{self.name}: vmap made {rows} rows for {worlds} worlds whose values may differ, so that a row's "
+                f"world is not known; expected {worlds} rows; pass arrays [world, ...], or build the Dynamics with "
+                f"worlds={rows}"
+            )

@@ -1,0 +1,202 @@
+"""One operation with a given set of arguments, as a JAX function with a gradient of its own."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import warp as wp
+from jax.custom_derivatives import SymbolicZero
+
+from ..dynamics.operation import derivative_of
+from ..dynamics.preparation import stand_in
+from .launches import forms_of, traceable
+
+if TYPE_CHECKING:
+    from .functions import Function
+
+Arrays = tuple[Any, ...]
+Traced = Callable[..., tuple[jax.Array, ...]]
+
+
+class Program:
+    """A :class:`Function` for some of its arguments, all of which are [row, ...].
+
+    To make one compiles the kernels and runs them once, ahead of XLA's graphs.
+
+    Args:
+        function: the function.
+        columns: names of the arguments, and how many right-hand sides each has; None where it has no axis for them.
+        alone: whether ``vmap`` makes the worlds.
+    """
+
+    def __init__(self, function: Function, columns: dict[str, int | None], alone: bool):
+        self.function, self.dyn, self.operation = function, function.dyn, function.operation
+        self.options, self.columns, self.alone = function.options, columns, alone
+        self._traced: dict[bool | tuple[str, ...], Traced] = {}
+        results = self._compute(self._samples())
+        self.kind = type(results)
+        self.count = 1 if isinstance(results, wp.array) else len(results)
+        self._traced[False] = self._forward(False)
+        self.call = jax.custom_vjp(self._result)
+        if function.single is None:
+            self.call.defvjp(self._result_and_residuals, self._pull_back, symbolic_zeros=True)
+        else:
+            self.call.defvjp(self._repeated, lambda pull, cotangents: pull(cotangents))
+
+    def __call__(self, *arrays: Any) -> Any:
+        return self.call(*arrays)
+
+    # -- forward ---------------------------------------------------------------------------------------------------
+    def _samples(self) -> dict[str, wp.array]:
+        """Return arguments to compile with, [world, ...]."""
+        arguments, frames = self.function.arguments, self.options.get("frames", ())
+        return {name: stand_in(self.dyn, arguments[name], frames, count) for name, count in self.columns.items()}
+
+    def _compute(self, given: dict[str, wp.array], **more: Any) -> Any:
+        return self.operation.entry(self.dyn, **given, **self.options, **more)
+
+    def _kept(self) -> dict[str, wp.array]:
+        """Return arrays for what the derivative reads of the operation besides the results."""
+        keeps = self.operation.derivative.keeps if self.operation.derivative else ()
+        axes = {one.name: one.axes for one in self.operation.arrays if one.name in keeps}
+        shapes = {name: self.dyn._engine.shape(words)[0] for name, words in axes.items()}
+        return {name: wp.empty(shape, dtype=self.dyn.dtype, device=self.dyn.device) for name, shape in shapes.items()}
+
+    def _computed(self, keep: bool) -> tuple[dict[str, wp.array], tuple[wp.array, ...], dict[str, wp.array]]:
+        """Return arguments, the results, and what else is kept, of one call."""
+        given, kept = self._samples(), self._kept() if keep else {}
+        results = self._compute(given, **kept)
+        return given, (results,) if self.count == 1 else tuple(results), kept
+
+    def _forward(self, keep: bool) -> Traced:
+        """Return the operation as a JAX function; its results are followed by what is kept."""
+        given, results, kept = self._computed(keep)
+
+        def run(inputs: Arrays, outputs: Arrays) -> None:
+            for part in self._parts(outputs[0].shape[0]):
+                found = [part(array) for array in outputs]
+                out = found[0] if self.count == 1 else tuple(found[: self.count])
+                more = dict(zip(kept, found[self.count :], strict=True))
+                self._compute(dict(zip(given, map(part, inputs), strict=True)), out=out, **more)
+
+        read, written = forms_of(given.values()), forms_of((*results, *kept.values()))
+        return traceable(self.operation.name, run, read, written, self.function.capture)
+
+    def _parts(self, rows: int) -> Iterator[Callable[[wp.array], wp.array]]:
+        """Return functions that take as many rows of an array as there are worlds, part after part."""
+        self.function.check_rows(rows, self.alone)
+        worlds = self.dyn.worlds
+        if rows == worlds:
+            yield lambda array: array
+            return
+        for first in range(0, rows, worlds):
+            yield functools.partial(_rows, first, first + worlds)
+
+    def _as_results(self, found: Arrays) -> Any:
+        """Return arrays as the operation returns them: one array, a tuple, or a named tuple."""
+        if self.count == 1:
+            return found[0]
+        return self.kind(*found) if hasattr(self.kind, "_fields") else tuple(found)
+
+    def _result(self, *arrays: Any) -> Any:
+        return self._as_results(self._traced[False](*arrays))
+
+    # -- backward --------------------------------------------------------------------------------------------------
+    @property
+    def _refused(self) -> str:
+        """What has no gradient, and what is expected, in words; "" if there is a gradient."""
+        derivative = self.operation.derivative
+        if derivative is None:
+            known = ", ".join(name for name, one in self.dyn._operations.items() if one.derivative is not None)
+            return f"it has no gradient; expected one of {known}"
+        return derivative.refuses(self.dyn, dict(self.options))
+
+    def _repeated(self, *arrays: Any) -> tuple[Any, Any]:
+        """Return the result of repetitions, and the way back through each of them."""
+        single, times = self.function.single, self.function.times
+        assert single is not None
+        once = Program(single, self.columns, self.alone)
+        names = [result.name for result in self.operation.results]
+
+        def repeat(*arrays: Any) -> Any:
+            given, found = dict(zip(self.columns, arrays, strict=True)), None
+            for _ in range(times):
+                found = once(*given.values())
+                given |= dict(zip(names, found, strict=True))
+            return found
+
+        return jax.vjp(repeat, *arrays)
+
+    def _result_and_residuals(self, *primals: Any) -> tuple[Any, Any]:
+        """Return the result, and what the way back reads. JAX keeps the keys of a dictionary while it traces."""
+        arrays = tuple(one.value for one in primals)
+        wanted: dict = {name: () for name, one in zip(self.columns, primals, strict=True) if one.perturbed}
+        keep = not self._refused
+        if keep not in self._traced:
+            self._traced[keep] = self._forward(keep)
+        found = self._traced[keep](*arrays)
+        return self._as_results(found[: self.count]), (wanted, arrays, found)
+
+    def _check_gradient(self, wanted: tuple[str, ...]) -> None:
+        """Raise an error if a gradient is asked for that the operation does not have."""
+        refused = self._refused
+        if refused:
+            raise ValueError(
+                f"{self.function.name}, backwards: {refused}; if no gradient should pass, put jax.lax.stop_gradient "
+                f"around the result"
+            )
+        by = derivative_of(self.operation).by
+        lacking = [name for name in wanted if name not in by]
+        if lacking:
+            raise ValueError(
+                f"{self.function.name}: it has no gradient by {lacking[0]}; expected gradients by "
+                f"{', '.join(by)}; pass jax.lax.stop_gradient({lacking[0]})"
+            )
+        several = [name for name, count in self.columns.items() if count is not None]
+        if several:
+            raise ValueError(
+                f"{self.function.name}: {several[0]} has an axis of columns, for which JAX gets no gradient; expected "
+                f"one column; map over them: jax.vmap(function, in_axes=..., out_axes=-1)"
+            )
+        self.dyn._gradients.check(self.operation)
+
+    def _pull_back(self, residuals: Any, cotangents: Any) -> tuple:
+        wanted, arrays, found = residuals
+        self._check_gradient(tuple(wanted))
+        given = (cotangents,) if self.count == 1 else tuple(cotangents)
+        whole = [jnp.zeros(one.shape, one.dtype) if isinstance(one, SymbolicZero) else one for one in given]
+        names = tuple(wanted)
+        if names not in self._traced:
+            self._traced[names] = self._backward(names)
+        gradients = self._traced[names](*arrays, *found, *whole)
+        by_name = dict(zip(wanted, gradients, strict=True))
+        return tuple(by_name.get(name) for name in self.columns)
+
+    def _backward(self, wanted: tuple[str, ...]) -> Traced:
+        """Return the gradients by some arguments as a JAX function of arguments, results, kept and cotangents."""
+        given, results, kept = self._computed(True)
+        sizes = len(given), len(results) + len(kept)
+
+        def pull(arrays: Arrays) -> list[wp.array]:
+            known = dict(zip(given, arrays, strict=False))
+            computed, cotangents = arrays[sizes[0] : sum(sizes)], arrays[sum(sizes) :]
+            gradients = self.dyn._gradients
+            found = gradients.pull_back(self.operation, known, self.options, computed, cotangents, wanted)
+            return [found[name] for name in wanted]
+
+        def run(inputs: Arrays, outputs: Arrays) -> None:
+            for part in self._parts(outputs[0].shape[0]):
+                for out, found in zip(outputs, pull(tuple(map(part, inputs))), strict=True):
+                    wp.copy(part(out), found)
+
+        read = (*given.values(), *results, *kept.values(), *results)
+        return traceable(f"{self.operation.name}_vjp", run, forms_of(read), forms_of(pull(read)), False)
+
+
+def _rows(first: int, end: int, array: wp.array) -> wp.array:
+    """Return rows of an array, which share its memory."""
+    return array[first:end]
