@@ -267,7 +267,9 @@ class SolverSPO(Plugs, SolverBase):
         given: dict[str, Any] = dict(tau=tau, body_f=body_f, **self._drives.targets(control, self._q, self._qd))
         if observables is None or not observables.kinds:
             q_out, qd_out = self._q.target(state_out.joint_q, "q_out"), self._qd.target(state_out.joint_qd, "qd_out")
-            more = {} if qdd is None else {"qdd": qdd, "status": self._status}  # the kernel of steps with observables
+            more: dict[str, Any] = (
+                {} if qdd is None else {"qdd": qdd, "status": self._status}
+            )  # the kernel of steps with observables
             self.dynamics.step(q, qd, dt=dt, integrator=self.integrator, out=(q_out, qd_out), **more, **given)
             if contacts is not None:
                 self._words.mark(contacts, self._words.kept)
