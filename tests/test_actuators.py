@@ -52,6 +52,9 @@ def test_voltage_of_a_motor_is_mujocos():
     K, R, gear = 0.3, 2.0, 5.0
     model = mujoco_arm([f'<dcmotor joint="a" motorconst="{K}" resistance="{R}" gear="{gear}"/>'])
     scene = arm([spo.Actuator(0, gear=gear, gain=K / R, bias=(0.0, 0.0, -K * K / R))])
+    for name, value in spo.from_mujoco(model).values.items():
+        if name.startswith("actuator"):
+            np.testing.assert_allclose(scene.values[name], value)
     data = mujoco.MjData(model)
     data.qvel[:], data.ctrl[:] = (2.0, -1.0, 0.5), 7.0
     mujoco.mj_forward(model, data)

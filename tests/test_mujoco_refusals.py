@@ -43,6 +43,11 @@ CASES = {
     "filter": ({"more": ACT.format("general", 'dyntype="filter"')}, "actuator 'drive', which has an activation", "tau"),
     "integrator": ({"more": ACT.format("intvelocity", 'actrange="0 1"')}, "(dyntype integrator)", "tau"),
     "muscle": ({"more": ACT.format("muscle", 'lengthrange="0 1"')}, "actuator 'drive', a muscle,", "tau"),
+    "cogging": (
+        {"more": ACT.format("dcmotor", 'motorconst="1" resistance="1" cogging="1 2 3"')},
+        "a DC motor with",
+        "tau",
+    ),
     "damper": ({"more": ACT.format("damper", 'kv="1" ctrlrange="0 1"')}, "actuator 'drive', whose gain depends", "tau"),
     "delay": ({"more": ACT.format("motor", 'delay=".1" nsample="9"')}, "actuator 'drive', which has a", "remove"),
     "site": ({"more": '<actuator><motor name="jet" site="s"/></actuator>'}, "a site transmission,", "tau"),

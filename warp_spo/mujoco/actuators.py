@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 
@@ -42,13 +44,13 @@ def read_actuators(source: Source, mechanism: Mechanism) -> list[Actuator]:
     found = []
     for actuator, gears in enumerate(joints):
         name = source.name("actuator", actuator)
-        affine = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
+        gain, bias = _gain_and_bias(source, actuator)
         found.append(
             Actuator(
                 [mechanism.joint_hinge(joint, source.words("actuator", actuator)) for joint in gears],
                 gear=list(gears.values()),
-                gain=model.actuator_gainprm[actuator, 0],
-                bias=model.actuator_biasprm[actuator, :3] if affine else (0.0, 0.0, 0.0),
+                gain=gain,
+                bias=bias,
                 ctrl_range=model.actuator_ctrlrange[actuator] if limited[actuator] else UNBOUNDED,
                 force_range=ranges[actuator],
                 strength=0.0 if actuator in off else 1.0,
@@ -64,15 +66,38 @@ def _refuse_actuator(source: Source, actuator: int) -> None:
     gain, bias, dynamics, transmission = (enum(kind) for enum, kind in zip(_enums(), kinds.values(), strict=True))
     if "mjGAIN_MUSCLE" == gain.name or "mjBIAS_MUSCLE" == bias.name:
         source.refuse(f"{words}, a muscle,", WAY_OUT)
-    if dynamics.name != "mjDYN_NONE":
+    if gain.name == "mjGAIN_DCMOTOR":
+        if not _is_plain_motor(source, actuator):
+            what = "cogging, friction, inductance, heat, a controller or a limited voltage"
+            source.refuse(f"{words}, a DC motor with {what},", WAY_OUT)
+    elif dynamics.name != "mjDYN_NONE":
         state = dynamics.name.removeprefix("mjDYN_").lower()
         source.refuse(f"{words}, which has an activation state (dyntype {state}),", WAY_OUT)
-    if gain.name not in ("mjGAIN_FIXED", "mjGAIN_AFFINE") or bias.name not in ("mjBIAS_NONE", "mjBIAS_AFFINE"):
+    elif gain.name not in ("mjGAIN_FIXED", "mjGAIN_AFFINE") or bias.name not in ("mjBIAS_NONE", "mjBIAS_AFFINE"):
         source.refuse(f"{words}, whose force is {gain.name[7:].lower()} with {bias.name[7:].lower()} bias,", WAY_OUT)
     if gain.name == "mjGAIN_AFFINE" and np.any(m.actuator_gainprm[actuator, 1:3]):
         source.refuse(f"{words}, whose gain depends on its length or velocity,", WAY_OUT)
     if transmission.name in WORDS:
         source.refuse(f"{words}, which has {WORDS[transmission.name]},", WAY_OUT)
+
+
+def _is_plain_motor(source: Source, actuator: int) -> bool:
+    """Whether a DC motor has a resistance R and a constant K alone, and a voltage V: its force is K (V - K l') / R."""
+    m, inputs = source.model, source.field("actuator_ctrlspec")
+    if inputs is None or inputs[actuator] != mujoco.mjtCtrlInput.mjINPUT_VOLTAGE:
+        return False
+    more = m.actuator_gainprm[actuator, 2:], m.actuator_biasprm[actuator], m.actuator_dynprm[actuator]
+    return not any(map(np.any, more)) and not m.actuator_actnum[actuator]
+
+
+def _gain_and_bias(source: Source, actuator: int) -> tuple[float, Any]:
+    """Return gain and bias of an actuator that was not refused."""
+    m = source.model
+    if mujoco.mjtGain(m.actuator_gaintype[actuator]).name == "mjGAIN_DCMOTOR":
+        resistance, constant = m.actuator_gainprm[actuator, :2].tolist()
+        return constant / resistance, (0.0, 0.0, -constant * constant / resistance)
+    affine = m.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
+    return m.actuator_gainprm[actuator, 0], m.actuator_biasprm[actuator, :3] if affine else (0.0, 0.0, 0.0)
 
 
 def _enums() -> tuple:
