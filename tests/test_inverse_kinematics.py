@@ -50,7 +50,7 @@ def errors(scene, q, targets, frames, weight=ANGLE_WEIGHT):
     return np.array(found)
 
 
-@pytest.fixture(scope="module", params=["float32", "float64"])
+@pytest.fixture(scope="module", params=["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def arm(request, device):
     """UR5 with limits that differ from world to world, its tool, and targets that it can reach."""
     scene = arms.scene("ur5")
