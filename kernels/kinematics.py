@@ -294,30 +294,25 @@ def body_velocities(s) -> wp.Kernel:
 def frame_poses(s) -> wp.Kernel:
     """Write the position and quaternion (xyzw) of every frame in the inertial frame.
 
-    One thread for each (frame, world). A frame is given by its body and its pose in the body frame; ``anchor`` is
-    the pose of the node frame in the body.
+    One thread for each (frame, world). A frame is given by its body and its pose in the body frame. The sign of its
+    quaternion is that of the product.
     """
-    T, vec3 = s.T, s.vec3
+    T, vec3, quat = s.T, s.vec3, wp.types.quaternion(s.T)
 
     @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
     def kernel(
         frame_node: wp.array[int],
         frame_pose: wp.array2d[T],  # [frame, (x, y, z, quaternion)]
-        anchor: wp.array3d[T],
-        world_pose: wp.array3d[T],
+        body_pose: wp.array3d[T],  # [world, body, (x, y, z, quaternion)]
         out: wp.array3d[T],
     ):
         frame, world = wp.tid()
-        node = frame_node[frame]
-        body = s.compose_inverse(s.load_pose(world_pose, node, world), s.load_pose(anchor, node, world))
-        R = s.quaternion_rotation(
-            frame_pose[frame, 3], frame_pose[frame, 4], frame_pose[frame, 5], frame_pose[frame, 6]
-        )
-        within = s.pose(R, vec3(frame_pose[frame, 0], frame_pose[frame, 1], frame_pose[frame, 2]))
-        pose = s.compose(body, within)
-        quaternion = wp.quat_from_matrix(s.rotation_of(pose))
+        b, f = body_pose[world, frame_node[frame]], frame_pose[frame]
+        turn = quat(b[3], b[4], b[5], b[6])
+        position = vec3(b[0], b[1], b[2]) + wp.quat_rotate(turn, vec3(f[0], f[1], f[2]))
+        quaternion = turn * quat(f[3], f[4], f[5], f[6])
         for c in range(3):
-            out[world, frame, c] = pose[9 + c]
+            out[world, frame, c] = position[c]
         for c in range(4):
             out[world, frame, 3 + c] = quaternion[c]
 

@@ -187,6 +187,8 @@ def test_frames_at_node_granularity(name, device):
     for operation in FRAMED[:2]:
         got = called(dyn, operation, on_device(dyn, a)).numpy()
         assert_equals_reference(scene, operation, a, got)
+    everywhere = dyn.frame_poses(a["q"], list(range(scene.body_count)))
+    np.testing.assert_allclose(everywhere, dyn.body_poses(a["q"]), atol=1e-15)  # signs of quaternions, too
 
 
 def test_frames_with_turning_anchors(device):

@@ -84,9 +84,9 @@ def body_states(run: Sweeps, out: wp.array, q: wp.array, qd: wp.array, velocitie
 
 
 def frame_poses(run: Sweeps, out: wp.array, q: wp.array, frames: tuple) -> None:
-    run.hinges(q)
-    inputs = [*run.frames(frames), run.parameters.anchor, run.world_poses()]
-    run.launch_nodes(kinematics.frame_poses, out.shape[1::-1], inputs, [out])
+    of_bodies = run.array("body poses", run.worlds, run.scene.body_count, 7)
+    body_poses(run, of_bodies, q)
+    run.launch_nodes(kinematics.frame_poses, out.shape[1::-1], [*run.frames(frames), of_bodies], [out])
 
 
 def frame_velocities(run: Sweeps, out: wp.array, q: wp.array, qd: wp.array, frames: tuple) -> None:
