@@ -92,6 +92,16 @@ class Agreement:
             worst = max(worst, relative(self.T[world].T @ ours[world], self.data(world, OTHERS).qfrc_passive))
         return worst
 
+    def actuator_error(self, ctrl: np.ndarray) -> float:
+        """Return the largest error of the actuators' forces under ``ctrl`` [world, actuator], relative as above."""
+        ours, worst = self.dyn.actuator_force(self.q, self.qd, ctrl), 0.0
+        for world in range(self.worlds):
+            data = self.data(world)
+            data.ctrl[:] = ctrl[world]
+            mujoco.mj_forward(self.model, data)
+            worst = max(worst, relative(self.T[world].T @ ours[world], data.qfrc_actuator))
+        return worst
+
 
 def full_mass(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Return the mass matrix; the order of the arguments differs between MuJoCo 3 and 4."""

@@ -8,6 +8,7 @@ import pytest
 
 import warp_spo as spo
 from benchmarks.mjcf_files import Agreement
+from benchmarks.robot_files import compare_mjcf, mjcf_files
 from warp_spo.newton import shipped
 
 mujoco = pytest.importorskip("mujoco")
@@ -103,6 +104,14 @@ def test_a_ground_plane_is_said_at_the_line_that_loads(tmp_path):
     with pytest.warns(UserWarning, match=r"robot.xml': left out: contacts of 2 geom\(s\), geom 'floor'") as caught:
         spo.load(written(tmp_path, world=world))
     assert len(caught) == 1 and caught[0].filename == __file__
+
+
+@pytest.mark.parametrize("name", [name for name, _ in mjcf_files() if not name.startswith("mujoco_warp")])
+def test_files_that_ship_with_packages(name):
+    """They move as in MuJoCo, or the error names the file. ``benchmarks.robot_files`` has mujoco_warp's."""
+    row = compare_mjcf(name, dict(mjcf_files())[name])
+    assert row.agrees or row.note.startswith("refused: "), row
+    assert row.agrees == (name.rpartition("/")[2] not in ("constraints.xml", "model.xml", "msh.xml"))
 
 
 # -- files that MuJoCo refuses -----------------------------------------------------------------------------------------

@@ -133,7 +133,7 @@ def _warn(source: Source) -> None:
     m = source.model
     found = list(source.left_out)
     solid = np.flatnonzero(m.geom_contype | m.geom_conaffinity)
-    if solid.size:
+    if solid.size and not source.disabled("CONTACT") and not source.disabled("CONSTRAINT"):
         planes = [source.words("geom", int(geom)) for geom in solid if m.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE]
         among = f", {', '.join(planes)} among them" if planes else ""
         found.append(f"contacts of {solid.size} geom(s){among} (pass contact forces as body_f)")
