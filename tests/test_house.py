@@ -21,6 +21,7 @@ LONGEST, LONG, LONG_FILES = 600, 400, 15  # lines; at most so many files may be 
 ROOMS = (
     "errors",
     "status",
+    "registry",
     "torch",
     "dlpack",
     "memory",

@@ -1,6 +1,7 @@
 """torch goes back through Dynamics: gradients against finite differences."""
 
 import functools
+import warnings
 
 import laws
 import numpy as np
@@ -92,24 +93,49 @@ def test_products_are_those_of_the_dense_derivatives(name):
     assert laws.error(moved, np.linalg.solve(J[2], tau_dot - J[0] @ q_dot - J[1] @ qd_dot)) <= 1e-11
 
 
+def squares(function, *args):
+    results = function(*args)
+    return sum((y * y).sum() for y in (results if isinstance(results, tuple) else (results,)))
+
+
 @pytest.mark.parametrize("operation", ["forward_dynamics", "step", "integrate", "solve_mass_matrix", "jacobian"])
 def test_under_compile(operation, device):
-    """As a custom op in one graph: the same gradients, to the bit."""
-    torch._dynamo.reset()  # it counts the ops that this test has handed it
-    scene = zoo.fork()
-    dyn = spo.Dynamics(scene, WORLDS, device=device, dtype="float64", granularity="tree")
-    op = spo_torch.custom_op(dyn, operation, **options(operation))
-    tensors = on(dyn, laws.states(scene, WORLDS), *OPERATIONS[operation][:3])
-
-    def squares(function, *args):
-        results = function(*args)
-        return sum((y * y).sum() for y in (results if isinstance(results, tuple) else (results,)))
-
-    wanted = torch.autograd.grad(squares(functools.partial(called, dyn, operation), *tensors), tensors)
-    for backend in ("eager", "aot_eager"):
-        compiled = torch.compile(functools.partial(squares, op), backend=backend, fullgraph=True)
-        for got, right in zip(torch.autograd.grad(compiled(*tensors), tensors), wanted, strict=True):
+    """Plain, and as a custom op, in one graph: the same gradients, to the bit. The first call is traced, too."""
+    torch._dynamo.reset()  # it counts the functions that this test has handed it
+    dyn = spo.Dynamics(zoo.fork(), WORLDS, device=device, dtype="float64", granularity="tree")
+    tensors = on(dyn, laws.states(dyn.scene, WORLDS), *OPERATIONS[operation][:3])
+    plain, op = functools.partial(called, dyn, operation), spo_torch.custom_op(dyn, operation, **options(operation))
+    for function, backend in ((plain, "aot_eager"), (plain, "eager"), (op, "aot_eager")):
+        compiled = torch.compile(functools.partial(squares, function), backend=backend, fullgraph=True)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", ".*(warp_spo|lru_cache|Dynamo)")
+            found = torch.autograd.grad(compiled(*tensors), tensors)
+        wanted = torch.autograd.grad(squares(plain, *tensors), tensors)
+        for got, right in zip(found, wanted, strict=True):
             assert torch.equal(got, right)
+
+
+def test_what_a_graph_fills(device):
+    """Arrays that a call writes, and options: numbers that vary, lists, and words."""
+    torch._dynamo.reset()
+    dyn = spo.Dynamics(zoo.fork(), WORLDS, device=device, dtype="float64", granularity="tree")
+    q, qd, tau = on(dyn, laws.states(dyn.scene, WORLDS), "q", "qd", "tau", grad=False)
+
+    def run(dt):
+        status, qdd, out = torch.full((WORLDS,), -1, dtype=torch.int32, device=q.device), qd * 0.0, qd * 0.0
+        dyn.forward_dynamics(q, qd, status=status, out=out)
+        ahead = dyn.step(q, qd, tau, dt=dt, qdd=qdd, status=status, out=(None, out))
+        frames = dyn.frame_poses(q, [(1, (0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0)), 0])
+        return *ahead, *dyn.step(q, qd, None, dt, integrator="midpoint"), status, qdd, out, frames
+
+    compiled = torch.compile(run, backend="aot_eager", fullgraph=True)
+    for dt in (0.01, 0.02, 0.03):
+        for got, wanted in zip(compiled(dt), run(dt), strict=True):
+            assert torch.equal(got, wanted)
+    with pytest.raises(Exception, match=r"Dynamics.mass_matrix_inverse: q requires grad; derivatives are not"):
+        torch.compile(dyn.mass_matrix_inverse, backend="aot_eager")(q.clone().requires_grad_())
+    with pytest.raises(Exception, match=r"q is a torch array float64 \(1, 12\)"):
+        torch.compile(dyn.mass_matrix, backend="eager")(q[:1])
 
 
 BUGS = {

@@ -51,3 +51,16 @@ def check_plain(call: str, name: str, value: Any) -> None:
 def call_with_gradient(*call: Any) -> Any:
     """Return the result of :func:`warp_spo.torch.call_with_gradient`."""
     return torch_border().call_with_gradient(*call)
+
+
+def is_compiling() -> bool:
+    """Whether torch traces the call, for ``torch.compile`` or for an export."""
+    torch = sys.modules.get("torch")
+    return torch is not None and torch.compiler.is_compiling()
+
+
+def call_in_graph(*call: Any) -> Any:
+    """Return the result of :func:`warp_spo.torch.call_in_graph`. What torch traces must not meet a cached function."""
+    from .torch import call_in_graph
+
+    return call_in_graph(*call)

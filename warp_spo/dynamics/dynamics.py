@@ -23,6 +23,7 @@ from ..execution.parameters import RIGID_VALUES, VARIABLE
 from ..execution.programs import Programs
 from ..execution.sweeps import Sweeps
 from ..gradients import TensorValues
+from ..registry import register
 from ..scene.scene import Scene
 from . import (
     actuators,
@@ -221,7 +222,7 @@ class Dynamics:
         self.granularity = self.plan.granularity
         self.recursions = Sweeps(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)
-        self.values = TensorValues()
+        self.values, self._handle = TensorValues(), register(self)
         self._replays = Replays(self.device, self.recursions.turn)
         self._engine, self._gradients = Engine(self), Gradients(self)
         self._closures = Closures(self, loops, independent)

@@ -90,8 +90,8 @@ class Gradients:
             wrt: names of arguments and of values.
         """
         replays, arguments = self.dyn._replays, (given, options, results, cotangents, wrt)
-        found, *kind = replays.replay(f"{operation.name}, backwards", arguments, {})
-        return found if found is not MISS else replays.run(*kind, lambda: self._pull_back(operation, *arguments))
+        found, key, arrays = replays.replay(f"{operation.name}, backwards", arguments, {})
+        return found if found is not MISS else replays.run(key, arrays, lambda: self._pull_back(operation, *arguments))
 
     def _pull_back(
         self, operation: Operation, given: dict, options: dict, results: Any, cotangents: Any, wrt: Any

@@ -39,7 +39,7 @@ import warp as wp
 from ..arrays import Call
 from ..dlpack import settle
 from ..execution.routine import Routine
-from ..gradients import call_with_gradient, records_gradient
+from ..gradients import call_in_graph, call_with_gradient, is_compiling, records_gradient
 from ..recursions.links import LINK_VALUES, MOTION_VALUES, Links
 from ..scene.frames import check_frames, origins
 from ..scene.scene import Scene
@@ -284,8 +284,16 @@ class Operation:
         signature, name = inspect.signature(function), self.name
         names = dict(list(signature.parameters.items())[1:])
 
+        written = tuple(one.name for one in self.arrays if one.written)
+        keeps = () if self.derivative is None else self.derivative.keeps
+        graphed = name, tuple(names), len(self.results), keeps, written
+        returns = str(function.__annotations__.get("return", ""))
+        in_graph = returns.startswith(("ArrayT", "tuple[ArrayT"))  # others make objects, which a graph does not know
+
         @functools.wraps(function)
         def call(dyn: Any, *args: Any, **more: Any) -> Any:
+            if is_compiling() and in_graph:
+                return call_in_graph(dyn._handle, *graphed, args, more)
             recorded = not dyn.values.tensors or not records_gradient((), dyn.values)
             result, *kind = dyn._replays.replay(name, args, more) if recorded else (MISS, None, [])
             if result is not MISS:

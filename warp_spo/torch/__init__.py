@@ -5,7 +5,7 @@ Only this package, and the environments, import torch. The rest of ``warp_spo`` 
 """
 
 from .autograd import call_with_gradient
-from .compiled import custom_op
+from .compiled import call_in_graph, custom_op
 from .module import Module
 from .tensors import (
     CLASSES,
@@ -28,6 +28,7 @@ __all__ = [
     "CLASSES",
     "Module",
     "addresses",
+    "call_in_graph",
     "call_with_gradient",
     "custom_op",
     "device_name",
