@@ -283,7 +283,6 @@ class Operation:
         self._methods.append(function)
         signature, name = inspect.signature(function), self.name
         names = dict(list(signature.parameters.items())[1:])
-
         written = tuple(one.name for one in self.arrays if one.written)
         keeps = () if self.derivative is None else self.derivative.keeps
         graphed = name, tuple(names), len(self.results), keeps, written

@@ -146,8 +146,8 @@ def _save(ctx: Any, inputs: tuple, output: list[torch.Tensor]) -> None:
     for name, value in ONLY.items():
         if options.get(name, value) != value:
             raise ValueError(
-                f"Dynamics.{operation.name} in a graph of torch: {name} is {options[name]!r} and an input requires grad; "
-                f"expected {value!r}, which has gradients here; call inside torch.no_grad(), or outside of the graph"
+                f"Dynamics.{operation.name} in a graph of torch: {name} is {options[name]!r} and an input requires "
+                f"grad; expected {value!r}, which has gradients; call it outside of the graph"
             )
     dyn._gradients.check(operation)
     ctx.results = len(operation.results)
@@ -194,7 +194,8 @@ def call_in_graph(
     out = given.pop("out", None)
     filled = {name: given.pop(name, None) for name in written}
     filled = {name: array for name, array in filled.items() if array is not None}
-    tensors, names, options, number, number_of = [], [], [], 0.0, ""
+    tensors, names, number, number_of = [], [], 0.0, ""
+    options: list[tuple[str, Any]] = []
     for name, value in given.items():
         if isinstance(value, torch.Tensor):
             tensors.append(value)
