@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+import wrapped
 import zoo
 from border import explained
 
@@ -209,6 +210,16 @@ def test_substeps():
     gradients = (jax.jit(jax.grad(lambda *x, f=f: (f(*x)[1] ** 2).sum(), (0, 1, 2))) for f in (thrice, chain))
     for one, other in zip(*(gradient(q, qd, tau) for gradient in gradients), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_a_step_over_arrays_of_another_library():
+    dyn = robot()
+    q, qd, tau = arrays(dyn, "q", "qd", "tau", make=np.array)
+    expected = dyn.step(q, qd, tau, 2e-3)
+    state = wrapped.Array(q), wrapped.Array(qd)
+    for one, other, wanted in zip(dyn.step(*state, tau, 2e-3, out=state), state, expected, strict=True):
+        assert one is other
+        np.testing.assert_array_equal(one.inside, wanted)
 
 
 def test_only_the_gradients_that_are_asked_for_are_computed(monkeypatch):

@@ -314,7 +314,7 @@ class Call:
         """Make the library's stream Warp's until the block ends; or else wait for the kernels when the block ends."""
         if kind.has_stream and self._saved_stream is None:
             self._enter_stream(dlpack.stream(self.device))
-        elif not kind.has_stream or self.device.stream != dlpack.stream(self.device):
+        elif not kind.has_stream or self.device.stream.cuda_stream != dlpack.stream(self.device).cuda_stream:
             self._waits = True
             if self.device.is_capturing:
                 raise ValueError(
