@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 import warp as wp
 
+from warp_spo import Dynamics
 from warp_spo import __main__ as job
-from warp_spo.trials import report, trial
+from warp_spo.trials import memory, report, trial
 from warp_spo.trials.operations import OPERATIONS, TOLERANCE
 
 # Two bars on the ground whose tips are pinned together: a loop.
@@ -89,8 +90,78 @@ def test_loops_are_cut_and_named(tmp_path, capsys, monkeypatch, device):
 
 
 @pytest.mark.parametrize(
+    ("loops", "says"),
+    [
+        ("embed", "closed by embed: 1 loop joint(s): pin"),
+        ("multipliers", "closed by multipliers: 1 loop joint(s): pin"),
+    ],
+)
+def test_loops_are_closed(tmp_path, capsys, monkeypatch, device, loops, says):
+    chosen = ("forward_dynamics", "body_poses", "mass_matrix", "psi")
+    monkeypatch.setattr(job, "OPERATIONS", {name: OPERATIONS[name] for name in chosen})
+    (tmp_path / "loop.xml").write_text(LOOP)
+    arguments = [str(tmp_path / "loop.xml"), "--worlds", "2", "--device", str(device), "--dtype", "float64"]
+    assert job.main([*arguments, "--loops", loops]) == 0
+    out = capsys.readouterr().out
+    left = {"embed": "forward_dynamics, mass_matrix, psi", "multipliers": "forward_dynamics, psi"}[loops]
+    assert says in out and f"not compared: {left}\n" in out and re.search(r"^body_poses ", out, re.M)
+    assert job.main([*arguments, "--loops", "raise"]) == 2
+    err = capsys.readouterr().err
+    assert "loop.xml' has 1 loop joint(s): pin, which --loops raise refuses; pass --loops cut, embed" in err
+
+
+def test_worlds_that_do_not_fit_are_refused_before_they_are_allocated(capsys, monkeypatch, device):
+    """The largest number of worlds that the message names is taken."""
+    monkeypatch.setattr(job, "OPERATIONS", {"gravity_force": OPERATIONS["gravity_force"]})
+    assert job.main(["cartpole", "--worlds", "2000000000", "--device", str(device)]) == 2
+    assert "--worlds is 2000000000: this needs about" in capsys.readouterr().err
+    monkeypatch.setattr(memory, "free_host_memory", lambda: 100_000)
+    assert job.main(["cartpole", "--worlds", "1000", "--device", str(device)]) == 2
+    most = re.search(r"pass --worlds (\d+) or fewer", capsys.readouterr().err)[1]
+    assert 5 < int(most) < 100
+    assert job.main(["cartpole", "--worlds", most, "--device", str(device)]) == 0
+
+
+def test_the_estimate_of_memory_is_about_what_warp_allocates(capsys):
+    """The estimate is for the whole job; it may be above the peak, and hardly below."""
+    worlds, reports = 1000, []
+    scene = job.load("cartpole")
+    with wp.ScopedMemoryTracker("job", report_func=reports.append) as tracker:
+        tracker.clear()  # totals are Warp's own, not this tracker's
+        dyn = Dynamics(scene, worlds, "cpu", "float32")
+        list(job.run([dyn]))
+    number, unit = re.search(r"Peak usage:\s+cpu\s+([\d.]+) (\w+)", reports[-1]).groups()
+    peak = float(number) * {"KB": 2**10, "MB": 2**20}[unit]
+    _, on_device = memory.bytes_per_world(scene, ("float32",), 1)
+    assert 0.95 <= on_device * worlds / peak <= 1.3  # 1.2 here
+    capsys.readouterr()
+
+
+BAD_FILES = {
+    "broken.urdf": ('<robot name="x"><link name="a"></robot>', "is not XML: mismatched tag: line 1"),
+    "broken.xml": ("<mujoco><worldbody><body></worldbody></mujoco>", "is not XML: mismatched tag: line 1"),
+    "page.xml": ("<html/>", "holds <html>; expected <mujoco>"),
+    "empty.xml": ("<mujoco><worldbody/></mujoco>", "has no bodies"),
+    "empty.usda": ("#usda 1.0", "has no bodies"),
+    "text.usda": ("hello", "is not a valid usda layer"),
+    "part.stl": ("solid", "ends in '.stl'; expected one of .urdf, .xml"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_a_bad_file_is_one_line_about_the_file(tmp_path, capfd, name):
+    text, expected = BAD_FILES[name]
+    (tmp_path / name).write_text(text)
+    assert job.main([str(tmp_path / name), "--worlds", "2"]) == 2
+    line = capfd.readouterr().err.splitlines()[-1]
+    assert line.startswith("python -m warp_spo: ") and f"{name}'" in line and expected in line
+    assert not any(word in line for word in ("load:", "from_newton", "Traceback", "pxrInternal"))
+
+
+@pytest.mark.parametrize(
     ("arguments", "expected"),
     [
+        ([os.path.dirname(__file__)], "is a folder; expected a URDF, MJCF or USD file"),
         (["no_such_robot"], "expected one of humanoid, ant, quadruped, cartpole"),
         (["no/such/file.urdf"], "no file 'no/such/file.urdf'"),
         ([__file__], "ends in '.py'"),

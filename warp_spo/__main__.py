@@ -2,13 +2,16 @@
 
 ROBOT is a URDF, MJCF or USD file, or a robot that comes with Newton: humanoid (the default), ant, quadruped, cartpole.
 The results of some worlds are compared with the dense float64 reference. The exit code is 0 if every error is within
-its tolerance, 1 if an error is not, and 2 if the command line is wrong.
+its tolerance, 1 if an error is not, and 2 if the command line is wrong or the file cannot be read.
+
+With --loops embed or multipliers, operations are compared that the dense reference of the open tree describes.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 import warnings
 from collections.abc import Iterator
@@ -17,16 +20,21 @@ from typing import Any, NoReturn
 
 import warp as wp
 
-from .dynamics.dynamics import Dynamics
+from .dynamics.closures import LOOPS
+from .dynamics.dynamics import MOST_WORLDS, Dynamics
+from .dynamics.dynamics import OPERATIONS as DECLARED
+from .dynamics.operation import AS_WRITTEN
 from .scene.scene import Scene
 from .trials import drawing, report
-from .trials.operations import OPERATIONS, TOLERANCE, Inputs
+from .trials.memory import check_memory
+from .trials.operations import OPERATIONS, TOLERANCE, Inputs, Operation
 from .trials.trial import SAMPLE, Subject, Trial
 
 WORLDS = {False: 1024, True: 4096}  # on a CPU, on a GPU
 WARM_UP, BUDGET = 0.05, 0.3  # [s] for each operation, so that all together take less than a minute
 SETS = {False: 1, True: 4}  # sets of inputs on a CPU, on a GPU; one graph evaluates them in turn
 REPORT = "report.html"
+CLOSED = ("forward_dynamics", "step")  # by either way they obey the loops, which the open tree does not
 
 
 class Parser(argparse.ArgumentParser):
@@ -46,6 +54,13 @@ def parser() -> Parser:
     p.add_argument("--worlds", type=int, metavar="N", help="number of worlds; default: 1024 on a CPU, 4096 on a GPU")
     p.add_argument("--device", metavar="D", help="Warp device, such as cpu or cuda:0; default: the current one")
     p.add_argument("--dtype", choices=("float32", "float64", "both"), default="both", help="default: both")
+    p.add_argument(
+        "--loops",
+        choices=LOOPS,
+        default="cut",
+        help="what to do with loop joints and couplings: refuse them, leave them open, close them by embedding or by "
+        "multipliers; default: cut",
+    )
     p.add_argument("--report", type=Path, metavar="DIR", help=f"folder for {REPORT}, with the table and a picture")
     return p
 
@@ -66,7 +81,12 @@ def main(argv: list[str] | None = None) -> int:
         device = find_device(options.device)
         worlds = options.worlds if options.worlds is not None else WORLDS[device.is_cuda]
         dtypes = ("float32", "float64") if options.dtype == "both" else (options.dtype,)
-        dyns = [Dynamics(scene, worlds, device, dtype, loops="cut") for dtype in dtypes]
+        if scene.ties and options.loops == "raise":
+            ways = "--loops cut, embed or multipliers"
+            raise ValueError(f"{options.robot!r} has {scene.ties}, which --loops raise refuses; pass {ways}")
+        if 0 < worlds <= MOST_WORLDS:
+            check_memory(scene, worlds, dtypes, SETS[device.is_cuda], device)
+        dyns = [Dynamics(scene, worlds, device, dtype, loops=options.loops) for dtype in dtypes]
     except (ValueError, TypeError, RuntimeError, OSError, ImportError) as error:
         return refuse(str(error))
 
@@ -74,7 +94,9 @@ def main(argv: list[str] | None = None) -> int:
     title += f"{device.alias} ({device.name})" if device.is_cuda else device.alias
     print(title)
     if scene.ties:
-        print(f"left open: {scene.ties}")
+        print(f"closed by {options.loops}: {scene.ties}" if dyns[0].closed else f"left open: {scene.ties}")
+    if dyns[0].closed:
+        print(f"not compared: {', '.join(sorted(set(OPERATIONS) - set(comparable(dyns[0]))))}")
     try:
         rows = list(run(dyns))
     except (MemoryError, RuntimeError) as error:
@@ -126,21 +148,40 @@ def load(robot: str) -> Scene:
     """Return the scene of a file, or of a robot that comes with Newton. Warnings become lines on stderr.
 
     Raises:
-        ValueError, OSError, ImportError: As :func:`warp_spo.newton.load`.
+        ValueError, OSError, ImportError: The message names the file, and says what is wrong with it.
     """
-    if os.sep in robot or Path(robot).suffix:
-        path = Path(robot)
-        if not path.is_file():  # checked here, because importing newton takes seconds
-            raise FileNotFoundError(f"no file {robot!r} (from {os.getcwd()!r}); expected a URDF, MJCF or USD file")
+    path = Path(robot)
+    is_file = os.sep in robot or bool(path.suffix) or path.exists()
+    if is_file and not path.is_file():  # checked here, because importing newton takes seconds
+        what = f"{robot!r} is a folder" if path.is_dir() else f"no file {robot!r} (from {os.getcwd()!r})"
+        raise FileNotFoundError(f"{what}; expected a URDF, MJCF or USD file")
     from . import newton
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        scene = newton.load(robot if os.sep in robot or Path(robot).suffix else newton.shipped(robot))
+        if not is_file and robot not in newton.SHIPPED:
+            raise ValueError(f"unknown robot {robot!r}; expected one of {', '.join(newton.SHIPPED)}, or a file")
+        try:
+            scene = newton.load(robot if is_file else newton.shipped(robot))
+        except Exception as error:  # importers of other packages raise whatever they meet
+            raise ValueError(describe(error, robot)) from error
     for warning in caught:
         if issubclass(warning.category, UserWarning):
             print(f"note: {warning.message}", file=sys.stderr)
     return scene
+
+
+def describe(error: Exception, file: str) -> str:
+    """Return what is wrong with a file, as a sentence that names the file and no function of Python."""
+    ours = isinstance(error, ValueError | OSError | ImportError)
+    lines = str(error).strip().splitlines() or ["no reason was given"]
+    text = " ".join(lines).strip() if ours else lines[0].strip()
+    text = re.sub(r"^Error in '.*? : '(.*)'$", r"\1", text)  # OpenUSD names its own source file first
+    text = re.sub(r"^(load|from_newton|from_mujoco|Scene|Tree)\b[^:]*: ", "", text)
+    name = repr(str(Path(file)))
+    if name in text:
+        return text
+    return f"{name} cannot be read{'' if ours else f' ({type(error).__name__})'}: {text}"
 
 
 def run(dyns: list[Dynamics]) -> Iterator[dict[str, Any]]:
@@ -155,8 +196,9 @@ def run(dyns: list[Dynamics]) -> Iterator[dict[str, Any]]:
     scene, worlds, cuda = dyns[0].scene, dyns[0].worlds, dyns[0].device.is_cuda
     inputs = [Inputs(scene, worlds, seed) for seed in range(SETS[cuda])]
     subjects = [Subject(dyn, inputs) for dyn in dyns]
-    with report.Progress(len(OPERATIONS) * len(dyns)) as progress:
-        for operation in OPERATIONS.values():
+    operations = comparable(dyns[0])
+    with report.Progress(len(operations) * len(dyns)) as progress:
+        for operation in operations.values():
             for subject in subjects:
                 dtype = subject.dyn.dtype.__name__
                 progress.step(f"{operation.name} {dtype}")
@@ -164,6 +206,17 @@ def run(dyns: list[Dynamics]) -> Iterator[dict[str, Any]]:
                 granularity = operation.granularity(subject.dyn)
                 row = dict(op=operation.name, granularity=granularity, dtype=dtype, worlds=worlds)
                 yield row | dict(error=error, seconds=timing.median)
+
+
+def comparable(dyn: Dynamics) -> dict[str, Operation]:
+    """Return the operations whose results the dense reference of the open tree describes."""
+    if not dyn.closed:
+        return OPERATIONS
+    forms: dict[str, Any] = {
+        name: one.embed if dyn.embedding is not None else one.multipliers for name, one in DECLARED.items()
+    }
+    forms |= dict.fromkeys(CLOSED)
+    return {name: operation for name, operation in OPERATIONS.items() if forms.get(name) is AS_WRITTEN}
 
 
 def _make_folder(path: Path) -> None:
