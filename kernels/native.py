@@ -5,7 +5,8 @@ import linecache
 
 import warp as wp
 
-MASKS = ("prescribed",)  # names of the arrays that hold booleans
+MASKS = ("prescribed",)  # names of the arrays [world, dof] that hold booleans
+CHOICES = ("chosen",)  # names of the arrays [world] that hold booleans
 INTEGERS = ("place", "shifts", "status")  # names of the arrays that hold integers; each has one axis
 
 
@@ -42,13 +43,14 @@ def kernel(
         name: the beginning of the kernel's name; a hash of ``native`` follows.
         native: the body.
         arrays: the name and the number of axes of each argument after ``worlds``; an argument without axes is a number.
-            The arrays of INTEGERS hold integers, those of MASKS booleans, the others scalars of type ``T``.
+            The arrays of INTEGERS hold integers, those of MASKS and CHOICES booleans, the others scalars of type ``T``.
         registers: the largest number of registers that a thread may use; None sets no limit.
         wide: the names of the arrays [entry, world] that hold float64 whatever ``T`` is.
     """
     key = f"{name}_{hashlib.sha256(native.encode()).hexdigest()[:16]}"
     types = {array: "table" if array in INTEGERS else f"array{axes}" for array, axes in arrays}
-    types |= {array: "mask" for array in types if array in MASKS} | {array: "wide" for array in wide}
+    types |= {array: "mask" for array in types if array in MASKS}
+    types |= {array: "choice" for array in types if array in CHOICES} | {array: "wide" for array in wide}
     declared = ", ".join(f"{array}: {kind}" for array, kind in types.items())
     source = f"""def native(thread: int, worlds: int, {declared}): ...
 
@@ -63,6 +65,7 @@ def {key}(worlds: int, {declared}):
         "array0": T,
         "table": wp.array(dtype=int, ndim=1),
         "mask": wp.array(dtype=wp.bool, ndim=2),
+        "choice": wp.array(dtype=wp.bool, ndim=1),
         "wide": wp.array(dtype=wp.float64, ndim=2),
         "wp": wp,
         "__name__": key,

@@ -80,17 +80,4 @@ def transpose(s) -> wp.Kernel:
     return kernel
 
 
-@functools.cache
-def widen(s) -> wp.Kernel:
-    """Set ``out = float64(value)``, for values that a user sets in the scalar type of a Dynamics."""
-    T = s.T
-
-    @wp.kernel(module=f"warp_spo_parameters_{T.__name__}", enable_backward=False)
-    def kernel(value: wp.array2d[T], value_out: wp.array2d[wp.float64]):
-        world, i = wp.tid()
-        value_out[world, i] = wp.float64(value[world, i])
-
-    return kernel
-
-
-KERNELS = (derive, transpose, widen)
+KERNELS = (derive, transpose)

@@ -75,7 +75,9 @@ class Dynamics:
         worlds: number of worlds; default: the scene's. A scene of one world serves any number.
         device: Warp device; default: the current one.
         dtype: "float32" or "float64".
-        variable: names of values that :meth:`set` changes without rebuilding, one row a world.
+        variable: names of values that :meth:`set` changes without rebuilding, one row a world: all of ``Scene.values``.
+            Every dof then has the laws whose values are variable; entries for limits of ball and free hinges are not
+            read. Velocity limits damp by the inertia that hinges feel at the scene's values, see :meth:`step`.
         granularity: None (the plan chooses), "node", "segment" or "tree", see :class:`warp_spo.execution.plan.Plan`.
         loops: how loop joints and couplings of the scene are treated. "raise": refuse them. "cut": leave them open.
             "embed": close them exactly; links that they tie form one node of the tree. Mass matrices, Jacobians,
@@ -190,6 +192,7 @@ class Dynamics:
     # -- operators of the scene, values, preparation ---------------------------------------------------------------
     operators = spatial_operators.operators
     set = scene_values.set_values
+    reset = scene_values.reset
     prepare = preparation.prepare
     __reduce__ = storage.reduce
 

@@ -139,10 +139,9 @@ class Gradients:
                 shape = dyn.scene.values[name].shape[1:]
                 arrays[name] = call.read(name, value, (dyn.worlds, *shape) if value.ndim > len(shape) else shape)
             call.order()
-            for name, array in arrays.items():  # on the stream that read has entered
+            for name in arrays:  # on the stream that read has entered
                 before[name] = wp.clone(parameters.value(name))
-                parameters.copy_in(name, array)
-            parameters.refresh(values)
+            parameters.set(arrays)
             try:
                 yield
             finally:

@@ -128,8 +128,9 @@ def rk4(
 ) -> None:
     """Launch the classical Runge-Kutta rule in the coordinates; quaternions are normalised at the end."""
     q, qd, q_out, qd_out, dt = interval
-    values = dyn.scene.values
-    if values["joint_friction"].any() or (abs(values["joint_velocity_limit"]) < DEFAULT_BOUND).any():
+    values, variable = dyn.scene.values, dyn.variable
+    rubs = "joint_friction" in variable or values["joint_friction"].any()
+    if rubs or "joint_velocity_limit" in variable or (abs(values["joint_velocity_limit"]) < DEFAULT_BOUND).any():
         raise UnsupportedError(call.name, "integrator='rk4' with friction or velocity limits", "use 'midpoint'")
     launch = dyn._engine.launch_routine
     q_at, qd_at, q_sum, qd_sum = (_scratch(dyn, f"rk4 {i}", a) for i, a in enumerate((q, qd, q, qd)))

@@ -183,7 +183,9 @@ Closed = Routine | AsWritten | Refused
 
 # -- derivatives -------------------------------------------------------------------------------------------------------
 ANCHORS = ("joint_X_p", "joint_X_c")
-GAINS = ("joint_damping", "joint_stiffness", "joint_friction", "joint_target_ke", "joint_target_kd")
+GAINS = ("joint_damping", "joint_stiffness", "joint_friction", "joint_target_ke", "joint_target_kd", "joint_rest_q",
+         "joint_limit_lower", "joint_limit_upper", "joint_limit_ke", "joint_limit_kd", "joint_effort_limit",
+         "joint_velocity_limit")  # fmt: skip
 KINEMATIC = (*ANCHORS, "body_com")  # values that enter poses, velocities and Jacobians
 ACTUATION = ("actuator_gain", "actuator_bias", "actuator_gear", "actuator_strength")
 DIFFERENTIABLE = (*LINK_VALUES, *GAINS, *ACTUATION)

@@ -1,4 +1,4 @@
-"""Values of the scene that callers change: variable ones by launches, folded ones by building anew."""
+"""What callers change between calls: values of the scene, and states of some worlds."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
-from ..arrays import Call, shape_of
+from ..arrays import AnyArray, ArrayT, Call, shape_of
 from ..dlpack import settle
 from ..execution.parameters import VARIABLE
+from ..execution.rows import as_rows, copy_rows
 from ..gradients import records_gradient
 from ..scene.parts import real
 from .refinement import Refinement
@@ -18,19 +20,26 @@ if TYPE_CHECKING:
     from .dynamics import Dynamics
 
 
-def set_values(self: Dynamics, **values: Any) -> None:
+def set_values(self: Dynamics, *, worlds: AnyArray | None = None, **values: Any) -> None:
     """Change values of the scene, in Newton's names and layouts, [world, ...] or [...] for all worlds.
 
-    A name in ``variable`` is copied by launches, which a graph may capture; its numbers are not inspected. Any other
-    name rebuilds the kernels' data that was derived from it, with a warning, and is checked as a scene's values are.
+    Names in ``variable`` are copied by launches, one for all names and one or two for what kernels derive from them,
+    which a graph may capture; their numbers are not inspected. Any other name rebuilds the kernels' data that was
+    derived from it, with a warning, and is checked as a scene's values are.
+
+    Args:
+        worlds: bool [world]; only worlds where it is True change. None: all change.
+        values: arrays by name.
 
     Raises:
-        ValueError: unknown name, wrong shape, dtype or device; a name that is not variable inside a graph capture.
+        ValueError: unknown name, wrong shape, dtype or device; a name that is not variable inside a graph capture or
+            with ``worlds``; a tensor that requires grad, now or in an earlier call, with ``worlds``.
     """
     folded: dict[str, Any] = {}
-    settle(values.values())
+    settle((worlds, *values.values()))
     with Call("Dynamics.set", self.device, self.dtype, turn=self.recursions.turn) as call:
         variable: dict[str, Any] = {}
+        chosen = None if worlds is None else read_mask(call, "worlds", worlds, self.worlds)
         for name, value in values.items():
             if name not in VARIABLE:
                 raise ValueError(f"Dynamics.set: unknown value {name!r}; expected one of {', '.join(VARIABLE)}")
@@ -49,6 +58,8 @@ def set_values(self: Dynamics, **values: Any) -> None:
                 variable[name] = array
             else:
                 folded[name] = value if isinstance(value, np.ndarray) else array
+        if chosen is not None:
+            _refuse_with_mask(self, values, folded)
         if folded and self.device.is_capturing:
             raise ValueError(
                 f"Dynamics.set: {', '.join(folded)} inside a graph capture; expected variable values only; build "
@@ -58,14 +69,70 @@ def set_values(self: Dynamics, **values: Any) -> None:
         checked = {name: self.scene.check_value("Dynamics.set", name, value) for name, value in host.items()}
         parameters = self.recursions.parameters
         call.order()
-        for name, array in variable.items():
-            parameters.copy_in(name, array)
+        parameters.set(variable, chosen)
+        for name in variable:
             self.values.set(name, values[name])
-        parameters.refresh(variable)
         if folded:
             for name in folded:
                 self.values.set(name, None)
             _rebuild(self, checked)
+
+
+def reset(
+    self: Dynamics, mask: AnyArray, q: ArrayT, qd: AnyArray, q_from: AnyArray, qd_from: AnyArray
+) -> tuple[ArrayT, AnyArray]:
+    """Write q_from, qd_from into q, qd in the worlds where ``mask`` is True; by one launch, which a graph may capture.
+
+    Args:
+        mask: bool [world].
+        q, qd: the state [world, coordinate], [world, dof]; changed in place.
+        q_from, qd_from: the state that these worlds get, [world, ...] each, or [...] for all of them.
+
+    Returns:
+        q, qd.
+
+    Raises:
+        TypeError, ValueError: as every call; q, qd must not overlap the other arrays.
+    """
+    settle((mask, q, qd, q_from, qd_from))
+    with Call("Dynamics.reset", self.device, self.dtype, turn=self.recursions.turn) as call:
+        chosen = read_mask(call, "mask", mask, self.worlds)
+        sizes = (self.scene.coord_count, "coordinate"), (self.scene.dof_count, "dof")
+        targets = [
+            call.update(name, array, (self.worlds, size), f"[world, {axis}]", optional=False)
+            for name, array, (size, axis) in zip(("q", "qd"), (q, qd), sizes, strict=True)
+        ]
+        sources = []
+        for name, array, (size, axis) in zip(("q_from", "qd_from"), (q_from, qd_from), sizes, strict=True):
+            shape = (size,) if len(getattr(array, "shape", ())) == 1 else (self.worlds, size)
+            sources.append(call.read(name, array, shape, f"[world, {axis}] or [{axis}]"))
+        call.order()
+        pairs = [(as_rows(a, b.shape[1:]), b) for a, b in zip(sources, targets, strict=True) if b.size]
+        if pairs:
+            copy_rows([a for a, _ in pairs], [b for _, b in pairs], self.worlds, chosen)
+    return q, qd
+
+
+def read_mask(call: Call, name: str, mask: Any, worlds: int) -> wp.array:
+    """Return a mask of worlds, an array or a list of bools, as a Warp array [world]."""
+    if not hasattr(mask, "shape"):
+        mask = np.asarray(mask)
+    return call.read(name, mask, (worlds,), "[world]", dtype=wp.bool)
+
+
+def _refuse_with_mask(dyn: Dynamics, values: dict[str, Any], folded: dict[str, Any]) -> None:
+    """Raise ValueError where values cannot change in some worlds alone."""
+    if folded:
+        raise ValueError(
+            f"Dynamics.set: worlds= with {', '.join(folded)}, which is folded into the kernels; expected variable "
+            f"values only; build Dynamics with variable=({', '.join(map(repr, folded))},)"
+        )
+    for name, value in values.items():
+        if name in dyn.values.tensors or records_gradient((value,)):
+            raise ValueError(
+                f"Dynamics.set: worlds= with {name}, whose tensor requires grad; expected tensors without grad; set it "
+                f"for all worlds, to torch.where of the mask, the new and the old tensor"
+            )
 
 
 def _rebuild(dyn: Dynamics, folded: dict[str, np.ndarray]) -> None:

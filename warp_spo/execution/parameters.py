@@ -7,7 +7,7 @@ had its own. A ``variable`` value has one row a world, and launches alone refres
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -20,6 +20,7 @@ from ..memory import broadcast_worlds
 from ..scene.actuators import ACTUATOR_VALUES
 from ..scene.scene import Scene
 from .node_functions import node_functions
+from .rows import as_rows, copy_rows
 
 VARIABLE = (
     "body_mass",
@@ -32,6 +33,13 @@ VARIABLE = (
     "joint_friction",
     "joint_target_ke",
     "joint_target_kd",
+    "joint_limit_lower",
+    "joint_limit_upper",
+    "joint_limit_ke",
+    "joint_limit_kd",
+    "joint_effort_limit",
+    "joint_velocity_limit",
+    "joint_rest_q",
     "joint_X_p",
     "joint_X_c",
     "gravity",
@@ -172,21 +180,18 @@ class Parameters:
         """Return Newton's value of this name [1 or worlds, ...], float64, without a copy."""
         return self._values[name]
 
-    def copy_in(self, name: str, value: wp.array) -> None:
-        """Set a variable value from an array [world, ...] or [...], by launches alone."""
-        own = self._values[name]
-        size = math.prod(own.shape[1:])
-        if value.ndim == own.ndim:
-            flat = value.reshape((self.worlds, size))
-        else:
-            flat = broadcast_worlds(value.reshape((1, size)), 0, self.worlds)
-        launches.launch(
-            kernels.widen(node_functions(self.dtype)),
-            dim=(self.worlds, size),
-            inputs=[flat],
-            outputs=[own.reshape((self.worlds, size))],
-            device=self.device,
-        )
+    def set(self, values: Mapping[str, wp.array], chosen: wp.array | None = None) -> None:
+        """Set variable values from arrays [world, ...] or [...] in one launch, and what depends on them.
+
+        Args:
+            values: by name, of the type of this object. chosen: the worlds whose values change [world]; None is all.
+        """
+        own = {name: self._values[name] for name, array in values.items() if array.size}
+        sources = [as_rows(values[name], array.shape[1:]) for name, array in own.items()]
+        targets = [as_rows(array, array.shape[1:]) for array in own.values()]
+        if sources:
+            copy_rows(sources, targets, self.worlds, chosen)
+            self.refresh(values)
 
     def adopt_variable(self, other: Parameters) -> None:
         """Copy the variable values of ``other``."""
@@ -202,11 +207,22 @@ class Parameters:
         other._sharers.append(self)
 
     def refresh(self, names: Iterable[str]) -> None:
-        """Compute again the arrays that depend on the named values."""
+        """Compute again the arrays that depend on the named values, the transposed ones in one launch.
+
+        That is not left to the next request: calls that were recorded, and graphs, read the arrays without one.
+        """
         for sharer in self._sharers:
             sharer.refresh(names)
         self._captured |= bool(self.device.is_capturing)
         self._version += 1
-        for known in self._derived.values():
-            if any(name in known.sources for name in names):
+        changed, fields = set(names), []
+        for key, known in self._derived.items():
+            if changed.isdisjoint(known.sources):
+                continue
+            if key in self._values:
+                fields.append(key)
+            else:
                 known.fill()
+        if fields:
+            own = [self._derived[name].arrays[0] for name in fields]
+            copy_rows([self._values[name] for name in fields], own, self.worlds, transposed=True)

@@ -30,6 +30,7 @@ from .tracing import Trace
 CREEP = 1e-4  # rate [rad/s, m/s] below which dry friction is a damper; it saturates at this rate
 DEFAULT_BOUND = 1e6  # effort and velocity limits of this size and more are no limits; Newton's default
 HOLD = 300.0  # resistance of a velocity limit, in inertias / h; the excess over the limit shrinks by this factor
+FREE = 1e20  # bound that no force or rate reaches, in place of a variable one of DEFAULT_BOUND and more
 NOISE = 4.0  # roundings of a law's terms; two pieces may differ by so much where they meet
 
 
@@ -180,8 +181,8 @@ class Impedance:
         return float(column[0])
 
     def _bound(self, name: str, dof: int, none: float) -> Value | None:
-        """Return a bound; None if it is ``none`` or larger in all worlds."""
-        if (np.abs(self.scene.values[name][:, dof]) >= none).all():
+        """Return a bound; None if it is ``none`` or larger in all worlds, and stays so."""
+        if name not in self.links.variable and (np.abs(self.scene.values[name][:, dof]) >= none).all():
             return None
         return self.value(name, dof)
 
@@ -189,6 +190,12 @@ class Impedance:
         """Return the lower and the upper limit of a dof, None where it has none."""
         low, high = (self._bound(f"joint_limit_{side}", dof, UNLIMITED) for side in ("lower", "upper"))
         return low, high
+
+    def _most(self, name: str, dof: int) -> Value | None:
+        """Return a bound of a force or a rate; one of DEFAULT_BOUND and more in some world has no effect there."""
+        bound = self._bound(name, dof, DEFAULT_BOUND)
+        some = name in self.links.variable or (self.scene.values[name][:, dof] >= DEFAULT_BOUND).any()
+        return select(less(bound, DEFAULT_BOUND), bound, FREE) if bound is not None and some else bound
 
     def _rest(self, coordinate: int) -> Value:
         return self.value("joint_rest_q", coordinate)
@@ -228,7 +235,7 @@ class Impedance:
         laws += [] if is_number(kd, 0.0) else [Law(kd * (self.target_qd(dof) - self.qd(dof)), kd)]
         if not laws:
             return []
-        effort, law = self._bound("joint_effort_limit", dof, DEFAULT_BOUND), add_laws(laws)
+        effort, law = self._most("joint_effort_limit", dof), add_laws(laws)
         if effort is not None and is_number(effort, 0.0):
             return []
         return [law] if effort is None else [law._replace(least=-effort, most=effort)]
@@ -237,10 +244,13 @@ class Impedance:
         """Return springs that push back into the range and never pull; outside the range with dampers."""
         dof, laws = link.dofs[i], []
         for name, inward in (("joint_limit_lower", 1.0), ("joint_limit_upper", -1.0)):
+            turns = link.hinge.quaternion is not None
+            if turns and (np.abs(self.scene.values[name][:, dof]) >= UNLIMITED).all():
+                continue  # variable or not: such a dof has no limits
             bound = self._bound(name, dof, UNLIMITED)
             if bound is None:
                 continue
-            if link.hinge.quaternion is not None:
+            if turns:
                 label = self.scene.dof_labels[dof]
                 raise UnsupportedError(
                     "Dynamics.step",
@@ -265,7 +275,7 @@ class Impedance:
 
         A dof without inertia takes the resistance of the ``others`` instead.
         """
-        bound = self._bound("joint_velocity_limit", dof, DEFAULT_BOUND)
+        bound = self._most("joint_velocity_limit", dof)
         if bound is None or is_number(self.h, 0.0):
             return []
         qd, inertia = self.qd(dof), self._inertia(dof)

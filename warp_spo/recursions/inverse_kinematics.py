@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..hinges.quaternions import matrix_quaternion, quaternion_rotation, rotation_vector
+from ..scene.parts import UNLIMITED
 from ..trace.emission import Store
-from ..trace.scalars import Value, is_constant, less, reciprocal, select, sqrt
+from ..trace.scalars import Value, absolute, is_constant, less, reciprocal, select, sqrt
 from ..trace.spatial import IDENTITY, ZERO, Vector, dot, total
 from .impedance import Impedance
 from .kinematics import columns, place_axes
@@ -75,9 +76,10 @@ def _start(link: Link, i: int, share: Value, low: Value | None, high: Value | No
     if link.hinge.quaternion is not None and i >= link.hinge.quaternion:
         return share
     reach = SLIDE if link.hinge.quaternion is not None or link.hinge.units == (5,) else TURN
-    if low is None:
-        low = -reach if high is None else high - 2.0 * reach
-    high = low + 2.0 * reach if high is None else high
+    below, above = (0.0 if x is None else less(absolute(x), UNLIMITED) for x in (low, high))  # variable ones may be none
+    low, high = (0.0 if x is None else x for x in (low, high))
+    low = select(below, low, select(above, high - 2.0 * reach, -reach))
+    high = select(above, high, low + 2.0 * reach)
     return _within(low + share * (high - low), low, high)
 
 
