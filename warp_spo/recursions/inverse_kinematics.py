@@ -76,7 +76,7 @@ def _start(link: Link, i: int, share: Value, low: Value | None, high: Value | No
     if link.hinge.quaternion is not None and i >= link.hinge.quaternion:
         return share
     reach = SLIDE if link.hinge.quaternion is not None or link.hinge.units == (5,) else TURN
-    below, above = (0.0 if x is None else less(absolute(x), UNLIMITED) for x in (low, high))  # variable ones may be none
+    below, above = (0.0 if x is None else less(absolute(x), UNLIMITED) for x in (low, high))  # of each world
     low, high = (0.0 if x is None else x for x in (low, high))
     low = select(below, low, select(above, high - 2.0 * reach, -reach))
     high = select(above, high, low + 2.0 * reach)
