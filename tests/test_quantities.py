@@ -271,16 +271,16 @@ def test_gradients(operation, dyn_and_state):
 def test_gradients_by_values(device):
     """Of the energies and the centre of mass by masses, places and springs."""
     scene = zoo.fork()
-    names = ("body_mass", "body_com", "gravity", "joint_stiffness")
+    names = ("body_mass", "body_com", "body_inertia", "joint_armature", "gravity", "joint_stiffness")
     dyn = spo.Dynamics(scene, 2, device=device, dtype="float64", granularity="tree", variable=names)
     where = wp.device_to_torch(dyn.device)
     a = states(scene, 2)
-    q = torch.tensor(a["q"], dtype=torch.float64, device=where)
+    q, qd = (torch.tensor(a[name], dtype=torch.float64, device=where) for name in ("q", "qd"))
     start = [torch.tensor(scene.values[n][0], dtype=torch.float64, device=where, requires_grad=True) for n in names]
 
     def energies(*values):
         dyn.set(**dict(zip(names, values, strict=True)))
-        return dyn.potential_energy(q), dyn.com(q)
+        return dyn.potential_energy(q), dyn.com(q), dyn.kinetic_energy(q, qd)
 
     assert torch.autograd.gradcheck(energies, start, atol=1e-6)
 
