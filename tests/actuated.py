@@ -86,9 +86,14 @@ def driven(scene):
     """The scene with a motor on one hinge, and another on two."""
     first, second = [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == 1][:2]
     motors = spo.Actuator(first, gear=2.0), spo.Actuator((first, second), gear=(1.0, -0.5), force_range=(-1.0, 0.5))
-    return spo.Scene(
-        scene.bodies, scene.hinges, loops=scene.loops, couplings=scene.couplings, actuators=motors
-    ).with_values(**{name: value for name, value in scene.values.items() if not name.startswith("actuator")})
+    return with_actuators(scene, motors)
+
+
+def with_actuators(scene, actuators):
+    """The scene, at its values, with these actuators."""
+    values = {name: value for name, value in scene.values.items() if not name.startswith("actuator")}
+    parts = dict(loops=scene.loops, couplings=scene.couplings, actuators=actuators)
+    return spo.Scene(scene.bodies, scene.hinges, **parts).with_values(**values)
 
 
 def slider(*actuators, **hinge):

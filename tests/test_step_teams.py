@@ -2,6 +2,7 @@
 
 import functools
 
+import actuated
 import implicit
 import laws
 import numpy as np
@@ -36,7 +37,17 @@ def alike():
     return scene.with_values(**{name: rng.uniform(1.0, 9.0, scene.dof_count) for name in names})
 
 
-AS_THEY_ARE = {"still": zoo.fork, "alike": alike}  # in "still" nothing bends: one pass
+def driven():
+    """The fingers with a servo at each hinge, a tendon from one to another, and a motor along its curve."""
+    scene = alike()
+    joints = [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == 1]
+    servos = [spo.Actuator(i, -0.5, 9.0, (0.1, -9.0, -0.2), force_range=(-0.6, 0.3 + 0.1 * i)) for i in joints]
+    others = (spo.Actuator(joints[1:4], (0.3, -0.2, 0.4), 2.0, (0.0, -2.0, -0.1), force_range=(-0.4, 0.4)),
+              spo.Actuator(joints[0], 0.2, torque_speed=(1.0, 3.0)))  # fmt: skip
+    return actuated.with_actuators(scene, [*servos, *others])
+
+
+AS_THEY_ARE = {"driven": driven, "still": zoo.fork, "alike": alike}  # in "still" nothing bends: one pass
 
 
 @functools.cache
@@ -122,6 +133,8 @@ def texts_of(monkeypatch, name, staged=False, **options):
     texts, scene = warp_machine.recorded(monkeypatch), scene_of(name)
     dyn = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="segment")
     a = states(scene, WORLDS)
+    if scene.actuators:
+        a["ctrl"] = np.random.default_rng(4).normal(size=(WORLDS, len(scene.actuators)))
     if not staged:
         del a["body_f"]  # long rows always come through shared memory
     rate, wide = (WORLDS, scene.dof_count), (WORLDS, scene.coord_count)
@@ -134,7 +147,7 @@ def texts_of(monkeypatch, name, staged=False, **options):
 
 
 @pytest.mark.parametrize("staged", [False, True])
-@pytest.mark.parametrize("name", [*SCENES, "still"])
+@pytest.mark.parametrize("name", [*SCENES, "still", "driven"])
 def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
     """Warp by warp in either order, written over the state; worlds need different numbers of passes."""
     text, a, (q, qd, passes) = texts_of(monkeypatch, name, staged, qdd=True, status=True)

@@ -64,7 +64,9 @@ def choose_layout(
     numbers = tuple(name for name, shape in shapes.items() if name in used and not shape)
     out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
     dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
-    over = [row.name for row in rows if row.entries == out.entries and row.name not in ("q", "body_f")]
+    read_by_others = ["q", "body_f", "ctrl"]  # entries that another piece than the one that writes them may read last
+    read_by_others += ["qd"] if warps > 1 and "ctrl" in used else []
+    over = [row.name for row in rows if row.entries == out.entries and row.name not in read_by_others]
     over = [name for name in over if is_read_before_written(stores, everything, name)]
     slots = count_slots(stores)
     fields = {name: tuple(sorted(used[name])) for name in FIELDS if name in used}
