@@ -187,6 +187,16 @@ def test_values_of_each_world(device):
             np.testing.assert_allclose(rate[w], stepped, atol=1e-11)
 
 
+def test_a_control_that_is_no_number_says_so(device):
+    """Infinite ones too, within a range or not."""
+    scene = arm([KINDS["motor with ranges"][0], KINDS["velocity"][0]])
+    dyn, status = spo.Dynamics(scene, 4, device=device, dtype="float64"), np.full(4, -1, np.int32)
+    q, qd, ctrl = states(scene, 4)
+    ctrl[1, 1], ctrl[2, 0], ctrl[3, 1] = np.nan, np.inf, -np.inf
+    after = dyn.step(q, qd, None, 1e-3, ctrl=ctrl, status=status)[1]
+    assert status.tolist() == [0, 2, 2, 2] and np.isfinite(after).all(axis=1).tolist() == [True, False, True, False]
+
+
 # -- gradients ---------------------------------------------------------------------------------------------------------
 def tensors(*arrays):
     return [torch.tensor(array, requires_grad=True) for array in arrays]
@@ -225,17 +235,19 @@ def test_gradients_of_steps():
 
 @pytest.mark.slow
 def test_gradients_of_steps_with_closed_loops():
-    scene = MECHANISMS["fivebar"]()
-    scene = spo.Scene(scene.bodies, scene.hinges, loops=scene.loops, couplings=scene.couplings, actuators=[
-        spo.Actuator(0, gain=30.0, bias=(0.0, -30.0, -1.0)), spo.Actuator((1, 2), (0.5, 1.0), torque_speed=(3.0, 9.0)),
-    ])  # fmt: skip
-    dyn = spo.Dynamics(scene, 1, device="cpu", dtype="float64", loops="embed")
-    q, qd = dyn.project(scene.neutral_q[None] + 0.1, np.full((1, scene.dof_count), 0.3))
+    motors = (
+        spo.Actuator(0, gain=30.0, bias=(0.0, -30.0, -1.0)),
+        spo.Actuator((1, 2), (0.5, 1.0), torque_speed=(3.0, 9.0)),
+    )
+    scene = actuated.with_actuators(MECHANISMS["fivebar"](), motors)
+    dyn, other = (spo.Dynamics(scene, 1, device="cpu", dtype="float64", loops=way) for way in ("embed", "multipliers"))
+    near = scene.neutral_q[None] + 0.3 * np.random.default_rng(0).normal(size=(1, scene.coord_count))
+    q, qd = dyn.project(near, np.full((1, scene.dof_count), 0.3), iterations=30)
     ctrl = np.array([[0.4, 1.0]])
     assert gradcheck(lambda *x: dyn.step(x[0], x[1], None, 5e-3, ctrl=x[2]), tensors(q, qd, ctrl), atol=1e-5)
-    open_tree = spo.Dynamics(scene, 1, device="cpu", dtype="float64", loops="multipliers")
-    a, b = (each.step(q, qd, None, 1e-5, ctrl=ctrl)[1] for each in (dyn, open_tree))
-    np.testing.assert_allclose(a, b, atol=1e-9)
+    a, b = (one.step(q, qd, None, 1e-3, ctrl=ctrl)[1] for one in (dyn, other))
+    np.testing.assert_allclose(a, b, atol=1e-10)
+    assert abs(a - other.step(q, qd, None, 1e-3)[1]).max() > 0.1
 
 
 # -- what is not there -------------------------------------------------------------------------------------------------
