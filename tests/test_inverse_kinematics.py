@@ -4,7 +4,6 @@ from importlib import metadata
 
 import laws
 import numpy as np
-import pinocchio as pin
 import pytest
 import warp as wp
 import zoo
@@ -79,6 +78,19 @@ def test_targets_are_reached_within_the_limits(arm):
     assert np.median(said) < rounding
     again = dyn.inverse_kinematics(given, frames, seeds=16)
     np.testing.assert_array_equal(again[0].numpy(), out[0].numpy())
+
+
+def test_a_graph_repeats_it_for_other_targets(arm):
+    dyn, frames, _, targets = arm
+    wanted = dyn.inverse_kinematics(targets[::-1].copy(), frames, seeds=3)
+    given = wp.array(targets, dtype=dyn.dtype, device=dyn.device)
+    out = tuple(wp.empty(shape, dtype=dyn.dtype, device=dyn.device) for shape in ((WORLDS, 6), (WORLDS,)))
+    with wp.ScopedCapture(dyn.device) as capture:
+        dyn.inverse_kinematics(given, frames, seeds=3, out=out)
+    given.assign(targets[::-1].astype(wp.dtype_to_numpy(dyn.dtype)))
+    wp.capture_launch(capture.graph)
+    for got, right in zip(out, wanted, strict=True):
+        np.testing.assert_array_equal(got.numpy(), right)
 
 
 def test_more_seeds_and_iterations_never_do_worse(arm):
@@ -170,6 +182,7 @@ def test_starts_cover_the_rotations():
 @pytest.mark.parametrize(("name", "link"), [("panda", "panda_hand_tcp"), ("ur5", "tool0")])
 def test_arms_are_those_of_the_files(name, link):
     """Pinocchio reads the released file; the table in the benchmarks gives the same poses and limits."""
+    pin = pytest.importorskip("pinocchio")
     try:
         file = metadata.distribution(robots.PACKAGE).locate_file(f"{robots.INSTALLED}/{FILES[name]}")
     except metadata.PackageNotFoundError:
