@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import numpy as np
 import torch
 import warp as wp
@@ -47,8 +48,10 @@ def use_dynamics(q: torch.Tensor, qd: torch.Tensor, tau: torch.nn.Parameter) -> 
     return qdd
 
 
-def use_other_kinds(dyn: spo.Dynamics, q: Array, on_device: "wp.array[Any, Any]") -> None:
+def use_other_kinds(dyn: spo.Dynamics, q: Array, on_device: "wp.array[Any, Any]", in_jax: jax.Array) -> None:
     assert_type(dyn.mass_matrix(q), Array)
+    assert_type(dyn.mass_matrix(in_jax), jax.Array)
+    assert_type(dyn.step(in_jax, q, on_device, 1e-3), tuple[jax.Array, jax.Array])
     assert_type(dyn.mass_matrix(on_device), "wp.array[Any, Any]")
 
 

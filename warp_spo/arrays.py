@@ -6,9 +6,9 @@ and device; nothing is copied silently. NumPy arrays alone are cast and copied. 
 of the result.
 
 :data:`ArrayT` says so to editors and type checkers: ``def f(self, q: ArrayT, out: ArrayT | None = None) -> ArrayT``
-returns a ``torch.Tensor`` for a ``torch.Tensor`` (or a ``torch.nn.Parameter``), a ``wp.array`` for a ``wp.array``, and
-a ``np.ndarray`` for a ``np.ndarray``. An argument that may be of another kind than the result is an :data:`AnyArray`.
-Neither imports torch at run time.
+returns a ``torch.Tensor`` for a ``torch.Tensor`` (or a ``torch.nn.Parameter``), a ``wp.array`` for a ``wp.array``, a
+``np.ndarray`` for a ``np.ndarray``, and a ``jax.Array`` for a ``jax.Array``. An argument that may be of another kind
+than the result is an :data:`AnyArray`. Neither imports torch or JAX at run time.
 """
 
 import functools
@@ -24,10 +24,11 @@ from .memory import is_same, overlap, view
 from .turns import Turn
 
 if TYPE_CHECKING:
+    import jax
     import torch
 
-ArrayT = TypeVar("ArrayT", "torch.Tensor", "wp.array[Any, Any]", "np.ndarray[Any, Any]")
-AnyArray = Union["torch.Tensor", "wp.array[Any, Any]", "np.ndarray[Any, Any]"]
+ArrayT = TypeVar("ArrayT", "torch.Tensor", "wp.array[Any, Any]", "np.ndarray[Any, Any]", "jax.Array")
+AnyArray = Union["torch.Tensor", "wp.array[Any, Any]", "np.ndarray[Any, Any]", "jax.Array"]
 NUMPY, WARP, TORCH = "NumPy", "Warp", "torch"
 CLASSES: dict[type, str] = {wp.array: WARP}
 """Kinds by class of array, of arrays that lie in a device's memory; torch's join when the first tensor comes."""
