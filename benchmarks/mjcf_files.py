@@ -86,21 +86,22 @@ class Agreement:
         return found
 
     def passive_error(self) -> float:
-        """Return the largest error of the passive force, relative to its largest entry."""
-        ours, worst = self.dyn.passive_force(self.q, self.qd), 0.0
-        for world in range(self.worlds):
-            worst = max(worst, relative(self.T[world].T @ ours[world], self.data(world, OTHERS).qfrc_passive))
-        return worst
+        """Return the largest error of the passive forces of all worlds, relative to their largest entry."""
+        theirs = [self.data(world, OTHERS).qfrc_passive for world in range(self.worlds)]
+        return self._force_error(self.dyn.passive_force(self.q, self.qd), np.array(theirs))
 
     def actuator_error(self, ctrl: np.ndarray) -> float:
-        """Return the largest error of the actuators' forces under ``ctrl`` [world, actuator], relative as above."""
-        ours, worst = self.dyn.actuator_force(self.q, self.qd, ctrl), 0.0
+        """Return the same of the actuators' forces under ``ctrl`` [world, actuator]."""
+        theirs = []
         for world in range(self.worlds):
             data = self.data(world)
             data.ctrl[:] = ctrl[world]
             mujoco.mj_forward(self.model, data)
-            worst = max(worst, relative(self.T[world].T @ ours[world], data.qfrc_actuator))
-        return worst
+            theirs.append(data.qfrc_actuator)
+        return self._force_error(self.dyn.actuator_force(self.q, self.qd, ctrl), np.array(theirs))
+
+    def _force_error(self, ours: np.ndarray, theirs: np.ndarray) -> float:
+        return relative((np.swapaxes(self.T, 1, 2) @ ours[..., None])[..., 0], theirs)
 
 
 def full_mass(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:

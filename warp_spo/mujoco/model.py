@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from ..errors import UnsupportedError
 from ..scene.actuators import Keyframe
 from ..scene.scene import Scene
 from .actuators import read_actuators
@@ -60,28 +61,31 @@ def from_mujoco(model: Any) -> Scene:
 
 def scene_of(source: Source, floating: bool | None) -> Scene:
     """Return the scene of a source, its base as ``floating`` says; warn once of what it leaves out."""
-    model = source.model
     refuse_unsupported(source)
-    if model.nbody == 1:
+    if source.model.nbody == 1:
         raise ValueError(f"{source.title}: the model has no bodies; expected one or more")
-    mechanism = Mechanism(source, floating)
-    loops, couplings = read_ties(source, mechanism)
-    actuators, keyframes = read_actuators(source, mechanism), _keyframes(source, mechanism)
     try:
-        scene = Scene(
-            mechanism.bodies,
-            mechanism.hinges,
-            gravity=np.zeros(3) if source.disabled("GRAVITY") else model.opt.gravity,
-            loops=loops,
-            couplings=couplings,
-            actuators=actuators,
-            sites=_sites(source),
-            keyframes=keyframes,
-        )
-    except ValueError as error:
+        scene = _scene(source, Mechanism(source, floating))
+    except UnsupportedError:
+        raise
+    except ValueError as error:  # of a body, a hinge or the scene, which know neither call nor file
         raise ValueError(f"{source.title}: {error}; correct the model") from None
     _warn(source)
     return scene
+
+
+def _scene(source: Source, mechanism: Mechanism) -> Scene:
+    loops, couplings = read_ties(source, mechanism)
+    return Scene(
+        mechanism.bodies,
+        mechanism.hinges,
+        gravity=np.zeros(3) if source.disabled("GRAVITY") else source.model.opt.gravity,
+        loops=loops,
+        couplings=couplings,
+        actuators=read_actuators(source, mechanism),
+        sites=_sites(source),
+        keyframes=_keyframes(source, mechanism),
+    )
 
 
 def _sites(source: Source) -> dict[str, tuple[int, np.ndarray]]:
