@@ -48,6 +48,11 @@ class Row(NamedTuple):
         return max(self.mass_matrix, self.bias_force) < self.limit and not self.acceleration > allowed
 
 
+def short(file: Path) -> str:
+    """Return a file's name behind the folder that tells it from others of that name."""
+    return f"{file.parts[-3]}/{file.name}"
+
+
 def error(ours: np.ndarray, theirs: np.ndarray) -> float:
     """Return the largest difference as a share of the largest entry."""
     scale = np.abs(theirs).max(initial=0.0)
@@ -134,11 +139,9 @@ def compare_urdf(file: Path, text: str | None = None) -> Row:
         try:
             scene = spo.load(file, floating=True, repair=False)
         except ValueError as refusal:
-            return Row(file.name, note=f"refused: {str(refusal).replace(str(file), file.name)}")
+            return Row(short(file), note=f"refused: {str(refusal).replace(str(file), file.name)}")
         spo.load(file, floating=True)
-    said = [re.sub(r"^load: ('\S*', )?", "", str(one.message)) for one in caught]
-    note = "; ".join(dict.fromkeys(re.split(r": the file's|; ", sentence)[0] for sentence in said))
-    row = Row(file.name, scene.dof_count, note=note)
+    row = Row(short(file), scene.dof_count, note=_counted(list(dict.fromkeys(str(one.message) for one in caught))))
     theirs = PinocchioFile(scene, text or file.read_text())
     errors = []
     for q, qd, tau in random_states(scene):
@@ -152,14 +155,34 @@ def compare_urdf(file: Path, text: str | None = None) -> Row:
         errors.append(one)
     mass_error, bias_error, acceleration_error, condition = (float(worst) for worst in np.max(errors, axis=0))
     if condition >= 1e15:
-        acceleration_error, note = np.nan, f"{note}; the mass matrix is singular".removeprefix("; ")
+        acceleration_error = np.nan
+        row = row._replace(note=f"{row.note}; the mass matrix is singular".removeprefix("; "))
     return row._replace(
         mass_matrix=mass_error,
         bias_force=bias_error,
         acceleration=acceleration_error,
         condition=condition,
-        note=note,
     )
+
+
+SAID = {
+    r"replaced the mass or inertia of (.*?): the file's": "inertias are replaced unless `repair=False`",
+    r"links (.*?) move and have no mass": "links are weighed by their shapes unless `repair=False`",
+    r"joint '[^']*' mimics ('[^']*'), which is no joint": "mimics name no joint",
+}
+"""What a warning of ``spo.load`` means, by a pattern whose group holds the names that it is about."""
+
+
+def _counted(said: list[str]) -> str:
+    """Return the warnings of ``spo.load`` in a few words, with the number of names that they are about."""
+    notes = []
+    for pattern, meaning in SAID.items():
+        count = 0
+        for names in re.findall(pattern, "\n".join(said)):
+            more = re.search(r"and (\d+) more", names)
+            count += len(re.findall(r"'[^']*'", names)) + (int(more.group(1)) if more else 0)
+        notes += [f"{count} {meaning}"] * (count > 0)
+    return "; ".join(notes)
 
 
 def urdf_files() -> list[Path]:
@@ -167,7 +190,7 @@ def urdf_files() -> list[Path]:
     import newton
 
     folders = [Path(newton.__file__).parent]
-    for package in ("example-robot-data", "mujoco"):
+    for package in ("example-robot-data", "mujoco-core"):
         try:
             folders += {Path(str(file.locate())) for file in metadata.files(package) or () if file.suffix == ".urdf"}
         except metadata.PackageNotFoundError:
@@ -214,20 +237,85 @@ def mjcf_rows(pattern: str = "") -> Iterator[Row]:
     yield from (compare_mjcf(name, file) for name, file in mjcf_files() if re.search(pattern, str(file)))
 
 
-FORMATS: dict[str, Callable[[str], Iterator[Row]]] = {"urdf": urdf_rows, "mjcf": mjcf_rows}
+# -- USD ---------------------------------------------------------------------------------------------------------------
+class UsdRow(NamedTuple):
+    """What came of one USD: the largest relative errors of the numbers that the file writes for its bodies."""
+
+    file: str
+    bodies: int = 0
+    dofs: int = 0
+    masses: float = np.nan
+    moments: float = np.nan
+    centers_of_mass: float = np.nan
+    note: str = ""
+
+    @property
+    def agrees(self) -> bool:
+        """Whether all errors are those of the float32 in which a USD and Newton's importer hold numbers."""
+        return not max(self.masses, self.moments, self.centers_of_mass, key=lambda x: -1.0 if np.isnan(x) else x) > 1e-6
+
+
+def compare_usd(file: Path) -> UsdRow:
+    """Return the errors of a USD's scene beside the masses, moments and centres that the file writes."""
+    from pxr import Usd, UsdGeom, UsdPhysics
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            scene = spo.load(file, repair=False)
+        except ValueError as refusal:
+            return UsdRow(short(file), note=f"refused: {str(refusal).replace(str(file), file.name)}")
+    stage = Usd.Stage.Open(str(file))
+    metre, kilogram = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
+    errors: dict[str, list[float]] = {"masses": [], "moments": [], "centers_of_mass": []}
+    for body, label in enumerate(scene.body_labels):
+        mass = UsdPhysics.MassAPI(stage.GetPrimAtPath(label))
+        value = mass.GetMassAttr().Get()
+        if value:
+            errors["masses"].append(error(scene.values["body_mass"][0, body], np.array(kilogram * value)))
+        moments = np.array(mass.GetDiagonalInertiaAttr().Get() or (0.0, 0.0, 0.0))
+        if value and moments.any():
+            ours = np.linalg.eigvalsh(scene.values["body_inertia"][0, body])
+            errors["moments"].append(error(ours, kilogram * metre**2 * np.sort(moments)))
+        center = np.array(mass.GetCenterOfMassAttr().Get() or (-np.inf,) * 3)
+        if np.isfinite(center).all():
+            scale = np.array(UsdGeom.Xformable(mass.GetPrim()).ComputeLocalToWorldTransform(0)).T[:3, :3]
+            center = metre * np.linalg.norm(scale, axis=0) * center
+            errors["centers_of_mass"].append(error(scene.values["body_com"][0, body], center))
+    return UsdRow(
+        short(file),
+        scene.body_count,
+        scene.dof_count,
+        **{name: max(found) for name, found in errors.items() if found},
+        note="" if any(errors.values()) else "the file writes none of these",
+    )
+
+
+def usd_rows(pattern: str = "") -> Iterator[UsdRow]:
+    """Yield a row for each USD of Newton that has rigid bodies and whose path matches an expression."""
+    import newton
+
+    files = sorted(Path(newton.__file__).parent.rglob("*.usd*"))
+    rows = (compare_usd(file) for file in files if re.search(pattern, str(file)))
+    yield from (row for row in rows if "has no rigid bodies" not in row.note)
+
+
+FORMATS: dict[str, Callable[[str], Iterator[Any]]] = {"urdf": urdf_rows, "mjcf": mjcf_rows, "usd": usd_rows}
 """Rows by format; a format is one line here."""
 
 
-def table(rows: list[Row]) -> str:
+def table(rows: list[Any]) -> str:
     """Return rows as a Markdown table."""
-    number = lambda value: "" if np.isnan(value) else f"{value:.0e}"  # noqa: E731
-    lines = [
-        "| file | dofs | mass matrix | bias force | forward dynamics | condition | |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        figures = " | ".join(number(value) for value in row[2:6])
-        lines.append(f"| `{row.file}` | {row.dofs or ''} | {figures} | {row.note} |")
+
+    def cell(value: Any) -> str:
+        if isinstance(value, float):
+            return "" if np.isnan(value) else f"{value:.0e}"
+        return str(value or "").replace("|", "/").replace("<", "&lt;")
+
+    fields = [name for name in rows[0]._fields if name not in ("file", "limit")]
+    names = ["file", *(name.replace("_", " ").replace("note", "") for name in fields)]
+    lines = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
+    lines += [f"| `{row.file}` | {' | '.join(cell(getattr(row, name)) for name in fields)} |" for row in rows]
     return "\n".join(lines)
 
 
@@ -243,9 +331,12 @@ def main(arguments: list[str]) -> int:
         rows = list(FORMATS[name](options.pattern))
         wrong += [row.file for row in rows if not row.agrees and not row.note.startswith("refused")]
         if options.write:
-            text, marks = PAGE.read_text(), (f"<!-- table {name} -->\n", f"\n<!-- end {name} -->")
-            before, _, rest = text.partition(marks[0])
-            PAGE.write_text(before + marks[0] + table(rows) + marks[1] + rest.partition(marks[1])[2])
+            begin, end = f"<!-- table {name} -->\n", f"<!-- end {name} -->"
+            before, _, rest = PAGE.read_text().partition(begin)
+            _, found, after = rest.partition(end)
+            if not found:
+                parser.error(f"{PAGE} has no place for the table; expected the lines {begin.strip()} and {end}")
+            PAGE.write_text(f"{before}{begin}{table(rows)}\n{end}{after}")
         else:
             print(f"\n{name}\n\n{table(rows)}")
     if wrong:

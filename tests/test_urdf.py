@@ -9,7 +9,7 @@ import pinocchio
 import pytest
 
 import warp_spo as spo
-from benchmarks.robot_files import compare_urdf, urdf_files
+from benchmarks.robot_files import compare_urdf, short, urdf_files
 from warp_spo.newton import load
 from warp_spo.reference import Dense, homogeneous
 
@@ -18,8 +18,8 @@ QUICK = ("go2.urdf", "tiago_pro.urdf", "talos_left_arm.urdf", "double_pendulum_c
 """Robots with branches, turned inertias, mimics on fixed joints, continuous joints and prismatic ones."""
 
 
-def check(name):
-    row = compare_urdf(FILES[name])
+def check(file):
+    row = compare_urdf(file)
     assert row.agrees, row
     return row
 
@@ -27,13 +27,14 @@ def check(name):
 @pytest.mark.parametrize("name", QUICK)
 def test_equals_pinocchios_parser(name):
     """Mass matrix, bias force and forward dynamics to 1e-9."""
-    assert np.isfinite(check(name).acceleration)
+    assert np.isfinite(check(FILES[name]).acceleration)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in FILES if name not in (*QUICK, "ur3.urdf")])
-def test_every_urdf_equals_pinocchios_parser(name):
-    check(name)
+@pytest.mark.parametrize("file", [f for f in urdf_files() if f.name not in (*QUICK, "ur3.urdf")], ids=short)
+def test_every_urdf_equals_pinocchios_parser(file):
+    """All of example-robot-data, of Newton and of MuJoCo."""
+    check(file)
 
 
 LINK = '<link name="{0}"><inertial><mass value="2"/><inertia ixx=".2" iyy=".3" izz=".4" ixy="0" ixz="0" iyz="0"/>'

@@ -62,6 +62,14 @@ def read_usd(file: Path, floating: bool | None, repair: bool) -> Scene:
             f"{str(file)!r} with bodies that Newton's importer leaves out ({quote_labels(lost)})",
             "give each a joint without excludeFromArticulation, or take it out of the articulation root",
         )
+    carried = set(builder.joint_child)
+    loose = [label for body, label in enumerate(builder.body_label) if body not in carried]
+    if loose:
+        raise UnsupportedError(
+            "load",
+            f"{str(file)!r} with bodies that are body1 of no joint ({quote_labels(loose)})",
+            "join each to the world by a joint without body0, or put an articulation root above them all",
+        )
     return scene_of(file, builder, repair)
 
 
