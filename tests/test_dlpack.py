@@ -178,9 +178,9 @@ def test_cupy_runs_on_its_own_stream(monkeypatch):
     cuda = types.SimpleNamespace(Device=Device, get_current_stream=lambda: types.SimpleNamespace(ptr=1234))
     monkeypatch.setitem(sys.modules, "cupy", types.SimpleNamespace(cuda=cuda))
     monkeypatch.setattr(wp, "Stream", lambda device, cuda_stream: (device, cuda_stream))
-    dlpack._stream.cache_clear()
+    monkeypatch.setattr(dlpack, "_streams", {})
     gpu = types.SimpleNamespace(ordinal=3, alias="cuda:3")
-    assert dlpack.stream(gpu) == ("cuda:3", 1234) and asked == [3]
-    dlpack._stream.cache_clear()
+    assert dlpack.stream(gpu) == (gpu, 1234) and asked == [3]
+    assert dlpack.stream(gpu) is dlpack.stream(gpu)
     kind = type("ndarray", (), {"__module__": "cupy", "__dlpack__": None, "__dlpack_device__": None})
     assert dlpack.library_of(kind()).has_stream and not dlpack.library_of(jnp.zeros(1)).has_stream

@@ -212,6 +212,26 @@ def test_substeps():
         np.testing.assert_array_equal(one, other)
 
 
+def test_status():
+    """It follows the results, and lets gradients pass."""
+    dyn = plain()
+    f = spo_jax.function(dyn, "forward_dynamics", status=True)
+    q, qd, tau = arrays(dyn, "q", "qd", "tau")
+    found, status = jax.jit(f)(q, qd.at[1, 0].set(jnp.nan), tau)
+    assert status.dtype == jnp.int32 and status.tolist() == [0, spo.Status.NOT_FINITE, 0]
+    np.testing.assert_array_equal(found[::2], spo_jax.function(dyn, "forward_dynamics")(q, qd, tau)[::2])
+    assert jax.vmap(f)(q, qd, tau)[1].shape == (WORLDS,)
+    with_status, bare = (spo_jax.function(robot(), "forward_dynamics", **more) for more in ({"status": True}, {}))
+    q, qd, tau = arrays(robot(), "q", "qd", "tau")
+    loss = lambda found: (found**2).sum()  # noqa: E731
+    expected = jax.grad(lambda x: loss(bare(q, qd, x)))(tau)
+    np.testing.assert_array_equal(jax.grad(lambda x: loss(with_status(q, qd, x)[0]))(tau), expected)
+    with explained(TypeError, "status is 1", "expected True"):
+        spo_jax.function(dyn, "forward_dynamics", status=1)
+    with explained(TypeError, "gravity_force", "status= is no option"):
+        spo_jax.function(dyn, "gravity_force", status=True)
+
+
 def test_a_step_over_arrays_of_another_library():
     dyn = robot()
     q, qd, tau = arrays(dyn, "q", "qd", "tau", make=np.array)

@@ -18,6 +18,8 @@ import warp as wp
 HOST, CUDA, PINNED, MANAGED = 1, 2, 3, 13  # DLPack's numbers of kinds of memory
 NAMES = {"jax": ("JAX", "jax.numpy"), "jaxlib": ("JAX", "jax.numpy"), "cupy": ("CuPy", "cupy")}
 
+_streams: dict[tuple[str, int], tuple[wp.Stream, Any]] = {}
+
 
 class Library(str):
     """The kind of an array of another library: the library's name, as users write it.
@@ -162,9 +164,8 @@ def stream(device: wp.Device) -> wp.Stream:
     """Return CuPy's current stream of a CUDA device as a Warp stream."""
     cupy: Any = sys.modules["cupy"]
     with cupy.cuda.Device(device.ordinal):
-        return _stream(device.alias, cupy.cuda.get_current_stream().ptr)
-
-
-@functools.cache
-def _stream(device: str, handle: int) -> wp.Stream:
-    return wp.Stream(device, cuda_stream=handle)
+        current = cupy.cuda.get_current_stream()
+    key = device.alias, current.ptr
+    if key not in _streams:
+        _streams[key] = wp.Stream(device, cuda_stream=current.ptr), current  # kept, so that its handle is not reused
+    return _streams[key][0]

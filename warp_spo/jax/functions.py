@@ -44,7 +44,8 @@ def function(dyn: Dynamics, operation: str, *, capture: bool = False, **options:
         capture: Let XLA capture the launches of the operation (not of its gradient) in its CUDA graphs, which saves the
             way through Python. After :meth:`Dynamics.set` of a value that is not ``variable``, such graphs are out of
             date.
-        options: The operation's arguments that are not arrays, such as ``dt`` and ``frames``.
+        options: The operation's arguments that are not arrays, such as ``dt`` and ``frames``. With ``status=True``, for
+            operations that take it, the status [world], int32, follows the results.
 
     Raises:
         TypeError: ``dyn`` is no Dynamics, or the options are not those of the operation.
@@ -63,9 +64,10 @@ class Function:
 
     def __init__(self, dyn: Dynamics, operation: Operation, options: dict[str, Any], capture: bool):
         self.name = f"warp_spo.jax.function({operation.name!r})"
-        self.dyn, self.operation, self.options, self.capture = dyn, operation, options, capture
+        self.dyn, self.operation, self.options, self.capture = dyn, operation, dict(options), capture
         self.arguments = {one.name: one for one in operation.arrays if not one.written}
         self._programs: dict[tuple, Program] = {}
+        self.status = self._takes_status()
         self._check_options()
         self._check_precision()
 
@@ -91,18 +93,28 @@ class Function:
         return jax.tree.map(lambda x: x[0], found) if alone else found
 
     @functools.cached_property
-    def single(self) -> Function | None:
-        """The function of one of several repetitions, which has the gradient; None where there are none."""
+    def repeated(self) -> tuple[int, Function]:
+        """How often the operation runs for one call, and the function of one of these times, which has the gradient."""
         options = dict(self.options)
         derivative = self.operation.derivative
-        self.times = 1 if derivative is None else derivative.repeats(self.name, options)
-        return None if self.times == 1 else Function(self.dyn, self.operation, options, self.capture)
+        times = 1 if derivative is None else derivative.repeats(self.name, options)
+        return (1, self) if times == 1 else (times, Function(self.dyn, self.operation, options, self.capture))
 
     def _has_columns(self, name: str, array: Any) -> bool:
         """Whether an argument [row, ...] has an axis of right-hand sides."""
         return array.ndim > len(self._shape(self.arguments[name]))
 
     # -- checks ----------------------------------------------------------------------------------------------------
+    def _takes_status(self) -> bool:
+        """Take ``status`` out of the options, and return whether it is asked for."""
+        asked = self.options.get("status", False)
+        if asked is False or "status" not in (one.name for one in self.operation.arrays):
+            return False
+        if asked is not True:
+            raise TypeError(f"{self.name}: status is {asked!r}; expected True, by which it is one of the results")
+        del self.options["status"]
+        return True
+
     def _check_options(self) -> None:
         parameters = inspect.signature(self.operation.function).parameters
         expected = {one.name: parameters[one.name].default for one in self.operation.options if one.name in parameters}

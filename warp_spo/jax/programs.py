@@ -36,13 +36,15 @@ class Program:
     def __init__(self, function: Function, columns: dict[str, int | None], alone: bool):
         self.function, self.dyn, self.operation = function, function.dyn, function.operation
         self.options, self.columns, self.alone = function.options, columns, alone
+        self._once: Program | None = None  # one of several repetitions
+        self._status = ("status",) if function.status else ()
         self._traced: dict[bool | tuple[str, ...], Traced] = {}
         results = self._compute(self._samples())
         self.kind = type(results)
         self.count = 1 if isinstance(results, wp.array) else len(results)
         self._traced[False] = self._forward(False)
         self.call = jax.custom_vjp(self._result)
-        if function.single is None:
+        if function.repeated[0] == 1:
             self.call.defvjp(self._result_and_residuals, self._pull_back, symbolic_zeros=True)
         else:
             self.call.defvjp(self._repeated, lambda pull, cotangents: pull(cotangents))
@@ -59,32 +61,33 @@ class Program:
     def _compute(self, given: dict[str, wp.array], **more: Any) -> Any:
         return self.operation.entry(self.dyn, **given, **self.options, **more)
 
-    def _kept(self) -> dict[str, wp.array]:
-        """Return arrays for what the derivative reads of the operation besides the results."""
-        keeps = self.operation.derivative.keeps if self.operation.derivative else ()
-        axes = {one.name: one.axes for one in self.operation.arrays if one.name in keeps}
-        shapes = {name: self.dyn._engine.shape(words)[0] for name, words in axes.items()}
-        return {name: wp.empty(shape, dtype=self.dyn.dtype, device=self.dyn.device) for name, shape in shapes.items()}
+    def _written(self, names: tuple[str, ...]) -> dict[str, wp.array]:
+        """Return arrays for arguments that the operation writes."""
+        dyn, arguments = self.dyn, {one.name: one for one in self.operation.arrays}
+        shapes = {name: dyn._engine.shape(arguments[name].axes)[0] for name in names}
+        types = {name: arguments[name].dtype or dyn.dtype for name in names}
+        return {name: wp.empty(shapes[name], dtype=types[name], device=dyn.device) for name in names}
 
     def _computed(self, keep: bool) -> tuple[dict[str, wp.array], tuple[wp.array, ...], dict[str, wp.array]]:
-        """Return arguments, the results, and what else is kept, of one call."""
-        given, kept = self._samples(), self._kept() if keep else {}
-        results = self._compute(given, **kept)
-        return given, (results,) if self.count == 1 else tuple(results), kept
+        """Return arguments of one call, its results, and what it writes: the status, and what the derivative keeps."""
+        keeps = self.operation.derivative.keeps if keep and self.operation.derivative else ()
+        given, written = self._samples(), self._written((*self._status, *keeps))
+        results = self._compute(given, **written)
+        return given, (results,) if self.count == 1 else tuple(results), written
 
     def _forward(self, keep: bool) -> Traced:
-        """Return the operation as a JAX function; its results are followed by what is kept."""
-        given, results, kept = self._computed(keep)
+        """Return the operation as a JAX function; its results are followed by what else it writes."""
+        given, results, written = self._computed(keep)
 
         def run(inputs: Arrays, outputs: Arrays) -> None:
             for part in self._parts(outputs[0].shape[0]):
                 found = [part(array) for array in outputs]
                 out = found[0] if self.count == 1 else tuple(found[: self.count])
-                more = dict(zip(kept, found[self.count :], strict=True))
+                more = dict(zip(written, found[self.count :], strict=True))
                 self._compute(dict(zip(given, map(part, inputs), strict=True)), out=out, **more)
 
-        read, written = forms_of(given.values()), forms_of((*results, *kept.values()))
-        return traceable(self.operation.name, run, read, written, self.function.capture)
+        forms = forms_of((*results, *written.values()))
+        return traceable(self.operation.name, run, forms_of(given.values()), forms, self.function.capture)
 
     def _parts(self, rows: int) -> Iterator[Callable[[wp.array], wp.array]]:
         """Return functions that take as many rows of an array as there are worlds, part after part."""
@@ -97,7 +100,10 @@ class Program:
             yield functools.partial(_rows, first, first + worlds)
 
     def _as_results(self, found: Arrays) -> Any:
-        """Return arrays as the operation returns them: one array, a tuple, or a named tuple."""
+        """Return arrays as the operation returns them: one array, a tuple, or a named tuple; with status, a tuple."""
+        found = found[: self.count + len(self._status)]
+        if self._status:
+            return tuple(found)
         if self.count == 1:
             return found[0]
         return self.kind(*found) if hasattr(self.kind, "_fields") else tuple(found)
@@ -117,9 +123,10 @@ class Program:
 
     def _repeated(self, *arrays: Any) -> tuple[Any, Any]:
         """Return the result of repetitions, and the way back through each of them."""
-        single, times = self.function.single, self.function.times
-        assert single is not None
-        once = Program(single, self.columns, self.alone)
+        times, single = self.function.repeated
+        if self._once is None:
+            self._once = Program(single, self.columns, self.alone)
+        once = self._once
         names = [result.name for result in self.operation.results]
 
         def repeat(*arrays: Any) -> Any:
@@ -139,7 +146,7 @@ class Program:
         if keep not in self._traced:
             self._traced[keep] = self._forward(keep)
         found = self._traced[keep](*arrays)
-        return self._as_results(found[: self.count]), (wanted, arrays, found)
+        return self._as_results(found), (wanted, arrays, found)
 
     def _check_gradient(self, wanted: tuple[str, ...]) -> None:
         """Raise an error if a gradient is asked for that the operation does not have."""
@@ -167,7 +174,7 @@ class Program:
     def _pull_back(self, residuals: Any, cotangents: Any) -> tuple:
         wanted, arrays, found = residuals
         self._check_gradient(tuple(wanted))
-        given = (cotangents,) if self.count == 1 else tuple(cotangents)
+        given = tuple(cotangents)[: self.count] if self._status or self.count > 1 else (cotangents,)
         whole = [jnp.zeros(one.shape, one.dtype) if isinstance(one, SymbolicZero) else one for one in given]
         names = tuple(wanted)
         if names not in self._traced:
@@ -177,13 +184,14 @@ class Program:
         return tuple(by_name.get(name) for name in self.columns)
 
     def _backward(self, wanted: tuple[str, ...]) -> Traced:
-        """Return the gradients by some arguments as a JAX function of arguments, results, kept and cotangents."""
-        given, results, kept = self._computed(True)
-        sizes = len(given), len(results) + len(kept)
+        """Return the gradients by some arguments as a JAX function of what the call read and wrote, and cotangents."""
+        given, results, written = self._computed(True)
+        sizes = len(given), len(results) + len(written)
 
         def pull(arrays: Arrays) -> list[wp.array]:
             known = dict(zip(given, arrays, strict=False))
-            computed, cotangents = arrays[sizes[0] : sum(sizes)], arrays[sum(sizes) :]
+            computed, cotangents = list(arrays[sizes[0] : sum(sizes)]), arrays[sum(sizes) :]
+            del computed[self.count : self.count + len(self._status)]
             gradients = self.dyn._gradients
             found = gradients.pull_back(self.operation, known, self.options, computed, cotangents, wanted)
             return [found[name] for name in wanted]
@@ -193,7 +201,7 @@ class Program:
                 for out, found in zip(outputs, pull(tuple(map(part, inputs))), strict=True):
                     wp.copy(part(out), found)
 
-        read = (*given.values(), *results, *kept.values(), *results)
+        read = (*given.values(), *results, *written.values(), *results)
         return traceable(f"{self.operation.name}_vjp", run, forms_of(read), forms_of(pull(read)), False)
 
 
