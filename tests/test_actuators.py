@@ -323,6 +323,14 @@ def test_delays_in_steps(device):
     np.testing.assert_allclose(found, expected(ctrl, [(3, 0, 1)] * 3, {(5, 1)}), atol=1e-13)
     dyn.reset_actuator_state(None, state)
     np.testing.assert_allclose(forces_of(dyn, state, ctrl), expected(ctrl, [(3, 0, 1)] * 3), atol=1e-13)
+    again = forces_of(dyn, state, ctrl[:4])
+    q, qd = np.zeros((2, 3, 1))
+    dyn.reset([False, False, True], q, qd, q + 1.0, np.zeros(1), actuator_state=state)
+    again = np.concatenate([again, forces_of(dyn, state, ctrl[4:])])
+    before = np.concatenate([ctrl, ctrl])  # the buffers were not reset in between
+    wanted = expected(before, [(3, 0, 1)] * 3, {(16, 2)})[12:]
+    np.testing.assert_allclose(again, wanted, atol=1e-13)
+    np.testing.assert_array_equal(q[:, 0], [0.0, 0.0, 1.0])
     assert "delays of up to 3 steps" in dyn.explain()
 
 

@@ -8,7 +8,6 @@ import warp as wp
 
 from .. import launches
 from ..arrays import WARP, AnyArray, ArrayT, Call, kind_of
-from ..dlpack import settle
 from ..errors import as_integer
 from ..execution.routine import Routine
 from ..kernels import delays
@@ -96,14 +95,6 @@ def actuator_state(self: Dynamics, like: Any = None, longest: int | None = None)
         for array in (ring, count):
             launches.fill(array, 0)
     return ActuatorState(*call.result)
-
-
-def reset_actuator_state(self: Dynamics, mask: AnyArray | None, state: ActuatorState) -> None:
-    """Forget the controls of the worlds under the mask [world], bool; None: of all worlds. A graph may capture it."""
-    settle((mask,))
-    with Call("Dynamics.reset_actuator_state", self.device, self.dtype, turn=self.recursions.turn) as call:
-        where = None if mask is None else call.read("mask", mask, (self.worlds,), "[world]", dtype=wp.bool)
-        forget_controls(self, call, where, state)
 
 
 def forget_controls(dyn: Dynamics, call: Call, mask: wp.array | None, state: Any) -> None:

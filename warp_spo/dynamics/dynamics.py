@@ -168,7 +168,7 @@ class Dynamics:
     # -- actuators -------------------------------------------------------------------------------------------------
     actuator_force = actuators.actuator_force
     actuator_state = actuators.actuator_state
-    reset_actuator_state = actuators.reset_actuator_state
+    reset_actuator_state = scene_values.reset_actuator_state
 
     # -- derivatives -----------------------------------------------------------------------------------------------
     inverse_dynamics_derivatives = derivatives.inverse_dynamics_derivatives

@@ -14,6 +14,7 @@ from ..execution.parameters import VARIABLE
 from ..execution.rows import as_rows, copy_rows
 from ..gradients import records_gradient
 from ..scene.parts import real
+from . import actuators
 from .refinement import Refinement
 
 if TYPE_CHECKING:
@@ -79,7 +80,13 @@ def set_values(self: Dynamics, *, worlds: AnyArray | None = None, **values: Any)
 
 
 def reset(
-    self: Dynamics, mask: AnyArray, q: ArrayT, qd: AnyArray, q_from: AnyArray, qd_from: AnyArray
+    self: Dynamics,
+    mask: AnyArray,
+    q: ArrayT,
+    qd: AnyArray,
+    q_from: AnyArray,
+    qd_from: AnyArray,
+    actuator_state: actuators.ActuatorState | None = None,
 ) -> tuple[ArrayT, AnyArray]:
     """Write q_from, qd_from into q, qd in the worlds where ``mask`` is True; by one launch, which a graph may capture.
 
@@ -87,6 +94,8 @@ def reset(
         mask: bool [world].
         q, qd: the state [world, coordinate], [world, dof]; changed in place.
         q_from, qd_from: the state that these worlds get, [world, ...] each, or [...] for all of them.
+        actuator_state: buffers of :meth:`actuator_state`, in which these worlds forget their controls, as in
+            :meth:`reset_actuator_state`; by one launch more.
 
     Returns:
         q, qd.
@@ -110,7 +119,23 @@ def reset(
         pairs = [(as_rows(a, b.shape[1:]), b) for a, b in zip(sources, targets, strict=True) if b.size]
         if pairs:
             copy_rows([a for a, _ in pairs], [b for _, b in pairs], self.worlds, chosen)
+        if actuator_state is not None:
+            actuators.forget_controls(self, call, chosen, actuator_state)
     return q, qd
+
+
+def reset_actuator_state(self: Dynamics, mask: AnyArray | None, state: actuators.ActuatorState) -> None:
+    """Forget the controls that delays hold back, in the worlds where ``mask`` is True; a graph may capture it.
+
+    Args:
+        mask: bool [world]. None: all worlds.
+        state: buffers of :meth:`actuator_state`; changed in place.
+    """
+    settle((mask,))
+    with Call("Dynamics.reset_actuator_state", self.device, self.dtype, turn=self.recursions.turn) as call:
+        chosen = None if mask is None else read_mask(call, "mask", mask, self.worlds)
+        call.order()
+        actuators.forget_controls(self, call, chosen, state)
 
 
 def read_mask(call: Call, name: str, mask: Any, worlds: int) -> wp.array:

@@ -225,4 +225,5 @@ class Parameters:
                 known.fill()
         if fields:
             own = [self._derived[name].arrays[0] for name in fields]
-            copy_rows([self._values[name] for name in fields], own, self.worlds, transposed=True)
+            values = (self._values[name] for name in fields)
+            copy_rows([as_rows(value, value.shape[1:]) for value in values], own, self.worlds, transposed=True)
