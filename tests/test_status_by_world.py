@@ -167,11 +167,8 @@ SINGULAR = {"thin rod": thin_rod, "coaxial": coaxial, "ball": point_mass("ball")
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("case", SINGULAR)
-def test_a_singular_hinge_never_gives_a_finite_number(case, dtype, device, granularity, request):
+def test_a_singular_hinge_never_gives_a_finite_number(case, dtype, device, granularity):
     """In exact arithmetic a pivot is zero; rounding makes it positive in half of all states. None of them may pass."""
-    if granularity == "plan" and case in ("ball", "free"):
-        reason = "straight-line code says status 1 and gives numbers of 1e15 all the same"
-        request.applymarker(pytest.mark.xfail(reason=reason, strict=False))
     for seed in range(6):
         built = SINGULAR[case](np.random.default_rng(seed))
         dyn = spo.Dynamics(built, 32, device=device, dtype=dtype)
@@ -200,11 +197,11 @@ def test_a_light_axis_is_kept(device):
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_an_inertia_that_no_mass_has_is_taken_as_it_is(dtype, device):
-    """Principal moments 1, 1, 50 and 0, 0, 1: accepted and not repaired, in Body and in values."""
+    """Principal moments 1, 1, 50 and 0, 0, 1: accepted where asked for and not repaired, in Body and in values."""
     rng = np.random.default_rng(0)
     turned = lambda moments: (lambda R: R @ np.diag(moments) @ R.T)(reference.rotation(zoo.unit(rng, 4)))  # noqa: E731
     given = [turned((1.0, 1.0, 50.0)), turned((0.0, 0.0, 1.0)), turned((1.0, 2.0, 2.5))]
-    bodies = [spo.Body(1.0, rng.normal(size=3), inertia) for inertia in given]
+    bodies = [spo.Body(1.0, rng.normal(size=3), inertia, any_inertia=True) for inertia in given]
     hinges = [spo.Hinge("free", -1, 0), *(zoo.random_hinge(rng, "revolute", k, k + 1) for k in range(2))]
     built = spo.Scene(bodies, hinges)
     np.testing.assert_allclose(built.values["body_inertia"][0], given, rtol=0, atol=1e-14)  # symmetrised, no more

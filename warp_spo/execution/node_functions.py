@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from ..hinges.quaternions import quaternion_rotation
 from ..kernels import native
 from ..kernels.elementary import C_TYPE, NATIVE
 from ..kernels.spatial import spatial
-from ..recursions import articulated, kinematics, links, motion, newton_euler
+from ..recursions import articulated, kinematics, motion, newton_euler
 from ..recursions.articulated import Pivot
 from ..recursions.links import Placed
 from ..recursions.motion import STILL, Motion
@@ -63,7 +64,7 @@ def _eliminate(P: Articulated, h: Vector, armature: Value, least: Value) -> tupl
 
 NODE_FUNCTIONS: dict[str, tuple[Callable, dict[str, ArgumentKind]]] = {
     # quaternion xyzw -> R; pose * inner; pose * inner^-1; pose^-1 * other; a point's vector in the other frame
-    "quaternion_rotation": (links.quaternion_rotation, {"x": NUMBER, "y": NUMBER, "z": NUMBER, "w": NUMBER}),
+    "quaternion_rotation": (quaternion_rotation, {"x": NUMBER, "y": NUMBER, "z": NUMBER, "w": NUMBER}),
     "compose": (
         lambda pose, inner: Pose(None, pose.rotation @ inner.rotation, pose.point_to_parent(inner.l)),
         {"pose": PLACE, "inner": PLACE},

@@ -20,6 +20,7 @@ from .motion import NONE, Motion, carry_acceleration, hinge_entries, hinge_motio
 
 LEAST = 4.0  # roundings of the terms that cancel in a pivot; a smaller pivot may be rounding alone
 SOLID = 1e-2  # least share of the carried mass, and of its own moments, at which a body's inertia bounds its pivots
+FLAT = 1e-12  # share of a body's largest moment, or mass, below which another one is rounding of the same numbers
 NO_INERTIA = Articulated(NONE, NONE, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 
 
@@ -120,12 +121,16 @@ def cancellation_sizes(
 ) -> list[Value]:
     """Return the size of the terms that may cancel in each pivot; zero for the first pivot of a link with inertia.
 
-    Later pivots of a hinge are the remainders of entries of P after the earlier ones. A link without inertia has only
-    its children's articulated inertias, which vanish along their own hinges: the size is the sum of their magnitudes.
+    Later pivots of a hinge are the remainders of entries of P after the earlier ones. The entries of a body that does
+    not resist some motion of the hinge, such as a point mass, are as inexact as its largest ones. A link without
+    inertia has only its children's articulated inertias, which vanish along their own hinges: the size is the sum of
+    their magnitudes.
     """
     if link.inertia is not None:
-        solid = len(units) == 1 or _is_solid(link, units)
-        return [0.0, *(0.0 if solid else P.entry(unit, unit) for unit in units[1:])]
+        if len(units) == 1 or _is_solid(link, units):
+            return [0.0] * len(units)
+        own = _inexact(link, units)
+        return [own[0], *(P.entry(unit, unit) + size for unit, size in zip(units[1:], own[1:], strict=True))]
     sizes = []
     for unit in units:
         terms = []
@@ -156,6 +161,21 @@ def _is_solid(link: Link, units: list[int]) -> bool:
             return False
         M -= np.outer(M[:, k], M[k]) / M[k, k]
     return True
+
+
+def _inexact(link: Link, units: list[int]) -> list[float]:
+    """Return for each unit the body's largest moment, or its mass, if its constant inertia is singular; else zeros."""
+    own = link.inertia
+    if own is None or not all(map(is_constant, own.packed)):
+        return [0.0] * len(units)
+    M = np.array([[own.articulated.entry(i, j) for j in units] for i in units], dtype=float)
+    turns = np.array(units) < 3
+    largest = np.where(turns, M.diagonal()[turns].max(initial=0.0), M.diagonal()[~turns].max(initial=0.0))
+    for k in range(len(units)):
+        if not M[k, k] > FLAT * largest[k]:
+            return largest.tolist()
+        M -= np.outer(M[:, k], M[k]) / M[k, k]
+    return [0.0] * len(units)
 
 
 def zero_or_nan(D: Value) -> Value:

@@ -19,17 +19,17 @@ import numpy as np
 
 from ..hinges.kind import Kind
 from ..hinges.kind import Placed as Placed
-from ..hinges.quaternions import quaternion_rotation
 from ..scene.scene import Scene
 from ..trace.scalars import Graph, Scalar, Value, is_constant
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
+from .rotations import aligned, folded, numbers, pose_of, still
 
 MOTION_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c", "joint_armature", "gravity")
 LINK_VALUES = (*MOTION_VALUES, "body_gravcomp")
 TABLES = ("value", "node_value")  # what links are made of; what bodies by themselves are, for the operators
 NOTHING = Rigid(0.0, ZERO, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 PRICES = (6, 10, 10, 10, 4, 4, 4, 8, 8, 8)  # of mass, first moment, moments and products of inertia
-ROUNDING = 1e-14  # a rotation's entry that is this close to 0 or 1 is meant to be
+POINT = 1e-15  # share of a body's largest moment about its CoM below which another one is zero
 
 
 class Lift(NamedTuple):
@@ -141,7 +141,7 @@ class Links:
         self.reverses: dict[Any, Any] = {}
         self._values = {name: self._symbols(name, name in variable) for name in LINK_VALUES}
         self.gravity = Vector(self._values["gravity"].tolist())
-        self._poses = {name: [_pose(p) for p in self._values[name]] for name in ("joint_X_p", "joint_X_c")}
+        self._poses = {name: [pose_of(p) for p in self._values[name]] for name in ("joint_X_p", "joint_X_c")}
         self.turns_vary = any(R.dtype == object for poses in self._poses.values() for R, _ in poses)
         for root in scene.tree.roots:
             self._visit(root)
@@ -225,10 +225,10 @@ class Links:
             R_a, p_a = poses["joint_X_c"][scene.hinge_of[parent]]
             R, p = R_a.T @ R, R_a.T @ (p - p_a)
         R_c, p_c = poses["joint_X_c"][scene.hinge_of[node]]
-        com = _numbers(R_c.T @ (self._values["body_com"][node] - p_c))
+        com = numbers(R_c.T @ (self._values["body_com"][node] - p_c))
         return Node(
-            (_folded(R), Vector(p.tolist())),
-            (_folded(R_c), Vector(p_c.tolist())),
+            (folded(R), Vector(p.tolist())),
+            (folded(R_c), Vector(p_c.tolist())),
             Vector(com.tolist()),
             self._rigid(node, R_c, com),
         )
@@ -244,21 +244,34 @@ class Links:
             symmetric(J[0][0], J[1][1], J[2][2], J[0][1], J[0][2], J[1][2]),
         )
 
+    def _without_rounding(self, node: int, own: Rigid) -> Rigid:
+        """Return the inertia of a body about its CoM without moments that are zero but for rounding.
+
+        They are the difference of moments about another point, and a pivot that should be zero would be positive.
+        """
+        inertia, R = self._values["body_inertia"][node], self._poses["joint_X_c"][self.scene.hinge_of[node]][0]
+        if inertia.dtype == object or R.dtype == object:
+            return own
+        moments = (R.T @ inertia @ R).diagonal()
+        gone = moments <= POINT * moments.max()
+        entry = lambda i, j: 0.0 if gone[i] or gone[j] else own.inertia[i][j]  # noqa: E731
+        return own._replace(inertia=Matrix.of([[entry(i, j) for j in range(3)] for i in range(3)]))
+
     def seat(self, body: int, pose: np.ndarray) -> Seat:
         """Where a frame of a body, or with -1 of the inertial frame, sits."""
-        R, p = _pose(pose)
+        R, p = pose_of(pose)
         if body < 0:
-            return Seat(None, _folded(R), Vector(p.tolist()))
+            return Seat(None, folded(R), Vector(p.tolist()))
         seat, (R_body, p_body) = self.seats[body], self.nodes[body].anchor
         axes = seat.matrix @ R_body.T
-        return Seat(seat.link, axes @ _folded(R), seat.offset + axes @ (Vector(p.tolist()) - p_body))
+        return Seat(seat.link, axes @ folded(R), seat.offset + axes @ (Vector(p.tolist()) - p_body))
 
     def on_parent_node(self, link: Link) -> Link:
         """The first link of a hinge as it sits in the parent's node frame, instead of in the parent's link."""
         matrix, offset = self.nodes[link.node].tree
         if link.align is not None:
             matrix = matrix @ link.align
-        return dataclasses.replace(link, matrix=_still(matrix), offset=offset)
+        return dataclasses.replace(link, matrix=still(matrix), offset=offset)
 
     # -- building --------------------------------------------------------------------------------------------------
     def _visit(self, root: int) -> None:
@@ -279,12 +292,12 @@ class Links:
         dof, coordinate = int(scene.qd_start[index]), int(scene.q_start[index])
         label, armatures = scene.body_labels[node], self._values["joint_armature"].tolist()
         for kind, axis in scene.hinges[index].elements:
-            align = None if axis is None else _aligned(axis)
+            align = None if axis is None else aligned(axis)
             own = range(dof, dof + kind.dofs)
             link = Link(
                 link,
                 kind,
-                _still(matrix if align is None else matrix @ align),
+                still(matrix if align is None else matrix @ align),
                 offset,
                 align,
                 tuple(own),
@@ -300,7 +313,9 @@ class Links:
         rest = Seat(link, matrix, offset)
         self.seats[node] = rest
         if rest.link is not None:
-            rest.link.add(Pose(None, rest.matrix, rest.offset).rigid_to_parent(body.rigid))
+            inertia = Pose(None, rest.matrix, rest.offset).rigid_to_parent(body.rigid)
+            at_com = rest.link.node == node and rest.link.hinge.at_com
+            rest.link.add(self._without_rounding(node, inertia) if at_com else inertia)
             share = self._values["body_gravcomp"].tolist()[node]
             rest.link.hold_up(share * body.rigid.mass, rest.offset + rest.matrix @ body.com)
 
@@ -342,19 +357,9 @@ def place_link(link: Link, q: Any) -> Placed:
     return link.hinge.placed(link, q)
 
 
-def _numbers(array: np.ndarray) -> np.ndarray:
-    """``array`` in float64, if no entry is a symbol."""
-    return array.astype(float) if all(map(is_constant, array.flat)) else array
-
-
 def _price(inertia: Rigid) -> int:
     """Operations, roughly, in which the numbers of an inertia that are not zero take part."""
     return sum(price for x, price in zip(inertia.packed, PRICES, strict=True) if not is_constant(x) or x != 0.0)
-
-
-def _pose(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    rotation = np.array(quaternion_rotation(*value[3:].tolist()), dtype=object)
-    return _numbers(rotation), _numbers(value[:3])
 
 
 def _changed(values: Any, change: Callable[[Value], Value]) -> Any:
@@ -365,32 +370,3 @@ def _changed(values: Any, change: Callable[[Value], Value]) -> Any:
         items = [_changed(value, change) for value in values]
         return type(values)(*items) if hasattr(values, "_fields") else type(values)(items)
     return values if values is None else change(values)
-
-
-def _folded(rotation: np.ndarray) -> Matrix:
-    """A rotation; if it is constant, entries that are 0 or 1 but for rounding become so, and fold."""
-    rotation = _numbers(rotation)
-    if rotation.dtype == object:
-        return Matrix.of(rotation.tolist())
-    near = np.round(rotation)
-    return Matrix.of(np.where(np.abs(rotation - near) < ROUNDING, near, rotation).tolist())
-
-
-def _still(matrix: Matrix) -> Matrix | None:
-    """A link's matrix, folded where it is constant; None if it turns nothing."""
-    matrix = _folded(np.array(matrix, dtype=object))
-    return None if matrix == IDENTITY else matrix
-
-
-def _aligned(axis: np.ndarray) -> Matrix:
-    """A rotation that takes z to ``axis``; a permutation of the axes where that can be."""
-    z = axis / np.linalg.norm(axis)
-    near = np.round(z)
-    if np.abs(z - near).max() < ROUNDING:
-        z = near
-        x = np.roll(np.abs(z), 1) * z.sum()
-    else:
-        x = np.eye(3)[int(np.argmin(np.abs(z)))]
-        x = x - z * (x @ z)
-        x /= np.linalg.norm(x)
-    return Matrix.of(np.stack([x, np.cross(z, x), z], axis=1).tolist())
