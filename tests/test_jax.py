@@ -308,6 +308,10 @@ def test_errors():
         spo_jax.function(dyn, "step")
     with explained(TypeError, "step", "actuator_state=", "memory that the call writes"):
         spo_jax.function(dyn, "step", dt=0.1, actuator_state=None)
+    with explained(ValueError, "warp_spo.jax.function('jacobian')", "frames is 5", "expected a list"):
+        spo_jax.function(dyn, "jacobian", frames=5)
+    with explained(TypeError, "warp_spo.jax.function('step')", "dt is 'soon'", "expected a number of seconds"):
+        spo_jax.function(dyn, "step", dt="soon")
     with explained(TypeError, "gravity_force", "dt= is no option", "expected none"):
         spo_jax.function(dyn, "gravity_force", dt=0.1)
     f = spo_jax.function(dyn, "body_velocities")

@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import copy
+import inspect
 import multiprocessing
 import pickle
 import types
@@ -126,6 +127,9 @@ def test_dynamics_keeps_its_options():
     assert copied.loops == "embed" and copied.independent_dofs.tolist() == dyn.independent_dofs.tolist()
     refined = pickle.loads(pickle.dumps(spo.Dynamics(zoo.fork(), 2, "cpu", refine=1, granularity="node")))
     assert refined.refine == 1 and refined.dtype is wp.float32
+
+    arguments = set(inspect.signature(spo.Dynamics).parameters) - {"scene"}
+    assert arguments == set(refined._options), "an argument of Dynamics that a copy would not have"
 
     class Own(spo.Dynamics):
         pass

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import warp as wp
 
+from ..arrays import Call
 from .programs import Program
 
 if TYPE_CHECKING:
@@ -130,6 +131,10 @@ class Function:
         for name, default in expected.items():
             if default is inspect.Parameter.empty and name not in self.options:
                 raise TypeError(f"{self.name}: {name} is missing; expected {name}=")
+        call = Call(self.name, self.dyn.device, self.dyn.dtype)
+        for one in self.operation.options:
+            if one.read is not None and one.name in self.options:
+                one.read(self.dyn.scene, call, self.options[one.name])
 
     def _check_precision(self) -> None:
         settings: Any = jax.config
