@@ -123,9 +123,11 @@ def test_missing_meshes_matter_only_for_masses(tmp_path):
     tail = '<contact><exclude body1="world" body2="b"/><pair geom1="g" geom2="h"/></contact>'
     world = '<geom name="h" type="hfield" hfield="h"/><geom type="mesh" mesh="other"/>'
     world += f'<body name="b"><freejoint/>{INERTIA}{mesh}<geom type="box" mesh="m"/></body>'
-    with pytest.warns(UserWarning, match=r"left out: 1 pairs, 1 excludes, the meshes .* of 4 geoms, with which MuJoCo"):
+    world += '<body><freejoint/><geom size=".1" mass="2"/><geom type="mesh" mesh="m" density="0"/></body>'
+    world += '<body><body><geom type="mesh" mesh="m"/></body></body>'
+    with pytest.warns(UserWarning, match=r"left out: 1 pairs, 1 excludes, the meshes .* of 6 geoms, with which MuJoCo"):
         scene = spo.load(written(tmp_path, before=asset, world=world, after=tail))
-    np.testing.assert_array_equal(scene.values["body_mass"], [[1.0]])
+    np.testing.assert_array_equal(scene.values["body_mass"], [[1.0, 2.0, 0.0, 0.0]])
     file = written(tmp_path, before=asset, world=f'<body name="b"><freejoint/>{mesh}</body>')
     with pytest.raises(ValueError, match=r"load: .*robot.xml': MuJoCo refuses it: .*no.stl.*; correct the file"):
         spo.load(file)

@@ -47,8 +47,8 @@ def compiled(file: Path) -> tuple[mujoco.MjModel, list[str]]:
         spec = mujoco.MjSpec.from_file(os.fspath(file))
         dropped = _drop_unneeded(spec)
         return spec.compile(), [f"{', '.join(dropped)}, with which MuJoCo refuses the file ({refusal})"]
-    except ValueError:
-        raise ValueError(f"load: {str(file)!r}: MuJoCo refuses it: {refusal}; correct the file") from None
+    except ValueError as error:
+        raise ValueError(f"load: {str(file)!r}: MuJoCo refuses it: {_one_line(error)}; correct the file") from None
 
 
 def _drop_unneeded(spec: Any) -> list[str]:
@@ -77,12 +77,22 @@ def _drop_unneeded(spec: Any) -> list[str]:
 
 
 def _gives_no_mass(spec: Any, geom: Any) -> bool:
-    """Whether a geom changes no body that can move: it is on the world, or its body has an <inertial> that counts."""
-    body = geom.parent
-    if body is spec.worldbody or body.name == "world":
+    """Whether a geom changes no body that can move: its body stands still, has an <inertial>, or takes none from it."""
+    always, never = (
+        spec.compiler.inertiafromgeom == getattr(mujoco.mjtInertiaFromGeom, f"mjINERTIAFROMGEOM_{name}")
+        for name in ("TRUE", "FALSE")
+    )
+    first, last = spec.compiler.inertiagrouprange
+    if never or 0.0 in (geom.mass, geom.density) or not first <= geom.group <= last:
         return True
-    always = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    return bool(body.explicitinertial) and not always
+    body = geom.parent
+    if body.explicitinertial and not always:
+        return True
+    while body is not None:
+        if body.joints:
+            return False
+        body = body.parent
+    return True
 
 
 def _one_line(error: Exception) -> str:
