@@ -83,6 +83,29 @@ def test_arrays_of_the_caller(model, device):
         c.qd(qpos, qpos)
 
 
+def test_graph_capture(model, device):
+    """A captured conversion repeats for new numbers; on the CPU, where nothing is captured, it runs again."""
+    c = spo.mujoco.Coordinates(spo.from_mujoco(model), model, WORLDS, device, "float32")
+    qpos, qvel = (wp.array(array, dtype=wp.float32, device=device) for array in states(model))
+    q, qd = c.q(qpos), c.qd(qpos, qvel)
+    graph = None
+    if c.device.is_cuda:
+        with wp.ScopedCapture(c.device) as capture:
+            c.q(qpos, out=q)
+            c.qd(qpos, qvel, out=qd)
+        graph = capture.graph
+    other = [array[::-1].astype(np.float32) for array in states(model)]
+    for array, numbers in zip((qpos, qvel), other, strict=True):
+        array.assign(numbers)
+    if graph is None:
+        c.q(qpos, out=q)
+        c.qd(qpos, qvel, out=qd)
+    else:
+        wp.capture_launch(graph)
+    np.testing.assert_array_equal(q.numpy(), c.q(other[0]))
+    np.testing.assert_array_equal(qd.numpy(), c.qd(*other))
+
+
 def test_torch_tensors(model):
     torch = pytest.importorskip("torch")
     c = spo.mujoco.Coordinates(spo.from_mujoco(model), model, WORLDS, "cpu", "float64")
