@@ -17,14 +17,14 @@ def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool) -> Scene:
 
     With ``repair``, masses and inertias that no rigid body can have are replaced, and a warning names the bodies.
     """
-    if repair:
-        inertias = [np.array(inertia, dtype=np.float64).reshape(3, 3) for inertia in builder.body_inertia]
-        masses, inertias = repair_bodies(builder.body_label, builder.body_mass, inertias)
-        builder.body_mass[:] = masses
-        builder.body_inertia[:] = inertias  # type: ignore[assignment]  # matrices, as Newton's own
-    # from_newton checks the topology itself, and it accepts joints outside articulations, which USD files have.
-    model = builder.finalize(device="cpu", skip_validation_joints=True, skip_validation_inertia=True)
     try:
+        if repair:
+            inertias = [np.array(inertia, dtype=np.float64).reshape(3, 3) for inertia in builder.body_inertia]
+            masses, inertias = repair_bodies(builder.body_label, builder.body_mass, inertias)
+            builder.body_mass[:] = masses
+            builder.body_inertia[:] = inertias  # type: ignore[assignment]  # matrices, as Newton's own
+        # from_newton checks the topology itself, and it accepts joints outside articulations, which USD files have.
+        model = builder.finalize(device="cpu", skip_validation_joints=True, skip_validation_inertia=True)
         return from_newton(model)
     except ValueError as error:
         error.args = (f"load: {str(file)!r}: {error}",)

@@ -60,10 +60,10 @@ def read_urdf(file: Path, floating: bool | None, repair: bool) -> Scene:
     hinges = [base, *(_hinge(joint, number, label) for joint in carried)]
     inertials = _inertials([links[link] for link in number], hinges, repair)
     masses, inertias = [i[0] for i in inertials], [i[2] for i in inertials]
-    if repair:
-        masses, inertias = repair_bodies(list(map(label, number)), masses, inertias)
     couplings = _couplings(carried)
     try:
+        if repair:
+            masses, inertias = repair_bodies(list(map(label, number)), masses, inertias)
         bodies = [
             Body(mass, com, inertia, label(link), any_inertia=not repair)
             for mass, (_, com, _), inertia, link in zip(masses, inertials, inertias, number, strict=True)
@@ -198,6 +198,7 @@ def _axis(joint: Element) -> np.ndarray:
     axis = element.numbers("xyz", 3)
     if not axis.any():
         raise element.error("xyz is the zero vector; expected a direction")
+    axis /= np.abs(axis).max()  # so that squares are in range
     return axis / np.linalg.norm(axis)
 
 
