@@ -38,5 +38,5 @@ def copy(source: type, target: type, count: int, transposed: bool = False) -> wp
     text = "\n".join([*lines, "#undef COPY", "#undef FROM", ""])
     arrays = [("chosen", 1), *((name, 2) for name, _ in pairs), *((name, 2) for _, name in pairs)]
     names = [name for name, _ in pairs] if source is wp.float64 else [name for _, name in pairs]
-    plain = source is target
-    return native.kernel("rows", text, arrays, target if source is wp.float64 else source, wide=() if plain else names)
+    name, T = f"rows_{source.__name__}_{target.__name__}", target if source is wp.float64 else source
+    return native.kernel(name, text, arrays, T, wide=() if source is target else names)

@@ -16,6 +16,7 @@ from step_scenes import TOLERANCE, H
 from value_scenes import KINDS
 
 import warp_spo as spo
+from warp_spo.kernels import rows
 from warp_spo.reference import Dense
 
 WORLDS = 3
@@ -106,6 +107,26 @@ def test_a_tensor_with_gradient_is_not_overwritten_in_some_worlds():
     dyn.set(body_mass=grown(3))
     with pytest.raises(ValueError, match="worlds= with body_mass, whose tensor requires grad"):
         dyn.set(worlds=MASK, body_mass=np.ones(3))
+
+
+@pytest.mark.parametrize("transposed", [False, True])
+def test_what_a_thread_copies_on_cuda(transposed, monkeypatch):
+    """An entry of each array, run on the CPU: all worlds, some of them, and rows that all worlds share."""
+    name = "TRANSPOSED" if transposed else "AS_THEY_ARE"
+    monkeypatch.setattr(rows, name, getattr(rows, name).replace("defined(__CUDA_ARCH__)", "1"))
+    types = (wp.float64, wp.float32) if transposed else (wp.float32, wp.float64)
+    kernel, rng = rows.copy.__wrapped__(*types, 2, transposed), np.random.default_rng(0)
+    given = [rng.normal(size=(WORLDS, 7)).astype(np.float32), rng.normal(size=(1, 2)).astype(np.float32)]
+    sources = [wp.array(x, dtype=types[0], device="cpu") for x in given]
+    for mask in (None, MASK):
+        shapes = [(x.shape[1], WORLDS) if transposed else (WORLDS, x.shape[1]) for x in given]
+        targets = [wp.full(shape, 9.0, dtype=types[1], device="cpu") for shape in shapes]
+        chosen = None if mask is None else wp.array(mask, dtype=wp.bool, device="cpu")
+        wp.launch(kernel, 7 * WORLDS, [WORLDS, chosen, *sources], targets, device="cpu")
+        for x, target in zip(given, targets, strict=True):
+            wanted = np.where(True if mask is None else mask[:, None], x, 9.0)
+            wanted = np.broadcast_to(wanted, (WORLDS, x.shape[1]))
+            np.testing.assert_array_equal(target.numpy().T if transposed else target.numpy(), wanted)
 
 
 # -- states of some worlds ---------------------------------------------------------------------------------------------
