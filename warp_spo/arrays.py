@@ -308,7 +308,7 @@ class Call:
         if self.device.is_cuda:
             self._enter_stream()
         if change:
-            torch.mark_changed(array)
+            torch.mark_changed([array])
         return view(pointer, tuple(array.shape), dtype, self.device.alias)
 
     def _order(self, name: str, kind: dlpack.Library) -> None:

@@ -53,10 +53,15 @@ def call_with_gradient(*call: Any) -> Any:
     return torch_border().call_with_gradient(*call)
 
 
-def is_compiling() -> bool:
-    """Whether torch traces the call, for ``torch.compile`` or for an export."""
+def is_traced() -> bool:
+    """Whether ``torch.compile`` traces the call. This is asked in every call, and takes the least that torch has."""
     torch = sys.modules.get("torch")
-    return torch is not None and torch.compiler.is_compiling()
+    return torch is not None and torch.compiler.is_dynamo_compiling()
+
+
+def is_exported() -> bool:
+    """Whether torch traces the call in any way, such as for an export, which runs it with tensors of no numbers."""
+    return "torch" in sys.modules and sys.modules["torch"].compiler.is_compiling()
 
 
 def call_in_graph(*call: Any) -> Any:

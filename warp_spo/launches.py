@@ -8,6 +8,7 @@ arrays in the packed arguments of the kernels and packs nothing else, which take
 from __future__ import annotations
 
 import ctypes
+import functools
 import threading
 from collections.abc import Sequence
 from typing import Any
@@ -91,6 +92,28 @@ class _Fill:
             _set_all(self._place.array(), self._value)
 
 
+class _Launch:
+    """A recorded launch. On CUDA it calls Warp's native function itself, with arguments that were looked up before."""
+
+    def __init__(self, command: Any):
+        runtime: Any = wp._src.context.runtime
+        self._command, self._runtime = command, runtime
+        self._call: Any = None
+        native: Any = getattr(runtime.core, "wp_cuda_launch_kernel", None)
+        if command.device.is_cuda and len(getattr(native, "argtypes", None) or ()) == 11:
+            blocks = command.bounds.size, command.max_blocks, command.block_dim, int(command.grid_stride)
+            rest = command.cluster_dim, command.hooks.forward_smem_bytes, command.params_addr
+            self._call = functools.partial(native, command.device.context, command.hooks.forward, *blocks, *rest)
+
+    def launch(self, stream: wp.Stream | None) -> None:
+        if self._call is None or stream is None or self._runtime.captures:  # Warp notes what its captures use
+            self._command.launch(stream)
+        elif self._call(stream.cuda_stream, None):
+            raise RuntimeError(
+                f"Kernel {self._command.kernel.key} failed to launch: {self._runtime.get_error_string()}"
+            )
+
+
 class Recording:
     """The device work of one call, done inside ``with Recording(arrays) as recording:``.
 
@@ -146,7 +169,7 @@ class Recording:
                 command.params_addr[at] = ctypes.c_void_p(ctypes.addressof(packed))
             self._follow(argument, packed)
         command.fwd_args = None  # would keep the caller's memory
-        self.steps.append(command)
+        self.steps.append(_Launch(command))
 
     def keep(self, step: type, *arguments: Any) -> None:
         """Keep a copy or fill that was done."""

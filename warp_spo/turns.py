@@ -15,16 +15,17 @@ class Turn:
     Attributes:
         lock: held during a call. On CUDA a call ends when its kernels are launched, and the stream of the next call
             waits for them.
+        stream: of the latest call.
     """
 
     def __init__(self, device: wp.Device):
         self._device = device
-        self._stream: wp.Stream | None = None
+        self.stream: wp.Stream | None = None
         self.lock = _locks.setdefault(device.alias, threading.RLock()) if device.is_cuda else threading.RLock()
 
     def order(self, stream: wp.Stream) -> None:
         """Let ``stream`` wait for the stream of the call before; in a graph capture nothing may wait."""
-        before, self._stream = self._stream, stream
+        before, self.stream = self.stream, stream
         if before is None or before is stream or before.cuda_stream == stream.cuda_stream:
             return
         if not (self._device.captures or before.is_capturing or stream.is_capturing):

@@ -39,7 +39,7 @@ import warp as wp
 from ..arrays import Call
 from ..dlpack import settle
 from ..execution.routine import Routine
-from ..gradients import call_in_graph, call_with_gradient, is_compiling, records_gradient
+from ..gradients import call_in_graph, call_with_gradient, is_exported, is_traced, records_gradient
 from ..recursions.links import LINK_VALUES, MOTION_VALUES, Links
 from ..scene.frames import check_frames, origins
 from ..scene.scene import Scene
@@ -293,19 +293,22 @@ class Operation:
 
         @functools.wraps(function)
         def call(dyn: Any, *args: Any, **more: Any) -> Any:
-            if is_compiling() and in_graph:
+            if is_traced() and in_graph:
                 return call_in_graph(dyn._handle, *graphed, args, more)
-            recorded = not dyn.values.tensors or not records_gradient((), dyn.values)
-            result, *kind = dyn._replays.replay(name, args, more) if recorded else (MISS, None, [])
-            if result is not MISS:
-                return result
+            key, arrays = None, []
+            if not dyn.values.tensors or not records_gradient((), dyn.values):
+                result, key, arrays = dyn._replays.replay(name, args, more)
+                if result is not MISS:
+                    return result
+            if is_exported() and in_graph:
+                return call_in_graph(dyn._handle, *graphed, args, more)
             if self.derivative is not None and records_gradient((*args, *more.values()), dyn.values):
                 arguments = dict(zip(names, args, strict=False)) | more
                 if len(arguments) < len(args) + len(more) or not arguments.keys() <= names.keys():
                     signature.bind(dyn, *args, **more)  # raises TypeError
                 return call_with_gradient(dyn, self, arguments)
             settle((*args, *more.values()))
-            return dyn._replays.run(*kind, lambda: function(dyn, *args, **more))
+            return dyn._replays.run(key, arrays, lambda: function(dyn, *args, **more))
 
         self._methods.append(call)
         return cast(MethodT, call)

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import warp as wp
 
@@ -24,7 +24,7 @@ from ..launches import recording as open_recording
 from ..memory import ranges_overlap, size_in_bytes
 from ..turns import Turn
 
-Builder = Callable[[list, list], Any]
+Builder = Callable[[Sequence[Any], list], Any]
 """``build(arrays, results)`` returns what a caller gets, of the arrays of the call and those that it made."""
 MOST_KINDS, MOST_TRIES = 256, 4  # kinds of calls that are kept; calls of a kind that are recorded
 NUMBERS = frozenset((int, float, bool, str))
@@ -32,71 +32,120 @@ MISS = object()
 """What :meth:`Replays.replay` returns if nothing was recorded for the call."""
 
 
-class Like(NamedTuple):
-    """What a recorded call knows of an array: of the next one it takes the same."""
-
-    shape: Any
-    dtype: Any
-    device: Any
+Repeat = Callable[[Sequence[Any]], Any]
+"""``repeat(arrays)`` does a recorded call with other arrays; :data:`MISS` if they differ in more than their memory."""
 
 
-class Plan:
-    """A recorded call.
+def _repeater(
+    device: wp.Device, turn: Turn, arrays: list, ranges: list, recording: Recording, build: Builder
+) -> Repeat:
+    """Return a function that repeats a recorded call.
 
     Args:
-        arrays: the arrays that it took, in the order of its arguments.
-        ranges: address and size in bytes of each.
-        recording: what it did.
-        build: what the caller gets.
+        arrays: the arrays that it took, in the order of its arguments. ranges: address and size in bytes of each.
+        recording: what it did. build: what the caller gets.
     """
+    is_torch, is_cuda = CLASSES[type(arrays[0])] == TORCH, device.is_cuda
+    find, maker, stream_of = _like(arrays), _maker, _stream
+    mark_changed: Any = None
+    if is_torch:
+        border = torch_border()
+        find, maker, stream_of, mark_changed = border.like(arrays), border.maker, border.stream, border.mark_changed
+    makers = [maker(shape, dtype, device) for _, shape, dtype in recording.results]
+    written = [i for i, x in enumerate(arrays) if any(x is other for other in recording.written)]
+    pairs = [(i, j) for i in written for j in range(len(arrays)) if i != j]
+    same = [(i, j, arrays[i] is arrays[j]) for i, j in pairs if ranges[i] == ranges[j]]
+    apart = [(i, ranges[i][1], j, ranges[j][1]) for i, j in pairs if ranges[i] != ranges[j]]
+    count, places = len(arrays), [*map(tuple, recording.places)]
+    given_places, made_places = places[:count], places[count:]
+    given_shifted = [one for one in recording.shifted if one[0] < count]
+    made_shifted = [(i - count, place, shift) for i, place, shift in recording.shifted if i >= count]
+    launches = [step.launch for step in recording.steps]
+    marks = is_torch and bool(written)
+    last: list[int] = []  # addresses of the arrays that the packed arguments hold
 
-    def __init__(self, device: wp.Device, arrays: list, ranges: list, recording: Recording, build: Builder):
-        self._device, self._recording, self._build = device, recording, build
-        self.kind = CLASSES[type(arrays[0])]
-        self._addresses, maker = _addresses, _maker
-        if self.kind == TORCH:
-            self._addresses, maker = torch_border().addresses, torch_border().maker
-        self._like = tuple(Like(x.shape, x.dtype, x.device) for x in arrays)
-        self._makers = [maker(shape, dtype, device) for _, shape, dtype in recording.results]
-        self._written = [i for i, x in enumerate(arrays) if any(x is other for other in recording.written)]
-        pairs = [(i, j) for i in self._written for j in range(len(arrays)) if i != j]
-        self._same = [(i, j, arrays[i] is arrays[j]) for i, j in pairs if ranges[i] == ranges[j]]
-        self._apart = [(i, ranges[i][1], j, ranges[j][1]) for i, j in pairs if ranges[i] != ranges[j]]
-        self._places = tuple(map(tuple, recording.places))
-        self._last: list[int] = []  # addresses that the packed arguments hold
-
-    def replay(self, turn: Turn, arrays: list) -> Any:
-        """Do the call again with other arrays; return :data:`MISS` if they differ in more than their memory."""
-        addresses = self._addresses(arrays, self._like)
+    def repeat(arrays: Sequence[Any]) -> Any:
+        nonlocal last
+        addresses = find(arrays)
         if addresses is None:
             return MISS
-        for i, j, identical in self._same:
+        for i, j, identical in same:
             if addresses[i] != addresses[j] or identical != (arrays[i] is arrays[j]):
                 return MISS
-        for i, size, j, other_size in self._apart:
-            if ranges_overlap(addresses[i], size, addresses[j], other_size):
-                return MISS
+        if addresses != last:
+            for i, size, j, other_size in apart:
+                if ranges_overlap(addresses[i], size, addresses[j], other_size):
+                    return MISS
+            last = addresses
+            _set_addresses(addresses, given_places, given_shifted)
         stream = None
-        if self._device.is_cuda:
-            stream = torch_border().stream(self._device) if self.kind == TORCH else self._device.stream
-            turn.order(stream)
+        if is_cuda:
+            stream = stream_of(device)
+            if stream is not turn.stream:
+                turn.order(stream)
         results = []
-        for make in self._makers:
-            owner, address = make()
-            results.append(owner)
-            addresses.append(address)
-        if addresses != self._last:
-            for address, places in zip(addresses, self._places, strict=True):
-                for place in places:
-                    place.data = address
-            for number, place, shift in self._recording.shifted:
-                place.data = addresses[number] + shift
-            self._last = addresses
-        if self.kind == TORCH and self._written:
-            torch_border().mark_changed([arrays[i] for i in self._written])
-        for step in self._recording.steps:
-            step.launch(stream)
-        return self._build(arrays, results)
+        if makers:
+            made = []
+            for make in makers:
+                owner, address = make()
+                results.append(owner)
+                made.append(address)
+            _set_addresses(made, made_places, made_shifted)
+        if marks:
+            mark_changed([arrays[i] for i in written])
+        for launch in launches:
+            launch(stream)
+        return build(arrays, results)
+
+    return repeat
+
+
+def _set_addresses(addresses: list[int], places: list[tuple], shifted: list[tuple[int, Any, int]]) -> None:
+    """Set the addresses of arrays in packed arguments."""
+    for address, holders in zip(addresses, places, strict=True):
+        for place in holders:
+            place.data = address
+    for number, place, shift in shifted:
+        place.data = addresses[number] + shift
+
+
+def _stream(device: wp.Device) -> wp.Stream:
+    return device.stream
+
+
+def _repeater_as_written(args: tuple, more: dict[str, Any], turn: Turn, repeat: Repeat) -> Callable[..., Any] | None:
+    """Return ``repeat(args, more)`` for the next call if it is written like this one; None if that has lists.
+
+    Most calls are written as the one before. Their arrays are found without a look at all arguments, whose classes the
+    comparison with the recorded ones looks at.
+    """
+    values, tail = (*args, *more.values()), 0
+    if type(values[-1]) is tuple:
+        tail = len(values[-1])
+        values = values[:-1] + values[-1]
+    places = [i for i, value in enumerate(values) if type(value) in CLASSES]
+    constants = [(i, value, type(value)) for i, value in enumerate(values) if i not in places]
+    if any(value is not None and kind not in NUMBERS for _, value, kind in constants):
+        return None
+    count, names, whole, lock = len(args), tuple(more), len(places) == len(values), turn.lock
+
+    def repeat_as_written(args: tuple, more: dict[str, Any]) -> Any:
+        if len(args) != count or tuple(more) != names:
+            return MISS
+        values = (*args, *more.values())
+        if tail:
+            last = values[-1]
+            if type(last) is not tuple or len(last) != tail:
+                return MISS
+            values = values[:-1] + last
+        for at, constant, kind in constants:
+            value = values[at]
+            if value is not constant and (type(value) is not kind or value != constant):
+                return MISS
+        with lock:
+            return repeat(values if whole else [values[i] for i in places])
+
+    return repeat_as_written
 
 
 @dataclasses.dataclass
@@ -104,10 +153,11 @@ class Kind:
     """Calls of one kind.
 
     Attributes:
-        plans: those that are recorded, which differ in the arrays that are written in place. tries: to record one.
+        plans: functions that repeat recorded calls, which differ in the arrays that are written in place.
+        tries: calls that were recorded.
     """
 
-    plans: list[Plan] = dataclasses.field(default_factory=list)
+    plans: list[Repeat] = dataclasses.field(default_factory=list)
     tries: int = 0
 
 
@@ -119,27 +169,38 @@ class Replays:
         if "torch" in sys.modules:
             torch_border()  # fills CLASSES
         self._kinds: dict[tuple, Kind] = {}
+        self._latest: dict[str, Callable[[tuple, dict[str, Any]], Any]] = {}
 
     def forget(self) -> None:
         """Forget all calls: arrays that they read were replaced."""
-        self._kinds = {}
+        self._kinds, self._latest = {}, {}
 
     def replay(self, name: str, args: tuple, more: dict[str, Any]) -> tuple[Any, tuple | None, list]:
         """Repeat a recorded call; return its result, its kind and its arrays. The result may be :data:`MISS`."""
+        runtime: Any = wp._src.context.runtime
+        if runtime.tape is not None or runtime._apic_capture is not None or open_recording() is not None:
+            return MISS, None, []  # who records launches wants to see them
+        latest = self._latest.get(name)
+        if latest is not None:
+            found = latest(args, more)
+            if found is not MISS:
+                return found, None, []
         key, arrays = _kind_of_call(name, args, more)
         kind = self._kinds.get(key) if key is not None else None
-        if kind is not None and kind.plans and open_recording() is None and _is_plain():
+        for repeat in () if kind is None else kind.plans:
             with self.turn.lock:
-                for plan in kind.plans:
-                    found = plan.replay(self.turn, arrays)
-                    if found is not MISS:
-                        return found, key, arrays
+                found = repeat(arrays)
+            if found is not MISS:
+                again = _repeater_as_written(args, more, self.turn, repeat)
+                if again is not None:
+                    self._latest[name] = again
+                return found, key, arrays
         return MISS, key, arrays
 
     def run(self, key: tuple | None, arrays: list, call: Callable[[], Any]) -> Any:
         """Return the result of ``call()``; record the second call of a kind."""
         with self.turn.lock:
-            plain = open_recording() is None and _is_plain() and not self._device.is_capturing
+            plain = not self._device.is_capturing
             if key is None or not arrays or not plain:
                 return call()
             kind = self._kinds.get(key)
@@ -159,7 +220,7 @@ class Replays:
             result = call()
         build = _builder(result, arrays, [owner for owner, _, _ in recording.results])
         if recording.complete and build is not None and _lie_apart(arrays, ranges, recording.written):
-            kind.plans.append(Plan(self._device, arrays, ranges, recording, build))
+            kind.plans.append(_repeater(self._device, self.turn, arrays, ranges, recording, build))
         return result
 
 
@@ -198,20 +259,21 @@ def _add(value: Any, kind: type, key: list, arrays: list) -> bool:
     return True
 
 
-def _is_plain() -> bool:
-    """Whether no tape and no capture of launches by Warp wants to know what is launched."""
-    runtime: Any = wp._src.context.runtime
-    return runtime.tape is None and runtime._apic_capture is None
+def _like(arrays: Sequence[wp.array]) -> Callable[[Sequence[Any]], list[int] | None]:
+    """Return a function of other Warp arrays that returns their addresses, or None if one is not like these."""
+    wanted = tuple((x.shape, x.dtype, x.device) for x in arrays)
 
+    def find(arrays: Sequence[Any]) -> list[int] | None:
+        found = []
+        for x, (shape, dtype, device) in zip(arrays, wanted, strict=True):
+            if type(x) is not wp.array or x.shape != shape or x.dtype is not dtype:
+                return None
+            if x.device is not device or not x.is_contiguous:
+                return None
+            found.append(x.ptr)
+        return found
 
-def _addresses(arrays: list, like: tuple[Like, ...]) -> list[int] | None:
-    """Return the addresses of Warp arrays; None if one is not like the recorded one."""
-    found = []
-    for x, (shape, dtype, device) in zip(arrays, like, strict=True):
-        if x.shape != shape or x.dtype is not dtype or x.device is not device or not x.is_contiguous:
-            return None
-        found.append(x.ptr)
-    return found
+    return find
 
 
 def _maker(shape: tuple[int, ...], dtype: type, device: wp.Device) -> Callable[[], tuple[wp.array, int]]:

@@ -9,7 +9,6 @@ from .compiled import call_in_graph, custom_op
 from .module import Module
 from .tensors import (
     CLASSES,
-    addresses,
     device_name,
     empty,
     has_dtype,
@@ -17,6 +16,7 @@ from .tensors import (
     is_grad_enabled,
     is_on,
     is_tensor,
+    like,
     maker,
     mark_changed,
     pointer,
@@ -27,7 +27,6 @@ from .tensors import (
 __all__ = [
     "CLASSES",
     "Module",
-    "addresses",
     "call_in_graph",
     "call_with_gradient",
     "custom_op",
@@ -38,6 +37,7 @@ __all__ = [
     "is_grad_enabled",
     "is_on",
     "is_tensor",
+    "like",
     "maker",
     "mark_changed",
     "pointer",

@@ -1,7 +1,7 @@
 """Tensors at the border: what :mod:`warp_spo.arrays` needs to know of a torch tensor."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -19,7 +19,8 @@ DTYPES: dict[Any, torch.dtype] = {
 }
 
 is_grad_enabled = torch.is_grad_enabled
-mark_changed = torch.autograd.graph.increment_version  # a backward pass that saved the tensor then raises an error
+mark_changed = getattr(torch._C, "_increment_version", torch.autograd.graph.increment_version)
+"""Says that tensors, a list, are changed. A backward pass that saved one then raises an error."""
 _streams: dict[tuple[int, int], wp.Stream] = {}
 
 
@@ -72,33 +73,67 @@ def pointer(call: str, name: str, tensor: torch.Tensor) -> int:
     return found
 
 
-def addresses(tensors: list[torch.Tensor], like: tuple[tuple[Any, Any, Any], ...]) -> list[int] | None:
-    """Return the addresses of tensors; None if one is not (shape, dtype, device), or no plain contiguous memory."""
-    if forward_ad._current_level >= 0:
+def like(tensors: Sequence[torch.Tensor]) -> Callable[[Sequence[Any]], list[int] | None]:
+    """Return a function of other tensors that returns their addresses.
+
+    It returns None if one differs in class, shape, dtype or device, has strides, no memory of its own, a tangent, or
+    needs a gradient. The guards with which torch protects its compiled code look at all of it in one call, and only if
+    they object does Python look once more: it does not mind strides of axes with one entry, for example.
+    """
+    wanted = tuple((x.shape, x.dtype, x.device) for x in tensors)
+    places = [i for i, x in enumerate(tensors) if not any(x is other for other in tensors[:i])]  # guards want each once
+    guards, pick = _guards([tensors[i] for i in places]), None if len(places) == len(tensors) else places
+
+    def find(tensors: Sequence[Any]) -> list[int] | None:
+        if forward_ad._current_level >= 0:
+            return None
+        if guards is not None and guards.check(*(tensors if pick is None else [tensors[i] for i in pick])):
+            found = [x.data_ptr() for x in tensors]
+            return None if 0 in found else found
+        return _addresses(tensors, wanted)
+
+    return find
+
+
+def _guards(tensors: list[torch.Tensor]) -> Any:
+    """Return torch's guards of tensors, or None if this torch has none."""
+    kind: Any = getattr(getattr(torch._C._dynamo, "guards", None), "TensorGuards", None)
+    try:
+        shapes, strides = [list(x.shape) for x in tensors], [list(x.stride()) for x in tensors]
+        found = kind(*tensors, dynamic_dims_sizes=shapes, dynamic_dims_strides=strides)
+        return found if found.check(*tensors) else None
+    except (TypeError, RuntimeError):
         return None
+
+
+def _addresses(tensors: Sequence[Any], wanted: tuple[tuple[Any, Any, Any], ...]) -> list[int] | None:
     found = []
     try:
-        for x, (shape, dtype, device) in zip(tensors, like, strict=True):
-            address = x.data_ptr()
-            if x.shape != shape or x.dtype is not dtype or x.device != device or not x.is_contiguous() or x.is_neg():
+        for x, (shape, dtype, device) in zip(tensors, wanted, strict=True):
+            if type(x) not in CLASSES or x.shape != shape or x.dtype is not dtype or x.device != device:
                 return None
-            if not address or (x.requires_grad and torch.is_grad_enabled()):
+            if not x.is_contiguous() or x.is_neg() or (x.requires_grad and torch.is_grad_enabled()):
                 return None
-            found.append(address)
+            found.append(x.data_ptr())
     except RuntimeError:  # sparse, or wrapped by a transform
         return None
-    return found
+    return found if all(found) else None
 
 
 def maker(shape: tuple[int, ...], dtype: type, device: wp.Device) -> Callable[[], tuple[torch.Tensor, int]]:
     """Return a function that returns a new tensor and its address."""
-    found, place = DTYPES[dtype], torch_device(device.alias)
+    kind, place = DTYPES[dtype], torch_device(device.alias)
+    fast = getattr(getattr(torch._C._dynamo, "guards", None), f"_empty_strided_{place.type}", None)  # as compiled code
+    if fast is None or (place.type == "cuda" and torch.cuda.device_count() > 1):
+        make: Callable[[], torch.Tensor] = functools.partial(torch.empty, shape, dtype=kind, device=place)
+    else:
+        make = functools.partial(fast, tuple(shape), torch.empty(shape, device="meta").stride(), kind)
 
-    def make() -> tuple[torch.Tensor, int]:
-        tensor = torch.empty(shape, dtype=found, device=place)
+    def make_both() -> tuple[torch.Tensor, int]:
+        tensor = make()
         return tensor, tensor.data_ptr()
 
-    return make
+    return make_both
 
 
 def empty(shape: tuple, dtype: type, device: wp.Device) -> torch.Tensor:
@@ -115,10 +150,13 @@ def stream(device: wp.Device) -> wp.Stream:
     """Return torch's current stream of a CUDA device as a Warp stream."""
     index = device.ordinal
     found = _streams.get((index, torch._C._cuda_getCurrentRawStream(index)))
-    if found is None:
-        current = torch.cuda.current_stream(torch_device(device.alias))
-        found = wp.stream_from_torch(current)  # keeps torch's stream alive, so its handle is not reused
-        _streams[index, current.cuda_stream] = found
+    return _wrapped_stream(device) if found is None else found
+
+
+def _wrapped_stream(device: wp.Device) -> wp.Stream:
+    current = torch.cuda.current_stream(torch_device(device.alias))
+    found = wp.stream_from_torch(current)  # keeps torch's stream alive, so its handle is not reused
+    _streams[device.ordinal, current.cuda_stream] = found
     return found
 
 
