@@ -331,6 +331,9 @@ def test_errors():
     with explained(ValueError, "interpolate", "no gradient by s", "expected gradients by q0, q1", "stop_gradient(s)"):
         between, (start,) = spo_jax.function(robot(), "interpolate"), arrays(robot(), "q")
         jax.grad(lambda s: between(start, 1.1 * start, s).sum())(jnp.full(WORLDS, 0.3))
+    slope = jax.grad(lambda qd: (f(q, qd) ** 2).sum())
+    with explained(ValueError, "body_velocities", "differentiated once more", "expected first", "finite differences"):
+        jax.grad(lambda qd: slope(qd).sum())(qd)
     with explained(TypeError, "jvp"):  # JAX's own words
         jax.jvp(lambda qd: f(q, qd), (qd,), (qd,))
     stopped = spo_jax.function(dyn, "body_states")

@@ -87,7 +87,8 @@ class Program:
                 self._compute(dict(zip(given, map(part, inputs), strict=True)), out=out, **more)
 
         forms = forms_of((*results, *written.values()))
-        return traceable(self.operation.name, run, forms_of(given.values()), forms, self.function.capture)
+        name, read = self.operation.name, forms_of(given.values())
+        return self._first_order(traceable(name, run, read, forms, self.function.capture))
 
     def _parts(self, rows: int) -> Iterator[Callable[[wp.array], wp.array]]:
         """Return functions that take as many rows of an array as there are worlds, part after part."""
@@ -183,6 +184,19 @@ class Program:
         by_name = dict(zip(wanted, gradients, strict=True))
         return tuple(by_name.get(name) for name in self.columns)
 
+    def _first_order(self, launch: Traced) -> Traced:
+        """Return a function with a way back that raises: JAX asks for it only where it differentiates a gradient."""
+
+        def refuse(residuals: Any, cotangents: Any) -> Any:
+            raise ValueError(
+                f"{self.function.name}: its gradient is differentiated once more; expected first derivatives only, "
+                f"because they are analytic and not traced; take finite differences of gradients for second derivatives"
+            )
+
+        guarded = jax.custom_vjp(launch)
+        guarded.defvjp(lambda *arrays: (launch(*arrays), None), refuse)
+        return guarded
+
     def _backward(self, wanted: tuple[str, ...]) -> Traced:
         """Return the gradients by some arguments as a JAX function of what the call read and wrote, and cotangents."""
         given, results, written = self._computed(True)
@@ -202,7 +216,8 @@ class Program:
                     wp.copy(part(out), found)
 
         read = (*given.values(), *results, *written.values(), *results)
-        return traceable(f"{self.operation.name}_vjp", run, forms_of(read), forms_of(pull(read)), False)
+        name = f"{self.operation.name}_vjp"
+        return self._first_order(traceable(name, run, forms_of(read), forms_of(pull(read)), False))
 
 
 def _rows(first: int, end: int, array: wp.array) -> wp.array:
