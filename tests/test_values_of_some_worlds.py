@@ -239,6 +239,20 @@ def test_a_step_has_gradients_by_variable_limits(device):
     dyn.set(**{name: scene().values[name][0] for name in LIMITS})
 
 
+def test_the_energy_of_springs_has_a_gradient_by_their_rest(device):
+    dyn, q = limited(device), laws.states(scene(), WORLDS)["q"]
+    place = dict(dtype=torch.float64, device=wp.device_to_torch(device))
+    rest = torch.tensor(various()["joint_rest_q"], **place).requires_grad_()
+
+    def run(rest):
+        dyn.set(joint_rest_q=rest)
+        return dyn.potential_energy(torch.tensor(q, **place))
+
+    assert check(run, [rest])
+    assert torch.autograd.grad(run(rest).sum(), rest)[0].abs().max() > 0.1
+    dyn.set(joint_rest_q=scene().values["joint_rest_q"][0])
+
+
 def test_rk4_refuses_friction_and_rates_that_may_come(device):
     dyn = limited(device)
     a = laws.states(scene(), WORLDS)

@@ -64,7 +64,7 @@ POTENTIAL_ENERGY = Operation(
     derivative=Derivative(
         Routine("potential_energy_vjp", adjoints.potential_energy_vjp),
         by=("q",),
-        values=("body_mass", *KINEMATIC, "gravity", "joint_stiffness"),
+        values=("body_mass", *KINEMATIC, "gravity", "joint_stiffness", "joint_rest_q"),
         embed=AS_WRITTEN,
         multipliers=AS_WRITTEN,
         lacking=_lacks_fixed_ground,
