@@ -139,6 +139,9 @@ def test_floating_bases_balls_and_several_frames(device):
     last = int(scene.q_start[scene.hinge_of[4]])
     assert (found[:, last] == scene.neutral_q[last]).all()
     q[:, last] = np.linspace(-1.0, 1.0, worlds)
+    q[:, 3:7] *= 1.7
+    start, _ = dyn.inverse_kinematics(targets, frames, q=q, iterations=0)
+    np.testing.assert_allclose(np.linalg.norm(start[:, 3:7], axis=1), 1.0, atol=1e-15)
     found, error = dyn.inverse_kinematics(targets, frames, q=q, seeds=2)
     np.testing.assert_array_equal(found[:, last], q[:, last])
     assert error.max() < 1e-9

@@ -61,10 +61,17 @@ def inverse_kinematics_start(trace: Trace, frames: tuple) -> list[Store]:
     limits, stores = Impedance(trace.links, 0.0, trace.vector("q"), trace.vector("qd")), list[Store]()
     for link in trace.links.links:
         trace.label(link, "o")
-        for i, neutral in enumerate(link.hinge.neutral):
+        values = list(link.hinge.neutral)
+        if GIVEN in trace.inputs:
+            values = [given(link.coordinate + i) for i in range(link.hinge.coordinates)]
+            if id(link) in moving and link.hinge.quaternion is not None:
+                turn = Vector(values[link.hinge.quaternion :])
+                values[link.hinge.quaternion :] = turn * reciprocal(sqrt(dot(turn, turn)))
+        for i, value in enumerate(values):
             at = link.coordinate + i
             low, high = (None, None) if link.hinge.quaternion is not None else bounds(trace, limits, link.dofs[i])
-            value = given(at) if GIVEN in trace.inputs else _within(neutral, low, high)
+            if GIVEN not in trace.inputs:
+                value = _within(value, low, high)
             if id(link) in moving:
                 value = select(first, _within(value, low, high), _start(link, i, share(at), low, high))
             stores.append(Store(NEXT, (at,), value))

@@ -47,7 +47,7 @@ def inverse_dynamics_regressor(trace: Trace) -> list[Store]:
             columns[id(link)] = carried_columns(trace, link, columns)
         for dof, column in columns[id(link)].items():
             trace.label(link, "y")
-            values = coefficients(motion, in_body(place, *column))
+            values = coefficients(motion, place.motion_to_child(*column))
             stores += [Store("out", (dof, COUNT * body + i), value) for i, value in enumerate(values)]
     return stores
 
@@ -61,7 +61,7 @@ def inverse_dynamics_regressor_transposed_product(trace: Trace) -> list[Store]:
         if key not in velocities:
             velocities[key] = carried_rates(trace, link, velocities, trace.vector("tau"))
         trace.label(link, "y")
-        values = coefficients(motion, in_body(place, *velocities[key]))
+        values = coefficients(motion, place.motion_to_child(*velocities[key]))
         stores += [Store("out", (COUNT * body + i,), value) for i, value in enumerate(values)]
     return stores
 
@@ -85,7 +85,8 @@ def inverse_dynamics_regressor_product(trace: Trace) -> list[Store]:
         n, f = Vector(force[:3]), Vector(force[3:])
         stores += [Store("out", (d,), x) for d, x in zip(link.dofs, hinge_entries(link, here, n, f), strict=True)]
         if link.parent is not None:
-            above, handed = id(link.parent), Vector((*(x := here.pose.force_to_parent(n, f))[0], *x[1]))
+            n, f = here.pose.force_to_parent(n, f)
+            above, handed = id(link.parent), Vector((*n, *f))
             forces[above] = forces[above] + handed if above in forces else handed
     return stores
 
@@ -111,11 +112,6 @@ def body_frame(trace: Trace, body: int) -> Pose:
     seat, (R, p) = trace.links.seats[body], trace.links.nodes[body].anchor
     axes = seat.matrix @ R.T
     return Pose(None, None if axes == IDENTITY else axes, seat.offset - axes @ p)
-
-
-def in_body(place: Pose, w: Vector, v: Vector) -> Twist:
-    """Return (omega; v) of the body frame for that of its link."""
-    return place.motion_to_child(w, v)
 
 
 def carried_columns(trace: Trace, link: Link, columns: dict[int, dict[int, Twist]]) -> dict[int, Twist]:
