@@ -180,15 +180,32 @@ def test_calls_equal_the_reference(dtype, device):
 
 
 @pytest.mark.parametrize("name", ["fork", pytest.param("skeleton", marks=pytest.mark.slow)])
-def test_frames_at_node_granularity(name, device):
+def test_node_granularity(name, device):
     scene = zoo.fork() if name == "fork" else SCENES[name]()
     dyn = spo.Dynamics(scene, WORLDS, device=device, dtype="float64", granularity="node")
     a = states(scene)
-    for operation in FRAMED[:2]:
+    for operation in (*FRAMED[:2], "com", "com_velocity", "kinetic_energy"):
+        assert dyn.plan.of(dyn._operations[operation].routine) == "node"
         got = called(dyn, operation, on_device(dyn, a)).numpy()
         assert_equals_reference(scene, operation, a, got)
     everywhere = dyn.frame_poses(a["q"], list(range(scene.body_count)))
     np.testing.assert_allclose(everywhere, dyn.body_poses(a["q"]), atol=1e-15)  # signs of quaternions, too
+
+
+def test_bodies_that_do_not_move_have_no_centre(device):
+    """Neither at node granularity: one body stands, one moves; a scene of the first alone has zeros."""
+    bodies = [spo.Body(2.0, com=(1.0, 0.0, 0.0)), spo.Body(3.0, com=(0.0, 0.5, 0.0))]
+    hinges = [spo.Hinge("fixed", -1, 0), spo.Hinge("prismatic", 0, 1, axis=(0, 0, 1))]
+    for granularity in ("node", "tree"):
+        options = dict(device=device, dtype="float64", granularity=granularity)
+        dyn = spo.Dynamics(spo.Scene(bodies, hinges), 1, **options)
+        q = np.array([[0.2]])
+        np.testing.assert_allclose(dyn.com(q), [[0.0, 0.5, 0.2]], atol=1e-15)
+        np.testing.assert_allclose(dyn.com_velocity(q, q), [[0.0, 0.0, 0.2]], atol=1e-15)
+        still = spo.Dynamics(spo.Scene(bodies[:1], hinges[:1]), 1, **options)
+        nothing = np.zeros((1, 0))
+        for zero in (still.com(nothing), still.com_velocity(nothing, nothing), still.kinetic_energy(nothing, nothing)):
+            assert (zero == 0.0).all()
 
 
 def test_frames_with_turning_anchors(device):

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from ..arrays import AnyArray, ArrayT
 from ..errors import UnsupportedError
+from ..execution import node_operations as nodes
 from ..execution.routine import Routine
 from ..recursions import energy as recursion
 from ..recursions.derivatives import adjoints
@@ -22,7 +23,7 @@ KINETIC_ENERGY = Operation(
     "kinetic_energy",
     arguments=(Q, required(QD)),
     results=(Result("energy", "world"),),
-    routine=Routine("kinetic_energy", recursion.kinetic_energy),
+    routine=Routine("kinetic_energy", recursion.kinetic_energy, nodes.kinetic_energy),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,
     derivative=Derivative(

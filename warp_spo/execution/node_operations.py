@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ..kernels import articulated, kinematics
+from ..kernels import articulated, declare, kinematics, sums
 from .sweeps import Sweeps
 
 
@@ -93,6 +93,27 @@ def frame_velocities(run: Sweeps, out: wp.array, q: wp.array, qd: wp.array, fram
     run.hinges(q, qd)
     inputs = [*run.frames(frames), run.parameters.anchor, run.world_poses(), run.velocities()]
     run.launch_nodes(kinematics.frame_velocities, out.shape[1::-1], inputs, [out])
+
+
+def com(run: Sweeps, out: wp.array, q: wp.array) -> None:
+    declare(sums, run.functions)
+    run.hinges(q)
+    inputs = [run.topology, run.parameters.rigid, run.world_poses()]
+    run.launch_nodes(sums.center_of_mass, run.worlds, inputs, [out])
+
+
+def com_velocity(run: Sweeps, out: wp.array, q: wp.array, qd: wp.array) -> None:
+    declare(sums, run.functions)
+    run.hinges(q, qd)
+    inputs = [run.topology, run.parameters.rigid, run.world_poses(), run.velocities()]
+    run.launch_nodes(sums.center_of_mass_velocity, run.worlds, inputs, [out])
+
+
+def kinetic_energy(run: Sweeps, out: wp.array, q: wp.array, qd: wp.array) -> None:
+    declare(sums, run.functions)
+    run.hinges(q, qd)
+    inputs = [run.parameters.rigid, run.velocities(), run.parameters.field("joint_armature"), qd]
+    run.launch_nodes(sums.kinetic_energy, run.worlds, inputs, [out])
 
 
 def jacobian(run: Sweeps, out: wp.array, q: wp.array, frames: tuple) -> None:
