@@ -1,4 +1,4 @@
-"""Sums over the bodies of a world: centre of mass, its velocity, kinetic energy. A thread adds up one world in order."""
+"""Sums over the bodies of a world: centre of mass, its velocity, kinetic energy. A thread adds up one world."""
 
 import functools
 
