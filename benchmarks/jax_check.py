@@ -83,7 +83,9 @@ def measure(row: Row, device: wp.Device) -> dict[str, Any]:
     """Return the times of a call [us], and its error before and after timing."""
 
     def error() -> float:
-        return row.error(row.call()) if row.error is not None else 0.0
+        result = row.call()
+        wait(result, device)  # CuPy's arrays may still be written on their stream
+        return row.error(result) if row.error is not None else 0.0
 
     for _ in range(WARM_UP):
         wait(row.call(), device)
@@ -131,7 +133,7 @@ def rows(scene: spo.Scene, worlds: int, device: wp.Device) -> list[Row]:
     )
 
     def some(result: Any) -> Any:
-        return jax.tree.map(lambda x: x[np.array(WORLDS)], result)
+        return jax.tree.map(lambda x: as_numpy(x)[list(WORLDS)], result)
 
     forward = [d.forward_dynamics(tau=wide["tau"][w]) for d, w in zip(dense, WORLDS, strict=True)]
     inverse = [d.inverse_dynamics(wide["qd"][w], wide["qdd"][w]) for d, w in zip(dense, WORLDS, strict=True)]
