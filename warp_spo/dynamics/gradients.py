@@ -21,7 +21,7 @@ from ..execution import link_values
 from ..execution.plan import MOST_DOFS
 from ..recursions.links import LINK_VALUES
 from .operation import DIFFERENTIABLE, Derivative, Operation, derivative_of
-from .replays import MISS
+from .replays import MISS, as_written
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
@@ -36,6 +36,7 @@ class Gradients:
     def __init__(self, dyn: Dynamics):
         self.dyn = dyn
         self._checked: set[str] = set()  # names of operations that have gradients on this scene
+        self.latest: dict[str, Callable[[tuple, dict[str, Any]], Any]] = {}  # repeats a call that torch records
 
     # -- for torch -------------------------------------------------------------------------------------------------
     @property
@@ -60,6 +61,30 @@ class Gradients:
     def forget(self) -> None:
         """Forget what was checked: values that kernels fold have changed."""
         self._checked.clear()
+        self.latest.clear()
+
+    def remember(self, record: Any, tensors: list, written: tuple, guards: Any, apply: Callable[..., Any]) -> None:
+        """Let the next call of an operation that torch records go without checks, if it is written as this one.
+
+        Args:
+            record: the call. tensors: its tensors. written: its arguments by position, and by name.
+            guards: ``guards(tensors)`` is None if tensors are not like these; None: torch cannot tell.
+            apply: ``apply(record, *tensors)`` returns the result.
+        """
+        find, values = as_written(*written), self.dyn.values
+        found = None if find is None else find(*written)
+        if find is None or found is None or guards is None or len(found) != len(tensors):
+            return
+        if any(x is not y for x, y in zip(found, tensors, strict=True)):
+            return  # torch wants its tensors in another order
+
+        def again(args: tuple, more: dict[str, Any]) -> Any:
+            tensors = find(args, more)
+            if tensors is None or values.tensors or values.stamps != record.stamps or guards(tensors) is None:
+                return MISS
+            return apply(record, *tensors)
+
+        self.latest[record.operation.name] = again
 
     def check_size(self, call: Call) -> None:
         """Raise UnsupportedError where the scene has too many dofs for derivatives."""
@@ -90,7 +115,8 @@ class Gradients:
             wrt: names of arguments and of values.
         """
         replays, arguments = self.dyn._replays, (given, options, results, cotangents, wrt)
-        found, key, arrays = replays.replay(f"{operation.name}, backwards", arguments, {})
+        flat = {**given, **options, "wrt": tuple(wrt)}
+        found, key, arrays = replays.replay(f"{operation.name}, backwards", (*results, *cotangents), flat)
         return found if found is not MISS else replays.run(key, arrays, lambda: self._pull_back(operation, *arguments))
 
     def _pull_back(

@@ -295,6 +295,11 @@ class Operation:
         def call(dyn: Any, *args: Any, **more: Any) -> Any:
             if is_traced() and in_graph:
                 return call_in_graph(dyn._handle, *graphed, args, more)
+            again = dyn._gradients.latest.get(name)
+            if again is not None:
+                result = again(args, more)
+                if result is not MISS:
+                    return result
             key, arrays = None, []
             if not dyn.values.tensors or not records_gradient((), dyn.values):
                 result, key, arrays = dyn._replays.replay(name, args, more)
@@ -306,7 +311,7 @@ class Operation:
                 arguments = dict(zip(names, args, strict=False)) | more
                 if len(arguments) < len(args) + len(more) or not arguments.keys() <= names.keys():
                     signature.bind(dyn, *args, **more)  # raises TypeError
-                return call_with_gradient(dyn, self, arguments)
+                return call_with_gradient(dyn, self, arguments, (args, more))
             settle((*args, *more.values()))
             return dyn._replays.run(key, arrays, lambda: function(dyn, *args, **more))
 
@@ -315,11 +320,11 @@ class Operation:
 
     def run(self, dyn: Any, *args: Any, **more: Any) -> Any:
         """Return the result without torch's gradients."""
-        result, *kind = dyn._replays.replay(self.name, args, more)
+        result, key, arrays = dyn._replays.replay(f"{self.name}, plain", args, more)
         if result is not MISS:
             return result
         settle((*args, *more.values()))
-        return dyn._replays.run(*kind, lambda: self.function(dyn, *args, **more))
+        return dyn._replays.run(key, arrays, lambda: self.function(dyn, *args, **more))
 
     @property
     def function(self) -> Callable[..., Any]:

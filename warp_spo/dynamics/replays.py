@@ -113,11 +113,10 @@ def _stream(device: wp.Device) -> wp.Stream:
     return device.stream
 
 
-def _repeater_as_written(args: tuple, more: dict[str, Any], turn: Turn, repeat: Repeat) -> Callable[..., Any] | None:
-    """Return ``repeat(args, more)`` for the next call if it is written like this one; None if that has lists.
+def as_written(args: tuple, more: dict[str, Any]) -> Callable[[tuple, dict[str, Any]], Any] | None:
+    """Return a function that finds the arrays of the next call, if it is written as this one; None if this has lists.
 
-    Most calls are written as the one before. Their arrays are found without a look at all arguments, whose classes the
-    comparison with the recorded ones looks at.
+    Most calls are written as the one before. The function returns None for others, and does not look at the arrays.
     """
     values, tail = (*args, *more.values()), 0
     if type(values[-1]) is tuple:
@@ -127,25 +126,24 @@ def _repeater_as_written(args: tuple, more: dict[str, Any], turn: Turn, repeat: 
     constants = [(i, value, type(value)) for i, value in enumerate(values) if i not in places]
     if any(value is not None and kind not in NUMBERS for _, value, kind in constants):
         return None
-    count, names, whole, lock = len(args), tuple(more), len(places) == len(values), turn.lock
+    count, names, whole = len(args), tuple(more), len(places) == len(values)
 
-    def repeat_as_written(args: tuple, more: dict[str, Any]) -> Any:
+    def find(args: tuple, more: dict[str, Any]) -> Any:
         if len(args) != count or tuple(more) != names:
-            return MISS
+            return None
         values = (*args, *more.values())
         if tail:
             last = values[-1]
             if type(last) is not tuple or len(last) != tail:
-                return MISS
+                return None
             values = values[:-1] + last
         for at, constant, kind in constants:
             value = values[at]
             if value is not constant and (type(value) is not kind or value != constant):
-                return MISS
-        with lock:
-            return repeat(values if whole else [values[i] for i in places])
+                return None
+        return values if whole else [values[i] for i in places]
 
-    return repeat_as_written
+    return find
 
 
 @dataclasses.dataclass
@@ -169,7 +167,7 @@ class Replays:
         if "torch" in sys.modules:
             torch_border()  # fills CLASSES
         self._kinds: dict[tuple, Kind] = {}
-        self._latest: dict[str, Callable[[tuple, dict[str, Any]], Any]] = {}
+        self._latest: dict[str, tuple[Any, Repeat]] = {}
 
     def forget(self) -> None:
         """Forget all calls: arrays that they read were replaced."""
@@ -182,18 +180,22 @@ class Replays:
             return MISS, None, []  # who records launches wants to see them
         latest = self._latest.get(name)
         if latest is not None:
-            found = latest(args, more)
-            if found is not MISS:
-                return found, None, []
+            find, repeat = latest
+            arrays = find(args, more)
+            if arrays is not None:
+                with self.turn.lock:
+                    found = repeat(arrays)
+                if found is not MISS:
+                    return found, None, []
         key, arrays = _kind_of_call(name, args, more)
         kind = self._kinds.get(key) if key is not None else None
         for repeat in () if kind is None else kind.plans:
             with self.turn.lock:
                 found = repeat(arrays)
             if found is not MISS:
-                again = _repeater_as_written(args, more, self.turn, repeat)
-                if again is not None:
-                    self._latest[name] = again
+                find = as_written(args, more)
+                if find is not None:
+                    self._latest[name] = find, repeat
                 return found, key, arrays
         return MISS, key, arrays
 

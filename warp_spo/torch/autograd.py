@@ -6,20 +6,22 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from .tensors import is_tensor, pointer, requires_grad
+from .tensors import is_tensor, like, pointer, requires_grad
 
 if TYPE_CHECKING:
     from ..dynamics.dynamics import Dynamics
     from ..dynamics.operation import Operation
 
 
-def call_with_gradient(dyn: "Dynamics", operation: "Operation", arguments: dict[str, Any]) -> Any:
+def call_with_gradient(
+    dyn: "Dynamics", operation: "Operation", arguments: dict[str, Any], written: tuple[tuple, dict[str, Any]]
+) -> Any:
     """Return the result of an operation, through which torch's backward pass can go.
 
     Args:
         dyn: The Dynamics.
         operation: The operation, which has a derivative.
-        arguments: Its arguments by name.
+        arguments: Its arguments by name. written: by position, and by name, as the caller wrote them.
     """
     assert operation.derivative is not None
     derivative = operation.derivative
@@ -52,6 +54,9 @@ def call_with_gradient(dyn: "Dynamics", operation: "Operation", arguments: dict[
         )
     record = Record(dyn, operation, arguments, tuple(inputs), tuple(value_tensors))
     dyn._gradients.check(operation)
+    if times == 1 and not value_tensors:
+        given = list(tensors.values())
+        dyn._gradients.remember(record, given, written, like(given, exactly=True), _Differentiable.apply)
     for _ in range(times - 1):
         results = _Differentiable.apply(record, *tensors.values())
         tensors |= {one.name: result for one, result in zip(operation.results, results, strict=True)}
@@ -116,7 +121,7 @@ class _Differentiable(torch.autograd.Function):
         ctx.record = record
         result, kept = record.run(tensors)
         ctx.save_for_backward(*tensors, *kept)
-        ctx.places = [(weakref.ref(x), x.data_ptr()) for x in tensors]
+        ctx.places, ctx.owners = [x.data_ptr() for x in tensors], [weakref.ref(x) for x in tensors]
         return result
 
     @staticmethod
@@ -124,12 +129,8 @@ class _Differentiable(torch.autograd.Function):
         record, saved = ctx.record, ctx.saved_tensors
         names = (*record.inputs, *record.values)
         tensors, results = saved[: len(names)], saved[len(names) :]
-        for name, tensor, (before, place) in zip(names, tensors, ctx.places, strict=True):
-            if tensor.data_ptr() != place and tensor is before():
-                raise RuntimeError(
-                    f"Dynamics.{record.operation.name}: {name}.data was replaced between this call and its backward "
-                    f"pass; expected the numbers of the call; pass {name}.clone(), or call backward before"
-                )
+        if ctx.places != [x.data_ptr() for x in tensors]:
+            _refuse_replaced(record, names, tensors, ctx)
         wanted = [name for name, needed in zip(names, ctx.needs_input_grad[1:], strict=True) if needed]
         given = tuple([c.contiguous() for c in cotangents])
         if not torch.is_grad_enabled():
@@ -144,6 +145,16 @@ class _Differentiable(torch.autograd.Function):
             sources = [x for x in (*tensors, *cotangents) if x.requires_grad]
             found = {name: _FirstOrder.apply(record.operation.name, value, *sources) for name, value in found.items()}
         return None, *[found.get(name) for name in names]
+
+
+def _refuse_replaced(record: Record, names: tuple[str, ...], tensors: Sequence[torch.Tensor], ctx: Any) -> None:
+    """Raise RuntimeError if a tensor has other memory than in the call; hooks of torch may save copies."""
+    for name, tensor, place, owner in zip(names, tensors, ctx.places, ctx.owners, strict=True):
+        if tensor.data_ptr() != place and tensor is owner():
+            raise RuntimeError(
+                f"Dynamics.{record.operation.name}: {name}.data was replaced between this call and its backward pass; "
+                f"expected the numbers of the call; pass {name}.clone(), or call backward before"
+            )
 
 
 class _FirstOrder(torch.autograd.Function):

@@ -73,12 +73,14 @@ def pointer(call: str, name: str, tensor: torch.Tensor) -> int:
     return found
 
 
-def like(tensors: Sequence[torch.Tensor]) -> Callable[[Sequence[Any]], list[int] | None]:
+def like(tensors: Sequence[torch.Tensor], exactly: bool = False) -> Any:
     """Return a function of other tensors that returns their addresses.
 
     It returns None if one differs in class, shape, dtype or device, has strides, no memory of its own, a tangent, or
     needs a gradient. The guards with which torch protects its compiled code look at all of it in one call, and only if
-    they object does Python look once more: it does not mind strides of axes with one entry, for example.
+    they object does Python look once more: it does not mind strides of axes with one entry, for example. With
+    ``exactly`` the guards alone decide, also that each tensor needs a gradient if its example does; without guards the
+    result is None.
     """
     wanted = tuple((x.shape, x.dtype, x.device) for x in tensors)
     places = [i for i, x in enumerate(tensors) if not any(x is other for other in tensors[:i])]  # guards want each once
@@ -90,9 +92,9 @@ def like(tensors: Sequence[torch.Tensor]) -> Callable[[Sequence[Any]], list[int]
         if guards is not None and guards.check(*(tensors if pick is None else [tensors[i] for i in pick])):
             found = [x.data_ptr() for x in tensors]
             return None if 0 in found else found
-        return _addresses(tensors, wanted)
+        return None if exactly else _addresses(tensors, wanted)
 
-    return find
+    return None if exactly and guards is None else find
 
 
 def _guards(tensors: list[torch.Tensor]) -> Any:
