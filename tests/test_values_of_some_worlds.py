@@ -79,6 +79,19 @@ def test_no_world_and_a_list(device):
     assert (np.abs(dyn.mass_matrix(q) - before).max(axis=(1, 2)) > 1e-3).tolist() == [False, True, False]
 
 
+def test_worlds_whose_table_would_crowd_the_cache(device):
+    """Rows of 1 KiB, which lie further apart on a CPU."""
+    worlds = 128
+    dyn = spo.Dynamics(scene(), worlds, device=device, dtype="float64", granularity="tree", variable=("body_mass",))
+    mass = scene().values["body_mass"] * np.random.default_rng(0).uniform(0.5, 2.0, (worlds, 1))
+    dyn.set(body_mass=mass)
+    q = np.tile(laws.states(scene(), 1)["q"], (worlds, 1))
+    got = dyn.mass_matrix(q)
+    for w in (0, 1, 64, 127):
+        wanted = Dense(scene().with_values(body_mass=mass[w]), q[w]).mass_matrix
+        np.testing.assert_allclose(got[w], wanted, atol=1e-12)
+
+
 def grown(shape):
     return torch.ones(shape, dtype=torch.float64, requires_grad=True)
 

@@ -260,8 +260,9 @@ class Dynamics:
 
         They are those that ``Dynamics(independent=...)`` names. Otherwise they are chosen when the object is made, from
         random configurations that close the loops: the first dofs that determine the others nearly as well as any dofs
-        do. Results in the independent dofs (mass matrices, Jacobians, forces) are NaN where these dofs no longer
-        determine the others (the dead point of a rocker); forward_dynamics and operational_inertia pass such points.
+        do, none that the loops hold still. Results in the independent dofs (mass matrices, Jacobians, forces) are NaN
+        where these dofs no longer determine the others (the dead point of a rocker); forward_dynamics and
+        operational_inertia pass such points.
         """
         return self._closures.independent_dofs
 
