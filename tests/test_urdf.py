@@ -11,6 +11,7 @@ import pytest
 import warp_spo as spo
 from benchmarks.robot_files import compare_urdf, short, urdf_files
 from warp_spo.newton import load
+from warp_spo.newton.repair import repaired
 from warp_spo.reference import Dense, homogeneous
 
 FILES = {file.name: file for file in urdf_files()}
@@ -86,6 +87,7 @@ REFUSED = {
     "numbers": (robot(*pair("fixed", '<origin xyz="0 0"/>')), r"line 4, <origin>: xyz is '0 0'; expected 3 finite num"),
     "limits": (robot(*pair("revolute", '<limit upper="-1"/>')), r"line 4, <limit>: of joint 'j': lower is 0, above u"),
     "damping": (robot(*pair("revolute", '<dynamics damping="-1"/>')), r"line 4, <dynamics>: damping is -1; expected 0"),
+    "floating": (robot(*pair("floating", '<dynamics damping="1"/>')), r"line 4, <joint name='j'>: has damping or fric"),
     "two_axes": (robot(*pair("revolute", "<axis xyz='1 0 0'/>" * 2)), r"line 4, <axis>: a second one in <joint> 'j'"),
     "mass": (robot('<link name="a"><inertial/></link>'), r"line 2, <inertial>: of link 'a': no <mass>"),
     "moment": (robot(LINK.format("a").replace("ixz", "xz")), r"line 2, <inertia>: no attribute 'ixz'"),
@@ -240,3 +242,29 @@ def test_no_file_of_a_mesh_that_gives_a_mass(tmp_path):
     with pytest.raises(ValueError, match=r"line 3, <mesh>: there is no file 'no.stl'; .*write <inertial>"):
         load(path)
     assert load(path, repair=False).dof_count == 1
+
+
+def test_a_spherical_joint_has_damping(tmp_path):
+    scene = load(written(tmp_path, robot(*pair("spherical", '<dynamics damping="2" friction="1"/>'))))
+    np.testing.assert_array_equal(scene.values["joint_damping"], [[2.0, 2.0, 2.0]])
+    np.testing.assert_array_equal(scene.values["joint_friction"], [[1.0, 1.0, 1.0]])
+
+
+@pytest.mark.filterwarnings("ignore::newton.NewtonWarning")
+def test_inertias_are_replaced_by_newtons_rule(rng):
+    """Symmetric matrices of all kinds; Newton computes in float32, where the least moment is a share of 1e-6."""
+    newton = pytest.importorskip("newton")
+    turns = np.linalg.qr(rng.normal(size=(200, 3, 3)))[0]
+    moments = rng.normal(0.3, 0.4, (200, 3)) * 10.0 ** rng.integers(-4, 2, (200, 1))
+    inertias = np.einsum("kij,kj,klj->kil", turns, moments, turns)
+    masses = rng.choice([0.0, -1.0, 1.0, 2.0], 200, p=[0.05, 0.05, 0.6, 0.3])
+    builder = newton.ModelBuilder()
+    for mass, inertia in zip(masses, inertias, strict=True):
+        body = builder.add_body()
+        builder.body_mass[body], builder.body_inertia[body] = float(mass), inertia
+    model = builder.finalize(device="cpu")
+    ours = [repaired(float(mass), inertia) for mass, inertia in zip(masses, inertias, strict=True)]
+    np.testing.assert_array_equal(model.body_mass.numpy(), [mass for mass, _ in ours])
+    assert sum(not np.array_equal(new, old) for (_, new), old in zip(ours, inertias, strict=True)) > 100
+    for (_, mine), theirs in zip(ours, model.body_inertia.numpy(), strict=True):
+        np.testing.assert_allclose(mine, theirs, atol=2e-6 * np.abs(theirs).max(initial=1e-3))

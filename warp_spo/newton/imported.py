@@ -20,7 +20,7 @@ def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool) -> Scene:
     try:
         if repair:
             inertias = [np.array(inertia, dtype=np.float64).reshape(3, 3) for inertia in builder.body_inertia]
-            masses, inertias = repair_bodies(builder.body_label, builder.body_mass, inertias)
+            masses, inertias = repair_bodies(builder.body_label, builder.body_mass, inertias, depth=4)
             builder.body_mass[:] = masses
             builder.body_inertia[:] = inertias  # type: ignore[assignment]  # matrices, as Newton's own
         # from_newton checks the topology itself, and it accepts joints outside articulations, which USD files have.

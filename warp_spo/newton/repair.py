@@ -34,9 +34,12 @@ def repaired(mass: float, inertia: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def repair_bodies(
-    labels: Sequence[str], masses: Sequence[float], inertias: Sequence[np.ndarray]
+    labels: Sequence[str], masses: Sequence[float], inertias: Sequence[np.ndarray], depth: int
 ) -> tuple[list[float], list[np.ndarray]]:
-    """Return the masses and inertias of bodies, repaired. A warning names the bodies whose values were replaced."""
+    """Return the masses and inertias of bodies, repaired. A warning names the bodies whose values were replaced.
+
+    ``depth`` is the number of calls from the user's to this one; the warning names the user's line.
+    """
     values = [repaired(mass, inertia) for mass, inertia in zip(masses, inertias, strict=True)]
     replaced = [
         label
@@ -49,6 +52,6 @@ def repair_bodies(
             "body (negative, a mass without inertia or an inertia without mass, or one principal moment exceeds the "
             "sum of the others); correct the file, or keep its values with load(path, repair=False)",
             UserWarning,
-            stacklevel=4,
+            stacklevel=depth + 1,
         )
     return [mass for mass, _ in values], [inertia for _, inertia in values]

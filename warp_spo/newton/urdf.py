@@ -63,7 +63,7 @@ def read_urdf(file: Path, floating: bool | None, repair: bool) -> Scene:
     couplings = _couplings(carried)
     try:
         if repair:
-            masses, inertias = repair_bodies(list(map(label, number)), masses, inertias)
+            masses, inertias = repair_bodies(list(map(label, number)), masses, inertias, depth=3)
         bodies = [
             Body(mass, com, inertia, label(link), any_inertia=not repair)
             for mass, (_, com, _), inertia, link in zip(masses, inertials, inertias, number, strict=True)
@@ -147,10 +147,14 @@ def _hinge(joint: Element, number: dict[str, int], label: Callable[[str], str]) 
     kind, (parent, child) = joint.needed("type"), _ends(joint)
     if kind not in KINDS:
         raise joint.error(f"the type is {kind!r}; expected one of {', '.join(KINDS)}")
-    values: dict[str, Any] = NO_LIMITS
+    values: dict[str, Any] = _resistances(joint) if kind != "fixed" else {}
+    if kind in ("floating", "spherical"):
+        values |= NO_LIMITS
+    if kind == "floating" and any(values.values()):
+        raise joint.error("has damping or friction; expected none of a floating joint; remove <dynamics>")
     if kind in (*SCALAR, "planar"):
         axis = _axis(joint)
-        values = {"axis": _in_plane(axis) if kind == "planar" else axis, **_resistances(joint)}
+        values["axis"] = _in_plane(axis) if kind == "planar" else axis
     if kind in SCALAR:
         values |= _limits(joint, kind)
     pose = np.concatenate(_origin(joint))
