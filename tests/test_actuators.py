@@ -33,8 +33,7 @@ def test_forces_are_those_of_the_reference(dtype, device):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_reference_is_mujoco(kind):
-    import mujoco
-
+    mujoco = pytest.importorskip("mujoco")
     scene, model = arm([KINDS[kind][0]]), mujoco_arm([KINDS[kind][1]])
     data, reached = mujoco.MjData(model), set()
     for q, qd, ctrl in zip(*states(scene, 20), strict=True):
@@ -47,8 +46,7 @@ def test_reference_is_mujoco(kind):
 
 def test_voltage_of_a_motor_is_mujocos():
     """A motor of which the terminal voltage is controlled: gain K / R, bias -K^2 / R."""
-    import mujoco
-
+    mujoco = pytest.importorskip("mujoco")
     K, R, gear = 0.3, 2.0, 5.0
     model = mujoco_arm([f'<dcmotor joint="a" motorconst="{K}" resistance="{R}" gear="{gear}"/>'])
     scene = arm([spo.Actuator(0, gear=gear, gain=K / R, bias=(0.0, 0.0, -K * K / R))])
@@ -63,8 +61,7 @@ def test_voltage_of_a_motor_is_mujocos():
 
 def test_steps_are_mujocos_where_both_are_implicit_in_the_rate():
     """MuJoCo's implicitfast takes derivatives of forces by qd alone: motors and velocity servos agree step by step."""
-    import mujoco
-
+    mujoco = pytest.importorskip("mujoco")
     names, h = ("motor", "motor with ranges", "velocity"), 1e-3
     model, scene = mujoco_arm([KINDS[name][1] for name in names], h), arm([KINDS[name][0] for name in names])
     dyn, data = spo.Dynamics(scene, 1, device="cpu", dtype="float64"), mujoco.MjData(model)
