@@ -19,8 +19,8 @@ from warp_spo.scene.frames import check_frames, origins
 
 WORLDS = 3
 TOLERANCE = 2e-12  # as laws.TOLERANCE: rounding of the deepest scene
-LARGE = ("every_d6", "tree10", "chain_helical")  # a second each
-SCENES = {name: zoo.SCENES[name] for name in ("forest", "chain_free", *LARGE)}
+LARGE = ("every_d6", "tree10", "chain_helical", "skeleton")  # a second each or more
+SCENES = {name: zoo.SCENES[name] for name in ("forest", "chain_free", *LARGE[:3])}
 SCENES["skeleton"] = skeleton
 
 
@@ -285,6 +285,7 @@ def test_gradients(operation, dyn_and_state):
     )
 
 
+@pytest.mark.slow
 def test_gradients_by_values(device):
     """Of the energies and the centre of mass by masses, places and springs."""
     scene = zoo.fork()

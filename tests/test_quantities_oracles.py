@@ -117,7 +117,7 @@ def moved(pose):
     return np.array(columns).T
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", ["arm", "forest", pytest.param("tree10", marks=pytest.mark.slow)])
 def test_regressor_of_pinocchio(name):
     """Its columns are parameters in joint frames, its rows are dual to its own velocities."""
     scene, a = case(name)
