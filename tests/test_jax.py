@@ -1,6 +1,7 @@
 """Operations as JAX functions: under jit, grad and vmap, against the calls themselves, torch and finite differences."""
 
 import functools
+import importlib
 import pickle
 import threading
 
@@ -32,13 +33,14 @@ DIFFERENCE = (
     1e-6  # step of central differences in float64; their error is about the square of it, and 1e-10 of rounding
 )
 DIFFERENCES = 2e-7
+enable_x64 = getattr(jax, "enable_x64", None) or importlib.import_module("jax.experimental").enable_x64  # before 0.8
 
 
 @pytest.fixture(scope="module", autouse=True)
 def float64(device):
     if not device.is_cpu:
         pytest.skip("on the CPU; benchmarks/jax_check.py looks at a GPU")
-    with jax.enable_x64(True):
+    with enable_x64(True):
         yield
 
 
@@ -281,17 +283,17 @@ def test_float32_and_the_switch():
     single, double = robot("float32"), robot()
     wide = arrays(double, "q", "qd", "qdd")
     q, qd, qdd = arrays(single, "q", "qd", "qdd")
-    with jax.enable_x64(False):
+    with enable_x64(False):
         f = spo_jax.function(single, "inverse_dynamics")
         assert f(q, qd, qdd).dtype == jnp.float32
         with explained(ValueError, "float64", "turned off", "expected", "jax_enable_x64", "dtype='float32'"):
             spo_jax.function(double, "inverse_dynamics")
     g = spo_jax.function(double, "inverse_dynamics")
-    with jax.enable_x64(False), explained(ValueError, "jax_enable_x64"):
+    with enable_x64(False), explained(ValueError, "jax_enable_x64"):
         g(q, qd, qdd)
     with explained(ValueError, "q is float32", "expected float64", "q.astype('float64')", "dtype='float32'"):
         g(q, qd, qdd)
-    with jax.enable_x64(False), explained(ValueError, "inverse_dynamics", "float64", "turned off", "jax_enable_x64"):
+    with enable_x64(False), explained(ValueError, "inverse_dynamics", "float64", "turned off", "jax_enable_x64"):
         double.inverse_dynamics(*wide)  # the call itself
     np.testing.assert_array_equal(g(*map(np.asarray, (q, qd, qdd))), direct(double, "inverse_dynamics", q, qd, qdd))
 
@@ -366,7 +368,7 @@ def test_a_call_waits_for_what_jax_still_computes():
     assert not pending.is_ready()
 
     def call():
-        with jax.enable_x64(True):
+        with enable_x64(True):
             found.append(dyn.gravity_force(pending))
 
     thread = threading.Thread(target=call, daemon=True)
