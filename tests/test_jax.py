@@ -33,7 +33,7 @@ DIFFERENCE = (
     1e-6  # step of central differences in float64; their error is about the square of it, and 1e-10 of rounding
 )
 DIFFERENCES = 2e-7
-enable_x64 = getattr(jax, "enable_x64", None) or importlib.import_module("jax.experimental").enable_x64  # before 0.8
+enable_x64 = jax.enable_x64 if hasattr(jax, "enable_x64") else importlib.import_module("jax.experimental").enable_x64
 
 
 @pytest.fixture(scope="module", autouse=True)
