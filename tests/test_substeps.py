@@ -135,3 +135,22 @@ def test_nothing_is_allocated_and_a_graph_repeats_it(device):
     wp.capture_launch(capture.graph)
     for x, y in zip(out, again, strict=True):
         np.testing.assert_array_equal(x.numpy(), y.numpy())
+
+
+@pytest.mark.slow
+def test_substeps_and_controls_in_a_graph_of_torch():
+    """Under torch.compile the step is one node; buffers of delays are refused by name."""
+    dyn = spo.Dynamics(arm([KINDS["position"][0]]), 2, device="cpu", dtype="float64")
+    q, qd, ctrl = (torch.as_tensor(array) for array in states(dyn.scene, 2))
+    step = lambda q, qd, ctrl, **more: dyn.step(q, qd, None, H, ctrl=ctrl, **more)  # noqa: E731
+    compiled = torch.compile(step, backend="eager", fullgraph=True)
+    for x, y in zip(compiled(q, qd, ctrl, substeps=COUNT), step(q, qd, ctrl, substeps=COUNT), strict=True):
+        assert torch.equal(x, y)
+    gradients = []
+    for call in (compiled, step):
+        given = ctrl.clone().requires_grad_(True)
+        call(q, qd, given)[1].sum().backward()
+        gradients.append(given.grad)
+    assert torch.equal(*gradients) and gradients[0].any()
+    with pytest.raises(Exception, match="actuator_state is of type ActuatorState"):
+        compiled(q, qd, ctrl, actuator_state=dyn.actuator_state(like=q))

@@ -203,7 +203,7 @@ def call_in_graph(
         elif isinstance(value, float) and not number_of:
             number, number_of = value, name
             options.append((name, NUMBER))
-        elif not isinstance(value, (*PLAIN, float)):
+        elif not isinstance(value, (*PLAIN, float)) or (name == "actuator_state" and value is not None):
             raise TypeError(
                 f"Dynamics.{operation} inside torch.compile: {name} is of type {type(value).__name__}; expected torch "
                 f"tensors, numbers and lists of them; call it outside of torch.compile"
