@@ -175,6 +175,16 @@ def test_armature_and_damping_of_an_actuator(device):
     np.testing.assert_allclose(both.scene.values["joint_armature"][0, 6], 0.3 + 9 * 0.2)
 
 
+def test_a_symmetric_actuatorfrcrange_is_the_effort_limit_of_drives():
+    """The actuator's own range, before its gear, is what the joint lets through."""
+    text = FREE.replace('name="a"', 'name="a" actuatorfrcrange="-2 2" actuatorfrclimited="true"')
+    scene = spo.from_mujoco(
+        compiled(text.format(**EMPTY | {"more": '<actuator><motor joint="a" gear="-4"/></actuator>'}))
+    )
+    assert scene.values["joint_effort_limit"][0].tolist() == [1e6] * 6 + [2.0]
+    assert scene.actuators[0].force_range == (-0.5, 0.5)
+
+
 KEYS = """<keyframe><key name="home" qpos="1 2 3 .5 .5 -.5 .5 .7" qvel="1 2 3 4 5 6 7" ctrl=".2"/><key/></keyframe>
  <actuator><motor joint="a"/></actuator>"""
 
@@ -182,8 +192,10 @@ KEYS = """<keyframe><key name="home" qpos="1 2 3 .5 .5 -.5 .5 .7" qvel="1 2 3 4 
 def test_sites_and_keyframes(device):
     """Sites are frames that calls take by name; keyframes are what Coordinates makes of qpos and qvel."""
     site = '<site name="tool" pos=".1 .2 .3" quat=".5 .1 .2 .3"/>'
-    model = compiled(FREE.format(root=site + "<site/>", world='<site name="on_world"/>', more=KEYS))
+    text = FREE.replace('armature=".3" damping=".2" stiffness="4"', "")  # the base is carried at its centre of mass
+    model = compiled(text.format(root=site + "<site/>", world='<site name="on_world"/>', more=KEYS))
     scene = spo.from_mujoco(model)
+    assert scene.bodies[scene.hinges[0].child].com.all()
     assert {name: body for name, (body, _) in scene.sites.items()} == {"tool": 0, "on_world": -1}
     assert list(scene.keyframes) == ["home", "key_1"]
     both = Agreement(model, scene, 2, device=device, granularity="node")

@@ -145,6 +145,9 @@ class Mechanism:
             lower, upper = np.clip(m.jnt_range[joint], -UNLIMITED, UNLIMITED)
             ke, kd = limit_gains(m.jnt_solref[joint], m.dof_invweight0[first])
             values |= {"limit_lower": lower, "limit_upper": upper, "limit_ke": ke, "limit_kd": kd}
+        low, high = m.jnt_actfrcrange[joint]
+        if m.jnt_actfrclimited[joint] and low == -high:
+            values["effort_limit"] = high  # of drives whose gains are set later; the file's actuators are bounded apart
         return values
 
     def _actuator_values(self, joint: int) -> dict[str, float]:
