@@ -21,6 +21,8 @@ TITLES = {"panda": "Panda arm", "go2": "Go2 quadruped", "g1": "G1 humanoid", "ar
 ON_CPU = ("Pinocchio", "MuJoCo C")  # libraries that have no GPU code
 SOLVE_ONLY = ("torch",)  # libraries that only solve, with mass matrix and bias force given
 GUIDE = "time in proportion to size"
+RANGE = "10 % to 90 % of the run times"
+THICK = 3.0  # width of the bars of that range [pt]
 PANELS = {
     "worlds": ("worlds", "number of worlds", "Robots"),
     "chain": ("dof", "dofs of the chain", "Chain"),
@@ -179,10 +181,16 @@ def _points(axes: Any, rows: Sequence[dict], names: Sequence[str]) -> None:
     for row, name in zip(rows, names, strict=True):
         ours, color = not row.get("peer"), drawing.color(row.get("peer"))
         size, marker = (8.5 if ours else 5.5), drawing.MARKERS.get(row["dtype"], "v")
+        axes.plot(_range(row), [row["error"]] * 2, color=color, linewidth=1.0, alpha=0.6, zorder=2)
         axes.plot(row["us"], row["error"], marker, color=color, markersize=size, linestyle="",
                   markeredgecolor="white", markeredgewidth=0.6, zorder=4 if ours else 3)  # fmt: skip
         points.append(Point(row["us"], row["error"], name, color, bold=ours))
     drawing.label_points(axes, points)
+
+
+def _range(row: dict) -> tuple[float, float]:
+    """Return the 10th and 90th percentiles of the run time; those of a row without them are the median."""
+    return row.get("p10_us", row["us"]), row.get("p90_us", row["us"])
 
 
 def _speedup(axes: Any, rows: Sequence[dict]) -> None:
@@ -220,6 +228,7 @@ def _legend(figure: Any, rows: Sequence[dict], pareto_front: bool = False) -> No
         if dtype in found:
             label, marker = drawing.PRECISIONS.get(dtype, dtype), drawing.MARKERS.get(dtype, "v")
             handles.append(Line2D([], [], marker=marker, linestyle="", color=drawing.FAINT, label=label))
+    handles.append(Line2D([], [], color=drawing.FAINT, linewidth=1.0, alpha=0.6, marker="|", label=RANGE))
     if pareto_front:
         handles.append(Line2D([], [], color=drawing.FAINT, linewidth=0.8, label="Pareto front"))
     drawing.legend_below(figure, handles)
@@ -250,6 +259,7 @@ def scaling(pyplot: Any, evidence: Evidence) -> Any:
     handles = [Line2D([], [], color=drawing.OURS, linestyle=_dashes(op), marker=".", linewidth=1.6, label=op)
                for op in dict.fromkeys(row["op"] for row in swept)]  # fmt: skip
     handles.append(Line2D([], [], color=drawing.FAINT, linestyle=":", linewidth=1.0, label=GUIDE))
+    handles.append(Line2D([], [], color=drawing.OURS, linewidth=THICK, alpha=0.4, label=RANGE))
     free = list(grid.flat)[len(panels) :]
     for axes in free:
         axes.axis("off")
@@ -259,7 +269,9 @@ def scaling(pyplot: Any, evidence: Evidence) -> Any:
         drawing.legend_below(figure, handles)
     drawing.finish_layout(figure)
     for axes, points in names:
-        drawing.label_points(axes, points, also=[place for line in axes.lines for place in _along(line)])
+        drawing.label_points(
+            axes, points, also=[place for line in axes.lines for place in _along(line) if line.get_linewidth() < THICK]
+        )
     return figure
 
 
@@ -273,6 +285,8 @@ def _sweep(axes: Any, name: str, rows: Sequence[dict]) -> list[Point]:
             mine = [row for row in rows if row["op"] == op and scene in ("", row["scene"])]
             points = sorted((_size(row, name), row["us"]) for row in mine)
             axes.plot(*zip(*points, strict=True), _dashes(op), marker=".", linewidth=1.6, color=color, label=op)
+            for row in mine:
+                axes.plot([_size(row, name)] * 2, _range(row), color=color, linewidth=THICK, alpha=0.4, zorder=1)
             if scene and op == MAIN:
                 ends.append(Point(*points[min(2, len(points) - 1)], _title(mine[0]), color))
     sizes, times = [_size(row, name) for row in rows], [row["us"] for row in rows]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rendering import assert_is_whole
 
-from warp_spo.examples import floating_arm, identify, parts, reach
+from warp_spo.examples import floating_arm, fourbar, gripper, identify, options, parts, reach, slider_crank
 
 FOLDER = Path(parts.__file__).parent
 
@@ -28,8 +28,8 @@ def test_a_floating_arm_draws_its_circle(tmp_path):
 
 def test_masses_and_damping_are_found_again(tmp_path):
     """Without noise to rounding; with it as well as the record says: the first mass turns about the vertical only."""
-    assert identify.main(steps=200, noise=0.0) <= 1e-10  # [kg, N m s]; 5e-14 here
-    assert identify.main(steps=1000, noise=0.1, picture=tmp_path / "found.svg") <= 0.03  # 0.008 here
+    assert identify.main(worlds=10, noise=0.0) <= 1e-10  # [kg, N m s]; 5e-14 here
+    assert identify.main(worlds=50, noise=0.1, picture=tmp_path / "found.svg") <= 0.03  # 0.008 here
     assert_is_whole((tmp_path / "found.svg").read_text())
 
 
@@ -39,16 +39,51 @@ def test_gradients_through_500_steps_bring_hands_to_targets(tmp_path):
     assert (tmp_path / "reach.png").stat().st_size > 10_000  # pictures need not be SVG
 
 
-@pytest.mark.parametrize("name", sorted(path.stem for path in FOLDER.glob("[a-z]*.py") if path.stem != "parts"))
+@pytest.mark.parametrize(
+    "name", sorted(path.stem for path in FOLDER.glob("[a-z]*.py") if path.stem not in ("parts", "options"))
+)
 def test_help_is_the_docstring_and_the_arguments(name, monkeypatch, capsys):
     module = importlib.import_module(f"warp_spo.examples.{name}")
     monkeypatch.setattr(sys, "argv", [name, "--help"])
     with pytest.raises(SystemExit) as end:
-        parts.command(module.main)
+        options.command(module.main)
     text = capsys.readouterr().out
     assert end.value.code == 0 and f"python -m warp_spo.examples.{name}" in text
     assert module.__doc__.strip() in text and "Later runs load them" in text
-    assert all(f"--{option} " in text for option in inspect.signature(module.main).parameters)
+    asked = inspect.signature(module.main).parameters
+    assert {"worlds", "device", "picture"} <= set(asked) and all(f"--{option} " in text for option in asked)
+
+
+@pytest.mark.parametrize("module", [fourbar, gripper, slider_crank], ids=lambda module: module.__name__[18:])
+def test_pictures_of_linkages_have_legends(module, tmp_path, device, capsys):
+    more = {"seconds": 0.02} if module is fourbar else {}
+    module.main(worlds=3, device=str(device), picture=tmp_path / "picture.svg", **more)
+    svg = (tmp_path / "picture.svg").read_text()
+    assert_is_whole(svg)
+    assert "3 worlds" in svg and "nan" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--device", "abacus"], "device is 'abacus'; expected one of this machine's devices"),
+        (["--worlds", "0"], "worlds is 0; expected 1 to"),
+        (
+            ["--picture", "drawing.txt"],
+            "--picture is 'drawing.txt'; expected a file in an existing folder that ends in",
+        ),
+        (
+            ["--picture", "no/folder/drawing.svg"],
+            "--picture is 'no/folder/drawing.svg'; expected a file in an existing",
+        ),
+    ],
+)
+def test_a_mistaken_option_is_one_line(arguments, expected, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["gripper", *arguments])
+    with pytest.raises(SystemExit, match="2"):
+        options.command(gripper.main)
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and expected in err and err.startswith("python -m warp_spo.examples.gripper: ")
 
 
 def test_pictures_are_asked_for_by_name():

@@ -79,7 +79,7 @@ def test_error_against_run_time_names_all_libraries_and_precisions(machines, pyp
 @pytest.mark.parametrize("machine", [0, 1])
 def test_run_time_against_size_names_its_lines(machines, pyplot, machine):
     figure = pictures.scaling(pyplot, machines[machine])
-    assert legends(figure) == ["forward_dynamics", "inverse_dynamics", pictures.GUIDE]
+    assert legends(figure) == ["forward_dynamics", "inverse_dynamics", pictures.GUIDE, pictures.RANGE]
     svg = drawing.svg(figure)
     assert {"Arm, 7 dof", "Humanoid, 27 dof", "Chain", "Random tree"} <= written(svg)
     assert_is_whole(svg)
@@ -88,7 +88,8 @@ def test_run_time_against_size_names_its_lines(machines, pyplot, machine):
 
 def _rows(dtypes, errors=(3e-8, 0.0, float("nan"), 2.0)):
     names = ("phi", "mass_matrix", "an_operation_with_quite_a_long_name", "forward_dynamics")
-    return [dict(op=name, granularity="tree", dtype=dtype, worlds=64, seconds=1e-5 * (1 + k), error=error)
+    return [dict(op=name, granularity="tree", dtype=dtype, worlds=64, seconds=1e-5 * (1 + k), error=error,
+                 least=0.1 * error, range=(0.9e-5 * (1 + k), 3e-5 * (1 + k)))
             for dtype in dtypes for k, (name, error) in enumerate(zip(names, errors, strict=True))]  # fmt: skip
 
 
@@ -96,7 +97,7 @@ def _rows(dtypes, errors=(3e-8, 0.0, float("nan"), 2.0)):
 def test_picture_of_the_main_job_names_every_operation(pyplot, dtypes):
     figure = report.picture(pyplot, TITLE, _rows(dtypes), TOLERANCE)
     svg = drawing.svg(figure)
-    assert legends(figure) == [*(f"warp_spo, {dtype}" for dtype in dtypes), "beyond the tolerance"]
+    assert legends(figure) == [*(f"warp_spo, {dtype}" for dtype in dtypes), "beyond the tolerance", report.BARS]
     assert {"phi", "mass_matrix", "forward_dynamics", f"{TITLE}: lower left is better"} <= written(svg)
     assert "float32, tolerance 10⁻⁴, 1 without a result" in written(svg)
     assert_is_whole(svg)
@@ -105,7 +106,8 @@ def test_picture_of_the_main_job_names_every_operation(pyplot, dtypes):
 
 def test_a_picture_of_one_point_or_none_is_whole(pyplot):
     for errors in ((1e-7,), (0.0,), (float("nan"),)):
-        rows = [dict(op="phi", dtype="float32", seconds=1e-5, error=error) for error in errors]
+        rows = [dict(op="phi", dtype="float32", seconds=1e-5, range=(1e-5, 1e-5), error=error, least=error)
+                for error in errors]  # fmt: skip
         figure = report.picture(pyplot, TITLE, rows, TOLERANCE)
         assert_is_whole(drawing.svg(figure))
         pyplot.close(figure)
@@ -122,6 +124,25 @@ def test_axes_have_plain_numbers():
     assert [drawing.time_text(us) for us in (0.5, 20.0, 1e3, 3e5, 2e6)] == ["0.5 µs", "20 µs", "1 ms", "300 ms", "2 s"]
     assert [drawing.power_text(error) for error in (1e-7, 3e-15, 1.0)] == ["10⁻⁷", "3×10⁻¹⁵", "10⁰"]
     assert [drawing.count_text(n) for n in (1, 100, 1e3, 1e6)] == ["1", "100", "1k", "1M"]
+
+
+@pytest.mark.parametrize("ends", [(72.0, 95.0), (1.0, 9.0), (30.0, 200.0), (1e-7, 4e-7), (3.0, 3e4), (1.0, 1e9)])
+def test_labels_of_ticks_do_not_touch(pyplot, ends):
+    """On axes of less than a decade, too, and at least one is there."""
+    with drawing.style():
+        figure, grid = pyplot.subplots(2, 3, figsize=(10.4, 6.0), layout="constrained")
+    for axes in grid.flat:
+        drawing.log_axis(axes.xaxis, ends, drawing.time_text)
+        drawing.log_axis(axes.yaxis, ends, drawing.power_text)
+    drawing.finish_layout(figure)
+    renderer = figure.canvas.get_renderer()
+    for axis in (grid[0][1].xaxis, grid[0][1].yaxis):
+        low, high = sorted(axis.get_view_interval())
+        labels = [label for label in axis.get_ticklabels() if label.get_text()]
+        boxes = [label.get_window_extent(renderer).padded(1.0) for label in labels]
+        assert boxes and all(low <= place <= high for place in axis.get_ticklocs())
+        assert not any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[:k])
+    pyplot.close(figure)
 
 
 def test_names_do_not_hide_each_other(pyplot):

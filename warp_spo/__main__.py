@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
 import warp as wp
 
 from .dynamics.closures import LOOPS
@@ -176,7 +177,7 @@ def describe(error: Exception, file: str) -> str:
     ours = isinstance(error, ValueError | OSError | ImportError)
     lines = str(error).strip().splitlines() or ["no reason was given"]
     text = " ".join(lines).strip() if ours else lines[0].strip()
-    text = re.sub(r"^Error in '.*? : '(.*)'$", r"\1", text)  # OpenUSD names its own source file first
+    text = re.sub(r"Error in '[^']*' at line \d+ in file \S+ : ", "", text)  # OpenUSD names its own source files
     text = re.sub(r"^(load|from_newton|from_mujoco|Scene|Tree)\b[^:]*: ", "", text)
     name = repr(str(Path(file)))
     if name in text:
@@ -187,8 +188,9 @@ def describe(error: Exception, file: str) -> str:
 def run(dyns: list[Dynamics]) -> Iterator[dict[str, Any]]:
     """Yield a row for each operation and each Dynamics; rows of one operation follow each other.
 
-    A row has op, granularity, dtype, worlds, error (see ``Operation.error``) and seconds, the median run time of one
-    evaluation of all worlds.
+    A row has op, granularity, dtype, worlds, error and least (the largest and the smallest of the compared worlds, see
+    ``Operation.error``), seconds, the median run time of one evaluation of all worlds [s], and range, its 10th and
+    90th percentiles.
 
     Args:
         dyns: Dynamics of the same scene and number of worlds.
@@ -202,10 +204,12 @@ def run(dyns: list[Dynamics]) -> Iterator[dict[str, Any]]:
             for subject in subjects:
                 dtype = subject.dyn.dtype.__name__
                 progress.step(f"{operation.name} {dtype}")
-                timing, error = Trial(subject, operation).measure(warm_up=WARM_UP, budget=BUDGET)
+                trial = Trial(subject, operation)
+                timing, error = trial.measure(warm_up=WARM_UP, budget=BUDGET)
                 granularity = operation.granularity(subject.dyn)
                 row = dict(op=operation.name, granularity=granularity, dtype=dtype, worlds=worlds)
-                yield row | dict(error=error, seconds=timing.median)
+                least = float(np.min(trial.forward_errors))
+                yield row | dict(error=error, least=least, seconds=timing.median, range=(timing.low, timing.high))
 
 
 def comparable(dyn: Dynamics) -> dict[str, Operation]:

@@ -6,10 +6,11 @@ The rods make four loops. Two independent ways to hold them, embedding and Lagra
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, bar, command
+from warp_spo.examples.options import command, drawing, error_band
+from warp_spo.examples.parts import at, bar
+from warp_spo.trials.drawing import OURS, OURS_DARK, log_axis, power_text
 
 THIGH, SHANK, ROD, CRANK = 0.4, 0.4, 0.3, 0.06  # lengths [m]
-WORLDS = 4
 
 
 def leg(side, trunk, bodies, hinges, loops):
@@ -41,25 +42,38 @@ def scene():
     return spo.Scene(bodies, hinges, loops=loops)
 
 
-def main(seconds=0.2, dt=1e-3, seed=0):
-    dyn = spo.Dynamics(scene(), WORLDS, dtype="float64", loops="embed")
-    other = spo.Dynamics(scene(), WORLDS, dtype="float64", loops="multipliers")
+def main(seconds=0.2, dt=1e-3, worlds=4, seed=0, device=None, picture=None):
+    dyn = spo.Dynamics(scene(), worlds, device, "float64", loops="embed")
+    other = spo.Dynamics(scene(), worlds, device, "float64", loops="multipliers")
 
     # A random state in which the rods meet the feet: project() moves each world to the nearest one.
     rng = np.random.default_rng(seed)
-    q, qd = np.tile(dyn.scene.neutral_q, (WORLDS, 1)), rng.normal(size=(WORLDS, dyn.scene.dof_count))
+    q, qd = np.tile(dyn.scene.neutral_q, (worlds, 1)), rng.normal(size=(worlds, dyn.scene.dof_count))
     q, qd = dyn.project(q + 0.1 * rng.normal(size=q.shape), qd, iterations=8)
 
     tau = rng.normal(size=qd.shape)  # [N m]
     qdd, expected = dyn.forward_dynamics(q, qd, tau), other.forward_dynamics(q, qd, tau)
     print(f"The biped has {dyn.scene.dof_count} dofs, of which {len(dyn.independent_dofs)} are independent.")
-    difference = np.abs(qdd - expected).max() / np.abs(qdd).max()
-    print(f"Accelerations by embedding and by multipliers differ by {difference:.1e} of the largest one.")
+    difference = np.abs(qdd - expected) / np.abs(qdd).max()
+    print(f"Accelerations by embedding and by multipliers differ by {difference.max():.1e} of the largest one.")
 
+    gaps = []
     for _ in range(round(seconds / dt)):
         q, qd = dyn.step(q, qd, None, dt)
-    gap = np.abs(dyn.closure_error(q)).max()
-    print(f"After {seconds} s of free fall the rods are off their feet by {gap:.1e} m at most.")
+        gaps.append(np.abs(dyn.closure_error(q)).max(axis=1))
+    print(f"After {seconds} s of free fall the rods are off their feet by {gaps[-1].max():.1e} m at most.")
+    if picture:
+        with drawing(picture, "Embedding and multipliers: lower is better", "Gaps of the rods: lower is better") as (
+            left,
+            right,
+        ):
+            size, shown = np.abs(qdd).ravel(), np.maximum(difference, 1e-18).ravel()
+            left.plot(size, shown, ".", color=OURS_DARK, label=f"{len(size)} accelerations, {worlds} worlds")
+            log_axis(left.xaxis, size, power_text)
+            log_axis(left.yaxis, shown, power_text)
+            left.set(xlabel="acceleration [m/s², rad/s²]", ylabel="difference, of the largest acceleration")
+            error_band(right, dt * np.arange(1, len(gaps) + 1), gaps, OURS, "gap")
+            right.set(xlabel="time [s]", ylabel="gap [m]")
 
 
 if __name__ == "__main__":

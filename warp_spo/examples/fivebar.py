@@ -6,10 +6,13 @@
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, bar, command
+from warp_spo.examples.options import command, drawing, error_band
+from warp_spo.examples.parts import at, bar
+from warp_spo.trials.drawing import OURS, OURS_DARK
 
 UPPER, LOWER, APART = 0.3, 0.5, 0.2  # lengths of the bars, and distance between the motors [m]
 MOTORS = ["left motor", "right motor"]
+MOST = 0.05  # torque that the last world adds at the left motor [N m]
 
 
 def scene():
@@ -25,11 +28,11 @@ def scene():
     return spo.Scene([bar(UPPER), bar(LOWER), bar(UPPER), bar(LOWER)], hinges, loops=[tip])
 
 
-def main(seconds=0.5, dt=1e-3):
-    dyn = spo.Dynamics(scene(), worlds=1, dtype="float64", loops="embed", independent=MOTORS)
+def main(seconds=0.5, dt=1e-3, worlds=5, device=None, picture=None):
+    dyn = spo.Dynamics(scene(), worlds, device, "float64", loops="embed", independent=MOTORS)
 
     # A guess with the elbows out and the tip below the motors, moved to the nearest state in which the loop is closed.
-    q = dyn.project(np.array([[2.4, -1.2, 0.74, 1.2]]), iterations=10)
+    q = dyn.project(np.tile([2.4, -1.2, 0.74, 1.2], (worlds, 1)), iterations=10)
     qd, tau = np.zeros_like(q), np.zeros_like(q)
 
     # gravity_force() is the torque of the motors that holds the robot still; tau has an entry for every dof.
@@ -40,16 +43,28 @@ def main(seconds=0.5, dt=1e-3):
     rest = np.abs(dyn.forward_dynamics(q, qd, tau)).max()
     print(f"With these torques the largest acceleration is {rest:.1e} rad/s^2.")
 
-    tau[:, motors[0]] += 0.05  # [N m]
-    before = q
+    more = MOST * np.arange(1, worlds + 1) / worlds  # torque that each world adds at its left motor [N m]
+    tau[:, motors[0]] += more
+    path, gaps = [q[:, motors]], []
     for _ in range(round(seconds / dt)):
         q, qd = dyn.step(q, qd, tau, dt)
-    turns = np.degrees(q - before)[0, motors]
+        path.append(q[:, motors])
+        gaps.append(np.abs(dyn.closure_error(q)).max(axis=1))
+    turns = np.degrees(np.array(path) - path[0])  # [step, world, motor]
+    left, right = turns[-1, -1]
     print(
-        f"With 0.05 N m more at the left motor, it turns by {turns[0]:.1f} deg in {seconds} s, and the right motor "
-        f"turns by {turns[1]:.1f} deg."
+        f"With {MOST} N m more at the left motor, it turns by {left:.1f} deg in {seconds} s, and the right motor turns "
+        f"by {right:.1f} deg."
     )
-    print(f"The tip's loop is open by {np.abs(dyn.closure_error(q)).max():.1e} m.")
+    print(f"The tip's loop is open by {gaps[-1].max():.1e} m at most.")
+    if picture:
+        with drawing(picture, "Turns of the motors", "Gap at the tip: lower is better") as axes:
+            times, range_of = dt * np.arange(len(path)), f"{more[0]:g} to {more[-1]:g} N m more"
+            for k, color in enumerate((OURS, OURS_DARK)):
+                axes[0].plot(times, turns[:, :, k], color=color)[0].set_label(f"{MOTORS[k]}, {range_of}")
+            axes[0].set(xlabel="time [s]", ylabel="turn [deg]")
+            error_band(axes[1], times[1:], gaps, OURS, "gap")
+            axes[1].set(xlabel="time [s]", ylabel="gap [m]")
 
 
 if __name__ == "__main__":

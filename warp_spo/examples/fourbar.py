@@ -7,10 +7,11 @@ Three hinges in a row carry crank, coupler and rocker, and a loop joint pins the
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, bar, command, energy
+from warp_spo.examples.options import command, drawing, error_band, some
+from warp_spo.examples.parts import at, bar, energy
+from warp_spo.trials.drawing import OURS, OURS_DARK
 
 CRANK, COUPLER, ROCKER, GROUND = 0.4, 0.9, 0.7, 1.0  # lengths of the bars, and of the ground between the pins [m]
-WORLDS = 8
 
 
 def scene():
@@ -25,29 +26,40 @@ def scene():
     return spo.Scene([bar(CRANK), bar(COUPLER), bar(ROCKER)], hinges, loops=[pin])
 
 
-def main(seconds=1.0, dt=1e-3):
-    dyn = spo.Dynamics(scene(), worlds=WORLDS, dtype="float64", loops="embed")
+def main(seconds=1.0, dt=1e-3, worlds=8, device=None, picture=None):
+    dyn = spo.Dynamics(scene(), worlds, device, "float64", loops="embed")
 
     # Every world has another crank angle. The other two angles are guesses: project() closes the loop, and hold=True
     # keeps the independent dof, which is the crank, at its angle.
-    q = np.zeros((WORLDS, 3))
-    q[:, 0] = np.linspace(0.0, 1.75 * np.pi, WORLDS)
+    q = np.zeros((worlds, 3))
+    q[:, 0] = np.linspace(0.0, 2.0 * np.pi, worlds, endpoint=False)
     q[:, 1], q[:, 2] = -1.0 - q[:, 0], 2.0
     q = dyn.project(q, hold=True, iterations=20)
 
     # The mass matrix has one row for each independent dof, so here it is the inertia of the whole linkage at the crank.
-    for angle, inertia in zip(q[:, 0], dyn.mass_matrix(q)[:, 0, 0], strict=True):
-        print(f"With the crank at {np.degrees(angle):3.0f} deg, the crank feels an inertia of {inertia:.4f} kg m^2.")
+    angles, inertias = np.degrees(q[:, 0]), dyn.mass_matrix(q)[:, 0, 0]
+    for world in some(worlds):
+        print(f"With the crank at {angles[world]:3.0f} deg, it feels an inertia of {inertias[world]:.4f} kg m^2.")
 
-    qd = np.zeros_like(q)
+    qd, times, gaps, drifts = np.zeros_like(q), [], [], []
     before = energy(dyn, q, qd)
-    for _ in range(round(seconds / dt)):
+    for step in range(1, round(seconds / dt) + 1):
         q, qd = dyn.step(q, qd, None, dt)  # tau=None: the linkage falls under gravity
-    drift = np.abs(energy(dyn, q, qd) - before).max()
-    gap = np.abs(dyn.closure_error(q)).max()
+        if step % 10 == 0 or step == round(seconds / dt):
+            times.append(step * dt)
+            gaps.append(np.abs(dyn.closure_error(q)).max(axis=1))
+            drifts.append(np.abs(energy(dyn, q, qd) - before))
     print(
-        f"After {seconds} s of falling the pin is open by {gap:.1e} m at most, and energy has changed by {drift:.1e} J."
+        f"After {seconds} s of falling the pin is open by {gaps[-1].max():.1e} m at most, and energy has changed by "
+        f"{drifts[-1].max():.1e} J."
     )
+    if picture:
+        with drawing(picture, "Inertia at the crank", "Errors of the simulation: lower is better") as (left, right):
+            left.plot(angles, inertias, ".-", color=OURS, label=f"{worlds} worlds")
+            left.set(xlabel="angle of the crank [deg]", ylabel="inertia [kg m²]", ylim=(0.0, None))
+            error_band(right, times, drifts, OURS_DARK, "energy [J]")
+            error_band(right, times, gaps, OURS, "gap at the pin [m]")
+            right.set(xlabel="time [s]", ylabel="change of energy, gap")
 
 
 if __name__ == "__main__":

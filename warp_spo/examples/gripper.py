@@ -6,7 +6,9 @@ A coupling holds ``q[hinge] = ratio * q[reference] + offset``, like a mimic join
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, bar, command
+from warp_spo.examples.options import command, drawing, some
+from warp_spo.examples.parts import at, bar
+from warp_spo.trials.drawing import FAINT, OURS, OURS_DARK
 
 
 def scene():
@@ -28,17 +30,19 @@ def scene():
     return spo.Scene(bodies, hinges, couplings=couplings)
 
 
-def main():
-    dyn = spo.Dynamics(scene(), worlds=2, dtype="float64", loops="embed")
+def main(worlds=5, device=None, picture=None):
+    dyn = spo.Dynamics(scene(), worlds, device, "float64", loops="embed")
     names = [dyn.scene.dof_labels[dof] for dof in dyn.independent_dofs]
     print(f"The gripper has {dyn.scene.dof_count} dofs, {len(names)} independent: {', '.join(names)}.")
 
     # project() fills in the coordinates that follow; hold=True keeps the independent ones.
-    q = dyn.project(np.array([[0.0, 0.02, 0, 0, 0], [0.5, 0.04, 0, 0, 0]]), hold=True)
-    for world in q:
-        right, left_tip, right_tip = world[2:]
+    q = np.zeros((worlds, 5))
+    q[:, 1] = np.linspace(0.0, 0.04, worlds)  # of the left finger [m]
+    q = dyn.project(q, hold=True)
+    for world in some(worlds):
+        _, finger, right, left_tip, right_tip = q[world]
         print(
-            f"With the left finger at {1e3 * world[1]:.0f} mm, the right finger is at {1e3 * right:.0f} mm, and "
+            f"With the left finger at {1e3 * finger:.0f} mm, the right finger is at {1e3 * right:.0f} mm, and "
             f"the tips are at {left_tip:.1f} rad and {right_tip:.1f} rad."
         )
 
@@ -48,6 +52,15 @@ def main():
     print(f"1 N of the motor accelerates the left finger by {qdd[1]:.3f} m/s^2 and its tip by {qdd[3]:.3f} rad/s^2.")
     wrist, finger = np.diagonal(dyn.mass_matrix(q)[0])
     print(f"The motor feels a mass of {finger:.3f} kg, tips included; the wrist feels {wrist:.5f} kg m^2.")
+    if picture:
+        x = 1e3 * q[:, 1]
+        with drawing(picture, "The other finger", "The tips") as (left, right):
+            left.plot(x, 1e3 * q[:, 2], ".-", color=OURS, label=f"right finger, {worlds} worlds")
+            left.set(xlabel="left finger [mm]", ylabel="right finger [mm]")
+            for name, value, color in (("left", q[:, 3], OURS), ("right", q[:, 4], OURS_DARK)):
+                right.plot(x, value, ".-", color=color, label=f"{name} tip")
+            right.axhline(0.0, color=FAINT, linewidth=0.8)
+            right.set(xlabel="left finger [mm]", ylabel="angle [rad]")
 
 
 if __name__ == "__main__":

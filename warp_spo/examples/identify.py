@@ -8,9 +8,11 @@ gives the derivatives of all windows at once.
 
 import numpy as np
 import torch
+import warp as wp
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, bar, command, drawing
+from warp_spo.examples.options import command, drawing
+from warp_spo.examples.parts import at, bar
 from warp_spo.trials.drawing import FAINT, OURS, OURS_DARK
 
 MASSES, DAMPING = [2.0, 1.5, 0.7], [0.5, 0.3, 0.1]  # the true values [kg], [N m s/rad]
@@ -38,14 +40,15 @@ def record(steps, noise, rng):
     return states + noise * UNITS * rng.normal(size=states.shape), np.concatenate(torques)
 
 
-def main(steps=1000, noise=1.0, iterations=6, seed=0, picture=None):
-    states, torques = (torch.as_tensor(x) for x in record(steps, noise, np.random.default_rng(seed)))
-    starts, ends, windows = states[:-1:WINDOW], states[WINDOW::WINDOW], steps // WINDOW
-    torques, units = torques.reshape(windows, WINDOW, 3), torch.as_tensor(UNITS)
-    dyn = spo.Dynamics(scene(), windows, "cpu", "float64", variable=("body_mass", "joint_damping"), granularity="tree")
-    guesses = [torch.tensor([*dyn.scene.values["body_mass"][0], *dyn.scene.values["joint_damping"][0]])]
+def main(worlds=50, noise=1.0, iterations=6, seed=0, device=None, picture=None):
+    values = ("body_mass", "joint_damping")
+    dyn = spo.Dynamics(scene(), worlds, device, "float64", variable=values, granularity="tree")
+    place, measured = wp.device_to_torch(dyn.device), record(worlds * WINDOW, noise, np.random.default_rng(seed))
+    states, torques, units = (torch.as_tensor(x, device=place) for x in (*measured, UNITS))
+    starts, ends, torques = states[:-1:WINDOW], states[WINDOW::WINDOW], torques.reshape(worlds, WINDOW, 3)
+    guesses = [torch.tensor(np.concatenate([dyn.scene.values[name][0] for name in values]), device=place)]
     for _ in range(iterations):
-        masses, damping = (x.repeat(windows, 1).requires_grad_() for x in guesses[-1].split(3))
+        masses, damping = (x.repeat(worlds, 1).requires_grad_() for x in guesses[-1].split(3))
         dyn.set(body_mass=masses, joint_damping=damping)
         q, qd = starts[:, :3].contiguous(), starts[:, 3:].contiguous()
         for k in range(WINDOW):
@@ -57,7 +60,7 @@ def main(steps=1000, noise=1.0, iterations=6, seed=0, picture=None):
         change = torch.linalg.lstsq(torch.cat(rows), -residuals.detach().T.reshape(-1, 1)).solution
         deviation = torch.linalg.inv(torch.cat(rows).T @ torch.cat(rows)).diagonal().sqrt()
         guesses.append(guesses[-1] + change[:, 0])
-    found, right = guesses[-1].numpy(), np.array(MASSES + DAMPING)
+    found, right = guesses[-1].cpu().numpy(), np.array(MASSES + DAMPING)
     for value, name, wanted in zip(
         found, ["bar 1", "bar 2", "bar 3", "hinge 1", "hinge 2", "hinge 3"], right, strict=True
     ):
@@ -66,7 +69,9 @@ def main(steps=1000, noise=1.0, iterations=6, seed=0, picture=None):
     print("The mass of bar 1 has the largest error: it turns about the vertical, where gravity has no effect.")
     if picture:
         with drawing(picture, "Masses of the bars", "Damping of the hinges") as axes:
-            for k, (value, spread, wanted) in enumerate(zip(np.transpose(guesses), deviation, right, strict=True)):
+            for k, (value, spread, wanted) in enumerate(
+                zip(torch.stack(guesses, 1).cpu().numpy(), deviation.cpu().numpy(), right, strict=True)
+            ):
                 each, color = axes[k // 3], (OURS, OURS_DARK, FAINT)[k % 3]
                 each.plot(value, ".-", color=color)
                 name = f"{('bar', 'hinge')[k // 3]} {k % 3 + 1} ± 2 standard errors"

@@ -10,7 +10,8 @@ import torch
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.examples.parts import at, band, bar, command, drawing
+from warp_spo.examples.options import band, command, drawing
+from warp_spo.examples.parts import at, bar
 from warp_spo.trials.drawing import OURS, log_axis
 
 DT, STEPS, KNOTS = 2e-3, 500, 11  # time step [s], steps of a rollout, knots of the torques
@@ -33,8 +34,8 @@ def hand(poses):
     return poses[:, 6, :3] + LINK * along
 
 
-def main(worlds=8, iterations=20, seed=0, picture=None):
-    dyn = spo.Dynamics(scene(), worlds, dtype="float64", granularity="tree")
+def main(worlds=8, iterations=20, seed=0, device=None, picture=None):
+    dyn = spo.Dynamics(scene(), worlds, device, "float64", granularity="tree")
     start = torch.tensor([START] * worlds, dtype=torch.float64, device=wp.device_to_torch(dyn.device))
     rng, hold = np.random.default_rng(seed), dyn.gravity_force(start)
     targets = hand(dyn.body_poses(start)) + torch.as_tensor(rng.uniform(-0.35, 0.35, (worlds, 3)), device=start.device)

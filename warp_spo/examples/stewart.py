@@ -7,7 +7,9 @@ other five legs meet it by loop joints.
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.examples.parts import about, at, bar, command
+from warp_spo.examples.options import band, command, drawing, error_band
+from warp_spo.examples.parts import about, at, bar
+from warp_spo.trials.drawing import OURS
 
 BASE, PLATFORM, HEIGHT = 1.0, 0.5, 1.0  # radii of the joints on base and platform, and height of the platform [m]
 
@@ -39,17 +41,32 @@ def scene(stiffness=2000.0):
     return spo.Scene([*bodies, platform], [*hinges, first], loops=loops)
 
 
-def main(seconds=0.5, dt=1e-3):
-    dyn = spo.Dynamics(scene(), worlds=1, dtype="float64", loops="embed")
+def main(seconds=0.5, dt=1e-3, worlds=4, seed=0, device=None, picture=None):
+    dyn = spo.Dynamics(scene(), worlds, device, "float64", loops="embed")
     print(f"The platform has {dyn.scene.dof_count} dofs, of which {len(dyn.independent_dofs)} are independent.")
 
-    q, qd = dyn.scene.neutral_q[None], np.zeros((1, dyn.scene.dof_count))
+    # Every world starts with other rates; project() moves them to the nearest ones with which the loops stay closed.
+    q = np.tile(dyn.scene.neutral_q, (worlds, 1))
+    qd = 0.1 * np.random.default_rng(seed).standard_normal((worlds, dyn.scene.dof_count))
+    q, qd = dyn.project(q, qd, iterations=4)
+    heights, gaps = [], []
     for _ in range(round(seconds / dt)):
         q, qd = dyn.step(q, qd, None, dt)  # springs and damping of the legs are part of the step
+        heights.append(dyn.body_poses(q)[:, 12, 2])
+        gaps.append(np.abs(dyn.closure_error(q)).max(axis=1))
 
-    sunk = HEIGHT - dyn.body_poses(q)[0, 12, 2]
-    print(f"After {seconds} s the platform has sunk by {1e3 * sunk:.1f} mm onto its springs.")
-    print(f"Its ball joints are open by {np.abs(dyn.closure_error(q)).max():.1e} m at most.")
+    low, high = 1e3 * (HEIGHT - heights[-1].max()), 1e3 * (HEIGHT - heights[-1].min())
+    print(
+        f"After {seconds} s the platform has sunk by {low:.1f} to {high:.1f} mm onto its springs, in {worlds} worlds."
+    )
+    print(f"Its ball joints are open by {gaps[-1].max():.1e} m at most.")
+    if picture:
+        with drawing(picture, "Height of the platform", "Gap of the ball joints: lower is better") as (left, right):
+            times = dt * np.arange(1, len(gaps) + 1)
+            band(left, times, np.array(heights), OURS, "platform")
+            left.set(xlabel="time [s]", ylabel="height [m]")
+            error_band(right, times, gaps, OURS, "gap")
+            right.set(xlabel="time [s]", ylabel="gap [m]")
 
 
 if __name__ == "__main__":

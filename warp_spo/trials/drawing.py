@@ -42,6 +42,8 @@ ANGLES = (0, 180, 90, 270, 45, 315, 135, 225, 20, 340, 160, 200, 65, 295, 115, 2
 REACHES = (6.0, 10.0, 16.0, 24.0, 34.0, 46.0, 60.0)  # distances of a name from its point [pt]
 TICKS = ((6.0, tuple(map(float, range(1, 10)))), (40.0, (1.0, 2.0, 5.0)), (400.0, (1.0, 3.0)))
 """Largest ratio of an axis' ends -> ticks of a decade; only powers of ten where the ratio is larger."""
+ROUND = (1, 10, 5, 2, 3, 7, 4, 6, 8, 9)  # first digits, those first whose ticks stay where labels would touch
+LETTER, GAP, LINE = 6.0, 7.0, 16.0  # width of a letter, space between labels, height of a line with space [pt]
 CLOSE = 6.0  # price of a place that is nearer to the point of another name, in points of distance
 LEADER = 15.0  # from this distance on a line joins a name and its point [pt]
 
@@ -137,12 +139,31 @@ def log_axis(axis: Any, values: Sequence[float], text: Any, most: int = 6) -> No
     parts = next((parts for most_ratio, parts in TICKS if high < most_ratio * low), (1.0,))
     step = -(-(last - first) // most)
     powers = range(-(-first // step) * step, last + 1, step)
-    ticks = [part * 10.0**power for power in powers for part in parts]
+    ticks = [part * 10.0**power for power in powers for part in parts if low <= part * 10.0**power <= high]
     axis.axes.set(**{f"{axis.axis_name}scale": "log", f"{axis.axis_name}lim": (low, high)})
-    axis.set_major_locator(FixedLocator([tick for tick in ticks if low <= tick <= high]))
+    axis.set_major_locator(FixedLocator(_apart(axis, ticks, text, math.log(high / low))))
     axis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))
     axis.set_minor_locator(NullLocator())
     axis.axes.grid(True)
+
+
+def _apart(axis: Any, ticks: Sequence[float], text: Any, span: float) -> list[float]:
+    """Return the ticks of a logarithmic axis whose labels do not touch, round numbers first.
+
+    Args:
+        axis: The axis; the layout of its figure need not be final.
+        ticks: Places of ticks.
+        text: ``text(value)`` is a tick's label.
+        span: Logarithm of the ratio of the axis' ends.
+    """
+    box, scale = axis.axes.get_window_extent(), axis.axes.figure.dpi / 72.0
+    length = (box.width if axis.axis_name == "x" else box.height) / scale
+    kept: list[float] = []
+    for tick in sorted(ticks, key=lambda tick: (ROUND.index(round(tick / 10.0 ** math.floor(math.log10(tick)))), tick)):
+        wide = LETTER * len(text(tick)) + GAP if axis.axis_name == "x" else LINE
+        if all(abs(math.log(tick / other)) / span * length >= wide for other in kept):
+            kept.append(tick)
+    return sorted(kept)
 
 
 def label_points(

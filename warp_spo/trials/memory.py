@@ -14,10 +14,11 @@ from ..execution.plan import MOST_DOFS
 from ..scene.scene import Scene
 from .operations import OPERATIONS, Inputs
 
-WORKSPACE = {"node": (240.0, 260.0, 1.5), "tree": (15.0, 40.0, 1.0)}
+WORKSPACE = {"node": (250.0, 190.0, 7.0), "tree": (4.5, 4.0, 1.05)}
 """Numbers in one world of operators and intermediate results, for each body, each dof and each pair of dofs.
 
-Fitted to the peaks of cartpole, quadruped, ant and humanoid on a CPU, 2026-11-22; they are within 20 % of those peaks.
+Fitted to the peaks of cartpole, quadruped, ant and humanoid on a CPU, 2026-11-22; the whole estimate is 0 to 25 % above
+them.
 """
 SHARE = 0.9  # of the free memory that the job may take
 SIZES = {"float32": 4, "float64": 8}  # bytes of a number

@@ -16,6 +16,7 @@ from .drawing import Point
 
 HEADS = ("operation", "granularity", "precision", "error", "time", "evaluations/s")
 BAR = 30  # characters
+BARS = "10 % to 90 % of the run times; smallest to largest error of a world"
 
 
 class Progress:
@@ -130,8 +131,9 @@ def image(figure: Any) -> str:
 def picture(pyplot: Any, title: str, rows: Sequence[dict], tolerance: dict[str, float]) -> Any:
     """Draw error against run time, both logarithmic, a panel a precision, a point with its name an operation.
 
-    An error of exactly zero is drawn at the bottom; one that is NaN is left out, and the panel's title says how many
-    are. A point beyond its tolerance is black.
+    Bars reach from the 10th to the 90th percentile of the run times, and down to the smallest error of a world. An
+    error of exactly zero is drawn at the bottom; one that is NaN is left out, and the panel's title says how many are.
+    A point beyond its tolerance is black.
     """
     from matplotlib.lines import Line2D
 
@@ -144,8 +146,13 @@ def picture(pyplot: Any, title: str, rows: Sequence[dict], tolerance: dict[str, 
         shown = [row for row in mine if row["error"] == row["error"]]
         bottom = min([row["error"] for row in shown if row["error"] > 0.0], default=1e-16) / 3.0
         errors = [max(row["error"], bottom) for row in shown]
-        drawing.log_axis(axes.xaxis, [1e6 * row["seconds"] for row in rows], drawing.time_text)
-        drawing.log_axis(axes.yaxis, errors or [bottom], drawing.power_text)
+        least = [max(row["least"], bottom) for row in shown]
+        drawing.log_axis(axes.xaxis, [1e6 * time for row in rows for time in row["range"]], drawing.time_text)
+        drawing.log_axis(axes.yaxis, [*errors, *least] or [bottom], drawing.power_text)
+        for row, error, low in zip(shown, errors, least, strict=True):
+            bars = {"color": drawing.OURS, "linewidth": 1.0, "alpha": 0.45, "zorder": 2.0}
+            axes.plot([1e6 * time for time in row["range"]], [error, error], **bars)
+            axes.plot([1e6 * row["seconds"]] * 2, [low, error], **bars)
         lost = f", {len(mine) - len(shown)} without a result" if len(shown) < len(mine) else ""
         axes.set_title(f"{dtype}, tolerance {drawing.power_text(tolerance[dtype])}{lost}")
         axes.set_ylabel("largest relative error")
@@ -158,6 +165,7 @@ def picture(pyplot: Any, title: str, rows: Sequence[dict], tolerance: dict[str, 
                for (_, marker, _), dtype in zip(panels, dtypes, strict=True)]  # fmt: skip
     if any(point.color == drawing.INK for _, _, points in panels for point in points):
         handles.append(Line2D([], [], marker="o", linestyle="", color=drawing.INK, label="beyond the tolerance"))
+    handles.append(Line2D([], [], color=drawing.OURS, linewidth=1.0, alpha=0.45, label=BARS))
     drawing.legend_below(figure, handles)
     drawing.finish_layout(figure)
     for axes, marker, points in panels:
