@@ -10,7 +10,6 @@ of captured steps from one state, see ``benchmarks.capabilities``; a row with su
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +21,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.dynamics.samples import rotations
 
+from . import runner
 from .capabilities import SETS, measure_time
 from .cases import SCENES
 
@@ -68,7 +68,7 @@ ROWS: dict[str, tuple[Callable[[int], list[spo.Actuator]], dict[str, Any]]] = {
 """Name -> actuators of a hinge, and options."""
 
 
-def run(scene: spo.Scene, row: str, worlds: int, device: wp.Device) -> dict[str, Any]:
+def measure(scene: spo.Scene, row: str, worlds: int, device: wp.Device) -> dict[str, Any]:
     """Return the time of a step [us] and its error."""
     make, options = ROWS[row]
     scene = with_actuators(scene, make)
@@ -113,22 +113,24 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--scenes", nargs="+", default=["go2"], choices=SCENES)
     parser.add_argument("--worlds", nargs="+", type=int, default=[4096, 65536])
     parser.add_argument("--only", default="", help="rows whose name has this text")
-    parser.add_argument("--json", help="file for the figures")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args(arguments)
-    device, found, worst = wp.get_device(options.device), {}, 0.0
+    device, worst = wp.get_device(options.device), 0.0
+    found: list[dict] = []
+    run = runner.record(found, options.device)
     for name in options.scenes:
         scene = SCENES[name]()
         for worlds in options.worlds:
             for row in ROWS:
                 if options.only in row:
-                    figures = run(scene, row, worlds, device)
-                    found[f"{name}.w{worlds}.{row}"] = figures
+                    figures = measure(scene, row, worlds, device)
+                    found.append(dict(group=f"a step with actuators, {name}", name=row, worlds=worlds, **figures))
                     worst = max(worst, figures["error"])
                     print(
                         f"{name}.w{worlds} {row:28} {figures['us']:9.4g} us  error {figures['error']:.1e}", flush=True
                     )
     if options.json:
-        Path(options.json).write_text(json.dumps({"device": str(device.name), "rows": found}, indent=1))
+        runner.save(run, options.json)
     return 0 if worst <= TOLERANCE else 1
 
 

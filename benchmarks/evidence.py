@@ -23,7 +23,7 @@ ROWS = {
 
 
 class Evidence(NamedTuple):
-    """Rows of one machine, each kind of row (and each peer) from the newest commit that has measured it.
+    """Rows of one machine, each kind of row (each peer, each group) from the newest commit that has measured it.
 
     All files of that commit are used; where two have the same row, the newer file counts.
 
@@ -33,7 +33,7 @@ class Evidence(NamedTuple):
         peers: rows of other libraries; "peer" is the library's name.
         stress: rows of the stress suite, with "case" and "verdict".
         sources: a line for each file that rows come from: machine, kinds of rows, commit, date, versions.
-        capabilities: rows of :mod:`.capabilities`, with "group".
+        capabilities: rows with "group", of :mod:`.capabilities` and of the benchmarks of one topic.
     """
 
     machine: dict
@@ -107,14 +107,15 @@ def gather(runs: Iterable[dict]) -> list[Evidence]:
 
 def _gather_machine(runs: list[dict]) -> Evidence:
     """Return the evidence of one machine; ``runs`` are its runs, newest first."""
-    newest: dict[tuple, str] = {}  # kind of rows -> commit that they come from
+    newest: dict[tuple, str] = {}  # kind of rows, and peer or group -> commit that they come from
     rows: dict[str, list[dict]] = {"ours": [], "peers": [], "stress": [], "capabilities": []}
     used: dict[int, dict[str, None]] = {}
     seen: set[tuple] = set()
     for index, data in enumerate(runs):
         for row in [*data["rows"], *data.get("stress", [])]:
             kind = _kind(row)
-            of_newest = newest.setdefault((kind, row.get("peer")), data["commit"]) == data["commit"]
+            part = kind, row.get("peer") or row.get("group")
+            of_newest = newest.setdefault(part, data["commit"]) == data["commit"]
             stressed = (row.get("case"), str(row.get("parameters")), row.get("precision"), row.get("granularity"))
             key = stressed if kind == "stress" else identity(row)
             if of_newest and key not in seen:

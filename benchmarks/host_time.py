@@ -12,8 +12,6 @@ more than rounding, or if a call under torch.compile broke the graph, warned, or
 from __future__ import annotations
 
 import argparse
-import json
-import platform
 import statistics
 import sys
 import time
@@ -28,9 +26,10 @@ import warp as wp
 
 import warp_spo as spo
 
-from . import robots
+from . import robots, runner
 from .cases import SCENES
 
+GROUP = "called from Python,"  # of the rows, before the name of the scene
 BATCH, BATCHES, WARM_UP = 20, 100, 5
 TOLERANCE = 1e-4  # of float32 results against the same kernels on NumPy arrays: gradients sum over worlds nowhere
 TARGETS = {  # [us], on an H200 machine with Go2 in 4096 worlds
@@ -56,28 +55,28 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--granularity", help="default: the plan's choice")
     parser.add_argument("--backend", default="inductor", help="of torch.compile")
     parser.add_argument("--only", default="", help="rows whose name has this text")
-    parser.add_argument("--json", help="file for the figures")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args(arguments)
     device = wp.get_device(options.device)
     scene = SCENES[options.scene]()
     compiled, complaints = compiled_row(scene, options, device)
     rows = [*torch_rows(scene, options, device), compiled, *warp_rows(scene, options, device)]
-    found = []
+    found: list[dict] = []
+    run = runner.record(found, options.device)
+    run["versions"]["torch"] = torch.__version__
     print(f"{options.scene}, {options.worlds} worlds, {device.name}, torch {torch.__version__}, microseconds a call")
     print(f"{'call':56} {'host':>8} {'done':>8} {'error':>8}")
     for row in rows:
         if options.only in row.name:
-            found.append(measure(row, device))
-            print("{name:56} {host_us:8.2f} {done_us:8.2f} {error:8.1e}".format(**found[-1]), flush=True)
+            found.append(dict(group=f"{GROUP} {options.scene}", worlds=options.worlds, **measure(row, device)))
+            print("{name:56} {us:8.2f} {done_us:8.2f} {error:8.1e}".format(**found[-1]), flush=True)
     for complaint in complaints:
         print(f"torch.compile: {complaint}")
-    over = [r for r in found if r["host_us"] > TARGETS.get(r["name"].removeprefix("torch: "), np.inf)]
+    over = [r for r in found if r["us"] > TARGETS.get(r["name"].removeprefix("torch: "), np.inf)]
     for row in over:
         print(f"over the target of {TARGETS[row['name'].removeprefix('torch: ')]} us: {row['name']}")
     if options.json:
-        about = dict(scene=options.scene, worlds=options.worlds, device=device.name, torch=torch.__version__)
-        about |= dict(warp=wp.__version__, python=platform.python_version(), host=platform.processor())
-        Path(options.json).write_text(json.dumps(dict(about=about, rows=found, compile=complaints), indent=1) + "\n")
+        runner.save(run, options.json)
     return 0 if not complaints and all(row["error"] <= TOLERANCE for row in found) else 1
 
 
@@ -97,7 +96,7 @@ def measure(row: Row, device: wp.Device) -> dict[str, Any]:
     errors.append(error(row))
     medians = [1e6 * statistics.median(times) / BATCH for times in (host, done)]
     low = 1e6 * min(host) / BATCH
-    return dict(name=row.name, host_us=medians[0], least_us=low, done_us=medians[1], error=max(errors))
+    return dict(name=row.name, us=medians[0], least_us=low, done_us=medians[1], error=max(errors))
 
 
 def error(row: Row) -> float:

@@ -10,9 +10,7 @@ together, ``host`` that until the last one returns. The exit code is 1 if an err
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import platform
 import statistics
 import sys
 import time
@@ -30,6 +28,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.reference import Dense
 
+from . import runner
 from .cases import SCENES
 
 BATCH, BATCHES, WARM_UP, STEPS, DT = 20, 30, 3, 50, 1e-3
@@ -55,27 +54,27 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--scene", default="humanoid", choices=SCENES)
     parser.add_argument("--worlds", type=int, default=4096)
     parser.add_argument("--only", default="", help="rows whose name has this text")
-    parser.add_argument("--json", help="file for the figures")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args(arguments)
     device = wp.get_device(options.device)
     place = jax.devices("gpu")[device.ordinal] if device.is_cuda else jax.devices("cpu")[0]
     scene, found = SCENES[options.scene](), []
+    run = runner.record(found, options.device)
+    run["versions"]["jax"] = jax.__version__
     print(f"{options.scene}, {options.worlds} worlds, {device.name}, JAX {jax.__version__}, microseconds")
     print(f"{'':44} {'host':>9} {'call':>9} {'error':>9} {'bound':>9}")
     with jax.default_device(place):
         for row in rows(scene, options.worlds, device):
             if options.only in row.name:
-                found.append(measure(row, device))
-                print(
-                    "{name:44} {host_us:9.1f} {call_us:9.1f} {error:9.1e} {bound:9.1e}".format(**found[-1]), flush=True
+                found.append(
+                    dict(group=f"called from JAX, {options.scene}", worlds=options.worlds, **measure(row, device))
                 )
+                print("{name:44} {us:9.1f} {done_us:9.1f} {error:9.1e} {bound:9.1e}".format(**found[-1]), flush=True)
     wrong = [row["name"] for row in found if not row["error"] <= row["bound"]]
     for name in wrong:
         print(f"WRONG: {name}")
     if options.json:
-        about = dict(scene=options.scene, worlds=options.worlds, device=device.name, jax=jax.__version__)
-        about |= dict(warp=wp.__version__, python=platform.python_version())
-        Path(options.json).write_text(json.dumps(dict(about=about, rows=found), indent=1) + "\n")
+        runner.save(run, options.json)
     return 1 if wrong else 0
 
 
@@ -99,7 +98,7 @@ def measure(row: Row, device: wp.Device) -> dict[str, Any]:
         done.append(time.perf_counter() - start)
     errors.append(error())
     medians = [1e6 * statistics.median(times) / (BATCH * row.per_call) for times in (host, done)]
-    return dict(name=row.name, host_us=medians[0], call_us=medians[1], error=max(errors), bound=row.bound)
+    return dict(name=row.name, us=medians[0], done_us=medians[1], error=max(errors), bound=row.bound)
 
 
 def wait(result: Any, device: wp.Device) -> None:
