@@ -118,10 +118,11 @@ def as_written(args: tuple, more: dict[str, Any]) -> Callable[[tuple, dict[str, 
 
     Most calls are written as the one before. The function returns None for others, and does not look at the arrays.
     """
-    values, tail = (*args, *more.values()), 0
-    if type(values[-1]) is tuple:
-        tail = len(values[-1])
-        values = values[:-1] + values[-1]
+    values, entries = (*args, *more.values()), 0
+    first = next((i for i, value in enumerate(values) if type(value) is tuple), 0)
+    if type(values[first]) is tuple:  # such as out=(q, qd)
+        entries = len(values[first])
+        values = values[:first] + values[first] + values[first + 1 :]
     places = [i for i, value in enumerate(values) if type(value) in CLASSES]
     constants = [(i, value, type(value)) for i, value in enumerate(values) if i not in places]
     if any(value is not None and kind not in NUMBERS for _, value, kind in constants):
@@ -132,11 +133,11 @@ def as_written(args: tuple, more: dict[str, Any]) -> Callable[[tuple, dict[str, 
         if len(args) != count or tuple(more) != names:
             return None
         values = (*args, *more.values())
-        if tail:
-            last = values[-1]
-            if type(last) is not tuple or len(last) != tail:
+        if entries:
+            inner = values[first]
+            if type(inner) is not tuple or len(inner) != entries:
                 return None
-            values = values[:-1] + last
+            values = values[:first] + inner + values[first + 1 :]
         for at, constant, kind in constants:
             value = values[at]
             if value is not constant and (type(value) is not kind or value != constant):

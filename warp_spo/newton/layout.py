@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from typing import Any
 
 import numpy as np
@@ -89,14 +90,18 @@ class Layout:
 
     def _check(self, flat: Any, name: str) -> None:
         """Raise TypeError or ValueError unless the array's memory is as the model's; kernels read it by its address."""
+        if isinstance(flat, wp.array):
+            kind = flat.dtype  # Warp's vectors count by their numbers
+            count = flat.size if kind is wp.float32 else flat.size * _components(kind)
+            scalar = getattr(kind, "_wp_scalar_type_", kind)
+            if count == self._count and scalar is wp.float32 and flat.device is self.device and flat.is_contiguous:
+                return
         expected = f"a Warp array float32 of {self._count} numbers on {self.device}, as the model has it"
         if not isinstance(flat, wp.array):
             raise TypeError(f"SolverSPO: {name} is of type {type(flat).__name__}; expected {expected}")
-        count, scalar = flat.size * _components(flat.dtype), getattr(flat.dtype, "_wp_scalar_type_", flat.dtype)
-        if count != self._count or scalar is not wp.float32 or flat.device != self.device or not flat.is_contiguous:
-            strides = "" if flat.is_contiguous else " with strides"
-            came = f"a Warp array {scalar.__name__} of {count} numbers on {flat.device}{strides}"
-            raise ValueError(f"SolverSPO: {name} is {came}; expected {expected}; use an array of this solver's model")
+        strides = "" if flat.is_contiguous else " with strides"
+        came = f"a Warp array {scalar.__name__} of {count} numbers on {flat.device}{strides}"
+        raise ValueError(f"SolverSPO: {name} is {came}; expected {expected}; use an array of this solver's model")
 
     def _launch(self, factory: Any, inputs: list, out: wp.array) -> None:
         if self._index.size:
@@ -122,4 +127,4 @@ def _scalars(flat: Any) -> wp.array:
 @functools.cache
 def _components(dtype: Any) -> int:
     """Return the count of numbers in one entry."""
-    return int(np.prod(getattr(dtype, "_shape_", ()) or (1,)))
+    return math.prod(getattr(dtype, "_shape_", ()))
