@@ -112,7 +112,8 @@ class SpatialOperators(LetterOwner):
         capturing, stamp = self._recursions.device.is_capturing, self._recursions.parameters.version
         if self._fused and (stamp is None or self._filled != stamp or self._captured or capturing):
             self._filled = None if capturing else stamp
-            self._write_blocks(self._q)
+            with self._recursions.turn.lock:
+                self._write_blocks(self._q)
 
     def _write_blocks(self, q: wp.array) -> None:
         run, f = self._recursions, self._factorization

@@ -16,8 +16,9 @@ def _make_method(operation: str) -> Callable[..., Any]:
     """Return a method of :class:`Module` that sets the parameters and calls an operation of Dynamics."""
 
     def method(self: "Module", *args: Any, **more: Any) -> Any:
-        self.dyn.set(**dict(self.named_parameters()))
-        return self.dyn._operations[operation].entry(self.dyn, *args, **more)
+        with self.dyn.recursions.turn.lock:  # no other thread may set values between
+            self.dyn.set(**dict(self.named_parameters()))
+            return self.dyn._operations[operation].entry(self.dyn, *args, **more)
 
     method.__name__, method.__qualname__ = operation, f"Module.{operation}"
     method.__doc__ = f"Return :meth:`warp_spo.Dynamics.{operation}` at the parameters."
