@@ -28,6 +28,7 @@ GRADIENTS = {
     "jacobian": ("q",),
     "integrate": ("q", "qd"),
 }
+SLOW = ("solve_mass_matrix", "jacobian", "integrate")  # one mathematics with the others, kernels of their own
 OPTIONS = {"step": {"dt": 2e-3}, "integrate": {"dt": 0.1}, "jacobian": {"frames": [0, 1]}}
 DIFFERENCE = (
     1e-6  # step of central differences in float64; their error is about the square of it, and 1e-10 of rounding
@@ -87,7 +88,9 @@ def weights_of(result):
     return [rng.normal(size=x.shape) for x in (result if isinstance(result, tuple) else (result,))]
 
 
-@pytest.mark.parametrize("operation", GRADIENTS)
+@pytest.mark.parametrize(
+    "operation", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in GRADIENTS]
+)
 def test_under_jit_and_grad(operation):
     """The results are those of the method to the bit; gradients are torch's to the bit, and those of differences."""
     dyn, names = robot(), GRADIENTS[operation]
@@ -119,6 +122,7 @@ def test_under_jit_and_grad(operation):
         assert abs((np.asarray(one) * along).sum() - slope) < DIFFERENCES * scale, names[i]
 
 
+@pytest.mark.slow
 def test_several_columns():
     """They go through at once; gradients go through vmap over them."""
     dyn = robot()
