@@ -84,7 +84,8 @@ def _refuse_actuator(source: Source, actuator: int) -> None:
 def _is_plain_motor(source: Source, actuator: int) -> bool:
     """Whether a DC motor has a resistance R and a constant K alone, and a voltage V: its force is K (V - K l') / R."""
     m, inputs = source.model, source.field("actuator_ctrlspec")
-    if inputs is None or inputs[actuator] != mujoco.mjtCtrlInput.mjINPUT_VOLTAGE:
+    named = getattr(mujoco, "mjtCtrlInput", None)  # MuJoCo 3.11 has no names of inputs; its 0 is the voltage
+    if inputs is None or inputs[actuator] != (0 if named is None else named.mjINPUT_VOLTAGE):
         return False
     more = m.actuator_gainprm[actuator, 2:], m.actuator_biasprm[actuator], m.actuator_dynprm[actuator]
     return not any(map(np.any, more)) and not m.actuator_actnum[actuator]

@@ -71,7 +71,7 @@ def _drop_unneeded(spec: Any) -> list[str]:
     dropped += [f"the meshes and height fields of {len(shapes)} geoms"] if shapes else []
     used = {name for geom in spec.geoms for name in (geom.meshname, geom.hfieldname)}
     for asset in [*spec.meshes, *spec.hfields]:
-        if asset.name not in used:
+        if (asset.name or Path(asset.file).stem) not in used:  # MuJoCo's rule for the name of an asset without one
             spec.delete(asset)
     return dropped
 
@@ -88,7 +88,7 @@ def _gives_no_mass(spec: Any, geom: Any) -> bool:
     body = geom.parent
     if body.explicitinertial and not always:
         return True
-    while body is not None:
+    while body.name != "world":  # whose parent is None in MuJoCo 4 and no body at all in 3.11
         if body.joints:
             return False
         body = body.parent
