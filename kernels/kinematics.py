@@ -156,64 +156,6 @@ def world_poses(s) -> wp.Kernel:
 
 
 @functools.cache
-def _anchor_quaternion(T: type):
-    quat = wp.types.quaternion(T)
-
-    @wp.func
-    def anchor_quaternion(pose: wp.array3d[wp.float64], world: int, hinge: int):
-        """Return the quaternion of an anchor."""
-        x, y, z = T(pose[world, hinge, 3]), T(pose[world, hinge, 4]), T(pose[world, hinge, 5])
-        return quat(x, y, z, T(pose[world, hinge, 6]))
-
-    return anchor_quaternion
-
-
-@functools.cache
-def quaternion_signs(s) -> wp.Kernel:
-    """Compute for every node whether the quaternion that :func:`body_poses` reads from its pose changes its sign.
-
-    One thread for each (node, world). Written is -1 where the product of the parent's quaternion, those of the anchors
-    and that of the hinge is the negative of the node's own; the first and the last are read from matrices. Along the
-    path to the root the product of these numbers is the sign that Newton's eval_fk gives, which multiplies quaternions.
-    """
-    T, vec3 = s.T, s.vec3
-    quat, anchor_quaternion = wp.types.quaternion(T), _anchor_quaternion(T)
-
-    @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
-    def kernel(
-        topology: Topology,
-        hinge_of: wp.array[int],
-        screw: wp.array2d[T],  # [dof, (axis, radians, metres per coordinate)]
-        joint_X_p: wp.array3d[wp.float64],
-        joint_X_c: wp.array3d[wp.float64],
-        q: wp.array2d[T],
-        world_pose: wp.array3d[T],
-        sign_out: wp.array2d[T],
-    ):
-        node, world = wp.tid()
-        parent = topology.parent[node]
-        turn = anchor_quaternion(joint_X_p, world, hinge_of[node])
-        if parent >= 0:
-            above = wp.quat_from_matrix(s.rotation_of(s.load_pose(world_pose, parent, world)))
-            turn = above * wp.quat_inverse(anchor_quaternion(joint_X_c, world, hinge_of[parent])) * turn
-        motion = topology.motion[node]
-        coord = topology.q_start[node]
-        if motion == SCREWS:
-            first = topology.qd_start[node]
-            for i in range(topology.dof_count[node]):
-                axis = vec3(screw[first + i, 0], screw[first + i, 1], screw[first + i, 2])
-                turn = turn * wp.quat_from_axis_angle(axis, q[world, coord + i] * screw[first + i, 3])
-        else:
-            if motion == FREE:
-                coord += 3
-            turn = turn * quat(q[world, coord], q[world, coord + 1], q[world, coord + 2], q[world, coord + 3])
-        own = wp.quat_from_matrix(s.rotation_of(s.load_pose(world_pose, node, world)))
-        sign_out[node, world] = wp.where(wp.dot(turn, own) < T(0.0), T(-1.0), T(1.0))
-
-    return kernel
-
-
-@functools.cache
 def body_poses(s) -> wp.Kernel:
     """Write the position and quaternion (xyzw) of every body, or without ``anchor`` of every node frame.
 
@@ -238,36 +180,74 @@ def body_poses(s) -> wp.Kernel:
 
 
 @functools.cache
-def apply_quaternion_signs(s) -> wp.Kernel:
-    """Give the quaternions of :func:`body_poses` the signs of eval_fk, in place; one thread for each (node, world).
+def quaternion_signs(s) -> wp.Kernel:
+    """Compute for every body whether the sign of its quaternion disagrees with that of its parent's.
 
-    ``sign`` are the numbers of :func:`quaternion_signs`, whose product along the path to the root belongs to the
-    quaternion that is read from the pose of the node; the anchor leads on to the body.
+    One thread for each (node, world). Written is -1 where the product of the quaternions of the parent, of the anchors
+    and of the hinge is the negative of the body's own; ``poses`` are those of :func:`body_poses`. Along the path to the
+    root the product of these numbers is the sign that Newton's eval_fk gives, which multiplies quaternions.
     """
-    T = s.T
-    quat, anchor_quaternion = wp.types.quaternion(T), _anchor_quaternion(T)
+    T, vec3 = s.T, s.vec3
+    quat = wp.types.quaternion(T)
+
+    @wp.func
+    def anchor(pose: wp.array3d[wp.float64], world: int, hinge: int):
+        x, y, z = T(pose[world, hinge, 3]), T(pose[world, hinge, 4]), T(pose[world, hinge, 5])
+        return quat(x, y, z, T(pose[world, hinge, 6]))
+
+    @wp.func
+    def turn(pose: wp.array3d[T], world: int, body: int):
+        return quat(pose[world, body, 3], pose[world, body, 4], pose[world, body, 5], pose[world, body, 6])
 
     @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
     def kernel(
         topology: Topology,
         hinge_of: wp.array[int],
+        screw: wp.array2d[T],  # [dof, (axis, radians, metres per coordinate)]
+        joint_X_p: wp.array3d[wp.float64],
         joint_X_c: wp.array3d[wp.float64],
-        world_pose: wp.array3d[T],
-        sign: wp.array2d[T],
-        poses_out: wp.array3d[T],
+        q: wp.array2d[T],
+        poses: wp.array3d[T],
+        sign_out: wp.array2d[T],
     ):
         node, world = wp.tid()
-        turn = wp.quat_from_matrix(s.rotation_of(s.load_pose(world_pose, node, world)))
-        inner = anchor_quaternion(joint_X_c, world, hinge_of[node])
-        body = quat(
-            poses_out[world, node, 3], poses_out[world, node, 4], poses_out[world, node, 5], poses_out[world, node, 6]
-        )
-        side = wp.dot(turn * wp.quat_inverse(inner), body)
+        parent = topology.parent[node]
+        product = anchor(joint_X_p, world, hinge_of[node])
+        if parent >= 0:
+            product = turn(poses, world, parent) * product
+        motion = topology.motion[node]
+        coord = topology.q_start[node]
+        if motion == SCREWS:
+            first = topology.qd_start[node]
+            for i in range(topology.dof_count[node]):
+                radians = screw[first + i, 3]
+                if radians != T(0.0):
+                    axis = vec3(screw[first + i, 0], screw[first + i, 1], screw[first + i, 2])
+                    product = product * wp.quat_from_axis_angle(axis, q[world, coord + i] * radians)
+        else:
+            if motion == FREE:
+                coord += 3
+            product = product * quat(q[world, coord], q[world, coord + 1], q[world, coord + 2], q[world, coord + 3])
+        own = turn(poses, world, node) * anchor(joint_X_c, world, hinge_of[node])
+        sign_out[node, world] = wp.where(wp.dot(product, own) < T(0.0), T(-1.0), T(1.0))
+
+    return kernel
+
+
+@functools.cache
+def apply_quaternion_signs(s) -> wp.Kernel:
+    """Give the quaternions of :func:`body_poses` the signs of eval_fk, in place; one thread for each (node, world)."""
+    T = s.T
+
+    @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
+    def kernel(topology: Topology, sign: wp.array2d[T], poses_out: wp.array3d[T]):
+        node, world = wp.tid()
+        product = T(1.0)
         above = node
         while above >= 0:
-            side *= sign[above, world]
+            product *= sign[above, world]
             above = topology.parent[above]
-        if side < T(0.0):
+        if product < T(0.0):
             for c in range(3, 7):
                 poses_out[world, node, c] = -poses_out[world, node, c]
 

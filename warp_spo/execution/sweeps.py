@@ -157,12 +157,11 @@ class Sweeps:
 
     def quaternion_signs(self, q: wp.array, out: wp.array) -> None:
         """Give the quaternions of body poses ``out`` [world, body, 7] the signs of eval_fk; after them."""
-        run, pose, sign = self.parameters, self.array("world_pose"), self.array("sign", *self.nodes)
+        run, sign = self.parameters, self.array("sign", *self.nodes)
         outer, inner = (broadcast_worlds(run.value(name), 0, self.worlds) for name in ("joint_X_p", "joint_X_c"))
-        inputs = [self.topology, run.hinge_of, self._screw, outer, inner, q, pose]
+        inputs = [self.topology, run.hinge_of, self._screw, outer, inner, q, out]
         self.launch_nodes(kinematics.quaternion_signs, self.nodes, inputs, [sign])
-        inputs = [self.topology, run.hinge_of, inner, pose, sign]
-        self.launch_nodes(kinematics.apply_quaternion_signs, self.nodes, inputs, [out])
+        self.launch_nodes(kinematics.apply_quaternion_signs, self.nodes, [self.topology, sign], [out])
 
     def frames(self, frames: tuple) -> tuple[wp.array, wp.array]:
         """Return bodies [frame], and origins [frame, 3] or poses [frame, 7] in the body frame, whichever are given.
