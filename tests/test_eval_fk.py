@@ -28,7 +28,7 @@ def flip(rng, array):
 
 
 @pytest.mark.filterwarnings("ignore:from_newton")
-@pytest.mark.parametrize("granularity", ["node", "segment", "tree"])
+@pytest.mark.parametrize("granularity", ["node", pytest.param("segment", marks=pytest.mark.slow), "tree"])
 def test_signs_of_quaternions(granularity, rng):
     """At angles beyond a half turn, with anchors whose quaternions have either sign, bodies in any order."""
     model = finalize(permuted_builder(rng, robots=1))

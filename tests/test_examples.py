@@ -54,7 +54,7 @@ def test_help_is_the_docstring_and_the_arguments(name, monkeypatch, capsys):
     assert {"worlds", "device", "picture"} <= set(asked) and all(f"--{option} " in text for option in asked)
 
 
-@pytest.mark.parametrize("module", [fourbar, gripper, slider_crank], ids=lambda module: module.__name__[18:])
+@pytest.mark.parametrize("module", [pytest.param(fourbar, marks=pytest.mark.slow), gripper, slider_crank])
 def test_pictures_of_linkages_have_legends(module, tmp_path, device, capsys):
     more = {"seconds": 0.02} if module is fourbar else {}
     module.main(worlds=3, device=str(device), picture=tmp_path / "picture.svg", **more)
