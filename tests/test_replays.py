@@ -154,6 +154,41 @@ def test_bad_input_is_refused_after_a_recording_too(case, device):
     assert out._version > version  # so that a backward pass that saved it raises
 
 
+def test_tensors_in_place_of_numbers_are_read_in_every_call(device):
+    """dt, a body and its pose in frames: the numbers that the tensors hold are none of the recording's."""
+    dyn = dynamics(device.alias)
+    a, pose = given(dyn, dyn._operations["integrate"], 0, "torch"), [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+    grown = a["q"].clone().requires_grad_()
+    for i in range(4):
+        dt, body, moved = 0.01 * (i + 1), i % 2, [float(i), *pose[1:]]
+        agree(dyn.integrate(a["q"], a["qd"], torch.tensor(dt, dtype=torch.float64)), dyn.integrate(a["q"], a["qd"], dt))
+        agree(dyn.jacobian(a["q"], [torch.tensor(body)]), dyn.jacobian(a["q"], [body]))
+        agree(dyn.jacobian(a["q"], [(0, torch.tensor(moved))]), dyn.jacobian(a["q"], [(0, moved)]))
+        results = [dyn.integrate(grown, a["qd"], x) for x in (torch.tensor(dt, dtype=torch.float64), dt)]
+        agree(*[torch.autograd.grad(x.square().sum(), grown) for x in results])
+
+
+def test_one_array_twice_then_another(device):
+    """Arguments that were the same tensor in the recorded call are looked at one by one in the next."""
+    dyn = dynamics(device.alias)
+    a = given(dyn, dyn._operations["bias_force"], 0, "torch")
+    wanted = dyn.step(numbers(a["q"]), numbers(a["qd"]), None, 0.01)
+    for out in ((0, 1), (0, None), (None, None)):
+        for _ in range(4):
+            q, qd = a["q"].clone(), a["qd"].clone()
+            agree(dyn.step(q, qd, None, 0.01, out=(q, qd)), wanted)
+        q, qd = a["q"].clone(), a["qd"].clone()
+        agree(dyn.step(q, qd, None, 0.01, out=tuple(None if i is None else (q, qd)[i] for i in out)), wanted)
+    q = a["q"].clone().requires_grad_()
+    for _ in range(3):
+        dyn.inverse_dynamics(q, a["qd"], a["qd"])
+    agree(dyn.inverse_dynamics(q, a["qd"], None).detach(), dyn.inverse_dynamics(a["q"], a["qd"], None))
+    for _ in range(3):
+        dyn.inverse_dynamics(q, a["qd"], a["qd"])
+    with explained(TypeError, "Dynamics.inverse_dynamics", "qdd is of type ndarray"):
+        dyn.inverse_dynamics(q, a["qd"], numbers(a["qd"]))
+
+
 def test_a_tape_and_a_tensor_of_values_are_seen(device):
     dyn = dynamics(device.alias)
     q = wp.array(given(dyn, dyn._operations["gravity_force"], 0, "numpy")["q"], dtype=wp.float64, device=device)

@@ -264,6 +264,8 @@ class Call:
     def _as_warp(self, name: str, array: Any, shape: tuple, meaning: str, dtype: Any, change: bool = False) -> wp.array:
         """Return a Warp array of scalars over the caller's memory, or over a copy of a NumPy array."""
         kind = kind_of(array, self.name, name)
+        if (recording := launches.recording()) is not None:
+            recording.taken.append(array)
         if self.kind is None:
             self.kind = kind
         if kind == NUMPY:

@@ -125,7 +125,9 @@ class Recording:
         steps: what was done, in order; ``step.launch(stream)`` does it again.
         places: for each array, the packed arguments that hold its address in ``data``.
         shifted: (array, packed argument, bytes from the array's start) of views that start inside an array.
-        written: the caller's arrays that the call writes.
+        taken: the caller's arrays whose memory the call reads or writes. Of others, such as a tensor in place of a
+            number, it took the numbers themselves.
+        written: those that the call writes.
         results: (array, shape, dtype) of each array that the call makes for its caller, after those of the caller.
         complete: the steps are all of the work; otherwise the call cannot be repeated.
     """
@@ -135,6 +137,7 @@ class Recording:
         self.steps: list[Any] = []
         self.places: list[list[Any]] = [[] for _ in arrays]
         self.shifted: list[tuple[int, Any, int]] = []
+        self.taken: list[Any] = []
         self.written: list[Any] = []
         self.results: list[tuple[Any, tuple[int, ...], type]] = []
         self.complete = True

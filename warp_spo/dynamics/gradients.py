@@ -21,7 +21,7 @@ from ..execution import link_values
 from ..execution.plan import MOST_DOFS
 from ..recursions.links import LINK_VALUES
 from .operation import DIFFERENTIABLE, Derivative, Operation, derivative_of
-from .replays import MISS, as_written
+from .replays import MISS, as_written, kind_of_call
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
@@ -117,7 +117,12 @@ class Gradients:
         replays, arguments = self.dyn._replays, (given, options, results, cotangents, wrt)
         flat = {**given, **options, "wrt": tuple(wrt)}
         found, key, arrays = replays.replay(f"{operation.name}, backwards", (*results, *cotangents), flat)
-        return found if found is not MISS else replays.run(key, arrays, lambda: self._pull_back(operation, *arguments))
+        if found is not MISS:
+            return found
+        numbers = tuple(options[option.name] for option in operation.options if option.name in options)
+        if kind_of_call(operation.name, numbers, {})[1]:  # a tensor for dt, for example
+            key = None
+        return replays.run(key, arrays, lambda: self._pull_back(operation, *arguments), all_taken=False)
 
     def _pull_back(
         self, operation: Operation, given: dict, options: dict, results: Any, cotangents: Any, wrt: Any

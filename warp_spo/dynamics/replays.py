@@ -188,7 +188,7 @@ class Replays:
                     found = repeat(arrays)
                 if found is not MISS:
                     return found, None, []
-        key, arrays = _kind_of_call(name, args, more)
+        key, arrays = kind_of_call(name, args, more)
         kind = self._kinds.get(key) if key is not None else None
         for repeat in () if kind is None else kind.plans:
             with self.turn.lock:
@@ -200,8 +200,13 @@ class Replays:
                 return found, key, arrays
         return MISS, key, arrays
 
-    def run(self, key: tuple | None, arrays: list, call: Callable[[], Any]) -> Any:
-        """Return the result of ``call()``; record the second call of a kind."""
+    def run(self, key: tuple | None, arrays: list, call: Callable[[], Any], all_taken: bool = True) -> Any:
+        """Return the result of ``call()``; record the second call of a kind.
+
+        Args:
+            all_taken: an array that the call does not take gives it numbers, such as a tensor for dt. These are not
+                seen when the call is repeated, so it is not recorded.
+        """
         with self.turn.lock:
             plain = not self._device.is_capturing
             if key is None or not arrays or not plain:
@@ -214,20 +219,22 @@ class Replays:
                 self._kinds[key] = Kind()
                 return result
             ranges = _ranges(arrays) if kind.tries < MOST_TRIES else None
-            return call() if ranges is None else self._record(kind, arrays, ranges, call)
+            return call() if ranges is None else self._record(kind, arrays, ranges, call, all_taken)
 
-    def _record(self, kind: Kind, arrays: list, ranges: list, call: Callable[[], Any]) -> Any:
+    def _record(self, kind: Kind, arrays: list, ranges: list, call: Callable[[], Any], all_taken: bool) -> Any:
         """Record a call and return its result."""
         kind.tries += 1
         with Recording(ranges) as recording:
             result = call()
         build = _builder(result, arrays, [owner for owner, _, _ in recording.results])
+        if all_taken and not all(any(x is other for other in recording.taken) for x in arrays):
+            return result
         if recording.complete and build is not None and _lie_apart(arrays, ranges, recording.written):
             kind.plans.append(_repeater(self._device, self.turn, arrays, ranges, recording, build))
         return result
 
 
-def _kind_of_call(name: str, args: tuple, more: dict[str, Any]) -> tuple[tuple | None, list]:
+def kind_of_call(name: str, args: tuple, more: dict[str, Any]) -> tuple[tuple | None, list]:
     """Return a key of the calls that pass the same arguments but for the arrays, and the arrays; None: no such key."""
     key: list[Any] = [name, len(args), *more]
     arrays: list[Any] = []

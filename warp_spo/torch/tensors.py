@@ -83,13 +83,20 @@ def like(tensors: Sequence[torch.Tensor], exactly: bool = False) -> Any:
     result is None.
     """
     wanted = tuple((x.shape, x.dtype, x.device) for x in tensors)
-    places = [i for i, x in enumerate(tensors) if not any(x is other for other in tensors[:i])]  # guards want each once
-    guards, pick = _guards([tensors[i] for i in places]), None if len(places) == len(tensors) else places
+    first = [next(j for j, other in enumerate(tensors) if other is x) for x in tensors]
+    pairs = [(i, j) for i, j in enumerate(first) if i != j]
+    places = [i for i, j in enumerate(first) if i == j]  # guards want each tensor once
+    guards = _guards([tensors[i] for i in places])
+
+    def same(tensors: Sequence[Any]) -> bool:
+        if not pairs:
+            return guards.check(*tensors)
+        return all(tensors[i] is tensors[j] for i, j in pairs) and guards.check(*[tensors[i] for i in places])
 
     def find(tensors: Sequence[Any]) -> list[int] | None:
         if forward_ad._current_level >= 0:
             return None
-        if guards is not None and guards.check(*(tensors if pick is None else [tensors[i] for i in pick])):
+        if guards is not None and same(tensors):
             found = [x.data_ptr() for x in tensors]
             return None if 0 in found else found
         return None if exactly else _addresses(tensors, wanted)
