@@ -189,6 +189,15 @@ def test_one_array_twice_then_another(device):
         dyn.inverse_dynamics(q, a["qd"], numbers(a["qd"]))
 
 
+def test_sparse_tensors_that_require_grad_are_refused_alike_each_time(device):
+    dyn = dynamics(device.alias)
+    a = given(dyn, dyn._operations["bias_force"], 0, "torch")
+    q = a["q"].to_sparse().requires_grad_()
+    for _ in range(3):
+        with explained(ValueError, "Dynamics.bias_force", "q is a torch array", "expected a dense one"):
+            dyn.bias_force(q, a["qd"])
+
+
 def test_a_tape_and_a_tensor_of_values_are_seen(device):
     dyn = dynamics(device.alias)
     q = wp.array(given(dyn, dyn._operations["gravity_force"], 0, "numpy")["q"], dtype=wp.float64, device=device)

@@ -110,7 +110,7 @@ def _guards(tensors: list[torch.Tensor]) -> Any:
     try:
         shapes, strides = [list(x.shape) for x in tensors], [list(x.stride()) for x in tensors]
         found = kind(*tensors, dynamic_dims_sizes=shapes, dynamic_dims_strides=strides)
-        return found if found.check(*tensors) else None
+        return found if all(map(is_dense, tensors)) and found.check(*tensors) else None
     except (TypeError, RuntimeError):
         return None
 
