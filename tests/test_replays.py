@@ -168,6 +168,22 @@ def test_tensors_in_place_of_numbers_are_read_in_every_call(device):
         agree(*[torch.autograd.grad(x.square().sum(), grown) for x in results])
 
 
+def test_options_that_change_before_the_backward_pass(device):
+    """The way back is that of the call: of the frames that its list held, and of the dt."""
+    dyn = dynamics(device.alias)
+    a = given(dyn, dyn._operations["integrate"], 0, "torch")
+    q, qd = a["q"].requires_grad_(), a["qd"].requires_grad_()
+    for _ in range(3):
+        frames, dt = [0], torch.tensor(0.01, dtype=torch.float64)
+        results = dyn.jacobian(q, frames), dyn.integrate(q, qd, dt)
+        wanted = dyn.jacobian(q, [0]), dyn.integrate(q, qd, 0.01)
+        frames[0] = 1
+        dt.fill_(0.5)
+        for result, other in zip(results, wanted, strict=True):
+            x = qd if other is wanted[1] else q
+            agree(*[torch.autograd.grad(y.square().sum(), x) for y in (result, other)])
+
+
 def test_one_array_twice_then_another(device):
     """Arguments that were the same tensor in the recorded call are looked at one by one in the next."""
     dyn = dynamics(device.alias)

@@ -76,7 +76,9 @@ class Record:
 
     def __init__(self, dyn: "Dynamics", operation: "Operation", options: dict, inputs: tuple, values: tuple):
         assert operation.derivative is not None
-        self.dyn, self.operation, self.derivative, self.options = dyn, operation, operation.derivative, options
+        self.dyn, self.operation, self.derivative = dyn, operation, operation.derivative
+        names = {option.name for option in operation.options}
+        self.options = {name: _copied(value) if name in names else value for name, value in options.items()}
         self.inputs, self.values = inputs, values
         self.stamps = dict(dyn.values.stamps)
 
@@ -111,6 +113,13 @@ class Record:
         before = {name: by_name[name] for name in changed if name in self.values}
         with self.dyn.recursions.turn.lock, gradients.at_values(before):
             return gradients.pull_back(self.operation, arrays, self.options, results, cotangents, wanted)
+
+
+def _copied(option: Any) -> Any:
+    """Return an option that stays as it is if the caller changes his: a list of frames, or a tensor for dt."""
+    if type(option) in (list, tuple):
+        return type(option)(map(_copied, option))
+    return option.clone() if is_tensor(option) else option
 
 
 class _Differentiable(torch.autograd.Function):
