@@ -205,6 +205,6 @@ def test_inputs_are_reproducible_and_exact_in_both_precisions():
     for name in INPUTS:
         assert a.array(name).dtype == np.float32
         assert np.array_equal(a.array(name), b.array(name))
-        assert not np.array_equal(a.array(name), other.array(name))
+        assert a.array(name).size == 0 or not np.array_equal(a.array(name), other.array(name))
     (first,) = rotations(scene)
     np.testing.assert_allclose(np.linalg.norm(a.array("q")[:, first : first + 4], axis=1), 1.0, atol=1e-6)

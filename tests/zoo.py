@@ -4,6 +4,7 @@ Random scenes have rotated and offset anchors on both sides, off-centre CoMs, fu
 inequality, and armature. Their float64 values come from seeded generators, so a failure can be run again.
 """
 
+import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -221,18 +222,22 @@ def permuted(scene, seed=0):
     coupled = [
         Coupling(int(new_hinge[c.hinge]), int(new_hinge[c.reference]), c.ratio, c.offset) for c in scene.couplings
     ]
+    actuators = [dataclasses.replace(a, hinges=[int(new_hinge[h]) for h in a.hinges]) for a in scene.actuators]
     new = Scene(
         [scene.bodies[k] for k in body],
         [renumbered(scene.hinges[h], Hinge) for h in hinge],
         gravity=scene.values["gravity"][0],
         loops=[renumbered(loop, Loop) for loop in scene.loops],
         couplings=coupled,
+        actuators=actuators,
     )
     entries = lambda start: np.concatenate([np.arange(start[h], start[h + 1]) for h in hinge]).astype(int)  # noqa: E731
     q, qd = entries(scene.q_start), entries(scene.qd_start)
     values = {}
     for name, array in scene.values.items():
-        by_dof = name not in ("gravity", "joint_X_p", "joint_X_c", "joint_rest_q") and not name.startswith("body")
+        by_dof = name not in ("gravity", "joint_X_p", "joint_X_c", "joint_rest_q") and name.startswith("joint")
+        if name.startswith("actuator"):
+            continue  # in the order of the actuators, which stays
         rows = {"gravity": slice(None), "joint_X_p": hinge, "joint_X_c": hinge, "joint_rest_q": q}
         values[name] = array[:, qd if by_dof else rows.get(name, body)]
     return Permuted(new.with_values(**values), body, hinge, q, qd)
