@@ -1,9 +1,11 @@
-"""States of MuJoCo and of a scene, each from the other.
+"""States, accelerations and forces of MuJoCo and of a scene, each from the other.
 
 qpos and q differ in the order of quaternions, w x y z and x y z w. Angular velocities of ball and free joints are in
 the body's axes in qvel, and in those of the parent anchor in qd: ``w_qd = R w_qvel``, R being the rotation of the
 joint's quaternion, normalised. The first three rates of a free joint are the velocity of the body frame's origin in
-qvel, and that of the centre of mass c (in the body frame) in qd: ``v_qd = v_qvel + w_qd x R c``. Sources: MuJoCo's
+qvel, and that of the centre of mass c (in the body frame) in qd: ``v_qd = v_qvel + w_qd x R c``. Their time derivatives
+give ``dw_qd = R dw_qvel``, because ``w x w`` is zero, and ``dv_qd = dv_qvel + dw_qd x R c + w_qd x (w_qd x R c)``.
+Forces have the same power in both: ``f_tau = f_qfrc`` and ``n_tau = R n_qfrc - R c x f``. Sources: MuJoCo's
 documentation, "Computation: Floating objects"; Newton's conventions for joint_q and joint_qd.
 """
 
@@ -25,6 +27,37 @@ def gather(T) -> wp.Kernel:
 
 
 @functools.cache
+def rotation(T) -> wp.Function:
+    """Return the function for the rotation of a quaternion among coordinates, which need not be of unit length."""
+    Matrix = wp.types.matrix((3, 3), T)
+
+    @wp.func
+    def function(q: wp.array2d[T], world: int, vector: int, real: int) -> Matrix:
+        x, y, z, w = q[world, vector], q[world, vector + 1], q[world, vector + 2], q[world, real]
+        s = T(2.0) / ((x * x + y * y) + (z * z + w * w))
+        one = T(1.0)
+        return Matrix(
+            one - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
+            s * (x * y + w * z), one - s * (x * x + z * z), s * (y * z - w * x),
+            s * (x * z - w * y), s * (y * z + w * x), one - s * (x * x + y * y),
+        )  # fmt: skip
+
+    return function
+
+
+@functools.cache
+def three(T) -> wp.Function:
+    """Return the function for the vector of three entries of a row."""
+    Vector = wp.types.vector(3, T)
+
+    @wp.func
+    def function(x: wp.array2d[T], world: int, first: int) -> Vector:
+        return Vector(x[world, first], x[world, first + 1], x[world, first + 2])
+
+    return function
+
+
+@functools.cache
 def rates(T) -> wp.Kernel:
     """Compute qd from qpos and qvel if ``to_scene``, else qvel from q and qd; a thread for each (world, joint).
 
@@ -34,18 +67,7 @@ def rates(T) -> wp.Kernel:
         vector, real: entries of its quaternion in ``coordinates``: the first of x, y, z, and w.
         com: centre of mass of the body that the joint carries, in the body frame [m].
     """
-    Vector, Matrix = wp.types.vector(3, T), wp.types.matrix((3, 3), T)
-
-    @wp.func
-    def rotation(q: wp.array2d[T], world: int, vector: int, real: int) -> Matrix:
-        x, y, z, w = q[world, vector], q[world, vector + 1], q[world, vector + 2], q[world, real]
-        s = T(2.0) / ((x * x + y * y) + (z * z + w * w))
-        one = T(1.0)
-        return Matrix(
-            one - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
-            s * (x * y + w * z), one - s * (x * x + z * z), s * (y * z - w * x),
-            s * (x * z - w * y), s * (y * z + w * x), one - s * (x * x + y * y),
-        )  # fmt: skip
+    Vector, turned, entries = wp.types.vector(3, T), rotation(T), three(T)
 
     @wp.kernel(module=f"warp_spo_mujoco_{T.__name__}", enable_backward=False)
     def kernel(
@@ -64,11 +86,11 @@ def rates(T) -> wp.Kernel:
         if kind[joint] == 0:
             out[world, first] = x[world, first]
             return
-        R = rotation(coordinates, world, vector[joint], real[joint])
+        R = turned(coordinates, world, vector[joint], real[joint])
         turn = first
         if kind[joint] == 2:
             turn = first + 3
-        given = Vector(x[world, turn], x[world, turn + 1], x[world, turn + 2])
+        given = entries(x, world, turn)
         if to_scene:
             w = R * given
             axes = w  # the angular velocity in the parent's axes
@@ -78,7 +100,7 @@ def rates(T) -> wp.Kernel:
         for i in range(3):
             out[world, turn + i] = w[i]
         if kind[joint] == 2:
-            v = Vector(x[world, first], x[world, first + 1], x[world, first + 2])
+            v = entries(x, world, first)
             c = Vector(com[world, joint, 0], com[world, joint, 1], com[world, joint, 2])
             shift = wp.cross(axes, R * c)
             if to_scene:
@@ -91,4 +113,99 @@ def rates(T) -> wp.Kernel:
     return kernel
 
 
-KERNELS = (gather, rates)
+@functools.cache
+def accelerations(T) -> wp.Kernel:
+    """Compute qdd from qpos, qvel and qacc if ``to_scene``, else qacc from q, qd and qdd; arguments as of `rates`."""
+    Vector, turned, entries = wp.types.vector(3, T), rotation(T), three(T)
+
+    @wp.kernel(module=f"warp_spo_mujoco_{T.__name__}", enable_backward=False)
+    def kernel(
+        to_scene: bool,
+        kind: wp.array[int],
+        dof: wp.array[int],
+        vector: wp.array[int],
+        real: wp.array[int],
+        com: wp.array3d[T],
+        coordinates: wp.array2d[T],
+        velocity: wp.array2d[T],
+        x: wp.array2d[T],
+        out: wp.array2d[T],
+    ):
+        world, joint = wp.tid()
+        first = dof[joint]
+        if kind[joint] == 0:
+            out[world, first] = x[world, first]
+            return
+        R = turned(coordinates, world, vector[joint], real[joint])
+        turn = first
+        if kind[joint] == 2:
+            turn = first + 3
+        given = entries(x, world, turn)
+        w = entries(velocity, world, turn)
+        if to_scene:
+            w = R * w
+            result = R * given
+            change = result  # of the angular velocity, in the parent's axes
+        else:
+            result = wp.transpose(R) * given
+            change = given
+        for i in range(3):
+            out[world, turn + i] = result[i]
+        if kind[joint] == 2:
+            a = entries(x, world, first)
+            arm = R * Vector(com[world, joint, 0], com[world, joint, 1], com[world, joint, 2])
+            shift = wp.cross(change, arm) + wp.cross(w, wp.cross(w, arm))
+            if to_scene:
+                a += shift
+            else:
+                a -= shift
+            for i in range(3):
+                out[world, first + i] = a[i]
+
+    return kernel
+
+
+@functools.cache
+def forces(T) -> wp.Kernel:
+    """Compute tau from qpos and qfrc if ``to_scene``, else qfrc from q and tau; arguments as of `rates`."""
+    Vector, turned, entries = wp.types.vector(3, T), rotation(T), three(T)
+
+    @wp.kernel(module=f"warp_spo_mujoco_{T.__name__}", enable_backward=False)
+    def kernel(
+        to_scene: bool,
+        kind: wp.array[int],
+        dof: wp.array[int],
+        vector: wp.array[int],
+        real: wp.array[int],
+        com: wp.array3d[T],
+        coordinates: wp.array2d[T],
+        x: wp.array2d[T],
+        out: wp.array2d[T],
+    ):
+        world, joint = wp.tid()
+        first = dof[joint]
+        if kind[joint] == 0:
+            out[world, first] = x[world, first]
+            return
+        R = turned(coordinates, world, vector[joint], real[joint])
+        turn = first
+        moment = Vector()  # of the force at the centre of mass about the origin, in world axes
+        if kind[joint] == 2:
+            turn = first + 3
+            f = entries(x, world, first)
+            c = Vector(com[world, joint, 0], com[world, joint, 1], com[world, joint, 2])
+            moment = wp.cross(R * c, f)
+            for i in range(3):
+                out[world, first + i] = f[i]
+        n = entries(x, world, turn)
+        if to_scene:
+            n = R * n - moment
+        else:
+            n = wp.transpose(R) * (n + moment)
+        for i in range(3):
+            out[world, turn + i] = n[i]
+
+    return kernel
+
+
+KERNELS = (gather, rates, accelerations, forces)

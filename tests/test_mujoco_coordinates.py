@@ -1,4 +1,6 @@
-"""spo.mujoco.Coordinates: states of MuJoCo and of its scene, each from the other, as velocities of bodies show."""
+"""spo.mujoco.Coordinates: states, accelerations and forces of MuJoCo and of its scene, each from the other."""
+
+import re
 
 import numpy as np
 import pytest
@@ -15,10 +17,18 @@ WORLDS = 5
 pytestmark = pytest.mark.filterwarnings("ignore:from_mujoco. left out")
 
 
+def text():
+    """Free, ball, hinge and slide joints; the free bodies' centres of mass are beside their origins.
+
+    Two of three free joints have neither springs, dampers nor armature: with these, from_mujoco gives the free joint a
+    body of its own whose centre of mass is the origin.
+    """
+    return re.sub(r'<joint name="(j0_0|j2_0)" type="free"[^>]*/>', r'<joint name="\1" type="free"/>', random_mjcf(2))
+
+
 @pytest.fixture(scope="module")
 def model():
-    """Free, ball, hinge and slide joints; the free bodies' centres of mass are beside their origins."""
-    return mujoco.MjModel.from_xml_string(random_mjcf(2))
+    return mujoco.MjModel.from_xml_string(text())
 
 
 def states(model, worlds=WORLDS):
@@ -35,6 +45,11 @@ def test_there_and_back(model, dtype, device):
     assert q.dtype == qd.dtype == qpos.dtype and not np.array_equal(q, qpos) and not np.array_equal(qd, qvel)
     np.testing.assert_array_equal(c.qpos(q), qpos)
     np.testing.assert_allclose(c.qvel(q, qd), qvel, atol=ROUNDING[dtype])
+    qacc = np.ascontiguousarray(qvel[::-1])
+    qdd, tau = c.qdd(qpos, qvel, qacc), c.tau(qpos, qacc)
+    np.testing.assert_allclose(c.qacc(q, qd, qdd), qacc, atol=20 * ROUNDING[dtype])  # squares of rates are added
+    np.testing.assert_allclose(c.qfrc(q, tau), qacc, atol=ROUNDING[dtype])
+    np.testing.assert_allclose((tau * qd).sum(1), (qacc * qvel).sum(1), atol=20 * ROUNDING[dtype])  # power, 35 terms
 
 
 def test_velocities_are_those_of_bodies(model, device):
@@ -58,6 +73,37 @@ def test_velocities_are_those_of_bodies(model, device):
         for body in range(1, model.nbody):
             mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, twist, 0)
             np.testing.assert_allclose(twists[world, body - 1], np.roll(twist, 3), atol=1e-12)
+
+
+def test_accelerations_and_forces_are_those_of_mujoco(device):
+    """mj_forward's qacc, passive and actuator forces, and mj_inverse's forces, all from the scene's own."""
+    actuators = '<actuator><position joint="j1_0" kp="20" kv="3" gear="2"/><motor joint="j6_1" gear="-3"/></actuator>'
+    model = mujoco.MjModel.from_xml_string(text().replace("</mujoco>", actuators + "</mujoco>"))
+    scene = spo.from_mujoco(model)
+    free = [scene.bodies[hinge.child] for hinge in scene.hinges if hinge.unconstrained]
+    assert sum(np.any(np.abs(body.com) > 0.1) for body in free) == 2
+    c = spo.mujoco.Coordinates(scene, model, WORLDS, device, "float64")
+    dyn = spo.Dynamics(scene, WORLDS, device, "float64", granularity="node")
+    (qpos, qvel), rng = states(model), np.random.default_rng(3)
+    ctrl, given = rng.normal(size=(WORLDS, model.nu)), rng.normal(size=(WORLDS, model.nv))
+    q, qd = c.q(qpos), c.qd(qpos, qvel)
+    passive, active = dyn.passive_force(q, qd), dyn.actuator_force(q, qd, ctrl)
+    qdd = dyn.forward_dynamics(q, qd, active + passive)
+    found = {"qacc": c.qacc(q, qd, qdd), "qfrc_passive": c.qfrc(q, passive), "qfrc_actuator": c.qfrc(q, active)}
+    inverse = c.qfrc(q, dyn.inverse_dynamics(q, qd, c.qdd(qpos, qvel, given)))
+    data = mujoco.MjData(model)
+    for world in range(WORLDS):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[world], qvel[world], ctrl[world]
+        mujoco.mj_forward(model, data)
+        expected = {name: getattr(data, name).copy() for name in found}
+        for name, array in expected.items():
+            np.testing.assert_allclose(found[name][world], array, atol=1e-12 * abs(array).max(), rtol=0)
+        np.testing.assert_allclose(qdd[world], c.qdd(qpos, qvel, np.tile(expected["qacc"], (WORLDS, 1)))[world],
+                                   atol=1e-12 * abs(qdd[world]).max(), rtol=0)  # fmt: skip
+        data.qacc[:] = given[world]
+        mujoco.mj_inverse(model, data)
+        total = data.qfrc_inverse + data.qfrc_passive
+        np.testing.assert_allclose(inverse[world], total, atol=1e-12 * abs(total).max(), rtol=0)
 
 
 def test_arrays_of_the_caller(model, device):

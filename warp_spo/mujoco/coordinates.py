@@ -1,7 +1,8 @@
-"""States of MuJoCo and of a scene, each from the other, on the device."""
+"""States, accelerations and forces of MuJoCo and of a scene, each from the other, on the device."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -18,13 +19,15 @@ from .mechanism import BALL, FREE, KINDS
 
 
 class Coordinates:
-    """Converts states between MuJoCo's ``qpos``, ``qvel`` and a scene's ``q``, ``qd``, one kernel a call.
+    """Converts between MuJoCo's ``qpos``, ``qvel``, ``qacc``, ``qfrc`` and a scene's ``q``, ``qd``, ``qdd``, ``tau``.
 
     ``qpos`` and ``q`` differ in the order of quaternions alone: w, x, y, z in MuJoCo and x, y, z, w here; entries
     keep their places, and nothing is normalised. ``qvel`` and ``qd`` differ for ball joints, whose angular velocity is
     in the body's axes in MuJoCo and in the parent anchor's here, and for free joints: there the velocity of the body
     frame's origin in world axes, then the angular velocity in the body's axes; here the velocity of the centre of mass,
-    then the angular velocity, both in world axes. Every conversion is exact to rounding.
+    then the angular velocity, both in world axes. ``qacc`` and ``qdd`` are the time derivatives of ``qvel`` and ``qd``;
+    forces have the same power in both, ``qfrc . qvel = tau . qd``. Each call launches one kernel and is exact to
+    rounding.
 
     Args:
         scene: what ``from_mujoco(model)`` or ``load(path)`` returned; its centres of mass are those of ``body_com``,
@@ -79,11 +82,27 @@ class Coordinates:
 
     def qd(self, qpos: ArrayT, qvel: AnyArray, out: ArrayT | None = None) -> ArrayT:
         """Return qd [world, dof] of ``qpos`` [world, nq] and ``qvel`` [world, nv] [m/s, rad/s]."""
-        return self._convert("qd", True, {"qpos": qpos, "qvel": qvel}, out)
+        return self._convert("qd", kernels.rates, True, {"qpos": qpos, "qvel": qvel}, out)
 
     def qvel(self, q: ArrayT, qd: AnyArray, out: ArrayT | None = None) -> ArrayT:
         """Return qvel [world, nv] of ``q`` [world, coordinate] and ``qd`` [world, dof] [m/s, rad/s]."""
-        return self._convert("qvel", False, {"q": q, "qd": qd}, out)
+        return self._convert("qvel", kernels.rates, False, {"q": q, "qd": qd}, out)
+
+    def qdd(self, qpos: ArrayT, qvel: AnyArray, qacc: AnyArray, out: ArrayT | None = None) -> ArrayT:
+        """Return qdd [world, dof] of ``qpos`` [world, nq], ``qvel`` and ``qacc`` [world, nv] [m/s^2, rad/s^2]."""
+        return self._convert("qdd", kernels.accelerations, True, {"qpos": qpos, "qvel": qvel, "qacc": qacc}, out)
+
+    def qacc(self, q: ArrayT, qd: AnyArray, qdd: AnyArray, out: ArrayT | None = None) -> ArrayT:
+        """Return qacc [world, nv] of ``q`` [world, coordinate], ``qd`` and ``qdd`` [world, dof] [m/s^2, rad/s^2]."""
+        return self._convert("qacc", kernels.accelerations, False, {"q": q, "qd": qd, "qdd": qdd}, out)
+
+    def tau(self, qpos: ArrayT, qfrc: AnyArray, out: ArrayT | None = None) -> ArrayT:
+        """Return tau [world, dof] of ``qpos`` [world, nq] and ``qfrc`` [world, nv] [N, N m]."""
+        return self._convert("tau", kernels.forces, True, {"qpos": qpos, "qfrc": qfrc}, out)
+
+    def qfrc(self, q: ArrayT, tau: AnyArray, out: ArrayT | None = None) -> ArrayT:
+        """Return qfrc [world, nv], as MuJoCo adds up, of ``q`` and ``tau`` [world, dof] [N, N m]."""
+        return self._convert("qfrc", kernels.forces, False, {"q": q, "tau": tau}, out)
 
     def _table(self, numbers: Any) -> wp.array:
         return wp.array(np.array(numbers, dtype=np.int32), dtype=int, device=self.device)
@@ -96,15 +115,17 @@ class Coordinates:
             wp.launch(kernels.gather(self.dtype), shape, [source, x], [result], device=self.device)
         return call.result
 
-    def _convert(self, name: str, to_scene: bool, arguments: dict[str, Any], out: Any) -> Any:
-        shapes = (self.worlds, self.coord_count), (self.worlds, self.dof_count)
-        words = "[world, coordinate]", "[world, dof]"
+    def _convert(
+        self, name: str, factory: Callable[[type], wp.Kernel], to_scene: bool, arguments: dict[str, Any], out: Any
+    ) -> Any:
+        states = ((self.worlds, self.coord_count), "[world, coordinate]")
+        rates = ((self.worlds, self.dof_count), "[world, dof]")
         with Call(f"Coordinates.{name}", self.device, self.dtype) as call:
-            items = zip(arguments.items(), shapes, words, strict=True)
-            read = [call.read(argument, array, shape, axes) for (argument, array), shape, axes in items]
-            result = call.write(out, shapes[1], words[1])
+            first, *others = arguments.items()
+            read = [call.read(*first, *states), *(call.read(*other, *rates) for other in others)]
+            result = call.write(out, *rates)
             wp.launch(
-                kernels.rates(self.dtype),
+                factory(self.dtype),
                 (self.worlds, self.joint_count),
                 [to_scene, *self._rates[to_scene], self._com, *read],
                 [result],
