@@ -12,7 +12,7 @@ import warp as wp
 
 @functools.cache
 def delay(T) -> wp.Kernel:
-    """Write ``ctrl`` into the rings and the delayed controls into ``out``; NaN where a delay does not fit the ring."""
+    """Write ``ctrl`` into the rings and the delayed controls into ``out``; NaN where a delay is not whole or does not fit the ring."""
 
     @wp.kernel(module=f"warp_spo_delays_{T.__name__}", enable_backward=False)
     def kernel(
@@ -26,8 +26,8 @@ def delay(T) -> wp.Kernel:
         slots, step = ring.shape[1], count[world, actuator]
         ring[world, step % slots, actuator] = ctrl[world, actuator]
         back = delays[actuator, world]
-        if back >= T(0.0) and back <= T(slots - 1):
-            out[world, actuator] = ring[world, (step - wp.min(int(back + T(0.5)), step)) % slots, actuator]
+        if back >= T(0.0) and back <= T(slots - 1) and back == wp.round(back):
+            out[world, actuator] = ring[world, (step - wp.min(int(back), step)) % slots, actuator]
         else:
             out[world, actuator] = T(wp.nan)
         count[world, actuator] = wp.where(step + 1 == 2 * slots, slots, step + 1)

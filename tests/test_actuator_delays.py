@@ -71,6 +71,27 @@ def test_delays_of_each_world(device):
     dyn.reset_actuator_state(None, state)
     found = forces_of(dyn, state, ctrl)
     assert np.isnan(found[:, 2]).all() and np.isfinite(found[:, [0, 1, 3]]).all()
+    assert "delays of as many steps as Dynamics.set says, in a launch" in dyn.explain()
+    delays[2, 1] = 0.5
+    dyn.set(actuator_delay=wp.array(delays, dtype=wp.float64, device=device))  # nobody looks at it
+    found = forces_of(dyn, state, ctrl)
+    assert np.isnan(found[:, 2]).all() and np.isfinite(found[:, [0, 1, 3]]).all()
+
+
+def test_delays_that_are_set_later_need_buffers_that_fit():
+    dyn = spo.Dynamics(slider(spo.Actuator(0)), 2, device="cpu", variable=("actuator_delay",))
+    with pytest.raises(ValueError, match=r"longest is None and actuator_delay is variable; .*; pass longest=, 0"):
+        dyn.actuator_state()
+    assert dyn.actuator_state(longest=2).ring.shape == (2, 3, 1)
+    for wrong in (-1.0, 0.5, np.nan, np.inf):
+        for delays in ([[1.0], [wrong]], [wrong]):
+            with pytest.raises(ValueError, match=f"Dynamics.set: actuator_delay holds {wrong}; expected whole steps"):
+                dyn.set(actuator_delay=np.array(delays, np.float32))
+        with pytest.raises(ValueError, match="actuator_delay holds"):
+            dyn.set(actuator_delay=[wrong])
+    nothing = spo.Dynamics(spo.Scene([spo.Body(1.0)], [spo.Hinge("prismatic", -1, 0, axis=(0, 0, 1))]), 1, device="cpu")
+    assert nothing.actuator_state().ring.shape == (1, 0, 0)
+    assert "longer than its buffers" in spo.Status.NOT_FINITE.advice
 
 
 def test_delayed_steps_are_recorded_and_repeated(device):
@@ -113,7 +134,7 @@ def test_delayed_steps_allocate_nothing_and_are_captured(device):
     place = lambda *shape: wp.array(np.random.default_rng(0).normal(size=shape), dtype=wp.float64, device=device)  # noqa: E731
     q, qd, ctrl, status = place(2, 1), place(2, 1), place(2, 3), wp.zeros(2, dtype=int, device=device)
     mask = wp.array([True, False], dtype=wp.bool, device=device)
-    state, twin = dyn.actuator_state(), dyn.actuator_state(q)
+    state, twin = dyn.actuator_state(longest=3), dyn.actuator_state(q, longest=3)
     dyn.reset_actuator_state(mask, state)
     given = dict(ctrl=ctrl, status=status, substeps=3)
     out = wp.clone(q), wp.clone(qd)

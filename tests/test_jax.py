@@ -218,6 +218,19 @@ def test_substeps():
         np.testing.assert_array_equal(one, other)
 
 
+def test_a_step_without_tau():
+    """None stands for it by position and by name, as in the method; the other arrays have their gradients."""
+    dyn = robot()
+    f = spo_jax.function(dyn, "step", dt=2e-3)
+    q, qd, tau = arrays(dyn, "q", "qd", "tau")
+    zero = jnp.zeros_like(tau)
+    for found in (f(q, qd, None), f(q=q, qd=qd, tau=None), jax.jit(lambda q, qd: f(q, qd, None))(q, qd)):
+        for one, wanted in zip(found, f(q, qd, zero), strict=True):
+            np.testing.assert_allclose(one, wanted, atol=1e-13)  # of a state of size 1; another kernel
+    one, wanted = (jax.grad(lambda qd, last=last: f(q, qd, last)[0].sum())(qd) for last in (None, zero))
+    np.testing.assert_allclose(one, wanted, atol=1e-13)
+
+
 def test_status():
     """It follows the results, and lets gradients pass."""
     dyn = plain()

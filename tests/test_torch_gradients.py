@@ -115,6 +115,17 @@ def test_under_compile(operation, device):
             assert torch.equal(got, right)
 
 
+def test_none_for_tau_in_a_custom_op(device):
+    """By position and by name, as in the method: the same results and gradients, to the bit."""
+    dyn = spo.Dynamics(zoo.fork(), WORLDS, device=device, dtype="float64", granularity="tree")
+    q, qd = on(dyn, laws.states(dyn.scene, WORLDS), "q", "qd")
+    op = spo_torch.custom_op(dyn, "step", dt=DT)
+    wanted = torch.autograd.grad(squares(dyn.step, q, qd, None, DT), (q, qd))
+    for call in (lambda q, qd: op(q, qd, None), lambda q, qd: op(q, qd=qd, tau=None)):
+        found = torch.autograd.grad(squares(call, q, qd), (q, qd))
+        assert all(torch.equal(one, other) for one, other in zip(found, wanted, strict=True))
+
+
 def test_what_a_graph_fills(device):
     """Arrays that a call writes, and options: numbers that vary, lists, and words."""
     torch._dynamo.reset()

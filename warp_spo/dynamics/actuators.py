@@ -71,14 +71,22 @@ def actuator_state(self: Dynamics, like: Any = None, longest: int | None = None)
 
     Args:
         like: an array of the kind that the buffers are to have, such as q. None: Warp arrays.
-        longest: the longest delay, in steps, that actuator_delay will be set to. None: the longest of the scene's
-            values. A longer delay makes that control NaN in its world.
+        longest: the longest delay, in steps, that actuator_delay will be set to; necessary where actuator_delay is
+            variable. A longer delay makes that control NaN in its world. None: the longest of the scene's values.
 
     Returns:
         :class:`warp_spo.ActuatorState`: (ring [world, longest + 1, actuator], count [world,
         actuator]). To copy or save a state, copy both arrays.
+
+    Raises:
+        ValueError: longest is shorter than a delay of the scene's values, or is None where actuator_delay is variable.
     """
     least = most_delay(self)
+    if longest is None and self.scene.actuators and "actuator_delay" in self.variable:
+        raise ValueError(
+            "Dynamics.actuator_state: longest is None and actuator_delay is variable; expected the steps of the "
+            f"longest delay that Dynamics.set will be given; pass longest=, {least} or more"
+        )
     steps = least if longest is None else as_integer(longest)
     if steps is None or steps < least:
         raise ValueError(
@@ -166,7 +174,7 @@ def _read(dyn: Dynamics, call: Call, state: Any) -> tuple[wp.array, wp.array]:
 
 def stand_in(dyn: Dynamics, given: dict[str, Any]) -> ActuatorState | None:
     """Return what ``prepare`` passes for the buffers of a call with these arguments."""
-    return actuator_state(dyn) if "ctrl" in given and delays_controls(dyn) else None
+    return actuator_state(dyn, longest=most_delay(dyn)) if "ctrl" in given and delays_controls(dyn) else None
 
 
 def explain(dyn: Dynamics) -> str:
@@ -175,6 +183,7 @@ def explain(dyn: Dynamics) -> str:
     if not actuators:
         return "none"
     dofs = {hinge for actuator in actuators for hinge in actuator.hinges}
-    longest = f"up to {most_delay(dyn)} steps{', variable' if 'actuator_delay' in dyn.variable else ''}"
+    set_later = "actuator_delay" in dyn.variable
+    longest = "as many steps as Dynamics.set says" if set_later else f"up to {most_delay(dyn)} steps"
     late = f"delays of {longest}, in a launch before each step" if delays_controls(dyn) else "no delays"
     return f"{len(actuators)} on {len(dofs)} hinges, in the kernel of a step that is given ctrl; {late}"

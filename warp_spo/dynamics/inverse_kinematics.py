@@ -78,7 +78,8 @@ def inverse_kinematics(
     From each start, ``iterations`` steps of damped least squares are made, and the best coordinates met on the way are
     kept; of all starts of a world, those with the least error are returned. One thread works on a start. All of it is
     two launches, which a graph can capture, and the numbers of seeds and iterations are fixed: the error says whether a
-    target was reached. With 16 seeds, 99.9 % of the poses that Panda and UR5 take at random configurations are reached.
+    target was reached. One seed, the default, serves targets near ``q``; of poses far from it, it reaches about a
+    quarter, 4 seeds four fifths, and 16 seeds 99.9 % (Panda and UR5, at random configurations within their limits).
 
     The error [m] of a world is the largest, over its frames, of the distance between the frame's origin and its target,
     and of the angle between their axes times ``angle_weight``. With the default weight an error below 1e-3 says that

@@ -13,6 +13,7 @@ from ..dlpack import settle
 from ..execution.parameters import VARIABLE
 from ..execution.rows import as_rows, copy_rows
 from ..gradients import records_gradient
+from ..scene.actuators import check_actuator_value
 from ..scene.parts import real
 from . import actuators
 from .refinement import Refinement
@@ -25,15 +26,17 @@ def set_values(self: Dynamics, *, worlds: AnyArray | None = None, **values: Any)
     """Change values of the scene, in Newton's names and layouts, [world, ...] or [...] for all worlds.
 
     Names in ``variable`` are copied by launches, one for all names and one or two for what kernels derive from them,
-    which a graph may capture; their numbers are not inspected. Any other name rebuilds the kernels' data that was
-    derived from it, with a warning, and is checked as a scene's values are.
+    which a graph may capture; their numbers are not inspected, but for delays in NumPy arrays. Any other name rebuilds
+    the kernels' data that was derived from it, with a warning, and is checked as a scene's values are.
 
     Args:
         worlds: bool [world]; only worlds where it is True change. None: all change.
-        values: arrays by name.
+        values: arrays by name. An actuator_delay on a device must be whole steps, 0 or more, and no longer than the
+            buffers of :meth:`actuator_state`; controls with another one are NaN.
 
     Raises:
-        ValueError: unknown name, wrong shape, dtype or device; a name that is not variable inside a graph capture or
+        ValueError: unknown name, wrong shape, dtype or device; a NumPy array of delays that are negative or not whole;
+            a name that is not variable inside a graph capture or
             with ``worlds``; a tensor that requires grad, now or in an earlier call, with ``worlds``.
     """
     folded: dict[str, Any] = {}
@@ -56,6 +59,8 @@ def set_values(self: Dynamics, *, worlds: AnyArray | None = None, **values: Any)
             plain = value.detach() if followed else value
             array = call.read(name, plain, shape, "[world, ...] or [...] as Newton has it")
             if name in self.variable:
+                if name == "actuator_delay" and isinstance(value, np.ndarray):
+                    check_actuator_value("Dynamics.set", name, value)
                 variable[name] = array
             else:
                 folded[name] = value if isinstance(value, np.ndarray) else array

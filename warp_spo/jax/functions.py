@@ -34,9 +34,10 @@ def function(dyn: Dynamics, operation: str, *, capture: bool = False, **options:
         jax.grad(height, argnums=2)(q, qd, tau)
         jax.vmap(step)(q, qd, tau)                  # the same as step(q, qd, tau): vmap's axis is the world
 
-    The function takes the operation's arrays by position or by name; they are ``[world, ...]``, or ``[...]`` of one
-    world where ``vmap`` makes the batch. A batch of several times as many rows as ``dyn`` has worlds is computed that
-    many rows at a time. Kernels run on XLA's device and stream, at the values of the scene that ``dyn`` has then.
+    The function takes the operation's arrays by position or by name, and None where the method does. They are
+    ``[world, ...]``, or ``[...]`` of one world where ``vmap`` makes the batch. A batch of several times as many rows as
+    ``dyn`` has worlds is computed that many rows at a time. Kernels run on XLA's device and stream, at the values of
+    the scene that ``dyn`` has then.
     Gradients are those that torch gets, of first order; ``jvp`` and ``jacfwd`` are refused by JAX.
 
     Args:

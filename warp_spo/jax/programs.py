@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +37,9 @@ class Program:
     def __init__(self, function: Function, columns: dict[str, int | None], alone: bool):
         self.function, self.dyn, self.operation = function, function.dyn, function.operation
         self.options, self.columns, self.alone = function.options, columns, alone
+        parameters = inspect.signature(self.operation.function).parameters
+        needed = (name for name in function.arguments if parameters[name].default is inspect.Parameter.empty)
+        self._absent: dict[str, Any] = {name: None for name in needed if name not in columns}
         self._once: Program | None = None  # one of several repetitions
         self._status = ("status",) if function.status else ()
         self._traced: dict[bool | tuple[str, ...], Traced] = {}
@@ -59,7 +63,7 @@ class Program:
         return {name: stand_in(self.dyn, arguments[name], frames, count) for name, count in self.columns.items()}
 
     def _compute(self, given: dict[str, wp.array], **more: Any) -> Any:
-        return self.operation.entry(self.dyn, **given, **self.options, **more)
+        return self.operation.entry(self.dyn, **self._absent, **given, **self.options, **more)
 
     def _written(self, names: tuple[str, ...]) -> dict[str, wp.array]:
         """Return arrays for arguments that the operation writes."""

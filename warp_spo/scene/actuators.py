@@ -128,5 +128,7 @@ def check_actuator_value(call: str, name: str, array: np.ndarray) -> None:
     """Raise ValueError if a value of actuators that a scene or ``Dynamics.set`` is given is not possible."""
     if name in RANGES and not (array[..., 0] <= array[..., 1]).all():
         raise ValueError(f"{call}: {name} holds a lower end above the upper end, or NaN; expected (lower, upper)")
-    if name == "actuator_delay" and (array != np.round(array)).any():
-        raise ValueError(f"{call}: actuator_delay holds {array[array != np.round(array)][0]}; expected whole steps")
+    if name == "actuator_delay":
+        possible = (array == np.round(array)) & (array >= 0) & (array < np.inf)
+        if not possible.all():
+            raise ValueError(f"{call}: actuator_delay holds {array[~possible][0]}; expected whole steps, 0 or more")

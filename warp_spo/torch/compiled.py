@@ -254,8 +254,9 @@ def custom_op(dyn: "Dynamics", operation: str, **options: Any) -> Callable[..., 
         options: The operation's arguments that are not tensors.
 
     Returns:
-        A function of the operation's tensors [world, ...], by position or by name. It raises RuntimeError if a value of
-        ``dyn`` is set to a tensor that requires grad, because this tensor is no input of the op.
+        A function of the operation's tensors [world, ...], by position or by name, and None where the method takes it.
+        It raises RuntimeError if a value of ``dyn`` is set to a tensor that requires grad, because this tensor is no
+        input of the op.
 
     Raises:
         TypeError: ``dyn`` is no Dynamics, or the options are not those of the operation.
@@ -274,13 +275,15 @@ def custom_op(dyn: "Dynamics", operation: str, **options: Any) -> Callable[..., 
 
     def call(*args: Any, **more: Any) -> Any:
         named = (*zip(by, args, strict=False), *more.items())
-        inputs = {n: x for n, x in named if x is not None}
-        if len(args) > len(by) or len(named) > len(dict(named)) or not all(n in by for n in more):
+        inputs = dict(named)
+        if len(args) > len(by) or len(named) > len(inputs) or not all(n in by for n in more):
             raise TypeError(
                 f"custom_op({operation!r}): {len(args)} tensors by position and {', '.join(more) or 'none'} by name; "
                 f"expected {', '.join(by)}, each once at most"
             )
         for n, x in inputs.items():
+            if x is None:
+                continue  # an option of the op
             if not is_tensor(x):
                 raise TypeError(f"custom_op({operation!r}): {n} is of type {type(x).__name__}; expected a torch tensor")
             if forward_ad._current_level >= 0 or not torch.compiler.is_compiling():
