@@ -12,7 +12,7 @@ import warp as wp
 
 @functools.cache
 def delay(T) -> wp.Kernel:
-    """Write ``ctrl`` into the rings and the delayed controls into ``out``; NaN where a delay is not whole or does not fit the ring."""
+    """Write ``ctrl`` into the rings, and into ``out`` the delayed controls; NaN if a delay is not whole or too long."""
 
     @wp.kernel(module=f"warp_spo_delays_{T.__name__}", enable_backward=False)
     def kernel(

@@ -75,4 +75,19 @@ def select_best(T: type) -> wp.Kernel:
     return kernel
 
 
-KERNELS = (select_best,)
+@functools.cache
+def take_positions(T: type) -> wp.Kernel:
+    """Copy target poses without their quaternions, in whose place the neutral one is written."""
+
+    @wp.kernel(module=f"warp_spo_searches_{T.__name__}", enable_backward=False)
+    def kernel(targets: wp.array3d[T], out: wp.array3d[T]):
+        world, frame = wp.tid()
+        for i in range(3):
+            out[world, frame, i] = targets[world, frame, i]
+            out[world, frame, 3 + i] = T(0.0)
+        out[world, frame, 6] = T(1.0)
+
+    return kernel
+
+
+KERNELS = (select_best, take_positions)

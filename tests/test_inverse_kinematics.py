@@ -153,6 +153,11 @@ def test_positions_alone(device):
     targets = dyn.frame_poses(between(scene, 8), frame)
     targets[..., 3:] = [0.5, 0.5, 0.5, 0.5]
     found, error = dyn.inverse_kinematics(targets, frame, seeds=4, angle_weight=0.0)
+    for nothing in (0.0, np.nan):  # in place of quaternions
+        targets[..., 3:] = nothing
+        again = dyn.inverse_kinematics(targets, frame, seeds=4, angle_weight=0.0)
+        np.testing.assert_array_equal(again[0], found)
+        np.testing.assert_array_equal(again[1], error)
     assert error.max() < 1e-9
     np.testing.assert_allclose(dyn.frame_poses(found, frame)[..., :3], targets[..., :3], atol=1e-9)
 
