@@ -101,13 +101,23 @@ def test_loops_are_closed(tmp_path, capsys, monkeypatch, device, loops, says):
     monkeypatch.setattr(job, "OPERATIONS", {name: OPERATIONS[name] for name in chosen})
     (tmp_path / "loop.xml").write_text(LOOP)
     arguments = [str(tmp_path / "loop.xml"), "--worlds", "2", "--device", str(device), "--dtype", "float64"]
-    assert job.main([*arguments, "--loops", loops]) == 0
-    out = capsys.readouterr().out
+    assert job.main([*arguments, "--loops", loops, "--report", str(tmp_path)]) == 0
+    out, page = capsys.readouterr().out, (tmp_path / job.REPORT).read_text()
     left = {"embed": "forward_dynamics, mass_matrix, psi", "multipliers": "forward_dynamics, psi"}[loops]
     assert says in out and f"not compared: {left}\n" in out and re.search(r"^body_poses ", out, re.M)
+    kept = {"embed": "body_poses", "multipliers": "body_poses, mass_matrix"}[loops]
+    assert f"With --loops {loops} only these are compared" in out and f"no dense reference here: {kept}\n" in out
+    assert f"no dense reference here: {kept}</p>" in page and f"not compared: {left}</p>" in page
     assert job.main([*arguments, "--loops", "raise"]) == 2
     err = capsys.readouterr().err
     assert "loop.xml' has 1 loop joint(s): pin, which --loops raise refuses; pass --loops cut, embed" in err
+
+
+def test_the_help_names_what_is_compared_where_loops_are_embedded():
+    forms = {name: one.embed for name, one in job.DECLARED.items() if name not in job.CLOSED}
+    kept = sorted(name for name in OPERATIONS if forms.get(name) is job.AS_WRITTEN)
+    said = re.search(r"with embed only (.*) and (\w+), because", " ".join(job.parser().format_help().split()))
+    assert [*said[1].split(", "), said[2]] == kept
 
 
 def test_worlds_that_do_not_fit_are_refused_before_they_are_allocated(capsys, monkeypatch, device):
