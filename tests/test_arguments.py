@@ -49,24 +49,48 @@ def test_a_frame_by_the_end_of_its_label(device):
             dyn.jacobian(q, [label])
 
 
+def test_sites_are_frames_by_name_and_bear_poses(device):
+    """A name that a body has, too, is refused: it would be read as the one that the caller did not mean."""
+    pose, half = (0.3, 0.1, -0.2, 0.0, 0.0, 0.6, 0.8), np.sqrt(0.5)
+    bodies = [spo.Body(1.0, inertia=np.eye(3), label=label) for label in ("thigh", "robot/shin")]
+    hinges = [spo.Hinge("revolute", k - 1, k, axis=np.eye(3)[k]) for k in range(2)]
+    sites = {"tool": (1, POSE), "thigh": (1, POSE), "shin": (0, POSE), "turned": (1, (1, 2, 3, 0, 0, half, half))}
+    dyn = spo.Dynamics(spo.Scene(bodies, hinges, sites=sites), 1, device=device, dtype="float64")
+    q = np.array([[0.4, -0.7]])
+    np.testing.assert_array_equal(dyn.jacobian(q, ["tool"]), dyn.jacobian(q, [(1, POSE)]))
+    turned = (1, (0.9, 2.3, 2.8, 0, 0, half * 1.4, half * 0.2))  # a quarter turn about z takes (x, y) to (-y, x)
+    np.testing.assert_allclose(dyn.frame_poses(q, [("turned", pose)]), dyn.frame_poses(q, [turned]), atol=1e-15)
+    site, offset = dyn.frame_poses(q, ["tool"])[0, 0], np.array(pose[:3])
+    moved = dyn.frame_poses(q, [("tool", pose)])[0, 0, :3] - site[:3]
+    np.testing.assert_allclose(moved, np.array(wp.quat_rotate(wp.quatd(*site[3:]), wp.vec3d(*offset))), atol=1e-15)
+    for frame in ("thigh", ("thigh", pose)):
+        with explained(ValueError, "jacobian: 'thigh' is a body and a site", "index, 0, or scene.sites['thigh']"):
+            dyn.jacobian(q, [frame])
+    with explained(ValueError, "'shin' is a body and a site", "index, 1, or scene.sites['shin']"):
+        dyn.jacobian(q, ["shin"])
+    np.testing.assert_array_equal(dyn.jacobian(q, [sites["thigh"]]), dyn.jacobian(q, ["tool"]))
+    with explained(ValueError, "no body and no site 'toool'", "scene.sites", "such as 'tool'"):
+        dyn.jacobian(q, ["toool"])
+
+
 BAD_FRAMES = {
     "none": (None, ValueError, "frames is None; expected a list of bodies"),
     "empty": ([], ValueError, "frames is []; expected a list of bodies"),
     "a number": (0, ValueError, "frames is 0; expected a list of bodies"),
     "a label": ("body_0", ValueError, "frames is 'body_0'; expected a list of bodies"),
-    "no such label": (["nobody"], ValueError, "no body 'nobody' in the scene; expected one of scene.body_labels"),
+    "no such label": (["nobody"], ValueError, "no body and no site 'nobody' in the scene; expected one of"),
     "beyond": ([5], ValueError, "a frame's body is 5; expected 0 to 4"),
     "negative": ([-1], ValueError, "a frame's body is -1; expected 0 to 4"),
-    "yes": ([True], TypeError, "a frame is True; expected a body (index or label) or (body, pose in the body)"),
-    "half": ([0.5], TypeError, "a frame is 0.5; expected a body (index or label) or (body, pose in the body)"),
+    "yes": ([True], TypeError, "a frame is True; expected a body (index or label), the name of a site"),
+    "half": ([0.5], TypeError, "a frame is 0.5; expected a body (index or label), the name of a site"),
     "a point": ([(0, (0, 0, 0))], ValueError, "expected x, y, z and a unit quaternion"),
     "long quaternion": ([(0, (0, 0, 0, 0, 0, 0, 2))], ValueError, "expected x, y, z and a unit quaternion"),
     "nan": ([(0, (np.nan, 0, 0, 0, 0, 0, 1))], ValueError, "expected x, y, z and a unit quaternion"),
-    "text": ([(0, "here")], TypeError, "expected a body (index or label) or (body, pose in the body)"),
-    "texts": ([(0, ["0"] * 6 + ["1"])], TypeError, "expected a body (index or label) or (body, pose in the body)"),
-    "complex": ([(0, np.ones(7) * 1j)], TypeError, "expected a body (index or label) or (body, pose in the body)"),
-    "huge": ([(0, (10**400, 0, 0, 0, 0, 0, 1))], TypeError, "expected a body (index or label) or (body, pose"),
-    "one number": ([(0, 1.0)], TypeError, "expected a body (index or label) or (body, pose in the body)"),
+    "text": ([(0, "here")], TypeError, "expected a body (index or label), the name of a site"),
+    "texts": ([(0, ["0"] * 6 + ["1"])], TypeError, "expected a body (index or label), the name of a site"),
+    "complex": ([(0, np.ones(7) * 1j)], TypeError, "expected a body (index or label), the name of a site"),
+    "huge": ([(0, (10**400, 0, 0, 0, 0, 0, 1))], TypeError, "expected a body (index or label), the name of a site"),
+    "one number": ([(0, 1.0)], TypeError, "expected a body (index or label), the name of a site"),
     "gradient": ([(0, torch.ones(7, requires_grad=True))], ValueError, "a frame's pose requires grad; derivatives"),
     "a truth": ([torch.tensor(True)], TypeError, "a frame is tensor(True); expected a body (index or label)"),
 }

@@ -168,7 +168,7 @@ def test_bad_input_is_named(device):
     for wrong in (dict(seeds=0), dict(iterations=1.5), dict(angle_weight=-1.0), dict(angle_weight="much")):
         with pytest.raises(ValueError, match=f"Dynamics.inverse_kinematics: {next(iter(wrong))} is .*expected"):
             dyn.inverse_kinematics(targets, [0], **wrong)
-    with pytest.raises(ValueError, match=r"targets is .*expected float32 \(1, 2, 7\) \[world, frame, 7\]"):
+    with pytest.raises(ValueError, match=r"targets is .*expected \(1, 2, 7\) \[world, frame, 7\]"):
         dyn.inverse_kinematics(targets, [0, 0])
     limited = spo.Dynamics(scene.with_values(joint_limit_upper=np.ones(3)), 1, device=device)
     with pytest.raises(spo.UnsupportedError, match=r"limits of the ball hinge"):

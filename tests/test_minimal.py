@@ -289,6 +289,13 @@ def test_what_speaks_of_independent_dofs_fits_what_speaks_of_all(device):
     dyn = spo.Dynamics(scene, 3, device=device, dtype="float64", loops="embed")
     s, frames, free = mechanisms.states(scene), frames_of(scene), dyn.independent_dofs
     qdd = dyn.forward_dynamics(s.q, s.qd, s.tau)
+    tau, full = dyn.inverse_dynamics(s.q, s.qd, qdd), np.zeros_like(s.tau)
+    full[:, free] = tau
+    np.testing.assert_allclose(dyn.forward_dynamics(s.q, s.qd, full), qdd, rtol=1e-9, atol=1e-9)
+    with pytest.raises(
+        ValueError, match=r"tau \(3, 2\) .*independent_dofs alone; expected \(3, 4\).*full\[:, dyn.inde"
+    ):
+        dyn.forward_dynamics(s.q, s.qd, tau)
     rate = np.einsum("wfij,wj->wfi", dyn.jacobian(s.q, frames), qdd[:, free]) + dyn.jacobian_bias(s.q, s.qd, frames)
     np.testing.assert_allclose(dyn.frame_accelerations(s.q, s.qd, qdd, frames), rate, rtol=1e-9, atol=1e-9)
     moves = dyn.body_accelerations(s.q, s.qd, qdd)[..., :3]

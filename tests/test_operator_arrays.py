@@ -146,14 +146,14 @@ REFUSED = {
     "x size": (
         lambda: chain_of_two() @ ones(3, 4),
         ValueError,
-        r"BWA.apply: x .*\(3, 4\); expected float64 \(any, 5\)",
+        r"BWA.apply: x .*\(3, 4\); expected \(any, 5\)",
     ),
     "x worlds": (
         lambda: BWA(Tree([-1, 0]), [None, ones(3, 1, 1)]) @ ones(4, 2, 1),
         ValueError,
-        r"\(4, 2, 1\); expected float64 \(3, 2, any\)",
+        r"\(4, 2, 1\); expected \(3, 2, any\)",
     ),
-    "x axes": (lambda: chain_of_two() @ ones(5), ValueError, r"\(5,\); expected float64 \(any, 5\)"),
+    "x axes": (lambda: chain_of_two() @ ones(5), ValueError, r"\(5,\); expected \(any, 5\)"),
     "x kind": (lambda: chain_of_two() @ [1.0], TypeError, "x is of type list"),
     "x grad": (lambda: chain_of_two() @ torch.zeros(1, 5).double().requires_grad_(), ValueError, "x requires grad"),
     "x dtype": (lambda: chain_of_two() @ torch.zeros(1, 5), ValueError, "torch array float32.*dtype='float32'"),

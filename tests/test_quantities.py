@@ -234,7 +234,7 @@ def test_a_share_is_a_number_or_an_array(device):
     a = states(scene)
     many = dyn.interpolate(a["q0"], a["q1"], np.full(WORLDS, 0.25))
     np.testing.assert_array_equal(dyn.interpolate(a["q0"], a["q1"], 0.25), many)
-    with pytest.raises(ValueError, match=r"Dynamics.interpolate: s is .* expected float64 \(3,\) \[world\]"):
+    with pytest.raises(ValueError, match=r"Dynamics.interpolate: s is .* expected \(3,\) \[world\]"):
         dyn.interpolate(a["q0"], a["q1"], np.zeros((WORLDS, 2)))
     with pytest.raises(TypeError, match=r"Dynamics.interpolate: s"):
         dyn.interpolate(a["q0"], a["q1"], True)

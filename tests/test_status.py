@@ -45,6 +45,7 @@ def test_kernels_hold_the_same_numbers():
 def test_every_state_has_advice_and_a_severity_of_its_own():
     assert all(len(state.advice) > 20 and state.advice.endswith(".") for state in spo.Status)
     assert sorted(state.severity for state in spo.Status) == list(range(len(spo.Status)))
+    assert spo.Status.OPEN.advice.startswith("Dynamics.project")
     order = sorted(spo.Status, key=lambda state: -state.severity)
     assert ", ".join(state.name for state in order) in " ".join(spo.Status.__doc__.split())
 

@@ -86,6 +86,7 @@ REFUSED = {
     "axis": (robot(*pair("continuous", '<axis xyz="0 0 0"/>')), r"line 4, <axis>: xyz is the zero vector"),
     "numbers": (robot(*pair("fixed", '<origin xyz="0 0"/>')), r"line 4, <origin>: xyz is '0 0'; expected 3 finite num"),
     "limits": (robot(*pair("revolute", '<limit upper="-1"/>')), r"line 4, <limit>: of joint 'j': lower is 0, above u"),
+    "crossed limits": (robot(*pair("revolute", '<limit lower="2" upper="1"/>')), "lower is 2, above upper 1; expected"),
     "damping": (robot(*pair("revolute", '<dynamics damping="-1"/>')), r"line 4, <dynamics>: damping is -1; expected 0"),
     "floating": (robot(*pair("floating", '<dynamics damping="1"/>')), r"line 4, <joint name='j'>: has damping or fric"),
     "two_axes": (robot(*pair("revolute", "<axis xyz='1 0 0'/>" * 2)), r"line 4, <axis>: a second one in <joint> 'j'"),

@@ -123,9 +123,9 @@ def test_gravity_folded_away_comes_back(device):
 
 REFUSED = {
     "unknown": (dict(mass=np.ones(12)), ValueError, "Dynamics.set: unknown value 'mass'; expected one of body_mass"),
-    "short": (dict(body_mass=np.ones(3)), ValueError, r"Dynamics.set: body_mass is .*\(3,\); expected float32 \(12,\)"),
-    "worlds": (dict(body_mass=np.ones((4, 12))), ValueError, r"body_mass is .*\(4, 12\); expected float32 \(3, 12\)"),
-    "scalar": (dict(body_mass=1.0), ValueError, r"Dynamics.set: body_mass is .*\(\); expected float32 \(12,\)"),
+    "short": (dict(body_mass=np.ones(3)), ValueError, r"Dynamics.set: body_mass is .*\(3,\); expected \(12,\)"),
+    "worlds": (dict(body_mass=np.ones((4, 12))), ValueError, r"body_mass is .*\(4, 12\); expected \(3, 12\)"),
+    "scalar": (dict(body_mass=1.0), ValueError, r"Dynamics.set: body_mass is .*\(\); expected \(12,\)"),
     "text": (dict(body_mass="heavy"), TypeError, "Dynamics.set: body_mass is 'heavy'; expected an array of numbers"),
     "dtype": (dict(gravity=torch.zeros(3).double()), ValueError, "gravity is a torch array float64.*expected float32"),
     "grad": (dict(gravity=torch.zeros(3).requires_grad_()), ValueError, r"gravity requires grad.*gravity.detach\(\)"),

@@ -80,9 +80,12 @@ def kind_of(array: object, call: str, name: str) -> str:
     if "torch" in sys.modules and torch_border().is_tensor(array):
         return TORCH
     if dlpack.is_traced(array):
+        way = f"call warp_spo.jax.function(dyn, {call.rpartition('.')[2]!r}) there"
+        if call == "Dynamics.set":
+            way = "set values outside of JAX's functions; they have no gradients in JAX: use torch for these"
         raise TypeError(
             f"{call}: {name} is traced by JAX (jit, grad or vmap), so it holds no numbers yet; expected an array with "
-            f"numbers; call warp_spo.jax.function(dyn, {call.rpartition('.')[2]!r}) there"
+            f"numbers; {way}"
         )
     library = dlpack.library_of(array)
     if library is None:
@@ -357,10 +360,12 @@ class Call:
             if dtype is self.dtype and _dtype_name(array) in _DTYPES:
                 way += f", or build the object with dtype={_dtype_name(array)!r}"
         else:
-            way = f"reshape {name}, or build the object for this size"
+            way = _way_to_shape(name, kind, came, shape, meaning)
         sizes = ", ".join("any" if size == -1 else str(size) for size in shape) + ("," if len(shape) == 1 else "")
-        expected = f"{dtype.__name__} ({sizes}) {meaning}".rstrip()
-        raise ValueError(f"{self.name}: {name} is {_describe(array, kind)}; expected {expected}; {way}")
+        expected, found = f"{dtype.__name__} ({sizes}) {meaning}".rstrip(), _describe(array, kind)
+        if kind == NUMPY and dtype_fits:  # it is cast, so that its dtype does not matter
+            expected, found = f"({sizes}) {meaning}".rstrip(), f"a {kind} array {tuple(array.shape)}"
+        raise ValueError(f"{self.name}: {name} is {found}; expected {expected}; {way}")
 
     def _refuse_place(self, name: str, array: Any, kind: str, contiguous: bool, change: bool) -> NoReturn:
         if kind == TORCH and not torch_border().is_dense(array):
@@ -447,6 +452,17 @@ def new(kind: str | None, shape: tuple, dtype: type, device: wp.Device) -> tuple
         return tensor, view(tensor.data_ptr(), shape, dtype, device.alias)
     array = wp.empty(shape, dtype=dtype, device=device)
     return array, array
+
+
+def _way_to_shape(name: str, kind: str, came: Any, shape: tuple, meaning: str) -> str:
+    """Return what the caller can do about an array of the shape that ``came`` in place of ``shape``, in words."""
+    inner = shape[1:]
+    of_one_world = len(came) == len(inner) and all(e in (-1, c) for c, e in zip(came, inner, strict=True))
+    if not of_one_world or not inner or not meaning.startswith("[world"):
+        return f"reshape {name}, or build the object for this size"
+    if shape[0] == 1:
+        return f"pass {name}.reshape({(1, *came)})" if kind == WARP else f"pass {name}[None]"
+    return f"it has the shape of one world; stack {shape[0]} of them along a first axis"
 
 
 def _dtype_name(array: Any) -> str:

@@ -84,8 +84,8 @@ _ADVICE = {
     Status.NOT_SETTLED: "Use a shorter dt. The step stands, with a force that a shorter dt would correct.",
     Status.LOOPS: "Use float64, or keep the mechanism away from configurations in which it can branch or lock.",
     Status.OPEN: (
-        "Use a shorter dt, start from Dynamics.project, use float64 where angles span many turns or places lie 100 m "
-        "from the origin."
+        "Dynamics.project closes the state from which steps start. Otherwise use a shorter dt, or float64 where angles "
+        "span many turns or places lie 100 m from the origin."
     ),
     Status.CONTACT: "Use a shorter dt or more passes, or lower the contact's stiffness.",
     Status.SLOTS: "Build the scene with more contact slots.",

@@ -111,7 +111,22 @@ class Engine:
             of_array: tuple[int, ...] = tuple(getattr(array, "shape", ()))
             shape = (*shape, of_array[-1]) if len(of_array) == len(shape) + 1 else shape
             meaning = f"{meaning} or {meaning[:-1]}, columns]"
-        return call.read(argument.name, array, shape, meaning)
+        try:
+            return call.read(argument.name, array, shape, meaning)
+        except ValueError:
+            if argument.name == "tau" and self._dyn.embedding is not None:
+                self._refuse_independent(call, array)
+            raise
+
+    def _refuse_independent(self, call: Call, tau: Any) -> None:
+        """Raise ValueError if ``tau`` has entries for the independent dofs alone, as inverse dynamics returns it."""
+        worlds, dofs, width = self._dyn.worlds, self._dyn.scene.dof_count, len(self._dyn.independent_dofs)
+        if tuple(tau.shape) == (worlds, width) and width != dofs:
+            raise ValueError(
+                f"{call.name}: tau {tuple(tau.shape)} has entries for dyn.independent_dofs alone; expected "
+                f"({worlds}, {dofs}) [world, dof]; pass full, zeros of that shape, after "
+                f"full[:, dyn.independent_dofs] = tau"
+            )
 
     def outs(self, call: Call, operation: Operation, out: Any) -> tuple[Any, ...]:
         """Return the caller's array for each result, or None.

@@ -96,7 +96,7 @@ def inverse_kinematics(
 
     Args:
         targets: pose of each frame in the inertial frame [world, frame, 7]: x, y, z [m], quaternion xyzw.
-        frames: bodies, pairs (body, pose in the body) or names of sites, as :meth:`frame_poses`.
+        frames: bodies, sites, or pairs (body or site, pose in it), as :meth:`frame_poses`.
         q: where the first seed starts [world, coordinate], brought within the limits; None: at the first start above.
         seeds: number of starts for each world. The first call with another number allocates.
         iterations: steps from each start.

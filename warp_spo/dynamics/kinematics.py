@@ -157,7 +157,7 @@ def frame_poses(self: Dynamics, q: ArrayT, frames: Sequence[Frame], out: ArrayT 
 
     Args:
         q: coordinates [world, coordinate].
-        frames: bodies (index or label), pairs (body, pose of the frame in the body), or names of sites.
+        frames: bodies (index or label), names of sites (``scene.sites``), or pairs (body or site, pose in it).
         out: array for the result.
 
     Returns:
@@ -224,7 +224,7 @@ def jacobian(self: Dynamics, q: ArrayT, frames: Sequence[Frame], out: ArrayT | N
 
     Args:
         q: coordinates [world, coordinate].
-        frames: bodies (index or label), or pairs (body, pose of the frame in the body).
+        frames: bodies, sites, or pairs (body or site, pose in it), as :meth:`frame_poses`.
         out: array for the result.
 
     Returns:

@@ -28,7 +28,9 @@ SHIPPED = {
 
 
 def shipped(name: str) -> Path:
-    """Return the path of a robot file that comes with Newton: "humanoid", "ant", "quadruped" or "cartpole".
+    """Return the path of a robot file that comes with Newton.
+
+    They are "humanoid" and "ant", which are MJCF, and "quadruped" and "cartpole", which are URDF.
 
     Raises:
         ValueError: The name is none of these.

@@ -236,8 +236,9 @@ def _limits(joint: Element, kind: str) -> dict[str, float]:
     if kind != "continuous" and (limit.get("lower") is not None or limit.get("upper") is not None):
         lower, upper = (limit.number(name, 0.0, infinite=True) for name in ("lower", "upper"))
         if lower > upper:
+            absent = " (an absent one is 0)" if None in (limit.get("lower"), limit.get("upper")) else ""
             raise limit.error(
-                f"of joint {joint.get('name')!r}: lower is {lower:g}, above upper {upper:g} (an absent one is 0); "
+                f"of joint {joint.get('name')!r}: lower is {lower:g}, above upper {upper:g}{absent}; "
                 "expected lower <= upper; swap them"
             )
         found["limit_lower"], found["limit_upper"] = np.clip([lower, upper], -UNLIMITED, UNLIMITED).tolist()

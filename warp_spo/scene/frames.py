@@ -7,12 +7,16 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from ..errors import as_integer, refuse_masked
 from ..gradients import check_plain
 from .parts import IDENTITY_POSE, real
 from .scene import Scene
 
-Frame = Any  # a body (its index, label, or the label's part after the last slash), (body, pose in it), or a site's name
+Frame = Any
+"""A body (its index, label, or the label's part after the last slash), a site's name, or (one of these, pose in it)."""
+EXPECTED = "expected a body (index or label), the name of a site, or (one of these, pose in it)"
 
 
 def check_frames(scene: Scene, call: str, frames: Sequence[Frame]) -> tuple[tuple[int, tuple[float, ...]], ...]:
@@ -22,34 +26,62 @@ def check_frames(scene: Scene, call: str, frames: Sequence[Frame]) -> tuple[tupl
         ValueError, TypeError: the list is empty, or an entry is not a frame of the scene.
     """
     if isinstance(frames, str) or not isinstance(frames, Sequence) or len(frames) == 0:
-        raise ValueError(f"{call}: frames is {frames!r}; expected a list of bodies or of (body, pose in the body)")
+        raise ValueError(
+            f"{call}: frames is {frames!r}; expected a list of bodies, names of sites, or "
+            "pairs (one of these, pose in it)"
+        )
     return tuple(_check_frame(scene, call, frame) for frame in frames)
 
 
 def _check_frame(scene: Scene, call: str, frame: Frame) -> tuple[int, tuple[float, ...]]:
     """Return the body of one frame, and the frame's pose in the body frame."""
-    labels = scene.body_labels
-    if isinstance(frame, str) and frame in scene.sites and frame not in labels:
-        frame = scene.sites[frame]
-    body, pose = frame if isinstance(frame, tuple | list) and len(frame) == 2 else (frame, IDENTITY_POSE)
-    if isinstance(body, str):
-        matches = [at for at, label in enumerate(labels) if label == body]
-        matches = matches or [at for at, label in enumerate(labels) if label.rpartition("/")[2] == body]
-        if not matches:
-            near = difflib.get_close_matches(body, [label.rpartition("/")[2] for label in labels], 3)
-            such = f", such as {', '.join(map(repr, near))}" if near else ""
-            raise ValueError(f"{call}: no body {body!r} in the scene; expected one of scene.body_labels{such}")
-        if len(matches) > 1:
-            raise ValueError(
-                f"{call}: {len(matches)} bodies have the label {body!r}; expected one; pass the body's index"
-            )
-        body = matches[0]
-    index = as_integer(body)
+    base, pose = frame if isinstance(frame, tuple | list) and len(frame) == 2 else (frame, IDENTITY_POSE)
+    at: tuple[float, ...] = IDENTITY_POSE
+    if isinstance(base, str):
+        base, at = _named(scene, call, base)
+    index = as_integer(base)
     if index is None:
         raise _wrong_frame(call, frame)
-    if not 0 <= index < len(labels):
-        raise ValueError(f"{call}: a frame's body is {index}; expected 0 to {len(labels) - 1}")
-    return index, IDENTITY_POSE if pose is IDENTITY_POSE else _pose(call, frame, pose)
+    if not 0 <= index < len(scene.bodies):
+        raise ValueError(f"{call}: a frame's body is {index}; expected 0 to {len(scene.bodies) - 1}")
+    if pose is IDENTITY_POSE:
+        return index, at
+    checked = _pose(call, frame, pose)
+    return index, checked if at is IDENTITY_POSE else _composed(at, checked)
+
+
+def _named(scene: Scene, call: str, name: str) -> tuple[int, tuple[float, ...]]:
+    """Return the body of this label and the identity, or the body of the site of this name and the site's pose."""
+    labels = scene.body_labels
+    ends = [label.rpartition("/")[2] for label in labels]
+    matches = [at for at, label in enumerate(labels) if label == name]
+    matches = matches or [at for at, end in enumerate(ends) if end == name]
+    if name in scene.sites:
+        if matches:
+            raise ValueError(
+                f"{call}: {name!r} is a body and a site; expected a name that stands for one of them; pass the body's "
+                f"index, {matches[0]}, or scene.sites[{name!r}]"
+            )
+        return scene.sites[name]
+    if not matches:
+        near = difflib.get_close_matches(name, [*ends, *scene.sites], 3)
+        such = f", such as {', '.join(map(repr, near))}" if near else ""
+        raise ValueError(
+            f"{call}: no body and no site {name!r} in the scene; expected one of scene.body_labels or scene.sites{such}"
+        )
+    if len(matches) > 1:
+        raise ValueError(f"{call}: {len(matches)} bodies have the label {name!r}; expected one; pass the body's index")
+    return matches[0], IDENTITY_POSE
+
+
+def _composed(outer: tuple[float, ...], inner: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the pose ``inner``, given in the pose ``outer``."""
+    place, turn = np.array(inner[:3]), np.array(inner[3:6])
+    axis, w = np.array(outer[3:6]), outer[6]
+    across = 2.0 * np.cross(axis, place)
+    place = outer[:3] + place + w * across + np.cross(axis, across)
+    vector = w * turn + inner[6] * axis + np.cross(axis, turn)
+    return *place.tolist(), *vector.tolist(), float(w * inner[6] - axis @ turn)
 
 
 def origins(frames: Sequence[tuple[int, tuple[float, ...]]]) -> tuple[tuple[int, tuple[float, ...]], ...]:
@@ -79,4 +111,4 @@ def _pose(call: str, frame: Frame, pose: Any) -> tuple[float, ...]:
 
 
 def _wrong_frame(call: str, frame: Frame) -> TypeError:
-    return TypeError(f"{call}: a frame is {frame!r}; expected a body (index or label) or (body, pose in the body)")
+    return TypeError(f"{call}: a frame is {frame!r}; {EXPECTED}")

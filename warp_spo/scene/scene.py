@@ -286,7 +286,11 @@ class Scene(Stored):
 
     @property
     def neutral_q(self) -> np.ndarray:
-        """The q at which the anchors of every hinge coincide [coordinate]: zeros and identity quaternions."""
+        """The q at which the anchors of every hinge coincide [coordinate]: zeros and identity quaternions.
+
+        It may lie outside of joint limits, and loops and couplings may not hold there: :meth:`Dynamics.project` closes
+        them.
+        """
         return np.concatenate([hinge.neutral for hinge in self.hinges])
 
     @property
