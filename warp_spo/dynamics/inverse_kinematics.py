@@ -118,7 +118,7 @@ def inverse_kinematics(
         frames, seeds = given["frames"], given["seeds"]
         _check_limits(self.scene, call)
         results = engine.write(call, INVERSE_KINEMATICS, outs, given)
-        wanted = given["targets"]
+        wanted: Any = given["targets"]
         if given["angle_weight"] == 0.0:
             plain = self.recursions.array(("positions", *wanted.shape), *wanted.shape)
             self.recursions.launch(kernels.take_positions, wanted.shape[:2], [wanted], [plain])
