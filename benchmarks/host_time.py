@@ -39,6 +39,19 @@ TARGETS = {  # [us], on an H200 machine with Go2 in 4096 worlds
 }
 
 
+class Empty(torch.autograd.Function):
+    """Three inputs, one result and three gradients that nobody computes: the least that torch asks of such a call."""
+
+    @staticmethod
+    def forward(ctx: Any, q: torch.Tensor, qd: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(q, qd, tau)
+        return torch.empty_like(qd)
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return tuple(torch.empty_like(x) for x in ctx.saved_tensors)
+
+
 class Row(NamedTuple):
     """One call: its name, what is timed, and two functions whose results agree (None: nothing to compare)."""
 
@@ -147,6 +160,7 @@ def torch_rows(scene: spo.Scene, options: argparse.Namespace, device: wp.Device)
         Row("add, out=", lambda: torch.add(qd, tau, out=out), lambda: n["qd"] + n["tau"]),
         Row("add", lambda: torch.add(qd, tau), lambda: n["qd"] + n["tau"]),
         Row("add, forward and backward", lambda: backward(torch.add, leaf[1:]), lambda: [n["bar"], n["bar"]]),
+        Row("an empty autograd.Function, forward and backward", lambda: backward(Empty.apply, leaf)),
         Row("forward_dynamics, out=", lambda: dyn.forward_dynamics(q, qd, tau, out=out), forward),
         Row("forward_dynamics", lambda: dyn.forward_dynamics(q, qd, tau), forward),
         Row("inverse_dynamics, out=", lambda: dyn.inverse_dynamics(q, qd, qdd, out=out), inverse),
