@@ -16,6 +16,7 @@ myst_heading_anchors = 3
 autosummary_generate = False  # tables alone; every call has its entry on the page below them
 autodoc_typehints = "none"  # docstrings give kinds, shapes and units
 autodoc_member_order = "bysource"
+nitpicky = True  # a reference to nothing is a warning
 smartquotes = False  # primes are derivatives
 napoleon_use_rtype = False
 napoleon_custom_sections = [
@@ -32,8 +33,32 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": [],
 }
-html_sidebars = {page: [] for page in ("index", "start", "concepts", "joints", "closed_loops", "theory", "results")}
+html_sidebars = {
+    page: []
+    for page in (
+        "index", "start", "concepts", "joints", "actuators", "closed_loops", "robot_files", "jax", "theory", "results"
+    )
+}  # fmt: skip
 html_static_path = ["_static"]
 html_css_files = ["page.css"]
 html_show_sourcelink = False
 copyright = "the warp_spo developers, Apache-2.0"
+
+HOMES = ("warp_spo.", "warp_spo.Dynamics.")
+
+
+def find_reference(app, env, node, content):
+    """Return the link for a name that a docstring gives without its class, quoted in a table or another module."""
+    if node.get("refdomain") != "py":
+        return None
+    domain = env.get_domain("py")
+    for home in HOMES:
+        name = home + node["reftarget"]
+        if found := domain.resolve_xref(env, node["refdoc"], app.builder, node["reftype"], name, node, content):
+            return found
+    return None
+
+
+def setup(app):
+    """Add what this file does to Sphinx."""
+    app.connect("missing-reference", find_reference)

@@ -165,8 +165,10 @@ def test_a_step_without_gradients_is_not_recorded(made):
     variable = [getattr(model, name) for name in solver.dynamics.variable]
     for array in variable:
         array.requires_grad = False
-    with wp.Tape() as tape:
+    seen = pytest.warns(UserWarning, match="no array of state_in, .* requires grad, .*finalize")
+    with wp.Tape() as tape, seen as caught:
         solver.step(*states, model.control(requires_grad=False), None, H)
+    assert len(caught) == 1 and caught[0].filename == __file__
     for array in variable:
         array.requires_grad = True
     assert tape.launches == []

@@ -22,7 +22,7 @@ class Status(enum.IntEnum):
     OK = 0
     """The result can be trusted."""
     PIVOT = 1
-    """The mass matrix is not positive definite to working precision: a pivot of its factorisation is not positive."""
+    """The mass matrix is not positive definite to working precision. A pivot of its factorisation is not positive."""
     NOT_FINITE = 2
     """An input, or a value of the scene, is NaN or infinite in this dtype."""
     DIGITS = 3
@@ -32,7 +32,7 @@ class Status(enum.IntEnum):
     NOT_SETTLED = 5
     """The last pass of a step ended with a limit or a friction law on another branch than the pass had assumed."""
     LOOPS = 6
-    """The closures of the loops lose rank, or half of the dtype's digits: the mechanism is at a change point."""
+    """The closures of the loops lose rank, or half of the dtype's digits. The mechanism is at a change point."""
     OPEN = 7
     """The closures of the loops do not hold after the step, in position or in velocity."""
     CONTACT = 8

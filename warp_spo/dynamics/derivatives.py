@@ -85,7 +85,7 @@ def inverse_dynamics_derivatives(
     in link frames and with classical accelerations, so that no velocity or position of the inertial frame enters.
 
     Args:
-        q, qd, qdd, body_f: as there. body_f stays fixed in inertial axes as the bodies move.
+        q, qd, qdd, body_f: as of :meth:`inverse_dynamics`. body_f stays fixed in inertial axes as the bodies move.
         out: (q, qd, qdd), each an array or None.
 
     Returns:
@@ -131,7 +131,7 @@ def forward_dynamics_derivatives(
     """Compute the derivatives of :meth:`forward_dynamics`: -Mass^-1 times those of inverse dynamics at qdd.
 
     Args:
-        q, qd, tau, body_f: as there. body_f stays fixed in inertial axes as the bodies move.
+        q, qd, tau, body_f: as of :meth:`forward_dynamics`. body_f stays fixed in inertial axes as the bodies move.
         out: (q, qd, tau), each an array or None.
 
     Returns:

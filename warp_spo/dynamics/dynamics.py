@@ -65,9 +65,9 @@ class Dynamics:
     Arrays are torch tensors, Warp arrays, NumPy arrays, or those of a library that speaks DLPack, such as JAX and CuPy,
     [world, ...] and C-contiguous; the kind of the first one is the kind of the result, and ``out=`` is filled and
     returned. All but NumPy arrays must have this object's dtype and device; NumPy arrays are cast and copied.
-    Coordinates, velocities and forces are those of the scene, see :mod:`warp_spo.scene.parts`. Threads may
-    share an object: its calls run one at a time, and on CUDA the stream of a call waits for that of the call before it,
-    except in a graph capture, where nothing may wait. pickle and ``copy.deepcopy`` build an equal object anew, with the
+    Coordinates, velocities and forces are those of the scene, see :doc:`/concepts`. Threads may share an object: its
+    calls run one at a time, and on CUDA the stream of a call waits for that of the call before it, except in a graph
+    capture, where nothing may wait. pickle and ``copy.deepcopy`` build an equal object anew, with the
     values that :meth:`set` gave this one.
 
     Args:
@@ -78,7 +78,7 @@ class Dynamics:
         variable: names of values that :meth:`set` changes without rebuilding, one row a world: all of ``Scene.values``.
             Every dof then has the laws whose values are variable; entries for limits of ball and free hinges are not
             read. Velocity limits damp by the inertia that hinges feel at the scene's values, see :meth:`step`.
-        granularity: None (the plan chooses), "node", "segment" or "tree", see :class:`warp_spo.execution.plan.Plan`.
+        granularity: None (the plan chooses), "node", "segment" or "tree", see :meth:`explain`.
         loops: how loop joints and couplings of the scene are treated. "raise": refuse them. "cut": leave them open.
             "embed": close them exactly; links that they tie form one node of the tree. Mass matrices, Jacobians,
             momentum matrices and forces of inverse_dynamics, bias_force and gravity_force are then of
@@ -256,7 +256,7 @@ class Dynamics:
 
     @property
     def independent_dofs(self) -> np.ndarray:
-        """Dofs that move all others where loops are embedded: the minimal coordinates, ascending [independent dof].
+        """Dofs that move all others where loops are embedded, the minimal coordinates, ascending [independent dof].
 
         They are those that ``Dynamics(independent=...)`` names. Otherwise they are chosen when the object is made, from
         random configurations that close the loops: the first dofs that determine the others nearly as well as any dofs
@@ -268,7 +268,10 @@ class Dynamics:
 
     @property
     def closure_rows(self) -> int:
-        """Rows of :meth:`closure_error`: of the loop joints one by one, translations first, then of the couplings."""
+        """Rows of :meth:`closure_error`.
+
+        They are those of the loop joints one by one, translations first, then those of the couplings.
+        """
         return self._closures.rows
 
     # -- what runs -------------------------------------------------------------------------------------------------

@@ -216,7 +216,7 @@ def forward_dynamics_vjp(
     other gradient is -(d tau / d x)* lambda, by one Newton-Euler recursion in reverse.
 
     Args:
-        q, qd, tau, body_f: as there.
+        q, qd, tau, body_f: as of :meth:`forward_dynamics`.
         cotangent: [world, dof].
         qdd: result of forward_dynamics for these arguments, if it is known; that saves computing it.
         wrt: names out of
@@ -308,7 +308,7 @@ def forward_dynamics_jvp(
     """Compute the change of qdd along a direction: J (dq, dqd, dtau, dbody_f) of :meth:`forward_dynamics`.
 
     Args:
-        q, qd, tau, body_f: as there.
+        q, qd, tau, body_f: as of :meth:`forward_dynamics`.
         dq: change of q along its tangent coordinates [world, dof], see :meth:`inverse_dynamics_derivatives`.
         dqd, dtau, dbody_f: changes of the arrays, of their shapes. None means zero and costs nothing.
         qdd: result of forward_dynamics for these arguments, if it is known; that saves computing it.

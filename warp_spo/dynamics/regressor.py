@@ -78,7 +78,8 @@ def inverse_dynamics_regressor_product(
     """Compute Y parameters for Y of :meth:`inverse_dynamics_regressor`, without Y: one recursion out and back.
 
     Args:
-        q, qd, qdd: as there. parameters: [world, 10 bodies].
+        q, qd, qdd: as of :meth:`inverse_dynamics_regressor`.
+        parameters: [world, 10 bodies].
         out: array for the result.
 
     Returns:
@@ -114,7 +115,8 @@ def inverse_dynamics_regressor_transposed_product(
     With the product it serves least squares over many samples, which never form Y.
 
     Args:
-        q, qd, qdd: as there. tau: [world, dof].
+        q, qd, qdd: as of :meth:`inverse_dynamics_regressor`.
+        tau: forces [world, dof].
         out: array for the result.
 
     Returns:

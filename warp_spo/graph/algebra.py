@@ -126,7 +126,7 @@ class Operator(abc.ABC):
         kernels. An operator may be applied on one stream at a time only, because it has one set of temporary arrays.
 
         Raises:
-            ValueError, TypeError: an array is refused, see :class:`warp_spo.arrays.Call`.
+            ValueError, TypeError: an array has another kind, shape, dtype or device than expected.
         """
         name = f"{type(self).__name__}.apply"
         kind_of(x, name, "x")

@@ -99,10 +99,10 @@ class Blocks(Operator):
     Args:
         shape: (rows, columns).
         places: (row start, column start, rows, columns) of each block. Overlapping blocks are added.
-        weights: a Warp array [world or 1, scalar] on the device, with any strides, or :class:`DeferredWeights`. The
+        weights: a Warp array [world or 1, scalar] on the device, with any strides, or ``DeferredWeights``. The
             blocks lie in it row-major. The operator keeps the array and applies the numbers that are in it at the time.
         offsets: the first scalar of each block in ``weights``; by default the blocks lie one after the other.
-        kind: kind of array that :meth:`dense` returns.
+        kind: kind of array that :meth:`Operator.dense` returns.
 
     Raises:
         ValueError: a block reaches out of the matrix or of the weights.

@@ -22,7 +22,7 @@ from .operators import BWA
 
 
 class Factorization:
-    """The operators of the factorisation; :meth:`update` computes them from the current E_phi, H, M and Delta.
+    """The operators of the factorisation of the current E_phi, H, M and Delta, see :meth:`Factorization.update`.
 
     Args:
         E_phi: block-weighted adjacency of a Tree.
@@ -30,7 +30,7 @@ class Factorization:
         M: one symmetric block m_k x m_k for each node.
         Delta: one symmetric block r_k x r_k for each node, at the rows of its block of H; None is zero.
         store: ``store(scalars)`` returns the weights of the other operators; a caller that passes it also calls
-            :meth:`update`.
+            :meth:`Factorization.update`.
 
     Attributes:
         phi: (I - E_phi)^-1.

@@ -81,7 +81,9 @@ class SolverSPO(Plugs, SolverBase):
     state, by joint_f and the targets of the control, and by those arrays of the model that are ``variable`` and enter
     the equations of motion (masses, centres of mass, inertias, armature, damping, stiffness, gains, gravity), from
     gradients by joint_q, joint_qd, body_q and body_qd of the second state. Each step of a tape needs a state of its
-    own.
+    own. Only arrays that require grad have gradients: ``builder.finalize(requires_grad=True)`` makes all arrays of the
+    model, its states and its controls such arrays, ``model.state(requires_grad=True)`` those of one state. A step whose
+    arrays need no gradient at all is not recorded, with a warning.
 
     Args:
         model: A finalized model whose worlds all have the same topology.
@@ -364,7 +366,8 @@ class SolverSPO(Plugs, SolverBase):
         :meth:`check_model` finds afterwards.
 
         Args:
-            flags: The flags that name the changed arrays.
+            flags: The ``newton.ModelFlags`` that name the changed arrays, joined by ``|``. For example,
+                ``newton.ModelFlags.BODY_INERTIAL_PROPERTIES`` names ``body_mass``, ``body_com`` and ``body_inertia``.
 
         Raises:
             ValueError: Inside a capture, a flag names no variable array.

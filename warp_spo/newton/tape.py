@@ -9,6 +9,7 @@ model.
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -89,7 +90,7 @@ class StepGradients:
         dt: float,
         observables: Any,
     ) -> StepRecord | None:
-        """Return the record of a step that is about to run, or None if none of its inputs requires grad.
+        """Return the record of a step that is about to run, or None, with a warning, if no input requires grad.
 
         Raises:
             UnsupportedError: The step has no gradient.
@@ -100,6 +101,12 @@ class StepGradients:
         model = {name: getattr(self.model, name) for name in values}
         wanted = {name: array for name, array in {**read, **model}.items() if array.requires_grad}
         if not wanted:
+            warnings.warn(
+                f"{CALL}: no array of state_in, of the control or of the model requires grad, so the tape does not "
+                "record the step; make the model with builder.finalize(requires_grad=True), or a state with "
+                "model.state(requires_grad=True)",
+                stacklevel=3,
+            )
             return None
         if integrator != "semi_implicit":
             raise UnsupportedError(CALL, f"integrator={integrator!r}", "only 'semi_implicit' has gradients")

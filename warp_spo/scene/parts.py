@@ -158,10 +158,19 @@ class Hinge(StoredPart):
         linear, angular: up to three axes each of a d6; translations first, then rotations, inboard first.
         pitch: of a helical hinge [m/rad].
         parent_pose, child_pose: the hinge's anchor in the parent body and in the child body [m, unit quaternion].
-        armature, damping, friction, stiffness: [kg m^2 or kg], [N m s or N s/m], [N m or N], [N m or N/m], one number
-            for all degrees of freedom or one each; so are all that follow but ``rest``.
-        target_ke, target_kd: gains of the drive. limit_lower, limit_upper: [rad or m]. limit_ke, limit_kd: stiffness
-            and damping of the limits. effort_limit, velocity_limit: bounds of the drive's force and of the velocity.
+        armature: inertia added to the diagonal [kg m^2 or kg]. It is one number for all degrees of freedom or one each;
+            so are all arguments below but ``rest``.
+        damping: [N m s or N s/m].
+        friction: bound of dry friction [N m or N].
+        stiffness: of the spring that pulls to ``rest`` [N m or N/m].
+        target_ke: stiffness of the drive [N m or N/m].
+        target_kd: damping of the drive [N m s or N s/m].
+        limit_lower: lower position limit [rad or m].
+        limit_upper: upper position limit [rad or m].
+        limit_ke: stiffness of the position limits [N m or N/m].
+        limit_kd: damping of the position limits [N m s or N s/m].
+        effort_limit: bound of the drive's force [N m or N].
+        velocity_limit: bound of the velocity [rad/s or m/s].
         rest: coordinates at which the spring is relaxed, one per coordinate.
         coordinates, pose: of a "custom" hinge, see :meth:`custom`.
         label: name in tables and errors.

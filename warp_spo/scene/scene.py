@@ -248,12 +248,12 @@ class Scene(Stored):
 
     @property
     def node_sizes(self) -> tuple[int, ...]:
-        """The paper's m_k: 6 for a rigid body."""
+        """The paper's m_k, which is 6 for a rigid body."""
         return (6,) * self.body_count
 
     @property
     def hinge_sizes(self) -> tuple[int, ...]:
-        """The paper's r_k, by node: the degrees of freedom of the hinge that carries the node."""
+        """The paper's r_k, by node. These are the degrees of freedom of the hinge that carries the node."""
         return tuple(self.hinges[h].dof_count for h in self.hinge_of)
 
     @property
@@ -268,7 +268,7 @@ class Scene(Stored):
 
     @property
     def dof_labels(self) -> list[str]:
-        """The label of every entry of qd: the hinge's label, with :0, :1, ... where the hinge has several."""
+        """The labels of the entries of qd. They are the hinges' labels, with ``:0``, ``:1`` and so on if one has several."""
         return [
             label if hinge.dof_count == 1 else f"{label}:{i}"
             for label, hinge in zip(self.joint_labels, self.hinges, strict=True)
@@ -286,7 +286,7 @@ class Scene(Stored):
 
     @property
     def neutral_q(self) -> np.ndarray:
-        """The q at which the anchors of every hinge coincide [coordinate]: zeros and identity quaternions.
+        """The q at which the anchors of every hinge coincide [coordinate]. It holds zeros and identity quaternions.
 
         It may lie outside of joint limits, and loops and couplings may not hold there: :meth:`Dynamics.project` closes
         them.
@@ -295,7 +295,7 @@ class Scene(Stored):
 
     @property
     def inertial_parameters(self) -> np.ndarray:
-        """Ten numbers for each body: m, m c (3), Ixx, Ixy, Iyy, Ixz, Iyz, Izz [worlds, 10 bodies].
+        """The ten numbers m, m c (3), Ixx, Ixy, Iyy, Ixz, Iyz, Izz of each body [worlds, 10 bodies].
 
         The moments of inertia are about the origin of the body frame, in its axes; c is the centre of mass there
         [kg, kg m, kg m^2]. They are what :meth:`Dynamics.inverse_dynamics_regressor` multiplies.
