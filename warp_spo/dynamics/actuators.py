@@ -44,7 +44,8 @@ def actuator_force(self: Dynamics, q: ArrayT, qd: AnyArray | None, ctrl: AnyArra
     Delays have no part in it: ``ctrl`` acts at once. Derivatives by a control or a force beyond its range are zero.
 
     Args:
-        q, qd: the state [world, coordinate], [world, dof]; qd=None means zero.
+        q: coordinates [world, coordinate].
+        qd: velocities [world, dof]; None means zero.
         ctrl: controls, in the order of ``scene.actuators`` [world, actuator].
     """
     return self._engine.run(ACTUATOR_FORCE, out, q=q, qd=qd, ctrl=ctrl)

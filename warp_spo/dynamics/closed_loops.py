@@ -79,7 +79,8 @@ def project(self: Dynamics, q: Any, qd: Any = None, hold: bool = False, iteratio
     :meth:`step` does the same by itself; to close a state by hand, pass more ``iterations``.
 
     Args:
-        q, qd: [world, coordinate], [world, dof]; qd None is left out.
+        q: coordinates [world, coordinate].
+        qd: velocities [world, dof]; None leaves them out.
         hold: keep the independent dofs as they are (loops="embed"); NaN where they do not determine the other dofs.
         iterations: Newton steps of q; each squares the error. 0 leaves q as it is.
         out: an array for q, or with qd a pair of arrays or None, (q, qd).
@@ -134,7 +135,7 @@ def loop_multipliers(
     units do not matter.
 
     Args:
-        q, qd, tau, body_f: as forward_dynamics.
+        q, qd, tau, body_f: as of :meth:`forward_dynamics`.
         out: (multipliers, rank), each an array or None.
 
     Returns:

@@ -210,7 +210,7 @@ def forward_dynamics_vjp(
     wrt: Sequence[str] = ("q", "qd", "tau"),
     out: dict[str, Any] | None = None,
 ) -> dict[str, ArrayT]:
-    """Compute gradients of cotangent . qdd: J* cotangent of :meth:`forward_dynamics`, in about twice its operations.
+    """Compute gradients of ``cotangent* qdd``: J* cotangent of :meth:`forward_dynamics`, in about twice its operations.
 
     With lambda = Mass^-1 cotangent, which needs only the factors that give qdd, the gradient by tau is lambda. Every
     other gradient is -(d tau / d x)* lambda, by one Newton-Euler recursion in reverse.
@@ -310,7 +310,7 @@ def forward_dynamics_jvp(
     Args:
         q, qd, tau, body_f: as of :meth:`forward_dynamics`.
         dq: change of q along its tangent coordinates [world, dof], see :meth:`inverse_dynamics_derivatives`.
-        dqd, dtau, dbody_f: changes of the arrays, of their shapes. None means zero and costs nothing.
+        dqd, dtau, dbody_f: change of qd, tau or body_f, of its shape. None means zero and costs nothing.
         qdd: result of forward_dynamics for these arguments, if it is known; that saves computing it.
 
     With embedded loops, directions may leave the motions that the closures allow; see :meth:`forward_dynamics_vjp`.

@@ -185,7 +185,7 @@ def inverse_dynamics_vjp(
     wrt: Sequence[str] = ("q", "qd", "qdd"),
     out: dict[str, Any] | None = None,
 ) -> dict[str, ArrayT]:
-    """Compute gradients of cotangent . tau: J* cotangent of :meth:`inverse_dynamics`, by a recursion out and back.
+    """Compute gradients of ``cotangent* tau``: J* cotangent of :meth:`inverse_dynamics`, by a recursion out and back.
 
     Arguments and results are those of :meth:`forward_dynamics_vjp`, with "qdd" for "tau"; qdd must be given if ``wrt``
     names it. With embedded loops the cotangent is [world, independent dof], and the gradient by qdd is zero at the

@@ -120,7 +120,8 @@ def body_states(
     """Compute :meth:`body_poses` and :meth:`body_velocities` in one kernel.
 
     Args:
-        q, qd: the state [world, coordinate], [world, dof].
+        q: coordinates [world, coordinate].
+        qd: velocities [world, dof].
         out: (poses, velocities), each an array or None.
 
     Returns:
@@ -194,7 +195,8 @@ def frame_velocities(
     whatever ties them.
 
     Args:
-        q, qd: the state [world, coordinate], [world, dof].
+        q: coordinates [world, coordinate].
+        qd: velocities [world, dof].
         frames: as :meth:`frame_poses`.
         out: array for the result.
 

@@ -110,7 +110,7 @@ def inverse_dynamics_regressor_transposed_product(
     tau: AnyArray,
     out: ArrayT | None = None,
 ) -> ArrayT:
-    """Compute Y* tau for Y of :meth:`inverse_dynamics_regressor`, without Y: the gradient of tau . (Y parameters).
+    """Compute Y* tau for Y of :meth:`inverse_dynamics_regressor`, without Y: the gradient of ``tau* Y parameters``.
 
     With the product it serves least squares over many samples, which never form Y.
 

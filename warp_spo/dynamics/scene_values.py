@@ -97,8 +97,10 @@ def reset(
 
     Args:
         mask: bool [world].
-        q, qd: the state [world, coordinate], [world, dof]; changed in place.
-        q_from, qd_from: the state that these worlds get, [world, ...] each, or [...] for all of them.
+        q: coordinates [world, coordinate], changed in place.
+        qd: velocities [world, dof], changed in place.
+        q_from: q that these worlds get, [world, coordinate], or [coordinate] for all of them.
+        qd_from: qd that these worlds get, [world, dof], or [dof] for all of them.
         actuator_state: buffers of :meth:`actuator_state`, in which these worlds forget their controls, as in
             :meth:`reset_actuator_state`; by one launch more.
 

@@ -45,9 +45,11 @@ class SpatialOperators(LetterOwner):
     changes is in force at once, with "node" after the next :meth:`update`.
 
     Attributes:
-        E_phi, phi: weights phi(p, k), eq. 15 to 17, with the rotation between node frames.
+        E_phi: the adjacency with weights phi(p, k), eq. 15 to 17, with the rotation between node frames.
+        phi: (I - E_phi)^-1.
         H: hinge maps, eq. 19; the columns of H.T in the order of qd.
-        M: body inertias [6 x 6 a node]. Delta: armature.
+        M: body inertias [6 x 6 a node].
+        Delta: armature.
         P, D, D_inverse, G, K, E_psi, psi: see :class:`Factorization`.
     """
 

@@ -174,12 +174,14 @@ def step(
     several launches, has no gradients, and raises UnsupportedError for limits, friction, effort and velocity limits.
 
     Args:
-        q, qd: the state [world, coordinate], [world, dof].
+        q: coordinates [world, coordinate].
+        qd: velocities [world, dof].
         tau: forces dual to qd [world, dof]; None means zero.
         dt: length of the step [s], of each substep where there are several, the same in all worlds. It does not fold:
             changing it compiles nothing.
         body_f: as :meth:`forward_dynamics`.
-        target_q, target_qd: targets of the drives, laid out as q and qd; None means the neutral q, and zero.
+        target_q: position targets of the drives [world, coordinate]; None means the neutral q.
+        target_qd: velocity targets of the drives [world, dof]; None means zero.
         integrator: "semi_implicit": order 1. "midpoint": implicit midpoint, order 2; the forces above are implicit, and
             the velocity terms take six fixed-point iterations, which diverge where a link turns by much of a radian in
             a step. "rk4": order 4, all explicit: stable only while (damping dt + stiffness dt^2) / inertia stays below

@@ -61,10 +61,12 @@ class Operator(abc.ABC):
     Attributes:
         shape: (rows, columns).
         worlds: the number of worlds; 1 stands for the same matrix in any number of worlds.
-        device, dtype: the device and the scalar type of the operator and of the arrays that it maps.
+        device: the device of the operator and of the arrays that it maps.
+        dtype: the scalar type of the operator and of the arrays that it maps.
         kind: the kind of array that :meth:`dense` returns; None is NumPy.
         letter: the owner and the name of the letter; None if the operator is not a letter.
-        form, operands: the name of the composition with its numbers, and the composed operators.
+        form: the name of the composition with its numbers.
+        operands: the composed operators.
     """
 
     letter: "tuple[LetterOwner, str] | None" = None

@@ -35,10 +35,12 @@ class Factorization:
     Attributes:
         phi: (I - E_phi)^-1.
         P: articulated inertia, P = M + sum over children w P+ w*, P+ = P - G H P.
-        D, D_inverse: H P H* + Delta and its inverse, block diagonal; NaN where D is not positive definite.
+        D: H P H* + Delta, block diagonal.
+        D_inverse: the inverse of D; NaN where D is not positive definite.
         G: gain, P H* D^-1.
         K: E_phi G.
-        E_psi, psi: the adjacency with weights w (I - G H), and its resolvent.
+        E_psi: the adjacency with weights w (I - G H).
+        psi: (I - E_psi)^-1.
 
     Raises:
         ValueError: the blocks do not fit the tree.

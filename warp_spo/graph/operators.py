@@ -34,7 +34,8 @@ class BWA(Operator):
         device, dtype: by default those of the weights; the CPU for NumPy weights.
 
     Attributes:
-        graph, dims: the graph, and the size of each node.
+        graph: the graph.
+        dims: the size of each node.
         starts: the first entry of each node in a vector, and the length of a vector.
         offsets: the first scalar of each edge's block in ``weights``, in the order of ``graph.edges``.
 
@@ -64,7 +65,8 @@ class BWA(Operator):
         """Return E with weights that already lie on the device, and may be rewritten there.
 
         Args:
-            graph, dims: as those of the class; dims is required.
+            graph: as that of the class.
+            dims: as that of the class, but required.
             weights: [world or 1, scalar] with any strides; the operator keeps them without a copy.
             offsets: the first scalar of each edge's block, in the order of ``graph.edges``; by default the blocks lie
                 one after the other.

@@ -155,9 +155,11 @@ class Hinge(StoredPart):
         child: body index.
         axis: unit vector in the parent anchor frame; universal: the two axes, inboard first; planar: the normal, or
             the two directions of translation. Cylindrical and planar hinges translate first, then turn.
-        linear, angular: up to three axes each of a d6; translations first, then rotations, inboard first.
+        linear: up to three axes of translation of a d6, inboard first; they come before the rotations.
+        angular: up to three axes of rotation of a d6, inboard first.
         pitch: of a helical hinge [m/rad].
-        parent_pose, child_pose: the hinge's anchor in the parent body and in the child body [m, unit quaternion].
+        parent_pose: the hinge's anchor in the parent body [m, unit quaternion].
+        child_pose: the hinge's anchor in the child body [m, unit quaternion].
         armature: inertia added to the diagonal [kg m^2 or kg]. It is one number for all degrees of freedom or one each;
             so are all arguments below but ``rest``.
         damping: [N m s or N s/m].
@@ -256,7 +258,7 @@ class Hinge(StoredPart):
         """Return a hinge whose pose is a function of 1 to 6 scalar coordinates, whose rates are its entries of qd.
 
         Args:
-            parent, child: body indices, as in :class:`Hinge`.
+            parent, child: body index, as in :class:`Hinge`.
             coordinates: how many, n.
             pose: takes a list of n scalars [rad or m, as the function means them] and returns the position (3,) [m] and
                 the rotation matrix (3, 3) of the child anchor in the parent anchor. It is called with abstract scalars
@@ -366,7 +368,7 @@ class Coupling:
     """A mimic: ``q[hinge] = offset + ratio * q[reference]``, between hinges of one coordinate.
 
     Args:
-        hinge, reference: indices into the scene's hinges.
+        hinge, reference: index into the scene's hinges.
         ratio: dimensionless, or [m/rad], [rad/m].
         offset: [rad] or [m].
     """

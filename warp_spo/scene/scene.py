@@ -84,7 +84,8 @@ class Scene(Stored):
             ``values``.
         tree: the :class:`Tree` over the bodies.
         hinge_of: index of the hinge that carries each body [body].
-        q_start, qd_start: first entry of q and qd of each hinge, and the total at the end [hinge + 1].
+        q_start: first entry of q of each hinge, and the total at the end [hinge + 1].
+        qd_start: first entry of qd of each hinge, and the total at the end [hinge + 1].
         values: float64 arrays by Newton's names, [1 or worlds, ...]: body_mass [kg], body_com [m], body_inertia
             [kg m^2], body_gravcomp, joint_X_p, joint_X_c (poses [hinge, 7]), gravity [m/s^2], joint_rest_q
             [coordinate], and per dof joint_armature, joint_damping, joint_friction, joint_stiffness, joint_target_ke,
@@ -92,8 +93,11 @@ class Scene(Stored):
             joint_velocity_limit. Of actuators: actuator_gain, actuator_strength, actuator_delay [actuator],
             actuator_bias [actuator, 3], actuator_ctrl_range, actuator_force_range [actuator, 2], and actuator_gear, of
             the hinges of the first actuator, of the second, and so on.
-        dof_axis [dof, 3], dof_angular [dof], dof_linear [dof]: the screws, in the parent anchor frame.
-        q_index, dof_index: entries [worlds, n] of the source model's flat joint_q and joint_qd.
+        dof_axis: axis of each dof, in the parent anchor frame [dof, 3].
+        dof_angular: radians about the axis per unit of the coordinate [dof].
+        dof_linear: metres along the axis per unit of the coordinate [dof].
+        q_index: entries of the source model's flat joint_q [worlds, coordinate].
+        dof_index: entries of the source model's flat joint_qd [worlds, dof].
 
     Raises:
         ValueError: the indices do not form a forest, or a value is invalid.
@@ -268,7 +272,7 @@ class Scene(Stored):
 
     @property
     def dof_labels(self) -> list[str]:
-        """The labels of the entries of qd. They are the hinges' labels, with ``:0``, ``:1`` and so on if one has several."""
+        """The labels of the entries of qd. They are the hinges' labels, with ``:0``, ``:1``, ... if several."""
         return [
             label if hinge.dof_count == 1 else f"{label}:{i}"
             for label, hinge in zip(self.joint_labels, self.hinges, strict=True)
