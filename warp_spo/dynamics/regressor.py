@@ -43,7 +43,7 @@ def inverse_dynamics_regressor(
     by itself: plain least squares finds what the motion shows of the parameters, and no more. To find masses where
     centres and inertias are known, use Y B and move Y pi to the other side, where pi holds the inertias about the
     centres. The column of B for a body holds, in its ten rows, 1, c, and the entries xx, xy, yy, xz, yz, zz of
-    |c|^2 1 - c c*. The page on theory has this as an example.
+    ``|c|^2 1 - c c*``. The page on theory has this as an example.
 
     Args:
         q, qd, qdd: state and accelerations, as :meth:`inverse_dynamics`; None means zero.
