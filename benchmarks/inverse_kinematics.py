@@ -96,10 +96,9 @@ class Problem:
         reached = (distance < DISTANCE) & (angle < ANGLE)
         outside = np.maximum(self.lower - q, q - self.upper).max(axis=1) > 1e-6
         return dict(
-            group="inverse kinematics",
-            name=f"{self.name}, {library}, {iterations} iterations, {100 * reached.mean():.2f} % reached",
+            group=f"inverse kinematics, {self.name}",
+            name=f"{library}, {iterations} iterations, {100 * reached.mean():.2f} % reached",
             worlds=len(q),
-            arm=self.name,
             library=library,
             seeds=self.seeds,
             iterations=iterations,

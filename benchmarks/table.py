@@ -194,7 +194,8 @@ def headline(evidence: Evidence) -> str:
             "",
             "Times are of one call, replayed in a CUDA graph. Without a graph Python sets the pace: forward dynamics",
             f"of {HEADLINE_WORLDS:,} Go2 quadrupeds takes **{time(cost)} µs replayed, {time(called)} µs called with "
-            f"torch tensors**, where torch's own `add` takes {time(beside)} µs. So capture your loop in a graph.",
+            f"torch tensors**, where torch's own",
+            f"`add` takes {time(beside)} µs. So capture your loop in a graph.",
         ]
     return "\n".join(text).lstrip("\n") + "\n" if text else ""
 
