@@ -79,7 +79,7 @@ def test_tables_and_headline_are_rewritten_between_the_markers(tmp_path, monkeyp
     assert main(["--readme", str(results)]) == 0
     assert "| **8.00 µs** | GRiD 2000 µs (250×) |" in first.read_text()
     assert (
-        "**2.44 µs replayed, 14.1 µs called with torch tensors**, where torch's own `add` takes 8.40 µs"
+        "**2.44 µs replayed, 14.1 µs called with torch tensors**, where torch's own\n`add` takes 8.40 µs"
         in first.read_text()
     )
     for file in (first, every):
