@@ -191,7 +191,7 @@ def test_mistakes_are_explained(device):
         call(dyn, a, [True, False])
     with pytest.raises(ValueError, match="prescribed is float64"):
         call(dyn, a, np.zeros(dofs))
-    with pytest.raises(ValueError, match=r"hybrid_dynamics: prescribed is a NumPy array bool \(2, "):
+    with pytest.raises(ValueError, match=r"hybrid_dynamics: prescribed is a NumPy array \(2, "):
         call(dyn, a, np.zeros((2, dofs), dtype=bool))
     with pytest.raises(TypeError, match="expected a pair of arrays or None"):
         call(dyn, a, a["mask"], out=np.empty((WORLDS, dofs)))

@@ -13,6 +13,7 @@ import zoo
 from border import explained, made
 from laws import numbers
 from mechanisms import MECHANISMS
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 import warp_spo as spo
 from warp_spo.dynamics.operation import Argument
@@ -212,6 +213,19 @@ def test_sparse_tensors_that_require_grad_are_refused_alike_each_time(device):
     for _ in range(3):
         with explained(ValueError, "Dynamics.bias_force", "q is a torch array", "expected a dense one"):
             dyn.bias_force(q, a["qd"])
+
+
+def test_results_have_memory_inside_transforms_and_modes_of_torch(device):
+    """The first call, which nothing repeats, gives what later ones do; fake tensors have no memory to write to."""
+    dyn = spo.Dynamics(zoo.fork(), WORLDS, device, "float64", granularity="node")
+    a = given(dyn, dyn._operations["inverse_dynamics"], 0, "torch")
+    q, qd = a["q"], a["qd"]
+    weights = torch.ones_like(qd)
+    for _ in range(4):
+        found = torch.func.grad(lambda z: (dyn.inverse_dynamics(q, qd) * z).sum())(weights)
+        with FakeTensorMode(allow_non_fake_inputs=True):
+            inside = dyn.inverse_dynamics(q, qd)
+        assert torch.equal(found, dyn.inverse_dynamics(q, qd)) and torch.equal(found, inside)
 
 
 def test_a_tape_and_a_tensor_of_values_are_seen(device):

@@ -217,7 +217,7 @@ def test_status_is_refused_in_words(device):
     q = laws.states(dyn.scene, WORLDS)["q"]
     for status, error, words in (
         (np.zeros(WORLDS), ValueError, r"status is a NumPy array float64 \(3,\); expected int32 \(3,\) \[world\]"),
-        (np.zeros(2, np.int32), ValueError, r"status is a NumPy array int32 \(2,\); expected int32 \(3,\) \[world\]"),
+        (np.zeros(2, np.int32), ValueError, r"status is a NumPy array \(2,\); expected \(3,\) \[world\]"),
         ([0, 0, 0], TypeError, "status is of type list; expected a torch tensor"),
     ):
         with pytest.raises(error, match="Dynamics.forward_dynamics: " + words):

@@ -118,9 +118,9 @@ def test_mistakes_are_explained(device):
         call(dt=np.array([2e-3]))
     with pytest.raises(ValueError, match="integrator is 'euler'; expected one of semi_implicit"):
         call(integrator="euler")
-    with pytest.raises(ValueError, match=r"Dynamics.step: qd is a NumPy array float64 \(2, 3\)"):
+    with pytest.raises(ValueError, match=r"Dynamics.step: qd is a NumPy array \(2, 3\)"):
         call(qd=np.zeros((2, 3)))
-    with pytest.raises(ValueError, match=r"target_q is a NumPy array float64 \(2, 11\)"):
+    with pytest.raises(ValueError, match=r"target_q is a NumPy array \(2, 11\)"):
         call(target_q=a["qd"])
     with pytest.raises(TypeError, match="expected a pair of arrays or None"):
         call(out=np.zeros((2, 12)))

@@ -448,8 +448,8 @@ def new(kind: str | None, shape: tuple, dtype: type, device: wp.Device) -> tuple
     For torch the owner is a tensor, so that torch reuses the memory in the order of the stream that used it.
     """
     if kind == TORCH:
-        tensor = torch_border().empty(shape, dtype, device)
-        return tensor, view(tensor.data_ptr(), shape, dtype, device.alias)
+        tensor, address = torch_border().maker(shape, dtype, device)()
+        return tensor, view(address, shape, dtype, device.alias)
     array = wp.empty(shape, dtype=dtype, device=device)
     return array, array
 

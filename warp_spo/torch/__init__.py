@@ -10,7 +10,6 @@ from .module import Module
 from .tensors import (
     CLASSES,
     device_name,
-    empty,
     has_dtype,
     is_dense,
     is_grad_enabled,
@@ -31,7 +30,6 @@ __all__ = [
     "call_with_gradient",
     "custom_op",
     "device_name",
-    "empty",
     "has_dtype",
     "is_dense",
     "is_grad_enabled",

@@ -130,7 +130,11 @@ def _addresses(tensors: Sequence[Any], wanted: tuple[tuple[Any, Any, Any], ...])
 
 
 def maker(shape: tuple[int, ...], dtype: type, device: wp.Device) -> Callable[[], tuple[torch.Tensor, int]]:
-    """Return a function that returns a new tensor and its address."""
+    """Return a function that returns a new tensor and its address.
+
+    Where it can, it asks the allocator of compiled code, which gives memory inside transforms and modes of torch, too.
+    The function raises ValueError where torch gives a tensor without memory.
+    """
     kind, place = DTYPES[dtype], torch_device(device.alias)
     fast = getattr(getattr(torch._C._dynamo, "guards", None), f"_empty_strided_{place.type}", None)  # as compiled code
     if fast is None or (place.type == "cuda" and torch.cuda.device_count() > 1):
@@ -140,14 +144,18 @@ def maker(shape: tuple[int, ...], dtype: type, device: wp.Device) -> Callable[[]
 
     def make_both() -> tuple[torch.Tensor, int]:
         tensor = make()
-        return tensor, tensor.data_ptr()
+        try:
+            address = tensor.data_ptr()
+        except RuntimeError:
+            address = 0
+        if not address and tensor.numel():
+            raise ValueError(
+                f"Dynamics: the result's memory is a {type(tensor).__name__} that a transform or mode of torch wraps; "
+                f"expected numbers in memory; call outside of it, or pass out="
+            )
+        return tensor, address
 
     return make_both
-
-
-def empty(shape: tuple, dtype: type, device: wp.Device) -> torch.Tensor:
-    """Return a tensor with undefined content."""
-    return torch.empty(shape, dtype=DTYPES[dtype], device=torch_device(device.alias))
 
 
 def device_name(device: torch.device) -> str:
