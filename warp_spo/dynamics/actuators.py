@@ -33,7 +33,7 @@ ACTUATOR_FORCE = Operation(
         embed=AS_WRITTEN,
         multipliers=AS_WRITTEN,
     ),
-    trial=Trial(lambda dense, q, qd, ctrl: dense.actuator_force(qd, ctrl), reads=("q", "qd", "ctrl")),
+    trial=Trial(lambda dense, q, qd, ctrl: dense.actuator_force(qd, ctrl)),
 )
 
 

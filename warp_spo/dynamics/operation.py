@@ -123,8 +123,8 @@ class Result:
 
 
 def required(argument: Argument) -> Argument:
-    """Return the argument without the choice of None."""
-    return dataclasses.replace(argument, optional=False)
+    """Return the argument without the choice of None, so that ``prepare`` passes it always."""
+    return dataclasses.replace(argument, optional=False, asked=False)
 
 
 def direction(argument: Argument) -> Argument:
