@@ -1,4 +1,4 @@
-"""What actuators cost a step, beside a step without them and a step with the same gains as drives.
+"""Time a step with actuators, beside a step without them and a step with the same gains as drives.
 
     python -m benchmarks.actuators [--device cuda:0] [--scenes go2] [--worlds 4096 65536] [--json FILE]
 

@@ -30,7 +30,7 @@ STATES = 1
 
 
 class Row(NamedTuple):
-    """What came of one file. Errors are NaN where they mean nothing, and ``note`` says why; ``limit`` is for them."""
+    """The comparison of one file. An error is NaN where it means nothing; ``note`` says why. ``limit`` is the bound."""
 
     file: str
     dofs: int = 0
@@ -170,7 +170,7 @@ SAID = {
     r"links (.*?) move and have no mass": "links are weighed by their shapes unless `repair=False`",
     r"joint '[^']*' mimics ('[^']*'), which is no joint": "mimics name no joint",
 }
-"""What a warning of ``spo.load`` means, by a pattern whose group holds the names that it is about."""
+"""Meaning of a warning of ``spo.load``, by a pattern whose group holds the names in it."""
 
 
 def _counted(said: list[str]) -> str:
@@ -239,7 +239,7 @@ def mjcf_rows(pattern: str = "") -> Iterator[Row]:
 
 # -- USD ---------------------------------------------------------------------------------------------------------------
 class UsdRow(NamedTuple):
-    """What came of one USD: the largest relative errors of the numbers that the file writes for its bodies."""
+    """The comparison of one USD: the largest relative errors of the numbers that the file writes for its bodies."""
 
     file: str
     bodies: int = 0

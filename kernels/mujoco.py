@@ -58,6 +58,34 @@ def three(T) -> wp.Function:
 
 
 @functools.cache
+def store_three(T) -> wp.Function:
+    """Return the function that writes a vector to three entries of a row."""
+    Vector = wp.types.vector(3, T)
+
+    @wp.func
+    def function(x: Vector, world: int, first: int, out: wp.array2d[T]):
+        for i in range(3):
+            out[world, first + i] = x[i]
+
+    return function
+
+
+@functools.cache
+def change_axes(T) -> wp.Function:
+    """Return the function ``R x``, from the body's axes to the parent's, or ``R* x``."""
+    Vector, Matrix = wp.types.vector(3, T), wp.types.matrix((3, 3), T)
+
+    @wp.func
+    def function(to_parent: bool, R: Matrix, x: Vector) -> Vector:
+        result = wp.transpose(R) * x
+        if to_parent:
+            result = R * x
+        return result
+
+    return function
+
+
+@functools.cache
 def rates(T) -> wp.Kernel:
     """Compute qd from qpos and qvel if ``to_scene``, else qvel from q and qd; a thread for each (world, joint).
 
@@ -67,7 +95,13 @@ def rates(T) -> wp.Kernel:
         vector, real: entries of its quaternion in ``coordinates``: the first of x, y, z, and w.
         com: centre of mass of the body that the joint carries, in the body frame [m].
     """
-    Vector, turned, entries = wp.types.vector(3, T), rotation(T), three(T)
+    Vector, rotate, entries, store, change = (
+        wp.types.vector(3, T),
+        rotation(T),
+        three(T),
+        store_three(T),
+        change_axes(T),
+    )
 
     @wp.kernel(module=f"warp_spo_mujoco_{T.__name__}", enable_backward=False)
     def kernel(
@@ -86,29 +120,20 @@ def rates(T) -> wp.Kernel:
         if kind[joint] == 0:
             out[world, first] = x[world, first]
             return
-        R = turned(coordinates, world, vector[joint], real[joint])
-        turn = first
-        if kind[joint] == 2:
-            turn = first + 3
-        given = entries(x, world, turn)
+        R = rotate(coordinates, world, vector[joint], real[joint])
+        if kind[joint] == 1:
+            store(change(to_scene, R, entries(x, world, first)), world, first, out)
+            return
+        given = entries(x, world, first + 3)
+        result = change(to_scene, R, given)
+        store(result, world, first + 3, out)
+        arm = R * Vector(com[world, joint, 0], com[world, joint, 1], com[world, joint, 2])
+        v = entries(x, world, first)
         if to_scene:
-            w = R * given
-            axes = w  # the angular velocity in the parent's axes
+            v += wp.cross(result, arm)
         else:
-            w = wp.transpose(R) * given
-            axes = given
-        for i in range(3):
-            out[world, turn + i] = w[i]
-        if kind[joint] == 2:
-            v = entries(x, world, first)
-            c = Vector(com[world, joint, 0], com[world, joint, 1], com[world, joint, 2])
-            shift = wp.cross(axes, R * c)
-            if to_scene:
-                v += shift
-            else:
-                v -= shift
-            for i in range(3):
-                out[world, first + i] = v[i]
+            v -= wp.cross(given, arm)
+        store(v, world, first, out)
 
     return kernel
 
@@ -116,7 +141,13 @@ def rates(T) -> wp.Kernel:
 @functools.cache
 def accelerations(T) -> wp.Kernel:
     """Compute qdd from qpos, qvel and qacc if ``to_scene``, else qacc from q, qd and qdd; arguments as of `rates`."""
-    Vector, turned, entries = wp.types.vector(3, T), rotation(T), three(T)
+    Vector, rotate, entries, store, change = (
+        wp.types.vector(3, T),
+        rotation(T),
+        three(T),
+        store_three(T),
+        change_axes(T),
+    )
 
     @wp.kernel(module=f"warp_spo_mujoco_{T.__name__}", enable_backward=False)
     def kernel(
@@ -136,31 +167,21 @@ def accelerations(T) -> wp.Kernel:
         if kind[joint] == 0:
             out[world, first] = x[world, first]
             return
-        R = turned(coordinates, world, vector[joint], real[joint])
-        turn = first
-        if kind[joint] == 2:
-            turn = first + 3
-        given = entries(x, world, turn)
-        w = entries(velocity, world, turn)
+        R = rotate(coordinates, world, vector[joint], real[joint])
+        if kind[joint] == 1:
+            store(change(to_scene, R, entries(x, world, first)), world, first, out)
+            return
+        given, w = entries(x, world, first + 3), entries(velocity, world, first + 3)
+        result = change(to_scene, R, given)
+        store(result, world, first + 3, out)
+        arm = R * Vector(com[world, joint, 0], com[world, joint, 1], com[world, joint, 2])
+        a = entries(x, world, first)
         if to_scene:
             w = R * w
-            result = R * given
-            change = result  # of the angular velocity, in the parent's axes
+            a += wp.cross(result, arm) + wp.cross(w, wp.cross(w, arm))
         else:
-            result = wp.transpose(R) * given
-            change = given
-        for i in range(3):
-            out[world, turn + i] = result[i]
-        if kind[joint] == 2:
-            a = entries(x, world, first)
-            arm = R * Vector(com[world, joint, 0], com[world, joint, 1], com[world, joint, 2])
-            shift = wp.cross(change, arm) + wp.cross(w, wp.cross(w, arm))
-            if to_scene:
-                a += shift
-            else:
-                a -= shift
-            for i in range(3):
-                out[world, first + i] = a[i]
+            a -= wp.cross(given, arm) + wp.cross(w, wp.cross(w, arm))
+        store(a, world, first, out)
 
     return kernel
 
@@ -168,7 +189,13 @@ def accelerations(T) -> wp.Kernel:
 @functools.cache
 def forces(T) -> wp.Kernel:
     """Compute tau from qpos and qfrc if ``to_scene``, else qfrc from q and tau; arguments as of `rates`."""
-    Vector, turned, entries = wp.types.vector(3, T), rotation(T), three(T)
+    Vector, rotate, entries, store, change = (
+        wp.types.vector(3, T),
+        rotation(T),
+        three(T),
+        store_three(T),
+        change_axes(T),
+    )
 
     @wp.kernel(module=f"warp_spo_mujoco_{T.__name__}", enable_backward=False)
     def kernel(
@@ -187,23 +214,18 @@ def forces(T) -> wp.Kernel:
         if kind[joint] == 0:
             out[world, first] = x[world, first]
             return
-        R = turned(coordinates, world, vector[joint], real[joint])
-        turn = first
-        moment = Vector()  # of the force at the centre of mass about the origin, in world axes
-        if kind[joint] == 2:
-            turn = first + 3
-            f = entries(x, world, first)
-            c = Vector(com[world, joint, 0], com[world, joint, 1], com[world, joint, 2])
-            moment = wp.cross(R * c, f)
-            for i in range(3):
-                out[world, first + i] = f[i]
-        n = entries(x, world, turn)
+        R = rotate(coordinates, world, vector[joint], real[joint])
+        if kind[joint] == 1:
+            store(change(to_scene, R, entries(x, world, first)), world, first, out)
+            return
+        f, n = entries(x, world, first), entries(x, world, first + 3)
+        store(f, world, first, out)
+        arm = R * Vector(com[world, joint, 0], com[world, joint, 1], com[world, joint, 2])
         if to_scene:
-            n = R * n - moment
+            n = R * n - wp.cross(arm, f)
         else:
-            n = wp.transpose(R) * (n + moment)
-        for i in range(3):
-            out[world, turn + i] = n[i]
+            n = wp.transpose(R) * (n + wp.cross(arm, f))
+        store(n, world, first + 3, out)
 
     return kernel
 

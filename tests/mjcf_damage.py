@@ -90,4 +90,4 @@ CHANGES = {
     "change value": _change_value,
     "swap values": _swap_values,
 }
-"""What can be done to a file."""
+"""Kinds of damage to a file."""

@@ -96,7 +96,7 @@ def test_host_code_launches(path):
 
 @pytest.mark.parametrize("room", ["graph", "execution", "dynamics"])
 def test_device_work_goes_through_one_file(room):
-    """What ``launches.py`` does not see is missing when a recorded call is repeated."""
+    """Work on a device that ``launches.py`` does not see is missing when a recorded call is repeated."""
     for path in sorted((PACKAGE / room).rglob("*.py")):
         for work in ("wp.launch(", "wp.copy(", ".zero_()", ".fill_(", ".assign("):
             assert work not in path.read_text(), f"{path.name}: {work}; use launch, copy or fill of launches.py"

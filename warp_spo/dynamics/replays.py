@@ -29,7 +29,7 @@ Builder = Callable[[Sequence[Any], list], Any]
 MOST_KINDS, MOST_TRIES = 256, 4  # kinds of calls that are kept; calls of a kind that are recorded
 NUMBERS = frozenset((int, float, bool, str))
 MISS = object()
-"""What :meth:`Replays.replay` returns if nothing was recorded for the call."""
+"""Returned by :meth:`Replays.replay` if nothing was recorded for the call."""
 
 
 Repeat = Callable[[Sequence[Any]], Any]

@@ -1,4 +1,4 @@
-"""What callers change between calls: values of the scene, and states of some worlds."""
+"""Values of the scene, and states of some worlds, which callers change between calls."""
 
 from __future__ import annotations
 

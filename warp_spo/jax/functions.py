@@ -62,7 +62,7 @@ def function(dyn: Dynamics, operation: str, *, capture: bool = False, **options:
 
 
 class Function:
-    """What :func:`function` returns."""
+    """An operation that JAX traces; :func:`function` makes it."""
 
     def __init__(self, dyn: Dynamics, operation: Operation, options: dict[str, Any], capture: bool):
         self.name = f"warp_spo.jax.function({operation.name!r})"

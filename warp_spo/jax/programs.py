@@ -119,7 +119,7 @@ class Program:
     # -- backward --------------------------------------------------------------------------------------------------
     @property
     def _refused(self) -> str:
-        """What has no gradient, and what is expected, in words; "" if there is a gradient."""
+        """Return in words which argument has no gradient, and what is expected; "" if there is a gradient."""
         derivative = self.operation.derivative
         if derivative is None:
             known = ", ".join(name for name, one in self.dyn._operations.items() if one.derivative is not None)
