@@ -111,28 +111,15 @@ def energies(scene: spo.Scene, q: np.ndarray, qd: np.ndarray, limits: bool = Tru
         limits: whether the solver's limits are springs; SolverSteel's are not.
     """
     dyn = spo.Dynamics(scene, len(q), "cpu", "float64")
-    poses, rates = dyn.body_poses(q), dyn.body_velocities(q, qd)
     values = {name: array[0] for name, array in scene.values.items()}
-    x, y, z, w = np.moveaxis(poses[..., 3:], -1, 0)
-    rows = [[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]  # fmt: skip
-    R = np.stack([np.stack(row, -1) for row in rows], -2)
-    spin = np.einsum("nbij,nbi->nbj", R, rates[..., 3:])
-    kinetic = 0.5 * np.einsum("b,nbi,nbi->n", values["body_mass"], rates[..., :3], rates[..., :3])
-    kinetic += 0.5 * np.einsum("nbi,bij,nbj->n", spin, values["body_inertia"], spin)
-    kinetic += 0.5 * (qd**2) @ values["joint_armature"]
-    com = poses[..., :3] + np.einsum("nbij,bj->nbi", R, values["body_com"])
-    potential = -np.einsum("b,nbi,i->n", values["body_mass"], com, values["gravity"])
+    kinetic, potential = dyn.kinetic_energy(q, qd), dyn.potential_energy(q)
     screws = [(c + i, d + i) for h, c, d in zip(scene.hinges, scene.q_start, scene.qd_start, strict=False)
               if h.coord_count == h.dof_count for i in range(h.dof_count)]  # fmt: skip
     for coordinate, dof in screws:
         at = q[:, coordinate]
         outside = np.maximum(values["joint_limit_lower"][dof] - at, 0.0)
         outside = outside + np.maximum(at - values["joint_limit_upper"][dof], 0.0)
-        stretch = at - values["joint_rest_q"][coordinate]
         potential += 0.5 * limits * values["joint_limit_ke"][dof] * outside**2
-        potential += 0.5 * values["joint_stiffness"][dof] * stretch**2
     return kinetic, potential
 
 

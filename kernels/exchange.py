@@ -57,18 +57,25 @@ def add(T) -> wp.Kernel:
 
 
 @functools.cache
+def rotation_of(T) -> wp.Function:
+    """Return the function for the quaternion of a pose [world, i, 7]."""
+    quat = wp.types.quaternion(T)
+
+    @wp.func
+    def function(pose: wp.array3d[T], world: int, i: int):
+        return quat(pose[world, i, 3], pose[world, i, 4], pose[world, i, 5], pose[world, i, 6])
+
+    return function
+
+
+@functools.cache
 def turn_wrenches(T) -> wp.Kernel:
     """Rotate wrenches on free hinges, in place, from world axes into the axes of the hinges' parent anchors.
 
     ``hinge`` [n, 3] holds the first dof, the hinge, and the parent body or -1. ``anchor`` [world, hinge, 7] and
     ``poses`` [world, body, 7] are poses; ``tau`` [world, dof] holds the wrenches.
     """
-    quat = wp.types.quaternion(T)
-    vec3 = wp.types.vector(3, T)
-
-    @wp.func
-    def rotation(pose: wp.array3d[T], world: int, i: int):
-        return quat(pose[world, i, 3], pose[world, i, 4], pose[world, i, 5], pose[world, i, 6])
+    rotation, vec3 = rotation_of(T), wp.types.vector(3, T)
 
     @wp.kernel(module=f"warp_spo_exchange_{T.__name__}", enable_backward=False)
     def kernel(hinge: wp.array2d[int], anchor: wp.array3d[T], poses: wp.array3d[T], tau: wp.array2d[T]):
@@ -97,12 +104,7 @@ def turn_gradients(T) -> wp.Kernel:
     ``tau_grad`` [world, dof] is changed in place, from R* w to w. ``poses_grad`` [world, body, 7], where it is given,
     is added to. The other arguments are those of :func:`turn_wrenches`.
     """
-    quat = wp.types.quaternion(T)
-    vec3 = wp.types.vector(3, T)
-
-    @wp.func
-    def rotation(pose: wp.array3d[T], world: int, i: int):
-        return quat(pose[world, i, 3], pose[world, i, 4], pose[world, i, 5], pose[world, i, 6])
+    quat, rotation, vec3 = wp.types.quaternion(T), rotation_of(T), wp.types.vector(3, T)
 
     @wp.kernel(module=f"warp_spo_exchange_{T.__name__}", enable_backward=False)
     def kernel(

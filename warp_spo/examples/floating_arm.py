@@ -71,9 +71,7 @@ def main(seconds=2.0, dt=2e-3, worlds=4, seed=0, device=None, picture=None):
 
 def place(dyn, q):
     """Return the hand's position [world, 3]."""
-    pose = dyn.body_poses(q)[:, 6]
-    u, w, v = pose[:, 3:6], pose[:, 6:], np.array([0.3, 0.0, 0.0])
-    return pose[:, :3] + v + 2.0 * np.cross(u, np.cross(u, v) + w * v)
+    return dyn.frame_poses(q, [(6, at(0.3))])[:, 0, :3]
 
 
 if __name__ == "__main__":
