@@ -166,9 +166,9 @@ def compare_urdf(file: Path, text: str | None = None) -> Row:
 
 
 SAID = {
-    r"replaced the mass or inertia of (.*?): the file's": "inertias are replaced unless `repair=False`",
-    r"links (.*?) move and have no mass": "links are weighed by their shapes unless `repair=False`",
-    r"joint '[^']*' mimics ('[^']*'), which is no joint": "mimics name no joint",
+    r"replaced the mass or inertia of (.*?): the file's": "inertias replaced unless `repair=False`",
+    r"links (.*?) move and have no mass": "links weighed by their shapes unless `repair=False`",
+    r"joint '[^']*' mimics ('[^']*'), which is no joint": "mimics of no joint",
 }
 """Meaning of a warning of ``spo.load``, by a pattern whose group holds the names in it."""
 
@@ -181,7 +181,7 @@ def _counted(said: list[str]) -> str:
         for names in re.findall(pattern, "\n".join(said)):
             more = re.search(r"and (\d+) more", names)
             count += len(re.findall(r"'[^']*'", names)) + (int(more.group(1)) if more else 0)
-        notes += [f"{count} {meaning}"] * (count > 0)
+        notes += [f"{meaning}: {count}"] * (count > 0)
     return "; ".join(notes)
 
 
