@@ -98,5 +98,5 @@ def test_values_that_are_set_reach_both_precisions(device):
 
 @pytest.mark.parametrize("refine", [-1, 0.5, "once"])
 def test_a_number_of_steps_is_asked_for(refine):
-    with pytest.raises(ValueError, match=r"Dynamics: refine is .*; expected how many steps, 0 or more"):
+    with pytest.raises(ValueError, match=r"Dynamics: refine is .*; expected an integer, 0 or more"):
         spo.Dynamics(chain(1), refine=refine)

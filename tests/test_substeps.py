@@ -105,10 +105,10 @@ def test_refusals():
     dyn = spo.Dynamics(scene, 1, device="cpu")
     zeros = np.zeros((1, 3), np.float32)
     for count in (0, 1.5, True, "2"):
-        with pytest.raises(ValueError, match=r"Dynamics.step: substeps is .*; expected how many steps, 1 or more"):
+        with pytest.raises(ValueError, match=r"Dynamics.step: substeps is .*; expected an integer, 1 or more"):
             dyn.step(zeros, zeros, None, H, substeps=count)
     grad = torch.zeros((1, 3), requires_grad=True)
-    with pytest.raises(ValueError, match="substeps is 0; expected how many steps"):
+    with pytest.raises(ValueError, match="substeps is 0; expected an integer"):
         dyn.step(grad, grad, None, H, substeps=0)
     with pytest.raises(ValueError, match="status is given with substeps and an input requires grad"):
         dyn.step(grad, grad, None, H, substeps=2, status=torch.zeros(1, dtype=torch.int32))

@@ -232,7 +232,7 @@ class Dynamics:
         self.closed, self.embedding = self._closures.closed, self._closures.embedding
         count = as_integer(refine)
         if count is None or count < 0:
-            raise ValueError(f"Dynamics: refine is {refine!r}; expected how many steps, 0 or more")
+            raise ValueError(f"Dynamics: refine is {refine!r}; expected an integer, 0 or more")
         if count and self.closed:
             raise UnsupportedError("Dynamics", f"refine={count} with loops={loops!r}", "dtype='float64'")
         self.refine = count

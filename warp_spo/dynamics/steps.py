@@ -82,7 +82,7 @@ def _take_substeps(call: str, arguments: dict[str, Any]) -> int:
     given = arguments.pop("substeps", 1)
     count = as_integer(given)
     if count is None or count < 1:
-        raise ValueError(f"{call}: substeps is {given!r}; expected how many steps, 1 or more")
+        raise ValueError(f"{call}: substeps is {given!r}; expected an integer, 1 or more")
     return count
 
 

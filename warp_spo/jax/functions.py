@@ -96,7 +96,7 @@ class Function:
 
     @functools.cached_property
     def repeated(self) -> tuple[int, Function]:
-        """How often the operation runs for one call, and the function of one of these times, which has the gradient."""
+        """Return how often the operation runs for one call, and the function of one run, which has the gradient."""
         options = dict(self.options)
         derivative = self.operation.derivative
         times = 1 if derivative is None else derivative.repeats(self.name, options)
