@@ -5,8 +5,6 @@ import math
 import numpy as np
 import warp as wp
 
-from warp_spo.examples.parts import rotate
-
 
 def rollout(dyn, q, qd, h, steps, integrator="semi_implicit", tau=None):
     """q, qd [world, ...] after so many steps."""
@@ -20,6 +18,22 @@ def rollout(dyn, q, qd, h, steps, integrator="semi_implicit", tau=None):
     for _ in range(steps // piece):
         wp.capture_launch(capture.graph)
     return tuple(x.numpy().astype(float) for x in state)
+
+
+def rotate(quaternion, vector):
+    """``vector`` rotated by quaternions xyzw."""
+    u, w = quaternion[..., :3], quaternion[..., 3:]
+    return vector + 2.0 * np.cross(u, np.cross(u, vector) + w * vector)
+
+
+def energy(dyn, q, qd):
+    """Kinetic and potential energy [world] [J], from the mass matrix and the poses. Loops must be embedded."""
+    # An embedded mass matrix is that of the independent dofs: their velocities give the whole kinetic energy.
+    rates = qd[:, dyn.independent_dofs]
+    kinetic = 0.5 * np.einsum("wi,wij,wj->w", rates, dyn.mass_matrix(q), rates)
+    values, poses = dyn.scene.values, dyn.body_poses(q)
+    com = poses[..., :3] + rotate(poses[..., 3:], values["body_com"])
+    return kinetic - np.einsum("b,wbi,i->w", values["body_mass"][0], com, values["gravity"][0])
 
 
 def conserved(dyn, q, qd):

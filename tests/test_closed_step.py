@@ -9,12 +9,13 @@ import pytest
 import symbolic
 import warp as wp
 from mechanisms import MECHANISMS
+from rollouts import energy
 from step_scenes import FORCES, furnished, smooth
 
 import warp_spo as spo
 from warp_spo.dynamics.embedding import Closing
 from warp_spo.errors import UnsupportedError
-from warp_spo.examples.parts import at, bar, energy
+from warp_spo.examples.parts import at, bar
 from warp_spo.recursions import impedance, step
 from warp_spo.recursions.loops import closed_step, clusters
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import warp as wp
 from mechanisms import MECHANISMS
+from rollouts import energy
 
 import warp_spo as spo
-from warp_spo.examples.parts import energy
 
 
 def rolled(dyn, q, qd, seconds, dt):
