@@ -92,7 +92,8 @@ def inverse_kinematics(
     covers the ranges evenly. Coordinates without limits start between -pi and pi, or -1 m and 1 m. A quaternion takes
     three shares, spread evenly over all rotations (K. Shoemake). More seeds contain the starts of fewer.
 
-    Coordinates that move none of the frames keep their values in ``q``; without ``q``, the neutral ones.
+    Coordinates that move none of the frames keep their values in ``q``; without ``q``, the neutral ones. Deflections of
+    flexible hinges are zero where they move a frame.
 
     Args:
         targets: pose of each frame in the inertial frame [world, frame, 7]: x, y, z [m], quaternion xyzw.

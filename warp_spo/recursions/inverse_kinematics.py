@@ -91,7 +91,9 @@ def _start(link: Link, i: int, share: Value, low: Value | None, high: Value | No
 
 
 def bounds(trace: Trace, limits: Impedance, dof: int) -> tuple[Value | None, Value | None]:
-    """Return the limits of a dof, None where it has none; in float32 rounded to the inside."""
+    """Return the limits of a dof, None where it has none; in float32 rounded to the inside. Deflections are zero."""
+    if dof in trace.links.scene.deflections:
+        return 0.0, 0.0
     low, high = limits.range(dof)
     if trace.epsilon == EPSILON["float32"]:
         low = _rounded(low, 1.0)

@@ -28,6 +28,7 @@ from .axes import in_plane as in_plane
 from .axes import screws_of
 from .checks import SYMMETRY, checked_array, checked_unit, read_only
 from .checks import real as real
+from .gears import checked_flexible, motor_and_deflection
 from .storage import StoredPart, check_function
 
 IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -174,6 +175,12 @@ class Hinge(StoredPart):
         effort_limit: bound of the drive's force [N m or N].
         velocity_limit: bound of the velocity [rad/s or m/s].
         rest: coordinates at which the spring is relaxed, one per coordinate.
+        flexible: (stiffness [N m/rad or N/m], damping [N m s or N s/m]) of a gear or shaft between the motor and the
+            child, of a hinge with one degree of freedom. The hinge then has two coordinates, the motor's and the
+            deflection, whose sum places the child. Armature, damping, friction, drive, limits, ``rest``, actuators and
+            couplings are those of the motor, unless two numbers are given. Spring and damper of the deflection are its
+            entries of joint_stiffness and joint_damping: steps and :meth:`Dynamics.passive_force` know them, forward
+            dynamics does not. Without armature or a rotor the motor has no inertia, and forward dynamics is NaN.
         coordinates, pose: of a "custom" hinge, see :meth:`custom`.
         label: name in tables and errors.
 
@@ -206,6 +213,7 @@ class Hinge(StoredPart):
     rest: Any = None
     label: str = ""
     rotor: Any = None
+    flexible: Any = None
     coordinates: int | None = None
     pose: Callable[[list], Any] | None = None
     screws: tuple = dataclasses.field(init=False, repr=False)
@@ -220,7 +228,9 @@ class Hinge(StoredPart):
             put("kind", ALIASES.get(self.kind, self.kind))
         if self.kind not in (*KINDS, "custom"):
             raise ValueError(f"{call}: unknown kind; expected one of {', '.join(KINDS)}, or Hinge.custom")
-        put("screws", tuple(screws_of(call, self.kind, self.axis, self.linear, self.angular, self.pitch)))
+        screws = tuple(screws_of(call, self.kind, self.axis, self.linear, self.angular, self.pitch))
+        put("flexible", checked_flexible(call, self.kind, len(screws), self.flexible))
+        put("screws", screws if self.flexible is None else screws * 2)  # the motor's, then the deflection's
         if self.kind == "custom":
             put("elements", (Element(self._custom(call)),))
         elif self.pose is not None or self.coordinates is not None:
@@ -234,9 +244,13 @@ class Hinge(StoredPart):
             value = getattr(self, field)
             value = default if value is None else value
             value = checked_array(call, field, value, () if np.ndim(value) == 0 else (self.dof_count,))
+            if self.flexible is not None:
+                value = motor_and_deflection(call, field, value, default, self.flexible)
             put(field, np.broadcast_to(value, (self.dof_count,)))
         rest = self.neutral if self.rest is None else self.rest
         rest = checked_array(call, "rest", rest, () if np.ndim(rest) == 0 else (self.coord_count,))
+        if self.flexible is not None:
+            rest = motor_and_deflection(call, "rest", rest, 0.0, self.flexible)
         rest = np.broadcast_to(rest, (self.coord_count,))
         for first in self.quaternions:
             checked_unit(call, "the quaternion (xyzw) of rest", rest[first : first + 4])
@@ -297,6 +311,11 @@ class Hinge(StoredPart):
     def coord_count(self) -> int:
         """Entries of ``q`` that the hinge owns."""
         return sum(element.kind.coordinates for element in self.elements)
+
+    @property
+    def driven(self) -> bool:
+        """Whether the hinge has one coordinate that a motor turns: all it has, or the first of a flexible hinge."""
+        return self.coord_count == 1 or self.flexible is not None
 
     @property
     def neutral(self) -> np.ndarray:

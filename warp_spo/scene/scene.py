@@ -216,14 +216,14 @@ class Scene(Stored):
             for index in (coupling.hinge, coupling.reference):
                 if not isinstance(index, int | np.integer):
                     raise TypeError(f"Scene: a coupling names hinge {index!r}; expected an integer")
-                if not 0 <= index < len(self.hinges) or self.hinges[index].coord_count != 1:
+                if not 0 <= index < len(self.hinges) or not self.hinges[index].driven:
                     raise ValueError(
                         f"Scene: a coupling names hinge {index}; expected one of {len(self.hinges)} "
                         f"hinges with one coordinate"
                     )
         for number, actuator in enumerate(self.actuators):
             for index in actuator.hinges:
-                if not 0 <= index < len(self.hinges) or self.hinges[index].coord_count != 1:
+                if not 0 <= index < len(self.hinges) or not self.hinges[index].driven:
                     raise ValueError(
                         f"Scene: actuator {number} {actuator.label!r} names hinge {index}; expected one of "
                         f"{len(self.hinges)} hinges with one coordinate"
@@ -272,12 +272,20 @@ class Scene(Stored):
 
     @property
     def dof_labels(self) -> list[str]:
-        """The labels of the entries of qd. They are the hinges' labels, with ``:0``, ``:1``, ... if several."""
+        """The labels of the entries of qd. They are the hinges' labels, with ``:0``, ``:1``, ... if several.
+
+        Those of a flexible hinge end in ``:motor`` and ``:deflection``.
+        """
         return [
-            label if hinge.dof_count == 1 else f"{label}:{i}"
+            label if hinge.dof_count == 1 else f"{label}:{('motor', 'deflection')[i] if hinge.flexible else i}"
             for label, hinge in zip(self.joint_labels, self.hinges, strict=True)
             for i in range(hinge.dof_count)
         ]
+
+    @property
+    def deflections(self) -> tuple[int, ...]:
+        """The dofs that are the deflection of a flexible hinge, of which every coordinate is a scalar."""
+        return tuple(int(first) + 1 for first, hinge in zip(self.qd_start, self.hinges, strict=False) if hinge.flexible)
 
     @property
     def ties(self) -> str:
