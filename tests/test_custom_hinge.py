@@ -235,6 +235,7 @@ SAME = {  # operation -> (arrays, {result: shape}, options)
     "body_accelerations": ("q qd qdd", {"out": "b6"}, {}),
     "body_reactions": ("q qd qdd", {"out": "b6"}, {}),
     "quasi_velocities": ("q qd", {"out": "n"}, {}),
+    "quasi_velocity_coriolis": ("q nu", {"out": "n"}, {}),
     "centroidal_momentum_bias": ("q qd", {"out": "6"}, {}),
     "hinge_force": ("q qd", {"out": "n"}, {}),
     "integrate": ("q qd dt", {"out": "c"}, {}),
@@ -245,7 +246,7 @@ SAME = {  # operation -> (arrays, {result: shape}, options)
 def more_states(scene):
     a, rng = states(scene), np.random.default_rng(8)
     a["prescribed"] = np.tile(np.arange(scene.dof_count) % 2.0, (WORLDS, 1))
-    a["b"] = a["b"][:, :, 0]
+    a["b"], a["nu"] = a["b"][:, :, 0], a["qdd"]
     a |= {f"{name}_dot": rng.normal(size=a["tau"].shape) for name in ("q", "qd", "tau")}
     return a | {"q_cotangent": rng.normal(size=a["q"].shape), "qd_cotangent": rng.normal(size=a["qd"].shape)}
 

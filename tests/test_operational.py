@@ -12,6 +12,7 @@ import zoo
 from allocations import no_warp_allocation
 
 import warp_spo as spo
+from warp_spo.dynamics import quasi_velocities as quasi
 from warp_spo.examples import estimation
 from warp_spo.recursions import (
     articulated_sweeps,
@@ -31,7 +32,7 @@ TOLERANCE = {
     "float64": 1e-12,  # cond(M) of the worst scene is 1e4
     "float32": 3e-5,
 }
-DIFFERENCES = 1e-10  # the gradient of log det: rounding of log det over a step of 0.01
+DIFFERENCES = 1e-10  # the gradient of log det, and C of quasi-velocities: rounding over a step of 0.01 or less
 LARGE = ("tree20", "trees25", "screw_tree", "every_d6", "floating_tree", "star")  # seconds
 SCENES = [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in zoo.SCENES]
 
@@ -52,6 +53,9 @@ OPERATIONS = {
     "centroidal_momentum_matrix": ((), lambda s: (6, s.dof_count), lambda d, a: d.centroidal_momentum_matrix),
     "centroidal_momentum_bias": (("qd",), lambda s: (6,), lambda d, a: d.centroidal_momentum_bias(a["qd"])),
     "quasi_velocities": (("qd",), lambda s: (s.dof_count,), lambda d, a: d.quasi_velocities(a["qd"])),
+    "generalized_velocities": (("nu",), lambda s: (s.dof_count,), lambda d, a: quasi.dense_velocities(d, a["nu"])),
+    "quasi_velocity_force": (("tau",), lambda s: (s.dof_count,), lambda d, a: quasi.dense_force(d, a["tau"])),
+    "quasi_velocity_coriolis": (("nu",), lambda s: (s.dof_count,), lambda d, a: quasi.dense_coriolis(d, a["nu"])),
     "log_det_mass_matrix_gradient": ((), lambda s: (s.dof_count,), lambda d, a: d.log_det_gradient),
     "mass_matrix_packed": (
         (),
@@ -70,8 +74,9 @@ FRAMED = ("jacobian_bias", "frame_accelerations", "operational_inertia_inverse_p
 
 
 def states(scene, worlds, **more):
-    """As in laws, and wrenches x on two frames."""
-    return laws.states(scene, worlds, **more) | {"x": np.random.default_rng(5).normal(size=(worlds, 12))}
+    """As in laws, quasi-velocities nu, and wrenches x on two frames."""
+    known = laws.states(scene, worlds, **more)
+    return known | {"nu": known["qdd"], "x": np.random.default_rng(5).normal(size=(worlds, 12))}
 
 
 def pattern(scene):
@@ -105,10 +110,12 @@ def wanted(scene, operation, a):
 
 def traced_error(scene, operation, a):
     got, right = traced(scene, operation, a), wanted(scene, operation, a)
-    if operation == "quasi_velocities" or operation.startswith("log_det") or "momentum" in operation:
+    if "velocit" in operation or operation.startswith("log_det") or "momentum" in operation:
         got, right = np.nan_to_num(got, nan=np.inf), right  # every entry is stored
     if operation in ("com_jacobian", "centroidal_momentum_matrix", "mass_matrix_packed"):
         got = np.nan_to_num(got)  # what is not stored is zero
+    if operation == "quasi_velocity_coriolis":
+        return laws.error(got, right) * (1e-12 / DIFFERENCES)
     if operation.startswith("log_det"):
         return np.abs(got - right).max(initial=0.0) / max(1.0, np.abs(right).max(initial=0.0)) * (1e-12 / DIFFERENCES)
     return laws.error(got, right) / (10.0 if "inverse" in operation else 1.0)  # cond(M)
@@ -242,7 +249,15 @@ BUGS = {
     "com_jacobian": (momentum, "center_of_mass", "mass = mass + body.mass", "mass = body.mass"),
     "centroidal_momentum_matrix": (momentum, "center_of_mass", " + origins[id(link)] * body.mass", ""),
     "centroidal_momentum_bias": (newton_euler, "body_force", "cross(motion.spin, in", "-cross(motion.spin, in"),
-    "quasi_velocities": (quasi_velocities, "quasi_velocities", "V = V + pivot", "V = pivot"),
+    "quasi_velocities": (quasi_velocities, "_scale", "V = V + pivot", "V = pivot"),
+    "generalized_velocities": (quasi_velocities, "_unscale", "V = V + pivot", "V = pivot"),
+    "quasi_velocity_force": (quasi_velocities, "_accelerate", "z = z + forces", "z = forces"),
+    "quasi_velocity_coriolis": (
+        quasi_velocities,
+        "_change",
+        "qd.__getitem__)\n    seeds",
+        "lambda dof: 0.0)\n    seeds",
+    ),
     "log_det_mass_matrix_gradient": (determinant, "upsilon", "dot(g, y) + pivot.inverse", "dot(g, y)"),
     "mass_matrix_packed": (articulated_sweeps, "pack", ">= item.index[1]", "<= item.index[1]"),
     "mass_matrix_inverse_packed": (articulated_sweeps, "pack", "sorted(entries)", "entries"),

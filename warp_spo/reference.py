@@ -474,26 +474,29 @@ class Dense:
             total[3:] += inertia @ AL[k] + np.cross(W[k], inertia @ W[k]) + np.cross(self.com[k] - c, force)
         return total
 
-    def quasi_velocities(self, qd=None):
-        """Return u^T qd [dof] for mass_matrix = u u^T; u is upper triangular if dofs nearer to the root come first."""
+    @cached_property
+    def mass_root(self):
+        """Return u of mass_matrix = u u^T [dof, dof], upper triangular if dofs nearer to the root come first."""
         order = np.concatenate([self.dofs[k] for k in self.outward]).astype(int)
         u = np.linalg.cholesky(self.mass_matrix[np.ix_(order, order)][::-1, ::-1])[::-1, ::-1]
-        nu = np.empty(self.dof_count)
-        nu[order] = u.T @ self._qd(qd)[order]
-        return nu
+        back = np.argsort(order)
+        return u[np.ix_(back, back)]
+
+    def quasi_velocities(self, qd=None):
+        """Return u^T qd [dof] for mass_matrix = u u^T."""
+        return self.mass_root.T @ self._qd(qd)
+
+    def rate(self, value, qd):
+        """Return the derivative of ``value(Dense)`` along qd, by central differences of order 8."""
+        h = 0.01 / max(1.0, np.abs(qd).max(initial=0.0))
+        at = lambda dt: value(Dense(self.scene, self.integrate(qd, dt), world=self.world))  # noqa: E731
+        weights = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
+        return sum(weight * (at(i * h) - at(-i * h)) for i, weight in weights) / h
 
     @cached_property
     def log_det_gradient(self):
         """Derivative of :attr:`log_det` along unit qd of each dof [dof], by central differences of order 8."""
-        h, gradient = 0.01, np.zeros(self.dof_count)
-        for i, unit in enumerate(np.eye(self.dof_count)):
-            for step, weight in ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280)):
-                ahead, behind = (
-                    Dense(self.scene, self.integrate(unit, sign * step * h), world=self.world).log_det
-                    for sign in (1, -1)
-                )
-                gradient[i] += weight * (ahead - behind) / h
-        return gradient
+        return np.array([self.rate(lambda dense: dense.log_det, unit) for unit in np.eye(self.dof_count)])
 
     @property
     def fixman_torque(self):

@@ -46,6 +46,7 @@ from . import (
 from . import forward_dynamics as forward
 from . import hybrid_dynamics as hybrid
 from . import inverse_dynamics as inverse
+from . import quasi_velocities as quasi
 from .closures import Closures, check_loops
 from .engine import Engine
 from .gradients import Gradients
@@ -121,11 +122,16 @@ class Dynamics:
     passive_force = inverse.passive_force
     body_reactions = inverse.body_reactions
 
-    # -- determinant and factor of the mass matrix -----------------------------------------------------------------
+    # -- determinant of the mass matrix ----------------------------------------------------------------------------
     log_det_mass_matrix = inertia.log_det_mass_matrix
     log_det_mass_matrix_gradient = inertia.log_det_mass_matrix_gradient
     fixman_torque = inertia.fixman_torque
-    quasi_velocities = inertia.quasi_velocities
+
+    # -- quasi-velocities ------------------------------------------------------------------------------------------
+    quasi_velocities = quasi.quasi_velocities
+    generalized_velocities = quasi.generalized_velocities
+    quasi_velocity_force = quasi.quasi_velocity_force
+    quasi_velocity_coriolis = quasi.quasi_velocity_coriolis
 
     # -- kinematics ------------------------------------------------------------------------------------------------
     body_poses = kinematics.body_poses

@@ -1,4 +1,4 @@
-"""The mass matrix: the matrix itself, its inverse, solves with it, its determinant and its factor."""
+"""The mass matrix: the matrix itself, its inverse, solves with it and its determinant."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from ..execution import node_operations as nodes
 from ..execution.routine import Routine
 from ..recursions import composite, determinant, inverse
 from ..recursions import forward_dynamics as solving
-from ..recursions import quasi_velocities as recursion
 from ..recursions.derivatives import adjoints
 from ..recursions.loops import minimal
-from .operation import AS_WRITTEN, QD, Argument, Derivative, Operation, Q, Refused, Result, Trial, required
+from .operation import AS_WRITTEN, Argument, Derivative, Operation, Q, Refused, Result, Trial
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
@@ -294,28 +293,3 @@ def fixman_torque(self: Dynamics, q: ArrayT, out: ArrayT | None = None) -> Array
         [world, dof], [1 per unit of the dof], dual to qd.
     """
     return self._engine.run(FIXMAN_TORQUE, out, q=q)
-
-
-QUASI_VELOCITIES = Operation(
-    "quasi_velocities",
-    arguments=(Q, required(QD)),
-    results=(Result("nu", "world, dof"),),
-    routine=Routine("quasi_velocities", recursion.quasi_velocities),
-    embed=Refused("factor mass_matrix, which is that of the independent dofs"),
-    multipliers=AS_WRITTEN,
-    trial=Trial(lambda dense, q, qd: dense.quasi_velocities(qd)),
-)
-
-
-@QUASI_VELOCITIES.method
-def quasi_velocities(self: Dynamics, q: ArrayT, qd: AnyArray, out: ArrayT | None = None) -> ArrayT:
-    """Compute nu = sqrt(D) [I + H phi K]* qd, in which the kinetic energy is nu . nu / 2 (armature included).
-
-    [I + H phi K] is formed dof by dof, and later dofs of a hinge are eliminated first: it is the unit upper triangular
-    factor U of Mass = U D U*, where dofs nearer to the root come first. Jain, Rodriguez 1995, "Diagonalized Lagrangian
-    robot dynamics".
-
-    Returns:
-        [world, dof], [sqrt(kg) m/s]; NaN where D is not positive.
-    """
-    return self._engine.run(QUASI_VELOCITIES, out, q=q, qd=qd)

@@ -1,21 +1,33 @@
-"""Quasi-velocities nu = sqrt(D) [I + H phi K]* qd, in which the kinetic energy is nu . nu / 2."""
+"""Quasi-velocities nu = sqrt(D) [I + H phi K]* qd, in which the kinetic energy is nu . nu / 2, and how they change.
+
+Their equations of motion have the identity for a mass matrix: nu' + C(q, nu) = eps, with eps = [I - H psi K] applied to
+the forces, over sqrt(D). C does no work, nu . C = 0. Jain, Rodriguez 1995, "Diagonalized Lagrangian robot dynamics".
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from ..trace.differentiation import forward
 from ..trace.emission import Store
-from ..trace.scalars import sqrt
+from ..trace.scalars import Value, is_constant, ordered, sqrt
 from ..trace.spatial import ZERO, Vector, dot
 from . import articulated, hybrid
+from .derivatives.tangents import coordinate_directions
+from .motion import carry_acceleration, link_motion
 
 if TYPE_CHECKING:
+    from .links import Link
     from .tracing import Trace
 
+Factors = dict[int, articulated.Factor]
+Entry = Callable[[int], Value]
 
-def factor_by_dofs(trace: Trace) -> dict[int, articulated.Factor]:
+
+def factor_by_dofs(trace: Trace) -> Factors:
     """Return the factors of every link in the coordinates of qd: Mass = U D U*, U unit upper triangular."""
-    done: dict[int, articulated.Factor] = {}
+    done: Factors = {}
     for link, outward in trace.traversal():
         if outward:
             trace.place(link)
@@ -30,19 +42,116 @@ def factor_by_dofs(trace: Trace) -> dict[int, articulated.Factor]:
 
 def quasi_velocities(trace: Trace) -> list[Store]:
     """out = sqrt(D) [I + H phi K]* qd"""
-    qd, done = trace.vector("qd"), factor_by_dofs(trace)
+    return _stores(_scale(trace, factor_by_dofs(trace), trace.vector("qd")))
+
+
+def generalized_velocities(trace: Trace) -> list[Store]:
+    """out = [I - H psi K]* nu / sqrt(D)"""
+    return _stores(_unscale(trace, factor_by_dofs(trace), trace.vector("nu")))
+
+
+def quasi_velocity_force(trace: Trace) -> list[Store]:
+    """out = eps = [I - H psi K] (tau - gravity_force + forces of body_f) / sqrt(D)"""
+    return _stores(_accelerate(trace, factor_by_dofs(trace), trace.vector("tau"), trace.base_acceleration))
+
+
+def quasi_velocity_coriolis(trace: Trace) -> list[Store]:
+    """out = C(q, nu) = -nu' where no force acts: nu changes with its factor, and because qd does"""
+    done = factor_by_dofs(trace)
+    qd = _unscale(trace, done, trace.vector("nu"))
+    _move(trace, qd.__getitem__)
+    by_acceleration = _accelerate(trace, done, lambda dof: 0.0, (ZERO, ZERO))
+    by_factor = _change(trace, done, qd)
+    return _stores({dof: -(rate + by_factor[dof]) for dof, rate in by_acceleration.items()})
+
+
+def _scale(trace: Trace, done: Factors, qd: Entry) -> dict[int, Value]:
+    """Return sqrt(D) [I + H phi K]* qd by dof."""
     velocity: dict[int, Vector] = {}
-    stores = []
+    nu: dict[int, Value] = {}
     for link in trace.links.links:
         trace.label(link, "v")
-        key, V = id(link), Vector((*ZERO, *ZERO))
-        if link.parent is not None:
-            above = velocity[id(link.parent)]
-            w, v = trace.places[key].pose.motion_to_child(Vector(above[:3]), Vector(above[3:]))
-            V = Vector((*w, *v))
-        for dof, pivot in zip(link.dofs, done[key].pivots[::-1], strict=True):
+        V = _carry(trace, link, velocity)
+        for dof, pivot in zip(link.dofs, done[id(link)].pivots[::-1], strict=True):
             eta = qd(dof) + pivot.inverse * dot(pivot.U, V)
-            stores.append(Store("out", (dof,), sqrt(pivot.D) * eta))
+            nu[dof] = sqrt(pivot.D) * eta
             V = V + pivot.column * qd(dof)
-        velocity[key] = V
-    return stores
+        velocity[id(link)] = V
+    return nu
+
+
+def _unscale(trace: Trace, done: Factors, nu: Entry) -> dict[int, Value]:
+    """Return qd = [I - H psi K]* nu / sqrt(D) by dof."""
+    velocity: dict[int, Vector] = {}
+    qd: dict[int, Value] = {}
+    for link in trace.links.links:
+        trace.label(link, "v")
+        V = _carry(trace, link, velocity)
+        for dof, pivot in zip(link.dofs, done[id(link)].pivots[::-1], strict=True):
+            qd[dof] = pivot.inverse * (sqrt(pivot.D) * nu(dof) - dot(pivot.U, V))
+            V = V + pivot.column * qd[dof]
+        velocity[id(link)] = V
+    return qd
+
+
+def _carry(trace: Trace, link: Link, velocity: dict[int, Vector]) -> Vector:
+    """Return phi*(p, k) V(p), the velocity (omega; v) of a link whose own hinge stands still."""
+    if link.parent is None:
+        return Vector((*ZERO, *ZERO))
+    above = velocity[id(link.parent)]
+    w, v = trace.places[id(link)].pose.motion_to_child(Vector(above[:3]), Vector(above[3:]))
+    return Vector((*w, *v))
+
+
+def _move(trace: Trace, qd: Entry) -> None:
+    """Give all links the velocity terms of qd."""
+    for link in trace.links.links:
+        trace.label(link, "w")
+        parent = None if link.parent is None else trace.motions[id(link.parent)]
+        trace.motions[id(link)] = link_motion(link, trace.places[id(link)], parent, qd)
+
+
+def _accelerate(trace: Trace, done: Factors, tau: Entry, base: tuple[Vector, Vector]) -> dict[int, Value]:
+    """Return sqrt(D) [I + H phi K]* qdd by dof, for the motions and external wrenches of the trace.
+
+    As in forward dynamics, loads and velocity terms enter by bodies and not as forces of the hinges, which would lose
+    digits; ``base`` is the acceleration that stands for gravity.
+    """
+    rates: dict[int, list[Value]] = {}
+    forces: dict[int, Vector] = {}
+    for link in reversed(trace.links.links):
+        trace.label(link, "z")
+        key, move = id(link), trace.motions[id(link)]
+        z = articulated.gyroscopic(link.inertia, move) - trace.external_wrench(link)
+        for child in link.children:
+            z = z + forces[id(child)]
+        rates[key] = []
+        for pivot, dof in zip(done[key].pivots, link.dofs[::-1], strict=True):
+            rate, z = articulated.reduce_pivot(pivot, z, tau(dof))
+            rates[key].append(rate)
+        forces[key] = articulated.force_on_parent(link, trace.places[key], done[key], move, z)
+    alpha: dict[int, tuple[Vector, Vector]] = {}  # accelerations at qdd = 0
+    found: dict[int, Value] = {}
+    for link in trace.links.links:
+        trace.label(link, "a")
+        key, move = id(link), trace.motions[id(link)]
+        above = base if link.parent is None else alpha[id(link.parent)]
+        w, v = carry_acceleration(trace.places[key], move, above)
+        alpha[key] = w, v = w + move.bias_w, v + move.bias_v
+        for dof, pivot, rate in zip(link.dofs, done[key].pivots[::-1], rates[key][::-1], strict=True):
+            found[dof] = sqrt(pivot.D) * (rate - pivot.share(dot(pivot.U, (*w, *v))))
+    return found
+
+
+def _change(trace: Trace, done: Factors, qd: dict[int, Value]) -> dict[int, Value]:
+    """Return how fast sqrt(D) [I + H phi K]* qd changes while q moves along qd and qd itself stays as it is."""
+    still = [x for x in qd.values() if not is_constant(x)]
+    nu = _scale(trace, done, qd.__getitem__)
+    inputs = [x for x in ordered(nu.values(), still) if x.op == "input" and x not in still]
+    along = coordinate_directions(trace, qd.__getitem__)
+    seeds = [along[x.args[1]] if x.args[0] == "q" else 0.0 for x in inputs]
+    return dict(zip(nu, forward(nu.values(), [*inputs, *still], [*seeds, *[0.0] * len(still)]), strict=True))
+
+
+def _stores(values: dict[int, Value]) -> list[Store]:
+    return [Store("out", (dof,), value) for dof, value in values.items()]
