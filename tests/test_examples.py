@@ -6,17 +6,30 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rendering import assert_is_whole
 
-from warp_spo.examples import floating_arm, fourbar, gripper, identify, options, parts, reach, slider_crank
+from warp_spo.examples import (
+    double_fourbar,
+    floating_arm,
+    fourbar,
+    gripper,
+    identify,
+    options,
+    parts,
+    reach,
+    slider_crank,
+)
 
 FOLDER = Path(parts.__file__).parent
 
 
-@pytest.mark.parametrize("module", [floating_arm, identify, reach])
-def test_is_short(module):
-    assert len(Path(module.__file__).read_text().splitlines()) < 100
+@pytest.mark.parametrize(
+    ("module", "lines"), [(floating_arm, 100), (identify, 100), (reach, 100), (double_fourbar, 60)]
+)
+def test_is_short(module, lines):
+    assert len(Path(module.__file__).read_text().splitlines()) < lines
 
 
 def test_a_floating_arm_draws_its_circle(tmp_path):
@@ -24,6 +37,13 @@ def test_a_floating_arm_draws_its_circle(tmp_path):
     svg = (tmp_path / "arm.svg").read_text()
     assert_is_whole(svg)
     assert "hand in 4 worlds" in svg and "distance from the circle [mm]" in svg
+
+
+def test_a_double_fourbar_ends_where_the_benchmark_says(tmp_path, device):
+    position, velocity = double_fourbar.main(device=str(device), picture=tmp_path / "rods.svg")
+    assert np.abs(position - (0.328457, 0.944519)).max() <= 1e-5  # [m], as promised; 1.2e-6 here
+    assert np.abs(velocity - (1.423050, -0.494867)).max() <= 1e-5  # [m/s]; 2.0e-6 here
+    assert_is_whole((tmp_path / "rods.svg").read_text())
 
 
 def test_masses_and_damping_are_found_again(tmp_path):

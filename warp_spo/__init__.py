@@ -13,6 +13,7 @@ from .graph.factorization import Factorization
 from .graph.operators import BWA, Blocks, Identity, Operator
 from .hinges.functions import clip, spline, where
 from .scene.actuators import Actuator, Keyframe
+from .scene.gears import Rotor
 from .scene.parts import Body, Coupling, Hinge, Loop
 from .scene.scene import Scene
 from .scene.tree import Digraph, Tree
@@ -44,6 +45,7 @@ __all__ = [
     "Keyframe",
     "Loop",
     "Operator",
+    "Rotor",
     "Scene",
     "Status",
     "Tree",

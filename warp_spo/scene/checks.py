@@ -53,3 +53,26 @@ def checked_unit(call: str, name: str, vector: np.ndarray) -> np.ndarray:
     if np.any(np.abs(norm - 1.0) > SYMMETRY):
         raise ValueError(f"{call}: {name} is {vector.tolist()}; expected unit length, got {norm.ravel().tolist()}")
     return vector / norm
+
+
+def checked_inertia(call: str, inertia: np.ndarray, any_inertia: Any = False) -> np.ndarray:
+    """Return ``inertia`` [..., 3, 3] made exactly symmetric; see :class:`Body` for what it may be.
+
+    ``any_inertia``, [...] or one bool, says whose eigenvalues may be negative.
+
+    Raises:
+        ValueError: the inertia is not symmetric up to rounding, or has a negative eigenvalue.
+    """
+    scale = np.abs(inertia).max(axis=(-1, -2))
+    skew = np.abs(inertia - np.swapaxes(inertia, -1, -2)).max(axis=(-1, -2))
+    if np.any(skew > SYMMETRY * scale):
+        raise ValueError(f"{call}: inertia is not symmetric, by {skew.max():.3g} kg m^2; expected I = I.T")
+    symmetric = 0.5 * (inertia + np.swapaxes(inertia, -1, -2))
+    lowest = np.linalg.eigvalsh(symmetric)[..., 0]
+    negative = (lowest < -SYMMETRY * scale) & ~np.asarray(any_inertia)
+    if np.any(negative):
+        raise ValueError(
+            f"{call}: inertia has the eigenvalue {lowest[negative].min():.3g} kg m^2; expected none below zero; "
+            "correct it, or accept it with Body(..., any_inertia=True)"
+        )
+    return symmetric

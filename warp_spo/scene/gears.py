@@ -1,13 +1,121 @@
-"""Flexible hinges: the spring between a motor and the body that it moves, checked, and values of the two dofs."""
+"""Geared motors: rotors, and the spring between a motor and the body that it moves in a flexible hinge."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 
 from ..errors import UnsupportedError
-from .checks import checked_array
+from .checks import SYMMETRY, checked_array, checked_inertia, checked_unit, read_only
+from .storage import StoredPart
+
+MODELS = ("full", "reduced", "reflected")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rotor(StoredPart):
+    """The rotor of a motor that drives a hinge through a gear.
+
+    It rides on the hinge's parent body and turns against it by ``ratio`` times the hinge's coordinate, about a line
+    through its own centre of mass. Its mass is symmetric about that line. Properties that are not given belong to the
+    parent body: the rotor's mass sits there, too, unless ``inertia`` is a Body.
+
+    Args:
+        inertia: the rotor's moment of inertia about its axis [kg m^2]; or its inertia about its centre of mass in the
+            axes of the hinge's parent anchor [kg m^2], shape (3, 3); or a :class:`Body` with mass, centre of mass and
+            inertia in the frame of that anchor.
+        ratio: turns of the rotor for each turn of the hinge; [rad/m] on a prismatic hinge. Negative if it turns the
+            other way.
+        axis: unit vector in the parent anchor's frame; None: the hinge's axis.
+        model: "reflected": ``ratio**2`` J, J being the moment about the axis, is added to joint_armature. The rest of
+            the rotor's motion is left out: nothing where the parent is the ground. Where the parent turns about the
+            rotor's axis, or turns that axis, accelerations are wrong by about ``ratio`` J / D of the largest of them; D
+            is the inertia that the hinge moves, ``ratio**2`` J included. On an arm of two rods with parallel axes it is
+            1.0 to 1.6 times that: 1 % for a ratio of 10 or 100, J of 1e-4 kg m^2 and D of 0.1 kg m^2 without it.
+
+    Raises:
+        ValueError: a value is invalid; the message names it.
+    """
+
+    inertia: Any
+    ratio: float
+    axis: Any = None
+    model: str = "full"
+
+    def __post_init__(self) -> None:
+        put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
+        if self.model not in MODELS:
+            raise ValueError(f"Rotor: model is {self.model!r}; expected one of {', '.join(MODELS)}")
+        put("ratio", float(checked_array("Rotor", "ratio", self.ratio, ())))
+        if self.axis is not None:
+            axis = checked_array("Rotor", "axis", self.axis, (3,))
+            put("axis", read_only(checked_unit("Rotor", "axis", axis)))
+        if hasattr(self.inertia, "com"):
+            if self.inertia.modes is not None or self.inertia.gravcomp:
+                raise ValueError("Rotor: inertia is a Body with modes or gravcomp; expected a rigid one without")
+        else:
+            name, shape = "inertia [kg m^2]", () if np.ndim(self.inertia) == 0 else (3, 3)
+            inertia = checked_array("Rotor", name, self.inertia, shape)
+            if shape:
+                inertia = read_only(checked_inertia("Rotor", inertia))
+            elif inertia < 0.0:
+                raise ValueError(f"Rotor: inertia is {inertia} kg m^2; expected zero or more")
+            put("inertia", inertia if shape else float(inertia))
+        if self.model == "reflected" and not isinstance(self.inertia, float):
+            raise ValueError(
+                "Rotor: model='reflected' knows the moment of inertia about the axis alone; expected that number as "
+                "inertia; add the rotor's mass and other moments to the parent body"
+            )
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """Inertia about the centre of mass, in the axes of the parent anchor [kg m^2], shape (3, 3)."""
+        if isinstance(self.inertia, float):
+            return self.inertia * np.outer(self.axis, self.axis)
+        return np.asarray(getattr(self.inertia, "inertia", self.inertia))
+
+    @property
+    def spin_inertia(self) -> float:
+        """Moment of inertia about the axis [kg m^2]."""
+        return float(self.axis @ self.matrix @ self.axis)
+
+
+def resolve_rotor(call: str, rotor: Any, kind: str, driven: bool, screws: tuple) -> Rotor | None:
+    """Return a hinge's rotor with its axis, the hinge's unless it has one of its own; None if there is no rotor.
+
+    Args:
+        driven: the hinge has one coordinate that a motor can turn.
+
+    Raises:
+        TypeError: ``rotor`` is something else.
+        ValueError: the hinge has several degrees of freedom, or none, or the rotor is not symmetric about its axis.
+    """
+    if rotor is None:
+        return None
+    if not isinstance(rotor, Rotor):
+        raise TypeError(f"{call}: rotor is of type {type(rotor).__name__}; expected a Rotor")
+    if not driven:
+        raise ValueError(
+            f"{call}: rotor= belongs to a hinge of one degree of freedom; a {kind} hinge here has another number; "
+            "leave rotor out, or make it a chain of hinges"
+        )
+    if rotor.axis is None:
+        if not screws:
+            raise ValueError(f"{call}: the rotor has no axis, nor has a {kind} hinge; expected Rotor(axis=)")
+        rotor = dataclasses.replace(rotor, axis=screws[0][0])
+    inertia = rotor.matrix
+    round_one = 0.5 * (np.trace(inertia) - rotor.spin_inertia) * (np.eye(3) - np.outer(rotor.axis, rotor.axis))
+    lopsided = inertia - round_one - rotor.spin_inertia * np.outer(rotor.axis, rotor.axis)
+    if np.abs(lopsided).max() > SYMMETRY * np.abs(inertia).max():
+        raise ValueError(
+            f"{call}: the rotor's inertia {inertia.tolist()} is not symmetric about its axis {rotor.axis.tolist()}; "
+            "expected equal moments about all lines across the axis, and no products with it"
+        )
+    if rotor.model != "reflected":
+        raise UnsupportedError(call, f"a rotor with model={rotor.model!r}", "take model='reflected'")
+    return rotor
 
 
 def checked_flexible(call: str, kind: str, screws: int, flexible: Any) -> tuple[float, float] | None:

@@ -26,9 +26,10 @@ from ..hinges.kind import Element
 from ..hinges.sequences import BY_NAME, elements
 from .axes import in_plane as in_plane
 from .axes import screws_of
-from .checks import SYMMETRY, checked_array, checked_unit, read_only
+from .checks import checked_array, checked_unit, read_only
+from .checks import checked_inertia as checked_inertia
 from .checks import real as real
-from .gears import checked_flexible, motor_and_deflection
+from .gears import Rotor, checked_flexible, motor_and_deflection, resolve_rotor
 from .storage import StoredPart, check_function
 
 IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -103,29 +104,6 @@ class Body(StoredPart):
         object.__setattr__(self, "inertia", read_only(checked_inertia(call, inertia, self.any_inertia)))
 
 
-def checked_inertia(call: str, inertia: np.ndarray, any_inertia: Any = False) -> np.ndarray:
-    """Return ``inertia`` [..., 3, 3] made exactly symmetric; see :class:`Body` for the values that it may have.
-
-    ``any_inertia``, [...] or one bool, says whose eigenvalues may be negative.
-
-    Raises:
-        ValueError: the inertia is not symmetric up to rounding, or has a negative eigenvalue.
-    """
-    scale = np.abs(inertia).max(axis=(-1, -2))
-    skew = np.abs(inertia - np.swapaxes(inertia, -1, -2)).max(axis=(-1, -2))
-    if np.any(skew > SYMMETRY * scale):
-        raise ValueError(f"{call}: inertia is not symmetric, by {skew.max():.3g} kg m^2; expected I = I.T")
-    symmetric = 0.5 * (inertia + np.swapaxes(inertia, -1, -2))
-    lowest = np.linalg.eigvalsh(symmetric)[..., 0]
-    negative = (lowest < -SYMMETRY * scale) & ~np.asarray(any_inertia)
-    if np.any(negative):
-        raise ValueError(
-            f"{call}: inertia has the eigenvalue {lowest[negative].min():.3g} kg m^2; expected none below zero; "
-            "correct it, or accept it with Body(..., any_inertia=True)"
-        )
-    return symmetric
-
-
 CLOSING = (
     "fixed",
     "revolute",
@@ -175,6 +153,7 @@ class Hinge(StoredPart):
         effort_limit: bound of the drive's force [N m or N].
         velocity_limit: bound of the velocity [rad/s or m/s].
         rest: coordinates at which the spring is relaxed, one per coordinate.
+        rotor: a :class:`Rotor` that turns with the hinge through a gear; one degree of freedom, or flexible.
         flexible: (stiffness [N m/rad or N/m], damping [N m s or N s/m]) of a gear or shaft between the motor and the
             child, of a hinge with one degree of freedom. The hinge then has two coordinates, the motor's and the
             deflection, whose sum places the child. Armature, damping, friction, drive, limits, ``rest``, actuators and
@@ -186,7 +165,7 @@ class Hinge(StoredPart):
 
     Raises:
         ValueError: a value is invalid; the message names it.
-        UnsupportedError: ``rotor`` (geared motors) is reserved.
+        UnsupportedError: ``flexible`` of a custom hinge.
     """
 
     kind: str
@@ -212,7 +191,7 @@ class Hinge(StoredPart):
     velocity_limit: Any = None
     rest: Any = None
     label: str = ""
-    rotor: Any = None
+    rotor: Rotor | None = None
     flexible: Any = None
     coordinates: int | None = None
     pose: Callable[[list], Any] | None = None
@@ -222,8 +201,6 @@ class Hinge(StoredPart):
     def __post_init__(self) -> None:
         call = f"Hinge({self.label!r})" if self.label else f"Hinge({self.kind!r})"
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
-        if self.rotor is not None:
-            raise UnsupportedError(call, "a rotor (rotor=)", "put its reflected inertia into armature")
         if isinstance(self.kind, str):
             put("kind", ALIASES.get(self.kind, self.kind))
         if self.kind not in (*KINDS, "custom"):
@@ -237,6 +214,7 @@ class Hinge(StoredPart):
             raise ValueError(f"{call}: pose= and coordinates= belong to a custom hinge")
         else:
             put("elements", elements(self.kind, self.screws))
+        put("rotor", resolve_rotor(call, self.rotor, self.kind, self.driven, self.screws))
         put("parent_pose", checked_pose(call, "parent_pose", self.parent_pose))
         put("child_pose", checked_pose(call, "child_pose", self.child_pose))
         for name, default in DOF_VALUES.items():
@@ -311,6 +289,14 @@ class Hinge(StoredPart):
     def coord_count(self) -> int:
         """Entries of ``q`` that the hinge owns."""
         return sum(element.kind.coordinates for element in self.elements)
+
+    @property
+    def reflected_inertia(self) -> np.ndarray:
+        """What a reflected rotor adds to the armature of each dof [kg m^2 or kg]; zeros without one."""
+        found = np.zeros(self.dof_count)
+        if self.rotor is not None and self.rotor.model == "reflected":
+            found[0] = self.rotor.ratio**2 * self.rotor.spin_inertia
+        return found
 
     @property
     def driven(self) -> bool:

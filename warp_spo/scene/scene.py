@@ -141,6 +141,7 @@ class Scene(Stored):
             field = name.removeprefix("joint_")
             values[name] = np.concatenate([getattr(hinge, field) for hinge in self.hinges])[None]
             _refuse_negative("Scene", name, values[name])
+        values["joint_armature"] = values["joint_armature"] + np.concatenate([h.reflected_inertia for h in self.hinges])
         self._refuse_impossible_inertias("Scene", values["body_inertia"])
         self._refuse_crossed_limits("Scene", values)
         values |= actuator_values(self.actuators)
