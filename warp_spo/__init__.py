@@ -14,6 +14,7 @@ from .graph.operators import BWA, Blocks, Identity, Operator
 from .hinges.functions import clip, spline, where
 from .scene.actuators import Actuator, Keyframe
 from .scene.gears import Rotor
+from .scene.modes import MassPoints, Modes
 from .scene.parts import Body, Coupling, Hinge, Loop
 from .scene.scene import Scene
 from .scene.tree import Digraph, Tree
@@ -44,6 +45,8 @@ __all__ = [
     "Identity",
     "Keyframe",
     "Loop",
+    "MassPoints",
+    "Modes",
     "Operator",
     "Rotor",
     "Scene",

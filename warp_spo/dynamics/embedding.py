@@ -51,7 +51,7 @@ class Closing:
         step = trace.vector("step")
         self._moved = [
             (link.coordinate + i, value)
-            for link in trace.links.links
+            for link in trace.links.leaders
             for i, value in enumerate(move(trace, link, [step(dof) for dof in link.dofs]))
         ]
 

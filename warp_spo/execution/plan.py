@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from ..errors import UnsupportedError
 from ..kernels.slots import WARP_SIZE
 from ..recursions.links import Links
 from ..recursions.pieces import Pieces
@@ -120,12 +121,18 @@ def choose(
     if granularity is not None and granularity not in GRANULARITIES:
         names = ", ".join(GRANULARITIES)
         raise ValueError(f"Dynamics: granularity is {granularity!r}; expected None or one of {names}")
-    asked = granularity or DEFAULT
-    side_by_side = cuda and asked != "node" and 0 < scene.dof_count <= MOST_DOFS
+    shared = scene.shares_dofs
+    if shared and granularity in ("node", "segment"):
+        what = f"granularity={granularity!r} for a scene with flexible bodies or rotors"
+        raise UnsupportedError("Dynamics", what, "use granularity=None or 'tree'")
+    asked = "tree" if shared else granularity or DEFAULT
+    side_by_side = cuda and not shared and asked != "node" and 0 < scene.dof_count <= MOST_DOFS
     pieces = Pieces(Links(scene)) if side_by_side else None
     limbs, alike = (pieces.warps, pieces.alike >= ALIKE[dtype]) if pieces else (1, True)
     rule = _chosen(scene.dof_count, limbs, alike, worlds, cuda, dtype, varies)
     chosen, reason = (asked, "asked for") if asked else rule
+    if shared:
+        reason = "links share dofs"
     rows = SHORT_ROWS if chosen == "tree" else LONG_ROWS
     staged = scene.dof_count > rows and worlds > (FEW_WORLDS if scene.dof_count <= LONG_ROWS else FEW_WORLDS // 16)
     outward, first = [], 0

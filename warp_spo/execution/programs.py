@@ -17,6 +17,7 @@ from ..kernels.native import INTEGERS
 from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout, Result
 from ..recursions import messages
+from ..recursions.flexible import attach
 from ..recursions.links import TABLES, Links
 from ..recursions.messages import INWARD, OUTWARD
 from ..recursions.pieces import Pieces
@@ -148,8 +149,14 @@ class Programs:
             self._links = Links(self.run.scene, self.run.parameters.variable)
         return self._links
 
+    def _copied(self, options: dict) -> Links:
+        """Return links of their own for one trace, with what the frames in its options sit on."""
+        links = self.links.with_tables()
+        attach(links, ((body, place[:3]) for body, place in options.get("frames", ())))
+        return links
+
     def _build(self, routine: Routine, shapes: dict, out_shape: tuple, more: dict, options: dict) -> Program | None:
-        links, shapes = self.links.with_tables(), {**shapes, "out": out_shape}
+        links, shapes = self._copied(options), {**shapes, "out": out_shape}
         if not links.links or not routine.suits(links, shapes, **options):
             return None
         if routine.start is not None:
@@ -201,7 +208,7 @@ class Programs:
         traced: list[list[Store]] = []
         apart: list[tuple[list[Store], list[Store], list[list[Store]]]] = []
         for index in range(len(pieces.pieces)):
-            links = self.links.with_tables()  # its own: pieces of equal structure then give equal text
+            links = self._copied(options)  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             traced.append([self._flattened(item, shapes) for item in routine.trace(trace, **options)])
             rounds = [[self._flattened(item, shapes) for item in turn] for turn in trace.rounds]

@@ -238,7 +238,7 @@ def actuator_force(trace: Trace) -> list[Store]:
         actuation.value("actuator_strength", number) * actuation.force(number) for number in range(len(actuation.moved))
     ]
     stores = []
-    for link in trace.links.links:
+    for link in trace.links.leaders:
         trace.label(link, "a")
         for dof in link.dofs:
             forces = (one.gear * strong[number] for number, one in actuation.acting.get(dof, ()))

@@ -21,6 +21,7 @@ from .motion import NONE, Motion, carry_acceleration, hinge_entries, hinge_motio
 LEAST = 4.0  # roundings of the terms that cancel in a pivot; a smaller pivot may be rounding alone
 SOLID = 1e-2  # least share of the carried mass, and of its own moments, at which a body's inertia bounds its pivots
 FLAT = 1e-12  # share of a body's largest moment, or mass, below which another one is rounding of the same numbers
+HERE = Pose(None, None, ZERO)
 NO_INERTIA = Articulated(NONE, NONE, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 
 

@@ -7,13 +7,17 @@ from typing import TYPE_CHECKING
 
 from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant
-from ..trace.spatial import Articulated, Vector, total
-from . import articulated
+from ..trace.spatial import ZERO, Articulated, Pose, Vector, total
+from . import articulated, groups
+from .articulated import HERE, NO_INERTIA
 from .links import Link
 from .motion import STILL
+from .newton_euler import link_acceleration
 
 if TYPE_CHECKING:
     from .tracing import Trace
+
+NO_FORCE = Vector((*ZERO, *ZERO))
 
 
 def factor_tree(trace: Trace) -> dict[int, articulated.Factor]:
@@ -39,10 +43,35 @@ def eliminate(trace: Trace, link: Link, done: dict[int, articulated.Factor], inn
     """Add the factor of a link to ``done``, and P+ in its parent's frame to ``inner``, after its children's."""
     trace.label(link, "P")
     carried = trace.from_children(link, "P", inner, Articulated.unpacked)
-    through = [(trace.places[id(child)].pose, done[id(child)].P) for child in link.children if id(child) in done]
+    if link.group is not None:
+        P = total_inertia(link, carried)
+        done[id(link)] = articulated.Factor([], P, NO_INERTIA, False, False, 0.0)
+        inner[id(link)] = NO_INERTIA
+        if link.closes:
+            leader = link.group.links[0]
+            own = {id(one): done[id(one)].P for one in link.group.links}
+            together = groups.factor(trace.stiffened(leader), trace.places, own, trace.epsilon)
+            done[id(leader)], inner[id(link)] = together, together.in_parent
+        return
+    through = [inside(trace, child, done) for child in link.children if id(child) in done]
     place = trace.places[id(link)]
     done[id(link)] = factor = articulated.factor(trace.stiffened(link), place, carried, through, trace.epsilon)
     inner[id(link)] = factor.in_parent
+
+
+def total_inertia(link: Link, carried: list[Articulated]) -> Articulated:
+    """Return a link's own inertia and what it carries."""
+    P = NO_INERTIA if link.inertia is None else link.inertia.articulated
+    for other in carried:
+        P = P + other
+    return P
+
+
+def inside(trace: Trace, child: Link, done: dict) -> tuple[Pose, Articulated]:
+    """Return what a child adds to its parent's inertia, before its dofs are eliminated in the parent's frame."""
+    if child.group is None:
+        return trace.places[id(child)].pose, done[id(child)].P
+    return HERE, done[id(child)].whole if child.leads else NO_INERTIA
 
 
 def reduce(
@@ -58,6 +87,7 @@ def reduce(
     rates: dict[int, list[Value]] = {}
     inner: dict[int, Articulated] = {}
     forces: dict[int, Vector] = {}
+    waiting: dict[int, Vector] = {}  # z of the links of groups
     stores: list[Store] = []
     for link, outward in trace.traversal():
         key = id(link)
@@ -72,8 +102,14 @@ def reduce(
             z = z - trace.external_wrench(link)
         for force in trace.from_children(link, letters[-1], forces, Vector):
             z = z + force
-        right = [tau(dof) for dof in link.dofs]
-        rates[key], forces[key] = articulated.reduce_link(link, place, factor, move, z, right)
+        if link.group is None:
+            right = [tau(dof) for dof in link.dofs]
+            rates[key], forces[key] = articulated.reduce_link(link, place, factor, move, z, right)
+        else:
+            waiting[key], rates[key], forces[key] = z, [], NO_FORCE
+            if link.closes:
+                leader, right = id(link.group.links[0]), [tau(dof) for dof in link.dofs]
+                rates[leader], _, forces[key] = groups.reduce(done[leader], trace.places, trace.motions, waiting, right)
         stores += trace.send_to_parent("P", link, inner[key].packed) if "P" in letters else []
         stores += trace.send_to_parent(letters[-1], link, forces[key])
     return done, rates, stores
@@ -84,6 +120,7 @@ def expand(
 ) -> list[Store]:
     """Sweep outward: return stores of qdd in the array ``name``, for ``rates`` of :func:`reduce`."""
     alpha: dict[int, tuple[Vector, Vector]] = {}
+    shared: dict[int, Value] = {}  # qdd of groups
     stores = []
     for link in trace.own_links:
         trace.label(link, "a")
@@ -95,9 +132,15 @@ def expand(
         else:
             received = trace.receive(letter, trace.piece.parent)  # type: ignore[union-attr, arg-type]
             above = Vector(received[:3]), Vector(received[3:])
-        qdd, alpha[key] = articulated.expand_link(
-            link, trace.places[key], done[key], rates[key], trace.motions[key], above
-        )
+        place, move = trace.places[key], trace.motions[key]
+        if link.group is None:
+            qdd, alpha[key] = articulated.expand_link(link, place, done[key], rates[key], move, above)
+        else:
+            qdd = groups.expand(done[key], rates[key], above)[0] if link.leads else []
+            shared |= zip(link.dofs, qdd, strict=False)
+            alpha[key] = link_acceleration(link, place, move, above, shared.__getitem__)
+            if not link.leads:
+                continue
         stores += [Store(name, (dof,), value) for dof, value in zip(link.dofs, qdd, strict=True)]
         if trace.piece is not None and trace.piece.children and link is trace.piece.links[-1]:
             stores += trace.send(letter, trace.piece, (*alpha[key][0], *alpha[key][1]))
@@ -109,7 +152,11 @@ def propagate_inward(trace: Trace, done: dict, link: Link, force: Vector, right:
     rates, over = {}, link
     while True:
         key = id(over)
-        rates[key], force = articulated.reduce_link(over, trace.places[key], done[key], STILL, force, right)
+        if over.group is None:
+            rates[key], force = articulated.reduce_link(over, trace.places[key], done[key], STILL, force, right)
+        else:
+            leader = id(over.group.links[0])
+            rates[leader], _, force = groups.reduce(done[leader], trace.places, {}, {key: force}, right)
         if over.parent is None:
             return rates
         over = over.parent

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 def entries(link: Link, places: dict[int, Placed], body: Rigid) -> dict[tuple[int, int], Value]:
     """(row, column) of Mass for the columns of a link that carries ``body`` = R, rows on the way to the root."""
     found = own_entries(link, places[id(link)], body)
+    if link.group is not None and link.leads:
+        for (i, j), x in link.group.coupled.items():
+            found[link.dofs[i], link.dofs[j]] = found[link.dofs[i], link.dofs[j]] + x
     for column, H in zip(link.dofs, columns(link, places[id(link)]), strict=True):
         n, f = body.apply(Vector(H[:3]), Vector(H[3:]))
         over = link
@@ -67,7 +70,8 @@ def mass_matrix(trace: Trace) -> list[Store]:
             carried[key] = trace.places[key].pose.rigid_to_parent(body)
             stores += trace.send_to_parent("R", link, carried[key].packed)
         trace.label(link, "F")
-        found |= entries(link, trace.places, body)
+        for at, value in entries(link, trace.places, body).items():
+            found[at] = found[at] + value if at in found else value  # links of a group add to the same entries
     return stores + mirror(found)
 
 

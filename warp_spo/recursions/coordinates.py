@@ -23,7 +23,7 @@ def integrate(trace: Trace) -> list[Store]:
 def difference(trace: Trace) -> list[Store]:
     """out [dof] = the velocity that moves q0 to q1 in 1 s"""
     stores = []
-    for link in trace.links.links:
+    for link in trace.links.leaders:
         trace.label(link, "d")
         rates = link.hinge.difference(link, trace.vector("q0"), trace.vector("q1"))
         stores += [Store("out", (dof,), value) for dof, value in zip(link.dofs, rates, strict=True)]
@@ -45,7 +45,7 @@ def coordinate_rates(trace: Trace) -> list[Store]:
 
 def _coordinates(trace: Trace, of: Callable[[Link], list[Value]]) -> list[Store]:
     stores = []
-    for link in trace.links.links:
+    for link in trace.links.leaders:
         trace.label(link, "q")
         stores += [Store("out", (link.coordinate + c,), value) for c, value in enumerate(of(link))]
     return stores

@@ -73,7 +73,7 @@ def log_det_mass_matrix(trace: Trace) -> list[Store]:
 def log_det_mass_matrix_gradient(trace: Trace, scale: float = 1.0) -> list[Store]:
     """out = d log det Mass / dq, dual to qd"""
     done = factor_tree(trace)
-    if any(link.hinge.columns_vary for link in trace.links.links):
+    if trace.links.shared or any(link.hinge.columns_vary for link in trace.links.links):
         return _by_reverse(trace, done, scale)
     carried: dict[int, Articulated] = {}
     stores = []

@@ -9,6 +9,7 @@ from ..trace.spatial import ZERO, Vector, dot
 from .impedance import Impedance
 from .kinematics import link_velocities, place_all
 from .momentum import composite_inertias
+from .motion import armature_forces
 
 if TYPE_CHECKING:
     from .tracing import Trace
@@ -23,8 +24,8 @@ def kinetic_energy(trace: Trace) -> list[Store]:
             w, v = velocities[id(link)]
             n, f = link.inertia.apply(w, v)
             twice = twice + (dot(w, n) + dot(v, f))
-        for dof, armature in zip(link.dofs, link.armature, strict=True):
-            twice = twice + armature * (qd(dof) * qd(dof))
+        for dof, momentum in zip(link.dofs, armature_forces(link, qd), strict=True):
+            twice = twice + momentum * qd(dof)
     return [Store("out", (), 0.5 * twice)]
 
 
@@ -42,7 +43,7 @@ def potential_energy(trace: Trace) -> list[Store]:
         Impedance(trace.links, 0.0, trace.vector("q"), trace.vector("qd")),
         -dot(trace.links.gravity, moment),
     )
-    for link in trace.links.links:
+    for link in trace.links.leaders:
         trace.label(link, "s")
         for part in springs.spring_energies(link):
             energy = energy + part

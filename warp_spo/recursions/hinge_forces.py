@@ -23,7 +23,7 @@ def hinge_force(trace: Trace) -> list[Store]:
     impedance = hinge_laws(trace, 0.0)
     stores = []
     held = compensation(trace)
-    for link in trace.links.links:
+    for link in trace.links.leaders:
         trace.label(link, "f")
         for dof, laws in zip(link.dofs, impedance.laws(link), strict=True):
             stores.append(Store("out", (dof,), total(law.at(0.0) for law in laws) + held.get(dof, 0.0)))
@@ -35,7 +35,7 @@ def passive_force(trace: Trace) -> list[Store]:
     impedance = Impedance(trace.links, 0.0, trace.vector("q"), trace.vector("qd"))
     stores = []
     held = compensation(trace)
-    for link in trace.links.links:
+    for link in trace.links.leaders:
         trace.label(link, "f")
         for dof, law in zip(link.dofs, impedance.passive(link), strict=True):
             stores.append(Store("out", (dof,), law.force + held.get(dof, 0.0)))
@@ -57,7 +57,8 @@ def compensation(trace: Trace) -> dict[int, Value]:
         for child in link.children:
             wrench = wrench + forces[id(child)]
         n, f = Vector(wrench[:3]), Vector(wrench[3:])
-        found |= zip(link.dofs, hinge_entries(link, place, n, f), strict=True)
+        for dof, force in zip(link.dofs, hinge_entries(link, place, n, f), strict=True):
+            found[dof] = found.get(dof, 0.0) + force
         n, f = place.pose.force_to_parent(n, f)
         forces[id(link)] = Vector((*n, *f))
     return found

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, NamedTuple
 from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant, select
 from ..trace.spatial import Articulated, Pose, Vector, dot, total
-from . import articulated
+from . import articulated, groups, newton_euler
 from .articulated import LEAST, NO_INERTIA, Factor, Pivot
+from .articulated_sweeps import NO_FORCE, inside, total_inertia
 from .links import Link, Placed
 from .motion import Motion, carry_acceleration
 
@@ -123,6 +124,8 @@ def hybrid_dynamics(trace: Trace, mask: tuple[bool, ...] | None = None) -> list[
     heads: dict[int, list[Value]] = {}
     inner: dict[int, Articulated] = {}
     forces: dict[int, Vector] = {}
+    waiting: dict[int, Vector] = {}  # z of the links of groups
+    shared: dict[int, Value] = {}  # qdd of groups
     for link, outward in trace.traversal():
         key = id(link)
         if outward:
@@ -131,8 +134,25 @@ def hybrid_dynamics(trace: Trace, mask: tuple[bool, ...] | None = None) -> list[
         trace.label(link, "P")
         place, move = trace.places[key], trace.motions[key]
         carried = [inner[id(child)] for child in link.children]
-        through = [(trace.places[id(child)].pose, done[id(child)].P) for child in link.children]
+        through = [inside(trace, child, done) for child in link.children]
         given[key] = known = Given(*([entry(dof) for dof in link.dofs] for entry in (prescribed, tau, qdd)))
+        if link.group is not None:
+            P, inner[key], forces[key] = total_inertia(link, carried), NO_INERTIA, NO_FORCE
+            done[key] = articulated.Factor([], P, NO_INERTIA, False, False, 0.0)
+            trace.label(link, "z")
+            waiting[key] = articulated.gyroscopic(link.inertia, move) - trace.external_wrench(link)
+            for child in link.children:
+                waiting[key] = waiting[key] + forces[id(child)]
+            if link.closes:
+                leader = link.group.links[0]
+                own = {id(one): done[id(one)].P for one in link.group.links}
+                together = groups.factor(leader, trace.places, own, trace.epsilon, known.mask)
+                done[id(leader)], inner[key] = together, together.in_parent
+                found = groups.reduce(
+                    together, trace.places, trace.motions, waiting, known.tau, (known.mask, known.qdd)
+                )
+                rates[id(leader)], heads[id(leader)], forces[key] = found
+            continue
         if known.free:
             done[key] = articulated.factor(link, place, carried, through, trace.epsilon)
         else:
@@ -153,6 +173,16 @@ def hybrid_dynamics(trace: Trace, mask: tuple[bool, ...] | None = None) -> list[
         key = id(link)
         above = trace.base_acceleration if link.parent is None else alpha[id(link.parent)]
         known, place, move = given[key], trace.places[key], trace.motions[key]
+        if link.group is not None:
+            if link.leads:
+                forward, felt = groups.expand(done[key], rates[key], above)
+                shared |= zip(link.dofs, forward, strict=True)
+                needed = (a + b for a, b in zip(felt, heads[key][::-1], strict=True))
+                inverse = [select(held, x, b) for held, x, b in zip(known.mask, needed, known.tau, strict=True)]
+                for dof, a, force in zip(link.dofs, forward, inverse, strict=True):
+                    stores += [Store("out", (dof,), a), Store("tau_out", (dof,), force)]
+            alpha[key] = newton_euler.link_acceleration(link, place, move, above, shared.__getitem__)
+            continue
         if known.free:
             forward, alpha[key] = articulated.expand_link(link, place, done[key], rates[key], move, above)
             inverse = known.tau

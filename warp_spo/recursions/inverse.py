@@ -11,17 +11,15 @@ from typing import TYPE_CHECKING
 
 from ..trace.emission import Store
 from ..trace.scalars import Value
-from ..trace.spatial import ZERO, Vector, dot, total
+from ..trace.spatial import Vector, dot, total
 from . import articulated
-from .articulated_sweeps import factor, mirror, pack
+from .articulated_sweeps import NO_FORCE, factor, factor_tree, mirror, pack, pivots, propagate_inward, weighted_products
 from .links import Link
 from .motion import STILL
 from .pieces import Piece, Pieces
 
 if TYPE_CHECKING:
     from .tracing import Trace
-
-NO_FORCE = Vector((*ZERO, *ZERO))
 
 
 class Inverse:
@@ -125,11 +123,24 @@ def _sixes(values: list[Value]) -> list[list[Value]]:
 
 def mass_matrix_inverse(trace: Trace) -> list[Store]:
     """out = Mass^-1, both triangles"""
+    if trace.links.shared:
+        return by_columns(trace)
     inverse = Inverse(trace)
     rounds = [mirror(entries) for entries in inverse.rounds]
     if trace.piece is not None:
         trace.rounds, trace.news, rounds = rounds, inverse.news, []
     return inverse.stores + mirror(inverse.entries) + [item for stores in rounds for item in stores]
+
+
+def by_columns(trace: Trace) -> list[Store]:
+    """out = Mass^-1 of a scene whose links share dofs, as Y* D Y over the whole tree"""
+    done, columns = factor_tree(trace), {}
+    for link in trace.links.leaders:
+        for i, dof in enumerate(link.dofs):
+            trace.graph.step = f"column {dof}|y"
+            unit = [float(i == j) for j in range(len(link.dofs))]
+            columns[dof] = propagate_inward(trace, done, link, NO_FORCE, unit)
+    return mirror(weighted_products(trace, *pivots(done), columns))
 
 
 def mass_matrix_inverse_packed(trace: Trace) -> list[Store]:

@@ -16,6 +16,8 @@ from .newton_euler import link_acceleration
 if TYPE_CHECKING:
     from .tracing import Trace
 
+NEUTRAL = Vector((0.0, 0.0, 0.0, 1.0))  # quaternion xyzw of no rotation
+
 
 def relative_quaternion(link: Link, q: Any) -> Quaternion:
     """Return the quaternion of the link's axes in its parent's."""
@@ -56,6 +58,8 @@ def place_axes(trace: Trace, link: Link) -> None:
 
 def frame_on_link(trace: Trace, body: int, origin: tuple) -> tuple[Link | None, Vector]:
     """Return the link that carries a frame of a body, and the frame's origin in the link's frame."""
+    if (body, tuple(origin)) in trace.links.ports:
+        return trace.links.ports[body, tuple(origin)].link, ZERO
     seat = trace.links.seats[body]
     R, p = trace.links.nodes[body].anchor
     return seat.link, seat.offset + seat.matrix @ (R.T @ (Vector(origin) - p))
@@ -82,7 +86,7 @@ def link_poses(trace: Trace) -> tuple[dict[int | None, Vector], dict[int | None,
     """Return the origin and the quaternion of every link in the inertial frame, by id; None is that frame itself."""
     q = trace.vector("q")
     at: dict[int | None, Vector] = {None: ZERO}
-    turns: dict[int | None, Quaternion] = {None: Vector((0.0, 0.0, 0.0, 1.0))}
+    turns: dict[int | None, Quaternion] = {None: NEUTRAL}
     for link in trace.links.links:
         trace.label(link, "p")
         over = None if link.parent is None else id(link.parent)
@@ -99,7 +103,7 @@ def quaternions_in_links(links: Links) -> dict[int, Quaternion]:
     Newton's eval_fk computes it. Signs of constants decide this, so that it costs no operation.
     """
     scene = links.scene
-    by_anchors = {-1: Vector((0.0, 0.0, 0.0, 1.0))}
+    by_anchors = {-1: NEUTRAL}
     by_links: dict[int | None, Quaternion] = {None: by_anchors[-1]}
     for link in links.links:
         over = None if link.parent is None else id(link.parent)
@@ -135,11 +139,11 @@ def frame_poses(trace: Trace, frames: tuple) -> list[Store]:
     (at, turns), of_bodies, stores = link_poses(trace), quaternions_in_links(trace.links), []
     for index, (body, pose) in enumerate(frames):
         trace.graph.step = f"frame {index}|f"
-        seat, (R, p) = trace.links.seats[body], trace.links.nodes[body].anchor
-        key = None if seat.link is None else id(seat.link)
-        axes = seat.matrix @ R.T
-        position = at[key] + turned(turns[key], seat.offset + axes @ (Vector(pose[:3]) - p))
-        within = multiplied(of_bodies[body], Vector(pose[3:]))
+        link, arm = frame_on_link(trace, body, pose[:3])
+        key = None if link is None else id(link)
+        position = at[key] + turned(turns[key], arm)
+        own = NEUTRAL if (body, tuple(pose[:3])) in trace.links.ports else of_bodies[body]
+        within = multiplied(own, Vector(pose[3:]))
         values = (*position, *multiplied(turns[key], within))
         stores += [Store("out", (index, c), value) for c, value in enumerate(values)]
     return stores
@@ -174,11 +178,11 @@ def frame_velocities(trace: Trace, frames: tuple) -> list[Store]:
 def body_velocities(trace: Trace) -> list[Store]:
     """out [body, 6] = velocity of the CoM, angular velocity, in inertial axes"""
     velocities, stores = link_velocities(trace), []
-    for body, seat in trace.links.seats.items():
-        key = None if seat.link is None else id(seat.link)
+    for body in trace.links.seats:
+        link, com = trace.links.center(body)
+        key = None if link is None else id(link)
         w, v = velocities[key]
         R = IDENTITY if key is None else trace.axes[key]
-        com = seat.offset + seat.matrix @ trace.links.nodes[body].com
         values = (*velocity(R, w, v, com), *(R @ w))
         stores += [Store("out", (body, c), value) for c, value in enumerate(values)]
     return stores

@@ -13,15 +13,21 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ..hinges.kind import Kind
 from ..hinges.kind import Placed as Placed
+from ..scene.modes import Amplitudes
 from ..scene.scene import Scene
 from ..trace.scalars import Graph, Scalar, Value, is_constant
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
+from . import flexible
+from .flexible import Flexible
+from .link import Group as Group
+from .link import Link as Link
+from .link import Node as Node
+from .link import Seat as Seat
 from .rotations import aligned, folded, numbers, pose_of, still
 
 MOTION_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c", "joint_armature", "gravity")
@@ -30,89 +36,6 @@ TABLES = ("value", "node_value")  # what links are made of; what bodies by thems
 NOTHING = Rigid(0.0, ZERO, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 PRICES = (6, 10, 10, 10, 4, 4, 4, 8, 8, 8)  # of mass, first moment, moments and products of inertia
 POINT = 1e-15  # share of a body's largest moment about its CoM below which another one is zero
-
-
-class Lift(NamedTuple):
-    """The part of a link's bodies that gravity compensation holds up: sum of gravcomp mass, and its first moment."""
-
-    mass: Value
-    moment: Vector
-
-    def __add__(self, other: tuple) -> Lift:
-        return Lift(*(a + b for a, b in zip(self, other, strict=True)))
-
-
-@dataclasses.dataclass(eq=False)
-class Link:
-    """One moving frame.
-
-    Attributes:
-        parent: the link it moves on, or None for the inertial frame.
-        hinge: the elementary hinge that moves it.
-        matrix, offset: axes and origin of the hinge's frame at rest in the parent link's frame.
-        align: the hinge's axes in those of the scene's hinge, whose z axis is the hinge's own axis; None: the same.
-        dofs: its entries of qd.
-        coordinate: its first entry of q.
-        armature: of each dof.
-        inertia: of the bodies it carries, in its frame; None where it carries none.
-        grouped: the same for sums of forces and composite inertias, where it may be counted elsewhere: what turns about
-            its own axis, or does not turn, belongs to the parent as well as to the link. It need not be positive.
-        lift: the part of its bodies whose weight is compensated, in its frame; None where nothing is.
-        node: the body whose hinge it belongs to; label: its name.
-        com: the link's origin from the child anchor, in the link's axes: the body's centre of mass, if the hinge moves
-            that.
-        children: the links that move on it.
-    """
-
-    parent: Link | None
-    hinge: Kind
-    matrix: Matrix | None
-    offset: Vector
-    align: Matrix | None
-    dofs: tuple[int, ...]
-    coordinate: int
-    armature: tuple
-    node: int
-    label: str
-    com: Vector = ZERO
-    inertia: Rigid | None = None
-    grouped: Rigid | None = None
-    lift: Lift | None = None
-    children: list = dataclasses.field(default_factory=list)
-
-    def add(self, inertia: Rigid) -> None:
-        if all(is_constant(x) and x == 0.0 for x in inertia.packed):
-            return
-        self.inertia = inertia if self.inertia is None else self.inertia + inertia
-
-    def hold_up(self, mass: Value, com: Vector) -> None:
-        """Compensate the weight of ``mass`` at ``com``, in the link's frame."""
-        if not (is_constant(mass) and mass == 0.0):
-            lift = Lift(mass, com * mass)
-            self.lift = lift if self.lift is None else self.lift + lift
-
-
-class Seat(NamedTuple):
-    """Where a body's node frame sits: fixed in a link, or in the inertial frame (link None)."""
-
-    link: Link | None
-    matrix: Matrix
-    offset: Vector
-
-
-class Node(NamedTuple):
-    """A body by itself, in the axes of its node frame.
-
-    Attributes:
-        tree: axes and origin of the hinge's parent anchor in the parent's node frame.
-        anchor: of the node frame in the body frame.
-        com: centre of mass in the node frame. rigid: inertia about its origin.
-    """
-
-    tree: tuple[Matrix, Vector]
-    anchor: tuple[Matrix, Vector]
-    com: Vector
-    rigid: Rigid
 
 
 class Links:
@@ -130,6 +53,8 @@ class Links:
         turns_vary: some joint's anchor is turned by what is no constant.
         tables: the scalars that an :meth:`with_tables` copy reads, by name, in order.
         reverses: what takes gradients by the tables back to the values, see :mod:`warp_spo.execution.link_values`.
+        values: one world's values; symbols where they vary. poses: of hinges' anchors, (rotation, position).
+        flexible: bodies with modes. ports: where children ("child", body) and frames (position) of them sit.
     """
 
     def __init__(self, scene: Scene, variable: tuple[str, ...] = ()):
@@ -139,19 +64,32 @@ class Links:
         self.nodes: dict[int, Node] = {}
         self.tables: dict[str, dict[Scalar, int]] = {table: {} for table in TABLES}
         self.reverses: dict[Any, Any] = {}
-        self._values = {name: self._symbols(name, name in variable) for name in LINK_VALUES}
-        self.gravity = Vector(self._values["gravity"].tolist())
-        self._poses = {name: [pose_of(p) for p in self._values[name]] for name in ("joint_X_p", "joint_X_c")}
-        self.turns_vary = any(R.dtype == object for poses in self._poses.values() for R, _ in poses)
+        self.flexible: dict[int, Flexible] = {}
+        self.ports: dict[tuple[int, Any], Seat] = {}
+        self.values = {name: self._symbols(name, name in variable) for name in LINK_VALUES}
+        self.gravity = Vector(self.values["gravity"].tolist())
+        self.poses = {name: [pose_of(p) for p in self.values[name]] for name in ("joint_X_p", "joint_X_c")}
+        self.turns_vary = any(R.dtype == object for poses in self.poses.values() for R, _ in poses)
         for root in scene.tree.roots:
             self._visit(root)
+        flexible.attach(self, ((end, pose[:3]) for loop in scene.loops for end, pose in loop.ends))
         self._group()
+
+    @property
+    def shared(self) -> bool:
+        """Whether some links share dofs."""
+        return any(link.group is not None for link in self.links)
+
+    @property
+    def leaders(self) -> list[Link]:
+        """The links at which dofs are accounted for, each dof at one."""
+        return [link for link in self.links if link.leads]
 
     def with_tables(self) -> Links:
         """Return a copy with a graph of its own, in which quantities that are not constant are entries of a table."""
         other = copy.copy(self)
         other.graph = Graph()
-        if self.graph.empty:
+        if self.graph.empty and not self.flexible:
             return other
 
         def table(name: str) -> Callable[[Any], Any]:
@@ -177,6 +115,16 @@ class Links:
             if link.parent is not None:
                 twin[link.parent].children.append(twin[link])
         other.links = [twin[link] for link in self.links]
+        groups = {id(link.group): link.group for link in self.links if link.group is not None}
+        for group in groups.values():
+            copied = Group([twin[link] for link in group.links], group.coupled)
+            for link in copied.links:
+                link.group = copied
+        other.flexible = {
+            node: Flexible(twin[own.link], value(own.axes), value(own.origin), twin[own.leader])
+            for node, own in self.flexible.items()
+        }
+        other.ports = {key: Seat(twin[s.link], *value(s[1:])) for key, s in self.ports.items()}
         other.seats = {node: Seat(twin[s.link], *value(s[1:])) for node, s in self.seats.items()}
         other.gravity = value(self.gravity)
         other.nodes = {
@@ -218,25 +166,25 @@ class Links:
         return symbols
 
     def _node(self, node: int) -> Node:
-        scene, poses = self.scene, self._poses
+        scene, poses = self.scene, self.poses
         R, p = poses["joint_X_p"][scene.hinge_of[node]]
         parent = scene.tree.parent[node]
         if parent >= 0:
             R_a, p_a = poses["joint_X_c"][scene.hinge_of[parent]]
             R, p = R_a.T @ R, R_a.T @ (p - p_a)
         R_c, p_c = poses["joint_X_c"][scene.hinge_of[node]]
-        com = numbers(R_c.T @ (self._values["body_com"][node] - p_c))
+        com = numbers(R_c.T @ (self.values["body_com"][node] - p_c))
         return Node(
             (folded(R), Vector(p.tolist())),
             (folded(R_c), Vector(p_c.tolist())),
             Vector(com.tolist()),
-            self._rigid(node, R_c, com),
+            self.rigid(node, R_c, com),
         )
 
-    def _rigid(self, node: int, R: np.ndarray, c: np.ndarray) -> Rigid:
+    def rigid(self, node: int, R: np.ndarray, c: np.ndarray) -> Rigid:
         """Inertia of the body about the origin of its node frame, for its CoM ``c`` in it."""
-        mass = self._values["body_mass"][node : node + 1]
-        inertia = R.T @ self._values["body_inertia"][node] @ R + (np.eye(3) * (c @ c) - np.outer(c, c)) * mass
+        mass = self.values["body_mass"][node : node + 1]
+        inertia = R.T @ self.values["body_inertia"][node] @ R + (np.eye(3) * (c @ c) - np.outer(c, c)) * mass
         J = (0.5 * (inertia + inertia.T)).tolist()
         return Rigid(
             mass.tolist()[0],
@@ -249,7 +197,7 @@ class Links:
 
         They are the difference of moments about another point, and a pivot that should be zero would be positive.
         """
-        inertia, R = self._values["body_inertia"][node], self._poses["joint_X_c"][self.scene.hinge_of[node]][0]
+        inertia, R = self.values["body_inertia"][node], self.poses["joint_X_c"][self.scene.hinge_of[node]][0]
         if inertia.dtype == object or R.dtype == object:
             return own
         moments = (R.T @ inertia @ R).diagonal()
@@ -262,9 +210,19 @@ class Links:
         R, p = pose_of(pose)
         if body < 0:
             return Seat(None, folded(R), Vector(p.tolist()))
+        if (body, tuple(p.tolist())) in self.ports:
+            port = self.ports[body, tuple(p.tolist())]
+            return Seat(port.link, port.matrix @ folded(R), port.offset)
         seat, (R_body, p_body) = self.seats[body], self.nodes[body].anchor
         axes = seat.matrix @ R_body.T
         return Seat(seat.link, axes @ folded(R), seat.offset + axes @ (Vector(p.tolist()) - p_body))
+
+    def center(self, body: int) -> tuple[Link | None, Vector]:
+        """The link that the centre of mass of a body sits on, and its place there; the mean one of a flexible body."""
+        if body in self.flexible:
+            return self.flexible[body].leader, ZERO
+        seat = self.seats[body]
+        return seat.link, seat.offset + seat.matrix @ self.nodes[body].com
 
     def on_parent_node(self, link: Link) -> Link:
         """The first link of a hinge as it sits in the parent's node frame, instead of in the parent's link."""
@@ -286,12 +244,16 @@ class Links:
         parent = scene.tree.parent[node]
         seat = self.seats[parent] if parent >= 0 else Seat(None, IDENTITY, ZERO)
         self.nodes[node] = body = self._node(node)
-        R, l = body.tree
-        matrix, offset, link = seat.matrix @ R, seat.offset + seat.matrix @ l, seat.link
         index = scene.hinge_of[node]
+        R, l = body.tree
+        if ("child", node) in self.ports:  # the parent's point that carries it, in the axes of the parent's body frame
+            seat, R, l = self.ports["child", node], folded(self.poses["joint_X_p"][index][0]), ZERO
+        matrix, offset, link = seat.matrix @ R, seat.offset + seat.matrix @ l, seat.link
         dof, coordinate = int(scene.qd_start[index]), int(scene.q_start[index])
-        label, armatures = scene.body_labels[node], self._values["joint_armature"].tolist()
+        label, armatures = scene.body_labels[node], self.values["joint_armature"].tolist()
         for kind, axis in scene.hinges[index].elements:
+            if isinstance(kind, Amplitudes):
+                break
             align = None if axis is None else aligned(axis)
             own = range(dof, dof + kind.dofs)
             link = Link(
@@ -307,19 +269,23 @@ class Links:
                 label,
                 body.com if kind.at_com else ZERO,
             )
-            self._append(link)
+            self.append(link)
             matrix, offset = IDENTITY if align is None else align.T, -link.com if kind.at_com else ZERO
             dof, coordinate = dof + kind.dofs, coordinate + kind.coordinates
         rest = Seat(link, matrix, offset)
         self.seats[node] = rest
+        if scene.bodies[node].modes is not None:
+            flexible.deform(self, node, dof, coordinate, tuple(armatures[dof : dof + scene.bodies[node].modes.count]))
+            return
         if rest.link is not None:
             inertia = Pose(None, rest.matrix, rest.offset).rigid_to_parent(body.rigid)
             at_com = rest.link.node == node and rest.link.hinge.at_com
             rest.link.add(self._without_rounding(node, inertia) if at_com else inertia)
-            share = self._values["body_gravcomp"].tolist()[node]
+            share = self.values["body_gravcomp"].tolist()[node]
             rest.link.hold_up(share * body.rigid.mass, rest.offset + rest.matrix @ body.com)
 
-    def _append(self, link: Link) -> None:
+    def append(self, link: Link) -> None:
+        """Add a link, after its parent."""
         self.links.append(link)
         if link.parent is not None:
             link.parent.children.append(link)

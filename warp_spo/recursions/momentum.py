@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from ..trace.emission import Store
+from ..trace.emission import Store, merge
 from ..trace.scalars import Value, reciprocal
 from ..trace.spatial import ZERO, Rigid, Vector, cross
 from . import articulated, composite, newton_euler
@@ -85,7 +85,7 @@ def com_jacobian(trace: Trace) -> list[Store]:
         trace.label(link, "j")
         for dof, (_, f) in zip(link.dofs, momenta(trace, link, bodies[id(link)]), strict=True):
             stores += [Store("out", (c, dof), value * inverse) for c, value in enumerate(f)]
-    return stores
+    return merge(stores) if trace.links.shared else stores
 
 
 def centroidal_momentum_matrix(trace: Trace) -> list[Store]:
@@ -98,7 +98,7 @@ def centroidal_momentum_matrix(trace: Trace) -> list[Store]:
         arm = origins[id(link)] - c
         for dof, (n, f) in zip(link.dofs, momenta(trace, link, bodies[id(link)]), strict=True):
             stores += [Store("out", (i, dof), value) for i, value in enumerate((*f, *(n + cross(arm, f))))]
-    return stores
+    return merge(stores) if trace.links.shared else stores
 
 
 def centroidal_momentum_bias(trace: Trace, qdd: Callable[[int], Value] = zero) -> list[Store]:

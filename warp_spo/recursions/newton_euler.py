@@ -9,7 +9,7 @@ from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Rigid, Vector, cross, skew
 from .links import Link, Placed
-from .motion import Motion, carry_acceleration, hinge_entries, hinge_motion
+from .motion import Motion, armature_forces, carry_acceleration, hinge_entries, hinge_motion
 
 if TYPE_CHECKING:
     from .tracing import Trace
@@ -51,7 +51,7 @@ def wrench(axes: Matrix, com: Vector, force: Vector, torque: Vector) -> tuple[Ve
 def hinge_force(link: Link, place: Placed, n: Vector, f: Vector, qdd: Any) -> list[Value]:
     """Return tau of the link's dofs for the force (n; f) that its hinge transmits."""
     forces = hinge_entries(link, place, n, f)
-    return [force + a * qdd(dof) for force, a, dof in zip(forces, link.armature, link.dofs, strict=True)]
+    return [force + own for force, own in zip(forces, armature_forces(link, qdd), strict=True)]
 
 
 def root_force(
@@ -74,6 +74,7 @@ def inverse_dynamics(
     qdd, moves = qdd or trace.vector("qdd"), "qd" in trace.inputs
     alpha: dict[int, tuple[Vector, Vector]] = {}
     forces: dict[int, Vector] = {}
+    shared: dict[int, Value] = {}  # of dofs that several links share
     stores = []
     for link, outward in trace.traversal():
         key = id(link)
@@ -95,7 +96,12 @@ def inverse_dynamics(
             tau = hinge_force(link, trace.places[key], n, f, qdd)
         else:
             tau = root_force(link, trace.places[key], n, f, mass, alpha[key][1], base, qdd)
-        stores += [Store("out", (dof,), value) for dof, value in zip(link.dofs, tau, strict=True)]
+        if link.group is None:
+            stores += [Store("out", (dof,), value) for dof, value in zip(link.dofs, tau, strict=True)]
+        else:
+            for dof, value in zip(link.dofs, tau, strict=True):
+                shared[dof] = shared.get(dof, 0.0) + value
+            stores += [Store("out", (dof,), shared[dof]) for dof in link.dofs if link.closes]
         if link.parent is not None:
             n, f = trace.places[key].pose.force_to_parent(n, f)
             forces[key] = Vector((*n, *f))

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import ZERO, Vector, cross
-from . import articulated
-from .articulated_sweeps import factor_tree, mirror, pivots, propagate_inward, weighted_products
+from . import articulated, groups
+from .articulated_sweeps import NO_FORCE, factor_tree, mirror, pivots, propagate_inward, weighted_products
 from .kinematics import accelerations_of_frames, frame_on_link, place_all, place_axes
 from .links import Link
 from .motion import STILL
+from .newton_euler import link_acceleration
 
 if TYPE_CHECKING:
     from .tracing import Trace
@@ -46,23 +47,33 @@ def operational_inertia_inverse_product(trace: Trace, frames: tuple) -> list[Sto
     """out [frame, 6] = J Mass^-1 J* x: wrenches x on the frames inward, the accelerations that they make outward"""
     place_all(trace)
     done = factor_tree(trace)
-    forces: dict[int, Vector] = {id(link): Vector((*ZERO, *ZERO)) for link in trace.links.links}
+    forces: dict[int, Vector] = {id(link): NO_FORCE for link in trace.links.links}
     for key, wrench in wrenches_on_links(trace, frames).items():
         forces[key] = forces[key] - wrench
     rates: dict[int, list[Value]] = {}
     for link in reversed(trace.links.links):
         trace.label(link, "z")
         key, still = id(link), [0.0] * len(link.dofs)
-        rates[key], force = articulated.reduce_link(link, trace.places[key], done[key], STILL, forces[key], still)
+        if link.group is None:
+            rates[key], force = articulated.reduce_link(link, trace.places[key], done[key], STILL, forces[key], still)
+        elif link.leads:
+            rates[key], _, force = groups.reduce(done[key], trace.places, {}, forces, still)
+        else:
+            continue
         if link.parent is not None:
             forces[id(link.parent)] = forces[id(link.parent)] + force
+    shared: dict[int, Value] = {}
     alpha: dict[int, tuple[Vector, Vector]] = {}
     for link in trace.links.links:
         trace.label(link, "a")
         above = (ZERO, ZERO) if link.parent is None else alpha[id(link.parent)]
-        _, alpha[id(link)] = articulated.expand_link(
-            link, trace.places[id(link)], done[id(link)], rates[id(link)], STILL, above
-        )
+        place = trace.places[id(link)]
+        if link.group is None:
+            _, alpha[id(link)] = articulated.expand_link(link, place, done[id(link)], rates[id(link)], STILL, above)
+            continue
+        if link.leads:
+            shared |= zip(link.dofs, groups.expand(done[id(link)], rates[id(link)], above)[0], strict=True)
+        alpha[id(link)] = link_acceleration(link, place, STILL, above, shared.__getitem__)
     return accelerations_of_frames(trace, frames, alpha)
 
 

@@ -43,7 +43,7 @@ class Step:
     """
 
     def __init__(self, trace: Trace):
-        self.trace, self.links = trace, trace.own_links
+        self.trace, self.links = trace, [link for link in trace.own_links if link.leads]
         trace.compensate_gravity()
         vector, given = trace.vector, trace.inputs
         self.h = trace.graph.input("dt", 0)
@@ -142,7 +142,7 @@ class Step:
 
     def _weightless(self, link: Link) -> bool:
         """Whether the link's one dof carries no mass and has a law with bounds, so that forces alone move it."""
-        bare = len(link.dofs) == 1 and is_number(link.armature[0], 0.0) and carries_nothing(link)
+        bare = len(link.dofs) == 1 and link.group is None and is_number(link.armature[0], 0.0) and carries_nothing(link)
         return bare and any(law.bends for law in self.laws[link.dofs[0]])
 
     def _solved(self, gains: dict[int, Value]) -> dict[int, Value]:
@@ -226,7 +226,7 @@ class Step:
         dofs = sorted(dof for link in self.links for dof in link.dofs)
         wide = ((link.coordinate, link.hinge.coordinates) for link in self.links)
         coordinates = sorted(first + c for first, count in wide for c in range(count))
-        own = {*map(id, self.links)} | (set() if trace.piece and trace.piece.index else {id(None)})
+        own = {*map(id, trace.own_links)} | (set() if trace.piece and trace.piece.index else {id(None)})
         bodies = sorted(body for body, seat in trace.links.seats.items() if id(seat.link) in own)
         for name in trace.inputs:
             if name in ("q", "target_q", "q_from"):

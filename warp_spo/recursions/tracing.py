@@ -68,10 +68,11 @@ class Trace:
         self.axes: dict[int, Matrix] = {}
         self.compensates = False
         self.stiffened: Callable[[Link], Link] = lambda link: link
-        self.bodies: dict[int, list[int]] = {}  # by link: the bodies that sit on it
-        for body, seat in links.seats.items():
-            if seat.link is not None:
-                self.bodies.setdefault(id(seat.link), []).append(body)
+        self.bodies: dict[int, list[int]] = {}  # by link: the bodies whose centre of mass is on it
+        for body in links.seats:
+            link, _ = links.center(body)
+            if link is not None:
+                self.bodies.setdefault(id(link), []).append(body)
 
     # -- inputs ----------------------------------------------------------------------------------------------------
     def vector(self, name: str) -> Callable[[int], Value]:
@@ -111,9 +112,8 @@ class Trace:
             return Vector((*n, *f))
         axes = self.axes[id(link)]
         for body in self.bodies.get(id(link), ()):
-            seat = self.links.seats[body]
             entries = Vector(self.graph.input("body_f", body, c) for c in range(6))
-            com = seat.offset + seat.matrix @ self.links.nodes[body].com
+            _, com = self.links.center(body)
             n_body, f_body = newton_euler.wrench(axes, com, Vector(entries[:3]), Vector(entries[3:]))
             n, f = n + n_body, f + f_body
         return Vector((*n, *f))

@@ -30,6 +30,7 @@ from .checks import checked_array, checked_unit, read_only
 from .checks import checked_inertia as checked_inertia
 from .checks import real as real
 from .gears import Rotor, checked_flexible, motor_and_deflection, resolve_rotor
+from .modes import Modes
 from .storage import StoredPart, check_function
 
 IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -61,7 +62,7 @@ def checked_pose(call: str, name: str, value: Any) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Body(StoredPart):
-    """A rigid body.
+    """A body, rigid unless it has ``modes``.
 
     No distribution of positive mass has a largest principal moment that exceeds the sum of the others, or a negative
     one. Robot files have both. ``any_inertia=True`` accepts them; results can be trusted as long as the mass matrix is
@@ -77,24 +78,24 @@ class Body(StoredPart):
             MuJoCo's attribute of that name. The force belongs to :meth:`Dynamics.passive_force` and to
             :meth:`Dynamics.step`; other calls leave it out.
         any_inertia: whether to accept every symmetric inertia.
+        modes: elastic deformation; None: the body is rigid.
 
     Raises:
         ValueError: a value is invalid; the message names it.
-        UnsupportedError: ``modes`` (flexible bodies) is reserved.
     """
 
     mass: float
     com: Any = (0.0, 0.0, 0.0)
     inertia: Any = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     label: str = ""
-    modes: Any = None
+    modes: Modes | None = None
     gravcomp: float = 0.0
     any_inertia: bool = False
 
     def __post_init__(self) -> None:
         call = f"Body({self.label!r})" if self.label else "Body"
-        if self.modes is not None:
-            raise UnsupportedError(call, "a flexible body (modes=)", "leave modes out for a rigid body")
+        if self.modes is not None and not isinstance(self.modes, Modes):
+            raise TypeError(f"{call}: modes is {self.modes!r}; expected spo.Modes")
         object.__setattr__(self, "mass", float(checked_array(call, "mass [kg]", self.mass, ())))
         object.__setattr__(self, "gravcomp", float(checked_array(call, "gravcomp", self.gravcomp, ())))
         object.__setattr__(self, "com", checked_array(call, "com [m]", self.com, (3,)))
@@ -347,6 +348,11 @@ class Loop(StoredPart):
     child_pose: Any = IDENTITY_POSE
     label: str = ""
     screws: tuple = dataclasses.field(init=False, repr=False)
+
+    @property
+    def ends(self) -> list[tuple[int, Any]]:
+        """The two bodies, each with the pose of the joint's anchor in it."""
+        return [(self.parent, self.parent_pose), (self.child, self.child_pose)]
 
     def __post_init__(self) -> None:
         if self.kind in ("custom", *KINDS[len(CLOSING) :]):

@@ -15,6 +15,7 @@ import numpy as np
 from ..errors import refuse_masked
 from .actuators import RANGES, Actuator, Keyframe, actuator_values, check_actuator_value
 from .checks import SYMMETRY
+from .modes import check_modes, with_modes
 from .parts import (
     DOF_VALUES,
     Body,
@@ -31,6 +32,7 @@ from .parts import (
 from .storage import Stored
 from .tree import Tree
 
+HINGE_VALUES = {name.removeprefix("joint_"): value for name, value in DOF_VALUES.items()}
 NOT_NEGATIVE = (
     "body_mass",
     "joint_damping",
@@ -120,6 +122,7 @@ class Scene(Stored):
         self.loops, self.couplings = _parts("loops", loops, Loop), _parts("couplings", couplings, Coupling)
         self.actuators = _parts("actuators", actuators, Actuator)
         self._check_indices()
+        self.hinges = tuple(with_modes(hinge, self.bodies[hinge.child].modes, HINGE_VALUES) for hinge in self.hinges)
         self.hinge_of = np.empty(len(self.bodies), dtype=np.int32)
         for index, hinge in enumerate(self.hinges):
             self.hinge_of[hinge.child] = index
@@ -157,6 +160,7 @@ class Scene(Stored):
         self.dof_index = np.arange(self.dof_count)[None]
         self.sites = MappingProxyType({name: self._site(name, *site) for name, site in sites.items()})
         self.keyframes = MappingProxyType({name: self._keyframe(name, key) for name, key in keyframes.items()})
+        check_modes(self)
 
     def _site(self, name: str, body: int, pose: Any) -> tuple[int, tuple[float, ...]]:
         """Return the body and the checked pose of a site."""
@@ -253,8 +257,13 @@ class Scene(Stored):
 
     @property
     def node_sizes(self) -> tuple[int, ...]:
-        """The paper's m_k, which is 6 for a rigid body."""
-        return (6,) * self.body_count
+        """The paper's m_k, which is 6 for a rigid body, and 6 and its modes for a flexible one."""
+        return tuple(6 + (0 if body.modes is None else body.modes.count) for body in self.bodies)
+
+    @property
+    def shares_dofs(self) -> bool:
+        """Whether bodies have modes, so that one dof moves several links."""
+        return any(body.modes is not None for body in self.bodies)
 
     @property
     def hinge_sizes(self) -> tuple[int, ...]:
@@ -275,18 +284,26 @@ class Scene(Stored):
     def dof_labels(self) -> list[str]:
         """The labels of the entries of qd. They are the hinges' labels, with ``:0``, ``:1``, ... if several.
 
-        Those of a flexible hinge end in ``:motor`` and ``:deflection``.
+        Those of a flexible hinge end in ``:motor`` and ``:deflection``; those of a body's modes are the label of its
+        hinge with ``/modes:0``, ``/modes:1``, ...
         """
-        return [
-            label if hinge.dof_count == 1 else f"{label}:{('motor', 'deflection')[i] if hinge.flexible else i}"
-            for label, hinge in zip(self.joint_labels, self.hinges, strict=True)
-            for i in range(hinge.dof_count)
-        ]
+        found = []
+        for label, hinge in zip(self.joint_labels, self.hinges, strict=True):
+            modes = getattr(self.bodies[hinge.child].modes, "count", 0)
+            own = hinge.dof_count - modes
+            ends = ("motor", "deflection") if hinge.flexible else range(own)
+            found += [label if own == 1 else f"{label}:{end}" for end in ends]
+            found += [f"{label}/modes:{i}" for i in range(modes)]
+        return found
 
     @property
     def deflections(self) -> tuple[int, ...]:
-        """The dofs that are the deflection of a flexible hinge, of which every coordinate is a scalar."""
-        return tuple(int(first) + 1 for first, hinge in zip(self.qd_start, self.hinges, strict=False) if hinge.flexible)
+        """The dofs that are the deflection of a flexible hinge, or the modes of a body: forces move them, not commands."""
+        found: list[int] = []
+        for first, end, hinge in zip(self.qd_start, self.qd_start[1:], self.hinges, strict=False):
+            modes = getattr(self.bodies[hinge.child].modes, "count", 0)
+            found += range(int(first) + 1 if hinge.flexible else int(end) - modes, int(end))
+        return tuple(found)
 
     @property
     def ties(self) -> str:

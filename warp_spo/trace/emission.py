@@ -39,6 +39,14 @@ class Store(NamedTuple):
     value: Value
 
 
+def merge(stores: list[Store]) -> list[Store]:
+    """Return stores in which those of the same entry are added up."""
+    found: dict[tuple, Value] = {}
+    for array, index, value in stores:
+        found[array, index] = found[array, index] + value if (array, index) in found else value
+    return [Store(*at, value) for at, value in found.items()]
+
+
 def literal(x: float, dtype: str) -> str:
     """Return the C++ literal of a number in the scalar type ``dtype``."""
     if x != x:

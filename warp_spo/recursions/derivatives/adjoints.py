@@ -93,7 +93,7 @@ def forward_dynamics_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
     power = Power(trace, lambda dof: -solved(dof), qdd)
     others = tuple(name for name in wrt if name != "tau")
     stores = power.stores + gradient_stores(trace, power.ways, others, wrt)
-    dofs = [dof for link in trace.own_links for dof in link.dofs] if "tau" in wrt else []
+    dofs = [dof for link in trace.own_links for dof in link.dofs if link.leads] if "tau" in wrt else []
     return stores + [Store(result_name("tau", wrt), (dof,), solved(dof)) for dof in dofs]
 
 
@@ -194,7 +194,7 @@ def step_vjp(trace: Trace, wrt: tuple[str, ...], equations: TreeEquations | None
     trace.compensate_gravity()
     qdd, qd, h = trace.vector("qdd"), trace.vector("qd"), trace.graph.input("dt", 0)
     pushed = trace.vector("q_cotangent"), trace.vector("qd_cotangent")
-    links = trace.links.links
+    links = trace.links.leaders
     dofs = [dof for link in links for dof in link.dofs]
     after = {dof: qd(dof) + h * qdd(dof) for dof in dofs}
     state = [Store("out", (dof,), rate) for dof, rate in after.items()]
@@ -278,9 +278,11 @@ def entries(trace: Trace, name: str, found: dict[tuple, Value]) -> Iterable[tupl
     elif name in ACTUATOR_VALUES:
         return _value_entries(trace, name, found)
     elif name in COORDINATES:
-        places = [(link.coordinate + c,) for link in trace.own_links for c in range(link.hinge.coordinates)]
+        places = [
+            (link.coordinate + c,) for link in trace.own_links for c in range(link.hinge.coordinates) if link.leads
+        ]
     else:
-        places = [(dof,) for link in trace.own_links for dof in link.dofs]
+        places = [(dof,) for link in trace.own_links for dof in link.dofs if link.leads]
     return [(place, found.get((name, *place), 0.0)) for place in places]
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ...trace.emission import Store
+from ...trace.emission import Store, merge
 from ...trace.scalars import Value
 from ...trace.spatial import ZERO, Rigid, Vector, cross, dot
 from .. import composite, motion, newton_euler
@@ -67,7 +67,11 @@ def inverse_dynamics_derivatives(trace: Trace) -> list[Store]:
             carried[key] = sensitivity.to_parent(place, drifts[key], all_in)
             forces[key] = place.pose.force_to_parent(n, f)
         stores += _entries(trace, link, all_in, (n, f), own, drifts)
-    return stores
+        if link.group is not None and link.leads:
+            for (i, j), x in link.group.coupled.items():
+                a, b = link.dofs[i], link.dofs[j]
+                stores += [Store("out", (QDD, a, b), x), Store("out", (QDD, b, a), x)]
+    return merge(stores) if trace.links.shared else stores
 
 
 def _wrenches(trace: Trace, link: Link) -> list[tuple[Vector, Vector, Vector]]:
@@ -76,9 +80,8 @@ def _wrenches(trace: Trace, link: Link) -> list[tuple[Vector, Vector, Vector]]:
     if "body_f" in trace.inputs:
         back = trace.axes[id(link)].T
         for body in trace.bodies.get(id(link), ()):
-            seat = trace.links.seats[body]
             entries = [trace.graph.input("body_f", body, c) for c in range(6)]
-            com = seat.offset + seat.matrix @ trace.links.nodes[body].com
+            _, com = trace.links.center(body)
             found.append((com, back @ Vector(entries[:3]), back @ Vector(entries[3:])))
     return found
 
@@ -151,7 +154,9 @@ def mass_matrix_derivative(trace: Trace) -> list[Store]:
         for child in link.children:
             pose = trace.places[id(child)].pose
             body = body + pose.rigid_to_parent(bodies[id(child)])
-            below |= {dof: pose.force_to_parent(n, f) for dof, (n, f) in tails[id(child)].items()}
+            for dof, tail in tails[id(child)].items():
+                n, f = pose.force_to_parent(*tail)
+                below[dof] = (below[dof][0] + n, below[dof][1] + f) if dof in below else (n, f)
         bodies[key] = body
         momenta = {dof: body.apply(w, v) for dof, (w, v) in heads[key].items()}
         tails[key] = below | {dof: momenta[dof] for dof in link.dofs}
@@ -167,7 +172,7 @@ def mass_matrix_derivative(trace: Trace) -> list[Store]:
                             continue
                         value = value + _power(changes[j], momenta[i])
                     stores += [Store("out", (*at, dof), value) for at in {(i, j), (j, i)}]
-    return stores
+    return merge(stores) if trace.links.shared else stores
 
 
 def _column_changes(link: Link, place: Placed, heads: dict, dof: int) -> dict[int, tuple[Vector, Vector]]:

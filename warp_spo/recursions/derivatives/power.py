@@ -16,7 +16,7 @@ from ...trace.emission import Store
 from ...trace.scalars import Value, cut, is_constant, ordered
 from ...trace.spatial import ZERO, Matrix, Rigid, Vector, cross, dot, skew
 from ..links import Link, Placed
-from ..motion import hinge_motion, own_bias, whirl
+from ..motion import armature_forces, hinge_motion, own_bias, whirl
 
 if TYPE_CHECKING:
     from ..tracing import Trace
@@ -140,12 +140,13 @@ class Power:
 
         before, dofs = _flat(carried.apart[:5]), link.dofs
         rates, weights = [self.qdd(dof) for dof in dofs], [self.multiplier(dof) for dof in dofs]
-        forces = [a * x for a, x in zip(link.armature, rates, strict=True)]
+        forces = armature_forces(link, self.qdd)
         ends = [*before, *rates, *weights]
         bars, axes = self._back([*_flat(moved), *forces], [*bars[:15], *weights], ends), bars[15:]
         for dof, bar in zip(dofs, bars[15:], strict=False):
             self._add(("qdd", dof), bar)
-        self.forces |= {dof: bar + f for dof, bar, f in zip(dofs, bars[15 + len(dofs) :], forces, strict=True)}
+        for dof, bar, f in zip(dofs, bars[15 + len(dofs) :], forces, strict=True):
+            self.forces[dof] = self.forces.get(dof, 0.0) + bar + f
         bars = [*bars[:15], *axes]
 
         turn = self.trace.places[id(link)].pose.turn or ()

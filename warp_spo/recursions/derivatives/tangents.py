@@ -15,6 +15,8 @@ def tangent_gradient(trace: Trace, gradient: dict[tuple, Value]) -> list[tuple[t
     """Return (index, value) of the gradient along tangent coordinates, for the ``gradient`` by entries of q."""
     entries: list[tuple[tuple[int, ...], Value]] = []
     for link in trace.own_links:
+        if not link.leads:
+            continue
         trace.label(link, "g")
         own = [gradient.get(("q", link.coordinate + i), 0.0) for i in range(link.hinge.coordinates)]
         along = link.hinge.tangent(link, trace.places[id(link)], trace.vector("q"), own)
@@ -25,7 +27,7 @@ def tangent_gradient(trace: Trace, gradient: dict[tuple, Value]) -> list[tuple[t
 def coordinate_directions(trace: Trace, rate: Entry) -> dict[int, Value]:
     """Return the rates of the entries of q for rates of the tangent coordinates, by dof."""
     found: dict[int, Value] = {}
-    for link in trace.links.links:
+    for link in trace.links.leaders:
         trace.label(link, "g")
         rates = [rate(dof) for dof in link.dofs]
         values = link.hinge.untangent(link, trace.places[id(link)], trace.vector("q"), rates)

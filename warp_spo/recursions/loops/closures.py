@@ -266,7 +266,7 @@ def _complement(axes: list[np.ndarray]) -> list[np.ndarray]:
 def closures(links: Links) -> list[Closure | Ratio]:
     """Return the constraints of a scene: of its loop joints, then of its couplings."""
     scene = links.scene
-    by_dof = {link.dofs[0]: link for link in links.links}
+    by_dof = {dof: link for link in links.leaders for dof in link.dofs}
     found: list[Closure | Ratio] = [Closure(links, loop) for loop in scene.loops]
     for coupling in scene.couplings:
         follower, leader = (by_dof[int(scene.qd_start[h])] for h in (coupling.hinge, coupling.reference))

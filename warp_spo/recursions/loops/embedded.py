@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ...trace.emission import Store
 from ...trace.scalars import Value
-from ...trace.spatial import ZERO, Articulated, Pose, Vector, total
+from ...trace.spatial import Articulated, Vector, total
 from .. import articulated, newton_euler
-from ..articulated import NO_INERTIA
+from ..articulated import HERE, NO_INERTIA
 from ..links import Link
 from . import clusters as aggregates
 from .closures import Closure, Ratio, closures
@@ -23,8 +23,6 @@ from .nullspace import Basis, NullSpace
 
 if TYPE_CHECKING:
     from ..tracing import Trace
-
-HERE = Pose(None, None, ZERO)
 
 
 class Embedding(NamedTuple):
