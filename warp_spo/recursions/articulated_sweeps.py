@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant
@@ -17,17 +17,19 @@ from .newton_euler import link_acceleration
 if TYPE_CHECKING:
     from .tracing import Trace
 
+Factors = dict[int, Any]
+"""The factor of every link by id, of :mod:`.articulated`; at the leader of a group the factor of :mod:`.groups`."""
 NO_FORCE = Vector((*ZERO, *ZERO))
 
 
-def factor_tree(trace: Trace) -> dict[int, articulated.Factor]:
+def factor_tree(trace: Trace) -> Factors:
     """Return the factor of every link, by id."""
     return factor(trace)[0]
 
 
-def factor(trace: Trace) -> tuple[dict[int, articulated.Factor], list[Store]]:
+def factor(trace: Trace) -> tuple[Factors, list[Store]]:
     """Return the factors of every link, by id, and the stores that send them to other pieces."""
-    done: dict[int, articulated.Factor] = {}
+    done: Factors = {}
     inner: dict[int, Articulated] = {}
     stores: list[Store] = []
     for link, outward in trace.traversal():
@@ -39,7 +41,7 @@ def factor(trace: Trace) -> tuple[dict[int, articulated.Factor], list[Store]]:
     return done, stores
 
 
-def eliminate(trace: Trace, link: Link, done: dict[int, articulated.Factor], inner: dict[int, Articulated]) -> None:
+def eliminate(trace: Trace, link: Link, done: Factors, inner: dict[int, Articulated]) -> None:
     """Add the factor of a link to ``done``, and P+ in its parent's frame to ``inner``, after its children's."""
     trace.label(link, "P")
     carried = trace.from_children(link, "P", inner, Articulated.unpacked)
@@ -83,7 +85,7 @@ def reduce(
         tau: force of a dof. moves: links have velocities. loads: subtract the external wrenches.
         letters: of the messages to other pieces; "P" among them sends the articulated inertias.
     """
-    done: dict[int, articulated.Factor] = {}
+    done: Factors = {}
     rates: dict[int, list[Value]] = {}
     inner: dict[int, Articulated] = {}
     forces: dict[int, Vector] = {}
@@ -116,7 +118,7 @@ def reduce(
 
 
 def expand(
-    trace: Trace, done: dict, rates: dict, base: tuple[Vector, Vector], letter: str = "a", name: str = "out"
+    trace: Trace, done: Factors, rates: dict, base: tuple[Vector, Vector], letter: str = "a", name: str = "out"
 ) -> list[Store]:
     """Sweep outward: return stores of qdd in the array ``name``, for ``rates`` of :func:`reduce`."""
     alpha: dict[int, tuple[Vector, Vector]] = {}
@@ -147,7 +149,9 @@ def expand(
     return stores
 
 
-def propagate_inward(trace: Trace, done: dict, link: Link, force: Vector, right: list[Value]) -> dict[int, list[Value]]:
+def propagate_inward(
+    trace: Trace, done: Factors, link: Link, force: Vector, right: list[Value]
+) -> dict[int, list[Value]]:
     """Return D^-1 [I - H psi K] of ``right`` at a link's dofs and a ``force`` on it, by link on the way to the root."""
     rates, over = {}, link
     while True:
@@ -197,7 +201,7 @@ def pack(stores: list[Store]) -> list[Store]:
     return [Store("out", (i,), entries[index]) for i, index in enumerate(sorted(entries))]
 
 
-def pivots(done: dict[int, articulated.Factor]) -> tuple[dict[int, list[Value]], Value]:
+def pivots(done: Factors) -> tuple[dict[int, list[Value]], Value]:
     """Return D by link; and NaN, or zero, for lost pivots that no other result would show."""
     return {key: [pivot.D for pivot in factor.pivots] for key, factor in done.items()}, total(
         factor.nothing for factor in done.values()

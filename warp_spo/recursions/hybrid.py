@@ -14,7 +14,7 @@ from ..trace.scalars import Value, is_constant, select
 from ..trace.spatial import Articulated, Pose, Vector, dot, total
 from . import articulated, groups, newton_euler
 from .articulated import LEAST, NO_INERTIA, Factor, Pivot
-from .articulated_sweeps import NO_FORCE, inside, total_inertia
+from .articulated_sweeps import NO_FORCE, Factors, inside, total_inertia
 from .links import Link, Placed
 from .motion import Motion, carry_acceleration
 
@@ -119,7 +119,7 @@ def hybrid_dynamics(trace: Trace, mask: tuple[bool, ...] | None = None) -> list[
     prescribed = trace.vector("prescribed") if mask is None else lambda dof: float(mask[dof])
     tau, qdd, moves = trace.vector("tau"), trace.vector("qdd"), "qd" in trace.inputs
     given: dict[int, Given] = {}
-    done: dict[int, articulated.Factor] = {}
+    done: Factors = {}
     rates: dict[int, list[Value]] = {}
     heads: dict[int, list[Value]] = {}
     inner: dict[int, Articulated] = {}

@@ -65,7 +65,7 @@ class Links:
         self.tables: dict[str, dict[Scalar, int]] = {table: {} for table in TABLES}
         self.reverses: dict[Any, Any] = {}
         self.flexible: dict[int, Flexible] = {}
-        self.ports: dict[tuple[int, Any], Seat] = {}
+        self.ports: dict[tuple, Seat] = {}
         self.values = {name: self._symbols(name, name in variable) for name in LINK_VALUES}
         self.gravity = Vector(self.values["gravity"].tolist())
         self.poses = {name: [pose_of(p) for p in self.values[name]] for name in ("joint_X_p", "joint_X_c")}

@@ -44,7 +44,7 @@ def merge(stores: list[Store]) -> list[Store]:
     found: dict[tuple, Value] = {}
     for array, index, value in stores:
         found[array, index] = found[array, index] + value if (array, index) in found else value
-    return [Store(*at, value) for at, value in found.items()]
+    return [Store(array, index, value) for (array, index), value in found.items()]
 
 
 def literal(x: float, dtype: str) -> str:
