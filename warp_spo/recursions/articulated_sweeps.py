@@ -41,7 +41,9 @@ def factor(trace: Trace) -> tuple[Factors, list[Store]]:
     return done, stores
 
 
-def eliminate(trace: Trace, link: Link, done: Factors, inner: dict[int, Articulated]) -> None:
+def eliminate(
+    trace: Trace, link: Link, done: Factors, inner: dict[int, Articulated], factor: Callable = articulated.factor
+) -> None:
     """Add the factor of a link to ``done``, and P+ in its parent's frame to ``inner``, after its children's."""
     trace.label(link, "P")
     carried = trace.from_children(link, "P", inner, Articulated.unpacked)
@@ -57,8 +59,8 @@ def eliminate(trace: Trace, link: Link, done: Factors, inner: dict[int, Articula
         return
     through = [inside(trace, child, done) for child in link.children if id(child) in done]
     place = trace.places[id(link)]
-    done[id(link)] = factor = articulated.factor(trace.stiffened(link), place, carried, through, trace.epsilon)
-    inner[id(link)] = factor.in_parent
+    done[id(link)] = found = factor(trace.stiffened(link), place, carried, through, trace.epsilon)
+    inner[id(link)] = found.in_parent
 
 
 def total_inertia(link: Link, carried: list[Articulated]) -> Articulated:

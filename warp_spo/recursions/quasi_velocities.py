@@ -7,37 +7,38 @@ the forces, over sqrt(D). C does no work, nu . C = 0. Jain, Rodriguez 1995, "Dia
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..trace.differentiation import forward
 from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant, ordered, sqrt
-from ..trace.spatial import ZERO, Vector, dot
-from . import articulated, hybrid
+from ..trace.spatial import ZERO, Articulated, Vector, dot, total
+from . import articulated, groups, hybrid
+from .articulated_sweeps import Factors, eliminate
 from .derivatives.tangents import coordinate_directions
 from .motion import carry_acceleration, link_motion
 
 if TYPE_CHECKING:
-    from .links import Link
+    from .links import Link, Placed
     from .tracing import Trace
 
-Factors = dict[int, articulated.Factor]
 Entry = Callable[[int], Value]
 
 
 def factor_by_dofs(trace: Trace) -> Factors:
     """Return the factors of every link in the coordinates of qd: Mass = U D U*, U unit upper triangular."""
     done: Factors = {}
+    inner: dict[int, Articulated] = {}
     for link, outward in trace.traversal():
         if outward:
             trace.place(link)
-            continue
-        trace.label(link, "P")
-        carried = [done[id(child)].in_parent for child in link.children]
-        through = [(trace.places[id(child)].pose, done[id(child)].P) for child in link.children]
-        free = [0.0] * len(link.dofs)
-        done[id(link)] = hybrid.factor(link, trace.places[id(link)], free, carried, through, trace.epsilon)
+        else:
+            eliminate(trace, link, done, inner, _factor)
     return done
+
+
+def _factor(link: Link, place: Placed, *carried: Any) -> articulated.Factor:
+    return hybrid.factor(link, place, [0.0] * len(link.dofs), *carried)
 
 
 def quasi_velocities(trace: Trace) -> list[Store]:
@@ -72,12 +73,30 @@ def _scale(trace: Trace, done: Factors, qd: Entry) -> dict[int, Value]:
     for link in trace.links.links:
         trace.label(link, "v")
         V = _carry(trace, link, velocity)
+        if link.group is not None:
+            for dof, pivot in zip(link.dofs, done[id(link)].pivots[::-1], strict=False):
+                nu[dof] = sqrt(pivot.D) * (qd(dof) + pivot.inverse * _felt(trace, link, pivot, velocity, qd))
+            velocity[id(link)] = _moved(done, link, V, qd)
+            continue
         for dof, pivot in zip(link.dofs, done[id(link)].pivots[::-1], strict=True):
             eta = qd(dof) + pivot.inverse * dot(pivot.U, V)
             nu[dof] = sqrt(pivot.D) * eta
             V = V + pivot.column * qd(dof)
         velocity[id(link)] = V
     return nu
+
+
+def _felt(trace: Trace, link: Link, pivot: groups.Pivot, velocity: dict[int, Vector], qd: Entry) -> Value:
+    """Return U* V(p) of a group's pivot, and what the rates before it add."""
+    above = Vector((*ZERO, *ZERO)) if link.parent is None else velocity[id(link.parent)]
+    return dot(pivot.U, above) + total(x * qd(link.dofs[i]) for i, x in enumerate(pivot.row))
+
+
+def _moved(done: Factors, link: Link, V: Vector, qd: Entry) -> Vector:
+    """Return V and the velocities that the rates of a group give one of its links."""
+    for dof, column in zip(link.dofs, done[id(link.group.links[0])].columns[id(link)], strict=True):  # type: ignore[union-attr]
+        V = V + column * qd(dof)
+    return V
 
 
 def _unscale(trace: Trace, done: Factors, nu: Entry) -> dict[int, Value]:
@@ -87,6 +106,12 @@ def _unscale(trace: Trace, done: Factors, nu: Entry) -> dict[int, Value]:
     for link in trace.links.links:
         trace.label(link, "v")
         V = _carry(trace, link, velocity)
+        if link.group is not None:
+            for dof, pivot in zip(link.dofs, done[id(link)].pivots[::-1], strict=False):
+                known = _felt(trace, link, pivot, velocity, qd.__getitem__)
+                qd[dof] = pivot.inverse * (sqrt(pivot.D) * nu(dof) - known)
+            velocity[id(link)] = _moved(done, link, V, qd.__getitem__)
+            continue
         for dof, pivot in zip(link.dofs, done[id(link)].pivots[::-1], strict=True):
             qd[dof] = pivot.inverse * (sqrt(pivot.D) * nu(dof) - dot(pivot.U, V))
             V = V + pivot.column * qd[dof]
@@ -119,6 +144,7 @@ def _accelerate(trace: Trace, done: Factors, tau: Entry, base: tuple[Vector, Vec
     """
     rates: dict[int, list[Value]] = {}
     forces: dict[int, Vector] = {}
+    waiting: dict[int, Vector] = {}  # z of the links of groups
     for link in reversed(trace.links.links):
         trace.label(link, "z")
         key, move = id(link), trace.motions[id(link)]
@@ -126,6 +152,12 @@ def _accelerate(trace: Trace, done: Factors, tau: Entry, base: tuple[Vector, Vec
         for child in link.children:
             z = z + forces[id(child)]
         rates[key] = []
+        if link.group is not None:
+            waiting[key], forces[key] = z, Vector((*ZERO, *ZERO))
+            if link.leads:  # which comes last
+                right = [tau(dof) for dof in link.dofs]
+                rates[key], _, forces[key] = groups.reduce(done[key], trace.places, trace.motions, waiting, right)
+            continue
         for pivot, dof in zip(done[key].pivots, link.dofs[::-1], strict=True):
             rate, z = articulated.reduce_pivot(pivot, z, tau(dof))
             rates[key].append(rate)
@@ -138,6 +170,10 @@ def _accelerate(trace: Trace, done: Factors, tau: Entry, base: tuple[Vector, Vec
         above = base if link.parent is None else alpha[id(link.parent)]
         w, v = carry_acceleration(trace.places[key], move, above)
         alpha[key] = w, v = w + move.bias_w, v + move.bias_v
+        if link.group is not None:
+            for dof, pivot, rate in zip(link.dofs, done[key].pivots[::-1], rates[key][::-1], strict=False):
+                found[dof] = sqrt(pivot.D) * (rate - pivot.inverse * dot(pivot.U, (*above[0], *above[1])))
+            continue
         for dof, pivot, rate in zip(link.dofs, done[key].pivots[::-1], rates[key][::-1], strict=True):
             found[dof] = sqrt(pivot.D) * (rate - pivot.share(dot(pivot.U, (*w, *v))))
     return found
