@@ -15,21 +15,28 @@ from warp_spo.examples import (
     floating_arm,
     fourbar,
     gripper,
+    harmonic_drive,
     identify,
     options,
     parts,
     reach,
     slider_crank,
+    star,
+    tether,
 )
 
 FOLDER = Path(parts.__file__).parent
 
 
-@pytest.mark.parametrize(
-    ("module", "lines"), [(floating_arm, 100), (identify, 100), (reach, 100), (double_fourbar, 60)]
-)
-def test_is_short(module, lines):
-    assert len(Path(module.__file__).read_text().splitlines()) < lines
+SHORT = {
+    **dict.fromkeys((floating_arm, identify, reach), 100),
+    **dict.fromkeys((double_fourbar, harmonic_drive, star, tether), 60),
+}
+
+
+@pytest.mark.parametrize("module", SHORT)
+def test_is_short(module):
+    assert len(Path(module.__file__).read_text().splitlines()) < SHORT[module]
 
 
 def test_a_floating_arm_draws_its_circle(tmp_path):
@@ -44,6 +51,25 @@ def test_a_double_fourbar_ends_where_the_benchmark_says(tmp_path, device):
     assert np.abs(position - (0.328457, 0.944519)).max() <= 1e-5  # [m], as promised; 1.2e-6 here
     assert np.abs(velocity - (1.423050, -0.494867)).max() <= 1e-5  # [m/s]; 2.0e-6 here
     assert_is_whole((tmp_path / "rods.svg").read_text())
+
+
+def test_a_harmonic_drive_rings_as_its_closed_form_says(tmp_path, device):
+    assert harmonic_drive.main(device=str(device), picture=tmp_path / "drive.svg") <= 1e-6  # 2e-7 here, of order dt^4
+    assert_is_whole((tmp_path / "drive.svg").read_text())
+
+
+@pytest.mark.parametrize(("seconds", "near"), [(0.2, 1.1), pytest.param(4.0, 2e-3, marks=pytest.mark.slow)])
+def test_a_star_keeps_its_angular_momentum(seconds, near, tmp_path, device):
+    open_by, change = star.main(seconds, device=str(device), picture=tmp_path / "star.svg")
+    assert open_by <= near and change <= 1e-5  # 1e-3 rad and 3e-6 after 4 s here
+    assert_is_whole((tmp_path / "star.svg").read_text())
+
+
+@pytest.mark.parametrize(("seconds", "left"), [(0.5, 0.97), pytest.param(4.0, 2e-3, marks=pytest.mark.slow)])
+def test_a_tether_falls_into_its_catenary(seconds, left, tmp_path, device):
+    errors = tether.main(seconds, worlds=2, device=str(device), picture=tmp_path / "tether.svg")
+    assert (errors[-1] <= left * errors[0]).all()
+    assert_is_whole((tmp_path / "tether.svg").read_text())
 
 
 def test_masses_and_damping_are_found_again(tmp_path):
