@@ -55,6 +55,8 @@ def moment_of_ground(trace: Trace) -> Vector:
     moment: Vector = ZERO
     for body, seat in trace.links.seats.items():
         if seat.link is None:
-            rigid = trace.links.nodes[body].rigid
-            moment = moment + seat.offset * rigid.mass + seat.matrix @ rigid.moment
+            rigid, axes, origin = trace.links.nodes[body].rigid, seat.matrix, seat.offset
+            if body in trace.links.flexible:  # its other pieces are links
+                _, axes, origin, _, rigid = trace.links.flexible[body]
+            moment = moment + origin * rigid.mass + axes @ rigid.moment
     return moment

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from .links import Links
 
 NO_MOMENTS = symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NOTHING = Rigid(0.0, ZERO, NO_MOMENTS)
 GONE = 1e-10  # share of a body's inertia below which what its points leave of it is rounding
 
 
@@ -34,12 +35,14 @@ class Flexible(NamedTuple):
     Attributes:
         link: the link that its frame sits on, or None. axes, origin: the body frame at rest in that link.
         leader: the piece at which the modal coordinates are accounted for; it moves as the body's centre of mass.
+        rest: the inertia that moves with the body frame, about its origin.
     """
 
     link: Link | None
     axes: Matrix
     origin: Vector
     leader: Link
+    rest: Rigid
 
 
 def deform(links: Links, node: int, dof: int, coordinate: int, armature: tuple) -> None:
@@ -59,15 +62,15 @@ def deform(links: Links, node: int, dof: int, coordinate: int, armature: tuple) 
     leader.armature = tuple(a + b for a, b in zip(armature, np.diag(mean.armature).tolist(), strict=True))
     pairs = zip(*np.nonzero(np.triu(mean.armature, 1)), strict=True)
     leader.group = Group([leader], {(int(i), int(j)): float(mean.armature[i, j]) for i, j in pairs})
-    own = links.flexible[node] = Flexible(seat.link, axes, origin, leader)
-    links.append(leader)
-
     whole = links.rigid(node, np.eye(3), links.values["body_com"][node])
     rest = whole if modes.points is None else _less(whole, modes.points.inertia[:6, :6])
-    if not mean.rest_slopes.any():
-        if seat.link is not None:
-            seat.link.add(Pose(None, axes, origin).rigid_to_parent(rest))
-    else:
+    follows = mean.rest_slopes.any()
+    own = links.flexible[node] = Flexible(seat.link, axes, origin, leader, NOTHING if follows else rest)
+    links.append(leader)
+
+    if seat.link is not None:
+        seat.link.add(Pose(None, axes, origin).rigid_to_parent(own.rest))
+    if follows:
         center = Vector(mean.rest_center.tolist())
         follower = leader if modes.points is None else add_piece(links, own, Deflection(mean.rest_slopes), center)
         follower.add(Pose(None, None, -center).rigid_to_parent(rest))
