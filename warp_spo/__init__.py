@@ -13,10 +13,12 @@ from .graph.factorization import Factorization
 from .graph.operators import BWA, Blocks, Identity, Operator
 from .hinges.functions import clip, spline, where
 from .scene.actuators import Actuator, Keyframe
+from .scene.beams import beam_modes
 from .scene.gears import Rotor
 from .scene.modes import MassPoints, Modes
 from .scene.parts import Body, Coupling, Hinge, Loop
 from .scene.scene import Scene
+from .scene.sections import Material, Section
 from .scene.tree import Digraph, Tree
 from .status import Status
 
@@ -46,14 +48,17 @@ __all__ = [
     "Keyframe",
     "Loop",
     "MassPoints",
+    "Material",
     "Modes",
     "Operator",
     "Rotor",
     "Scene",
+    "Section",
     "Status",
     "Tree",
     "UnsupportedError",
     "__version__",
+    "beam_modes",
     "clip",
     "from_mujoco",
     "from_newton",
