@@ -121,7 +121,7 @@ class Links:
             for link in copied.links:
                 link.group = copied
         other.flexible = {
-            node: Flexible(twin[own.link], value(own.axes), value(own.origin), twin[own.leader])
+            node: Flexible(twin[own.link], value(own.axes), value(own.origin), twin[own.leader], apart(own.rest))
             for node, own in self.flexible.items()
         }
         other.ports = {key: Seat(twin[s.link], *value(s[1:])) for key, s in self.ports.items()}
