@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any
+from weakref import WeakSet
 
+import numpy as np
 import warp as wp
 
 from .. import launches
@@ -13,17 +17,19 @@ from ..dlpack import settle
 from ..execution.programs import Programs
 from ..execution.routine import Routine
 from ..execution.sweeps import Sweeps
-from ..graph.algebra import LetterOwner
-from ..graph.blocks import Blocks, DeferredWeights, weights_array
+from ..graph.algebra import LetterOwner, Operator
+from ..graph.blocks import Blocks, DeferredWeights, new_weights, weights_array
 from ..graph.factorization import Factorization
 from ..graph.operators import BWA
-from ..kernels import kinematics, rigid_blocks
+from ..graph.similarity import ChangeOfVariables, check_together
+from ..kernels import common_frames, declare, kinematics, rigid_blocks
 from ..recursions import operators as recursion
 from .operation import AS_WRITTEN, Operation, Q, Refused
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
 
+WRITTEN = ("E_phi", "H", "M", "Delta", "P", "D", "D_inverse", "G", "E_psi")  # operators whose blocks kernels write
 EXPRESSION = Routine(
     "expression",
     recursion.expression,
@@ -81,7 +87,7 @@ class SpatialOperators(LetterOwner):
         self.E_phi, self.phi, self.H, self.M, self.Delta = E_phi, f.phi, H, M, Delta
         self.P, self.D, self.D_inverse, self.G, self.K = f.P, f.D, f.D_inverse, f.G, f.K
         self.E_psi, self.psi = f.E_psi, f.psi
-        for name in ("E_phi", "H", "M", "Delta", "P", "D", "D_inverse", "G", "E_psi"):
+        for name in WRITTEN:
             getattr(self, name).letter = self, name
         self._frames: Any = None
         self._kind: str | None = WARP
@@ -89,6 +95,8 @@ class SpatialOperators(LetterOwner):
         self._q: Any = wp.empty((worlds, scene.coord_count), dtype=dtype, device=device) if self._fused else None
         self._filled: int | None = None  # stamp of the values that the blocks were filled with
         self._captured = False
+        self._fillings = 0  # how often the host has launched the kernels that fill the blocks
+        self._similar: WeakSet[SimilarOperators] = WeakSet()
 
     def update(self, q: Any) -> None:
         """Take the coordinates ``q`` [world, coordinate]; launches only."""
@@ -98,17 +106,15 @@ class SpatialOperators(LetterOwner):
             q = call.read("q", q, (run.worlds, run.scene.coord_count), "[world, coordinate]")
             self._kind = call.kind
             call.order()
+            # A graph with these launches may be replayed at any time: the host no longer knows what is up to date.
+            self._captured = self._captured or run.device.is_capturing
             if self._fused:
                 launches.copy(self._q, q)
                 self._filled = None
-                # A graph with this launch may be replayed at any time: the host no longer knows what is up to date.
-                self._captured = self._captured or run.device.is_capturing
             else:
                 self._write_blocks(q)
-        for operator in (self.E_phi, self.phi, self.H, self.M, self.Delta, self.P, self.D, self.D_inverse, self.G):
-            operator.kind = self._kind
-        for derived in (self.K, self.E_psi, self.psi):
-            derived.kind = self._kind
+        for owner in (self, *self._similar):
+            set_kind(owner, self._kind)
 
     def fill(self) -> None:
         capturing, stamp = self._recursions.device.is_capturing, self._recursions.parameters.version
@@ -118,6 +124,7 @@ class SpatialOperators(LetterOwner):
                 self._write_blocks(self._q)
 
     def _write_blocks(self, q: wp.array) -> None:
+        self._fillings += 1
         run, f = self._recursions, self._factorization
         if self._frames is None:
             self._frames = wp.empty((run.worlds, run.scene.body_count, 7), dtype=run.dtype, device=run.device)
@@ -148,6 +155,122 @@ class SpatialOperators(LetterOwner):
             self.fill()
             launches.copy(out, self._frames)
         return call.result
+
+    @functools.cached_property
+    def R(self) -> Blocks:
+        """Composite inertias, see :class:`Factorization`; computed from the first time on that they are asked for."""
+        self.fill()
+        composite = self._factorization.R
+        composite.letter, composite.kind = (self, None), self._kind
+        return composite
+
+    def change_variables(self, B: Blocks) -> SimilarOperators:
+        """Return the operators for vectors x' = B x over the nodes; they follow each :meth:`update`.
+
+        phi' = B phi B^-1, H' = H B^-1, M' = B M B*. The articulated-body recursion runs in the new variables. What maps
+        hinges to hinges stays up to rounding, such as D and the mass matrix.
+
+        Args:
+            B: block diagonal, one invertible square block for each node (:meth:`Blocks.diagonal`). It is read again
+                after each :meth:`update`.
+
+        Raises:
+            ValueError, TypeError: B does not fit the nodes, or has another device, dtype or number of worlds.
+        """
+        check_together(B, self.E_phi)
+        change, E = ChangeOfVariables(self.E_phi.dims, B), self.E_phi
+        E_changed = BWA.packed(E.graph, E.dims, change.edge_weights(E))
+        return SimilarOperators(self, E_changed, change, B, change.update, WRITTEN)
+
+    def change_frames(self, origin: str) -> SimilarOperators:
+        """Return the operators for vectors that all refer to one frame o; they follow each :meth:`update`.
+
+        A force x(k) of node k becomes phi(o, k) x(k), a velocity V(k) becomes phi*(k, o) V(k). All weights of E_phi are
+        then the identity, and phi sums over subtrees. In float32 a common frame costs digits: D loses about (distance
+        of the frame / length of a link)^2 roundings.
+
+        Args:
+            origin: "world" for the inertial frame, "root" for the node frame of the root of each tree.
+
+        Raises:
+            ValueError: origin is something else.
+        """
+        if origin not in ("world", "root"):
+            raise ValueError(
+                f"operators.change_frames: origin is {origin!r}; expected 'world' or 'root'; the operators as they are "
+                f"refer to the frame of each body"
+            )
+        run, E = self._recursions, self.E_phi
+        declare(common_frames, run.functions)
+        sizes = [rows * columns for _, _, rows, columns in self.M.places]
+        weights = [new_weights(run.worlds, sum(sizes), run.dtype, run.device) for _ in range(2)]
+        B, inverse = (Blocks(E.shape, self.M.places, one) for one in weights)
+        change = ChangeOfVariables(E.dims, B, inverse)
+        identity = np.tile(np.eye(6).ravel(), max(1, len(E.graph.edges)))[None]
+        E_common = BWA.packed(E.graph, E.dims, wp.array(identity, dtype=run.dtype, device=run.device))
+
+        def update() -> None:
+            inputs = [self._factorization.tables, weights_array(E.stored), self._frames if origin == "world" else None]
+            run.launch_nodes(common_frames.common_frame, run.nodes, inputs, weights)
+            change.update()
+
+        return SimilarOperators(self, E_common, change, B, update, (*WRITTEN, "B"))
+
+
+class SimilarOperators(LetterOwner):
+    """Spatial operators for other vectors x' = B x over the nodes; made by ``ops.change_frames("world")`` and its kin.
+
+    Attributes:
+        B: the change of variables. Forces change as x' = B x, velocities as V' = B^-* V.
+        E_phi, phi, H, M, Delta, P, D, D_inverse, G, K, E_psi, psi: as in :class:`SpatialOperators`.
+    """
+
+    def __init__(
+        self,
+        source: SpatialOperators,
+        E_phi: BWA,
+        change: ChangeOfVariables,
+        B: Blocks,
+        prepare: Callable[[], None],
+        written: tuple[str, ...],
+    ):
+        self._source, self._seen = source, -1
+        H, M = change.hinge_maps(source.H), change.inertias(source.M)
+        self._factorization = f = Factorization(
+            E_phi,
+            H,
+            M,
+            source.Delta,
+            lambda scalars: DeferredWeights(source.H.worlds, scalars, B.dtype, B.device),
+            prepare,
+        )
+        self.B, self.E_phi, self.phi, self.H, self.M, self.Delta = B, E_phi, f.phi, H, M, source.Delta
+        self.P, self.D, self.D_inverse, self.G, self.K = f.P, f.D, f.D_inverse, f.G, f.K
+        self.E_psi, self.psi = f.E_psi, f.psi
+        for name in written:
+            if name != "Delta":  # a letter of its source
+                getattr(self, name).letter = self, name
+        set_kind(self, source.H.kind)
+        source._similar.add(self)
+
+    def fill(self) -> None:
+        source = self._source
+        capturing = source.H.device.is_capturing
+        with source._recursions.turn.lock:
+            source.fill()
+            if self._seen != source._fillings or source._captured or capturing:
+                self._factorization.update()
+                self._seen = -1 if capturing else source._fillings
+
+    def run(self, expression: Any, x: wp.array, out: wp.array) -> bool:
+        return False
+
+
+def set_kind(operators: LetterOwner, kind: str | None) -> None:
+    """Set the kind of array that :meth:`Operator.dense` of the letters, and of what they make up, returns."""
+    for operator in vars(operators).values():
+        if isinstance(operator, Operator) and operators in operator.letters:
+            operator.kind = kind
 
 
 OPERATORS = Operation("operators", arguments=(Q,), results=(), embed=Refused(), multipliers=AS_WRITTEN)

@@ -64,12 +64,12 @@ class Operator(abc.ABC):
         device: the device of the operator and of the arrays that it maps.
         dtype: the scalar type of the operator and of the arrays that it maps.
         kind: the kind of array that :meth:`dense` returns; None is NumPy.
-        letter: the owner and the name of the letter; None if the operator is not a letter.
+        letter: the owner and the name of the letter, None if no kernel knows it; None if the operator is not a letter.
         form: the name of the composition with its numbers.
         operands: the composed operators.
     """
 
-    letter: "tuple[LetterOwner, str] | None" = None
+    letter: "tuple[LetterOwner, str | None] | None" = None
     form: tuple = ()
     operands: "tuple[Operator, ...]" = ()
     __array_ufunc__ = None  # NumPy hands array @ op and array + op to the operator
@@ -286,7 +286,7 @@ class Sum(Operator):
                     f"sum of operators: {self.terms[0]!r} and {term!r} differ in shape; expected equal shapes; check "
                     f"which of them is missing a .T"
                 )
-        super().__init__(self.terms[0].shape, *_common("sum", self.terms))
+        super().__init__(self.terms[0].shape, *common("sum", self.terms))
         self.form, self.operands = ("sum",), self.terms
 
     def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
@@ -309,7 +309,7 @@ class Product(Operator):
                     f"product of operators: {left!r} @ {right!r}; expected as many columns on the left as rows on the "
                     f"right; check which of them is missing a .T"
                 )
-        super().__init__((self.factors[0].shape[0], self.factors[-1].shape[1]), *_common("product", self.factors))
+        super().__init__((self.factors[0].shape[0], self.factors[-1].shape[1]), *common("product", self.factors))
         self.form, self.operands = ("product",), self.factors
 
     def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
@@ -346,7 +346,7 @@ def _flatten(kind: type, operands: Sequence[Operator], name: str) -> tuple[Opera
     )
 
 
-def _common(what: str, operands: Sequence[Operator]) -> tuple[int, wp.Device, type, str | None]:
+def common(what: str, operands: Sequence[Operator]) -> tuple[int, wp.Device, type, str | None]:
     """Return worlds, device, dtype and kind of a composition; ValueError that names two operands that do not fit."""
     first = operands[0]
     worlds = 1

@@ -6,7 +6,9 @@ hold for all such systems, not only for rigid bodies.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+import itertools
+from collections.abc import Callable, Sequence
 from itertools import accumulate
 from typing import Any
 
@@ -19,6 +21,7 @@ from ..memory import broadcast_worlds
 from ..scene.tree import Tree
 from .blocks import Blocks, new_weights, weights_array
 from .operators import BWA
+from .similarity import ChangeOfVariables, check_together
 
 
 class Factorization:
@@ -31,6 +34,7 @@ class Factorization:
         Delta: one symmetric block r_k x r_k for each node, at the rows of its block of H; None is zero.
         store: ``store(scalars)`` returns the weights of the other operators; a caller that passes it also calls
             :meth:`Factorization.update`.
+        prepare: :meth:`Factorization.update` calls it first; it fills the blocks of E_phi, H, M and Delta.
 
     Attributes:
         phi: (I - E_phi)^-1.
@@ -41,6 +45,7 @@ class Factorization:
         K: E_phi G.
         E_psi: the adjacency with weights w (I - G H).
         psi: (I - E_psi)^-1.
+        R: composite inertia, computed from the first time on that it is asked for.
 
     Raises:
         ValueError: the blocks do not fit the tree.
@@ -53,6 +58,7 @@ class Factorization:
         M: Blocks,
         Delta: Blocks | None = None,
         store: Callable[[int], Any] | None = None,
+        prepare: Callable[[], None] = lambda: None,
     ):
         if not isinstance(E_phi.graph, Tree):
             raise ValueError("Factorization: E_phi belongs to a Digraph; expected a Tree (Tree.from_edges cuts edges)")
@@ -68,6 +74,7 @@ class Factorization:
         _check_places("M", M, [(E_phi.starts[k], E_phi.starts[k], m[k], m[k]) for k in nodes])
         pivot_places = [(row[k], row[k], r[k], r[k]) for k in nodes]
         pivot_offsets = list(accumulate((size * size for size in r), initial=0))
+        self._prepare = prepare
         self.worlds = max(operator.worlds for operator in (E_phi, H, M, *([Delta] if Delta else [])))
         self.device, self.dtype = E_phi.device, E_phi.dtype
 
@@ -78,6 +85,9 @@ class Factorization:
             zero = new_weights(1, pivot_offsets[-1], self.dtype, self.device)
             Delta = Blocks((dofs, dofs), pivot_places, zero, pivot_offsets[:-1], kind)
         _check_places("Delta", Delta, pivot_places)
+        _check_apart("E_phi", E_phi.offsets, [m[parent] * m[child] for parent, child in tree.edges])
+        for name, blocks in (("H", H), ("M", M), ("Delta", Delta)):
+            _check_apart(name, blocks.offsets, [rows * columns for _, _, rows, columns in blocks.places])
         self.E_phi, self.H, self.M, self.Delta = E_phi, H, M, Delta
         self.phi = E_phi.resolvent()
         self.P = Blocks((N, N), M.places, weights_for(M.stored.shape[1]), M.offsets, kind)
@@ -105,7 +115,8 @@ class Factorization:
             self.update()
 
     def update(self) -> None:
-        """Compute P, D, G and E_psi again, by launches alone."""
+        """Compute P, D, G and E_psi again, by launches alone, and R if it has been asked for."""
+        self._prepare()
         inputs = [
             broadcast_worlds(weights_array(op.stored), 0, self.worlds)
             for op in (self.E_phi, self.H, self.M, self.Delta)
@@ -121,6 +132,43 @@ class Factorization:
                 outputs=[*outputs, *map(weights_array, self._scratch)],
                 device=self.device,
             )
+        if "_locked" in vars(self):
+            self._locked.update()
+
+    @property
+    def R(self) -> Blocks:
+        """Composite inertia R = M + sum over children w R w*, which is what P is where no hinge moves.
+
+        phi M phi* = R + phi~ R + R phi~*, with phi~ = phi - I, ``phi.strict``.
+        """
+        return self._locked.P
+
+    @functools.cached_property
+    def _locked(self) -> Factorization:
+        """The factorisation without hinges."""
+        places = [(0, row, 0, size) for row, _, size, _ in self.M.places]
+        H = Blocks((0, self.M.shape[1]), places, new_weights(1, 0, self.dtype, self.device), [0] * len(places))
+        return Factorization(self.E_phi, H, self.M)
+
+    def change_variables(self, B: Blocks) -> Factorization:
+        """Return the factorisation for vectors x' = B x over the nodes: E' = B E B^-1, H' = H B^-1, M' = B M B*.
+
+        Then phi' = B phi B^-1, P' = B P B*, G' = B G and psi' = B psi B^-1, computed by the recursion in the new
+        variables; D, Delta and all else that maps hinges to hinges stay, up to rounding. :meth:`update` of the new one
+        reads the blocks of this one, and those of B, again.
+
+        Args:
+            B: block diagonal, one invertible square block for each node (:meth:`Blocks.diagonal`). A singular block
+                makes its world NaN.
+
+        Raises:
+            ValueError, TypeError: B does not fit the nodes, or has another device, dtype or number of worlds.
+        """
+        check_together(B, self.E_phi, self.H, self.M, self.Delta)
+        change, E = ChangeOfVariables(self.E_phi.dims, B), self.E_phi
+        E_changed = BWA.packed(E.graph, E.dims, change.edge_weights(E), kind=E.kind)
+        H, M = change.hinge_maps(self.H), change.inertias(self.M)
+        return Factorization(E_changed, H, M, self.Delta, prepare=change.update)
 
 
 def block_tables(tree: Tree, device: wp.Device, **tables) -> kernels.BlockTables:
@@ -133,6 +181,17 @@ def block_tables(tree: Tree, device: wp.Device, **tables) -> kernels.BlockTables
     for name, table in tables.items():
         setattr(struct, name, wp.array(np.asarray(table, dtype=np.int32), dtype=int, device=device))
     return struct
+
+
+def _check_apart(name: str, offsets: Sequence[int], sizes: Sequence[int]) -> None:
+    """Raise ValueError if two blocks of an operator share scalars; results lie at the same offsets."""
+    spans = sorted((at, at + size) for at, size in zip(offsets, sizes, strict=True) if size)
+    for (_, end), (start, _) in itertools.pairwise(spans):
+        if start < end:
+            raise ValueError(
+                f"Factorization: two blocks of {name} share scalar {start} of its weights; expected blocks that lie "
+                f"apart; repeat what several blocks have in common"
+            )
 
 
 def _check_places(name: str, operator: Blocks, expected: list[tuple[int, int, int, int]]) -> None:

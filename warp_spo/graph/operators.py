@@ -17,6 +17,7 @@ from ..errors import as_integer
 from ..scene.tree import Digraph, Tree
 from .algebra import Identity, Operator, Product, Scaled, Sum, Transpose, Workspace, add_scaled
 from .blocks import Blocks, DeferredWeights, Table, choose_memory, matrix_size, pack, place_offsets, weights_array
+from .similarity import ChangeOfVariables, check_together
 
 __all__ = ["BWA", "Blocks", "Identity", "Operator", "Product", "Resolvent", "Scaled", "Sum", "Transpose"]
 
@@ -119,6 +120,25 @@ class BWA(Operator):
     def resolvent(self) -> "Resolvent":
         """Return A = (I - E)^-1."""
         return Resolvent(self)
+
+    def change_variables(self, B: Blocks) -> "BWA":
+        """Return E' = B E B^-1, the adjacency for vectors x' = B x over the nodes; its resolvent is B A B^-1.
+
+        Args:
+            B: block diagonal, one invertible square block for each node (:meth:`Blocks.diagonal`).
+
+        The weights b_p w(p, k) b_k^-1 are copies, made now. A singular block makes the weights of its edges NaN.
+
+        Raises:
+            ValueError, TypeError: B does not fit the nodes, or has another device, dtype or number of worlds.
+        """
+        check_together(B, self)
+        change = ChangeOfVariables(self.dims, B)
+        changed = BWA.packed(self.graph, self.dims, change.edge_weights(self), kind=self.kind)
+        self._fill()
+        B._fill()
+        change.update()
+        return changed
 
     def power(self, exponent: int) -> Operator:
         """Return E^exponent, whose blocks are sums over paths of that length of products of weights (Lemma 1).
