@@ -42,6 +42,8 @@ class Dense:
     """
 
     def __init__(self, scene, q, qd=None, world=0):
+        if any(getattr(body, "modes", None) is not None for body in getattr(scene, "bodies", ())):
+            raise ValueError("Dense: the scene has bodies with modes; expected rigid bodies")
         self.scene, self.world = scene, world
         self.body_count, self.dof_count = len(scene.hinge_of), int(scene.qd_start[-1])
         self.q = self._vector("q", q, int(scene.q_start[-1]))

@@ -69,6 +69,9 @@ class Engine:
 
     def refuse(self, name: str, form: Operation | Derivative) -> None:
         """Raise UnsupportedError if an operation, or a derivative, has no form for the loops of this Dynamics."""
+        if self._dyn.scene.shares_dofs and isinstance(form, Operation) and isinstance(form.sharing, Refused):
+            way = form.sharing.way_out or "leave out modes and rotors"
+            raise UnsupportedError(f"Dynamics.{name}", "a scene with flexible bodies or rotors", way)
         if not self._dyn.closed:
             return
         closures = self._dyn._closures

@@ -135,8 +135,8 @@ def forward_dynamics(
             * 0, OK: none of these. If tau and gravity nearly cancel, digits can still be lost, as in any subtraction;
               pass gravity through the scene and wrenches through body_f, not through tau.
 
-            Where loops are closed only 2, 6 and 1 are written, because digits are not estimated. Worlds never change
-            each other's result.
+            Where loops are closed, or bodies have modes or rotors, only 2, 6 and 1 are written, because digits are not
+            estimated. Worlds never change each other's result.
         out: array for the result.
 
     Returns:

@@ -263,6 +263,7 @@ BODY_REACTIONS = Operation(
     arguments=(Q, required(QD), required(QDD), BODY_F),
     results=(Result("wrenches", "world, body, 6"),),
     routine=Routine("body_reactions", reactions.body_reactions),
+    sharing=Refused(),
     embed=Refused(),
     multipliers=Refused(),
 )

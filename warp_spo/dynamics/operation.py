@@ -259,6 +259,7 @@ class Operation:
         routine: kernel of the open tree; None: the method calls other operations.
         embed: form with ``loops="embed"``. multipliers: form with ``loops="multipliers"``. An operation that declares
             nothing is refused there.
+        sharing: form of scenes whose links share dofs: of flexible bodies and rotors.
         derivative: its way back; None: torch gets no gradients.
         trial: how it is compared with the dense reference.
         product: it is itself a product with a Jacobian, of another operation.
@@ -270,6 +271,7 @@ class Operation:
     routine: Routine | None = None
     embed: Closed = Refused()
     multipliers: Closed = Refused()
+    sharing: Closed = AS_WRITTEN
     derivative: Derivative | None = None
     trial: Trial | None = None
     product: bool = False

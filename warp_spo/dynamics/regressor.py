@@ -20,6 +20,7 @@ INVERSE_DYNAMICS_REGRESSOR = Operation(
     results=(Result("regressor", "world, dof, 10 bodies"),),
     routine=Routine("inverse_dynamics_regressor", recursion.inverse_dynamics_regressor, long_result=True),
     embed=OPEN,
+    sharing=Refused("differentiate inverse_dynamics by the values"),
     multipliers=AS_WRITTEN,
     trial=Trial(lambda dense, q, qd, qdd: dense.inverse_dynamics_regressor(qd, qdd)),
 )
@@ -61,6 +62,7 @@ INVERSE_DYNAMICS_REGRESSOR_PRODUCT = Operation(
     results=(Result("tau", "world, dof"),),
     routine=Routine("inverse_dynamics_regressor_product", recursion.inverse_dynamics_regressor_product),
     embed=OPEN,
+    sharing=Refused("differentiate inverse_dynamics by the values"),
     multipliers=AS_WRITTEN,
     trial=Trial(lambda dense, q, qd, qdd, p: dense.inverse_dynamics_regressor(qd, qdd) @ p),
 )
@@ -96,6 +98,7 @@ INVERSE_DYNAMICS_REGRESSOR_TRANSPOSED_PRODUCT = Operation(
         "inverse_dynamics_regressor_transposed_product", recursion.inverse_dynamics_regressor_transposed_product
     ),
     embed=OPEN,
+    sharing=Refused("differentiate inverse_dynamics by the values"),
     multipliers=AS_WRITTEN,
     trial=Trial(lambda dense, q, qd, qdd, tau: dense.inverse_dynamics_regressor(qd, qdd).T @ tau),
 )

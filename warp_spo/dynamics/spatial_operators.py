@@ -23,6 +23,7 @@ from ..graph.factorization import Factorization
 from ..graph.operators import BWA
 from ..graph.similarity import ChangeOfVariables, check_together
 from ..kernels import common_frames, declare, kinematics, rigid_blocks
+from ..recursions import node_blocks
 from ..recursions import operators as recursion
 from .operation import AS_WRITTEN, Operation, Q, Refused
 
@@ -38,13 +39,15 @@ EXPRESSION = Routine(
     variants=64,
     title=lambda inputs, expression: recursion.format_expression(expression),
 )
+NODE_BLOCKS = Routine("node_blocks", node_blocks.node_blocks)
 
 
 class SpatialOperators(LetterOwner):
     """phi, psi and their kin for all worlds; made by ``dyn.operators(q)``.
 
     Vectors over nodes are [world, sum of node sizes], body after body, each [omega; v] or [n; f] in the node frame (the
-    child anchor of the body's hinge) about its origin. Vectors over hinges are [world, dof], in the order of qd.
+    child anchor of the body's hinge) about its origin; of a body with modes, their rates or forces come first. Vectors
+    over hinges are [world, dof], in the order of qd.
 
     Whatever is composed of these operators, applied to one vector a world, is one kernel that starts from q, unless the
     granularity is "node"; the blocks are then filled when something else asks for them. A value that ``dyn.set``
@@ -90,8 +93,9 @@ class SpatialOperators(LetterOwner):
         for name in WRITTEN:
             getattr(self, name).letter = self, name
         self._frames: Any = None
+        self._rows: dict[str, wp.array] = {}  # blocks as a traced kernel leaves them
         self._kind: str | None = WARP
-        self._fused = recursions.plan.of(EXPRESSION) != "node" and dofs > 0
+        self._fused = recursions.plan.of(EXPRESSION) != "node" and dofs > 0 and not scene.shares_dofs
         self._q: Any = wp.empty((worlds, scene.coord_count), dtype=dtype, device=device) if self._fused else None
         self._filled: int | None = None  # stamp of the values that the blocks were filled with
         self._captured = False
@@ -128,6 +132,10 @@ class SpatialOperators(LetterOwner):
         run, f = self._recursions, self._factorization
         if self._frames is None:
             self._frames = wp.empty((run.worlds, run.scene.body_count, 7), dtype=run.dtype, device=run.device)
+        if run.scene.shares_dofs:
+            self._write_traced_blocks(q)
+            f.update()
+            return
         run.hinges(q)
         armature = run.parameters.field("joint_armature")
         inputs = [run.topology, f.tables, run.array("pose"), run.array("axis"), run.parameters.rigid, armature]
@@ -135,6 +143,22 @@ class SpatialOperators(LetterOwner):
         run.launch_nodes(rigid_blocks.fill, run.nodes, inputs, outputs)
         f.update()
         run.launch_nodes(kinematics.body_poses, run.nodes, [run.world_poses(), None], [self._frames])
+
+    def _write_traced_blocks(self, q: wp.array) -> None:
+        """Fill the blocks by the traced kernel of a scene whose links share dofs."""
+        named: dict[str, Any] = {"M": self.M, "E_phi": self.E_phi, "H": self.H, "Delta": self.Delta}
+        stored = {name: weights_array(operator.stored) for name, operator in named.items()}
+        if not self._rows:  # kernels write rows of worlds, blocks lie entry by entry
+            self._rows = {name: wp.empty(array.shape, dtype=q.dtype, device=q.device) for name, array in stored.items()}
+        rows = {**self._rows, "frames": self._frames.reshape((q.shape[0], -1))}
+        rows = {name: array for name, array in rows.items() if array.size}
+        more = {name: array.shape for name, array in rows.items() if name != "M"}
+        program = self._programs.find(NODE_BLOCKS, {"q": q.shape}, rows["M"].shape, more)
+        assert program is not None
+        self._programs.launch(program, {"q": q}, *rows.values())
+        for name, array in stored.items():
+            if array.size:
+                launches.copy(array, self._rows[name])
 
     def run(self, expression: Any, x: wp.array, out: wp.array) -> bool:
         if not self._fused or x.shape[0] != self._recursions.worlds:

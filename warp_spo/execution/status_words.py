@@ -5,7 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from .. import launches
-from ..kernels import declare
+from ..kernels import declare, loops
 from ..kernels import status as kernels
 from ..kernels.spatial import ARTICULATED
 from .sweeps import Sweeps
@@ -25,8 +25,14 @@ def write(
 
     The sweep reads pose, axis, articulated, gain and pivot. With ``factored``, forward dynamics has left them in the
     workspace. Otherwise a generated kernel computed forward dynamics, and the sweeps factorise now. The digits that
-    they lose are an upper bound for the generated kernel, whose hinges lie along axes.
+    they lose are an upper bound for the generated kernel, whose hinges lie along axes. Where links share dofs, digits
+    are not estimated: a world is NOT_FINITE, PIVOT or OK.
     """
+    if run.scene.shares_dofs:
+        declare(loops, run.dtype)
+        margin, least = run.array("no margin", run.worlds, 0), run.dtype(0.0)
+        run.launch(loops.status_word, run.worlds, [q, qd, tau, body_f, qdd, margin, least], [status])
+        return
     declare(kernels, run.functions)
     if not factored:
         run.hinges(q)

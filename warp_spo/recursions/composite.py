@@ -20,9 +20,8 @@ if TYPE_CHECKING:
 def entries(link: Link, places: dict[int, Placed], body: Rigid) -> dict[tuple[int, int], Value]:
     """(row, column) of Mass for the columns of a link that carries ``body`` = R, rows on the way to the root."""
     found = own_entries(link, places[id(link)], body)
-    if link.group is not None and link.leads:
-        for (i, j), x in link.group.coupled.items():
-            found[link.dofs[i], link.dofs[j]] = found[link.dofs[i], link.dofs[j]] + x
+    for (i, j), x in link.coupled.items():
+        found[link.dofs[i], link.dofs[j]] = found[link.dofs[i], link.dofs[j]] + x
     for column, H in zip(link.dofs, columns(link, places[id(link)]), strict=True):
         n, f = body.apply(Vector(H[:3]), Vector(H[3:]))
         over = link

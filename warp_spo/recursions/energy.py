@@ -9,7 +9,6 @@ from ..trace.spatial import ZERO, Vector, dot
 from .impedance import Impedance
 from .kinematics import link_velocities, place_all
 from .momentum import composite_inertias
-from .motion import armature_forces
 
 if TYPE_CHECKING:
     from .tracing import Trace
@@ -24,8 +23,10 @@ def kinetic_energy(trace: Trace) -> list[Store]:
             w, v = velocities[id(link)]
             n, f = link.inertia.apply(w, v)
             twice = twice + (dot(w, n) + dot(v, f))
-        for dof, momentum in zip(link.dofs, armature_forces(link, qd), strict=True):
-            twice = twice + momentum * qd(dof)
+        for dof, armature in zip(link.dofs, link.armature, strict=True):
+            twice = twice + armature * (qd(dof) * qd(dof))
+        for (i, j), x in link.coupled.items():
+            twice = twice + (2.0 * x) * (qd(link.dofs[i]) * qd(link.dofs[j]))
     return [Store("out", (), 0.5 * twice)]
 
 

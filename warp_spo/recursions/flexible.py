@@ -87,7 +87,7 @@ def deform(links: Links, node: int, dof: int, coordinate: int, armature: tuple) 
         hinge = scene.hinge_of[child]
         found = slopes_of_child(scene, int(child))
         anchor = Vector(links.poses["joint_X_p"][hinge][1].tolist())
-        links.ports["child", child] = Seat(add_piece(links, own, Deflection(*found), anchor), IDENTITY, ZERO)
+        links.ports[int(child)] = Seat(add_piece(links, own, Deflection(*found), anchor), IDENTITY, ZERO)
 
 
 def attach(links: Links, frames: Iterable[tuple[int, Any]]) -> None:

@@ -66,6 +66,11 @@ class Link:
         return self.group is None or self.group.links[0] is self
 
     @property
+    def coupled(self) -> dict[tuple[int, int], float]:
+        """Inertia between two of its dofs that no link accounts for, by place among them; at the leader of a group."""
+        return self.group.coupled if self.group is not None and self.leads else {}
+
+    @property
     def closes(self) -> bool:
         """Whether the link is the last of its group, at which a sweep inward has all of it."""
         return self.group is not None and self.group.links[-1] is self

@@ -54,7 +54,7 @@ class Links:
         tables: the scalars that an :meth:`with_tables` copy reads, by name, in order.
         reverses: what takes gradients by the tables back to the values, see :mod:`warp_spo.execution.link_values`.
         values: one world's values; symbols where they vary. poses: of hinges' anchors, (rotation, position).
-        flexible: bodies with modes. ports: where children ("child", body) and frames (position) of them sit.
+        flexible: bodies with modes. ports: where children, by body, and frames, by (body, position), of them sit.
     """
 
     def __init__(self, scene: Scene, variable: tuple[str, ...] = ()):
@@ -65,7 +65,7 @@ class Links:
         self.tables: dict[str, dict[Scalar, int]] = {table: {} for table in TABLES}
         self.reverses: dict[Any, Any] = {}
         self.flexible: dict[int, Flexible] = {}
-        self.ports: dict[tuple, Seat] = {}
+        self.ports: dict[Any, Seat] = {}
         self.values = {name: self._symbols(name, name in variable) for name in LINK_VALUES}
         self.gravity = Vector(self.values["gravity"].tolist())
         self.poses = {name: [pose_of(p) for p in self.values[name]] for name in ("joint_X_p", "joint_X_c")}
@@ -217,6 +217,10 @@ class Links:
         axes = seat.matrix @ R_body.T
         return Seat(seat.link, axes @ folded(R), seat.offset + axes @ (Vector(p.tolist()) - p_body))
 
+    def carrier(self, body: int) -> Link | None:
+        """The link that the centre of mass of a body sits on."""
+        return self.flexible[body].leader if body in self.flexible else self.seats[body].link
+
     def center(self, body: int) -> tuple[Link | None, Vector]:
         """The link that the centre of mass of a body sits on, and its place there; the mean one of a flexible body."""
         if body in self.flexible:
@@ -246,8 +250,8 @@ class Links:
         self.nodes[node] = body = self._node(node)
         index = scene.hinge_of[node]
         R, l = body.tree
-        if ("child", node) in self.ports:  # the parent's point that carries it, in the axes of the parent's body frame
-            seat, R, l = self.ports["child", node], folded(self.poses["joint_X_p"][index][0]), ZERO
+        if node in self.ports:  # the parent's point that carries it, in the axes of the parent's body frame
+            seat, R, l = self.ports[node], folded(self.poses["joint_X_p"][index][0]), ZERO
         matrix, offset, link = seat.matrix @ R, seat.offset + seat.matrix @ l, seat.link
         dof, coordinate = int(scene.qd_start[index]), int(scene.q_start[index])
         label, armatures = scene.body_labels[node], self.values["joint_armature"].tolist()

@@ -81,8 +81,7 @@ def carry_acceleration(place: Placed, motion: Motion, acceleration: tuple[Vector
 def armature_forces(link: Link, rate: Any) -> list[Value]:
     """Return armature times ``rate(dof)``, for each dof of a link."""
     forces = [a * rate(dof) for a, dof in zip(link.armature, link.dofs, strict=True)]
-    if link.group is not None and link.leads:
-        for (i, j), x in link.group.coupled.items():
-            forces[i] = forces[i] + x * rate(link.dofs[j])
-            forces[j] = forces[j] + x * rate(link.dofs[i])
+    for (i, j), x in link.coupled.items():
+        forces[i] = forces[i] + x * rate(link.dofs[j])
+        forces[j] = forces[j] + x * rate(link.dofs[i])
     return forces

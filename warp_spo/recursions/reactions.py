@@ -18,13 +18,13 @@ def body_accelerations(trace: Trace) -> list[Store]:
     """out [body, 6] = acceleration of the CoM, angular acceleration"""
     _, alpha = _moving(trace)
     stores = []
-    for body, seat in trace.links.seats.items():
-        if seat.link is None:
+    for body in trace.links.seats:
+        link, com = trace.links.center(body)
+        if link is None:
             continue
-        key = id(seat.link)
-        trace.label(seat.link, "a")
+        key = id(link)
+        trace.label(link, "a")
         (w, v), move, R = alpha[key], trace.motions[key], trace.axes[key]
-        com = seat.offset + seat.matrix @ trace.links.nodes[body].com
         linear = R @ (v + cross(w, com) + move.whirl @ com) + trace.links.gravity
         stores += [Store("out", (body, c), value) for c, value in enumerate((*linear, *(R @ w)))]
     return stores

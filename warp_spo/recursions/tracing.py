@@ -70,7 +70,7 @@ class Trace:
         self.stiffened: Callable[[Link], Link] = lambda link: link
         self.bodies: dict[int, list[int]] = {}  # by link: the bodies whose centre of mass is on it
         for body in links.seats:
-            link, _ = links.center(body)
+            link = links.carrier(body)
             if link is not None:
                 self.bodies.setdefault(id(link), []).append(body)
 

@@ -67,10 +67,9 @@ def inverse_dynamics_derivatives(trace: Trace) -> list[Store]:
             carried[key] = sensitivity.to_parent(place, drifts[key], all_in)
             forces[key] = place.pose.force_to_parent(n, f)
         stores += _entries(trace, link, all_in, (n, f), own, drifts)
-        if link.group is not None and link.leads:
-            for (i, j), x in link.group.coupled.items():
-                a, b = link.dofs[i], link.dofs[j]
-                stores += [Store("out", (QDD, a, b), x), Store("out", (QDD, b, a), x)]
+        for (i, j), x in link.coupled.items():
+            a, b = link.dofs[i], link.dofs[j]
+            stores += [Store("out", (QDD, a, b), x), Store("out", (QDD, b, a), x)]
     return merge(stores) if trace.links.shared else stores
 
 

@@ -1,0 +1,142 @@
+"""Blocks of the spatial operators of scenes whose links share dofs: weights, H, M and Delta, as a trace.
+
+Node k is body k. Its vector is (eta'; omega; v): the rates of its modes, then the velocity of its node frame. With the
+slopes Pi of the point of the parent that carries the body, and phi from the body's node frame to that point,
+
+    w(p, k) = [Pi*; phi(p, point)] phi(point, k) [0, I],  H = [[0, H], [I, 0]],
+
+where the rows of H are the hinge's dofs, then the modes. M(k) is the inertia of all pieces of the body at q.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..hinges.quaternions import matrix_quaternion
+from ..trace.emission import Store
+from ..trace.scalars import Value
+from ..trace.spatial import IDENTITY, ZERO, Pose, Rigid, Vector, cross, dot
+from .articulated import columns
+from .kinematics import place_all
+from .link import Link, Seat
+
+if TYPE_CHECKING:
+    from .tracing import Trace
+
+NOTHING = Vector((*ZERO, *ZERO))
+Six = list[Value]
+
+
+def node_blocks(trace: Trace) -> list[Store]:
+    """out = blocks of M, row by row, node after node; E_phi, edge after edge; H; Delta; frames [node, 7]"""
+    links, scene = trace.links, trace.links.scene
+    origins, first = place_all(trace), ZERO
+    if links.links:
+        first = trace.places[id(links.links[0])].pose.l
+    found: dict[str, list[Value]] = {name: [] for name in ("out", "E_phi", "H", "Delta", "frames")}
+    for parent, child in scene.tree.edges:
+        found["E_phi"] += _weight(trace, int(parent), int(child))
+    for node in range(scene.body_count):
+        modes, own = scene.node_sizes[node] - 6, _hinge_links(trace, node)
+        columns_of = {
+            dof: _at_node(trace, node, link, column)
+            for link in own
+            for dof, column in zip(link.dofs, columns(link, trace.places[id(link)]), strict=True)
+        }
+        for dof in sorted(columns_of):
+            found["H"] += [0.0] * modes + columns_of[dof]
+        found["H"] += [float(i == j) for i in range(modes) for j in range(modes + 6)]
+        armature = {dof: a for link in own for dof, a in zip(link.dofs, link.armature, strict=True)}
+        diagonal = [armature[dof] for dof in sorted(armature)] + [0.0] * modes
+        found["Delta"] += [a if i == j else 0.0 for i, a in enumerate(diagonal) for j in range(len(diagonal))]
+        found["out"] += _inertia(trace, node)
+        seat = links.seats[node]
+        axes, origin = (IDENTITY, ZERO) if seat.link is None else (trace.axes[id(seat.link)], origins[id(seat.link)])
+        at = origin + axes @ seat.offset + (ZERO if seat.link is None else first)
+        found["frames"] += [*at, *matrix_quaternion(axes @ seat.matrix)]
+    return [Store(array, (i,), value) for array, values in found.items() for i, value in enumerate(values)]
+
+
+def _hinge_links(trace: Trace, node: int) -> list[Link]:
+    """Return the links of a body's own hinge, inboard first."""
+    return [link for link in trace.links.links if link.node == node and link.group is None]
+
+
+def _at_node(trace: Trace, node: int, link: Link, column: Vector) -> Six:
+    """Return a motion of a link of a body's hinge as a motion of the body's node frame."""
+    seat, path = trace.links.seats[node], list[Link]()
+    over = seat.link
+    while over is not link:
+        assert over is not None
+        path.append(over)
+        over = over.parent
+    w, v = Vector(column[:3]), Vector(column[3:])
+    for other in reversed(path):
+        w, v = trace.places[id(other)].pose.motion_to_child(w, v)
+    return [*(x for part in Pose(None, seat.matrix, seat.offset).motion_to_child(w, v) for x in part)]
+
+
+def _weight(trace: Trace, parent: int, child: int) -> list[Value]:
+    """Return w(parent, child), row by row."""
+    links, scene = trace.links, trace.links.scene
+    seat, inner = links.seats[child], links.seats[parent]
+    port = links.ports[child].link if child in links.ports else None
+    rows: list[list[Value]] = [[] for _ in range(scene.node_sizes[parent])]
+    for c in range(6):
+        n, f = Vector(float(i == c) for i in range(3)), Vector(float(i + 3 == c) for i in range(3))
+        n, f = Pose(None, seat.matrix, seat.offset).force_to_parent(n, f)
+        over, modal = seat.link, list[Value]()
+        while over is not inner.link:
+            assert over is not None
+            if over is port:
+                modal = [dot(h, (*n, *f)) for h in columns(over, trace.places[id(over)])]
+            n, f = trace.places[id(over)].pose.force_to_parent(n, f)
+            over = over.parent
+        back = inner.matrix.T
+        entries = [*modal, *(back @ (n - cross(inner.offset, f))), *(back @ f)]
+        for row, entry in zip(rows, entries, strict=True):
+            row.append(entry)
+    unfelt = [0.0] * (scene.node_sizes[child] - 6)
+    return [x for row in rows for x in (*unfelt, *row)]
+
+
+def _inertia(trace: Trace, node: int) -> list[Value]:
+    """Return M of a node, row by row: of its rigid body, or of all pieces of its flexible one."""
+    links = trace.links
+    if node not in links.flexible:
+        P = links.nodes[node].rigid.articulated
+        return [P.entry(i, j) for i in range(6) for j in range(6)]
+    own, seat = links.flexible[node], links.seats[node]
+    n, leader = len(own.leader.dofs), own.leader
+    M: list[list[Value]] = [[0.0] * (n + 6) for _ in range(n + 6)]
+    rigid = [_in_link(seat, Vector(float(i == c) for i in range(6))) for c in range(6)]
+    ports = {id(port.link) for port in links.ports.values()}
+    still = Pose(None, own.axes, own.origin)
+    pieces: list[tuple[Rigid, list[Vector]]] = [
+        (own.rest, [NOTHING] * n + [Vector(_flat(still.motion_to_child(*motion))) for motion in rigid])
+    ]
+    for piece in leader.group.links:  # type: ignore[union-attr]
+        if piece.inertia is not None and id(piece) not in ports:
+            place = trace.places[id(piece)]
+            moved = [Vector(_flat(place.pose.motion_to_child(*motion))) for motion in rigid]
+            pieces.append((piece.inertia, [*columns(piece, place), *moved]))
+    for inertia, J in pieces:
+        forces = [_flat(inertia.apply(Vector(column[:3]), Vector(column[3:]))) for column in J]
+        for i in range(n + 6):
+            for j in range(i + 1):
+                M[i][j] = M[j][i] = M[i][j] + dot(J[i], forces[j])
+    for i, a in enumerate(leader.armature):
+        M[i][i] = M[i][i] + a
+    for (i, j), x in leader.coupled.items():
+        M[i][j] = M[j][i] = M[i][j] + x
+    return [x for row in M for x in row]
+
+
+def _in_link(seat: Seat, motion: Vector) -> tuple[Vector, Vector]:
+    """Return a motion of a node frame as one of the frame of the link that it sits on."""
+    w, v = seat.matrix @ Vector(motion[:3]), seat.matrix @ Vector(motion[3:])
+    return w, v + cross(seat.offset, w)
+
+
+def _flat(twist: tuple[Vector, Vector]) -> Six:
+    return [*twist[0], *twist[1]]
