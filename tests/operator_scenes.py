@@ -147,6 +147,11 @@ OPERATORS = {
         E - 2 * E.resolvent().T - E.resolvent(),
         s.E - 2 * transposed(inverse_of(s)) - inverse_of(s),
     ),
+    "doubled": lambda E, s, *_: (doubled(E), inverse_of(s)),
+    "doubled sum": lambda E, s, *_: (
+        E - 2 * doubled(E).T - doubled(E),
+        s.E - 2 * transposed(inverse_of(s)) - inverse_of(s),
+    ),
     "twice": lambda E, s, *_: (twice(E.resolvent()), 2 * inverse_of(s) + inverse_of(s) @ inverse_of(s)),
     "products": lambda E, s, *_: (both_ways(E, E.resolvent()), both_ways_dense(s.E, inverse_of(s))),
     "nested": lambda E, s, *_: (nested(E.resolvent() + E), nested(inverse_of(s) + s.E)),
@@ -155,6 +160,11 @@ OPERATORS = {
         f(m) for f, m in zip((lambda op: op.T, transposed), mass_like(E, s, d, t), strict=True)
     ),
 }
+
+
+def doubled(E):
+    """The resolvent by doubling; by sweeps where nodes have several parents."""
+    return E.resolvent(method="doubling" if isinstance(E.graph, Tree) else "sweep")
 
 
 def twice(A):

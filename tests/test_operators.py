@@ -89,7 +89,7 @@ def test_nan_in_the_weights_of_one_world_stays_there(device):
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE)
-@pytest.mark.parametrize("operator", ["A", "A.T", "products"])
+@pytest.mark.parametrize("operator", ["A", "A.T", "doubled", "products"])
 def test_same_bits_in_every_run_order_and_number_of_worlds(operator, dtype, device):
     op, _ = pair(operator, "shared", device, dtype)
     x = random((4097, op.shape[1]), dtype)
@@ -118,7 +118,7 @@ def test_no_allocation_after_first_use(operator, scene, device):
         np.testing.assert_array_equal(out.numpy(), first)
 
 
-@pytest.mark.parametrize("operator", ["A", "B.T A A.T B", "products"])
+@pytest.mark.parametrize("operator", ["A", "doubled", "B.T A A.T B", "products"])
 def test_captured_in_a_graph(operator, device):
     if not device.is_cuda:
         pytest.skip("graphs need CUDA")

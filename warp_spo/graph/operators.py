@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from ..arrays import WARP
@@ -17,9 +18,11 @@ from ..errors import as_integer
 from ..scene.tree import Digraph, Tree
 from .algebra import Identity, Operator, Product, Scaled, Sum, Transpose, Workspace, add_scaled
 from .blocks import Blocks, DeferredWeights, Table, choose_memory, matrix_size, pack, place_offsets, weights_array
+from .doubling import Doubling
 from .similarity import ChangeOfVariables, check_together
 
 __all__ = ["BWA", "Blocks", "Identity", "Operator", "Product", "Resolvent", "Scaled", "Sum", "Transpose"]
+METHODS = ("sweep", "doubling")
 
 
 class BWA(Operator):
@@ -117,9 +120,22 @@ class BWA(Operator):
     def _apply_transposed(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
         self._down.gather(weights_array(self.stored), x, out, alpha, accumulate)
 
-    def resolvent(self) -> "Resolvent":
-        """Return A = (I - E)^-1."""
-        return Resolvent(self)
+    def resolvent(self, method: str = "sweep") -> "Resolvent":
+        """Return A = (I - E)^-1.
+
+        Args:
+            method: how ``A @ x`` and ``A.T @ x`` run; the results differ by rounding alone.
+
+                * "sweep": a level of the graph after the other, one launch each: O(nodes) work in depth + 1 steps.
+                * "doubling": (I + E) (I + E^2) (I + E^4) ... x in ceil(log2(depth + 1)) rounds of two launches, O(nodes
+                  log depth) work, and memory for the blocks of every power of E. For trees so deep that the launches
+                  of a sweep take longest, and few worlds. It needs a Tree. Every call squares the weights anew,
+                  because they may have been rewritten.
+
+        Raises:
+            ValueError: no such method, or doubling for a Digraph.
+        """
+        return Resolvent(self, method)
 
     def change_variables(self, B: Blocks) -> "BWA":
         """Return E' = B E B^-1, the adjacency for vectors x' = B x over the nodes; its resolvent is B A B^-1.
@@ -158,25 +174,56 @@ class BWA(Operator):
 
 
 class Resolvent(Operator):
-    """A = (I - E)^-1, applied by sweeps; ``A(i, j)`` is the sum over all paths from i to j of products of weights.
+    """A = (I - E)^-1, never formed; ``A(i, j)`` is the sum over all paths from i to j of products of weights.
 
     A sweeps inward: ``y(k) = x(k) + sum of w(k, j) y(j)`` over the children j. A.T sweeps outward:
     ``y(k) = x(k) + sum of w(p, k)* y(p)`` over the parents p. A sweep is O(nodes), with one launch a level.
+    :meth:`BWA.resolvent` offers another method for deep trees.
 
     Attributes:
         E: the adjacency (eq. 10).
+        method: "sweep" or "doubling".
     """
 
-    def __init__(self, E: BWA):
+    def __init__(self, E: BWA, method: str = "sweep"):
+        if method not in METHODS:
+            raise ValueError(f"BWA.resolvent: method is {method!r}; expected one of {', '.join(METHODS)}")
+        if method == "doubling" and not isinstance(E.graph, Tree):
+            raise ValueError(
+                "BWA.resolvent: method is 'doubling', and the graph is a Digraph, whose nodes may have several "
+                "parents; expected a Tree; method='sweep' serves both"
+            )
         super().__init__(E.shape, E.worlds, E.device, E.dtype, E.kind)
-        self.E = E
-        self.form, self.operands = ("resolvent",), (E,)
+        self.E, self.method = E, method
+        self.operands = (E,)
+        if method == "sweep":
+            self.form = ("resolvent",)  # kernels of whole expressions sweep
 
     def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
-        self._sweep(self.E._up, x, out, alpha, accumulate, space)
+        if self.method == "doubling":
+            self._double(x, out, alpha, accumulate, space, transposed=False)
+        else:
+            self._sweep(self.E._up, x, out, alpha, accumulate, space)
 
     def _apply_transposed(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:
-        self._sweep(self.E._down, x, out, alpha, accumulate, space)
+        if self.method == "doubling":
+            self._double(x, out, alpha, accumulate, space, transposed=True)
+        else:
+            self._sweep(self.E._down, x, out, alpha, accumulate, space)
+
+    def _double(
+        self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace, transposed: bool
+    ) -> None:
+        weights = weights_array(self.E.stored)
+        self._doubling.square(weights)
+        take = functools.partial(space.take, self, self.shape[0])
+        self._doubling.apply(weights, x, out, take, alpha, accumulate, transposed)
+
+    @functools.cached_property
+    def _doubling(self) -> Doubling:
+        E, offsets = self.E, np.zeros(self.E.graph.node_count, np.int64)
+        offsets[[child for _, child in E.graph.edges]] = E.offsets
+        return Doubling(E.graph, E.dims, offsets, E.worlds, E.dtype, E.device)
 
     def _sweep(
         self, table: Table, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace
