@@ -80,6 +80,12 @@ class Dynamics:
             Every dof then has the laws whose values are variable; entries for limits of ball and free hinges are not
             read. Velocity limits damp by the inertia that hinges feel at the scene's values, see :meth:`step`.
         granularity: None (the plan chooses), "node", "segment" or "tree", see :meth:`explain`.
+        recursion: how recursions at node granularity pass through the tree. "sweep": one level after the other, with a
+            launch for each. "scan": in a number of launches that grows with the logarithm of the depth, at three to
+            five times the work, for deep trees in few worlds; granularity is then "node". Factors, solutions,
+            velocities, accelerations and poses scan; the inward sums of inverse_dynamics and mass_matrix, and the
+            digits of status=, sweep. A body whose mass or inertia is set to zero while the values are ``variable``
+            gives NaN where a scan begins at it; otherwise results differ by rounding alone. None: the plan chooses.
         loops: how loop joints and couplings of the scene are treated. "raise": refuse them. "cut": leave them open.
             "embed": close them exactly; links that they tie form one node of the tree. Mass matrices, Jacobians,
             momentum matrices and forces of inverse_dynamics, bias_force and gravity_force are then of
@@ -215,6 +221,7 @@ class Dynamics:
         loops: str = "raise",
         independent: Sequence[int | str] | None = None,
         refine: int = 0,
+        recursion: str | None = None,
     ):
         if not isinstance(scene, Scene):
             raise TypeError(
@@ -227,7 +234,8 @@ class Dynamics:
         self.variable = _variable_names(variable)
         check_loops(scene, loops)
         varies = any(name in self.variable or scene.values[name].shape[0] > 1 for name in RIGID_VALUES)
-        self.plan = plans.choose(scene, self.worlds, self.device.is_cuda, self.dtype.__name__, granularity, varies)
+        cuda, precision = self.device.is_cuda, self.dtype.__name__
+        self.plan = plans.choose(scene, self.worlds, cuda, precision, granularity, varies, recursion)
         self.granularity = self.plan.granularity
         self.recursions = Sweeps(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)
@@ -252,6 +260,7 @@ class Dynamics:
             "loops": loops,
             "independent": independent,
             "refine": count,
+            "recursion": recursion,
         }
 
     # -- loops -----------------------------------------------------------------------------------------------------
@@ -298,6 +307,8 @@ class Dynamics:
             f"actuators    {actuators.explain(self)}",
             f"workspace    {memory:.1f} MiB so far",
         ]
+        if self.plan.scan_reason:
+            lines.insert(3, f"recursion    {plans.describe_recursion(self.plan)}")
         return "\n".join(lines + self.programs.described())
 
     @property

@@ -34,7 +34,9 @@ class Refinement:
         self.steps = steps
         other = "float64" if dyn.dtype is wp.float32 else "float32"
         granularity = dyn.granularity if dyn.plan.forced else None
-        twin = type(dyn)(dyn.scene, dyn.worlds, dyn.device, other, dyn.variable, granularity, "cut")
+        recursion = "scan" if dyn.plan.forced and dyn.plan.stretch else None
+        own = dyn.scene, dyn.worlds, dyn.device, other, dyn.variable, granularity, "cut"
+        twin = type(dyn)(*own, recursion=recursion)
         twin.recursions.parameters.share(dyn.recursions.parameters)
         self.narrow, self.wide = (dyn, twin) if dyn.dtype is wp.float32 else (twin, dyn)
         self._shape = dyn.worlds, dyn.scene.dof_count

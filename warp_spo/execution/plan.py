@@ -10,8 +10,10 @@ from ..recursions.links import Links
 from ..recursions.pieces import Pieces
 from ..scene.scene import Scene
 from .routine import Routine
+from .stretches import cut, solid_nodes
 
 GRANULARITIES = ("node", "segment", "tree")
+RECURSIONS = ("sweep", "scan")
 DEFAULT: str | None = None  # granularity of who asks for none; None: chosen by the rules below
 COLUMN_BYTES = 1 << 28  # workspace of a solve with many right-hand sides; more columns go in turns
 
@@ -28,6 +30,17 @@ FEW_RESULTS = 2  # short ones that a thread writes by itself
 MOST_WARPS = 16
 DEEPEST = 12  # dofs from a root to a leaf, a free hinge one, up to which velocity terms that come first are as accurate
 APART = {"chain": 2048, "tree": 4 * FEW_WORLDS, "segment": FEW_WORLDS}  # worlds beyond which they are faster
+
+# First guesses for GPUs, to be measured with benchmarks/depth.py. In a graph, a launch of a sweep takes about 2 us and
+# one of a scan 5 us, for a level is one step of the recursion, a round of a scan is a product of two elements, and a
+# stretch is STRETCH steps. A scan does three to five times the work of a sweep, so it pays while threads wait.
+STRETCH = 4  # nodes that a thread of a scan works through; fewer take more rounds, more take longer in each
+SCAN_LAUNCH = 3  # launches of sweeps that take the time of one launch of a scan
+SWEEPS = 4  # of forward dynamics: motion outward, factors and forces inward, accelerations outward
+SCAN_THREADS = 32768  # stretches times worlds that keep a GPU busy; with more a scan only does more work
+# Measured on a CPU, 2026-11-22: whole paths as stretches take 0.1 ms for 256 bodies in one world, sweeps 8 ms, nearly
+# all of it launches; at 16 worlds 1.3 against 6, and at 128 worlds 30 against 17.
+CPU_WORLDS = 32
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +60,9 @@ class Plan:
         limbs: serial chains that end in a leaf; counted where it matters.
         apart: forward dynamics takes velocity terms and loads first, and keeps no link's velocity for the rest.
         varies: inertias or hinge frames come from memory.
+        stretch: at node granularity, scans do the work of most sweeps, with so many nodes for a thread, see
+            :mod:`.scan`; 0: sweeps do.
+        scan_reason: why.
     """
 
     granularity: str
@@ -60,6 +76,8 @@ class Plan:
     limbs: int = 1
     apart: bool = False
     varies: bool = False
+    stretch: int = 0
+    scan_reason: str = ""
 
     @property
     def few(self) -> bool:
@@ -109,23 +127,35 @@ class Plan:
 
 
 def choose(
-    scene: Scene, worlds: int, cuda: bool, dtype: str, granularity: str | None = None, varies: bool = False
+    scene: Scene,
+    worlds: int,
+    cuda: bool,
+    dtype: str,
+    granularity: str | None = None,
+    varies: bool = False,
+    recursion: str | None = None,
 ) -> Plan:
-    """Return the plan for a scene and a world count; ``granularity`` forces one.
+    """Return the plan for a scene and a world count; ``granularity`` and ``recursion`` force one.
 
     ``varies``: inertias or hinge frames are inputs, which a thread has to hold too.
 
     Raises:
-        ValueError: no such granularity.
+        ValueError: no such granularity or recursion, or a scan at another granularity than "node".
     """
-    if granularity is not None and granularity not in GRANULARITIES:
-        names = ", ".join(GRANULARITIES)
-        raise ValueError(f"Dynamics: granularity is {granularity!r}; expected None or one of {names}")
+    for name, value, known in (("granularity", granularity, GRANULARITIES), ("recursion", recursion, RECURSIONS)):
+        if value is not None and value not in known:
+            raise ValueError(f"Dynamics: {name} is {value!r}; expected None or one of {', '.join(known)}")
+    if recursion == "scan" and granularity not in (None, "node"):
+        raise ValueError(
+            f"Dynamics: recursion is 'scan' and granularity is {granularity!r}; expected granularity 'node' or None, "
+            f"because kernels of other granularities sweep"
+        )
     shared = scene.shares_dofs
-    if shared and granularity in ("node", "segment"):
-        what = f"granularity={granularity!r} for a scene with flexible bodies or rotors"
-        raise UnsupportedError("Dynamics", what, "use granularity=None or 'tree'")
-    asked = "tree" if shared else granularity or DEFAULT
+    if shared and (granularity in ("node", "segment") or recursion == "scan"):
+        option = f"granularity={granularity!r}" if granularity else "recursion='scan'"
+        what, way = f"{option} for a scene with flexible bodies or rotors", "use granularity=None or 'tree'"
+        raise UnsupportedError("Dynamics", what, way if granularity else "leave recursion out")
+    asked = "tree" if shared else granularity or ("node" if recursion == "scan" else DEFAULT)
     side_by_side = cuda and not shared and asked != "node" and 0 < scene.dof_count <= MOST_DOFS
     pieces = Pieces(Links(scene)) if side_by_side else None
     limbs, alike = (pieces.warps, pieces.alike >= ALIKE[dtype]) if pieces else (1, True)
@@ -142,7 +172,28 @@ def choose(
     apart = side_by_side and not varies and worlds > APART["chain" if limbs == 1 else chosen]
     apart = apart and _depth(scene) <= DEEPEST
     levels, dofs = tuple(outward), scene.dof_count
-    return Plan(chosen, reason, asked is not None, staged, levels, worlds, dtype, dofs, limbs, apart, varies)
+    if recursion is not None:
+        stretch = STRETCH if recursion == "scan" else 0, "asked for"
+    elif chosen != "node" or not dofs:
+        stretch = 0, ""
+    else:
+        stretch = (0, "granularity is asked for") if asked else _stretch(scene, worlds, cuda, varies)
+    return Plan(chosen, reason, asked is not None, staged, levels, worlds, dtype, dofs, limbs, apart, varies, *stretch)
+
+
+def _stretch(scene: Scene, worlds: int, cuda: bool, varies: bool) -> tuple[int, str]:
+    """Return how many nodes a thread of a scan takes, 0 if sweeps take less time than scans, and why."""
+    length, most = (STRETCH, SCAN_THREADS) if cuda else (scene.body_count, CPU_WORLDS)
+    pieces = cut(scene.tree, solid_nodes(scene), length)
+    scans, sweeps = pieces.launches, SWEEPS * len(scene.tree.levels)
+    counts = f"{scans} launches in a row against {sweeps} of sweeps"
+    if SCAN_LAUNCH * scans >= sweeps:
+        return 0, f"scans would be {counts}"
+    if varies and any(level.longest > 1 for level in pieces.levels):
+        return 0, "scans begin at bodies that have inertia, which variable values may take away"
+    if worlds * (len(pieces.nodes) if cuda else 1) > most:
+        return 0, f"with {worlds} worlds the work takes longer than launches; scans would be {counts}"
+    return length, counts
 
 
 def _depth(scene: Scene) -> int:
@@ -183,3 +234,9 @@ def describe(plan: Plan) -> str:
     rows = "through shared memory" if staged else "each by its thread"
     first = "forward dynamics takes velocity terms first; " if plan.apart else ""
     return f"{plan.granularity}: {plan.reason}; rows are read {rows}; {first}granularity= can force {others}"
+
+
+def describe_recursion(plan: Plan) -> str:
+    """Return one line: whether node granularity sweeps or scans, and the reason for it."""
+    chosen, other = RECURSIONS[::-1] if plan.stretch else RECURSIONS
+    return f"{chosen}: {plan.scan_reason}; recursion= can force {other}"

@@ -1,4 +1,4 @@
-"""The sweeps of a scene at node granularity: one method a sweep, one launch a level.
+"""The sweeps of a scene at node granularity: one method a sweep, one launch a level, or a scan in fewer launches.
 
 A method launches its kernels and leaves the results in the workspace, [node or dof, component, world], where later
 methods read them. The first use of a workspace array allocates it.
@@ -24,6 +24,7 @@ from . import node_hinges
 from .node_functions import node_functions
 from .parameters import Parameters
 from .plan import Plan
+from .scan import Scan
 
 
 class Sweeps:
@@ -34,6 +35,7 @@ class Sweeps:
         parameters: the scene's values on the device.
         functions: the functions that kernels at node granularity call at a node.
         turn: of calls that use the workspace.
+        scan: does the work of some sweeps in few rounds; None where sweeps do it.
     """
 
     def __init__(self, scene: Scene, plan: Plan, device: wp.Device, dtype: type, variable: tuple[str, ...]):
@@ -51,6 +53,7 @@ class Sweeps:
         self._workspace: dict[Hashable, wp.array] = {}
         self._frames: dict[tuple, tuple[wp.array, wp.array]] = {}
         self._hinge_kernels: dict[bool, wp.Kernel | None] = {}  # with velocities or not
+        self.scan = Scan(self, plan.stretch) if plan.stretch else None
 
     def replace_values(self, scene: Scene) -> None:
         """Take the values of ``scene``, which has the same topology; variable values stay as they were set."""
@@ -58,6 +61,8 @@ class Sweeps:
         self.scene = scene
         self.parameters = Parameters(scene, self.topology, self.worlds, self.device, self.dtype, variable)
         self.parameters.adopt_variable(before)
+        if self.scan is not None:
+            self.scan.replace_values()
 
     # -- launching -------------------------------------------------------------------------------------------------
     @property
@@ -130,6 +135,9 @@ class Sweeps:
     def velocities(self) -> wp.array:
         """Return V = phi* H* qd of every node; after :meth:`hinges` with qd."""
         velocity = self.array("velocity")
+        if self.scan is not None:
+            self.scan.motion(None, self.array("bias"), None, velocity, None)
+            return velocity
         inputs = [self.array("pose"), self.array("axis"), self.array("bias"), None, None]
         self._sweep(kinematics.node_motion, self.plan.outward, inputs, [velocity, None])
         return velocity
@@ -145,6 +153,9 @@ class Sweeps:
         velocity, bias = (self.array("velocity"), self.array("bias")) if moving else (None, None)
         acceleration = self._per_node("acceleration", MOTION)
         base = self.parameters.gravity if gravity else None
+        if self.scan is not None:
+            self.scan.motion(qdd, bias, base, velocity, acceleration)
+            return acceleration, velocity
         inputs = [self.array("pose"), self.array("axis"), bias, base, qdd]
         self._sweep(kinematics.node_motion, self.plan.outward, inputs, [velocity, acceleration])
         return acceleration, velocity
@@ -152,7 +163,10 @@ class Sweeps:
     def world_poses(self) -> wp.array:
         """Return the pose of every node frame in the inertial frame; after :meth:`hinges`."""
         world_pose = self._per_node("world_pose", POSE)
-        self._sweep(kinematics.world_poses, self.plan.outward, [self.array("pose")], [world_pose])
+        if self.scan is not None:
+            self.scan.world_poses(world_pose)
+        else:
+            self._sweep(kinematics.world_poses, self.plan.outward, [self.array("pose")], [world_pose])
         return world_pose
 
     def quaternion_signs(self, q: wp.array, out: wp.array) -> None:
@@ -219,7 +233,10 @@ class Sweeps:
             self.array("gain", dofs, MOTION, self.worlds),
             self.array("pivot", dofs, self.worlds),
         ]
-        self._sweep(articulated.factor, self.plan.inward, inputs, outputs)
+        if self.scan is not None:
+            self.scan.factor(inputs, outputs)
+        else:
+            self._sweep(articulated.factor, self.plan.inward, inputs, outputs)
         return outputs[2]
 
     def solve(self, b: wp.array | None, out: wp.array, force: wp.array | None = None, gravity: bool = False) -> None:
@@ -233,9 +250,11 @@ class Sweeps:
         base = self.parameters.gravity if gravity else None
         for columns, work in self._chunks(shape[2]):
             self._eliminate(columns, force, b, False, work, out)
-            self._sweep_columns(
-                articulated.back_substitute, self.plan.outward, columns, [*self._factors, base], [work, out]
-            )
+            inputs = [*self._factors, base]
+            if self.scan is not None:
+                self.scan.back_substitute(columns, inputs, out)
+            else:
+                self._sweep_columns(articulated.back_substitute, self.plan.outward, columns, inputs, [work, out])
 
     def inverse_product(self, b: wp.array | None, columns: int, out: wp.array) -> None:
         """Write b* Mass^-1 b into ``out`` [world, column, column]; after :meth:`factor`.
@@ -262,7 +281,10 @@ class Sweeps:
     ) -> None:
         """Write D^-1 [I - H psi K] (b - H phi force) into ``out``."""
         inputs = [*self._factors, force, b, identity]
-        self._sweep_columns(articulated.eliminate, self.plan.inward, columns, inputs, [work, out])
+        if self.scan is not None:
+            self.scan.eliminate(columns, inputs, out)
+        else:
+            self._sweep_columns(articulated.eliminate, self.plan.inward, columns, inputs, [work, out])
 
     def _chunks(self, columns: int) -> list[tuple[tuple[int, int], wp.array]]:
         """Return (first, count) of each group of right-hand sides that one launch solves, with its workspace."""

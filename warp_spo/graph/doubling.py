@@ -37,14 +37,12 @@ class Doubling:
     Args:
         tree: the tree.
         dims: the size of each node.
-        offsets: the first scalar of each node's weight; not looked at for roots.
+        offsets: the first scalar of each node's weight [node]; not looked at for roots.
         worlds: of the weights; 1 if all worlds share them.
         dtype, device: of the weights and vectors.
     """
 
-    def __init__(
-        self, tree: Tree, dims: Sequence[int], offsets: Sequence[int], worlds: int, dtype: type, device: wp.Device
-    ):
+    def __init__(self, tree: Tree, dims: Sequence[int], offsets: Any, worlds: int, dtype: type, device: wp.Device):
         self._worlds, self._dtype, self._device = worlds, dtype, device
         self.rounds = _rounds(tree, dims, offsets, device)
         declare(kernels, dtype)
@@ -91,7 +89,7 @@ class Doubling:
             x = y
 
 
-def _rounds(tree: Tree, dims: Sequence[int], offsets: Sequence[int], device: wp.Device) -> list[Round]:
+def _rounds(tree: Tree, dims: Sequence[int], offsets: Any, device: wp.Device) -> list[Round]:
     """Return E, E^2, E^4, ... as long as they have blocks."""
     size = np.asarray(dims, np.int32)
     start = np.cumsum([0, *size[:-1]])

@@ -222,6 +222,7 @@ class Resolvent(Operator):
     @functools.cached_property
     def _doubling(self) -> Doubling:
         E, offsets = self.E, np.zeros(self.E.graph.node_count, np.int64)
+        assert isinstance(E.graph, Tree), "checked when the resolvent was made"
         offsets[[child for _, child in E.graph.edges]] = E.offsets
         return Doubling(E.graph, E.dims, offsets, E.worlds, E.dtype, E.device)
 
