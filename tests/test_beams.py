@@ -156,6 +156,17 @@ def test_what_is_attached_beside_the_axis_turns_with_the_section():
     np.testing.assert_allclose(found, expected, atol=1e-17)
 
 
+def test_a_frame_beyond_the_tip_moves_with_the_tip():
+    modes = modes_of()
+    tip, _ = modes.shape((LENGTH, 0.0, 0.0))
+    beyond, second = modes.shape((LENGTH + 0.2, 0.0, 0.0))
+    arm = np.array([0.2, 0.0, 0.0])
+    np.testing.assert_allclose(beyond[3:] - tip[3:], np.cross(tip[:3], arm[:, None], axis=0), atol=1e-14)
+    turns = tip[1:3]
+    expected = modes.shape((LENGTH, 0.0, 0.0))[1][0] + 0.2 * turns.T @ turns  # the arm's cosine
+    np.testing.assert_allclose(second[0], expected, rtol=1e-12, atol=1e-12)
+
+
 @pytest.mark.parametrize("stiffening", [True, False])
 def test_children_get_the_slopes_of_their_place(stiffening):
     modes = modes_of(children={"tip": LENGTH, 2: (0.4, 0.1, 0.0)}, stiffening=stiffening)

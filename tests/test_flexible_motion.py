@@ -4,8 +4,8 @@ import functools
 
 import numpy as np
 import pytest
-from flexible_scenes import Traced
-from flexible_twin import Twin
+from flexible_scenes import Traced, about
+from flexible_twin import Twin, of_quaternion
 
 import warp_spo as spo
 
@@ -77,6 +77,25 @@ def test_a_flexible_arm_accelerates_as_the_second_implementation_says():
     np.testing.assert_allclose(traced("forward_dynamics", q=q, qd=qd, tau=tau), found, rtol=1e-10)
     for world in range(3):
         np.testing.assert_allclose(found[world], twin.forward_dynamics(q[world], qd[world], tau[world]), rtol=1e-10)
+
+
+def test_frames_anywhere_on_a_beam_move_as_massless_bodies_there():
+    """On the axis, beside it, and beyond the tip; beside the second implementation's Jacobians."""
+    scene, rng = flexible_arm(2), np.random.default_rng(5)
+    places = [(0, (0.35, 0.0, 0.0)), (1, (0.5, 0.04, -0.03)), (1, (0.9, 0.02, 0.01))]
+    frames = [(body, (*place, *about((0.6, 0.0, 0.8), 0.7))) for body, place in places]
+    welds = [spo.Hinge("fixed", body, 3 + i, parent_pose=pose) for i, (body, pose) in enumerate(frames)]
+    twin = Twin(spo.Scene([*scene.bodies, *[spo.Body(0.0)] * 3], [*scene.hinges, *welds]))
+    dyn = spo.Dynamics(scene, 1, "cpu", "float64")
+    q, qd = rng.normal(size=(2, 1, scene.dof_count)) * [1.0, 0.1, 0.1, 1.0, 0.1, 0.1]
+    poses, J = dyn.frame_poses(q, frames)[0], dyn.jacobian(q, frames)[0]
+    velocities = dyn.frame_velocities(q, qd, frames)[0]
+    for i in range(3):
+        R, x = twin.poses(q[0])[3 + i]
+        np.testing.assert_allclose(poses[i, :3], x, atol=1e-13)
+        np.testing.assert_allclose(of_quaternion(*poses[i, 3:]), R, atol=1e-13)
+        np.testing.assert_allclose(J[i], twin.jacobian(q[0], 3 + i), atol=1e-12)
+        np.testing.assert_allclose(velocities[i], J[i] @ qd[0], atol=1e-12)
 
 
 @functools.cache

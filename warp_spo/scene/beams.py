@@ -115,9 +115,9 @@ def _relative(curves: Curves, terms: int) -> Curves:
 class BeamShapes(StoredPart):
     """How sections of a beam and what is attached to them move with the modes.
 
-    Calling it with a position in the undeformed beam (3,) [m], body axes, returns the slopes (6, n) of a frame there,
+    Calling it with a position at the undeformed beam (3,) [m], body axes, returns the slopes (6, n) of a frame there,
     rotation then displacement per unit amplitude, and its stiffening (3, n, n), or None: the displacement has the
-    second-order part -1/2 eta* G_c eta along axis c.
+    second-order part -1/2 eta* G_c eta along axis c. A frame beside the axis, or beyond an end, moves with the section.
     """
 
     curves: tuple[Curves, Curves, Curves, Curves]  # in the order of DIRECTIONS
@@ -146,14 +146,15 @@ class BeamShapes(StoredPart):
 
     def __call__(self, position: Any) -> tuple[np.ndarray, np.ndarray | None]:
         position = checked_array("modes.shape", "position [m]", position, (3,))
-        (slopes,), arm = self.section(position[:1]), position * (0.0, 1.0, 1.0)
+        x = float(np.clip(position[0], 0.0, self.curves[0].length))  # beyond an end, all moves with the end
+        (slopes,), arm = self.section([x]), position - (x, 0.0, 0.0)
         turn = slopes[:3].copy()
         slopes[3:] += np.cross(turn, arm[:, None], axis=0)
         if not self.stiffening:
             return slopes, None
         along = np.einsum("ci,j->cij", turn, arm @ turn)  # of exp(turn eta) arm
         second = np.einsum("c,ij->cij", arm, turn.T @ turn) - 0.5 * (along + along.swapaxes(1, 2))
-        second[0] += self.foreshortening(float(position[0]))
+        second[0] += self.foreshortening(x)
         return slopes, second
 
 
