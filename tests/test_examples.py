@@ -19,6 +19,7 @@ from warp_spo.examples import (
     identify,
     options,
     parts,
+    quasi_velocities,
     reach,
     slider_crank,
     star,

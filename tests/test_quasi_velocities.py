@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 import symbolic
 import zoo
+from flexible_scenes import Traced
+from test_flexible_twin import TREES
+from test_flexible_twin import states as flexible_states
+from test_flexible_twin import tree as flexible_tree
 
 import warp_spo as spo
 from warp_spo.examples import quasi_velocities as example
@@ -15,7 +19,8 @@ NAMES = ["chain7", "fork", "every_d6", "forest", "floating_tree"]
 CUSTOM = ("rolling_knee", "ellipsoid_shoulder", "many_functions")
 SCENES = {name: zoo.SCENES[name] for name in NAMES} | {"custom": lambda: custom_hinges.skeleton(names=CUSTOM)}
 ROUNDING = 1e-12  # relative to the largest entry; cond(M) of the worst scene is 1e4
-DIFFERENCES = 1e-9  # of order 8, with rounding over a step of 0.003 s or more
+DIFFERENCES = 1e-9  # of order 8, with rounding over a step of 0.001 s or more
+WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}  # of central differences over so many steps
 
 
 def run(scene, operation, a, given):
@@ -66,11 +71,10 @@ def test_the_rate_of_nu_along_a_motion(name):
     dense = Dense(scene, a["q"])
     qdd = dense.forward_dynamics(a["qd"], a["tau"], a["body_f"])
     h = 0.01 / max(1.0, np.abs(a["qd"]).max())
-    weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-    times = h * np.array([sign * step for step in weights for sign in (1, -1)])
+    times = h * np.array([sign * step for step in WEIGHTS for sign in (1, -1)])
     q = np.array([dense.integrate(a["qd"], t) for t in times])  # to first order in t; so is what the rate sees
     nu = nu_of(scene, q, a["qd"] + times[:, None] * qdd)
-    rate = sum(weight * (nu[2 * i] - nu[2 * i + 1]) for i, weight in enumerate(weights.values())) / h
+    rate = sum(weight * (nu[2 * i] - nu[2 * i + 1]) for i, weight in enumerate(WEIGHTS.values())) / h
     worlds = {key: array[None] for key, array in a.items()}
     worlds["nu"] = nu_of(scene, worlds["q"], worlds["qd"])
     eps = run(scene, "quasi_velocity_force", worlds, "q tau body_f")
@@ -104,3 +108,20 @@ def test_the_example_keeps_the_energy(device, tmp_path):
     worst = example.main(seconds=0.2, worlds=2, device=device, picture=tmp_path / "nu.svg")
     assert worst["nu"] <= 1e-13 and 1e-8 <= worst["qd"] <= 1e-3
     assert "in nu, all 2 worlds" in (tmp_path / "nu.svg").read_text()
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_flexible_trees(name):
+    """Energy, the way back, no work, and the rate of nu along forward dynamics, where links share modal coordinates."""
+    scene = flexible_tree(name)
+    traced, (q, qd) = Traced(scene), flexible_states(scene, 1)
+    nu = nu_of(scene, q, qd)
+    assert laws.error((nu**2).sum(1), 2.0 * traced("kinetic_energy", q=q, qd=qd)) <= ROUNDING
+    assert laws.error(run(scene, "generalized_velocities", {"q": q, "nu": nu}, "q nu"), qd) <= ROUNDING
+    C = run(scene, "quasi_velocity_coriolis", {"q": q, "nu": nu}, "q nu")
+    eps = run(scene, "quasi_velocity_force", {"q": q}, "q")
+    assert np.abs((nu * C).sum()) <= ROUNDING * np.linalg.norm(nu) * np.linalg.norm(C)
+    qdd, h = traced("forward_dynamics", q=q, qd=qd), 0.003 / max(1.0, np.abs(qd).max())
+    at = lambda t: nu_of(scene, traced("integrate", q=q, qd=qd, dt=np.full((1, 1), t)), qd + t * qdd)  # noqa: E731
+    rate = sum(weight * (at(i * h) - at(-i * h)) for i, weight in WEIGHTS.items()) / h
+    assert laws.error(eps - C, rate) <= DIFFERENCES
