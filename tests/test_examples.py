@@ -31,7 +31,7 @@ FOLDER = Path(parts.__file__).parent
 
 SHORT = {
     **dict.fromkeys((floating_arm, identify, reach), 100),
-    **dict.fromkeys((double_fourbar, harmonic_drive, star, tether), 60),
+    **dict.fromkeys((double_fourbar, harmonic_drive, quasi_velocities, star, tether), 60),
 }
 
 

@@ -16,13 +16,6 @@ from warp_spo.trials.drawing import OTHER, OURS
 ITERATIONS = 10  # of the midpoint's equations; each brings about one more digit
 
 
-def chain(links=4):
-    """Return bars whose joints turn about y and z, with nothing that holds the first, in a world without gravity."""
-    axes = [(0, 1, 0) if k % 2 else (0, 0, 1) for k in range(links)]
-    hinges = [spo.Hinge("revolute", k - 1, k, axis=axes[k], parent_pose=at(0.5)) for k in range(1, links)]
-    return spo.Scene([bar(0.5)] * links, [spo.Hinge("free", -1, 0), *hinges], gravity=(0.0, 0.0, 0.0))
-
-
 def midpoint(dyn, q, v, dt, velocities, rates):
     """Return q and v after dt, for velocities qd = velocities(q, v) and v' = rates(q, v)."""
     q_middle, v_middle = q, v
@@ -33,38 +26,34 @@ def midpoint(dyn, q, v, dt, velocities, rates):
 
 
 def main(seconds=3.0, dt=0.01, worlds=4, device=None, picture=None):
-    dyn, rng = spo.Dynamics(chain(), worlds, device, "float64"), np.random.default_rng(0)
-    rest = np.tile(dyn.scene.values["joint_rest_q"], (worlds, 1))
-    start = dyn.integrate(rest, rng.normal(size=(worlds, dyn.scene.dof_count)), 1.0)
-    turning = rng.normal(size=(worlds, dyn.scene.dof_count))
-    energy = dyn.kinetic_energy(start, turning)
-    in_qd = dict(velocities=lambda q, qd: qd, rates=dyn.forward_dynamics)
-    in_nu = dict(velocities=dyn.generalized_velocities, rates=lambda q, nu: -dyn.quasi_velocity_coriolis(q, nu))
-    change, where = {}, {}
-    for name, equations, v, parts in (
-        ("finer", in_qd, turning, 4),
-        ("qd", in_qd, turning, 1),
-        ("nu", in_nu, dyn.quasi_velocities(start, turning), 1),
-    ):
-        q, change[name], where[name] = start, [], []
-        for step in range(round(seconds / dt) * parts):
-            q, v = midpoint(dyn, q, v, dt / parts, **equations)
-            if step % parts == parts - 1:
-                now = dyn.kinetic_energy(q, equations["velocities"](q, v))
-                change[name].append(np.abs(now / energy - 1.0))
-                where[name].append(dyn.body_poses(q)[:, -1, :3])
-    for name in ("qd", "nu"):
-        print(f"Integrated in {name}, the energy changes by at most {np.max(change[name]):.1e} of itself.")
+    hinges = [spo.Hinge("revolute", k - 1, k, axis=np.eye(3)[1 + k % 2], parent_pose=at(0.5)) for k in (1, 2, 3)]
+    scene = spo.Scene([bar(0.5)] * 4, [spo.Hinge("free", -1, 0), *hinges], gravity=(0.0, 0.0, 0.0))
+    dyn, rng = spo.Dynamics(scene, worlds, device, "float64"), np.random.default_rng(0)
+    turn, qd = rng.normal(size=(2, worlds, scene.dof_count))
+    start = dyn.integrate(np.tile(scene.neutral_q, (worlds, 1)), turn, 1.0)
+    in_qd = qd, lambda q, qd: qd, dyn.forward_dynamics
+    nu, coriolis = dyn.quasi_velocities(start, qd), dyn.quasi_velocity_coriolis
+    in_nu = nu, dyn.generalized_velocities, lambda q, nu: -coriolis(q, nu)
+    energy, change, tip = dyn.kinetic_energy(start, qd), {}, {}
+    for name, (v, velocities, rates), parts in (("finer", in_qd, 4), ("qd", in_qd, 1), ("nu", in_nu, 1)):
+        q, change[name], tip[name] = start, [], []
+        for step in range(1, round(seconds / dt) * parts + 1):
+            q, v = midpoint(dyn, q, v, dt / parts, velocities, rates)
+            if step % parts == 0:
+                change[name].append(np.abs(dyn.kinetic_energy(q, velocities(q, v)) / energy - 1.0))
+                tip[name].append(dyn.body_poses(q)[:, -1, :3])
+    worst = {name: float(np.max(change[name])) for name in ("qd", "nu")}
+    for name, value in worst.items():
+        print(f"Integrated in {name}, the energy changes by at most {value:.1e} of itself.")
     if picture:
-        t = dt * np.arange(1, len(change["qd"]) + 1)
         with drawing(picture, "Change of the energy", "Distance of the last bar from a finer run") as axes:
             for name, color in (("qd", OTHER), ("nu", OURS)):
-                error_band(axes[0], t, np.array(change[name]), color, f"in {name}")
-                distance = np.linalg.norm(np.array(where[name]) - where["finer"], axis=-1)
-                error_band(axes[1], t, distance, color, f"in {name}")
-            axes[0].set(xlabel="time [s]", ylabel="relative change")
-            axes[1].set(xlabel="time [s]", ylabel="distance [m]")
-    return {name: float(np.max(change[name])) for name in ("qd", "nu")}
+                off = np.linalg.norm(np.subtract(tip[name], tip["finer"]), axis=-1)
+                both, labels = (np.array(change[name]), off), ("relative change", "distance [m]")
+                for each, values, label in zip(axes, both, labels, strict=True):
+                    error_band(each, dt * np.arange(1, len(off) + 1), values, color, f"in {name}")
+                    each.set(xlabel="time [s]", ylabel=label)
+    return worst
 
 
 if __name__ == "__main__":
