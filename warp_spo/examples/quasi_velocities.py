@@ -1,9 +1,8 @@
 """A chain that tumbles in free fall, integrated in quasi-velocities: its energy stays what it was.
 
-In quasi-velocities nu the kinetic energy is nu . nu / 2, whatever the configuration, and nu' = -C(q, nu) with
-nu . C = 0. The implicit midpoint rule keeps sums of squares, so it keeps the energy to rounding. The same rule in qd
-does not: there the energy is qd* Mass(q) qd / 2. Energy is not everything: both rules are of second order, and here
-the one in qd says better where the chain is. (Jain, Rodriguez 1995.)
+In quasi-velocities nu the kinetic energy is nu . nu / 2, and nu' = -C(q, nu) with nu . C = 0. The implicit midpoint
+rule keeps sums of squares, so it keeps the energy to rounding. The same rule in qd does not: there the energy is
+qd* Mass(q) qd / 2. But both rules are of second order, and here the one in qd says better where the chain is.
 """
 
 import numpy as np
