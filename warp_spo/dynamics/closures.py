@@ -56,6 +56,9 @@ class Closures:
         self.closed = loops in ("embed", "multipliers") and bool(scene.loops or scene.couplings)
         if independent is not None and not (self.closed and loops == "embed"):
             raise ValueError("Dynamics: independent= belongs to loops='embed' of a scene with loops or couplings")
+        if self.closed and loops == "multipliers" and scene.shares_dofs:
+            what = "loops='multipliers' of a scene with flexible bodies or rotors"
+            raise UnsupportedError("Dynamics", what, "use loops='embed'")
         self._usual_rank = usual_rank(scene) if self.closed and loops == "multipliers" else 0
         self.embedding = embedding(scene, independent) if self.closed and loops == "embed" else None
         if self.closed:

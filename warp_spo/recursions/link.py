@@ -63,7 +63,7 @@ class Link:
     @property
     def leads(self) -> bool:
         """Whether work that a dof does once is done at this link, not at another one of its group."""
-        return self.group is None or self.group.links[0] is self
+        return self.group is None or self.group.links[0].hinge is self.hinge  # of a copy with other armature, too
 
     @property
     def coupled(self) -> dict[tuple[int, int], float]:

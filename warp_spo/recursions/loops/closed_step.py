@@ -62,7 +62,8 @@ class ClosedStep(Step):
         self.rates = [*qd.values()]
         for cluster in self.loops.clusters:
             self.loops.label(cluster, "c")
-            self._close(cluster, q, qd)
+            if cluster.constraints:
+                self._close(cluster, q, qd)
         self.after = q, qd
         closed = {"q_out": q, "out": qd}
         return [s._replace(value=closed[s.array][s.index[0]]) if s.array in closed else s for s in stores]
@@ -75,7 +76,7 @@ class ClosedStep(Step):
         self.margins_after += tied.space.margins
         for _ in range(count):
             step = tied.space.particular([-g for g in tied.errors(places, q.__getitem__)])
-            for link in cluster.links:
+            for link in (link for link in cluster.links if link.leads):
                 new = integrate_link(link, q.__getitem__, lambda dof: step.get(dof, 0.0), 1.0)  # noqa: B023
                 q |= {link.coordinate + c: value for c, value in enumerate(new)}
             places = place()

@@ -128,7 +128,8 @@ class Closure:
         rows = self._rows(inner, outer)
         for dof, w, v in self._columns(places, outer):
             for entries, row in zip(found, rows, strict=True):
-                entries[dof] = dot(row.w, w) + dot(row.v, v)
+                value = dot(row.w, w) + dot(row.v, v)
+                entries[dof] = entries[dof] + value if dof in entries else value
         return found
 
     def sizes(self, places: dict[int, Placed]) -> list[Value]:

@@ -29,6 +29,7 @@ from .closures import Closure, Ratio
 from .nullspace import Basis, NullSpace
 
 Columns = dict[int, Value]  # by dof
+Entries = dict[tuple[int, int], Value]  # by row and column
 
 
 @dataclasses.dataclass
@@ -46,7 +47,7 @@ class Cluster:
 
     @property
     def dofs(self) -> list[int]:
-        return [dof for link in self.links for dof in link.dofs]
+        return [dof for link in self.links for dof in link.dofs if link.leads]
 
     @property
     def rows(self) -> list[int]:
@@ -55,7 +56,7 @@ class Cluster:
 
 
 def clusters(links: Links, constraints: list[Closure | Ratio]) -> list[Cluster]:
-    """Return the clusters of a scene, in the order of their first links."""
+    """Return the clusters of a scene, in the order of their first links; links that share dofs go together."""
     owner = {id(link): id(link) for link in links.links}
 
     def find(key: int) -> int:
@@ -66,6 +67,9 @@ def clusters(links: Links, constraints: list[Closure | Ratio]) -> list[Cluster]:
     for constraint in constraints:
         for link in constraint.path[1:]:
             owner[find(id(link))] = find(id(constraint.path[0]))
+    for link in links.links:
+        if link.group is not None:
+            owner[find(id(link))] = find(id(link.group.links[0]))
     found: dict[int, Cluster] = {}
     first = 0
     for constraint in constraints:
@@ -165,7 +169,7 @@ def factor(
     """
     X, inside = space.basis, set(map(id, cluster.links))
     carried: dict[int, Articulated] = {}
-    handed, M, F = NO_INERTIA, {}, {}
+    handed, M, F = NO_INERTIA, Entries(), dict[int, Vector]()
     for link in reversed(cluster.links):
         key = id(link)
         P = own[key]
@@ -173,15 +177,22 @@ def factor(
             if id(child) in carried:
                 P = P + carried[id(child)]
         H_T = articulated.columns(link, places[key])
-        for dof, armature, H in zip(link.dofs, stiffened(link).armature, H_T, strict=True):
+        stiff, entries = stiffened(link) if link.leads else link, Entries()
+        for dof, armature, H in zip(link.dofs, stiff.armature, H_T, strict=True):
             n, f = P.apply(Vector(H[:3]), Vector(H[3:]))
             over: Link | None = link
             while over is not None and id(over) in inside:
                 for row, force in zip(over.dofs, hinge_entries(over, places[id(over)], n, f), strict=True):
-                    M[row, dof] = M[dof, row] = force + (armature if row == dof else 0.0)
+                    entries[row, dof] = entries[dof, row] = force + (armature if row == dof else 0.0)
                 n, f = places[id(over)].pose.force_to_parent(n, f)
                 over = over.parent
-            F[dof] = Vector((*n, *f))
+            handed_on = Vector((*n, *f))
+            F[dof] = F[dof] + handed_on if dof in F else handed_on
+        for (i, j), x in link.coupled.items():
+            for at in ((link.dofs[i], link.dofs[j]), (link.dofs[j], link.dofs[i])):
+                entries[at] = entries[at] + x
+        for at, entry in entries.items():
+            M[at] = M[at] + entry if at in M else entry  # links of a group add to the same entries
         carried[key] = NO_INERTIA if link.parent is None else places[key].pose.articulated_to_parent(P)
         if link.parent is None or id(link.parent) not in inside:
             handed = handed + carried[key]
@@ -244,7 +255,9 @@ def hinge_forces(
             if id(child) in passed:
                 force = force + passed[id(child)]
         n, f = Vector(force[:3]), Vector(force[3:])
-        tau |= zip(link.dofs, newton_euler.hinge_force(stiffened(link), places[key], n, f, qdd), strict=True)
+        stiff = stiffened(link) if link.leads else link
+        for dof, value in zip(link.dofs, newton_euler.hinge_force(stiff, places[key], n, f, qdd), strict=True):
+            tau[dof] = tau[dof] + value if dof in tau else value
         if link.parent is None:
             continue
         n, f = places[key].pose.force_to_parent(n, f)

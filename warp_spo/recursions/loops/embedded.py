@@ -68,6 +68,9 @@ class ClosedLoops:
         """The clusters, in the order of their first links."""
         found = aggregates.clusters(self.trace.links, self.constraints)
         tied = {id(link) for cluster in found for link in cluster.links}
+        groups = [link for link in self.trace.links.links if link.group is not None and link.leads]
+        found += [Cluster(link.group.links, link.parent, []) for link in groups if id(link) not in tied]  # type: ignore[union-attr]
+        tied |= {id(link) for cluster in found for link in cluster.links}
         return found + [Cluster([link], link.parent, []) for link in self._alone if id(link) not in tied]
 
     @functools.cached_property

@@ -52,7 +52,7 @@ def project_position(trace: Trace, embedding: Embedding, fixed: tuple[int, ...] 
 def move_all(trace: Trace, step: Columns) -> list[Store]:
     """out [coordinate] = q after a small step"""
     stores = []
-    for link in trace.links.links:
+    for link in trace.links.leaders:
         trace.label(link, "q")
         coordinates = move(trace, link, [step.get(dof, 0.0) for dof in link.dofs])
         stores += [Store("out", (link.coordinate + i,), value) for i, value in enumerate(coordinates)]
