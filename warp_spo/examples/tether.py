@@ -32,7 +32,7 @@ def at_rest(pull):
 def main(seconds=4.0, dt=0.01, worlds=3, device=None, picture=None):
     dyn = spo.Dynamics(scene(), worlds, device, "float64", granularity="node")
     pull = np.linspace([15.0, 0.0, 10.0], [25.0, 5.0, 25.0], worlds)
-    ends, q, qd = [(k, at(LENGTH / LINKS)) for k in range(LINKS)], *np.zeros((2, worlds, 2 * LINKS))
+    ends, (q, qd) = [(k, at(LENGTH / LINKS)) for k in range(LINKS)], np.zeros((2, worlds, 2 * LINKS))
     q[:, 0], load, wanted = -0.5, np.zeros((worlds, LINKS, 6)), at_rest(pull)
     times, shapes = [0.0], [dyn.frame_poses(q, ends)[..., :3]]
     for step in range(1, round(seconds / dt) + 1):
