@@ -7,26 +7,14 @@ worlds at once, is ready in seconds. That emitted code agrees with evaluated tra
 import functools
 
 import numpy as np
+import symbolic
 
 import warp_spo as spo
-from warp_spo.recursions import composite, coordinates, energy, forward_dynamics, hinge_forces, kinematics, newton_euler
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
 
 FULL = {"y": 2, "z": 2, "torsion": 1, "axial": 1}
-ROUTINES = {
-    "bias_force": newton_euler.inverse_dynamics,
-    "body_poses": kinematics.body_poses,
-    "body_velocities": kinematics.body_velocities,
-    "forward_dynamics": forward_dynamics.forward_dynamics,
-    "integrate": coordinates.integrate,
-    "inverse_dynamics": newton_euler.inverse_dynamics,
-    "kinetic_energy": energy.kinetic_energy,
-    "mass_matrix": composite.mass_matrix,
-    "passive_force": hinge_forces.passive_force,
-    "potential_energy": energy.potential_energy,
-}
 
 
 class Traced:
@@ -37,7 +25,8 @@ class Traced:
         self._stores = functools.cache(self._traced)
 
     def _traced(self, name, inputs):
-        return ROUTINES[name](Trace(Links(self.scene), "float64", inputs))
+        name = "inverse_dynamics" if name == "bias_force" else name
+        return symbolic.function(name)(Trace(Links(self.scene), "float64", inputs))
 
     def __call__(self, name, **arrays):
         arrays = {key: np.asarray(value, float) for key, value in arrays.items()}

@@ -146,7 +146,7 @@ def many_modes(count, lowest=1.0, highest=1e8, tip=0.5):
     return spo.Scene([body, carried], [revolute(-1, 0), revolute(0, 1, 1.0)])
 
 
-@pytest.mark.parametrize("count", [0, 1, 6, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [0, 1, *(pytest.param(count, marks=pytest.mark.slow) for count in (6, 20))])
 @pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_stiff_modes_are_implicit_in_the_step(count, dtype):
     """Modal stiffness 1 to 1e8 at steps of 1 ms: each step solves (M + h D + h^2 K) qdd = forces at q + h qd."""

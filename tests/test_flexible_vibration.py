@@ -11,11 +11,11 @@ UNIT = dict(section=spo.Section(1.0, THIN**2, THIN**2), material=spo.Material(1.
 
 TABLE = [
     (0.0, 3.5160, 3.5160, 3.5160),
-    (2.0, 4.1374, 4.1373, 3.6218),
-    (4.0, 5.5858, 5.5850, 3.8977),
+    pytest.param(2.0, 4.1374, 4.1373, 3.6218, marks=pytest.mark.slow),
+    pytest.param(4.0, 5.5858, 5.5850, 3.8977, marks=pytest.mark.slow),
     (6.0, 7.3636, 7.3604, 4.2634),
-    (8.0, 9.2657, 9.2568, 4.6577),
-    (10.0, 11.2210, 11.2023, 5.0505),
+    pytest.param(8.0, 9.2657, 9.2568, 4.6577, marks=pytest.mark.slow),
+    pytest.param(10.0, 11.2210, 11.2023, 5.0505, marks=pytest.mark.slow),
     (12.0, 13.2036, 13.1702, 5.4304),
 ]
 """A beam that spins about its clamped end, in units of sqrt(EI / rho A) / L^2 (Wright et al., 1982): rate, its first
@@ -74,6 +74,7 @@ def test_a_rotating_beam(rate, table, exact, in_the_plane):
     assert lagging == pytest.approx(in_the_plane, rel=0.005 if rate <= 8.0 else 0.015)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate, exact", [(10.0, 5.0505), (12.0, 5.4304)])
 def test_more_modes_in_the_plane_of_rotation(rate, exact):
     """Six modes give every row of the table to 0.5 %."""
