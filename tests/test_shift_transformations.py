@@ -13,6 +13,8 @@ from operator_scenes import SCENES, TOLERANCE, scene_of
 from operators_of_robots import close
 from rendering import assert_is_whole
 from test_abstract_systems import abstract_system
+from test_flexible_twin import states as flexible_states
+from test_flexible_twin import tree as flexible_tree
 
 import warp_spo as spo
 from benchmarks import frames
@@ -252,6 +254,21 @@ def test_index_shift(name, device):
             of = reference.Dense(dyn.scene, q[world])
             whole = of.phi @ of.M @ of.phi.T * np.kron(np.eye(dyn.scene.body_count), np.ones((6, 6)))
             assert laws.error(R.dense()[world], whole) <= tolerance
+
+
+def test_flexible_bodies(device):
+    """Nodes of 6 to 9 entries have other variables and composite inertias; frames for them are refused by name."""
+    scene = flexible_tree("two trees")
+    q = flexible_states(scene, WORLDS)[0]
+    dyn = spo.Dynamics(scene, WORLDS, device=device, dtype="float64")
+    ops = dyn.operators(q)
+    close(ops.phi @ ops.M @ ops.phi.T, ops.R + ops.phi.strict @ ops.R + ops.R @ ops.phi.strict.T, 1e-12)
+    B = spo.Blocks.diagonal(invertible(ops.E_phi.dims, 10), device=device)
+    similar, b = ops.change_variables(B), B.dense()
+    close(similar.D, ops.D, 1e-10)
+    close(similar.phi, b @ ops.phi.dense() @ np.linalg.inv(b), 1e-10)
+    with pytest.raises(spo.UnsupportedError, match=r"change_frames: node 0 of 9 entries .* use change_variables"):
+        ops.change_frames("world")
 
 
 def test_composite_inertias_of_a_fused_robot_follow(device):

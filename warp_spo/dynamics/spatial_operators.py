@@ -14,6 +14,7 @@ import warp as wp
 from .. import launches
 from ..arrays import WARP, AnyArray, Call
 from ..dlpack import settle
+from ..errors import UnsupportedError
 from ..execution.programs import Programs
 from ..execution.routine import Routine
 from ..execution.sweeps import Sweeps
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from .dynamics import Dynamics
 
 WRITTEN = ("E_phi", "H", "M", "Delta", "P", "D", "D_inverse", "G", "E_psi")  # operators whose blocks kernels write
+RIGID = 6  # entries of a rigid body's vector
 EXPRESSION = Routine(
     "expression",
     recursion.expression,
@@ -218,6 +220,7 @@ class SpatialOperators(LetterOwner):
 
         Raises:
             ValueError: origin is something else.
+            UnsupportedError: a node has more than the 6 entries of a rigid body.
         """
         if origin not in ("world", "root"):
             raise ValueError(
@@ -225,6 +228,13 @@ class SpatialOperators(LetterOwner):
                 f"refer to the frame of each body"
             )
         run, E = self._recursions, self.E_phi
+        for node, size in enumerate(E.dims):
+            if size != RIGID:
+                raise UnsupportedError(
+                    "operators.change_frames",
+                    f"node {node} of {size} entries (modes, or several links that share dofs)",
+                    "use change_variables with a matrix for each node",
+                )
         declare(common_frames, run.functions)
         sizes = [rows * columns for _, _, rows, columns in self.M.places]
         weights = [new_weights(run.worlds, sum(sizes), run.dtype, run.device) for _ in range(2)]
