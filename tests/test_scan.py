@@ -15,7 +15,7 @@ from warp_spo import launches
 from warp_spo.execution import plan
 from warp_spo.execution.stretches import cut, solid_nodes
 
-SWEEP = {"float64": 1e-12, "float32": 5e-6}  # of P+ and z+; float64 also of qdd
+SWEEP = {"float64": 1e-12, "float32": 5e-6}  # of P+, z+ and tau; float64 also of qdd
 SWEEPS = 4  # errors of float32 qdd, in those of float32 sweeps: with 4096 bodies 3.3 with a node a stretch, 2 with four
 PATHS = 10**6  # nodes of a stretch that is a whole path
 SCANNED = ("forward_dynamics", "solve_mass_matrix", "mass_matrix_inverse", "log_det_mass_matrix", "inverse_dynamics")
@@ -88,6 +88,20 @@ def test_nothing_is_allocated_after_the_first_call(scanned, device):
         laws.call(dyn, "forward_dynamics", arrays, out=out)
 
 
+def test_captured_in_a_graph(scanned, device):
+    if not device.is_cuda:
+        pytest.skip("graphs need CUDA")
+    dyn = scanned(zoo.SCENES["tree20"](), 3)
+    arrays = laws.to_device(dyn, laws.states(dyn.scene, 3))
+    out = wp.empty((3, dyn.scene.dof_count), dtype=dyn.dtype, device=device)
+    wanted = laws.call(dyn, "forward_dynamics", arrays, out=out).numpy()
+    with wp.ScopedCapture(device) as capture:
+        laws.call(dyn, "forward_dynamics", arrays, out=out)
+    out.fill_(np.nan)
+    wp.capture_launch(capture.graph)
+    np.testing.assert_array_equal(out.numpy(), wanted)
+
+
 # -- beside sweeps -----------------------------------------------------------------------------------------------------
 def compare_with_sweeps(scene, q, qd, tau, scanned, lengths, device, dtypes=tuple(SWEEP)):
     """qdd and P+ of scans beside those of float64 sweeps."""
@@ -98,6 +112,7 @@ def compare_with_sweeps(scene, q, qd, tau, scanned, lengths, device, dtypes=tupl
         own = worst(sweeps(dtype).forward_dynamics(q, qd, tau), wanted)
         for length in lengths:
             dyn = scanned(scene, len(q), dtype, length)
+            assert worst(dyn.inverse_dynamics(q, qd, tau), exact.inverse_dynamics(q, qd, tau)) <= SWEEP[dtype], length
             error = worst(dyn.forward_dynamics(q, qd, tau), wanted)
             assert error <= max(SWEEPS * own if dtype == "float32" else 0.0, SWEEP[dtype]), (length, own)
             assert worst(articulated_after(dyn, q, qd, tau), P) <= SWEEP[dtype], length
@@ -150,8 +165,8 @@ def test_chains(ratio, scanned, device):
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [8, 33, 128, 512, 1024, 4096])
 def test_longer_chains_of_all_mass_ratios(n, scanned, device):
-    for ratio in (1e-6, 1e-3, 1.0, 1e3, 1e6) if n <= 128 else (1e-6, 1e6):
-        compare_chain(n, ratio, scanned, (1, 4), device)
+    for ratio in (1e-6, 1e-3, 1.0, 1e3, 1e6) if n <= 128 else (1e-6, 1e6) if n < 4096 else (1.0,):
+        compare_chain(n, ratio, scanned, (1, 4) if n < 4096 else (4,), device)
 
 
 def compare_tree(seed, bodies, worlds, scanned, lengths, device, root_kind="free"):

@@ -82,10 +82,10 @@ class Dynamics:
         granularity: None (the plan chooses), "node", "segment" or "tree", see :meth:`explain`.
         recursion: how recursions at node granularity pass through the tree. "sweep": one level after the other, with a
             launch for each. "scan": in a number of launches that grows with the logarithm of the depth, at three to
-            five times the work, for deep trees in few worlds; granularity is then "node". Factors, solutions,
-            velocities, accelerations and poses scan; the inward sums of inverse_dynamics and mass_matrix, and the
-            digits of status=, sweep. A body whose mass or inertia is set to zero while the values are ``variable``
-            gives NaN where a scan begins at it; otherwise results differ by rounding alone. None: the plan chooses.
+            five times the work, for deep trees in few worlds; granularity is then "node". All recursions scan but
+            those of mass_matrix's composite bodies and of the digits that status= estimates, which sweep. A body
+            whose mass or inertia is set to zero while the values are ``variable`` gives NaN where a scan begins at
+            it; otherwise results differ by rounding alone. None: the plan chooses.
         loops: how loop joints and couplings of the scene are treated. "raise": refuse them. "cut": leave them open.
             "embed": close them exactly; links that they tie form one node of the tree. Mass matrices, Jacobians,
             momentum matrices and forces of inverse_dynamics, bias_force and gravity_force are then of

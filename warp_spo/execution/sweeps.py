@@ -208,7 +208,10 @@ class Sweeps:
     def hinge_forces(self, qdd: wp.array | None, force: wp.array, out: wp.array) -> None:
         """Write H phi force + Delta qdd into ``out`` [world, dof]; after :meth:`hinges`."""
         inputs = [self.array("pose"), self.array("axis"), self.parameters.field("joint_armature"), qdd]
-        self._sweep(newton_euler.force, self.plan.inward, inputs, [force, out])
+        if self.scan is not None:
+            self.scan.hinge_forces(inputs, force, out)
+        else:
+            self._sweep(newton_euler.force, self.plan.inward, inputs, [force, out])
 
     # -- mass matrix -----------------------------------------------------------------------------------------------
     def mass_matrix(self, out: wp.array) -> None:

@@ -17,6 +17,8 @@ from ..scene.tree import Tree
 from .algebra import add_scaled
 from .blocks import new_weights
 
+THREADS = 64  # of a block: doubling has few threads, and more blocks use more of a GPU
+
 
 @dataclasses.dataclass(frozen=True)
 class Round:
@@ -58,7 +60,7 @@ class Doubling:
         for before, after, power in zip(self.rounds, self.rounds[1:], self._powers, strict=False):
             dim = (after.widest, len(after.nodes), self._worlds)
             inputs = [before.tables, after.tables, after.nodes, weights]
-            launches.launch(kernel, dim, inputs, [power], device=self._device)
+            launches.launch(kernel, dim, inputs, [power], device=self._device, block_dim=THREADS)
             weights = power
 
     def apply(
@@ -85,7 +87,8 @@ class Doubling:
             y = out if r == last else take(r % 2)
             factor, add = (alpha, accumulate) if r == last else (1.0, False)
             power = self._powers[r - 1] if r else weights
-            launches.launch(kernel, dim, [one.tables, power, factor, add, x], [y], device=self._device)
+            inputs = [one.tables, power, factor, add, x]
+            launches.launch(kernel, dim, inputs, [y], device=self._device, block_dim=THREADS)
             x = y
 
 
