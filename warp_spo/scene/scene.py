@@ -298,7 +298,7 @@ class Scene(Stored):
 
     @property
     def deflections(self) -> tuple[int, ...]:
-        """The dofs that are the deflection of a flexible hinge or the modes of a body: only forces move them."""
+        """The dofs that only forces move, those that are the deflection of a flexible hinge or the modes of a body."""
         found: list[int] = []
         for first, end, hinge in zip(self.qd_start, self.qd_start[1:], self.hinges, strict=False):
             modes = getattr(self.bodies[hinge.child].modes, "count", 0)
