@@ -43,6 +43,40 @@ def arm(ratio, inertia, model, axes=((0, 0, 1), (0, 0, 1)), **more):
     return spo.Scene([zoo.rod(0.5, 0.8, thin=False) for _ in range(2)], hinges, gravity=(0, 0, 0))
 
 
+def round_body(rng, axis):
+    """A rotor of 0.1 to 0.3 kg that is symmetric about the axis through its centre of mass, off the anchor."""
+    spin, across, mass = 10.0 ** rng.uniform(-4, -3), 10.0 ** rng.uniform(-4, -3), rng.uniform(0.1, 0.3)
+    inertia = across * np.eye(3) + (spin - across) * np.outer(axis, axis)
+    return spo.Body(mass, rng.uniform(-0.1, 0.1, 3), inertia, any_inertia=True)
+
+
+def lift(q):
+    """A custom hinge of one coordinate: a screw whose pitch grows."""
+    c, s = np.cos(q[0]), np.sin(q[0])
+    return (0.0, 0.0, 0.1 * q[0] ** 2), ((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0))
+
+
+def geared_tree(model, seed=90, root="free"):
+    """A root with two arms: rotors of all three forms, on turns, a slide, a flexible and a custom hinge."""
+    rng = np.random.default_rng(seed)
+    axes, ratio = zoo.unit(rng, 5, 3), rng.uniform(-60.0, 60.0, 5)
+    forms = [round_body(rng, axes[0]), 3e-4, round_body(rng, axes[2]).inertia, 2e-4, round_body(rng, axes[4])]
+    rotors = [spo.Rotor(form, r, axis, model) for form, r, axis in zip(forms, ratio, axes, strict=True)]
+    bodies = [zoo.random_body(rng) for _ in range(7)]
+    turn, slide = (zoo.random_hinge(rng, kind, p, k) for kind, p, k in (("revolute", 0, 1), ("prismatic", 1, 2)))
+    hinges = [
+        zoo.random_hinge(rng, root, -1, 0),
+        dataclasses.replace(turn, rotor=rotors[0]),
+        dataclasses.replace(slide, rotor=rotors[1]),
+        flexible(rng, "revolute", 0, 3, rotor=rotors[2]),
+        spo.Hinge.custom(3, 4, coordinates=1, pose=lift, rotor=rotors[3], parent_pose=zoo.random_pose(rng)),
+        zoo.random_hinge(rng, "ball", 4, 5),
+        spo.Hinge("revolute", -1, 6, axis=axes[4], rotor=rotors[4], parent_pose=zoo.random_pose(rng)),
+    ]
+    order = rng.permutation(len(hinges))
+    return spo.Scene(bodies, [hinges[k] for k in order], gravity=rng.uniform(-9.81, 9.81, 3))
+
+
 def with_bodies(scene):
     """The scene with each rotor as a body of its own on the parent, tied to its hinge by a coupling.
 

@@ -14,6 +14,7 @@ from warp_spo.examples import (
     double_fourbar,
     floating_arm,
     fourbar,
+    geared_arm,
     gripper,
     harmonic_drive,
     identify,
@@ -57,6 +58,13 @@ def test_a_double_fourbar_ends_where_the_benchmark_says(tmp_path, device):
 def test_a_harmonic_drive_rings_as_its_closed_form_says(tmp_path, device):
     assert harmonic_drive.main(device=str(device), picture=tmp_path / "drive.svg") <= 1e-6  # 2e-7 here, of order dt^4
     assert_is_whole((tmp_path / "drive.svg").read_text())
+
+
+def test_a_geared_arm_shows_the_error_of_reflected_inertia(tmp_path, device):
+    errors, shares = geared_arm.main(seconds=0.2, worlds=2, device=str(device), picture=tmp_path / "arm.svg")
+    assert (errors[..., 0] <= 2.5 * shares[..., 0]).all() and (errors >= 0.9 * shares).all()
+    assert np.abs(errors[-1, :, 1] / shares[-1, :, 1] - 1.0).max() <= 0.05
+    assert_is_whole((tmp_path / "arm.svg").read_text())
 
 
 @pytest.mark.parametrize(("seconds", "near"), [(0.2, 1.1), pytest.param(4.0, 2e-3, marks=pytest.mark.slow)])

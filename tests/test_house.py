@@ -32,6 +32,7 @@ ROOMS = (
     "kernels",
     "reference_jets",
     "reference_rotations",
+    "reference_rotors",
     "reference",
     "trace",
     "hinges",
@@ -152,8 +153,8 @@ def test_files_are_short():
 
 
 def test_the_reference_imports_numpy_alone():
-    own_of = {"reference.py": {"reference_jets", "reference_rotations"}}
-    for name in ("reference.py", "reference_jets.py", "reference_rotations.py"):
+    own_of = {"reference.py": {"reference_jets", "reference_rotations", "reference_rotors"}}
+    for name in ("reference.py", "reference_jets.py", "reference_rotations.py", "reference_rotors.py"):
         assert imports(PACKAGE / name) <= {"__future__", "functools", "itertools", "typing", "numpy"}
         assert {room for _, room in rooms_imported(PACKAGE / name)} <= own_of.get(name, set())
 

@@ -15,16 +15,9 @@ from functools import cached_property
 import numpy as np
 
 from .reference_jets import curve
-from .reference_rotations import (
-    homogeneous,
-    pose7,
-    quaternion,  # noqa: F401  for those who import it from here
-    quaternion_product,
-    rotation,
-    rotation_about,
-    rotation_vector,
-    skew,
-)
+from .reference_rotations import homogeneous, pose7, quaternion_product, rotation, rotation_about, rotation_vector, skew
+from .reference_rotations import quaternion as quaternion
+from .reference_rotors import Rotors, moving
 
 
 class Dense:
@@ -57,6 +50,8 @@ class Dense:
         for node in self.outward:
             self.outward += children[node + 1]
         self._place()
+        self.moves = moving(self)
+        self._rotors = Rotors(self)
 
     @staticmethod
     def _vector(name, value, size):
@@ -174,11 +169,14 @@ class Dense:
 
     @cached_property
     def mass_matrix(self):
-        """H phi M phi^T H^T + Delta [dof, dof]. Eq. 1a."""
-        return self.H @ self.phi @ self.M @ self.phi.T @ self.H.T + self.Delta
+        """H phi M phi^T H^T + Delta [dof, dof], eq. 1a; and what rotors add."""
+        bodies = self.H @ self.phi @ self.M @ self.phi.T @ self.H.T + self.Delta
+        return bodies + sum(J.T @ momentum for J, momentum in self._rotors.momenta)
 
     @cached_property
     def _riccati(self):
+        if self._rotors.matter:
+            raise ValueError("Dense: P, D and G of a scene with rotors; expected no rotors, or model='reflected'")
         P, D, G = self.M.copy(), self.Delta.copy(), np.zeros(self.H.T.shape)
         for k in reversed(self.outward):
             rows, dofs = self.rows[k], self.dofs[k]
@@ -282,12 +280,10 @@ class Dense:
     @cached_property
     def _node_jacobian(self):
         """Velocity of every node frame's origin, then angular velocity, per unit qd, world axes [node, 6, dof]."""
-        columns = [self._motion(unit, np.zeros(self.dof_count)) for unit in np.eye(self.dof_count)]
-        return (
-            np.stack([np.concatenate([V, W], axis=1) for W, V, _, _ in columns], axis=-1)
-            if columns
-            else np.zeros((self.body_count, 6, 0))
-        )
+        J = np.zeros((self.body_count, 6, self.dof_count))
+        for i, unit in enumerate(np.eye(self.dof_count)):
+            J[:, 3:, i], J[:, :3, i], _, _ = self._motion(unit, 0.0 * unit)
+        return J
 
     def _jacobian_at(self, body, point):
         """Return the Jacobian [6, dof] of a body's material point at ``point`` in the world."""
@@ -307,7 +303,7 @@ class Dense:
     def potential_energy(self):
         """-m g . c of all bodies, zero at the origin, and stiffness (q - rest)^2 / 2 of all dofs [J]."""
         springs = 0.5 * self.value("joint_stiffness") @ self._deviation**2
-        return springs - self.value("body_mass") @ self.com @ self.value("gravity")
+        return springs - sum(mass * com for mass, com, *_ in self._matter) @ self.value("gravity")
 
     def inverse_dynamics_regressor(self, qd, qdd):
         """Return Y [dof, 10 bodies] of tau = Y parameters + armature qdd, for each body m, m c and
@@ -368,17 +364,31 @@ class Dense:
             body_f: external force [N], then torque [N m] at the CoM, world axes [body, 6]; None: none.
         """
         qdd = self._vector("qdd", qdd, self.dof_count)
-        W, _, A, AL = self._motion(self._qd(qd), qdd)
         tau = self.value("joint_armature") * qdd
-        for k, R in enumerate(self.body_matrix[:, :3, :3]):
-            r = self.com[k] - self.node_matrix[k][:3, 3]
-            a = A[k] + np.cross(AL[k], r) + np.cross(W[k], np.cross(W[k], r))
-            inertia = R @ self.value("body_inertia")[k] @ R.T
-            force = self.value("body_mass")[k] * (a - self.value("gravity"))
-            moment = inertia @ AL[k] + np.cross(W[k], inertia @ W[k])
-            wrench = np.concatenate([force, moment]) - (0.0 if body_f is None else np.asarray(body_f)[k])
-            tau = tau + self._jacobian_at(k, self.com[k]).T @ wrench
+        for (mass, _, _, J), wrench in zip(self._matter, self._efforts(self._qd(qd), qdd), strict=True):
+            tau = tau + J.T @ (wrench - np.concatenate([mass * self.value("gravity"), np.zeros(3)]))
+        for k, load in enumerate(() if body_f is None else np.asarray(body_f)):
+            tau = tau - self._jacobian_at(k, self.com[k]).T @ load
         return tau
+
+    @cached_property
+    def _matter(self):
+        """List mass, centre of mass, inertia about it, Jacobian of it and of the turn [6, dof]: bodies, then rotors."""
+        found = []
+        for k, R in enumerate(self.body_matrix[:, :3, :3]):
+            inertia = R @ self.value("body_inertia")[k] @ R.T
+            found.append((self.value("body_mass")[k], self.com[k], inertia, self._jacobian_at(k, self.com[k])))
+        return found + self._rotors.matter
+
+    def _efforts(self, qd, qdd):
+        """Return m a, then I alpha + omega x I omega of all bodies, then of rotors [body and rotor, 6]."""
+        W, V, A, AL = self._motion(qd, qdd)
+        found = []
+        for k, (mass, com, inertia, _) in enumerate(self._matter[: self.body_count]):
+            r = com - self.node_matrix[k][:3, 3]
+            a = A[k] + np.cross(AL[k], r) + np.cross(W[k], np.cross(W[k], r))
+            found.append(np.concatenate([mass * a, inertia @ AL[k] + np.cross(W[k], inertia @ W[k])]))
+        return found + self._rotors.efforts(qd, qdd, (W, V, A, AL))
 
     def bias_force(self, qd=None, body_f=None):
         """Return inverse dynamics at qdd = 0 [dof]: velocity terms and gravity, minus the effect of body_f."""
@@ -431,16 +441,14 @@ class Dense:
 
     @cached_property
     def _moving(self):
-        """Mass of every body [body], 0 for bodies that no hinge can move."""
-        moves = np.zeros(self.body_count + 1, dtype=bool)  # the last is the inertial frame
-        for k in self.outward:
-            moves[k] = moves[self.parent[k]] or len(self.dofs[k]) > 0
-        return np.where(moves[:-1], self.value("body_mass"), 0.0)
+        """Mass of every body and rotor, 0 for bodies that no hinge can move."""
+        moves = [*self.moves[:-1], *(True for _ in self._rotors.matter)]
+        return np.where(moves, [mass for mass, *_ in self._matter], 0.0)
 
     @property
     def center_of_mass(self):
-        """Centre of mass of all bodies that can move, in the world [3], [m]."""
-        return self._moving @ self.com / (self._moving.sum() or 1.0)
+        """Centre of mass of all bodies that can move, and their rotors, in the world [3], [m]."""
+        return self._moving @ np.array([com for _, com, *_ in self._matter]) / (self._moving.sum() or 1.0)
 
     @property
     def com_jacobian(self):
@@ -454,11 +462,9 @@ class Dense:
         They are the sums over bodies of m v, and of I omega + (c(k) - c) x m v.
         """
         total, c = np.zeros((6, self.dof_count)), self.center_of_mass
-        for k, R in enumerate(self.body_matrix[:, :3, :3]):
-            J = self._jacobian_at(k, self.com[k])
-            momentum = self.value("body_mass")[k] * J[:3]
-            total[:3] += momentum
-            total[3:] += R @ self.value("body_inertia")[k] @ R.T @ J[3:] + skew(self.com[k] - c) @ momentum
+        for mass, com, inertia, J in self._matter:
+            total[:3] += mass * J[:3]
+            total[3:] += inertia @ J[3:] + skew(com - c) @ (mass * J[:3])
         return total
 
     def centroidal_momentum_bias(self, qd=None):
@@ -466,14 +472,10 @@ class Dense:
 
         It is the sum over bodies of m a, and of I alpha + omega x I omega + (c(k) - c) x m a.
         """
-        W, _, A, AL = self._motion(self._qd(qd), np.zeros(self.dof_count))
         total, c = np.zeros(6), self.center_of_mass
-        for k, R in enumerate(self.body_matrix[:, :3, :3]):
-            r, inertia = self.com[k] - self.node_matrix[k][:3, 3], R @ self.value("body_inertia")[k] @ R.T
-            a = A[k] + np.cross(AL[k], r) + np.cross(W[k], np.cross(W[k], r))
-            force = self.value("body_mass")[k] * a
-            total[:3] += force
-            total[3:] += inertia @ AL[k] + np.cross(W[k], inertia @ W[k]) + np.cross(self.com[k] - c, force)
+        for (_, com, *_), effort in zip(self._matter, self._efforts(self._qd(qd), 0.0 * self.qd), strict=True):
+            total[:3] += effort[:3]
+            total[3:] += effort[3:] + np.cross(com - c, effort[:3])
         return total
 
     @cached_property

@@ -138,6 +138,8 @@ def solve_mass_matrix(self: Dynamics, q: ArrayT, b: AnyArray, out: ArrayT | None
             self._refinement.solve_mass_matrix(**given, out=x)
         elif self.embedding is not None and x.ndim == 3:
             _solve_columns(self, **given, out=x)
+        elif x.ndim == 3 and self.scene.shares_dofs:
+            _solve_one_by_one(self, **given, out=x)
         elif x.ndim == 3:
             nodes.solve_mass_matrix(self.recursions, x, **given)
         else:
@@ -158,6 +160,15 @@ def _solve_columns(dyn: Dynamics, q: wp.array, b: wp.array, out: wp.array) -> No
         launches.copy(right, b[:, :, turn])
         launch(SOLVE_MASS_MATRIX, x, q=q, b=right, columns=size[2])
         launches.copy(out[:, :, turn], x)
+
+
+def _solve_one_by_one(dyn: Dynamics, q: wp.array, b: wp.array, out: wp.array) -> None:
+    """Solve for several right-hand sides where links share dofs, of which node granularity knows nothing."""
+    right, x = (dyn.recursions.array((name, 1), *b.shape[:2]) for name in ("columns of b", "columns of Mass^-1 b"))
+    for c in range(b.shape[2]):
+        launches.copy(right, b[:, :, c])
+        dyn._engine.launch(SOLVE_MASS_MATRIX, x, q=q, b=right)
+        launches.copy(out[:, :, c], x)
 
 
 # -- packed ------------------------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from ..scene.modes import Amplitudes
 from ..scene.scene import Scene
 from ..trace.scalars import Graph, Scalar, Value, is_constant
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
-from . import flexible
+from . import flexible, rotors
 from .flexible import Flexible
 from .link import Group as Group
 from .link import Link as Link
@@ -255,6 +255,7 @@ class Links:
         matrix, offset, link = seat.matrix @ R, seat.offset + seat.matrix @ l, seat.link
         dof, coordinate = int(scene.qd_start[index]), int(scene.q_start[index])
         label, armatures = scene.body_labels[node], self.values["joint_armature"].tolist()
+        rotor, anchor = scene.hinges[index].rotor, (matrix, offset)
         for kind, axis in scene.hinges[index].elements:
             if isinstance(kind, Amplitudes):
                 break
@@ -274,6 +275,8 @@ class Links:
                 body.com if kind.at_com else ZERO,
             )
             self.append(link)
+            if rotor is not None and rotor.shares_dof and dof == scene.qd_start[index]:
+                rotors.add(self, link, rotor, *anchor)
             matrix, offset = IDENTITY if align is None else align.T, -link.com if kind.at_com else ZERO
             dof, coordinate = dof + kind.dofs, coordinate + kind.coordinates
         rest = Seat(link, matrix, offset)

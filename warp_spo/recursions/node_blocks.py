@@ -6,19 +6,28 @@ slopes Pi of the point of the parent that carries the body, and phi from the bod
     w(p, k) = [Pi*; phi(p, point)] phi(point, k) [0, I],  H = [[0, H], [I, 0]],
 
 where the rows of H are the hinge's dofs, then the modes. M(k) is the inertia of all pieces of the body at q.
+
+A rotor of the hinge comes before all that, with its velocity about its centre of mass, axis along z, in model "full",
+and with its turn rate about the axis alone in model "reduced", whose locked rotor is part of M(p):
+
+    w(p, k) = [phi(p, rotor) [I or z], phi(p, k)],  H = [ratio z or ratio, H],  M(k) = diag(M_rotor or J, M).
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from ..hinges.deflection import Deflection
 from ..hinges.quaternions import matrix_quaternion
+from ..hinges.spin import Spin
 from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Pose, Rigid, Vector, cross, dot
 from .articulated import columns
 from .kinematics import place_all
 from .link import Link, Seat
+from .rotations import folded
+from .rotors import locked, own_link
 
 if TYPE_CHECKING:
     from .tracing import Trace
@@ -37,19 +46,21 @@ def node_blocks(trace: Trace) -> list[Store]:
     for parent, child in scene.tree.edges:
         found["E_phi"] += _weight(trace, int(parent), int(child))
     for node in range(scene.body_count):
-        modes, own = scene.node_sizes[node] - 6, _hinge_links(trace, node)
+        modes, own, rotor = _modes(trace, node), _hinge_links(trace, node), own_link(links, node)
+        size = scene.node_sizes[node] - 6 - modes  # of the rotor
         columns_of = {
             dof: _at_node(trace, node, link, column)
             for link in own
             for dof, column in zip(link.dofs, columns(link, trace.places[id(link)]), strict=True)
         }
         for dof in sorted(columns_of):
-            found["H"] += [0.0] * modes + columns_of[dof]
-        found["H"] += [float(i == j) for i in range(modes) for j in range(modes + 6)]
+            turns = columns(rotor, trace.places[id(rotor)])[0] if rotor is not None and dof in rotor.dofs else NOTHING
+            found["H"] += [*_entries(turns, size), *[0.0] * modes, *columns_of[dof]]
+        found["H"] += [float(i == j - size) for i in range(modes) for j in range(size + modes + 6)]
         armature = {dof: a for link in own for dof, a in zip(link.dofs, link.armature, strict=True)}
         diagonal = [armature[dof] for dof in sorted(armature)] + [0.0] * modes
         found["Delta"] += [a if i == j else 0.0 for i, a in enumerate(diagonal) for j in range(len(diagonal))]
-        found["out"] += _inertia(trace, node)
+        found["out"] += _beside(_rotor_inertia(rotor, size), _inertia(trace, node))
         seat = links.seats[node]
         axes, origin = (IDENTITY, ZERO) if seat.link is None else (trace.axes[id(seat.link)], origins[id(seat.link)])
         at = origin + axes @ seat.offset + (ZERO if seat.link is None else first)
@@ -59,7 +70,30 @@ def node_blocks(trace: Trace) -> list[Store]:
 
 def _hinge_links(trace: Trace, node: int) -> list[Link]:
     """Return the links of a body's own hinge, inboard first."""
-    return [link for link in trace.links.links if link.node == node and link.group is None]
+    return [x for x in trace.links.links if x.node == node and not isinstance(x.hinge, Deflection | Spin)]
+
+
+def _modes(trace: Trace, node: int) -> int:
+    return len(trace.links.flexible[node].leader.dofs) if node in trace.links.flexible else 0
+
+
+def _entries(six: Vector, size: int) -> Six:
+    """Return the entries of a rotor's motion or force that its node has: all, omega or n about its axis, or none."""
+    return [*six] if size == 6 else [six[2]] * size
+
+
+def _rotor_inertia(rotor: Link | None, size: int) -> list[list[Value]]:
+    """Return the rotor's block of M."""
+    if rotor is None or rotor.inertia is None:
+        return [[0.0] * size for _ in range(size)]
+    P = rotor.inertia.articulated
+    return [[P.entry(i, j) for j in range(6)] for i in range(6)] if size == 6 else [[P.entry(2, 2)]]
+
+
+def _beside(first: list[list[Value]], second: list[list[Value]]) -> list[Value]:
+    """Return the block diagonal of two matrices, row by row."""
+    rows = [[*row, *[0.0] * len(second)] for row in first] + [[*[0.0] * len(first), *row] for row in second]
+    return [x for row in rows for x in row]
 
 
 def _at_node(trace: Trace, node: int, link: Link, column: Vector) -> Six:
@@ -80,32 +114,53 @@ def _weight(trace: Trace, parent: int, child: int) -> list[Value]:
     """Return w(parent, child), row by row."""
     links, scene = trace.links, trace.links.scene
     seat, inner = links.seats[child], links.seats[parent]
-    port = links.ports[child].link if child in links.ports else None
-    rows: list[list[Value]] = [[] for _ in range(scene.node_sizes[parent])]
+    port, rotor = links.ports[child].link if child in links.ports else None, own_link(links, child)
+    modes, spins, above = _modes(trace, child), scene.node_sizes[child] - 6, scene.node_sizes[parent] - 6
+    spins, above = spins - modes, above - _modes(trace, parent)
+    starts: list[tuple[Link | None, Vector, Vector] | None] = []
+    for c in range(spins):
+        unit = _unit(c if spins == 6 else 2)
+        starts.append((rotor, Vector(unit[:3]), Vector(unit[3:])))
+    starts += [None] * modes
     for c in range(6):
-        n, f = Vector(float(i == c) for i in range(3)), Vector(float(i + 3 == c) for i in range(3))
-        n, f = Pose(None, seat.matrix, seat.offset).force_to_parent(n, f)
-        over, modal = seat.link, list[Value]()
-        while over is not inner.link:
-            assert over is not None
-            if over is port:
-                modal = [dot(h, (*n, *f)) for h in columns(over, trace.places[id(over)])]
-            n, f = trace.places[id(over)].pose.force_to_parent(n, f)
-            over = over.parent
-        back = inner.matrix.T
-        entries = [*modal, *(back @ (n - cross(inner.offset, f))), *(back @ f)]
+        unit = _unit(c)
+        at_seat = Pose(None, seat.matrix, seat.offset).force_to_parent(Vector(unit[:3]), Vector(unit[3:]))
+        starts.append((seat.link, *at_seat))
+    rows: list[list[Value]] = [[] for _ in range(scene.node_sizes[parent])]
+    for start in starts:
+        if start is None:  # modes of the child
+            entries: list[Value] = [0.0] * len(rows)
+        else:
+            (over, n, f), modal = start, list[Value]()
+            while over is not inner.link:
+                assert over is not None
+                if over is port:
+                    modal = [dot(h, (*n, *f)) for h in columns(over, trace.places[id(over)])]
+                n, f = trace.places[id(over)].pose.force_to_parent(n, f)
+                over = over.parent
+            back = inner.matrix.T
+            entries = [*[0.0] * above, *modal, *(back @ (n - cross(inner.offset, f))), *(back @ f)]
         for row, entry in zip(rows, entries, strict=True):
             row.append(entry)
-    unfelt = [0.0] * (scene.node_sizes[child] - 6)
-    return [x for row in rows for x in (*unfelt, *row)]
+    return [x for row in rows for x in row]
 
 
-def _inertia(trace: Trace, node: int) -> list[Value]:
-    """Return M of a node, row by row: of its rigid body, or of all pieces of its flexible one."""
-    links = trace.links
+def _unit(c: int) -> Vector:
+    return Vector(float(i == c) for i in range(6))
+
+
+def _inertia(trace: Trace, node: int) -> list[list[Value]]:
+    """Return M of a node without its rotor: of its rigid body, or of all pieces of its flexible one, and of the locked
+    rotors that ride on it."""
+    links, scene = trace.links, trace.links.scene
+    riders = [(int(k), scene.hinges[scene.hinge_of[k]]) for k in scene.tree.children[node]]
+    riders = [(k, h) for k, h in riders if getattr(h.rotor, "model", "") == "reduced" and links.seats[node].link]
     if node not in links.flexible:
-        P = links.nodes[node].rigid.articulated
-        return [P.entry(i, j) for i in range(6) for j in range(6)]
+        whole = links.nodes[node].rigid
+        for child, hinge in riders:
+            whole = whole + locked(hinge.rotor, *links.nodes[child].tree)
+        P = whole.articulated
+        return [[P.entry(i, j) for j in range(6)] for i in range(6)]
     own, seat = links.flexible[node], links.seats[node]
     n, leader = len(own.leader.dofs), own.leader
     M: list[list[Value]] = [[0.0] * (n + 6) for _ in range(n + 6)]
@@ -120,6 +175,12 @@ def _inertia(trace: Trace, node: int) -> list[Value]:
             place = trace.places[id(piece)]
             moved = [Vector(_flat(place.pose.motion_to_child(*motion))) for motion in rigid]
             pieces.append((piece.inertia, [*columns(piece, place), *moved]))
+    for child, hinge in riders:
+        port = links.ports[child].link
+        assert port is not None
+        moved = [Vector(_flat(trace.places[id(port)].pose.motion_to_child(*motion))) for motion in rigid]
+        anchor = links.poses["joint_X_p"][scene.hinge_of[child]][0]
+        pieces.append((locked(hinge.rotor, folded(anchor), ZERO), [*columns(port, trace.places[id(port)]), *moved]))
     for inertia, J in pieces:
         forces = [_flat(inertia.apply(Vector(column[:3]), Vector(column[3:]))) for column in J]
         for i in range(n + 6):
@@ -129,7 +190,7 @@ def _inertia(trace: Trace, node: int) -> list[Value]:
         M[i][i] = M[i][i] + a
     for (i, j), x in leader.coupled.items():
         M[i][j] = M[j][i] = M[i][j] + x
-    return [x for row in M for x in row]
+    return M
 
 
 def _in_link(seat: Seat, motion: Vector) -> tuple[Vector, Vector]:

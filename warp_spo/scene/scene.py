@@ -257,13 +257,18 @@ class Scene(Stored):
 
     @property
     def node_sizes(self) -> tuple[int, ...]:
-        """The paper's m_k, which is 6 for a rigid body, and 6 and its modes for a flexible one."""
-        return tuple(6 + (0 if body.modes is None else body.modes.count) for body in self.bodies)
+        """The paper's m_k: 6, the modes of the body, and for the rotor of its hinge 6 more, or 1 if it is reduced."""
+        rotors = (self.hinges[h].rotor for h in self.hinge_of)
+        return tuple(
+            6 + getattr(body.modes, "count", 0) + getattr(rotor, "dimensions", 0)
+            for body, rotor in zip(self.bodies, rotors, strict=True)
+        )
 
     @property
     def shares_dofs(self) -> bool:
-        """Whether bodies have modes, so that one dof moves several links."""
-        return any(body.modes is not None for body in self.bodies)
+        """Whether bodies have modes, or hinges rotors that move: one dof then moves several links."""
+        rotors = any(hinge.rotor is not None and hinge.rotor.shares_dof for hinge in self.hinges)
+        return rotors or any(body.modes is not None for body in self.bodies)
 
     @property
     def hinge_sizes(self) -> tuple[int, ...]:
