@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from ..trace.scalars import Value, cos, sin
-from ..trace.spatial import IDENTITY, Matrix, Vector, dot, skew, total
-from .custom import Custom
+from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, dot, skew
+from .custom import Custom, Shape
 
-TERMS = 14  # of the series of a rotation by a vector: exact to 1e-15 up to half a turn
+TERMS = 11  # of the series of a rotation by a vector: exact to 1e-15 up to 1.9 rad, to 3e-12 up to half a turn
 PARALLEL = 1e-12  # part of the slopes across the first axis below which all of them turn about it
 
 
@@ -41,33 +41,37 @@ class Deflection(Custom):
 
     def evaluated(self, x: list[Any]) -> tuple[Vector, Matrix]:
         """Return displacement and rotation for amplitudes ``x``."""
-        linear = [dot(row, x) for row in self.slopes[3:].tolist()]
+        position, shape = self._shape(x)
+        return position, shape.rotation
+
+    def _shape(self, x: list[Any]) -> tuple[Vector, Shape]:
+        linear, bent = self.slopes[3:].tolist(), [[0.0] * self.dofs] * 3  # T, and G eta
         if self.stiffening is not None:
-            linear = [a - 0.5 * _quadratic(G, x) for a, G in zip(linear, self.stiffening.tolist(), strict=True)]
-        return Vector(linear), rotation(self.slopes[:3], x)
+            bent = [[dot(row, x) for row in G] for G in self.stiffening.tolist()]
+        position = Vector(dot(row, x) - 0.5 * dot(x, curve) for row, curve in zip(linear, bent, strict=True))
+        R, turns = rotation(self.slopes[:3], x)
+        slopes = [Vector(linear[c][i] - bent[c][i] for c in range(3)) for i in range(self.dofs)]
+        return position, Shape(x, R, slopes, [(turn, R.T @ v) for turn, v in zip(turns, slopes, strict=True)])
 
 
-def _quadratic(G: list[list[float]], x: list[Any]) -> Value:
-    """Return x* G x; products of amplitudes are formed once."""
-    terms = []
-    for i, row in enumerate(G):
-        terms += [(g if i == j else g + G[j][i]) * (x[i] * x[j]) for j, g in enumerate(row) if j <= i]
-    return total(terms)
+def rotation(slopes: np.ndarray, x: list[Any]) -> tuple[Matrix, list[Vector]]:
+    """Return the rotation by the vector ``slopes`` x, and the angular velocity per unit rate of each x, turned back.
 
-
-def rotation(slopes: np.ndarray, x: list[Any]) -> Matrix:
-    """Return the rotation by the vector ``slopes`` x; about a constant axis if all slopes are parallel."""
+    Where all slopes are parallel, it is a rotation about a constant axis.
+    """
     if not slopes.any():
-        return IDENTITY
+        return IDENTITY, [ZERO] * slopes.shape[1]
     axis = slopes[:, np.argmax(np.linalg.norm(slopes, axis=0))]
     axis = axis / np.linalg.norm(axis)
     along = axis @ slopes
     if np.abs(slopes - np.outer(axis, along)).max() <= PARALLEL * np.abs(slopes).max():
-        angle = dot(along.tolist(), x)
-        return _about(Vector(axis.tolist()), sin(angle), 1.0 - cos(angle))
+        angle, unit = dot(along.tolist(), x), Vector(axis.tolist())
+        return _about(unit, sin(angle), 1.0 - cos(angle)), [unit * one for one in along.tolist()]
     vector = Vector(dot(row, x) for row in slopes.tolist())
     square = dot(vector, vector)
-    return _about(vector, _series(square, 1), _series(square, 2))
+    first, second = _series(square, 1), _series(square, 2)
+    rates = _about(vector, -second, _series(square, 3))
+    return _about(vector, first, second), [rates @ Vector(column) for column in slopes.T.tolist()]
 
 
 def _about(vector: Vector, first: Value, second: Value) -> Matrix:
@@ -78,7 +82,7 @@ def _about(vector: Vector, first: Value, second: Value) -> Matrix:
 
 
 def _series(square: Value, least: int) -> Value:
-    """Return sin(a) / a for ``least`` 1, (1 - cos(a)) / a^2 for 2, as a polynomial in a^2: smooth at zero."""
+    """Return a polynomial in a^2, smooth at zero: sin(a) / a, (1 - cos a) / a^2, (a - sin a) / a^3 for 1, 2, 3."""
     found: Value = 0.0
     for k in reversed(range(TERMS)):
         found = found * square + (-1.0) ** k / math.factorial(2 * k + least)

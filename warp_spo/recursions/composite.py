@@ -17,20 +17,42 @@ if TYPE_CHECKING:
     from .tracing import Trace
 
 
-def entries(link: Link, places: dict[int, Placed], body: Rigid) -> dict[tuple[int, int], Value]:
-    """(row, column) of Mass for the columns of a link that carries ``body`` = R, rows on the way to the root."""
+Force = tuple[Vector, Vector]
+
+
+def entries(
+    link: Link, places: dict[int, Placed], body: Rigid, shared: dict[int, Force]
+) -> dict[tuple[int, int], Value]:
+    """(row, column) of Mass for the columns of a link that carries ``body`` = R, rows on the way to the root.
+
+    The forces of a group's columns on its parent are added up in ``shared``, and go on from its last link.
+    """
     found = own_entries(link, places[id(link)], body)
     for (i, j), x in link.coupled.items():
         found[link.dofs[i], link.dofs[j]] = found[link.dofs[i], link.dofs[j]] + x
     for column, H in zip(link.dofs, columns(link, places[id(link)]), strict=True):
         n, f = body.apply(Vector(H[:3]), Vector(H[3:]))
         over = link
+        if link.group is not None and link.parent is not None:
+            n, f = places[id(link)].pose.force_to_parent(n, f)
+            if column in shared:
+                n, f = shared[column][0] + n, shared[column][1] + f
+            shared[column] = n, f
+            if not link.closes:
+                continue
+            over = link.parent
+            found |= _rows(over, places, column, n, f)
         while over.parent is not None:
             n, f = places[id(over)].pose.force_to_parent(n, f)
             over = over.parent
-            for row, force in zip(over.dofs, hinge_entries(over, places[id(over)], n, f), strict=True):
-                found[row, column] = force
+            found |= _rows(over, places, column, n, f)
     return found
+
+
+def _rows(link: Link, places: dict[int, Placed], column: int, n: Vector, f: Vector) -> dict[tuple[int, int], Value]:
+    """Return the entries of a link's dofs in a column that puts (n; f) on the link."""
+    forces = hinge_entries(link, places[id(link)], n, f)
+    return {(row, column): force for row, force in zip(link.dofs, forces, strict=True)}
 
 
 def own_entries(link: Link, place: Placed, body: Rigid) -> dict[tuple[int, int], Value]:
@@ -55,6 +77,7 @@ def mass_matrix(trace: Trace) -> list[Store]:
     """out = Mass, both triangles"""
     carried: dict[int, Rigid] = {}
     found: dict[tuple[int, int], Value] = {}
+    shared: dict[int, Force] = {}
     stores: list[Store] = []
     for link, outward in trace.traversal():
         if outward:
@@ -69,7 +92,7 @@ def mass_matrix(trace: Trace) -> list[Store]:
             carried[key] = trace.places[key].pose.rigid_to_parent(body)
             stores += trace.send_to_parent("R", link, carried[key].packed)
         trace.label(link, "F")
-        for at, value in entries(link, trace.places, body).items():
+        for at, value in entries(link, trace.places, body, shared).items():
             found[at] = found[at] + value if at in found else value  # links of a group add to the same entries
     return stores + mirror(found)
 
