@@ -34,9 +34,7 @@ APART = {"chain": 2048, "tree": 4 * FEW_WORLDS, "segment": FEW_WORLDS}  # worlds
 # First guesses for GPUs, to be measured with benchmarks/depth.py. In a graph, a launch of a sweep takes about 2 us and
 # one of a scan 5 us, for a level is one step of the recursion, a round of a scan is a product of two elements, and a
 # stretch is STRETCH steps. A scan does three to five times the work of a sweep, so it pays while threads wait.
-STRETCH = (
-    4  # nodes that a thread of a scan works through; fewer take more rounds and err more, more take longer in each
-)
+STRETCH = 4  # nodes that a thread of a scan works through; fewer err more in more rounds, more take longer in each
 SCAN_LAUNCH = 3  # launches of sweeps that take the time of one launch of a scan
 SWEEPS = 4  # of forward dynamics: motion outward, factors and forces inward, accelerations outward
 SCAN_THREADS = 32768  # stretches times worlds that keep a GPU busy; with more a scan only does more work
