@@ -6,6 +6,7 @@ import pickle
 import geared
 import implicit
 import laws
+import mujoco
 import numpy as np
 import pytest
 import symbolic
@@ -200,6 +201,12 @@ def test_what_makes_no_sense_is_refused(arguments, expected):
 def test_a_flexible_custom_hinge_is_refused():
     with pytest.raises(spo.UnsupportedError, match="two coordinates"):
         spo.Hinge.custom(-1, 0, coordinates=1, pose=lambda q: ((q[0], 0, 0), np.eye(3)), flexible=(1.0, 0.0))
+
+
+def test_coordinates_of_mujoco_refuse_a_joint_that_they_do_not_have():
+    xml = "<mujoco><worldbody><body><joint axis='0 0 1'/><geom size='.1'/></body></worldbody></mujoco>"
+    with pytest.raises(ValueError, match="joint 0 revolute of 2 degrees of freedom; expected revolute"):
+        spo.mujoco.Coordinates(drive(), mujoco.MjModel.from_xml_string(xml), 1, "cpu")
 
 
 def test_the_reference_places_bodies_by_the_sum():

@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 import pytest
 import symbolic
+import torch
+import warp as wp
 import zoo
 from step_scenes import FORCES, H, furnished
 from step_scenes import states as step_states
@@ -20,6 +22,8 @@ import warp_spo as spo
 from warp_spo.dynamics.embedding import embedding
 from warp_spo.examples import fourbar
 from warp_spo.reference import Dense
+from warp_spo.trials.operations import DECLARED, Inputs, of_declaration
+from warp_spo.trials.trial import Subject, Trial
 
 EXACT = 1e-12  # float64, two bodies
 SPIN = 1e-4  # of the rotors [kg m^2]
@@ -286,3 +290,43 @@ def test_a_rotor_in_a_closed_loop_equals_a_body_that_a_coupling_ties(model):
     wanted = symbolic.run(twin, "embedded_forward_dynamics", wide, ["q", "qd", "tau"],
                           {"out": (4,)}, embedding=embedding(twin))["out"]  # fmt: skip
     close(found, wanted[:, :3], AGREE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", EXACT_MODELS)
+def test_every_declared_operation_equals_the_reference_or_is_refused_by_name(model, device):
+    scene = geared.arm(30.0, SPIN, model, axes=((0, 0, 1), (0.6, 0.0, 0.8)), flexible=(50.0, 0.5))
+    subject, refused = Subject(spo.Dynamics(scene, WORLDS, device, "float64"), [Inputs(scene, WORLDS)]), []
+    for declared in (d for d in DECLARED.values() if d.trial is not None):
+        try:
+            assert Trial(subject, of_declaration(declared)).check() <= 1e-11, declared.name
+        except spo.UnsupportedError as error:
+            assert "rotors" in str(error)
+            refused.append(declared.name)
+    assert all(name.startswith("inverse_dynamics_regressor") for name in refused)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", [*EXACT_MODELS, "reflected"])
+def test_gradients_of_a_step_by_values_equal_differences(model, device):
+    scene = geared.arm(30.0, SPIN, model, axes=((0, 0, 1), (0.6, 0.0, 0.8)), flexible=(50.0, 0.5))
+    names = ("body_mass", "joint_stiffness", "joint_damping", "joint_armature")
+    dyn = spo.Dynamics(scene, 1, device, "float64", variable=names)
+    a, place = laws.states(scene, 1), wp.device_to_torch(dyn.device)
+    q, qd, tau = (torch.as_tensor(a[name], device=place) for name in ("q", "qd", "tau"))
+
+    def loss(values):
+        dyn.set(**values)
+        after, rate = dyn.step(q.clone(), qd.clone(), tau, 0.01)
+        return (after.sin() + rate).sum()
+
+    values = {name: torch.tensor(scene.values[name], device=place, requires_grad=True) for name in names}
+    loss(values).backward()
+    for name, value in values.items():
+        for i in np.ndindex(*value.shape):
+            ends = []
+            for h in (1e-5, -1e-5):
+                moved = {key: x.detach().clone() for key, x in values.items()}
+                moved[name][i] += h
+                ends.append(float(loss(moved)))
+            assert abs((ends[0] - ends[1]) / 2e-5 - float(value.grad[i])) <= 1e-6 * max(1.0, abs(float(value.grad[i])))

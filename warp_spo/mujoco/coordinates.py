@@ -14,6 +14,7 @@ from ..errors import as_integer
 from ..kernels import declare
 from ..kernels import mujoco as kernels
 from ..memory import broadcast_worlds
+from ..scene.parts import Hinge
 from ..scene.scene import Scene
 from .mechanism import BALL, FREE, KINDS
 
@@ -137,7 +138,7 @@ class Coordinates:
 def _moving_hinges(scene: Scene, model: mujoco.MjModel) -> list[int]:
     """Return the hinge of each joint of the model; ValueError if the scene's hinges are not the model's joints."""
     moving = [index for index, hinge in enumerate(scene.hinges) if hinge.dof_count]
-    kinds = [scene.hinges[index].kind for index in moving]
+    kinds = [_kind(scene.hinges[index]) for index in moving]
     expected = [KINDS[int(kind)] for kind in model.jnt_type]
     if kinds != expected:
         at = next((i for i, (a, b) in enumerate(zip(kinds, expected, strict=False)) if a != b), None)
@@ -148,3 +149,9 @@ def _moving_hinges(scene: Scene, model: mujoco.MjModel) -> list[int]:
             "scene that load(path) returns without floating="
         )
     return moving
+
+
+def _kind(hinge: Hinge) -> str:
+    """Return a hinge's kind, and how many degrees of freedom it has if it is flexible or carries a flexible body."""
+    own = {"ball": 3, "free": 6}.get(hinge.kind, 1)
+    return hinge.kind if hinge.dof_count == own else f"{hinge.kind} of {hinge.dof_count} degrees of freedom"

@@ -257,7 +257,7 @@ class Scene(Stored):
 
     @property
     def node_sizes(self) -> tuple[int, ...]:
-        """The paper's m_k: 6, the modes of the body, and for the rotor of its hinge 6 more, or 1 if it is reduced."""
+        """The paper's m_k. It is 6, and the body's modes, and 6 for the rotor of its hinge or 1 if that is reduced."""
         rotors = (self.hinges[h].rotor for h in self.hinge_of)
         return tuple(
             6 + getattr(body.modes, "count", 0) + getattr(rotor, "dimensions", 0)
@@ -266,7 +266,7 @@ class Scene(Stored):
 
     @property
     def shares_dofs(self) -> bool:
-        """Whether bodies have modes, or hinges rotors that move: one dof then moves several links."""
+        """Whether bodies have modes, or hinges have rotors that move, so that one dof moves several links."""
         rotors = any(hinge.rotor is not None and hinge.rotor.shares_dof for hinge in self.hinges)
         return rotors or any(body.modes is not None for body in self.bodies)
 
