@@ -169,8 +169,6 @@ def test_every_trace_equals_the_dense_reference(model, name, given, shape, wante
 
 @pytest.mark.parametrize("name", SAME)
 def test_full_and_reduced_rotors_agree(name):
-    if name in ("body_reactions", "quasi_velocity_coriolis"):
-        pytest.skip("refused, or of other arguments")
     scene, (given, results, options) = tree("full"), SAME[name]
     sized, a = shapes(scene), more_states(scene)
     wide = {"jacobian_vjp": "f6n", "body_poses_vjp": "b7", "integrate_vjp": "c"}.get(name, "n")
@@ -330,3 +328,32 @@ def test_gradients_of_a_step_by_values_equal_differences(model, device):
                 moved[name][i] += h
                 ends.append(float(loss(moved)))
             assert abs((ends[0] - ends[1]) / 2e-5 - float(value.grad[i])) <= 1e-6 * max(1.0, abs(float(value.grad[i])))
+
+
+def on_a_flexible_body(model):
+    """A body with two bending modes on a turn; at its tip a body with a rotor on the flexible one."""
+    rng = np.random.default_rng(3)
+    momenta, slopes = np.zeros((2, 6, 2))
+    momenta[4, 0], momenta[5, 1], momenta[2, 0], momenta[1, 1] = 0.3, 0.3, 0.2, -0.2
+    slopes[4, 0], slopes[5, 1], slopes[2, 0], slopes[1, 1] = 1.0, 1.0, 1.2, -1.2
+    modes = spo.Modes(np.eye(2), (50.0, 80.0), None, momenta, slopes={1: slopes})
+    root = spo.Body(1.0, (0.5, 0.0, 0.0), np.diag([0.02, 0.1, 0.1]), modes=modes)
+    axis, u = zoo.unit(rng, 2, 3)
+    rotor = spo.Rotor(geared.round_body(rng, u), 20.0, u, model)
+    tip = spo.Hinge("revolute", 0, 1, axis=axis, parent_pose=(1.0, 0, 0, 0, 0, 0, 1), rotor=rotor)
+    return spo.Scene([root, zoo.random_body(rng)], [spo.Hinge("revolute", -1, 0, **AXIS), tip])
+
+
+@pytest.mark.slow
+def test_rotors_on_flexible_bodies_agree_with_each_other_and_with_the_operators(device):
+    found = []
+    for model in EXACT_MODELS:
+        scene = on_a_flexible_body(model)
+        a, n = laws.states(scene, WORLDS), scene.dof_count
+        mass = symbolic.run(scene, "mass_matrix", a, ["q"], {"out": (n, n)})["out"]
+        found.append((mass, symbolic.run(scene, "forward_dynamics", a, ["q", "qd", "tau"], {"out": (n,)})["out"]))
+        assert scene.node_sizes == (8, {"full": 12, "reduced": 7}[model])
+        ops = spo.Dynamics(scene, WORLDS, device, "float64").operators(a["q"])
+        close(np.asarray((ops.H @ ops.phi @ ops.M @ ops.phi.T @ ops.H.T + ops.Delta).dense()), mass)
+    for full, reduced in zip(*found, strict=True):
+        close(reduced, full)
