@@ -208,7 +208,7 @@ def beam_modes(
 
     Raises:
         ValueError: a value is out of range; the message names it.
-        TypeError: ``section`` or ``material`` is something else.
+        TypeError: ``section``, ``material`` or ``children`` is something else.
     """
     (length,) = positive("beam_modes", length=length)
     for name, value, kind in (("section", section, Section), ("material", material, Material)):
@@ -220,6 +220,8 @@ def beam_modes(
     if zeta < 0.0:
         raise ValueError(f"beam_modes: damping_ratio is {zeta}; expected zero or more")
     counts = _counts(count, ends)
+    if children is not None and not isinstance(children, Mapping):
+        raise TypeError(f"beam_modes: children is {children!r}; expected places by label or index of the child")
     number = as_integer(points)
     if points is not None and (number is None or number < 2):
         raise ValueError(f"beam_modes: points is {points!r}; expected an integer of two or more, or None")

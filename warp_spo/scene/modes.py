@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..errors import UnsupportedError
 from ..hinges.kind import Element, Kind
 from .checks import SYMMETRY, checked_array, read_only
 from .storage import StoredPart
@@ -58,15 +59,15 @@ class MassPoints(StoredPart):
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
-        mass = np.asarray(self.mass, dtype=np.float64)
-        count = mass.shape[0] if mass.ndim == 1 else 0
-        n = np.shape(self.shapes)[-1] if np.ndim(self.shapes) == 3 else 0
+        masses, sizes = _shape(self.mass), _shape(self.shapes)
+        count = masses[0] if len(masses) == 1 else 0
+        n = sizes[-1] if len(sizes) == 3 else 0
         if count == 0 or n == 0:
             raise ValueError(
-                f"MassPoints: mass has shape {np.shape(self.mass)} and shapes {np.shape(self.shapes)}; expected (s,) "
-                "and (s, 3, n), for s points and n modes"
+                f"MassPoints: mass has shape {masses} and shapes {sizes}; expected (s,) and (s, 3, n), for s points "
+                "and n modes"
             )
-        put("mass", checked_array("MassPoints", "mass [kg]", mass, (count,)))
+        put("mass", checked_array("MassPoints", "mass [kg]", self.mass, (count,)))
         if self.mass.min() < 0.0:
             raise ValueError(f"MassPoints: mass holds {self.mass.min()} kg; expected zero or more")
         put("position", checked_array("MassPoints", "position [m]", self.position, (count, 3)))
@@ -102,6 +103,9 @@ class Modes(StoredPart):
     Modal stiffness and damping become ``joint_stiffness`` and ``joint_damping`` of the modal coordinates: they belong
     to :meth:`Dynamics.passive_force` and, implicit, to :meth:`Dynamics.step`.
 
+    How the rest moves on average with the modes follows from the body's mass, centre of mass and inertia in the scene.
+    If these are ``variable``, :meth:`Dynamics.set` changes the inertia of a flexible body and keeps that motion.
+
     Args:
         mass: modal mass M, shape (n, n); None: that of the points.
         stiffness: of each amplitude, shape (n,), or a diagonal matrix (n, n).
@@ -121,6 +125,7 @@ class Modes(StoredPart):
 
     Raises:
         ValueError: a shape is wrong, a matrix is not symmetric or not diagonal, or a mass is missing.
+        TypeError: ``points`` are no MassPoints, or ``shape`` cannot be called.
     """
 
     mass: Any = None
@@ -135,17 +140,18 @@ class Modes(StoredPart):
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
+        if self.points is not None and not isinstance(self.points, MassPoints):
+            raise TypeError(f"Modes: points is {self.points!r}; expected spo.MassPoints")
+        if self.shape is not None and not callable(self.shape):
+            raise TypeError(f"Modes: shape is {self.shape!r}; expected a function of a position")
         if self.points is None and (self.mass is None or self.coupling is None):
             raise ValueError(
                 "Modes: mass and coupling are missing; expected (n, n) and (6, n), or points=MassPoints(...)"
             )
-        n = (
-            self.points.shapes.shape[2]
-            if self.points is not None
-            else np.shape(self.mass)[-1]
-            if np.ndim(self.mass)
-            else 0
-        )
+        sizes = _shape(self.mass) if self.points is None else self.points.shapes.shape
+        if len(sizes) < 2:
+            raise ValueError(f"Modes: mass is {self.mass!r}; expected numbers of shape (n, n), for n modes")
+        n = sizes[-1]
         if not 1 <= n <= MOST_MODES:
             raise ValueError(f"Modes: {n} modes; expected 1 to {MOST_MODES}")
         own = np.zeros((6 + n, 6 + n)) if self.points is None else self.points.inertia
@@ -157,8 +163,13 @@ class Modes(StoredPart):
             raise ValueError("Modes: stiffness is missing; expected one number for each mode, shape (n,)")
         put("stiffness", _diagonal("stiffness", self.stiffness, n))
         put("damping", _diagonal("damping", np.zeros(n) if self.damping is None else self.damping, n))
-        put("slopes", _by_name("slopes", self.slopes or {}, (6, n)))
-        put("stiffening", _by_name("stiffening", self.stiffening or {}, (3, n, n)))
+        put("slopes", _by_name("slopes", {} if self.slopes is None else self.slopes, (6, n)))
+        put("stiffening", _by_name("stiffening", {} if self.stiffening is None else self.stiffening, (3, n, n)))
+        alone = [name for name in self.stiffening if name not in self.slopes]
+        if alone:
+            raise ValueError(
+                f"Modes: stiffening names {alone[0]!r}, which slopes does not; expected the same names; add its slopes"
+            )
 
     @property
     def count(self) -> int:
@@ -179,7 +190,16 @@ class Modes(StoredPart):
                 f"Modes(slopes={{{name!r}: an array (6, {self.count})}}), zeros if it sits where the body does not "
                 "deform, or Modes(shape=...)"
             )
-        return self.shape(np.asarray(position, dtype=np.float64))
+        found = self.shape(np.array(position, dtype=np.float64))
+        if not isinstance(found, tuple | list) or len(found) != 2:
+            raise ValueError(
+                f"Modes: shape returns {found!r} for {what}; expected slopes (6, {self.count}), and stiffening "
+                f"(3, {self.count}, {self.count}) or None"
+            )
+        slopes, bends = found
+        slopes = checked_array("Modes", f"what shape returns for {what}, slopes", slopes, (6, self.count))
+        name, size = f"what shape returns for {what}, stiffening", (3, self.count, self.count)
+        return slopes, None if bends is None else _symmetric("Modes", name, bends, size)
 
 
 def slopes_of_child(scene: Any, child: int) -> tuple[np.ndarray, np.ndarray | None]:
@@ -198,15 +218,25 @@ def slopes_of_frame(scene: Any, body: int, position: tuple[float, ...]) -> tuple
     return modes.slopes_at(name, position, f"the frame at {position} of body {scene.body_labels[body]!r}")
 
 
-def check_modes(scene: Any) -> None:
-    """Raise ValueError if the modes of a scene's bodies do not suit the bodies, their children and sites."""
+def check_modes(scene: Any, call: str = "Scene") -> None:
+    """Check that the modes of a scene's bodies suit the bodies, their children and sites.
+
+    Raises:
+        ValueError: they do not.
+        UnsupportedError: mass, centre of mass or inertia of a body with modes differ between worlds.
+    """
     for body, part in enumerate(scene.bodies):
         if part.modes is None:
             continue
         label, children = scene.body_labels[body], scene.tree.children[body]
+        for name in MASS_VALUES:
+            if (scene.values[name][:, body] != scene.values[name][0, body]).any():
+                what = f"{name} of body {label!r}, which has modes, that differs between worlds"
+                raise UnsupportedError(call, what, "use one scene and one Dynamics for each")
         mean_motion(label, part.modes, *(scene.values[name][0, body] for name in MASS_VALUES))
         for child in children:
             slopes_of_child(scene, child)
+        _refuse_ambiguous_names(scene, body)
         known = [*map(int, children), *(scene.body_labels[child] for child in children)]
         known += [name for name, (on, _) in scene.sites.items() if on == body]
         for name in (*part.modes.slopes, *part.modes.stiffening):
@@ -215,6 +245,30 @@ def check_modes(scene: Any) -> None:
                 raise ValueError(
                     f"Scene: the modes of body {label!r} have slopes for {name!r}, which is no child and no site of "
                     f"it; expected one of {names}"
+                )
+
+
+def _refuse_ambiguous_names(scene: Any, body: int) -> None:
+    """Raise ValueError if one of the slopes by name of a body is of two places, or if one place has two of them."""
+    slopes, children = scene.bodies[body].modes.slopes, scene.tree.children[body]
+    call = f"Scene: the modes of body {scene.body_labels[body]!r} have slopes"
+    sites = {name: pose[:3] for name, (on, pose) in scene.sites.items() if on == body and name in slopes}
+    labels = [scene.body_labels[child] for child in children]
+    for child, label in zip(children, labels, strict=True):
+        if int(child) in slopes and label in slopes:
+            raise ValueError(f"{call} for {label!r} and for its index {int(child)}; expected one of them")
+        if label in slopes and (label in sites or labels.count(label) > 1):
+            raise ValueError(f"{call} for {label!r}, a name of several places; expected a name for each; rename one")
+    for name, place in sites.items():
+        if not any(place) and slopes[name].any():
+            raise ValueError(
+                f"{call} for site {name!r} at its origin, where frames are the body frame; expected zeros, or a "
+                "site elsewhere; a body on a fixed hinge may sit there, and deforms with its slopes"
+            )
+        for other in sites:
+            if sites[other] == place and (slopes[other] != slopes[name]).any():
+                raise ValueError(
+                    f"{call} for sites {name!r} and {other!r}, which sit at the same place; expected equal ones"
                 )
 
 
@@ -246,7 +300,7 @@ def mean_motion(label: str, modes: Modes, mass: float, com: np.ndarray, inertia:
     whole[:6, 6:], whole[6:, :6], whole[6:, 6:] = modes.coupling, modes.coupling.T, modes.mass
     own = np.zeros_like(whole) if modes.points is None else modes.points.inertia
     scale = np.sqrt(np.maximum(np.diag(whole), np.diag(own)))
-    scale[:3], scale[3:6] = max(scale[:3].max(), 1e-300), max(scale[3:6].max(), 1e-300)
+    scale[:3], scale[3:6] = scale[:3].max(), scale[3:6].max()
     scale[scale == 0.0] = 1.0
     for what, matrix in (("body and modes", whole), ("what the points leave of body and modes", whole - own)):
         least = np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0]
@@ -285,6 +339,14 @@ def _spatial(mass: float, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
     return np.block([[inertia - mass * arm @ arm, mass * arm], [-mass * arm, mass * np.eye(3)]])
 
 
+def _shape(value: Any) -> tuple[int, ...]:
+    """Return the shape of an array; () of what is none."""
+    try:
+        return np.shape(value)
+    except ValueError:  # rows of several lengths
+        return ()
+
+
 def _symmetric(call: str, name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return an array whose last two axes are symmetric, made exactly so."""
     array = checked_array(call, name, value, shape)
@@ -296,7 +358,7 @@ def _symmetric(call: str, name: str, value: Any, shape: tuple[int, ...]) -> np.n
 
 def _diagonal(name: str, value: Any, n: int) -> np.ndarray:
     """Return the entries of a diagonal matrix that is given as such or as a vector."""
-    array = checked_array("Modes", name, value, (n,) if np.ndim(value) == 1 else (n, n))
+    array = checked_array("Modes", name, value, (n, n) if len(_shape(value)) == 2 else (n,))
     if array.ndim == 1:
         return array
     off = np.abs(array - np.diag(np.diag(array))).max()

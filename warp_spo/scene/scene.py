@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import refuse_masked
 from .actuators import RANGES, Actuator, Keyframe, actuator_values, check_actuator_value
 from .checks import SYMMETRY
-from .modes import check_modes, with_modes
+from .modes import MASS_VALUES, check_modes, with_modes
 from .parts import (
     DOF_VALUES,
     Body,
@@ -348,12 +348,15 @@ class Scene(Stored):
 
         Raises:
             ValueError: a name is unknown, a shape is wrong, numbers are not finite, or world counts differ.
+            UnsupportedError: mass, centre of mass or inertia of a body with modes would differ between worlds.
         """
         scene = object.__new__(Scene)
         scene.__dict__.update(self.__dict__)
         checked = {name: self.check_value("Scene.with_values", name, value) for name, value in values.items()}
         scene.values = MappingProxyType({**self.values, **checked})
         scene._refuse_crossed_limits("Scene.with_values", scene.values)
+        if not checked.keys().isdisjoint(MASS_VALUES):
+            check_modes(scene, "Scene.with_values")
         counts = {array.shape[0] for array in (scene.q_index, *scene.values.values())} - {1}
         if len(counts) > 1:
             raise ValueError(f"Scene.with_values: values for {sorted(counts)} worlds; expected one world count")
