@@ -16,6 +16,7 @@ from .scene.actuators import Actuator, Keyframe
 from .scene.beams import beam_modes
 from .scene.gears import Rotor
 from .scene.modes import MassPoints, Modes
+from .scene.normal_modes import normal_modes
 from .scene.parts import Body, Coupling, Hinge, Loop
 from .scene.scene import Scene
 from .scene.sections import Material, Section
@@ -63,6 +64,7 @@ __all__ = [
     "from_mujoco",
     "from_newton",
     "load",
+    "normal_modes",
     "spline",
     "where",
 ]

@@ -364,8 +364,8 @@ def _diagonal(name: str, value: Any, n: int) -> np.ndarray:
     off = np.abs(array - np.diag(np.diag(array))).max()
     if off > SYMMETRY * np.abs(array).max():
         raise ValueError(
-            f"Modes: {name} has the off-diagonal entry {off:.3g}; expected a diagonal matrix; change to normal modes, "
-            "the eigenvectors of stiffness and mass, in which both are diagonal: shapes, slopes and coupling times them"
+            f"Modes: {name} has the off-diagonal entry {off:.3g}; expected a diagonal matrix; spo.normal_modes "
+            "takes a full one and returns the modes in amplitudes in which it is diagonal"
         )
     return read_only(np.diag(array).copy())
 
