@@ -12,6 +12,7 @@ from ..scene.scene import Scene
 from .routine import Routine
 from .stretches import cut, solid_nodes
 
+SHARED = "links share dofs"
 GRANULARITIES = ("node", "segment", "tree")
 RECURSIONS = ("sweep", "scan")
 DEFAULT: str | None = None  # granularity of who asks for none; None: chosen by the rules below
@@ -162,7 +163,7 @@ def choose(
     rule = _chosen(scene.dof_count, limbs, alike, worlds, cuda, dtype, varies)
     chosen, reason = (asked, "asked for") if asked else rule
     if shared:
-        reason = "links share dofs"
+        reason = SHARED
     rows = SHORT_ROWS if chosen == "tree" else LONG_ROWS
     staged = scene.dof_count > rows and worlds > (FEW_WORLDS if scene.dof_count <= LONG_ROWS else FEW_WORLDS // 16)
     outward, first = [], 0
@@ -233,7 +234,8 @@ def describe(plan: Plan) -> str:
     staged = plan.staged and (limbs == 1 or plan.worlds > FEW_WORLDS // 4)
     rows = "through shared memory" if staged else "each by its thread"
     first = "forward dynamics takes velocity terms first; " if plan.apart else ""
-    return f"{plan.granularity}: {plan.reason}; rows are read {rows}; {first}granularity= can force {others}"
+    force = "no other granularity serves them" if plan.reason == SHARED else f"granularity= can force {others}"
+    return f"{plan.granularity}: {plan.reason}; rows are read {rows}; {first}{force}"
 
 
 def describe_recursion(plan: Plan) -> str:

@@ -16,7 +16,7 @@ from .. import composite, motion, newton_euler
 from ..links import Link, Placed
 from ..motion import STILL, Motion
 from . import sensitivity
-from .sensitivity import CarriedSums, Sensitivity
+from .sensitivity import CarriedSums, Row, Sensitivity
 
 if TYPE_CHECKING:
     from ..tracing import Trace
@@ -33,6 +33,7 @@ def inverse_dynamics_derivatives(trace: Trace) -> list[Store]:
     carried: dict[int, CarriedSums] = {}
     forces: dict[int, tuple[Vector, Vector]] = {}
     drifts: dict[int, Vector] = {}
+    shared: dict[int, tuple[Row, list]] = {}  # of groups, by dof
     stores: list[Store] = []
     for link, outward in trace.traversal():
         key, over = id(link), link.parent
@@ -66,7 +67,7 @@ def inverse_dynamics_derivatives(trace: Trace) -> list[Store]:
         if over is not None:
             carried[key] = sensitivity.to_parent(place, drifts[key], all_in)
             forces[key] = place.pose.force_to_parent(n, f)
-        stores += _entries(trace, link, all_in, (n, f), own, drifts)
+        stores += _entries(trace, link, all_in, (n, f), own, drifts, shared)
         for (i, j), x in link.coupled.items():
             a, b = link.dofs[i], link.dofs[j]
             stores += [Store("out", (QDD, a, b), x), Store("out", (QDD, b, a), x)]
@@ -85,8 +86,22 @@ def _wrenches(trace: Trace, link: Link) -> list[tuple[Vector, Vector, Vector]]:
     return found
 
 
+def _added(one: tuple[Row, list], row: Row, blocks: list) -> tuple[Row, list]:
+    """Return the sums of rows and of forces of two links of a group, as their parent feels them."""
+    both = zip(one[1], blocks, strict=True)
+    return Row(*(a + b for a, b in zip(one[0], row, strict=True))), [
+        (block, n + n_other, f + f_other) for (block, n, f), (_, n_other, f_other) in both
+    ]
+
+
 def _entries(
-    trace: Trace, link: Link, all_in: CarriedSums, force: tuple[Vector, Vector], own: dict, drifts: dict[int, Vector]
+    trace: Trace,
+    link: Link,
+    all_in: CarriedSums,
+    force: tuple[Vector, Vector],
+    own: dict,
+    drifts: dict[int, Vector],
+    shared: dict,
 ) -> list[Store]:
     """Entries of the three blocks in which a dof of the link meets one of its hinge or nearer to the root."""
     place, stores = trace.places[id(link)], []
@@ -116,6 +131,10 @@ def _entries(
             pose = trace.places[id(over)].pose
             row = row.to_parent(trace.places[id(over)], drifts[id(over)])
             blocks = [*((block, *pose.force_to_parent(n, f)) for block, n, f in blocks[:2]), (QDD, row.w, row.v)]
+            if over is link and link.group is not None:  # links of a group go on together from the last one
+                row, blocks = shared[dof] = _added(shared[dof], row, blocks) if dof in shared else (row, blocks)
+                if not link.closes:
+                    break
             over = over.parent
             for block, n, f in blocks:
                 for i, value in zip(over.dofs, motion.hinge_entries(over, trace.places[id(over)], n, f), strict=True):
