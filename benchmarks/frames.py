@@ -1,4 +1,4 @@
-"""What digits the choice of frames costs: forward dynamics by the operators of one robot, in three frames.
+"""Digits that the choice of frames costs: forward dynamics by the operators of one robot, in three frames.
 
     python -m benchmarks.frames            # prints the table
     python -m benchmarks.frames --write    # puts table and picture into the documentation

@@ -1,4 +1,4 @@
-"""What flexible bodies refuse: arrays that are none, names of several places, worlds that differ, matrices that lie."""
+"""Errors of flexible bodies: wrong arrays, names of several places, worlds that differ, matrices that do not fit."""
 
 import numpy as np
 import pytest

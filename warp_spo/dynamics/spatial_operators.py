@@ -193,8 +193,8 @@ class SpatialOperators(LetterOwner):
     def change_variables(self, B: Blocks) -> SimilarOperators:
         """Return the operators for vectors x' = B x over the nodes; they follow each :meth:`update`.
 
-        phi' = B phi B^-1, H' = H B^-1, M' = B M B*. The articulated-body recursion runs in the new variables. What maps
-        hinges to hinges stays up to rounding, such as D and the mass matrix.
+        phi' = B phi B^-1, H' = H B^-1, M' = B M B*. The articulated-body recursion runs in the new variables. D, the
+        mass matrix and all else that maps hinges to hinges stay the same up to rounding.
 
         Args:
             B: block diagonal, one invertible square block for each node (:meth:`Blocks.diagonal`). It is read again

@@ -1,7 +1,7 @@
 """Cuts a tree into paths, and paths into stretches of a few nodes, for work that is parallel in depth.
 
-A path leads from a node inward along the heaviest children (Sleator and Tarjan's heavy paths). What hangs on a path
-beside it must be finished first, so paths have levels: on level 0 nothing hangs; a tree of n nodes has at most
+A path leads from a node inward along the heaviest children (Sleator and Tarjan's heavy paths). Paths that end
+on a path must be finished first, so paths have levels: no path ends on one of level 0; a tree of n nodes has at most
 log2(n) + 1 levels. A stretch is a run of consecutive nodes of a path. A node with several children is the outermost
 node of its stretch.
 """

@@ -76,7 +76,7 @@ def _scale(trace: Trace, done: Factors, qd: Entry) -> dict[int, Value]:
         if link.group is not None:
             for dof, pivot in zip(link.dofs, done[id(link)].pivots[::-1], strict=False):
                 nu[dof] = sqrt(pivot.D) * (qd(dof) + pivot.inverse * _felt(trace, link, pivot, velocity, qd))
-            velocity[id(link)] = _moved(done, link, V, qd)
+            velocity[id(link)] = _add_group_rates(done, link, V, qd)
             continue
         for dof, pivot in zip(link.dofs, done[id(link)].pivots[::-1], strict=True):
             eta = qd(dof) + pivot.inverse * dot(pivot.U, V)
@@ -92,7 +92,7 @@ def _felt(trace: Trace, link: Link, pivot: groups.Pivot, velocity: dict[int, Vec
     return dot(pivot.U, above) + total(x * qd(link.dofs[i]) for i, x in enumerate(pivot.row))
 
 
-def _moved(done: Factors, link: Link, V: Vector, qd: Entry) -> Vector:
+def _add_group_rates(done: Factors, link: Link, V: Vector, qd: Entry) -> Vector:
     """Return V and the velocities that the rates of a group give one of its links."""
     for dof, column in zip(link.dofs, done[id(link.group.links[0])].columns[id(link)], strict=True):  # type: ignore[union-attr]
         V = V + column * qd(dof)
@@ -110,7 +110,7 @@ def _unscale(trace: Trace, done: Factors, nu: Entry) -> dict[int, Value]:
             for dof, pivot in zip(link.dofs, done[id(link)].pivots[::-1], strict=False):
                 known = _felt(trace, link, pivot, velocity, qd.__getitem__)
                 qd[dof] = pivot.inverse * (sqrt(pivot.D) * nu(dof) - known)
-            velocity[id(link)] = _moved(done, link, V, qd.__getitem__)
+            velocity[id(link)] = _add_group_rates(done, link, V, qd.__getitem__)
             continue
         for dof, pivot in zip(link.dofs, done[id(link)].pivots[::-1], strict=True):
             qd[dof] = pivot.inverse * (sqrt(pivot.D) * nu(dof) - dot(pivot.U, V))

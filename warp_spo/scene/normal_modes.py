@@ -75,7 +75,6 @@ def normal_modes(
         moved = MassPoints(points.mass, points.position, points.shapes @ basis, bends)
     at = {name: checked_array(call, f"slopes[{name!r}]", rows, (6, n)) @ basis for name, rows in (slopes or {}).items()}
     bent = {name: _in_basis(np.asarray(G, dtype=np.float64), basis) for name, G in (stiffening or {}).items()}
-    # Rounding must not make a diagonal matrix full.
     return Modes(np.eye(n), omega**2, np.diag(D), change(coupling), at, bent, moved, rigid), basis
 
 

@@ -293,7 +293,7 @@ class Hinge(StoredPart):
 
     @property
     def reflected_inertia(self) -> np.ndarray:
-        """What a reflected rotor adds to the armature of each dof [kg m^2 or kg]; zeros without one."""
+        """The armature that a reflected rotor adds to each dof [kg m^2 or kg]; zeros without one."""
         found = np.zeros(self.dof_count)
         if self.rotor is not None and self.rotor.model == "reflected":
             found[0] = self.rotor.ratio**2 * self.rotor.spin_inertia

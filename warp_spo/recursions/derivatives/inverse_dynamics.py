@@ -86,7 +86,7 @@ def _wrenches(trace: Trace, link: Link) -> list[tuple[Vector, Vector, Vector]]:
     return found
 
 
-def _added(one: tuple[Row, list], row: Row, blocks: list) -> tuple[Row, list]:
+def _sum_of_links(one: tuple[Row, list], row: Row, blocks: list) -> tuple[Row, list]:
     """Return the sums of rows and of forces of two links of a group, as their parent feels them."""
     both = zip(one[1], blocks, strict=True)
     return Row(*(a + b for a, b in zip(one[0], row, strict=True))), [
@@ -132,7 +132,7 @@ def _entries(
             row = row.to_parent(trace.places[id(over)], drifts[id(over)])
             blocks = [*((block, *pose.force_to_parent(n, f)) for block, n, f in blocks[:2]), (QDD, row.w, row.v)]
             if over is link and link.group is not None:  # links of a group go on together from the last one
-                row, blocks = shared[dof] = _added(shared[dof], row, blocks) if dof in shared else (row, blocks)
+                row, blocks = shared[dof] = _sum_of_links(shared[dof], row, blocks) if dof in shared else (row, blocks)
                 if not link.closes:
                     break
             over = over.parent
