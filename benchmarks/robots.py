@@ -1,4 +1,4 @@
-"""Released robots from the package example-robot-data: a 7-dof arm, a quadruped (18 dof), a humanoid (35 dof).
+"""Released robots from the package example-robot-data: a 7-dof arm, a quadruped (18 dof), a humanoid (35 dof), and others.
 
 Only the URDF text is needed. Its masses, joints and their placements are used as they are. Shapes, damping, friction
 and mimics of joints are removed, and the joints under ``locked`` are fixed at zero.
@@ -33,6 +33,15 @@ ROBOTS = {
     "go2": Robot("go2_description/urdf/go2.urdf", True),
     "g1": Robot("g1_description/urdf/g1_29dof_rev_1_0.urdf", True),
 }
+"""Those that tables compare with other libraries."""
+
+UNLIKE = {
+    "b1_z1": Robot("b1_description/urdf/b1-z1.urdf", True),
+    "centauro": Robot("centauro_description/urdf/centauro.urdf", True),
+}
+"""Legs and arms on one body: a quadruped with an arm (25 dof), a centaur (45 dof)."""
+
+ALL = ROBOTS | UNLIKE
 
 
 def urdf_file(name: str) -> Path:
@@ -51,7 +60,7 @@ def urdf_file(name: str) -> Path:
             )
         return file
     try:
-        return Path(str(metadata.distribution(PACKAGE).locate_file(f"{INSTALLED}/{ROBOTS[name].path}")))
+        return Path(str(metadata.distribution(PACKAGE).locate_file(f"{INSTALLED}/{ALL[name].path}")))
     except metadata.PackageNotFoundError:
         raise ImportError(
             f"robots: {name!r} needs the package {PACKAGE}; pip install warp_spo[robots], or set {FOLDER} to a "
@@ -74,7 +83,7 @@ def urdf_text(name: str) -> str:
         ImportError, FileNotFoundError: as :func:`urdf_file`.
     """
     root = ET.parse(urdf_file(name)).getroot()
-    _strip(root, ROBOTS[name].locked)
+    _strip(root, ALL[name].locked)
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
@@ -99,7 +108,7 @@ def _strip(root: ET.Element, locked: tuple[str, ...]) -> None:
 
 
 def scene(name: str) -> spo.Scene:
-    """Return a robot of :data:`ROBOTS`, without armature, in gravity of 9.81 m/s^2 along -z.
+    """Return a robot of :data:`ALL`, without armature, in gravity of 9.81 m/s^2 along -z.
 
     Raises:
         ImportError, FileNotFoundError: as :func:`urdf_file`.
@@ -107,5 +116,5 @@ def scene(name: str) -> spo.Scene:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name}.urdf"
         file.write_text(urdf_text(name))
-        loaded = spo.load(file, floating=ROBOTS[name].floating)
+        loaded = spo.load(file, floating=ALL[name].floating)
     return loaded.with_values(joint_armature=0.0 * loaded.values["joint_armature"])
