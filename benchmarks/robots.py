@@ -1,4 +1,4 @@
-"""Released robots from the package example-robot-data: a 7-dof arm, a quadruped (18 dof), a humanoid (35 dof), and others.
+"""Released robots of the package example-robot-data: an arm (7 dof), a quadruped (18), a humanoid (35), and others.
 
 Only the URDF text is needed. Its masses, joints and their placements are used as they are. Shapes, damping, friction
 and mimics of joints are removed, and the joints under ``locked`` are fixed at zero.
