@@ -1,0 +1,171 @@
+"""Times of chosen operations beside a limit that each should keep: a table of what is fast enough and what is not.
+
+    python -m benchmarks.speed [PATTERN] [--device cuda:0] [--json FILE] [--compile]
+
+A line gives the time of one call of all worlds [us], the largest error of the results against the dense float64
+reference, the figure that has a limit, and the limit. A figure is the time itself, a rate [1e9 worlds/s], or the time
+over that of another call in the same run. ``PATTERN`` is a regular expression on the lines' names. ``--compile``
+compiles the kernels into Warp's cache, several at a time, and times nothing. The exit code is 1 if an error exceeds
+its tolerance; a limit that is missed is printed, and is no error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import concurrent.futures
+import dataclasses
+import functools
+import gc
+import multiprocessing
+import os
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import warp as wp
+
+import warp_spo as spo
+from warp_spo.trials.operations import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
+from warp_spo.trials.trial import Subject, Trial
+
+from . import robots, runner
+from .resources import record_launches, resources
+
+FEW, MANY, MOST = 4096, 65536, 1 << 20
+INERTIAS = ("body_mass", "body_com", "body_inertia")
+SETS, SAMPLE, REPEATS, WARM_UP, BUDGET = 3, 2, 15, 0.1, 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class Call:
+    """A call that is timed: an operation of a robot, how many worlds, and options of Dynamics."""
+
+    robot: str
+    operation: str
+    worlds: int
+    dtype: str = "float32"
+    variable: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        more = [self.dtype] * (self.dtype != "float32") + ["variable inertias"] * bool(self.variable)
+        return ", ".join([f"{self.robot} {self.operation}", f"{self.worlds} worlds", *more])
+
+
+@dataclasses.dataclass(frozen=True)
+class Line:
+    """A call, and the limit of a figure: of "us", "ratio" (its time over that of ``beside``), or "rate" (at least)."""
+
+    call: Call
+    kind: str
+    limit: float
+    beside: Call | None = None
+
+    def figure(self, time: Callable[[Call], float]) -> float:
+        """Return the figure; ``time`` gives the time of a call [us]."""
+        us = time(self.call)
+        if self.beside is not None:
+            return us / time(self.beside)
+        return 1e-3 * self.call.worlds / us if self.kind == "rate" else us
+
+    def keeps(self, figure: float) -> bool:
+        """Return whether the figure keeps the limit."""
+        return figure >= self.limit if self.kind == "rate" else figure <= self.limit
+
+
+def _over_float32(robot: str, operation: str, worlds: int, limit: float) -> Line:
+    call = Call(robot, operation, worlds, "float64")
+    return Line(call, "ratio", limit, dataclasses.replace(call, dtype="float32"))
+
+
+def _over_folded(robot: str, limit: float) -> Line:
+    call = Call(robot, "forward_dynamics", MOST, variable=INERTIAS)
+    return Line(call, "ratio", limit, dataclasses.replace(call, variable=()))
+
+
+LINES = (
+    *(_over_float32("centauro", "forward_dynamics", worlds, 3.0) for worlds in (FEW, MANY)),
+    Line(Call("centauro", "forward_dynamics", MOST), "rate", 0.8),
+    Line(Call("g1", "forward_dynamics", MOST), "rate", 1.6),
+    Line(Call("go2", "forward_dynamics", MANY), "us", 12.5),
+    Line(Call("go2", "inverse_dynamics", MANY), "us", 7.0),
+    Line(Call("g1", "forward_dynamics_derivatives", FEW), "us", 150.0),
+    Line(Call("g1", "forward_dynamics_derivatives", MANY), "us", 1500.0),
+    Line(Call("g1", "mass_matrix_inverse", FEW, "float64"), "us", 60.0),
+    *(_over_float32(robot, name, FEW, 2.5) for robot in ("go2", "g1") for name in ("phi", "phi.T", "psi")),
+    *(_over_folded(robot, 1.4) for robot in ("panda", "go2", "g1")),
+)
+
+
+def trial_of(call: Call, device: wp.Device, sets: int = SETS) -> Trial:
+    """Return the trial of a call, after its first evaluation."""
+    scene = robots.scene(call.robot)
+    dyn = spo.Dynamics(scene, call.worlds, device, call.dtype, variable=call.variable)
+    inputs = [Inputs(scene, call.worlds, seed) for seed in range(sets)]
+    return Trial(Subject(dyn, inputs), (OPERATIONS | APPLICATIONS)[call.operation], SAMPLE)
+
+
+def measure(call: Call, device: wp.Device) -> dict:
+    """Return ``us``, percentiles, ``error``, and what the call's kernels take."""
+    with record_launches() as launched:
+        trial = trial_of(call, device)
+        del launched[:]
+        trial.evaluate(0)
+    checked = trial.check()
+    timing, left = trial.measure(REPEATS, WARM_UP, BUDGET)
+    row = dataclasses.asdict(call) | dict(us=1e6 * timing.median, p10_us=1e6 * timing.low, p90_us=1e6 * timing.high)
+    return row | dict(error=max(checked, left), launches=len(launched)) | resources(launched, device)
+
+
+def calls_of(lines: list[Line]) -> list[Call]:
+    """Return the calls that the lines need, each once."""
+    return list(dict.fromkeys(call for line in lines for call in (line.call, line.beside) if call is not None))
+
+
+def _compile(call: Call, device: str) -> None:
+    trial_of(call, wp.get_device(device), sets=1)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="benchmarks.speed", description="Times beside limits.")
+    parser.add_argument("pattern", nargs="?", default="", help="regular expression on the names of lines")
+    parser.add_argument("--device", help="Warp device, default: the current one")
+    parser.add_argument("--json", type=Path, help="file or folder for the rows")
+    parser.add_argument("--compile", action="store_true", help="compile all kernels, and time nothing")
+    options = parser.parse_args(arguments)
+    device = wp.get_device(options.device)
+    lines = [line for line in LINES if re.search(options.pattern, str(line.call))]
+    if options.compile:
+        context = multiprocessing.get_context("spawn")
+        with concurrent.futures.ProcessPoolExecutor(os.cpu_count(), context) as pool:
+            for task in [pool.submit(_compile, call, str(device)) for call in calls_of(lines)]:
+                task.result()
+        return 0
+    rows: list[dict] = []
+
+    @functools.cache
+    def time(call: Call) -> float:
+        gc.collect()
+        rows.append(measure(call, device))
+        return rows[-1]["us"]
+
+    for line in lines:
+        figure, unit = line.figure(time), {"us": "us", "rate": "1e9/s", "ratio": "times"}[line.kind]
+        error = max(row["error"] for row in rows if Call(*(row[f.name] for f in dataclasses.fields(Call))) == line.call)
+        limit = f"{'at least' if line.kind == 'rate' else 'at most'} {line.limit:g}"
+        beside = f" of {line.beside}, {time(line.beside):.4g} us" if line.beside else ""
+        word = "kept" if line.keeps(figure) else "MISSED"
+        print(
+            f"{line.call!s}: {time(line.call):.4g} us, error {error:.1e}; {figure:.4g} {unit}{beside}; {limit}: {word}",
+            flush=True,
+        )
+    if options.json:
+        print(f"wrote {runner.save(runner.record(rows, device), options.json)}")
+    wrong = [row for row in rows if not row["error"] <= TOLERANCE[row["dtype"]]]
+    for row in wrong:
+        print(f"error {row['error']:.1e} exceeds its tolerance in {row}", file=sys.stderr)
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
