@@ -2,6 +2,7 @@
 
     python -m benchmarks.depth --device cuda:0 --json benchmarks/results/
     python -m benchmarks.depth --bodies 64 --worlds 1 16        # some sizes
+    python -m benchmarks.depth --draw RESULTS.json docs/_static/depth.svg    # the picture of an earlier run's chains
 
 Every result is checked against the float64 sweeps on the CPU, then timed, on CUDA in a graph. Columns [us]:
 
@@ -20,6 +21,8 @@ by doubling. The exit code is 1 if an error exceeds its tolerance.
 import argparse
 import dataclasses
 import functools
+import json
+import math
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -30,6 +33,7 @@ import warp as wp
 
 import warp_spo as spo
 from warp_spo.execution import plan
+from warp_spo.trials import drawing
 from warp_spo.trials.operations import OPERATIONS, Inputs
 from warp_spo.trials.trial import Subject, Trial
 
@@ -65,15 +69,21 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--dtype", nargs="+", default=["float32"], choices=TOLERANCE)
     parser.add_argument("--bodies", nargs="+", type=int, help="of chains; with it no other scene is timed")
     parser.add_argument("--worlds", nargs="+", type=int)
+    parser.add_argument("--columns", nargs="+", help="those to time; default: all; tree takes minutes to compile")
     parser.add_argument("--parts", action="store_true", help="time motion, factors and solution by themselves, too")
     parser.add_argument("--json", type=Path, help="file or folder for the rows")
+    parser.add_argument("--draw", nargs=2, type=Path, metavar=("JSON", "SVG"), help="draw the rows of a file, no more")
     options = parser.parse_args(arguments)
+    if options.draw is not None:
+        source, target = options.draw
+        target.write_text(picture(json.loads(source.read_text())))
+        return 0
     if options.json is not None:
         runner.check_place("--json", options.json)
     device = wp.get_device(options.device)
     rows: list[dict] = []
     for dtype in options.dtype:
-        for row in forward_dynamics(device, dtype, cases(device, options), options.parts):
+        for row in forward_dynamics(device, dtype, cases(device, options), options.columns, options.parts):
             rows.append(row)
         rows += resolvents(device, dtype, (64, 256) if options.bodies else (64, 256, 1024))
     if options.json is not None:
@@ -105,9 +115,14 @@ def methods(scene: spo.Scene) -> dict[str, tuple[dict, int]]:
     return found | {"plan": ({}, plan.STRETCH)}
 
 
-def forward_dynamics(device: wp.Device, dtype: str, lines: list, parts: bool) -> Iterator[dict]:
+COLUMNS = ("levels", "paths", "tree", *(f"scan {nodes}" for nodes in STRETCHES), "plan")
+
+
+def forward_dynamics(
+    device: wp.Device, dtype: str, lines: list, columns: list[str] | None, parts: bool
+) -> Iterator[dict]:
     """Print a line for each scene and world count, and yield a row for each time in it."""
-    names = ["levels", "paths", "tree", *(f"scan {nodes}" for nodes in STRETCHES), "plan"]
+    names = [name for name in COLUMNS if columns is None or name in columns]
     print(f"forward dynamics, {dtype}, us\n{'':22s}" + "".join(f"{name:>10s}" for name in names) + "      gain   error")
     for name, bodies, worlds in lines:
         scene = SCENES[name](bodies)
@@ -115,6 +130,8 @@ def forward_dynamics(device: wp.Device, dtype: str, lines: list, parts: bool) ->
         inputs = [Inputs(scene, worlds, seed, reference) for seed in range(SETS)]
         found: dict[str, dict] = {}
         for method, (options, nodes) in methods(scene).items():
+            if method not in names:
+                continue
             size = dict(scene=name, bodies=bodies, worlds=worlds, depth=scene.tree.depth, dof=scene.dof_count)
             row = (
                 size | dict(dtype=dtype, method=method) | measure(scene, worlds, device, dtype, options, nodes, inputs)
@@ -122,8 +139,8 @@ def forward_dynamics(device: wp.Device, dtype: str, lines: list, parts: bool) ->
             found[method] = row
             yield row
         times = [f"{found[each]['us']:10.1f}" if each in found else f"{'-':>10s}" for each in names]
-        scans = min(row["us"] for each, row in found.items() if each.startswith("scan"))
-        sweeps = min(found[each]["us"] for each in ("levels", "paths", "tree") if each in found)
+        scans = min((row["us"] for each, row in found.items() if each.startswith("scan")), default=math.nan)
+        sweeps = min((found[each]["us"] for each in ("levels", "paths", "tree") if each in found), default=math.nan)
         worst = max(row["error"] for row in found.values())
         label = f"{name} {bodies}, {worlds} world{'s' * (worlds > 1)}"
         print(f"{label:22s}{''.join(times)}{sweeps / scans:10.2f} {worst:7.0e}", flush=True)
@@ -222,6 +239,47 @@ def resolvents(device: wp.Device, dtype: str, sizes: tuple[int, ...]) -> list[di
         times = "".join(f"{us:10.1f}" for us, _ in found.values())
         print(f"chain {bodies:<16d}{times} {max(errors):7.0e}", flush=True)
     return rows
+
+
+@drawing.style()
+def picture(run: dict) -> str:
+    """Return SVG text: time of forward dynamics of chains against bodies, a panel for each number of worlds."""
+    pyplot = drawing.load_pyplot("--draw")
+    rows = [row for row in run["rows"] if row["scene"] == "chain" and row["dtype"] == "float32"]
+    panels = sorted({row["worlds"] for row in rows})
+    lines = {
+        "sweeps, a launch a level": ("levels", drawing.OTHER, "--"),
+        "sweeps, a thread a path": ("paths", drawing.OTHER, "-"),
+        "straight-line code": ("tree", drawing.OURS_DARK, ":"),
+        "fastest scan": ("scan", drawing.OURS, "-"),
+    }
+    figure, grid = pyplot.subplots(
+        1, len(panels), figsize=(10.4, 3.9), layout="constrained", squeeze=False, sharey=True
+    )
+    for axes, worlds in zip(grid[0], panels, strict=True):
+        here = [row for row in rows if row["worlds"] == worlds]
+        drawing.log_axis(axes.xaxis, [row["bodies"] for row in rows], drawing.count_text)
+        drawing.log_axis(axes.yaxis, [row["us"] for row in rows], drawing.time_text)
+        for label, (method, color, dashes) in lines.items():
+            best: dict[int, float] = {}
+            for row in here:
+                if row["method"].startswith(method):
+                    best[row["bodies"]] = min(row["us"], best.get(row["bodies"], np.inf))
+            axes.plot(
+                sorted(best),
+                [best[bodies] for bodies in sorted(best)],
+                dashes,
+                color=color,
+                marker="o",
+                ms=3,
+                label=label,
+            )
+        axes.set(title=f"{worlds:,} world{'s' * (worlds > 1)}", xlabel="bodies of the chain")
+        axes.label_outer()
+    grid[0][0].set_ylabel("run time")
+    drawing.title(figure, f"Forward dynamics of chains, {run['machine']['device']}, float32")
+    drawing.legend_below(figure, grid[0][0].get_legend_handles_labels()[0])
+    return drawing.svg(figure)
 
 
 if __name__ == "__main__":

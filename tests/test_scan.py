@@ -324,3 +324,15 @@ def test_refined_scans(scanned, device):
     dyn = scanned(scene, 2, "float32", refine=2)
     assert dyn._refinement.wide.plan.stretch == 1
     assert worst(dyn.forward_dynamics(q, qd, tau), wanted) <= 2e-7
+
+
+@pytest.mark.slow
+def test_the_benchmark_checks_times_and_draws(device, tmp_path, capsys):
+    from benchmarks import depth  # found behind an installed warp_spo, see conftest.py
+
+    pytest.importorskip("matplotlib")
+    run = tmp_path / "run.json"
+    assert depth.main(["--device", str(device), "--bodies", "8", "--worlds", "1", "3", "--json", str(run)]) == 0
+    assert "chain 8, 3 worlds" in capsys.readouterr().out
+    assert depth.main(["--draw", str(run), str(tmp_path / "run.svg")]) == 0
+    assert "fastest scan" in (tmp_path / "run.svg").read_text()
