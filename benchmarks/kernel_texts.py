@@ -28,6 +28,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.dynamics import dynamics
 from warp_spo.examples import biped, fivebar, fourbar, slider_crank, stewart
+from warp_spo.execution.device_facts import MEASURED
 from warp_spo.kernels import native
 
 from . import robots, shapes
@@ -92,8 +93,8 @@ def recording(recorder: Recorder) -> Iterator[None]:
     """Plan as for a GPU; record kernels instead of making them, and launch nothing."""
     choose = dynamics.plans.choose
 
-    def as_for_cuda(scene: Any, worlds: int, cuda: bool, *more: Any) -> Any:
-        return choose(scene, worlds, True, *more)
+    def as_for_cuda(scene: Any, worlds: int, device: Any, *more: Any) -> Any:
+        return choose(scene, worlds, MEASURED, *more)
 
     def record(name: str, native: str, arrays: list, T: type, registers: Any = None, wide: tuple = ()) -> Any:
         recorder.add(name, arrays, registers, wide, native)

@@ -121,7 +121,11 @@ class KernelLayout(NamedTuple):
 
     def fits(self, T: type) -> bool:
         """Return whether the shared memory of a block has room for this layout, for scalars of type ``T``."""
-        return self.shared_scalars * self.groups * wp.types.type_size_in_bytes(T) <= SHARED_BYTES
+        return self.shared_bytes(T) <= SHARED_BYTES
+
+    def shared_bytes(self, T: type) -> int:
+        """Return the bytes of shared memory of a block, for scalars of type ``T``."""
+        return self.shared_scalars * self.groups * wp.types.type_size_in_bytes(T)
 
 
 def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:

@@ -13,6 +13,7 @@ from allocations import no_warp_allocation
 import warp_spo as spo
 from warp_spo import launches
 from warp_spo.execution import plan
+from warp_spo.execution.device_facts import CPU, MEASURED
 from warp_spo.execution.stretches import cut, solid_nodes
 
 SWEEP = {"float64": 1e-12, "float32": 5e-6}  # of P+, z+ and tau; float64 also of qdd
@@ -289,15 +290,15 @@ def test_stretches_of_random_trees(length):
 def test_the_plan_scans_deep_trees_in_few_worlds():
     deep, flat = chain(300)[0], zoo.star(300)
     choose = functools.partial(plan.choose, dtype="float32")
-    assert choose(deep, 1, cuda=True).stretch == plan.STRETCH and choose(deep, 16, cuda=True).stretch == plan.STRETCH
-    assert "launches in a row against 1200 of sweeps" in plan.describe_recursion(choose(deep, 1, cuda=True))
+    assert choose(deep, 1, MEASURED).stretch == plan.STRETCH and choose(deep, 16, MEASURED).stretch == plan.STRETCH
+    assert "launches in a row against 1200 of sweeps" in plan.describe_recursion(choose(deep, 1, MEASURED))
     for scene, worlds, options in ((flat, 1, {}), (deep, 4096, {}), (deep, 1, {"varies": True})):
-        assert not choose(scene, worlds, cuda=True, **options).stretch
-    assert not choose(deep, 1, cuda=True, granularity="node").stretch  # bits do not depend on the number of worlds
-    assert not choose(deep, 1, cuda=True, recursion="sweep").stretch
-    assert choose(deep, 1, cuda=False).stretch == 300 and not choose(deep, 64, cuda=False).stretch
-    assert choose(deep, 1, cuda=False, varies=True).stretch == 300  # a path in one stretch needs no element
-    assert choose(zoo.SCENES["rods"](), 1, cuda=True).scan_reason == ""
+        assert not choose(scene, worlds, MEASURED, **options).stretch
+    assert not choose(deep, 1, MEASURED, granularity="node").stretch  # bits do not depend on the number of worlds
+    assert not choose(deep, 1, MEASURED, recursion="sweep").stretch
+    assert choose(deep, 1, CPU).stretch == 300 and not choose(deep, 64, CPU).stretch
+    assert choose(deep, 1, CPU, varies=True).stretch == 300  # a path in one stretch needs no element
+    assert choose(zoo.SCENES["rods"](), 1, MEASURED).scan_reason == ""
 
 
 def test_explain_says_how_recursions_run(device):

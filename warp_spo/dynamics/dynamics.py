@@ -19,6 +19,7 @@ import warp as wp
 from ..arrays import parse_device, parse_dtype
 from ..errors import UnsupportedError, as_integer, as_names
 from ..execution import plan as plans
+from ..execution.device_facts import read_facts
 from ..execution.parameters import RIGID_VALUES, VARIABLE
 from ..execution.programs import Programs
 from ..execution.sweeps import Sweeps
@@ -234,8 +235,8 @@ class Dynamics:
         self.variable = _variable_names(variable)
         check_loops(scene, loops)
         varies = any(name in self.variable or scene.values[name].shape[0] > 1 for name in RIGID_VALUES)
-        cuda, precision = self.device.is_cuda, self.dtype.__name__
-        self.plan = plans.choose(scene, self.worlds, cuda, precision, granularity, varies, recursion)
+        device, precision = read_facts(self.device), self.dtype.__name__
+        self.plan = plans.choose(scene, self.worlds, device, precision, granularity, varies, recursion)
         self.granularity = self.plan.granularity
         self.recursions = Sweeps(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)

@@ -9,6 +9,7 @@ from ..kernels.slots import WARP_SIZE
 from ..recursions.links import Links
 from ..recursions.pieces import Pieces
 from ..scene.scene import Scene
+from .device_facts import DeviceFacts
 from .routine import Routine
 from .stretches import cut, solid_nodes
 
@@ -18,7 +19,8 @@ RECURSIONS = ("sweep", "scan")
 DEFAULT: str | None = None  # granularity of who asks for none; None: chosen by the rules below
 COLUMN_BYTES = 1 << 28  # workspace of a solve with many right-hand sides; more columns go in turns
 
-# Measured on an H200, 2026-11-21; see CONTRIBUTING.
+# Measured on an H200, 2026-11-21; see CONTRIBUTING. Numbers of worlds and of threads are in proportion to its
+# multiprocessors on another GPU, see DeviceFacts.scaled.
 FEW_WORLDS = 32768  # so many leave a GPU waiting: a warp for each limb, and rows read where they are
 MOST_DOFS = 128  # straight-line code of more takes too long to compile
 SPILLS = {"float32": 32, "float64": 15}  # dofs at which one thread no longer holds a whole tree in registers,
@@ -56,6 +58,7 @@ class Plan:
         staged: rows of many worlds come in through shared memory, see :meth:`stages`.
         outward: (first, count) into the nodes ordered by level, roots first.
         worlds: number of worlds.
+        device: what it is that runs them.
         dtype: "float32" or "float64".
         dofs: of the scene.
         limbs: serial chains that end in a leaf; counted where it matters.
@@ -72,6 +75,7 @@ class Plan:
     staged: bool
     outward: tuple[tuple[int, int], ...]
     worlds: int
+    device: DeviceFacts
     dtype: str
     dofs: int
     limbs: int = 1
@@ -83,7 +87,7 @@ class Plan:
     @property
     def few(self) -> bool:
         """So few worlds that a GPU waits for latency, not for instructions."""
-        return self.worlds <= FEW_WORLDS
+        return self.worlds <= self.device.scaled(FEW_WORLDS)
 
     @property
     def inward(self) -> tuple[tuple[int, int], ...]:
@@ -111,7 +115,7 @@ class Plan:
 
     def stages(self, routine: Routine, warps: int) -> bool:
         """Whether rows come in through shared memory, for kernels in which ``warps`` share 32 worlds."""
-        return self.staged and (warps == 1 or self.worlds > FEW_WORLDS // 4 or routine.passes)
+        return self.staged and (warps == 1 or self.worlds > self.device.scaled(FEW_WORLDS // 4) or routine.passes)
 
     def gathers(self, routine: Routine, warps: int, results: int) -> bool:
         """Whether short results leave through shared memory though rows do not come in through it.
@@ -130,13 +134,13 @@ class Plan:
 def choose(
     scene: Scene,
     worlds: int,
-    cuda: bool,
+    device: DeviceFacts,
     dtype: str,
     granularity: str | None = None,
     varies: bool = False,
     recursion: str | None = None,
 ) -> Plan:
-    """Return the plan for a scene and a world count; ``granularity`` and ``recursion`` force one.
+    """Return the plan for a scene and a world count on a device; ``granularity`` and ``recursion`` force one.
 
     ``varies``: inertias or hinge frames are inputs, which a thread has to hold too.
 
@@ -157,20 +161,22 @@ def choose(
         what, way = f"{option} for a scene with flexible bodies or rotors", "use granularity=None or 'tree'"
         raise UnsupportedError("Dynamics", what, way if granularity else "leave recursion out")
     asked = "tree" if shared else granularity or ("node" if recursion == "scan" else DEFAULT)
-    side_by_side = cuda and not shared and asked != "node" and 0 < scene.dof_count <= MOST_DOFS
+    side_by_side = device.cuda and not shared and asked != "node" and 0 < scene.dof_count <= MOST_DOFS
     pieces = Pieces(Links(scene)) if side_by_side else None
     limbs, alike = (pieces.warps, pieces.alike >= ALIKE[dtype]) if pieces else (1, True)
-    rule = _chosen(scene.dof_count, limbs, alike, worlds, cuda, dtype, varies)
+    rule = _chosen(scene.dof_count, limbs, alike, worlds, device, dtype, varies)
     chosen, reason = (asked, "asked for") if asked else rule
     if shared:
         reason = SHARED
     rows = SHORT_ROWS if chosen == "tree" else LONG_ROWS
-    staged = scene.dof_count > rows and worlds > (FEW_WORLDS if scene.dof_count <= LONG_ROWS else FEW_WORLDS // 16)
+    staged = scene.dof_count > rows and worlds > device.scaled(
+        FEW_WORLDS if scene.dof_count <= LONG_ROWS else FEW_WORLDS // 16
+    )
     outward, first = [], 0
     for level in scene.tree.levels:
         outward.append((first, len(level)))
         first += len(level)
-    apart = side_by_side and not varies and worlds > APART["chain" if limbs == 1 else chosen]
+    apart = side_by_side and not varies and worlds > device.scaled(APART["chain" if limbs == 1 else chosen])
     apart = apart and _depth(scene) <= DEEPEST
     levels, dofs = tuple(outward), scene.dof_count
     if recursion is not None:
@@ -178,13 +184,15 @@ def choose(
     elif chosen != "node" or not dofs:
         stretch = 0, ""
     else:
-        stretch = (0, "granularity is asked for") if asked else _stretch(scene, worlds, cuda, varies)
-    return Plan(chosen, reason, asked is not None, staged, levels, worlds, dtype, dofs, limbs, apart, varies, *stretch)
+        stretch = (0, "granularity is asked for") if asked else _stretch(scene, worlds, device, varies)
+    return Plan(
+        chosen, reason, asked is not None, staged, levels, worlds, device, dtype, dofs, limbs, apart, varies, *stretch
+    )
 
 
-def _stretch(scene: Scene, worlds: int, cuda: bool, varies: bool) -> tuple[int, str]:
+def _stretch(scene: Scene, worlds: int, device: DeviceFacts, varies: bool) -> tuple[int, str]:
     """Return how many nodes a thread of a scan takes, 0 if sweeps take less time than scans, and why."""
-    length, most = (STRETCH, SCAN_THREADS) if cuda else (scene.body_count, CPU_WORLDS)
+    length, most = (STRETCH, device.scaled(SCAN_THREADS)) if device.cuda else (scene.body_count, CPU_WORLDS)
     pieces = cut(scene.tree, solid_nodes(scene), length)
     scans, sweeps = pieces.launches, SWEEPS * len(scene.tree.levels)
     counts = f"{scans} launches in a row against {sweeps} of sweeps"
@@ -192,7 +200,7 @@ def _stretch(scene: Scene, worlds: int, cuda: bool, varies: bool) -> tuple[int, 
         return 0, f"scans would be {counts}"
     if varies and any(level.longest > 1 for level in pieces.levels):
         return 0, "scans begin at bodies that have inertia, which variable values may take away"
-    if worlds * (len(pieces.nodes) if cuda else 1) > most:
+    if worlds * (len(pieces.nodes) if device.cuda else 1) > most:
         return 0, f"with {worlds} worlds the work takes longer than launches; scans would be {counts}"
     return length, counts
 
@@ -207,31 +215,34 @@ def _depth(scene: Scene) -> int:
     return max(depth.values())
 
 
-def _chosen(dofs: int, limbs: int, alike: bool, worlds: int, cuda: bool, dtype: str, varies: bool) -> tuple[str, str]:
+def _chosen(
+    dofs: int, limbs: int, alike: bool, worlds: int, device: DeviceFacts, dtype: str, varies: bool
+) -> tuple[str, str]:
+    few_worlds = device.scaled(FEW_WORLDS)
     if dofs == 0:
         return "node", "nothing moves"
     if dofs > MOST_DOFS:
         return "node", f"more than {MOST_DOFS} dof take long to compile as straight-line code"
-    if not cuda:
+    if not device.cuda:
         return "tree", "one thread works through a world"
     if limbs == 1:
         return "tree", "the scene is one chain"
     if limbs > MOST_WARPS:
         return "tree", f"more than {MOST_WARPS} limbs"
-    if worlds <= FEW_WORLDS:
-        return "segment", f"up to {FEW_WORLDS} worlds, {limbs} limbs side by side take less time"
+    if worlds <= few_worlds:
+        return "segment", f"up to {few_worlds} worlds, {limbs} limbs side by side take less time"
     if dofs > (min(HELD, SPILLS[dtype]) if varies else SPILLS[dtype]):
         if not alike:
             return "tree", f"{limbs} limbs with code of their own each do not fit into the instruction cache"
         return "segment", f"{dofs} dof in {dtype} do not fit into one thread's registers"
-    return "tree", f"more than {FEW_WORLDS} worlds keep the GPU busy with a thread each"
+    return "tree", f"more than {few_worlds} worlds keep the GPU busy with a thread each"
 
 
 def describe(plan: Plan) -> str:
     """Return one line: the granularity, the reason for it, and the other granularities."""
     others = ", ".join(name for name in GRANULARITIES if name != plan.granularity)
     limbs = plan.limbs if plan.granularity == "segment" else 1
-    staged = plan.staged and (limbs == 1 or plan.worlds > FEW_WORLDS // 4)
+    staged = plan.staged and (limbs == 1 or plan.worlds > plan.device.scaled(FEW_WORLDS // 4))
     rows = "through shared memory" if staged else "each by its thread"
     first = "forward dynamics takes velocity terms first; " if plan.apart else ""
     force = "no other granularity serves them" if plan.reason == SHARED else f"granularity= can force {others}"

@@ -25,13 +25,14 @@ from ..recursions.step import GAIN, GUESS, LOOPED, MISSED
 from ..recursions.tracing import Trace
 from ..trace.emission import PREFIX, Emitter, RangeReduction, Store, render
 from . import link_values, searches, staging
+from .device_facts import RESERVED
 from .plan import MOST_WARPS, Plan
 from .routine import Routine
 from .staging import FIELDS
 from .sweeps import Sweeps
 from .teams import Passes, Team, Work
 
-REGISTERS, PARTS = 65536, 4  # of a multiprocessor
+PARTS = 4  # of a multiprocessor
 MOST_REGISTERS = 255  # of a thread
 PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
 
@@ -246,11 +247,12 @@ class Programs:
                 sum(each.operations for each in {emitter, checking, later}),
             )
         cuda = team.cuda()  # fills the tables
-        registers = _registers(pieces.warps)
+        registers = self._registers(pieces.warps)
         if routine.occupancy is not None and dtype == "float32" and not self.plan.few:
             blocks, enough = routine.occupancy
-            fewer = _registers(blocks * pieces.warps)
-            registers = fewer if fewer >= enough else registers
+            fewer = self._registers(blocks * pieces.warps)
+            room = blocks * (layout.shared_bytes(self.run.dtype) + RESERVED) <= self.plan.device.shared_bytes
+            registers = fewer if fewer >= enough and room else registers
         lists = {"place": table, "table": team.table, "shifts": team.shifts}
         tables = {name: values for name, values in lists.items() if values}
         cap = registers if registers < MOST_REGISTERS else None
@@ -293,6 +295,10 @@ class Programs:
         return Program(
             kernel, rows, fields, tuple(held.values()), layout.warps, layout.block, operations, result.slots, entry
         )
+
+    def _registers(self, warps: int) -> int:
+        """Of a thread, if a multiprocessor is to hold so many warps: its parts share them, each with its registers."""
+        return self.plan.device.registers // PARTS // (WARP_SIZE * -(-warps // PARTS)) // 8 * 8
 
     def _layout(
         self,
@@ -348,11 +354,6 @@ class Programs:
             return index[0] if len(index) == 1 else staging.flat_index(index, shapes[array][1:])
 
         return Emitter(self.run.dtype.__name__, load, store, flat, angles, FIELDS)
-
-
-def _registers(warps: int) -> int:
-    """Of a thread, if a multiprocessor is to hold so many warps: its parts share them, each with its own registers."""
-    return REGISTERS // PARTS // (WARP_SIZE * -(-warps // PARTS)) // 8 * 8
 
 
 def _title(key: tuple) -> str:

@@ -1,0 +1,52 @@
+"""Plans on GPUs of other sizes: numbers of worlds in proportion to multiprocessors, blocks that shared memory holds."""
+
+import dataclasses
+
+import pytest
+import zoo
+
+import warp_spo as spo
+from warp_spo.dynamics.inertia import SOLVE_MASS_MATRIX
+from warp_spo.execution import device_facts, plan
+from warp_spo.execution.device_facts import CPU, MEASURED, DeviceFacts
+from warp_spo.kernels import native
+
+L4 = DeviceFacts("NVIDIA L4", multiprocessors=58, shared_bytes=100 * 1024)
+
+
+def test_a_small_gpu_is_full_with_fewer_worlds():
+    scene = zoo.fork()
+    for device, limit in ((MEASURED, 32768), (L4, 14398)):
+        few, many = (plan.choose(scene, limit + more, device, "float32") for more in (0, 1))
+        assert (few.granularity, many.granularity) == ("segment", "tree") and few.few and not many.few
+        assert f"up to {limit} worlds" in few.reason and f"more than {limit} worlds" in many.reason
+    assert CPU.scaled(100) == 100
+
+
+def test_a_deep_tree_scans_in_fewer_worlds_on_a_small_gpu():
+    scene = zoo.planar_chain(300)
+    assert plan.choose(scene, 256, MEASURED, "float32").stretch and not plan.choose(scene, 256, L4, "float32").stretch
+
+
+def test_facts_are_those_of_the_device(device):
+    facts = device_facts.read_facts(device)
+    assert facts.cuda == device.is_cuda
+    if device.is_cuda:
+        assert facts.multiprocessors == device.sm_count and facts.shared_bytes >= 48 * 1024
+        assert spo.Dynamics(zoo.fork(), 2, device).plan.device == facts
+
+
+@pytest.mark.parametrize("kilobytes, capped", [(228, True), (8, False)])
+def test_registers_are_capped_only_where_shared_memory_holds_the_blocks(kilobytes, capped, monkeypatch):
+    """A solve by limbs wants four blocks on a multiprocessor; without shared memory for them a cap would only spill."""
+    facts, caps, worlds = dataclasses.replace(MEASURED, shared_bytes=kilobytes * 1024), {}, 1 << 16
+
+    def note(name, text, arrays, T, registers=None, wide=()):
+        caps[name] = registers
+
+    monkeypatch.setattr("warp_spo.dynamics.dynamics.read_facts", lambda device: facts)
+    monkeypatch.setattr(native, "kernel", note)
+    dyn = spo.Dynamics(zoo.star(4), worlds, "cpu", granularity="segment")
+    shape = (worlds, dyn.scene.dof_count)
+    dyn.programs.find(SOLVE_MASS_MATRIX.routine, {"q": (worlds, dyn.scene.coord_count), "b": shape}, shape)
+    assert (caps["solve_mass_matrix"] is not None) == capped
