@@ -34,6 +34,7 @@ ROOMS = (
     "reference_rotations",
     "reference_rotors",
     "reference",
+    "reference_contact",
     "trace",
     "hinges",
     "scene",
@@ -153,8 +154,11 @@ def test_files_are_short():
 
 
 def test_the_reference_imports_numpy_alone():
-    own_of = {"reference.py": {"reference_jets", "reference_rotations", "reference_rotors"}}
-    for name in ("reference.py", "reference_jets.py", "reference_rotations.py", "reference_rotors.py"):
+    own_of = {
+        "reference.py": {"reference_jets", "reference_rotations", "reference_rotors"},
+        "reference_contact.py": {"reference", "reference_rotations"},
+    }
+    for name in (*own_of, "reference_jets.py", "reference_rotations.py", "reference_rotors.py"):
         assert imports(PACKAGE / name) <= {"__future__", "functools", "itertools", "typing", "numpy"}
         assert {room for _, room in rooms_imported(PACKAGE / name)} <= own_of.get(name, set())
 

@@ -14,6 +14,7 @@ from .graph.operators import BWA, Blocks, Identity, Operator
 from .hinges.functions import clip, spline, where
 from .scene.actuators import Actuator, Keyframe
 from .scene.beams import beam_modes
+from .scene.contacts import Contact, HeightField, Plane
 from .scene.gears import Rotor
 from .scene.modes import MassPoints, Modes
 from .scene.normal_modes import normal_modes
@@ -39,11 +40,13 @@ __all__ = [
     "ActuatorState",
     "Blocks",
     "Body",
+    "Contact",
     "Coupling",
     "Digraph",
     "DirectedLoopError",
     "Dynamics",
     "Factorization",
+    "HeightField",
     "Hinge",
     "Identity",
     "Keyframe",
@@ -52,6 +55,7 @@ __all__ = [
     "Material",
     "Modes",
     "Operator",
+    "Plane",
     "Rotor",
     "Scene",
     "Section",

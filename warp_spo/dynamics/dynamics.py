@@ -25,6 +25,7 @@ from ..execution.programs import Programs
 from ..execution.sweeps import Sweeps
 from ..gradients import TensorValues
 from ..registry import register
+from ..scene import contacts
 from ..scene.scene import Scene
 from . import (
     actuators,
@@ -306,6 +307,7 @@ class Dynamics:
             f"gravity      {'none' if gravity is None else 'acceleration of the inertial frame'}",
             f"loops        {self._closures.explain()}",
             f"actuators    {actuators.explain(self)}",
+            f"contacts     {contacts.describe(scene)}",
             f"workspace    {memory:.1f} MiB so far",
         ]
         if self.plan.scan_reason:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from ..arrays import AnyArray, ArrayT, Call
-from ..errors import as_integer
+from ..errors import UnsupportedError, as_integer
 from ..execution.routine import Routine
 from ..kernels import combination
 from ..recursions.derivatives import adjoints
@@ -218,6 +218,8 @@ def step(
     """
     engine = self._engine
     with engine.call(STEP) as call:
+        if self.scene.contacts:
+            raise UnsupportedError(call.name, "a scene with contacts", "leave out contacts=")
         if integrator not in INTEGRATORS:
             raise ValueError(f"{call.name}: integrator is {integrator!r}; expected one of {', '.join(INTEGRATORS)}")
         outs = engine.outs(call, STEP, out)

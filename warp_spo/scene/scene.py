@@ -15,6 +15,16 @@ import numpy as np
 from ..errors import refuse_masked
 from .actuators import RANGES, Actuator, Keyframe, actuator_values, check_actuator_value
 from .checks import SYMMETRY
+from .contacts import (
+    CONTACT_VALUES,
+    Contact,
+    ContactPoint,
+    HeightField,
+    Plane,
+    check_contacts,
+    contact_points,
+    contact_values,
+)
 from .modes import MASS_VALUES, check_modes, with_modes
 from .parts import (
     DOF_VALUES,
@@ -45,6 +55,7 @@ NOT_NEGATIVE = (
     "joint_velocity_limit",
     "actuator_strength",
     "actuator_delay",
+    *CONTACT_VALUES,
 )
 
 
@@ -80,10 +91,12 @@ class Scene(Stored):
         actuators: forces that control values command.
         sites: named frames, (body index, pose in the body (x, y, z, qx, qy, qz, qw)) by name.
         keyframes: named states.
+        contacts: points of bodies that touch the ground in :meth:`Dynamics.step`; other calls leave them out.
+        ground: a :class:`Plane` or a :class:`HeightField`; None: the plane at height 0, where there are contacts.
 
     Attributes:
-        bodies, hinges, loops, couplings, actuators, sites, keyframes: the arguments; :meth:`with_values` changes only
-            ``values``.
+        bodies, hinges, loops, couplings, actuators, sites, keyframes, contacts, ground: the arguments;
+            :meth:`with_values` changes only ``values``.
         tree: the :class:`Tree` over the bodies.
         hinge_of: index of the hinge that carries each body [body].
         q_start: first entry of q of each hinge, and the total at the end [hinge + 1].
@@ -94,7 +107,10 @@ class Scene(Stored):
             joint_target_kd, joint_limit_lower, joint_limit_upper, joint_limit_ke, joint_limit_kd, joint_effort_limit,
             joint_velocity_limit. Of actuators: actuator_gain, actuator_strength, actuator_delay [actuator],
             actuator_bias [actuator, 3], actuator_ctrl_range, actuator_force_range [actuator, 2], and actuator_gear, of
-            the hinges of the first actuator, of the second, and so on.
+            the hinges of the first actuator, of the second, and so on. Of contacts: contact_friction,
+            contact_stiffness [N/m], contact_damping [N s/m] [point].
+        contact_points: the :class:`warp_spo.scene.contacts.ContactPoint` of all contacts, contact after contact; other
+            calls mean them where axes say "contact".
         dof_axis: axis of each dof, in the parent anchor frame [dof, 3].
         dof_angular: radians about the axis per unit of the coordinate [dof].
         dof_linear: metres along the axis per unit of the coordinate [dof].
@@ -117,11 +133,17 @@ class Scene(Stored):
         actuators: Sequence[Actuator] = (),
         sites: Mapping[str, tuple[int, Any]] = MappingProxyType({}),
         keyframes: Mapping[str, Keyframe] = MappingProxyType({}),
+        contacts: Sequence[Contact] = (),
+        ground: Plane | HeightField | None = None,
     ):
         self.bodies, self.hinges = _parts("bodies", bodies, Body), _parts("hinges", hinges, Hinge)
         self.loops, self.couplings = _parts("loops", loops, Loop), _parts("couplings", couplings, Coupling)
         self.actuators = _parts("actuators", actuators, Actuator)
         self._check_indices()
+        self.contacts: tuple[Contact, ...] = _parts("contacts", contacts, Contact)
+        check_contacts(self.contacts, ground, self.bodies)
+        self.ground = Plane() if ground is None and self.contacts else ground
+        self.contact_points: tuple[ContactPoint, ...] = contact_points(self.contacts)
         self.hinges = tuple(with_modes(hinge, self.bodies[hinge.child].modes, HINGE_VALUES) for hinge in self.hinges)
         self.hinge_of = np.empty(len(self.bodies), dtype=np.int32)
         for index, hinge in enumerate(self.hinges):
@@ -148,9 +170,10 @@ class Scene(Stored):
         self._refuse_impossible_inertias("Scene", values["body_inertia"])
         self._refuse_crossed_limits("Scene", values)
         values |= actuator_values(self.actuators)
+        self.values = MappingProxyType(values)
+        values |= contact_values(self)
         for array in values.values():
             read_only(array)
-        self.values = MappingProxyType(values)
 
         screws = [self._screws_of(hinge) for hinge in self.hinges]
         self.dof_axis = np.concatenate([axis for axis, _, _ in screws]).reshape(-1, 3)

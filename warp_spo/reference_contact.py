@@ -1,0 +1,240 @@
+"""The specification of a time step with contacts: dense float64 NumPy for one world, deliberately simple.
+
+A contact is a spring, a damper and friction between a point of a body and the ground, all implicit: its force is
+f = f0 - G J v, with the velocity v = qd' after the step, a positive semidefinite G [3, 3] and the spring's load f0
+along the normal n. A step solves, with the pose held,
+
+    (Mass + h S + h J* G J) v = Mass qd + h (tau - bias + l + J* f0),
+
+where S and l are resistances and loads of the hinges' laws. G, S and l depend on v; each pass takes them from the v of
+the pass before. Friction, effort limits and dry friction are secants: dampers that give the bound at the v before. The
+first pass closes all candidates, later passes open those that pull, the last of three or more only closes.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .reference import Dense
+from .reference_rotations import homogeneous
+
+CREEP = 1e-4  # rate below which dry friction is a damper [rad/s, m/s]
+UNBOUNDED, UNLIMITED = 1e6, 1e10  # effort and velocity limits, position limits, of this size and more are none
+HOLD = 300.0  # resistance of a velocity limit, in inertias over the step
+SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
+
+
+class Points(NamedTuple):
+    """Contact points at one pose: J [point, 3, dof] and n [point, 3] in inertial axes, the others [point].
+
+    ``depth`` is the penetration [m], ``weight`` 0.6 of the inverse weight at the neutral pose [1/kg].
+    """
+
+    J: np.ndarray
+    n: np.ndarray
+    depth: np.ndarray
+    k: np.ndarray
+    d: np.ndarray
+    mu: np.ndarray
+    eps: np.ndarray
+    weight: np.ndarray
+
+
+class Limits(NamedTuple):
+    """Position limits [limit]: the dof, which way it is pushed (1 or -1), how far it is outside, stiffness, damping."""
+
+    dof: np.ndarray
+    way: np.ndarray
+    depth: np.ndarray
+    k: np.ndarray
+    d: np.ndarray
+
+
+class Laws(NamedTuple):
+    """Laws of the dofs, forces ``load - resistance v`` [dof]; a drive's is s (a - v), at most ``effort``.
+
+    ``dry`` is the bound of dry friction, ``fastest`` a velocity limit and ``brake`` its resistance; ``weight`` is the
+    diagonal of Mass^-1 at the neutral pose.
+    """
+
+    load: np.ndarray
+    resistance: np.ndarray
+    s: np.ndarray
+    a: np.ndarray
+    effort: np.ndarray
+    dry: np.ndarray
+    fastest: np.ndarray
+    brake: np.ndarray
+    weight: np.ndarray
+
+
+class Found(NamedTuple):
+    """After the last pass: v [dof]; f [point, 3]; excess of cone, adhesion [N] and effort; what was closed."""
+
+    v: np.ndarray
+    f: np.ndarray
+    excess: np.ndarray
+    on: np.ndarray
+
+
+def solve(M, laws, limits, points, v, load, h, passes=3, gravity=0.0):
+    """Return what the passes find for the velocity ``v`` before the step and the hinges' forces ``load`` [dof]."""
+    start, kd = v, points.k * h + points.d
+    at = points.J @ v
+    candidate = points.depth + h * np.maximum(0.0, -_along(points.n, at)) + 0.5 * gravity * h * h > 0.0
+    fn = candidate * np.maximum(0.0, points.k * points.depth - kd * _along(points.n, at))
+    w = _slip(points.n, at)
+    drive_s, dry_w = laws.s, np.abs(v)
+    on = limit_on = None
+    for number in range(passes):
+        first, last = number == 0, number == passes - 1 and passes >= 3
+        if not first:
+            candidate = candidate | reached(points, at, h)
+        closed = candidate & (first | pushes(points, at, kd))
+        inward = limits.way * v[limits.dof]
+        held = limits.depth + h * np.maximum(0.0, -inward) > 0.0
+        if not first:
+            held = limits.k * limits.depth - (h * limits.k + limits.d) * inward > 0.0
+        by_rule = np.zeros_like(held)
+        if last:
+            closed, by_rule = closed | on, limit_on & ~held
+        on, limit_on = closed, held | by_rule
+        G = dampers(points, on, kd, fn, w)
+        f0 = (on * points.k * points.depth)[:, None] * points.n
+        S, l = laws.resistance.copy(), laws.load.copy()
+        S, l = S + drive_s, l + drive_s * laws.a
+        dry_s = laws.dry / np.sqrt(dry_w**2 + CREEP**2)
+        S = S + dry_s
+        depth = np.where(by_rule, np.maximum(limits.depth, 0.0), limits.depth)
+        np.add.at(S, limits.dof, limit_on * (h * limits.k + limits.d))
+        np.add.at(l, limits.dof, limit_on * limits.way * limits.k * depth)
+        fast = np.abs(v) > laws.fastest
+        S, l = S + fast * laws.brake, l + fast * laws.brake * np.sign(v) * np.where(fast, laws.fastest, 0.0)
+        A = M + h * np.diag(S) + h * np.einsum("pai,pab,pbj->ij", points.J, G, points.J)
+        v = np.linalg.solve(A, M @ start + h * (load + l + np.einsum("pai,pa->i", points.J, f0)))
+        at = points.J @ v
+        f = f0 - np.einsum("pab,pb->pa", G, at)
+        fn, ft = np.maximum(0.0, _along(points.n, f)), _slip(points.n, f)
+        w = _slip(points.n, at) + h * points.weight * np.maximum(0.0, ft - points.mu * fn)
+        force = drive_s * (laws.a - v)
+        beyond = np.maximum(0.0, np.abs(force) - laws.effort)
+        drive_s = clamped(laws, v, force, h)
+        dry_w = np.abs(v) + h * laws.weight * np.maximum(0.0, dry_s * np.abs(v) - laws.dry)
+    cone, adhesion = ft - points.mu * fn, -_along(points.n, f)
+    excess = np.array([np.maximum(x, 0.0).max(initial=0.0) for x in (cone, adhesion, beyond)])
+    return Found(v, f, excess, on)
+
+
+def reached(points, at, h):
+    """Return which points the velocities ``at`` carry below the ground within the step."""
+    return points.depth - h * _along(points.n, at) > 0.0
+
+
+def pushes(points, at, kd):
+    """Return which points push at the velocities ``at``."""
+    return points.k * points.depth - kd * _along(points.n, at) > 0.0
+
+
+def dampers(points, on, kd, fn, w):
+    """Return G [point, 3, 3]: the damper along n of closed points, and friction's secant across it."""
+    across = points.mu * fn / np.sqrt(w**2 + points.eps**2)
+    nn = points.n[:, :, None] * points.n[:, None, :]
+    return across[:, None, None] * (np.eye(3) - nn) + (on * kd)[:, None, None] * nn
+
+
+def clamped(laws, v, force, h):
+    """Return the resistances of the drives that give at most their effort at the velocities ``v``."""
+    w = np.abs(v - laws.a) + h * laws.weight * np.maximum(0.0, np.abs(force) - laws.effort)
+    return np.minimum(laws.s, np.divide(laws.effort, w, out=np.full(len(w), np.inf), where=w > 0.0))
+
+
+def _along(n, x):
+    return np.einsum("pa,pa->p", n, x)
+
+
+def _slip(n, x):
+    return np.linalg.norm(x - _along(n, x)[:, None] * n, axis=1)
+
+
+class ContactStep:
+    """One step of a scene with contacts in one world.
+
+    Args:
+        scene: a Scene with contact_points and a ground that is a plane.
+        q, qd: the state [coordinate], [dof]. h: length of the step [s].
+        target_q, target_qd: of the drives; None: the neutral q, zero.
+    """
+
+    def __init__(self, scene, q, qd, h, target_q=None, target_qd=None, world=0):
+        self.scene, self.h, self.world = scene, h, world
+        self.dense, self.qd = Dense(scene, q, qd, world), np.asarray(qd, dtype=np.float64)
+        self.neutral = Dense(scene, scene.neutral_q)
+        self.points, self.limits = self._points(), self._limits()
+        target_q = scene.neutral_q if target_q is None else target_q
+        self.laws = self._laws(target_q, np.zeros(scene.dof_count) if target_qd is None else target_qd)
+
+    def run(self, tau=None, body_f=None, passes=3):
+        """Return q' and what the passes find."""
+        dense = self.dense
+        load = (0.0 if tau is None else np.asarray(tau)) - dense.bias_force(self.qd, body_f)
+        gravity = np.linalg.norm(dense.value("gravity"))
+        found = solve(dense.mass_matrix, self.laws, self.limits, self.points, self.qd, load, self.h, passes, gravity)
+        return dense.integrate(found.v, self.h), found
+
+    def _points(self):
+        dense, ground, points = self.dense, self.scene.ground, self.scene.contact_points
+        normal = np.asarray(ground.normal)
+        inverse, weights = np.linalg.pinv(self.neutral.mass_matrix), []
+        J, depth = np.zeros((len(points), 3, dense.dof_count)), np.zeros(len(points))
+        for i, point in enumerate(points):
+            at = (dense.body_matrix[point.body] @ homogeneous([*point.position, 0, 0, 0, 1]))[:3, 3]
+            at = at - point.radius * normal
+            J[i], depth[i] = dense._jacobian_at(point.body, at)[:3], ground.height - normal @ at
+            there = self.neutral.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
+            weights.append(SLIP * np.trace(there @ inverse @ there.T) / 3.0)
+        k, d, mu = (dense.value(f"contact_{name}") for name in ("stiffness", "damping", "friction"))
+        eps = np.array([point.eps for point in points])
+        return Points(J, np.tile(normal, (len(points), 1)), depth, k, d, mu, eps, np.array(weights))
+
+    def _positions(self):
+        """Return the coordinate of each dof; NaN of those without one."""
+        found, scene = np.full(self.dense.dof_count, np.nan), self.scene
+        for hinge, q, v in zip(scene.hinges, scene.q_start, scene.qd_start, strict=False):
+            if hinge.kind not in ("ball", "free"):
+                found[v : v + hinge.dof_count] = self.dense.q[q : q + hinge.dof_count]
+        return found
+
+    def _limits(self):
+        value, at, rows = self.dense.value, self._positions(), []
+        for name, way in (("lower", 1.0), ("upper", -1.0)):
+            bound = value(f"joint_limit_{name}")
+            for dof in np.flatnonzero((np.abs(bound) < UNLIMITED) & np.isfinite(at)):
+                depth = way * (bound[dof] - at[dof])
+                damping = value("joint_limit_kd")[dof] if depth > 0.0 else 0.0
+                rows.append((dof, way, depth, value("joint_limit_ke")[dof], damping))
+        columns = np.array(rows).reshape(-1, 5).T
+        return Limits(columns[0].astype(int), *columns[1:])
+
+    def _laws(self, target_q, target_qd):
+        value, dense, h, n = self.dense.value, self.dense, self.h, self.dense.dof_count
+        ke, kd, effort = value("joint_target_ke"), value("joint_target_kd"), value("joint_effort_limit")
+        stiff, damp, lift = value("joint_stiffness"), value("joint_damping"), np.zeros(len(self.scene.bodies))
+        drives = self.scene.with_values(
+            **{name: array[min(self.world, len(array) - 1)] for name, array in self.scene.values.items()}
+        ).with_values(joint_stiffness=ke, joint_damping=np.zeros(n), joint_rest_q=target_q, body_gravcomp=lift)
+        s = (h * ke + kd) * (effort > 0.0)
+        pull = Dense(drives, dense.q).passive_force(np.zeros(n)) + kd * target_qd  # at v = 0
+        a = np.divide(pull, s, out=np.zeros(n), where=s > 0.0)
+        inertia = 1.0 / np.diag(np.linalg.inv(self.neutral.mass_matrix))
+        fastest = np.where(value("joint_velocity_limit") < UNBOUNDED, value("joint_velocity_limit"), np.inf)
+        return Laws(
+            load=dense.passive_force(np.zeros(n)),
+            resistance=damp + h * stiff,
+            s=s,
+            a=a,
+            effort=np.where(effort < UNBOUNDED, effort, np.inf),
+            dry=value("joint_friction"),
+            fastest=fastest,
+            brake=np.where(np.isfinite(fastest), HOLD * inertia / h, 0.0),
+            weight=1.0 / inertia,
+        )

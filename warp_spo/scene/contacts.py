@@ -1,0 +1,356 @@
+"""Contacts of bodies with the ground: their points, and the constants that a scene chooses where a user gives none."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..errors import UnsupportedError, as_integer
+from .checks import checked_array, checked_unit, read_only
+from .storage import Stored, StoredPart
+
+CONTACT_VALUES = ("contact_friction", "contact_stiffness", "contact_damping")
+"""Names of a scene's values that come from its contacts, one entry a point."""
+SINK = 1.7e-3  # how far a robot sinks in [m] that rests on its points, where the stiffness is chosen
+RESTS = 4  # points at most on which a robot rests
+STANCE = 2  # bodies at most whose points, up to RESTS each, carry a robot
+MARGIN = 1.6  # of the moment that holds up one leg, over what tips it: 360 N m/rad of 226 for a humanoid of 33 kg
+DAMPING = 0.5  # of sqrt(k m), the share of mass over one point; standing is quiet from 0.1 to 2
+DIRECTIONS = 2048  # in which the extreme points of a hull are looked for
+STANDARD_GRAVITY = 9.81  # [m/s^2], in scenes without gravity
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Plane(StoredPart):
+    """Flat ground: the points x with normal . x = height; bodies are on the side that the normal points to.
+
+    Args:
+        height: [m].
+        normal: unit vector, inertial axes.
+
+    Raises:
+        ValueError: a value is invalid; the message names it.
+    """
+
+    height: float = 0.0
+    normal: Any = (0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "height", float(checked_array("Plane", "height [m]", self.height, ())))
+        normal = checked_unit("Plane", "normal", checked_array("Plane", "normal", self.normal, (3,)))
+        object.__setattr__(self, "normal", tuple(normal.tolist()))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class HeightField(StoredPart):
+    """Ground whose height over x and y is given on a grid, bilinear between its points.
+
+    Point (i, j) of the grid lies at x = origin[0] + i cell, y = origin[1] + j cell, inertial axes. Beyond its edges the
+    field goes on as it is at the edge.
+
+    Args:
+        heights: [m], shape (points along x, points along y), two or more each.
+        cell: distance between neighbours [m].
+        origin: x and y of the point (0, 0) [m], and a height that is added to all [m] if there are three numbers.
+
+    Raises:
+        ValueError: a value is invalid, NaN among the heights included; the message names it.
+    """
+
+    heights: Any
+    cell: float
+    origin: Any = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        shape = np.shape(self.heights)
+        if len(shape) != 2 or min(shape) < 2:
+            raise ValueError(
+                f"HeightField: heights has shape {shape}; expected (points along x, points along y), two or more each"
+            )
+        heights = np.asarray(self.heights)
+        if heights.dtype.kind == "f" and not np.isfinite(heights).all():
+            i, j = np.argwhere(~np.isfinite(heights))[0].tolist()
+            raise ValueError(f"HeightField: heights[{i}, {j}] is {heights[i, j]}; expected finite numbers")
+        object.__setattr__(self, "heights", checked_array("HeightField", "heights [m]", self.heights, shape))
+        object.__setattr__(self, "cell", float(checked_array("HeightField", "cell [m]", self.cell, ())))
+        if not self.cell > 0.0:
+            raise ValueError(f"HeightField: cell is {self.cell} m; expected more than zero")
+        count = 3 if np.shape(self.origin) == (3,) else 2
+        origin = checked_array("HeightField", "origin [m]", self.origin, (count,))
+        object.__setattr__(self, "origin", (*origin.tolist(), 0.0)[:3])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Contact(StoredPart):
+    """Points of a body that touch the scene's ground in :meth:`Dynamics.step`.
+
+    One of the shapes says which points. A ``point`` is one. A ``sphere`` is its lowest point, which moves over the
+    sphere as the body turns. A ``capsule`` is the two spheres at its ends; a ``box`` its eight corners; a ``hull``
+    those of its points that lie on the convex hull. Each point is a spring and a damper along the ground's normal,
+    which never pull, and friction in the ground's plane, at most ``friction`` times the normal force.
+
+    Args:
+        body: index of the body.
+        point: (x, y, z) [m], in the body frame, as all that follow.
+        sphere: ((x, y, z), radius) [m].
+        capsule: ((x, y, z) of one end of its axis, (x, y, z) of the other, radius) [m].
+        box: half its sizes (x, y, z) [m], about the body frame's origin; or (half its sizes, its pose in the body).
+        hull: points [n, 3], [m].
+        other: must be None, the ground; contacts between bodies are not supported.
+        friction: ratio of the largest friction force to the normal force.
+        stiffness: of each point [N/m]; None: so that a robot that stands on up to four points sinks by 1.7 mm, and that
+            the points of one body can hold it up alone, if they span a sole. See :attr:`Scene.contact_points`.
+        damping: of each point [N s/m]; None: sqrt(stiffness mass) / 2, with the mass that rests on the point when the
+            robot stands on two such bodies, or on four points.
+        eps: speed [m/s] below which friction is a damper. A point that sticks creeps by less than that.
+        label: name in tables and errors.
+
+    Raises:
+        ValueError: a value is invalid, or not exactly one shape is given; the message names it.
+        UnsupportedError: ``other`` is not None.
+    """
+
+    body: int
+    point: Any = None
+    sphere: Any = None
+    capsule: Any = None
+    box: Any = None
+    hull: Any = None
+    other: Any = None
+    friction: float = 0.8
+    stiffness: float | None = None
+    damping: float | None = None
+    eps: float = 1e-3
+    label: str = ""
+    positions: np.ndarray = dataclasses.field(init=False, repr=False)  # of the points, in the body frame [point, 3]
+    radius: float = dataclasses.field(init=False, repr=False)  # of the sphere about each
+
+    def __post_init__(self) -> None:
+        call = f"Contact({self.label!r})" if self.label else "Contact"
+        given = [name for name in SHAPES if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"{call}: {', '.join(given) or 'no shape'} given; expected one of {', '.join(SHAPES)}")
+        if self.other is not None:
+            raise UnsupportedError(call, f"other={self.other!r}, contact between bodies,", "leave out other=")
+        for name in ("friction", "stiffness", "damping", "eps"):
+            value = getattr(self, name)
+            if value is None and name in ("stiffness", "damping"):
+                continue
+            value = float(checked_array(call, name, value, ()))
+            if value < 0.0 or (value == 0.0 and name in ("stiffness", "eps")):
+                raise ValueError(f"{call}: {name} is {value}; expected a positive number")
+            object.__setattr__(self, name, value)
+        positions, radius = SHAPES[given[0]](call, getattr(self, given[0]))
+        object.__setattr__(self, "positions", read_only(positions))
+        object.__setattr__(self, "radius", radius)
+
+
+class ContactPoint(NamedTuple):
+    """One point that may touch the ground, a row of ``contact_f``, ``contact_gap`` and ``contact_slip``.
+
+    Attributes:
+        contact: index of its contact in ``Scene.contacts``. body: index of its body.
+        position: of the point, or of the centre of its sphere, in the body frame [m]. radius: of the sphere, or 0 [m].
+        eps: speed below which friction is a damper [m/s].
+    """
+
+    contact: int
+    body: int
+    position: tuple[float, float, float]
+    radius: float
+    eps: float
+
+
+# -- shapes ------------------------------------------------------------------------------------------------------------
+Points = tuple[np.ndarray, float]
+
+
+def _point(call: str, value: Any) -> Points:
+    return checked_array(call, "point [m]", value, (3,))[None], 0.0
+
+
+def _parts(call: str, name: str, value: Any, count: int, expected: str) -> tuple:
+    """Return the parts of a shape; ValueError if there are not ``count``."""
+    try:
+        parts = tuple(value)
+    except TypeError:
+        parts = ()
+    if len(parts) != count:
+        raise ValueError(f"{call}: {name} is {value!r}; expected {expected}")
+    return parts
+
+
+def _radius(call: str, name: str, value: Any) -> float:
+    radius = float(checked_array(call, f"the radius [m] of {name}", value, ()))
+    if radius < 0.0:
+        raise ValueError(f"{call}: the radius of {name} is {radius} m; expected zero or more")
+    return radius
+
+
+def _sphere(call: str, value: Any) -> Points:
+    centre, radius = _parts(call, "sphere", value, 2, "((x, y, z), radius)")
+    return checked_array(call, "the centre [m] of sphere", centre, (3,))[None], _radius(call, "sphere", radius)
+
+
+def _capsule(call: str, value: Any) -> Points:
+    *ends, radius = _parts(call, "capsule", value, 3, "((x, y, z), (x, y, z), radius)")
+    found = [checked_array(call, "an end [m] of capsule", end, (3,)) for end in ends]
+    return np.array(found), _radius(call, "capsule", radius)
+
+
+def _box(call: str, value: Any) -> Points:
+    from .parts import checked_pose
+
+    parts = _parts(call, "box", value, 3 if np.ndim(_first(value)) == 0 else 2, "half its sizes, or (those, its pose)")
+    sizes, pose = (parts, (0, 0, 0, 0, 0, 0, 1)) if len(parts) == 3 else parts
+    half = checked_array(call, "half the sizes [m] of box", sizes, (3,))
+    if not (half >= 0.0).all():
+        raise ValueError(f"{call}: half the sizes of box are {half.tolist()} m; expected none below zero")
+    place = _matrix(checked_pose(call, "the pose of box", pose))
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
+    return corners @ place[:3, :3].T + place[:3, 3], 0.0
+
+
+def _first(value: Any) -> Any:
+    try:
+        return next(iter(value))
+    except (TypeError, StopIteration):
+        return None
+
+
+def _hull(call: str, value: Any) -> Points:
+    shape = np.shape(value)
+    if len(shape) != 2 or shape[1] != 3 or shape[0] == 0:
+        raise ValueError(f"{call}: hull has shape {shape}; expected (points, 3)")
+    points = checked_array(call, "hull [m]", value, shape)
+    return points[extreme_points(points)], 0.0
+
+
+SHAPES = {"point": _point, "sphere": _sphere, "capsule": _capsule, "box": _box, "hull": _hull}
+
+
+def extreme_points(points: np.ndarray) -> np.ndarray:
+    """Return the indices, ascending, of the points that lie farthest in some of many directions."""
+    turn = np.arange(DIRECTIONS) * (np.pi * (3.0 - np.sqrt(5.0)))  # spread evenly over the sphere
+    z = 1.0 - (2.0 * np.arange(DIRECTIONS) + 1.0) / DIRECTIONS
+    r = np.sqrt(1.0 - z * z)
+    spread = np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)
+    centred = points - points.mean(axis=0)
+    outward = np.concatenate([spread, np.eye(3), -np.eye(3), centred])
+    return np.unique((centred @ outward.T).argmax(axis=0))
+
+
+# -- scenes ------------------------------------------------------------------------------------------------------------
+def contact_points(contacts: Sequence[Contact]) -> tuple[ContactPoint, ...]:
+    """Return the points of all contacts, contact after contact."""
+    return tuple(
+        ContactPoint(index, contact.body, (x, y, z), contact.radius, contact.eps)
+        for index, contact in enumerate(contacts)
+        for x, y, z in contact.positions.tolist()
+    )
+
+
+def check_contacts(contacts: Sequence[Contact], ground: Any, bodies: Sequence[Any]) -> None:
+    """Raise an error if a contact is on a body that is not there, or the ground is of an unknown kind."""
+    if ground is not None and not isinstance(ground, Plane | HeightField):
+        raise TypeError(f"Scene: ground is of type {type(ground).__name__}; expected spo.Plane or spo.HeightField")
+    for number, contact in enumerate(contacts):
+        name = f"contact {number} {contact.label!r}" if contact.label else f"contact {number}"
+        index = as_integer(contact.body)
+        if index is None:
+            raise TypeError(f"Scene: {name} is on body {contact.body!r}; expected an integer")
+        if not 0 <= index < len(bodies):
+            raise ValueError(f"Scene: {name} is on body {index}; expected one of {len(bodies)} bodies, 0 and up")
+        if bodies[index].modes is not None:
+            raise UnsupportedError(f"Scene: {name}", "a contact of a body with modes", "put it on a rigid body")
+
+
+class Stand(Stored):
+    """A scene in its neutral configuration, as the constants of contacts need it."""
+
+    def __init__(self, scene: Any):
+        values = {name: array[0] for name, array in scene.values.items()}
+        self.places = np.empty((len(scene.bodies), 4, 4))
+        self.roots = np.arange(len(scene.bodies))
+        for body in (body for level in scene.tree.levels for body in level):
+            hinge = scene.hinge_of[body]
+            parent = scene.tree.parent[body]
+            place = _matrix(values["joint_X_p"][hinge]) @ np.linalg.inv(_matrix(values["joint_X_c"][hinge]))
+            if parent >= 0:
+                place, self.roots[body] = self.places[parent] @ place, self.roots[parent]
+            self.places[body] = place
+        self.masses = values["body_mass"]
+        self.coms = np.einsum("bij,bj->bi", self.places[:, :3, :3], values["body_com"]) + self.places[:, :3, 3]
+        size = np.linalg.norm(values["gravity"])
+        self.gravity = float(size) or STANDARD_GRAVITY
+        self.up = -values["gravity"] / size if size else np.array([0.0, 0.0, 1.0])
+
+    def at(self, point: ContactPoint) -> np.ndarray:
+        """Return the place of a point in the inertial frame."""
+        place = self.places[point.body]
+        return place[:3, :3] @ point.position + place[:3, 3]
+
+
+def contact_values(scene: Any) -> dict[str, np.ndarray]:
+    """Return the values of a scene that come from its contacts, [1, point] by name; what is None is chosen."""
+    points = scene.contact_points
+    values = {name: np.zeros((1, len(points))) for name in CONTACT_VALUES}
+    if not points:
+        return values
+    stand = Stand(scene)
+    at = np.array([stand.at(point) for point in points])
+    bodies = np.array([point.body for point in points])
+    for i, point in enumerate(points):
+        contact, tree = scene.contacts[point.contact], stand.roots == stand.roots[point.body]
+        mass, own = float(stand.masses[tree].sum()), at[bodies == point.body]
+        com = stand.masses[tree] @ stand.coms[tree] / mass if mass else own.mean(axis=0)
+        rests = min(RESTS, int(tree[bodies].sum()))
+        k = contact.stiffness
+        if k is None:
+            k = max(mass * stand.gravity / (rests * SINK), _sole_stiffness(own, mass * stand.gravity, com, stand.up))
+            k = k or 1.0  # of massless bodies
+        d = contact.damping
+        if d is None:
+            shared = max(rests, min(STANCE, len(set(bodies[tree[bodies]]))) * min(len(own), RESTS))
+            d = DAMPING * np.sqrt(k * mass / shared)
+        for name, value in zip(CONTACT_VALUES, (contact.friction, k, d), strict=True):
+            values[name][0, i] = value
+    return values
+
+
+def _sole_stiffness(points: np.ndarray, weight: float, com: np.ndarray, up: np.ndarray) -> float:
+    """Return k with n k b^2 = MARGIN m g l: the points of one body hold up the robot above; 0 without a sole.
+
+    b is half the width of the points across their longest extent, l how far the centre of mass lies above them.
+    """
+    centred = points - points.mean(axis=0)
+    width = np.ptp(centred @ np.linalg.svd(centred)[2][1]) / 2.0 if len(points) > 2 else 0.0
+    height = max(float(up @ (com - points.mean(axis=0))), 0.0)
+    return MARGIN * weight * height / (len(points) * width**2) if width > 0.0 else 0.0
+
+
+def describe(scene: Any) -> str:
+    """Return a line on the scene's contacts."""
+    points = scene.contact_points
+    if not points:
+        return "none"
+    bodies, ground = len({point.body for point in points}), type(scene.ground).__name__
+    figures = []
+    for name, unit in zip(CONTACT_VALUES, ("", " N/m", " N s/m"), strict=True):
+        low, high = scene.values[name].min(), scene.values[name].max()
+        value = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+        figures.append(f"{name.removeprefix('contact_')} {value}{unit}")
+    return f"{len(points)} points of {bodies} bodies with the {ground}; {', '.join(figures)}"
+
+
+def _matrix(pose: np.ndarray) -> np.ndarray:
+    """Return the 4 x 4 matrix of a pose (x, y, z, qx, qy, qz, qw) with a unit quaternion."""
+    x, y, z, w = pose[3:]
+    axis, found = np.array([x, y, z]), np.eye(4)
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    found[:3, :3] = (w * w - axis @ axis) * np.eye(3) + 2.0 * np.outer(axis, axis) + 2.0 * w * across
+    found[:3, 3] = pose[:3]
+    return found
