@@ -1,104 +1,239 @@
-"""Check the plan's choice of granularity: time forward dynamics of ten random trees at each, and at the plan's choice.
+"""Compare the plan's choice with the best: time operations at each granularity, and as the plan chooses.
 
-    python -m benchmarks.plans [--device cuda:0] [--trees 0 1 ...] [--worlds 1 256 4096 65536] [--compile]
+    python -m benchmarks.plans [--device cuda:0] [--scenes panda go2 4 ...] [--operations step ...] [--compile]
 
-A line gives, for one tree and world count, the time at each granularity [us], the plan's choice, and its time over the
-shortest. All kernels are compiled first, several at a time. The exit code is 1 if a choice takes more than ``ALLOWED``
-times the shortest.
+A scene is a robot, or the number of a random tree. A line gives, for one scene, operation and number of worlds, the
+time at each granularity [us], the plan's choice, and its time over the shortest. ``--compile`` compiles all kernels,
+several at a time, and times nothing. ``--leave N`` occupies all multiprocessors but N, and makes plans as for a GPU
+that has no more. The exit code is 1 if a choice takes more than ``ALLOWED`` times the shortest, or a result is wrong.
 """
 
+from __future__ import annotations
+
 import argparse
+import concurrent.futures
+import contextlib
+import dataclasses
+import gc
+import multiprocessing
 import os
 import sys
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
+import numpy as np
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.kernels.slots import WARP_SIZE
-from warp_spo.trials.operations import OPERATIONS, Inputs
+from warp_spo.dynamics import dynamics
+from warp_spo.execution.device_facts import DeviceFacts, read_facts
+from warp_spo.trials.operations import OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, Trial
+
+from . import robots, runner
+from .capabilities import DT, KD, KE
+from .crowding import crowd
 
 sys.path.append(str(Path(__file__).parent.parent / "tests"))  # the random trees come from the tests
 import zoo
 
-OPERATION = "forward_dynamics"
-WORLDS = (1, 256, 4096, 65536)
-NODE_WORLDS = 256  # largest world count at which granularity "node", one launch for each level, is timed
+NAMES = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "step")
+SCENES = ("panda", "go2", "g1", *map(str, range(len(zoo.BRANCHED))))
+WORLDS = (1, 256, 4096, 16384, 65536)
+NODE_WORLDS = 256  # largest number of worlds at which granularity "node", a launch for each level, is timed
 ALLOWED = 1.1  # largest time of the plan's choice, over the shortest
-SAMPLE, REPEATS, WARM_UP, BUDGET = 1, 10, 0.01, 0.1
+STEPS_AGREE = 1e-3  # largest difference of velocities after a step at two granularities, of the largest velocity
+SETS, SAMPLE, REPEATS = 2, 1, 7
+CALLS = 32  # in a graph, whose launch takes 8 us
+PLAN = "plan"  # where it has other kernels than each granularity by itself
+
+
+def scene_of(name: str) -> spo.Scene:
+    """Return a robot, or a random tree by its number, with drives."""
+    scene = zoo.branched(int(name)) if name.isdigit() else robots.scene(name)
+    driven = np.concatenate([np.full(hinge.dof_count, hinge.kind != "free") for hinge in scene.hinges])
+    return scene.with_values(joint_target_ke=KE * driven, joint_target_kd=KD * driven)
+
+
+class Steps:
+    """A step of a Dynamics from states within the limits of the joints, towards the neutral state."""
+
+    sets = 1
+
+    def __init__(self, dyn: spo.Dynamics):
+        self.dyn, scene, rng = dyn, dyn.scene, np.random.default_rng(0)
+        low, high = (np.clip(scene.values[f"joint_limit_{end}"][0], -1.0, 1.0) for end in ("lower", "upper"))
+        rates = (high - low) * rng.uniform(-0.45, 0.45, (dyn.worlds, scene.dof_count)) + 0.5 * (low + high)
+        neutral = np.tile(scene.neutral_q, (dyn.worlds, 1))
+        array = lambda value: wp.array(value, dtype=dyn.dtype, device=dyn.device)  # noqa: E731
+        self.q = dyn.integrate(array(neutral), array(rates), 1.0)
+        self.qd = array(rng.normal(size=rates.shape))
+        self.out = wp.empty_like(self.q), wp.empty_like(self.qd)
+
+    def evaluate(self, index: int) -> None:
+        """Launch one step."""
+        self.dyn.step(self.q, self.qd, None, DT, out=self.out)
+
+
+class Timed:
+    """Calls in a row, which are timed together: as a graph on CUDA.
+
+    Args:
+        run: launches a call at one of its ``sets`` of inputs.
+    """
+
+    def __init__(self, run: Callable[[int], None], sets: int, device: wp.Device):
+        self.run, self.sets, self.device, self.seconds = run, sets, device, []
+        self.graph = None
+        if device.is_cuda:
+            run(0)
+            with wp.ScopedCapture(device) as capture:
+                self._calls()
+            self.graph = capture.graph
+            self.events = [wp.Event(device, enable_timing=True) for _ in range(2)]
+            wp.capture_launch(self.graph)
+            wp.synchronize_device(device)
+
+    def _calls(self) -> None:
+        for at in range(CALLS if self.device.is_cuda else 2):
+            self.run(at % self.sets)
+
+    def measure(self) -> None:
+        """Time the row once."""
+        if self.graph is None:
+            start = time.perf_counter()
+            self._calls()
+            self.seconds.append((time.perf_counter() - start) / 2)
+            return
+        start, end = self.events
+        self.device.stream.record_event(start)
+        wp.capture_launch(self.graph)
+        self.device.stream.record_event(end)
+        wp.synchronize_event(end)
+        self.seconds.append(1e-3 * wp.get_event_elapsed_time(start, end) / CALLS)
+
+    @property
+    def us(self) -> float:
+        """The median time of a call [us]."""
+        return 1e6 * float(np.median(self.seconds))
+
+
+def prepared(dyn: spo.Dynamics, operation: str, inputs: list[Inputs], results: list[np.ndarray]) -> tuple[Timed, float]:
+    """Return what times an operation, and its error; ``results`` collects what steps of it gave."""
+    if operation == "step":
+        steps = Steps(dyn)
+        steps.evaluate(0)
+        results.append(steps.out[1].numpy()[:256])
+        difference = np.abs(results[-1] - results[0]).max() / np.abs(results[0]).max()
+        return Timed(steps.evaluate, 1, dyn.device), float(difference) * TOLERANCE["float32"] / STEPS_AGREE
+    trial = Trial(Subject(dyn, inputs), OPERATIONS[operation], SAMPLE)
+    error = trial.check()
+    return Timed(trial.evaluate, SETS, dyn.device), error
+
+
+def candidates(dyn: spo.Dynamics, operation: str) -> list[str]:
+    """Return the granularities at which the operation can run, and that are worth timing."""
+    routine = dyn._operations[operation].routine
+    assert routine is not None
+    limbs = bool(routine.letters) and 1 < dyn.plan.limbs <= 16
+    return ["tree", *["segment"] * limbs, *["node"] * (routine.has_node_form and dyn.worlds <= NODE_WORLDS)]
+
+
+def kernels_of(dyn: spo.Dynamics) -> tuple[str, ...]:
+    """Return the names of the kernels that a Dynamics has made so far; equal texts have equal names."""
+    return tuple(sorted(program.kernel.key for program in dyn.programs._programs.values() if program is not None))
+
+
+def compare(name: str, operation: str, worlds: int, device: str | None, leave: int | None = None) -> dict[str, Any]:
+    """Return a row: times by granularity, the plan's choice, its time over the shortest, and the largest error."""
+    scene = scene_of(name)
+    planned = spo.Dynamics(scene, worlds, device)
+    inputs, results = [Inputs(scene, worlds, seed) for seed in range(SETS)], []
+    timed, errors, by_kernels = {}, [], {}
+    for granularity in [*candidates(planned, operation), PLAN]:
+        own = granularity == PLAN
+        dyn = planned if own else spo.Dynamics(scene, worlds, device, granularity=granularity)
+        found, error = prepared(dyn, operation, inputs, results)
+        errors.append(error)
+        twin = by_kernels.setdefault(kernels_of(dyn) or granularity, granularity)
+        if twin == granularity:
+            timed[granularity] = found
+    chosen = planned.plan.of(planned._operations[operation].routine)
+    with crowd(planned.device, leave):
+        for _ in range(REPEATS):
+            for each in timed.values():
+                each.measure()
+    times = {granularity: each.us for granularity, each in timed.items()}
+    ratio = times[PLAN if PLAN in times and chosen != "node" else chosen] / min(times.values())
+    row = dict(scene=name, dofs=scene.dof_count, limbs=planned.plan.limbs, operation=operation, worlds=worlds)
+    return row | dict(us=times, chosen=chosen, ratio=ratio, error=max(errors))
+
+
+def _compile(name: str, operation: str, counts: list[int], device: str | None, facts: DeviceFacts) -> None:
+    with as_on(facts):
+        for worlds in counts:
+            scene = scene_of(name)
+            planned = spo.Dynamics(scene, worlds, device)
+            for granularity in [None, *candidates(planned, operation)]:
+                dyn = planned if granularity is None else spo.Dynamics(scene, worlds, device, granularity=granularity)
+                dyn.prepare(operation)
+                if operation == "step":
+                    dyn.prepare("integrate")
+
+
+@contextlib.contextmanager
+def as_on(facts: DeviceFacts) -> Iterator[None]:
+    """Make plans as for a device with these facts."""
+    with mock.patch.object(dynamics, "read_facts", lambda device: facts):
+        yield
 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="benchmarks.plans", description="Compare the plan's choice with the best.")
     parser.add_argument("--device", help="Warp device, default: the current one")
-    parser.add_argument("--trees", nargs="+", type=int, default=list(range(len(zoo.BRANCHED))))
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES, metavar="S", help=", ".join(SCENES))
+    parser.add_argument("--operations", nargs="+", choices=NAMES, default=NAMES, metavar="O", help=", ".join(NAMES))
     parser.add_argument("--worlds", nargs="+", type=int, default=WORLDS)
-    parser.add_argument(
-        "--compile", action="store_true", help="compile the kernels into Warp's cache, and time nothing"
-    )
+    parser.add_argument("--leave", type=int, metavar="N", help="multiprocessors that others do not occupy")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes that compile; default: all cores")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
+    parser.add_argument("--seconds", type=float, default=3600.0, help="time after which no further case begins")
+    parser.add_argument("--compile", action="store_true", help="compile the kernels, and time nothing")
     options = parser.parse_args(arguments)
-    start = time.perf_counter()
-    scenes = {which: zoo.branched(which) for which in options.trees}
-    made = {which: trace_dynamics(scene, options.worlds, options.device) for which, scene in scenes.items()}
-    compile_kernels(made)
-    print(f"traced and compiled in {time.perf_counter() - start:.0f} s", flush=True)
+    device, begin = wp.get_device(options.device), time.perf_counter()
+    facts = read_facts(device)
+    facts = facts if options.leave is None else dataclasses.replace(facts, multiprocessors=options.leave)
+    cases = [(name, operation) for name in options.scenes for operation in options.operations]
     if options.compile:
+        context = multiprocessing.get_context("spawn")
+        with concurrent.futures.ProcessPoolExecutor(options.jobs, context) as pool:
+            for task in [pool.submit(_compile, *case, options.worlds, str(device), facts) for case in cases]:
+                task.result()
+        print(f"compiled in {time.perf_counter() - begin:.0f} s")
         return 0
-    beyond = []
-    for which, scene in scenes.items():
-        for worlds in options.worlds:
-            chosen = OPERATIONS[OPERATION].granularity(spo.Dynamics(scene, worlds, options.device))
-            inputs = [Inputs(scene, worlds)]
-            times = {}
-            for name in ("tree", "segment", *(["node"] if worlds <= NODE_WORLDS else [])):
-                dyn = made[which].get((name, worlds)) or spo.Dynamics(scene, worlds, options.device, granularity=name)
-                trial = Trial(Subject(dyn, inputs), OPERATIONS[OPERATION], SAMPLE)
-                times[name] = 1e6 * trial.measure(REPEATS, WARM_UP, BUDGET)[0].median
-            ratio = times[chosen] / min(times.values())
-            beyond += [ratio] * (ratio > ALLOWED)
-            shown = ", ".join(f"{name} {us:.4g}" for name, us in times.items())
-            limbs = sum(not children for children in scene.tree.children)
-            print(
-                f"tree {which}: {scene.dof_count} dof, depth {scene.tree.depth}, {limbs} leaves, w{worlds}: {shown}; "
-                f"plan {chosen}, {ratio:.3f} of the best",
-                flush=True,
-            )
-    print(f"{len(beyond)} of {len(scenes) * len(options.worlds)} choices take more than {ALLOWED} times the best")
-    return 1 if beyond else 0
-
-
-def trace_dynamics(scene: spo.Scene, counts: list[int], device: str | None) -> dict[tuple[str, int], spo.Dynamics]:
-    """Return a Dynamics for each granularity and world count, traced but not compiled; equal plans share programs."""
-    made, programs = {}, {}
-    for name in ("tree", "segment"):
-        for worlds in counts:
-            made[name, worlds] = dyn = spo.Dynamics(scene, worlds, device, granularity=name)
-            key = name, dyn.plan.staged, dyn.plan.few, dyn.plan.apart
-            if key in programs:
-                dyn.programs._programs = programs[key]
-                continue
-            rate = (worlds, scene.dof_count)
-            dyn.programs.find(
-                OPERATIONS[OPERATION].routine, {"q": (worlds, scene.coord_count), "qd": rate, "tau": rate}, rate
-            )
-            programs[key] = dyn.programs._programs
-    return made
-
-
-def compile_kernels(made: dict) -> None:
-    """Compile the kernels of all Dynamics, several at a time."""
-    blocks: dict[int, dict] = {}
-    device = None
-    for dyns in made.values():
-        for dyn in dyns.values():
-            device = dyn.device
-            for program in dyn.programs._programs.values():
-                kernel = program.kernel
-                blocks.setdefault(program.block if device.is_cuda else WARP_SIZE, {})[kernel.key] = kernel.module
-    for block, modules in blocks.items():
-        wp.force_load(device, list(modules.values()), block_dim=block, max_workers=os.cpu_count())
+    rows: list[dict] = []
+    with as_on(facts):
+        for name, operation in cases:
+            for worlds in options.worlds:
+                if time.perf_counter() - begin > options.seconds:
+                    continue
+                gc.collect()
+                rows.append(row := compare(name, operation, worlds, options.device, options.leave))
+                shown = ", ".join(f"{key} {us:.4g}" for key, us in row["us"].items())
+                print(
+                    f"{name} {operation}, {row['dofs']} dofs, {row['limbs']} limbs, {worlds} worlds: {shown} us; "
+                    f"plan {row['chosen']}, {row['ratio']:.3f} of the best, error {row['error']:.1e}",
+                    flush=True,
+                )
+    if options.json:
+        runner.save(runner.record(rows, device), options.json)
+    beyond = [row for row in rows if row["ratio"] > ALLOWED]
+    wrong = [row for row in rows if not row["error"] <= TOLERANCE["float32"]]
+    print(f"{len(beyond)} of {len(rows)} choices take more than {ALLOWED} times the best; {len(wrong)} wrong results")
+    return 1 if beyond or wrong else 0
 
 
 if __name__ == "__main__":
