@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from .dynamics.actuators import ActuatorState
 from .dynamics.dynamics import Dynamics
 from .errors import DirectedLoopError, UnsupportedError
+from .execution.tuned import Tuned
 from .graph.factorization import Factorization
 from .graph.operators import BWA, Blocks, Identity, Operator
 from .hinges.functions import clip, spline, where
@@ -61,6 +62,7 @@ __all__ = [
     "Section",
     "Status",
     "Tree",
+    "Tuned",
     "UnsupportedError",
     "__version__",
     "beam_modes",

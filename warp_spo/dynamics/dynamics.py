@@ -44,6 +44,7 @@ from . import (
     spatial_operators,
     steps,
     storage,
+    tuning,
 )
 from . import forward_dynamics as forward
 from . import hybrid_dynamics as hybrid
@@ -208,6 +209,7 @@ class Dynamics:
     set = scene_values.set_values
     reset = scene_values.reset
     prepare = preparation.prepare
+    tune = tuning.tune
     __reduce__ = storage.reduce
 
     _operations: ClassVar[dict[str, Operation]]
@@ -312,6 +314,7 @@ class Dynamics:
         ]
         if self.plan.scan_reason:
             lines.insert(3, f"recursion    {plans.describe_recursion(self.plan)}")
+        lines[3:3] = tuning.explain(self)
         return "\n".join(lines + self.programs.described())
 
     @property

@@ -47,13 +47,18 @@ def prepare(self: Dynamics, operation: str, **options: Any) -> None:
 
 
 def _prepare_operation(dyn: Dynamics, operation: Operation, options: dict[str, Any]) -> None:
+    operation.entry(dyn, **stand_ins(dyn, operation, options))
+
+
+def stand_ins(dyn: Dynamics, operation: Operation, options: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Return arguments with which an operation compiles and allocates; ``options`` are those of :func:`prepare`."""
+    options = {} if options is None else options
     given = _options(dyn, operation.options, options)
     arguments = [one for one in operation.arrays if not one.asked or options.pop(one.name, False)]
     columns = options.pop("columns", None) if any(one.columns for one in arguments) else None
     _refuse_rest(operation.name, options)
     given |= {one.name: stand_in(dyn, one, given.get("frames", ()), columns) for one in arguments}
-    given |= {one.name: one.stand_in(dyn, given) for one in operation.options if one.stand_in is not None}
-    operation.entry(dyn, **given)
+    return given | {one.name: one.stand_in(dyn, given) for one in operation.options if one.stand_in is not None}
 
 
 def _prepare_backwards(dyn: Dynamics, operation: Operation, options: dict[str, Any]) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from .. import launches
+from ..execution.tuned import Tuned
 from ..scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ def reduce(self: Dynamics) -> tuple[Callable[..., Dynamics], tuple[Any, ...]]:
     if self.embedding is not None:  # chosen for the values that the scene had when this object was made
         options["independent"] = tuple(int(dof) for dof in self.independent_dofs)
     values = {name: self.recursions.parameters.value(name).numpy() for name in self.variable}
-    return build, (type(self), self.scene, options, values, dict(self.values.tensors))
+    return build, (type(self), self.scene, options, values, dict(self.values.tensors), dict(self.plan.tuned))
 
 
 def build(
@@ -34,6 +35,7 @@ def build(
     options: dict[str, Any],
     values: dict[str, np.ndarray],
     tensors: dict[str, Any],
+    tuned: dict[str, Tuned],
 ) -> Dynamics:
     device = options["device"]
     try:
@@ -45,6 +47,7 @@ def build(
             f"Dynamics(scene, device=...) here"
         ) from None
     dyn = kind(scene, **options)
+    dyn.plan.tuned.update(tuned)
     parameters = dyn.recursions.parameters
     for name, value in values.items():
         launches.copy(parameters.value(name), wp.array(value, dtype=wp.float64, device=dyn.device))

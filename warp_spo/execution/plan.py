@@ -12,6 +12,7 @@ from ..scene.scene import Scene
 from .device_facts import DeviceFacts
 from .routine import Routine
 from .stretches import cut, solid_nodes
+from .tuned import Tuned
 
 SHARED = "links share dofs"
 GRANULARITIES = ("node", "segment", "tree")
@@ -31,6 +32,7 @@ SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as throug
 LONG_ROWS = 24  # in segments; longer rows come in together already at fewer worlds
 FEW_RESULTS = 2  # short ones that a thread writes by itself
 MOST_WARPS = 16
+NODE_WORLDS = 1024  # beyond which a launch for each level is never the fastest, and its workspace large
 DEEPEST = 12  # dofs from a root to a leaf, a free hinge one, up to which velocity terms that come first are as accurate
 APART = {"chain": 2048, "tree": 4 * FEW_WORLDS, "segment": FEW_WORLDS}  # worlds beyond which they are faster
 
@@ -67,6 +69,7 @@ class Plan:
         stretch: at node granularity, scans do the work of most sweeps, with so many nodes for a thread, see
             :mod:`.scan`; 0: sweeps do.
         scan_reason: why.
+        tuned: choices that were measured, by the routine's name; they replace the rules.
     """
 
     granularity: str
@@ -83,6 +86,7 @@ class Plan:
     varies: bool = False
     stretch: int = 0
     scan_reason: str = ""
+    tuned: dict[str, Tuned] = dataclasses.field(default_factory=dict)
 
     @property
     def few(self) -> bool:
@@ -96,6 +100,8 @@ class Plan:
 
     def of(self, routine: Routine) -> str:
         """Return the granularity of one routine: the plan's own where the routine has that form."""
+        if routine.name in self.tuned:
+            return self.tuned[routine.name].granularity
         if not routine.letters and not routine.has_node_form:
             return "tree"
         chosen = self.granularity if self.forced else self._rule(routine)
@@ -112,6 +118,16 @@ class Plan:
             if routine.short or (not routine.velocities and self.dofs <= SOLVES[self.dtype]):
                 return "tree"
         return self.granularity
+
+    def candidates(self, routine: Routine) -> tuple[str, ...]:
+        """Return the granularities at which a routine may run here, those of the rules first."""
+        first = self.of(routine)
+        if self.forced or self.dofs > MOST_DOFS or not self.dofs:
+            return (first,)
+        divides = self.device.cuda and bool(routine.letters) and 1 < self.limbs <= MOST_WARPS
+        sweeps = routine.has_node_form and self.worlds <= NODE_WORLDS
+        found = ["tree", *["segment"] * divides, *["node"] * sweeps]
+        return (first, *(name for name in found if name != first))
 
     def stages(self, routine: Routine, warps: int) -> bool:
         """Whether rows come in through shared memory, for kernels in which ``warps`` share 32 worlds."""

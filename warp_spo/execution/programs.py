@@ -76,8 +76,11 @@ class Programs:
         self._programs: dict[tuple, Program | None] = {}
         self._links: Links | None = None
 
-    def forget(self) -> None:
-        """Drop all programs: values that they folded have changed."""
+    def forget(self, routine: Routine | None = None) -> None:
+        """Drop all programs, because values that they folded have changed, or those of one routine."""
+        if routine is not None:
+            self._programs = {key: program for key, program in self._programs.items() if key[0] is not routine}
+            return
         self._programs.clear()
         self._links = None
 

@@ -22,6 +22,7 @@ class Options:
     loops: str = "raise"
     integrator: str = "semi_implicit"
     granularity: str | None = None
+    tune: bool = False
 
 
 def adapter(manager: Any, configuration: Any) -> tuple[type, type]:

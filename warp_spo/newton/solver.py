@@ -94,6 +94,8 @@ class SolverSPO(Plugs, SolverBase):
             :meth:`warp_spo.Dynamics.step`. "cut" ignores them.
         integrator: As in :meth:`warp_spo.Dynamics.step`. "midpoint" and "rk4" have no observables.
         granularity: As in :class:`warp_spo.Dynamics`.
+        tune: Time the granularities at which the step can run, as :meth:`warp_spo.Dynamics.tune` does, and use the
+            fastest. The choice is kept in a file, so that only the first solver of a model measures.
 
     Raises:
         UnsupportedError: :func:`warp_spo.from_newton` cannot represent the model; mimic joints with loops="raise"; a
@@ -114,6 +116,7 @@ class SolverSPO(Plugs, SolverBase):
         loops: str = "raise",
         integrator: str = "semi_implicit",
         granularity: str | None = None,
+        tune: bool = False,
     ):
         if not hasattr(model, "particle_count"):
             raise TypeError(f"SolverSPO: model is of type {type(model).__name__}; expected a newton.Model")
@@ -127,7 +130,7 @@ class SolverSPO(Plugs, SolverBase):
                 f"{model.particle_count} particles",
                 "simulate them with another solver on a view of the model",
             )
-        self.integrator = integrator
+        self.integrator, self._tunes = integrator, tune
         self._options: dict[str, Any] = {"loops": loops, "granularity": granularity}
         with paused_tape():
             self._build()
@@ -147,6 +150,8 @@ class SolverSPO(Plugs, SolverBase):
         variable = tuple(name for name in self._asked if name not in GAINS or self._drives.any)
         W, device = scene.worlds, model.device
         self.dynamics = Dynamics(scene, W, device, "float32", variable, **self._options)
+        if self._tunes:
+            self.dynamics.tune("forward_dynamics" if self.integrator == "rk4" else "step")
         if self.dynamics.closed:
             check_loop_joints(model, worlds.loops)
         declare(exchange, wp.float32)

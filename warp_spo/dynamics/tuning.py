@@ -1,0 +1,214 @@
+"""Plans by measurement: time the granularities at which an operation can run, and keep the best one."""
+
+from __future__ import annotations
+
+import datetime
+import functools
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import warp as wp
+
+from ..errors import UnsupportedError, as_names
+from ..execution import tuned as files
+from ..execution.routine import Routine
+from ..execution.tuned import Tuned
+from ..scene.fingerprint import fingerprint
+from ..scene.scene import Scene
+from .operation import Operation
+from .preparation import stand_ins
+from .samples import rotations
+
+if TYPE_CHECKING:
+    from .dynamics import Dynamics
+
+USUAL = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "step")
+DIFFERENT = 1024  # worlds with inputs of their own; more repeat them
+REACH = 1.0  # largest coordinate of the inputs [rad, m]
+REPEATS = 9  # of which the median counts
+ROW_SECONDS, MOST_CALLS = 2e-3, 64  # calls in a row are timed together: as many as take that long
+WARM_UP = 0.05  # [s] of calls before the timing, in which clocks rise
+
+
+def tune(self: Dynamics, operations: Sequence[str] | None = None) -> dict[str, Tuned]:
+    """Time the granularities at which operations can run here, and use the fastest from now on.
+
+    The choice is kept in a file beside Warp's kernels and read from there the next time, so that it is stable from run
+    to run. It holds for one scene (its structure and the values that fold), number of worlds, dtype, device, driver,
+    and version of Warp and of this package; :meth:`explain` names it. Only granularities that the plan may choose are
+    timed, so results change by no more than rounding; for results that do not change at all use
+    ``Dynamics(granularity=)``. Where the constants of the plan are within 3 % of the best, their choice stays.
+
+    Kernels of all candidates are compiled, which takes as long as that many calls of ``prepare``. Operations that share
+    a kernel's recursion, as bias_force and inverse_dynamics do, share the choice. Graphs captured before keep their
+    kernels. Other objects and processes are not affected until they call ``tune``.
+
+    Args:
+        operations: names of methods that have a kernel of their own; a name is a list of one. None: forward_dynamics,
+            inverse_dynamics, mass_matrix and step, those that the loops of this object allow.
+
+    Returns:
+        The choice of each operation by name: ``granularity``, times ``us`` by granularity, ``device``, ``date``,
+        ``file``, and ``measured``, False if it was read from the file.
+
+    Raises:
+        ValueError: no such operation, or a graph capture is running.
+        UnsupportedError: the loops of this object refuse an operation; or it was made with ``refine``.
+    """
+    names = USUAL if operations is None else as_names("Dynamics.tune", "operations", operations, USUAL[:1])
+    if self.device.is_capturing:
+        raise ValueError("Dynamics.tune: a graph capture is running; expected a call before the capture")
+    if self.refine:
+        raise UnsupportedError("Dynamics.tune", f"refine={self.refine}", "force one with granularity=")
+    found = {}
+    for name in names:
+        operation = self._operations.get(name)
+        if operation is None or operation.routine is None or operation.product:
+            known = ", ".join(name for name, one in self._operations.items() if one.routine and not one.product)
+            raise ValueError(f"Dynamics.tune: operations names {name!r}; expected some of {known}")
+        try:
+            found[name] = _tune_one(self, operation)
+        except UnsupportedError:
+            if operations is not None:
+                raise
+    return found
+
+
+def explain(dyn: Dynamics) -> list[str]:
+    """Return a line for each routine whose granularity was measured."""
+    return [f"tuned        {name}: {choice}" for name, choice in dyn.plan.tuned.items()]
+
+
+def _tune_one(dyn: Dynamics, operation: Operation) -> Tuned:
+    dyn._engine.refuse(operation.name, operation)
+    embedded = dyn.embedding is not None and isinstance(operation.embed, Routine)
+    routine = operation.embed if embedded else operation.routine
+    assert isinstance(routine, Routine)
+    if routine.name in dyn.plan.tuned:
+        return dyn.plan.tuned[routine.name]
+    candidates = dyn.plan.candidates(routine)
+    if len(candidates) == 1:
+        return Tuned(candidates[0])
+    key = _key(dyn, routine)
+    choice = files.read(key, candidates)
+    if choice is None:
+        us = _measure(dyn, operation, routine, candidates)
+        best = files.choice_of(us, candidates[0])
+        now = Tuned(best, us, dyn.plan.device.name, f"{datetime.date.today()}", measured=True)
+        choice = files.read(key, candidates, warn=False)  # another process may have been faster
+        choice = files.write(key, now) if choice is None else choice
+    use(dyn, routine, choice)
+    return choice
+
+
+def use(dyn: Dynamics, routine: Routine, choice: Tuned | None) -> None:
+    """Let a routine run at the granularity of a choice from now on; None: at the plan's."""
+    dyn.plan.tuned.pop(routine.name, None)
+    if choice is not None:
+        dyn.plan.tuned[routine.name] = choice
+    dyn.programs.forget(routine)
+    dyn._replays.forget()
+    dyn._gradients.forget()
+
+
+def _key(dyn: Dynamics, routine: Routine) -> dict[str, Any]:
+    """Return what a choice depends on, in words and numbers."""
+    import warp_spo
+
+    device, runtime = dyn.plan.device, cast(Any, wp._src.context.runtime)
+    return {
+        "scene": fingerprint(dyn.scene, dyn.variable),
+        "routine": routine.name,
+        "worlds": dyn.worlds,
+        "dtype": dyn.dtype.__name__,
+        "variable": sorted(dyn.variable),
+        "loops": dyn._closures.loops if dyn.closed else "",
+        "device": [dyn.device.name, device.multiprocessors, device.shared_bytes, dyn.device.arch],
+        "driver": list(runtime.driver_version or ()) if device.cuda else [],
+        "versions": {"warp": wp.__version__, "warp_spo": warp_spo.__version__},
+    }
+
+
+# -- measuring ---------------------------------------------------------------------------------------------------------
+def _measure(dyn: Dynamics, operation: Operation, routine: Routine, candidates: Sequence[str]) -> dict[str, float]:
+    """Return the time of one call [us] by granularity."""
+    given = _inputs(dyn, operation)
+    us, out = {}, None
+    before = dyn.plan.tuned.get(routine.name)
+    try:
+        for granularity in candidates:
+            use(dyn, routine, Tuned(granularity))
+            out = operation.entry(dyn, **given) if out is None else out
+            us[granularity] = 1e6 * _seconds(functools.partial(operation.entry, dyn, **given, out=out), dyn.device)
+    finally:
+        use(dyn, routine, before)
+    return us
+
+
+def _inputs(dyn: Dynamics, operation: Operation) -> dict[str, Any]:
+    """Return random arguments of an operation: coordinates within limits, other arrays of normal numbers."""
+    given, rng = stand_ins(dyn, operation), np.random.default_rng(0)
+    for argument in operation.arrays:
+        array = given.get(argument.name)
+        if not isinstance(array, wp.array) or argument.written or not array.size:
+            continue
+        if argument.axes == "world, coordinate":
+            rows = _coordinates(dyn.scene, rng, min(dyn.worlds, DIFFERENT))
+        else:
+            rows = rng.standard_normal((min(dyn.worlds, DIFFERENT), *array.shape[1:]))
+        repeated = np.resize(rows, array.shape)
+        given[argument.name] = wp.array(repeated, dtype=dyn.dtype, device=dyn.device)
+    return given
+
+
+def _coordinates(scene: Scene, rng: np.random.Generator, worlds: int) -> np.ndarray:
+    """Return coordinates within the limits of the joints [world, coordinate]."""
+    q = rng.uniform(-REACH, REACH, (worlds, scene.coord_count))
+    for hinge, first, start in zip(scene.hinges, scene.q_start, scene.qd_start, strict=False):
+        if hinge.coord_count == hinge.dof_count:
+            own, dofs = slice(first, first + hinge.coord_count), slice(start, start + hinge.dof_count)
+            low, high = (scene.values[f"joint_limit_{end}"][0, dofs] for end in ("lower", "upper"))
+            q[:, own] = np.clip(q[:, own], np.minimum(low, 0.9 * low), np.maximum(high, 0.9 * high))
+    for first in rotations(scene):
+        turn = rng.standard_normal((worlds, 4))
+        q[:, first : first + 4] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
+    return q
+
+
+def _seconds(call: Callable[[], Any], device: wp.Device) -> float:
+    """Return the median time of a call that launches, after calls that compile and warm up."""
+    call()
+    call()
+    wp.synchronize_device(device)
+    once = _wall(call, device)
+    count = int(np.clip(ROW_SECONDS / once, 1, MOST_CALLS))
+
+    def row() -> None:
+        for _ in range(count):
+            call()
+
+    if not device.is_cuda:
+        return float(np.median([_wall(row, device) for _ in range(REPEATS)])) / count
+    with wp.ScopedCapture(device) as capture:
+        row()
+    start = time.perf_counter()
+    while time.perf_counter() - start < WARM_UP:
+        _wall(lambda: wp.capture_launch(capture.graph), device)
+    times = []
+    for _ in range(REPEATS):
+        begin, end = (wp.Event(device, enable_timing=True) for _ in range(2))
+        device.stream.record_event(begin)
+        wp.capture_launch(capture.graph)
+        device.stream.record_event(end)
+        wp.synchronize_stream(device.stream)
+        times.append(1e-3 * wp.get_event_elapsed_time(begin, end) / count)
+    return float(np.median(times))
+
+
+def _wall(run: Callable[[], Any], device: wp.Device) -> float:
+    start = time.perf_counter()
+    run()
+    wp.synchronize_device(device)
+    return time.perf_counter() - start
