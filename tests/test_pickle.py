@@ -114,8 +114,8 @@ def test_dynamics_keeps_its_values(changed, way):
 
 def test_a_value_that_is_lost_is_seen(changed):
     """The planted bug: the values are those of the scene alone."""
-    build, (kind, scene, options, _, tensors_set) = changed.__reduce__()
-    lost = build(kind, scene, options, {}, tensors_set)
+    build, (kind, scene, options, _, *more) = changed.__reduce__()
+    lost = build(kind, scene, options, {}, *more)
     q, qd, qdd = tensors(changed, "q", "qd", "qdd")
     assert not torch.equal(lost.inverse_dynamics(q, qd, qdd), changed.inverse_dynamics(q, qd, qdd))
 

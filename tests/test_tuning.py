@@ -39,7 +39,8 @@ def times(monkeypatch):
     def seconds(call, device):
         call()
         found["measured"] += 1
-        return found[call.args[0].plan.tuned[NAME].granularity]
+        dyn = call.args[0]
+        return found[dyn.plan.of(dyn._operations[NAME].routine)]
 
     monkeypatch.setattr(tuning, "_seconds", seconds)
     return found
@@ -80,7 +81,7 @@ def test_copies_keep_the_choice(device, times):
     dyn = made(device)
     dyn.tune(NAME)
     copy = pickle.loads(pickle.dumps(dyn))
-    assert copy.plan.tuned == dyn.plan.tuned
+    assert copy.plan.tuned == dyn.plan.tuned and copy.plan.of(copy._operations[NAME].routine) == "node"
     assert not made(device).plan.tuned  # others are not affected
 
 

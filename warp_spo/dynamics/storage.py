@@ -11,6 +11,7 @@ import warp as wp
 from .. import launches
 from ..execution.tuned import Tuned
 from ..scene.scene import Scene
+from . import tuning
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
@@ -47,7 +48,8 @@ def build(
             f"Dynamics(scene, device=...) here"
         ) from None
     dyn = kind(scene, **options)
-    dyn.plan.tuned.update(tuned)
+    for name, choice in tuned.items():
+        tuning.use(dyn, name, choice)
     parameters = dyn.recursions.parameters
     for name, value in values.items():
         launches.copy(parameters.value(name), wp.array(value, dtype=wp.float64, device=dyn.device))

@@ -13,6 +13,7 @@ import warp as wp
 
 from ..errors import UnsupportedError, as_names
 from ..execution import tuned as files
+from ..execution.plan import choose
 from ..execution.routine import Routine
 from ..execution.tuned import Tuned
 from ..scene.fingerprint import fingerprint
@@ -40,6 +41,8 @@ def tune(self: Dynamics, operations: Sequence[str] | None = None) -> dict[str, T
     and version of Warp and of this package; :meth:`explain` names it. Only granularities that the plan may choose are
     timed, so results change by no more than rounding; for results that do not change at all use
     ``Dynamics(granularity=)``. Where the constants of the plan are within 3 % of the best, their choice stays.
+
+    Where the choice is the plan's own, its kernels stay; others are those of an object with that ``granularity=``.
 
     Kernels of all candidates are compiled, which takes as long as that many calls of ``prepare``. Operations that share
     a kernel's recursion, as bias_force and inverse_dynamics do, share the choice. Graphs captured before keep their
@@ -99,16 +102,27 @@ def _tune_one(dyn: Dynamics, operation: Operation) -> Tuned:
         now = Tuned(best, us, dyn.plan.device.name, f"{datetime.date.today()}", measured=True)
         choice = files.read(key, candidates, warn=False)  # another process may have been faster
         choice = files.write(key, now) if choice is None else choice
-    use(dyn, routine, choice)
+    use(dyn, routine.name, choice)
     return choice
 
 
-def use(dyn: Dynamics, routine: Routine, choice: Tuned | None) -> None:
-    """Let a routine run at the granularity of a choice from now on; None: at the plan's."""
-    dyn.plan.tuned.pop(routine.name, None)
-    if choice is not None:
-        dyn.plan.tuned[routine.name] = choice
-    dyn.programs.forget(routine)
+def use(dyn: Dynamics, name: str, choice: Tuned) -> None:
+    """Let the routine of this name run by a choice from now on."""
+    _switch(dyn, name, choice.granularity)
+    dyn.plan.tuned[name] = choice
+
+
+def _switch(dyn: Dynamics, name: str, granularity: str | None) -> None:
+    """Let the routine of this name run as if a granularity were asked for; None, or that of the rules: by the rules."""
+    plan = dyn.plan
+    routines = [one.routine for one in dyn._operations.values() if one.routine and one.routine.name == name]
+    names = {name, *(one.bias_first.name for one in routines if one.bias_first is not None)}
+    for each in names:
+        plan.instead.pop(each, None)
+    if granularity is not None and any(plan.of(one) != granularity for one in routines):
+        asked = choose(dyn.scene, dyn.worlds, plan.device, plan.dtype, granularity, plan.varies)
+        plan.instead.update(dict.fromkeys(names, asked))
+    dyn.programs.forget(name)
     dyn._replays.forget()
     dyn._gradients.forget()
 
@@ -136,14 +150,13 @@ def _measure(dyn: Dynamics, operation: Operation, routine: Routine, candidates: 
     """Return the time of one call [us] by granularity."""
     given = _inputs(dyn, operation)
     us, out = {}, None
-    before = dyn.plan.tuned.get(routine.name)
     try:
         for granularity in candidates:
-            use(dyn, routine, Tuned(granularity))
+            _switch(dyn, routine.name, granularity)
             out = operation.entry(dyn, **given) if out is None else out
             us[granularity] = 1e6 * _seconds(functools.partial(operation.entry, dyn, **given, out=out), dyn.device)
     finally:
-        use(dyn, routine, before)
+        _switch(dyn, routine.name, None)
     return us
 
 

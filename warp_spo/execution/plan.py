@@ -70,6 +70,7 @@ class Plan:
             :mod:`.scan`; 0: sweeps do.
         scan_reason: why.
         tuned: choices that were measured, by the routine's name; they replace the rules.
+        instead: the plans by which the routines run whose choice is another granularity than that of the rules.
     """
 
     granularity: str
@@ -87,6 +88,7 @@ class Plan:
     stretch: int = 0
     scan_reason: str = ""
     tuned: dict[str, Tuned] = dataclasses.field(default_factory=dict)
+    instead: dict[str, Plan] = dataclasses.field(default_factory=dict)
 
     @property
     def few(self) -> bool:
@@ -100,8 +102,8 @@ class Plan:
 
     def of(self, routine: Routine) -> str:
         """Return the granularity of one routine: the plan's own where the routine has that form."""
-        if routine.name in self.tuned:
-            return self.tuned[routine.name].granularity
+        if routine.name in self.instead:
+            return self.instead[routine.name].of(routine)
         if not routine.letters and not routine.has_node_form:
             return "tree"
         chosen = self.granularity if self.forced else self._rule(routine)
@@ -119,6 +121,10 @@ class Plan:
                 return "tree"
         return self.granularity
 
+    def at(self, routine: Routine) -> Plan:
+        """Return the plan by which a routine runs."""
+        return self.instead.get(routine.name, self)
+
     def candidates(self, routine: Routine) -> tuple[str, ...]:
         """Return the granularities at which a routine may run here, those of the rules first."""
         first = self.of(routine)
@@ -131,7 +137,8 @@ class Plan:
 
     def stages(self, routine: Routine, warps: int) -> bool:
         """Whether rows come in through shared memory, for kernels in which ``warps`` share 32 worlds."""
-        return self.staged and (warps == 1 or self.worlds > self.device.scaled(FEW_WORLDS // 4) or routine.passes)
+        enough = self.worlds > self.device.scaled(FEW_WORLDS // 4)
+        return self.at(routine).staged and (warps == 1 or enough or routine.passes)
 
     def gathers(self, routine: Routine, warps: int, results: int) -> bool:
         """Whether short results leave through shared memory though rows do not come in through it.

@@ -76,10 +76,10 @@ class Programs:
         self._programs: dict[tuple, Program | None] = {}
         self._links: Links | None = None
 
-    def forget(self, routine: Routine | None = None) -> None:
-        """Drop all programs, because values that they folded have changed, or those of one routine."""
-        if routine is not None:
-            self._programs = {key: program for key, program in self._programs.items() if key[0] is not routine}
+    def forget(self, name: str = "") -> None:
+        """Drop all programs, because values that they folded have changed, or those of the routine of this name."""
+        if name:
+            self._programs = {key: program for key, program in self._programs.items() if key[0].name != name}
             return
         self._programs.clear()
         self._links = None
@@ -166,7 +166,7 @@ class Programs:
         if routine.start is not None:
             return searches.build(self, routine, links, "given" in shapes, options)
         shared = self.plan.of(routine) == "segment" and routine.divides(self.run.scene, shapes, **options)
-        if routine.bias_first is not None and self.plan.apart and "qd" in shapes:
+        if routine.bias_first is not None and self.plan.at(routine).apart and "qd" in shapes:
             routine = routine.bias_first
         if shared:
             pieces = Pieces(links)
@@ -185,7 +185,7 @@ class Programs:
         layout = self._layout(routine, outs, stores, shapes, more)
         if routine.tiled:
             result = Result(TILED, layout.result.array, slots=staging.count_slots(stores))
-            layout = layout._replace(staged=self.plan.staged, result=result)
+            layout = layout._replace(staged=self.plan.at(routine).staged, result=result)
         once = routine.passes or any(item.array in LOOPED for item in stores)  # may write over what it reads
         layout = layout._replace(
             retries=not once and not layout.staged and layout.result.way in (DIRECT, TILED, RELAYED)
