@@ -13,6 +13,7 @@ from .execution.tuned import Tuned
 from .graph.factorization import Factorization
 from .graph.operators import BWA, Blocks, Identity, Operator
 from .hinges.functions import clip, spline, where
+from .scene import terrain
 from .scene.actuators import Actuator, Keyframe
 from .scene.beams import beam_modes
 from .scene.contacts import Contact, HeightField, Plane
@@ -72,6 +73,7 @@ __all__ = [
     "load",
     "normal_modes",
     "spline",
+    "terrain",
     "where",
 ]
 
