@@ -45,7 +45,7 @@ def test_every_public_call_has_its_entry_in_the_reference():
     for name in modules:
         module = getattr(spo, name)
         own = (each for each, value in vars(module).items() if getattr(value, "__module__", None) == module.__name__)
-        public |= {f"{name}.{each}" for each in own if not each.startswith("_")}
+        public |= {f"{module.__name__}.{each}".removeprefix("warp_spo.") for each in own if not each.startswith("_")}
     calls = {f"Dynamics.{name}" for name, _ in inspect.getmembers(spo.Dynamics) if not name.startswith("_")}
     missing = (public | calls) - set(entries)
     assert not missing, f"without an entry in docs/api: {', '.join(sorted(missing))}"

@@ -102,7 +102,7 @@ class Contact(StoredPart):
         other: must be None, the ground; contacts between bodies are not supported.
         friction: ratio of the largest friction force to the normal force.
         stiffness: of each point [N/m]; None: so that a robot that stands on up to four points sinks by 1.7 mm, and that
-            the points of one body can hold it up alone, if they span a sole. See :attr:`Scene.contact_points`.
+            the points of one body can hold it up alone, if they span a sole. See ``contact_points`` of :class:`Scene`.
         damping: of each point [N s/m]; None: sqrt(stiffness mass) / 2, with the mass that rests on the point when the
             robot stands on two such bodies, or on four points.
         eps: speed [m/s] below which friction is a damper. A point that sticks creeps by less than that.

@@ -109,7 +109,7 @@ class Scene(Stored):
             actuator_bias [actuator, 3], actuator_ctrl_range, actuator_force_range [actuator, 2], and actuator_gear, of
             the hinges of the first actuator, of the second, and so on. Of contacts: contact_friction,
             contact_stiffness [N/m], contact_damping [N s/m] [point].
-        contact_points: the :class:`warp_spo.scene.contacts.ContactPoint` of all contacts, contact after contact; other
+        contact_points: the points (``ContactPoint``) of all contacts, contact after contact; other
             calls mean them where axes say "contact".
         dof_axis: axis of each dof, in the parent anchor frame [dof, 3].
         dof_angular: radians about the axis per unit of the coordinate [dof].

@@ -164,7 +164,7 @@ def tiles(
     columns: int = 16,
     size: Any = SIZE,
     cell: float = CELL,
-    kinds: Mapping[str, Kind] = KINDS,
+    kinds: Mapping[str, Kind] | None = None,
     seed: int = 0,
 ) -> Tiles:
     """Return one field of tiles side by side: difficulty grows with the row, from 0 to 1; the kind changes by column.
@@ -173,7 +173,7 @@ def tiles(
         rows, columns: number of tiles along x and y.
         size: of a tile, lengths along x and y [m], multiples of the cell. cell: as :func:`slope`.
         kinds: name -> function of size, cell, difficulty and seed that returns a field of this size, height zero along
-            its edges.
+            its edges; None: those of ``KINDS``.
         seed: of the random numbers; each tile gets one of its own.
 
     Returns:
@@ -189,6 +189,7 @@ def tiles(
         if count is None or count < 1:
             raise ValueError(f"{call}: {name} is {given!r}; expected an integer, 1 or more")
         counts.append(count)
+    kinds = KINDS if kinds is None else kinds
     if not kinds:
         raise ValueError(f"{call}: kinds is empty; expected one function or more")
     tile, names = _Grid(call, size, cell), list(kinds)
