@@ -96,8 +96,10 @@ def recording(recorder: Recorder) -> Iterator[None]:
     def as_for_cuda(scene: Any, worlds: int, device: Any, *more: Any) -> Any:
         return choose(scene, worlds, MEASURED, *more)
 
-    def record(name: str, native: str, arrays: list, T: type, registers: Any = None, wide: tuple = ()) -> Any:
-        recorder.add(name, arrays, registers, wide, native)
+    def record(
+        name: str, native: str, arrays: list, T: type, registers: Any = None, wide: tuple = (), **more: Any
+    ) -> Any:
+        recorder.add(name, arrays, registers, wide, *more.values(), native)
         return None
 
     empty = wp.empty

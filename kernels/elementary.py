@@ -9,8 +9,16 @@ of the hardware with one Newton step (two in float64).
 import warp as wp
 
 C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
+FUSED = """
+#if defined(__CUDA_ARCH__)
+#define FUSED(a, b, c) on::fused(a, b, c)
+#else
+#define FUSED(a, b, c) ((a) * (b) + (c))
+#endif
+"""
 NATIVE = {
-    "float": r"""
+    "float": FUSED
+    + r"""
 struct on
 {
     static CUDA_CALLABLE inline float reach() { return 1.0e5f; }
@@ -29,7 +37,7 @@ struct on
     static CUDA_CALLABLE inline void sincos(float x, float& sine, float& cosine)
     {
 #if !defined(__CUDA_ARCH__)
-        if (!(absolute(x) <= reach())) x = reduced(x);
+        x = within_reach(x);
 #endif
         const float magic = 12582912.0f;
         const float t = fused(x, 0.636619772f, magic);
@@ -55,8 +63,7 @@ struct on
 
     static CUDA_CALLABLE inline void sincos_any(float x, float& sine, float& cosine)
     {
-        if (!(absolute(x) <= reach())) x = reduced(x);
-        sincos(x, sine, cosine);
+        sincos(within_reach(x), sine, cosine);
     }
 
     static CUDA_CALLABLE inline float reciprocal(float x)
@@ -75,15 +82,27 @@ struct on
     static CUDA_CALLABLE inline float absolute(float x) { return fabsf(x); }
     static CUDA_CALLABLE inline double log(double x) { return ::log(x); }
 
+    static CUDA_CALLABLE inline double fused(double a, double b, double c)
+    {
+#if defined(__CUDA_ARCH__)
+        return fma(a, b, c);
+#else
+        return a * b + c;
+#endif
+    }
+
     static CUDA_CALLABLE inline float reduced(float x)
     {
-        const double turns = ::floor((double)x * 0.15915494309189535 + 0.5);
-        return (float)(((double)x - turns * 6.283185307179586) - turns * 2.4492935982947064e-16);
+        const double turns = ::floor(fused((double)x, 0.15915494309189535, 0.5));
+        return (float)fused(turns, -2.4492935982947064e-16, fused(turns, -6.283185307179586, (double)x));
     }
+
+    static CUDA_CALLABLE inline float within_reach(float x) { return absolute(x) <= reach() ? x : reduced(x); }
 };
 const float nan = NAN, infinity = INFINITY;
 """,
-    "double": r"""
+    "double": FUSED
+    + r"""
 struct on
 {
     static CUDA_CALLABLE inline double reach() { return 1.0e8; }
@@ -102,7 +121,7 @@ struct on
     static CUDA_CALLABLE inline void sincos(double x, double& sine, double& cosine)
     {
 #if !defined(__CUDA_ARCH__)
-        if (!(absolute(x) <= reach())) x = reduced(x);
+        x = within_reach(x);
 #endif
 #if defined(__CUDA_ARCH__) || defined(__FMA__) || defined(__ARM_FEATURE_FMA)
         const double magic = 6755399441055744.0;
@@ -139,8 +158,7 @@ struct on
 
     static CUDA_CALLABLE inline void sincos_any(double x, double& sine, double& cosine)
     {
-        if (!(absolute(x) <= reach())) x = reduced(x);
-        sincos(x, sine, cosine);
+        sincos(within_reach(x), sine, cosine);
     }
 
     static CUDA_CALLABLE inline double reciprocal(double x)
@@ -162,9 +180,11 @@ struct on
 
     static CUDA_CALLABLE inline double reduced(double x)
     {
-        const double turns = ::floor(x * 0.15915494309189535 + 0.5);
+        const double turns = ::floor(fused(x, 0.15915494309189535, 0.5));
         return fused(turns, -2.4492935982947064e-16, fused(turns, -6.283185307179586, x));
     }
+
+    static CUDA_CALLABLE inline double within_reach(double x) { return absolute(x) <= reach() ? x : reduced(x); }
 };
 const double nan = NAN, infinity = INFINITY;
 """,

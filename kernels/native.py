@@ -36,6 +36,7 @@ def kernel(
     T: type,
     registers: int | None = None,
     wide: tuple[str, ...] = (),
+    shared: int = 0,
 ) -> wp.Kernel:
     """Return a kernel in which each thread runs the C++ text ``native``.
 
@@ -46,6 +47,7 @@ def kernel(
             The arrays of INTEGERS hold integers, those of MASKS and CHOICES booleans, the others scalars of type ``T``.
         registers: the largest number of registers that a thread may use; None sets no limit.
         wide: the names of the arrays [entry, world] that hold float64 whatever ``T`` is.
+        shared: the bytes of shared memory that a launch asks for, beside what ``native`` declares.
     """
     key = f"{name}_{hashlib.sha256(native.encode()).hexdigest()[:16]}"
     types = {array: "table" if array in INTEGERS else f"array{axes}" for array, axes in arrays}
@@ -74,4 +76,8 @@ def {key}(worlds: int, {declared}):
     space["native"] = wp.func_native(native)(space["native"])
     options = {} if registers is None else {"cuda_max_registers": registers}
     decorate = wp.kernel(name=key, module=f"warp_spo_{key}", enable_backward=False, grid_stride=False, **options)
-    return decorate(space[key])
+    made = decorate(space[key])
+    made.module.options["fuse_fp"] = False  # the text says which products and sums are fused, see trace.emission
+    if shared:
+        made.adj.get_total_required_shared = lambda: shared
+    return made

@@ -19,7 +19,9 @@ DEFINE_ASYNC_COPY = """\
 #define ON_ITS_WAY(to, from) asm volatile("cp.async.ca.shared.global [%0], [%1], %2;" \
     :: "r"((unsigned)__cvta_generic_to_shared(to)), "l"(from), "n"(sizeof(*(to))) : "memory")"""
 WAIT_FOR_COPIES = 'asm volatile("cp.async.wait_all;" ::: "memory");'
-SHARED_BYTES = 46 * 1024  # shared memory that a block may declare: 48 KiB less the share that Warp uses
+SHARED_BYTES = (
+    46 * 1024
+)  # shared memory that a block may declare: 48 KiB less the share that Warp uses; more is asked for
 MOST_PASSES = 16  # limit for the passes of a loop; 13 was the largest count ever measured, see CONTRIBUTING
 IN_PLACE, STAGED, MAPPED, RELAYED, TILED, DIRECT = "in place", "staged", "mapped", "relayed", "tiled", "direct"
 BY_TABLE = (MAPPED, RELAYED)  # the ways in which a table says which value each entry of a row receives
@@ -119,9 +121,13 @@ class KernelLayout(NamedTuple):
         """The further results that go to memory through shared memory."""
         return tuple(row for row in self.further if self.further_staged and row.name not in INTEGERS)
 
-    def fits(self, T: type) -> bool:
-        """Return whether the shared memory of a block has room for this layout, for scalars of type ``T``."""
-        return self.shared_bytes(T) <= SHARED_BYTES
+    def fits(self, T: type, room: int) -> bool:
+        """Return whether a block with ``room`` bytes of shared memory holds this layout, for scalars of type ``T``."""
+        return self.shared_bytes(T) <= room
+
+    def asks_for_shared_memory(self, T: type) -> bool:
+        """Return whether the launch asks for the shared memory, because a block may not declare as much."""
+        return self.shared_bytes(T) > SHARED_BYTES
 
     def shared_bytes(self, T: type) -> int:
         """Return the bytes of shared memory of a block, for scalars of type ``T``."""
@@ -141,7 +147,10 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
     text += ["const int present = worlds - start < 32 ? worlds - start : 32;", "const bool mine = lane < present;"]
     text += ["const long long first = start, world = mine ? start + lane : worlds - 1;"]
     if layout.shared_scalars:
-        text += [f"__shared__ __align__(16) {c} shared[{layout.groups * layout.shared_scalars}];"]
+        if layout.asks_for_shared_memory(T):
+            text += ["extern __shared__ __align__(16) char asked_for[];", f"{c}* shared = ({c}*)asked_for;"]
+        else:
+            text += [f"__shared__ __align__(16) {c} shared[{layout.groups * layout.shared_scalars}];"]
         text += [f"{c}* stage = shared + (threadIdx.x / {team}) * {layout.shared_scalars};"]
     for row in layout.rows:
         if layout.staged:

@@ -20,7 +20,7 @@ from warp_spo.trace.evaluation import evaluate
 TYPES = {"float32": wp.float32, "float64": wp.float64}
 
 
-def compiled(values, rows, dtype, device):
+def compiled(values, rows, dtype, device, fuses=False):
     """``values`` of inputs ("x", i) for rows [world, i], by a kernel."""
     T, count = TYPES[dtype], len(values)
     out = straight.Row("out", 2, count)
@@ -29,7 +29,7 @@ def compiled(values, rows, dtype, device):
         result=straight.Result(straight.DIRECT, out), messages=0, warps=1, block=32)  # fmt: skip
     emitter = Emitter(dtype, lambda array, entry: f"{array}_row[{entry}]",
                       lambda array, entry, value: f"if (mine) result_row[{entry}] = {value};",
-                      lambda array, index: index[0])  # fmt: skip
+                      lambda array, index: index[0], fuses=fuses)  # fmt: skip
     text = render(emitter.region([Store("out", (i,), value) for i, value in enumerate(values)]), dtype)
     kernel = native.kernel("trace", straight.assemble(frame, text, text, T), [("x", 2), ("out", 2)], T)
     x = wp.array(rows, dtype=T, device=device)
@@ -54,6 +54,47 @@ def test_every_operation_as_code(dtype, tolerance, device):
     for at, want in enumerate(wanted):
         want = np.broadcast_to(np.asarray(want, np.float64), 33)
         np.testing.assert_allclose(got[:, at], want, rtol=4 * tolerance, atol=tolerance, err_msg=str(values[at]))
+
+
+@pytest.mark.parametrize("dtype, tolerance", [("float32", 1e-6), ("float64", 1e-15)])
+def test_products_fused_with_sums(dtype, tolerance, device):
+    """Each form in which a sum or a difference takes a product, constants of either sign among the factors."""
+    graph = g.Graph()
+    x, y, z = (graph.input("x", i) for i in range(3))
+    values = [x * y + z, z + x * y, x * y - z, z - x * y, x * y + y * z, x * y - y * z, -0.3 * x + z, 0.3 * x - z,
+              z - (-0.3) * x, x * x + x, x * z + 0.25, x * z - 0.25, 0.25 - x * z]  # fmt: skip
+    rows = np.random.default_rng(8).uniform(0.5, 2.0, (33, 3)).astype(dtype).astype(np.float64)
+    wanted = evaluate(values, lambda _, index: rows[:, index[0]])
+    got = compiled(values, rows, dtype, device, fuses=True)
+    for at, want in enumerate(wanted):
+        np.testing.assert_allclose(got[:, at], want, rtol=4 * tolerance, atol=4 * tolerance, err_msg=str(values[at]))
+
+
+def test_products_have_no_statement_where_sums_alone_use_them():
+    """A product that is stored, multiplied or used twice by one sum keeps its statement; a later region repeats it."""
+    graph = g.Graph()
+    x, y, z = (graph.input("x", i) for i in range(3))
+
+    def emitted(stores, *later):
+        emitter = Emitter("float32", lambda array, entry: f"{array}[{entry}]", lambda _, entry, value: f"{value};",
+                          lambda array, index: index[0], fuses=True)  # fmt: skip
+        return [
+            render(emitter.region([Store("out", (i,), value) for i, value in enumerate(region)]), "float32")
+            for region in (stores, *later)
+        ]
+
+    def count(text):
+        return text.count("FUSED("), text.count(" * ")
+
+    assert count(emitted([x * y + z])[0]) == (1, 0)
+    assert count(emitted([x * y + y * z])[0]) == (1, 1)
+    assert count(emitted([x * y + z, x * y - x])[0]) == (2, 0)
+    assert count(emitted([x * y + z, x * y])[0]) == (0, 1)
+    assert count(emitted([x * y + z, g.sqrt(x * y)])[0]) == (0, 1)
+    assert count(emitted([x * y + x * y])[0]) == (0, 1)
+    first, second = emitted([x * y + z], [x * y, z + x])
+    assert count(first) == (1, 0) and count(second) == (0, 1)
+    assert count(emitted([x * y + z], [g.sqrt(x * y + z)])[1]) == (0, 0)
 
 
 @pytest.mark.parametrize("dtype", TYPES)

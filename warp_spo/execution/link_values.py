@@ -56,6 +56,7 @@ def _kernel(name: str, values: list, sources: list[str], T: type) -> wp.Kernel:
         lambda array, entry, value: f"out.data[({entry}) * (long long)worlds + world] = ({straight.C_TYPE[T]}){value};",
         lambda array, index: index[0],
         late=sources,
+        fuses=True,
     )
     listing = emitter.region([Store("out", (entry,), value) for entry, value in enumerate(values)])
     text = straight.assemble_per_world(sources, render(listing, "float64"))
@@ -104,7 +105,7 @@ def _reverse_kernel(stores: list[Store], sources: list[str], size: int, sizes: d
     def store(array: str, entry: str, value: str) -> str:
         return f"{array}_bar.data[world * {sizes[array]} + {entry}] = ({straight.C_TYPE[T]})({value});"
 
-    emitter = Emitter("float64", load, store, lambda array, index: index[0], late=(*sources, "cotangent"))
+    emitter = Emitter("float64", load, store, lambda array, index: index[0], late=(*sources, "cotangent"), fuses=True)
     text = straight.assemble_per_world(sources, render(emitter.region(stores), "float64"))
     arrays = [(source, 2) for source in sources] + [("cotangent", 2)] + [(f"{name}_bar", 2) for name in sizes]
     return native.kernel("links_reverse", text, arrays, T, wide=tuple(sources))

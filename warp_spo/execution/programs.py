@@ -226,7 +226,7 @@ class Programs:
         layout = self._layout(routine, whole, everything, shapes, more, sent, pieces.warps)
         if layout.result.way == DIRECT and layout.result.array.entries > staging.LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
-        if not layout.fits(self.run.dtype):
+        if not layout.fits(self.run.dtype, self.room):
             return None  # nor for what limbs tell each other
         team = Team(pieces, dtype, passes)
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
@@ -294,10 +294,18 @@ class Programs:
         arrays += [("out", result.array.ndim if entry is None else 3)] + [
             (row.name, row.ndim) for row in layout.further
         ]
-        kernel = native.kernel(routine.name, text, arrays, self.run.dtype, registers)
+        asks = layout.shared_bytes(self.run.dtype) if layout.asks_for_shared_memory(self.run.dtype) else 0
+        kernel = native.kernel(routine.name, text, arrays, self.run.dtype, registers, shared=asks)
         return Program(
             kernel, rows, fields, tuple(held.values()), layout.warps, layout.block, operations, result.slots, entry
         )
+
+    @property
+    def room(self) -> int:
+        """Bytes of shared memory that a block may have: for as many scalars in float64 as in float32 if the GPU can."""
+        wanted = straight.SHARED_BYTES * wp.types.type_size_in_bytes(self.run.dtype) // 4
+        allowed = self.plan.device.shared_bytes - 2 * RESERVED
+        return min(wanted, max(allowed, straight.SHARED_BYTES)) if self.plan.device.cuda else wanted
 
     def _registers(self, warps: int) -> int:
         """Of a thread, if a multiprocessor is to hold so many warps: its parts share them, each with its registers."""
@@ -314,7 +322,9 @@ class Programs:
         warps: int = 1,
     ) -> KernelLayout:
         ways = self.plan.stages(routine, warps), self.plan.gathers(routine, warps, 1 + len(more))
-        return staging.choose_layout(stores, everything, shapes, more, sent, warps, self.run.dtype, *ways, self.relays)
+        return staging.choose_layout(
+            stores, everything, shapes, more, sent, warps, self.run.dtype, *ways, self.relays, self.room
+        )
 
     def _emitter(self, shapes: dict, layout: KernelLayout) -> Emitter:
         result = layout.result
@@ -356,7 +366,7 @@ class Programs:
                 return places[array][index[0]]
             return index[0] if len(index) == 1 else staging.flat_index(index, shapes[array][1:])
 
-        return Emitter(self.run.dtype.__name__, load, store, flat, angles, FIELDS)
+        return Emitter(self.run.dtype.__name__, load, store, flat, angles, FIELDS, fuses=True)
 
 
 def _title(key: tuple) -> str:

@@ -33,7 +33,8 @@ def build(programs: Programs, routine: Routine, links: Links, given: bool, optio
     used = read_entries([*start, *step])
     fields = [name for name in FIELDS if name in used]
     at_start, at_step = (
-        Emitter(dtype, _load, _store, lambda array, index: index[0] if index else 0, late=FIELDS) for _ in range(2)
+        Emitter(dtype, _load, _store, lambda array, index: index[0] if index else 0, late=FIELDS, fuses=True)
+        for _ in range(2)
     )
     first, again = (render(emitter.region(s), dtype) for emitter, s in ((at_start, start), (at_step, step)))
     text = searches.assemble_search(fields, first, again, run.scene.coord_count, given, run.dtype)

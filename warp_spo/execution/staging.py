@@ -45,6 +45,7 @@ def choose_layout(
     staged: bool,
     gathered: bool,
     relays: bool,
+    room: int,
 ) -> KernelLayout:
     """Return the first layout in the order of preference that fits into shared memory.
 
@@ -58,6 +59,7 @@ def choose_layout(
         T: the scalar type.
         staged: rows are read through shared memory if it has room for them.
         gathered: short results are written through shared memory even if rows are not read through it.
+        room: the bytes of shared memory that a block may have.
         relays: a result without room in shared memory may wait in its own rows, see :mod:`warp_spo.kernels.slots`.
     """
     used = read_entries(everything)
@@ -102,7 +104,7 @@ def choose_layout(
         for together in ((True, False) if other_results and result.way in (IN_PLACE, STAGED) else (False,))
         for entries in cached[::-1]
     ]
-    return next((layout for layout in layouts if layout.fits(T)), layouts[-1])
+    return next((layout for layout in layouts if layout.fits(T, room)), layouts[-1])
 
 
 def _may_write_early(rows: list[Row], out: Row) -> bool:

@@ -101,6 +101,8 @@ class Emitter:
         angles: when full turns are subtracted from large angles.
         late: the names of the arrays whose entries are loaded where they are first used, instead of where the trace
             first read them.
+        fuses: a product and the sum that takes it are one statement, FUSED(a, b, c) = a b + c, rounded once on CUDA.
+            Otherwise the compiler decides, and may decide differently in another kernel with the same formulas.
     """
 
     def __init__(
@@ -111,9 +113,11 @@ class Emitter:
         flat: Callable[[str, tuple], int],
         angles: RangeReduction = RangeReduction.FIRST,
         late: Iterable[str] = (),
+        fuses: bool = False,
     ):
         self.dtype, self._load, self._store, self._flat = dtype, load, store, flat
-        self._angles, self._late = angles, tuple(late)
+        self._angles, self._late, self._fuses = angles, tuple(late), fuses
+        self._products: dict[tuple, Scalar] = {}
         self.counts: Counter = Counter()
         self._names: dict[tuple, str] = {}
         self._count = 0
@@ -150,6 +154,9 @@ class Emitter:
         needed = [scalar for scalar in ordered(values) if scalar.key not in self._names]
         lines += self._reduce_angles(needed)
         needed = [scalar for scalar in needed if not self._is_late(scalar) or scalar.key in due]
+        fused: set[tuple] = set()  # products without a statement of their own
+        if self._fuses:
+            self._products, fused = choose_products(needed, {value.key for value in values})
         for scalar in sorted(needed, key=lambda scalar: scalar.number):
             where, _, step = scalar.step.rpartition("|")
             if where != self._place:
@@ -157,7 +164,7 @@ class Emitter:
                 self._labels.append(where)
                 lines.append(f"// {LABEL}{len(self._labels) - 1}\x04")
             if scalar.key not in self._names:
-                lines += self._statement(scalar, step)
+                lines += self._statement(scalar, step) if scalar.key not in fused else []
                 self.counts[scalar.op] += 1
             for item in due.get(scalar.key, ()):
                 self._emit_store(item)
@@ -171,7 +178,7 @@ class Emitter:
         They concern coordinates whose sines are needed, and hardly ever apply. Rows in shared memory are changed in
         place; two warps of a team may both reduce an angle, because a second reduction changes nothing. Otherwise the
         angles are read first. A thread without a team then uses them as they are, and starts ``again`` if one of them
-        was beyond reach.
+        was beyond reach. An angle within reach stays as it is, whatever the others are, so that all ways agree.
         """
         T = C_TYPE[self.dtype]
         sines = (scalar.args[0] for scalar in needed if scalar.op in ("sin", "cos"))
@@ -186,7 +193,7 @@ class Emitter:
                 lines.append(f"{T} {name} = {place};")
                 place = name
             places.append(place)
-        reduced = [*(f"    {place} = on::reduced({place});" for place in places), "}"]
+        reduced = [*(f"    {place} = on::within_reach({place});" for place in places), "}"]
         farthest = "farthest" if self._angles is RangeReduction.AGAIN else f"{PREFIX}farthest"
         largest = [f"{T} {farthest} = 0;"]
         largest += [f"{farthest} = max({farthest}, on::absolute({place}));" for place in places]
@@ -234,6 +241,8 @@ class Emitter:
             sine, cosine = (self._name(scalar.graph.make(name, *args), name) for name in ("sin", "cos"))
             which = "sincos" if args[0].op == "input" else "sincos_any"  # coordinates are within reach already
             return [f"{T} {sine}, {cosine};", f"on::{which}({angle}, {sine}, {cosine});"]
+        if scalar.key in self._products:
+            return self._fused_statement(scalar, self._products[scalar.key], step)
         texts = [self._text(a) for a in args]
         name = self._name(scalar, step)
         if op in BINARY:
@@ -256,6 +265,41 @@ class Emitter:
             function = f"{LIBRARY[op]}f" if self.dtype == "float32" else f"::{LIBRARY[op]}"
             return [f"const {T} {name} = {function}({', '.join(texts)});"]
         return [f"const {T} {name} = on::{op}({', '.join(texts)});"]
+
+    def _fused_statement(self, scalar: Scalar, product: Scalar, step: str) -> list[str]:
+        """Return the statement of a sum or difference that takes ``product``."""
+        first = scalar.args[0] is product
+        a, b, c = (self._text(value) for value in (*product.args, scalar.args[1 if first else 0]))
+        if scalar.op == "sub":
+            a, c = (a, f"-({c})") if first else (f"-({a})", c)
+        return [f"const {C_TYPE[self.dtype]} {self._name(scalar, step)} = FUSED({a}, {b}, {c});"]
+
+
+def choose_products(scalars: list[Scalar], stored: set[tuple]) -> tuple[dict[tuple, Scalar], set[tuple]]:
+    """Return the product that each sum or difference takes, by the key of the sum, and the keys of these products.
+
+    A product is taken where sums and differences alone use it, so that it needs no statement of its own. The choice
+    depends on the formulas only. Products with few uses come first, of equal ones the later.
+
+    Args:
+        scalars: the scalars of a region.
+        stored: the keys of those that are stored or used later.
+    """
+    uses: dict[tuple, list[Scalar]] = {}
+    for scalar in scalars:
+        for value in scalar.args:
+            if value.__class__ is Scalar:
+                uses.setdefault(value.key, []).append(scalar)
+    products = [scalar for scalar in scalars if scalar.op == "mul" and scalar.key not in stored]
+    taken: dict[tuple, Scalar] = {}
+    fused = {product.key for product in products if product.key not in uses}  # earlier regions have taken them
+    for product in sorted(products, key=lambda product: (len(uses.get(product.key, ())), -product.number)):
+        takers = {taker.key: taker for taker in uses.get(product.key, ())}
+        sums = len(takers) == len(uses.get(product.key, ())) and all(x.op in ("add", "sub") for x in takers.values())
+        if sums and not takers.keys() & taken.keys():
+            taken |= dict.fromkeys(takers, product)
+            fused.add(product.key)
+    return taken, fused
 
 
 def fill_in(listing: Listing, constants: list[str], indices: list[str], labels: list[str], prefix: str = "") -> str:
