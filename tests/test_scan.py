@@ -292,7 +292,8 @@ def test_the_plan_scans_deep_trees_in_few_worlds():
     choose = functools.partial(plan.choose, dtype="float32")
     assert choose(deep, 1, MEASURED).stretch == plan.STRETCH and choose(deep, 16, MEASURED).stretch == plan.STRETCH
     assert "launches in a row against 1200 of sweeps" in plan.describe_recursion(choose(deep, 1, MEASURED))
-    for scene, worlds, options in ((flat, 1, {}), (deep, 4096, {}), (deep, 1, {"varies": True})):
+    assert [choose(deep, worlds, MEASURED).stretch for worlds in (1024, 4096, 16384)] == [16, 64, 256]
+    for scene, worlds, options in ((flat, 1, {}), (deep, 65536, {}), (deep, 1, {"varies": True})):
         assert not choose(scene, worlds, MEASURED, **options).stretch
     assert not choose(deep, 1, MEASURED, granularity="node").stretch  # bits do not depend on the number of worlds
     assert not choose(deep, 1, MEASURED, recursion="sweep").stretch

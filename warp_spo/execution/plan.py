@@ -36,10 +36,10 @@ NODE_WORLDS = 1024  # beyond which a launch for each level is never the fastest,
 DEEPEST = 12  # dofs from a root to a leaf, a free hinge one, up to which velocity terms that come first are as accurate
 APART = {"chain": 2048, "tree": 4 * FEW_WORLDS, "segment": FEW_WORLDS}  # worlds beyond which they are faster
 
-# First guesses for GPUs, to be measured with benchmarks/depth.py. In a graph, a launch of a sweep takes about 2 us and
-# one of a scan 5 us, for a level is one step of the recursion, a round of a scan is a product of two elements, and a
-# stretch is STRETCH steps. A scan does three to five times the work of a sweep, so it pays while threads wait.
-STRETCH = 4  # nodes that a thread of a scan works through; fewer err more in more rounds, more take longer in each
+# Measured on an H200, 2026-11-22, see benchmarks/depth.py. In a graph, a launch of a sweep takes 3.4 us and one of a
+# scan 5 to 7 us, because a round of a scan is a product of two elements. A scan does three to five times the work of a
+# sweep, so it pays while threads wait; with more worlds a thread takes more nodes.
+STRETCH = 4  # nodes that a thread of a scan works through where few threads run; 8 are as fast, 2 and 16 slower
 SCAN_LAUNCH = 3  # launches of sweeps that take the time of one launch of a scan
 SWEEPS = 4  # of forward dynamics: motion outward, factors and forces inward, accelerations outward
 SCAN_THREADS = 32768  # stretches times worlds that keep a GPU busy; with more a scan only does more work
@@ -215,17 +215,21 @@ def choose(
 
 def _stretch(scene: Scene, worlds: int, device: DeviceFacts, varies: bool) -> tuple[int, str]:
     """Return how many nodes a thread of a scan takes, 0 if sweeps take less time than scans, and why."""
-    length, most = (STRETCH, device.scaled(SCAN_THREADS)) if device.cuda else (scene.body_count, CPU_WORLDS)
-    pieces = cut(scene.tree, solid_nodes(scene), length)
+    solid, length = solid_nodes(scene), STRETCH if device.cuda else scene.body_count
+    pieces = cut(scene.tree, solid, length)
+    while device.cuda and length < scene.body_count and worlds * len(pieces.nodes) > device.scaled(SCAN_THREADS):
+        length *= 2
+        pieces = cut(scene.tree, solid, length)
     scans, sweeps = pieces.launches, SWEEPS * len(scene.tree.levels)
     counts = f"{scans} launches in a row against {sweeps} of sweeps"
     if SCAN_LAUNCH * scans >= sweeps:
         return 0, f"scans would be {counts}"
     if varies and any(level.longest > 1 for level in pieces.levels):
         return 0, "scans begin at bodies that have inertia, which variable values may take away"
-    if worlds * (len(pieces.nodes) if device.cuda else 1) > most:
+    threads, most = (len(pieces.nodes), device.scaled(SCAN_THREADS)) if device.cuda else (1, CPU_WORLDS)
+    if worlds * threads > most:
         return 0, f"with {worlds} worlds the work takes longer than launches; scans would be {counts}"
-    return length, counts
+    return length, f"{counts}, a thread takes up to {length} nodes"
 
 
 def _depth(scene: Scene) -> int:
