@@ -365,6 +365,18 @@ def repeat_passes(ahead: str, a_pass: str, last: str, names: tuple[str, str, str
     return "\n".join([ahead, *declared, loop, last])
 
 
+def repeat_counted_passes(parts: list[str], entries: dict[str, int], T: type) -> str:
+    """Return code that runs the first of three ``parts``, the second as often as ``passes`` says, and the third.
+
+    ``entries`` are the sizes of the thread's arrays by name, ``name_row[i]``, which begin as zeros; their indices are
+    constants. ``pass_row[0]`` counts the passes from zero.
+    """
+    c, (begin, a_pass, last) = C_TYPE[T], parts
+    declared = [f"{c} {name}_row[{count}] = {{}};" for name, count in entries.items()]
+    loop = "for (int turn = 0; turn < (int)passes_row[0]; ++turn) {"
+    return "\n".join([*declared, begin, loop, f"const {c} pass_row[1] = {{({c})turn}};", a_pass, "}", last])
+
+
 def repeat_team_passes(a_pass: str, flags: int, warps: int, c: str) -> str:
     """Return code in which a team repeats ``a_pass`` until, in all its worlds, no warp has added to ``missed_row[0]``.
 

@@ -25,12 +25,12 @@ from ..execution.programs import Programs
 from ..execution.sweeps import Sweeps
 from ..gradients import TensorValues
 from ..registry import register
-from ..scene import contacts
 from ..scene.scene import Scene
 from . import (
     actuators,
     closed_loops,
     configurations,
+    contacts,
     derivatives,
     energy,
     inertia,
@@ -309,7 +309,7 @@ class Dynamics:
             f"gravity      {'none' if gravity is None else 'acceleration of the inertial frame'}",
             f"loops        {self._closures.explain()}",
             f"actuators    {actuators.explain(self)}",
-            f"contacts     {contacts.describe(scene)}",
+            f"contacts     {contacts.explain(self)}",
             f"workspace    {memory:.1f} MiB so far",
         ]
         if self.plan.scan_reason:

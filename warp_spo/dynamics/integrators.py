@@ -14,6 +14,7 @@ from ..execution.routine import Routine
 from ..kernels import combination, loops
 from ..recursions import coordinates, hinge_forces
 from ..recursions import step as recursion
+from ..recursions.contact import step as contact
 from ..recursions.impedance import DEFAULT_BOUND
 from ..recursions.loops import closed_step, multipliers
 from ..recursions.loops.closed_step import NEWTON_STEPS
@@ -33,6 +34,7 @@ def _divides(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
 
 
 STEP = Routine("step", recursion.step, letters="PzaS", divides=_divides, passes=True)
+CONTACT_STEP = Routine("contact_step", contact.step, passes=True)
 EMBEDDED_STEP = Routine("step", closed_step.step, passes=True)
 STEP_UNDER_MULTIPLIERS = Routine("step", closed_step.step_with_multipliers, passes=True)
 STEP_SYSTEM = Routine("step_system", closed_step.step_system)
@@ -58,12 +60,15 @@ def semi_implicit(
     interval: Interval,
     qdd: wp.array | None = None,
     status: wp.array | None = None,
+    reports: dict[str, wp.array] | None = None,
+    passes: int | None = None,
     **given: Any,
 ) -> None:
     """Launch the implicit step of order 1.
 
     Args:
-        qdd, status: arrays to fill, see :meth:`Dynamics.step`.
+        qdd, status: arrays to fill, see :meth:`Dynamics.step`; reports: others, by name. passes: of scenes with
+            contacts.
         given: forces and targets by name. With ``q_from``, ``qd_from`` the step starts from that state, while its sweep
             and the laws of its joints are evaluated at q, qd.
     """
@@ -73,7 +78,11 @@ def semi_implicit(
     if dyn.scene.dof_count == 0 and status is not None:
         launches.fill(status, 0)
     launch, more = dyn._engine.launch_routine, {"q_out": q_out, **asked}
-    if not dyn.closed:
+    if dyn.scene.contacts:
+        count = float(contact.PASSES if passes is None else passes)
+        given |= {"passes": count, "reports": tuple(reports or ()), **option}
+        launch(CONTACT_STEP, qd_out, more | (reports or {}), q=q, qd=qd, dt=dt, **given)
+    elif not dyn.closed:
         launch(STEP, qd_out, more, q=q, qd=qd, dt=dt, **given, **option)
     elif dyn.embedding is not None:
         launch(EMBEDDED_STEP, qd_out, more, q=q, qd=qd, dt=dt, embedding=dyn.embedding, **given, **option)

@@ -22,7 +22,8 @@ and ``mass_matrix = inertia.mass_matrix`` is its line in the class. Checks of ar
 
 Axes are written as words: "world, dof". The words are "world", "coordinate", "dof", "independent dof" (the dofs that
 move all others where loops are embedded, otherwise all dofs), "body", "frame", "6 frames" (six for each frame), "10
-bodies", "row" (of the closures of loops), "actuator", "entry" (of a packed matrix), and numbers.
+bodies", "row" (of the closures of loops), "actuator", "contact" (each point), "entry" (of a packed matrix), and
+numbers.
 """
 
 from __future__ import annotations

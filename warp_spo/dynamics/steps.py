@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from ..arrays import AnyArray, ArrayT, Call
-from ..errors import UnsupportedError, as_integer
+from ..errors import as_integer
 from ..execution.routine import Routine
 from ..kernels import combination
 from ..recursions.derivatives import adjoints
 from ..recursions.loops import embedded_adjoints
 from ..status import Status
-from . import actuators, integrators
+from . import actuators, contacts, integrators
 from .gradients import by_name
 from .integrators import INTEGRATORS, Interval
 from .operation import (
@@ -66,6 +66,8 @@ def _pull_step(
 
 def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
     """Return what a call of a step asks for that has no gradient, and what is expected; "" if nothing."""
+    if dyn.scene.contacts:
+        return "the scene has contacts; expected a scene without, whose steps have gradients"
     if arguments.get("integrator", "semi_implicit") != "semi_implicit":
         return f"integrator is {arguments['integrator']!r}; expected integrator='semi_implicit', which has gradients"
     if arguments.get("qdd") is not None:
@@ -102,6 +104,8 @@ STEP = Operation(
         CTRL,
         Option("actuator_state", asked=False, stand_in=actuators.stand_in),
         Option("substeps", default=lambda scene: 1),
+        Option("passes", default=lambda scene: None),
+        *contacts.ARGUMENTS,
     ),
     results=(Result("q", "world, coordinate", over="q"), Result("qd", "world, dof", over="qd")),
     routine=integrators.STEP,
@@ -137,6 +141,11 @@ def step(
     ctrl: AnyArray | None = None,
     actuator_state: actuators.ActuatorState | None = None,
     substeps: int = 1,
+    passes: int | None = None,
+    contact_f: AnyArray | None = None,
+    contact_gap: AnyArray | None = None,
+    contact_slip: AnyArray | None = None,
+    contact_excess: AnyArray | None = None,
     out: tuple[ArrayT | None, ArrayT | None] = (None, None),
 ) -> tuple[ArrayT, ArrayT]:
     """Compute the state after ``dt``: forward dynamics with the forces of all hinges, and q moved along the new qd.
@@ -166,6 +175,14 @@ def step(
     more. Laws that are zero or unbounded in the scene generate no code. The forces are implicit, which takes one
     addition to the mass matrix's diagonal: (Mass + dt R) qdd = tau - bias_force(q, qd) + F. Which parts of the
     piecewise-linear laws hold is found in passes, in one launch, until no force changes (16 at most).
+
+    A scene with ``contacts`` takes a fixed number of passes instead, each one sweep. The first closes all points that
+    may touch, later ones open those that pull, and the last of three or more only closes. Friction, effort limits and
+    dry friction are then dampers that give their bound at the velocity of the pass before: a pass that ends outside of
+    a bound does so by what :attr:`contact_excess` says, and gains no energy at a held pose. The normal force of a point
+    is stiffness times depth plus damping times the speed inward, both after the step; there is no restitution. A point
+    that sticks creeps, by eps rho / sqrt(1 - rho^2) for the share rho of friction that is used. Contacts need
+    integrator="semi_implicit", no closed loops, and granularity None or "tree"; they have no gradients.
 
     Where Dynamics closes loops, accelerations obey the closures, with all of the above on every dof, those that a loop
     moves included. Two Newton steps then move q', and qd' there, onto the closures; they leave O((h rate)^6), 1e-10 at
@@ -201,6 +218,9 @@ def step(
               did not close it. Bars turn too far in the step (half a radian), which wants a shorter dt; or the step
               started open, see :meth:`project`; or angles of many turns, or positions 100 m away, are rounded by as
               much, which wants float64, angles without full turns, or an origin nearby.
+            * 8, CONTACT: the last pass of a scene with contacts ended outside of a friction cone or with a pulling
+              contact by more than 0.1 of the weight of all bodies, or outside of an effort limit by more than 0.1 of
+              the least such limit.
             * 5, NOT_SETTLED: the last pass still found a law in another part than it had assumed. The step stands, with
               a force that a shorter dt would correct.
             * 0, OK: none of these.
@@ -211,6 +231,16 @@ def step(
         substeps: how many steps of ``dt`` to take, with the same forces, targets and controls: to the bit what as many
             calls compute, each on the state that the one before returned. The time that passes is substeps dt. Delays
             count substeps. With a tensor that requires grad, every substep is recorded.
+        passes: of a scene with contacts; None: 3. One is stable and coarse; more than three gain little, a shorter dt
+            gains more.
+        contact_f: written with the force of the ground on each contact point [world, contact, 3] [N], inertial axes,
+            the mean over substeps. The points are ``scene.contact_points``.
+        contact_gap: written with the distance of each point from the ground [world, contact] [m], negative inside, at
+            the q that the last substep starts from.
+        contact_slip: written with the speed of each point along the ground after the step [world, contact] [m/s].
+        contact_excess: written with what the last pass of the last substep leaves [world, 3]: the largest friction
+            force beyond its cone and the largest pull of a contact [N], and the largest force of a drive beyond its
+            effort limit [N m or N].
         out: (q, qd) after the step, each an array or None. They may be the arrays of the state itself.
 
     Returns:
@@ -218,8 +248,6 @@ def step(
     """
     engine = self._engine
     with engine.call(STEP) as call:
-        if self.scene.contacts:
-            raise UnsupportedError(call.name, "a scene with contacts", "leave out contacts=")
         if integrator not in INTEGRATORS:
             raise ValueError(f"{call.name}: integrator is {integrator!r}; expected one of {', '.join(INTEGRATORS)}")
         outs = engine.outs(call, STEP, out)
@@ -227,6 +255,8 @@ def step(
             if array is not None and integrator != "semi_implicit":
                 raise ValueError(f"{call.name}: {name} with integrator={integrator!r}; expected 'semi_implicit'")
         count = _take_substeps(call.name, {"substeps": substeps})
+        asked = dict(zip(contacts.REPORTS, (contact_f, contact_gap, contact_slip, contact_excess), strict=True))
+        taken = contacts.check_step(self, call, integrator, passes, asked)
         actuators.check_state(self, call, ctrl, actuator_state)
         forces = {"tau": tau, "body_f": body_f, "target_q": target_q, "target_qd": target_qd, "ctrl": ctrl}
         written = {} if integrator != "semi_implicit" else {"qdd": qdd, "status": status}
@@ -234,6 +264,8 @@ def step(
         if not given["dt"] > 0.0:
             raise ValueError(f"{call.name}: dt is {given['dt']} s; expected more than zero")
         buffers = actuators.read_state(self, call, actuator_state)
+        reports = engine.read(call, STEP, **{name: array for name, array in asked.items() if array is not None})
+        given |= {} if taken is None else {"passes": taken, "reports": reports}
         q_out, qd_out = engine.write(call, STEP, outs, given)
         interval = Interval(given["q"], given["qd"], q_out, qd_out, given["dt"])
         given = {name: value for name, value in given.items() if name not in Interval._fields}
@@ -256,12 +288,17 @@ def _launch(
         given: forces, targets, controls, and arrays to fill, by name. buffers: of delayed controls; None: no delays.
     """
     ctrl, status = given.pop("ctrl"), given.get("status")
+    force = given.get("reports", {}).get("contact_f") if count > 1 else None
+    if force is not None:
+        given["reports"]["contact_f"] = dyn.recursions.array("contact force", *force.shape)
     ctrl = ctrl if dyn.scene.actuators else None
     for substep in range(count):
         now = ctrl if ctrl is None or buffers is None else actuators.delayed(dyn, ctrl, buffers)
         if substep and status is not None:
             given["status"] = dyn._later_status
         INTEGRATORS[integrator](dyn, call, interval, **given, ctrl=now)
+        if force is not None:
+            contacts.add_share(dyn, substep, count, given["reports"]["contact_f"], force)
         if substep and status is not None:
             dyn.recursions.launch(combination.worst, dyn.worlds, [SEVERITY, dyn._later_status], [status])
         interval = interval._replace(q=interval.q_out, qd=interval.qd_out)

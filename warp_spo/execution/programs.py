@@ -17,6 +17,7 @@ from ..kernels.native import INTEGERS
 from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout, Result
 from ..recursions import messages
+from ..recursions.contact.secants import SECANT
 from ..recursions.flexible import attach
 from ..recursions.links import TABLES, Links
 from ..recursions.messages import INWARD, OUTWARD
@@ -32,6 +33,7 @@ from .staging import FIELDS
 from .sweeps import Sweeps
 from .teams import Passes, Team, Work
 
+PASSED = (*LOOPED, SECANT)  # variables of the loops over passes
 PARTS = 4  # of a multiprocessor
 MOST_REGISTERS = 255  # of a thread
 PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
@@ -182,7 +184,7 @@ class Programs:
         stores = [self._flattened(item, shapes) for item in routine.trace(trace, **options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         outs = [item for item in stores if item.array == "out"]
-        layout = self._layout(routine, outs, stores, shapes, more)
+        layout = self._layout(routine, outs, trace.begin + stores, shapes, more)
         if routine.tiled:
             result = Result(TILED, layout.result.array, slots=staging.count_slots(stores))
             layout = layout._replace(staged=self.plan.at(routine).staged, result=result)
@@ -192,10 +194,13 @@ class Programs:
         )
         placed, table = staging.arrange_stores(outs, layout.result)
         placed += apart
-        emitter, looped = self._emitter(shapes, layout), [item for item in stores if item.array in LOOPED]
-        regions = [emitter.region([], trace.ahead), emitter.branch(looped)] if looped else []
+        emitter, looped = self._emitter(shapes, layout), [item for item in stores if item.array in PASSED]
+        regions = [emitter.region(trace.begin, trace.ahead), emitter.branch(looped)] if looped else []
         *before, body = (render(each, self.run.dtype.__name__) for each in [*regions, emitter.region(placed)])
-        if looped:
+        if trace.begin:
+            entries = {GAIN: self.run.scene.dof_count, SECANT: len(trace.begin)}
+            body = straight.repeat_counted_passes([*before, body], entries, self.run.dtype)
+        elif looped:
             ahead, a_pass = before
             body = straight.repeat_passes(ahead, a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
         block = PAIR * WARP_SIZE if self.plan.few and not layout.shared_scalars else WARP_SIZE
@@ -263,7 +268,7 @@ class Programs:
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
-        if item.array in (INWARD, OUTWARD, *LOOPED):
+        if item.array in (INWARD, OUTWARD, *PASSED):
             return item
         return item._replace(index=(staging.flat_index(item.index, shapes[item.array][1:]),))
 

@@ -47,6 +47,8 @@ def eliminate(
     """Add the factor of a link to ``done``, and P+ in its parent's frame to ``inner``, after its children's."""
     trace.label(link, "P")
     carried = trace.from_children(link, "P", inner, Articulated.unpacked)
+    if id(link) in trace.dampers:
+        carried = [*carried, trace.dampers[id(link)]]
     if link.group is not None:
         P = total_inertia(link, carried)
         done[id(link)] = articulated.Factor([], P, NO_INERTIA, False, False, 0.0)
@@ -104,6 +106,8 @@ def reduce(
         z = articulated.gyroscopic(link.inertia, move)
         if loads:
             z = z - trace.external_wrench(link)
+        if key in trace.pushes:
+            z = z - trace.pushes[key]
         for force in trace.from_children(link, letters[-1], forces, Vector):
             z = z + force
         if link.group is None:
@@ -120,10 +124,19 @@ def reduce(
 
 
 def expand(
-    trace: Trace, done: Factors, rates: dict, base: tuple[Vector, Vector], letter: str = "a", name: str = "out"
+    trace: Trace,
+    done: Factors,
+    rates: dict,
+    base: tuple[Vector, Vector],
+    letter: str = "a",
+    name: str = "out",
+    alpha: dict[int, tuple[Vector, Vector]] | None = None,
 ) -> list[Store]:
-    """Sweep outward: return stores of qdd in the array ``name``, for ``rates`` of :func:`reduce`."""
-    alpha: dict[int, tuple[Vector, Vector]] = {}
+    """Sweep outward: return stores of qdd in the array ``name``, for ``rates`` of :func:`reduce`.
+
+    ``alpha`` receives the acceleration of every link, by id.
+    """
+    alpha = {} if alpha is None else alpha
     shared: dict[int, Value] = {}  # qdd of groups
     stores = []
     for link in trace.own_links:

@@ -31,6 +31,7 @@ CREEP = 1e-4  # rate [rad/s, m/s] below which dry friction is a damper; it satur
 DEFAULT_BOUND = 1e6  # effort and velocity limits of this size and more are no limits; Newton's default
 HOLD = 300.0  # resistance of a velocity limit, in inertias / h; the excess over the limit shrinks by this factor
 FREE = 1e20  # bound that no force or rate reaches, in place of a variable one of DEFAULT_BOUND and more
+LIMIT, FRICTION = "limit", "friction"  # roles of laws
 NOISE = 4.0  # roundings of a law's terms; two pieces may differ by so much where they meet
 
 
@@ -38,6 +39,8 @@ class Law(NamedTuple):
     """f(u) = scale * clip(force - resistance u, least, most); None is no bound.
 
     ``scale`` is zero or more and does not influence which piece is active, so that derivatives by it exist at zero.
+    ``role`` is LIMIT or FRICTION where a step with contacts treats a law in its own way; ``depth`` is how far outside a
+    limit q is, and ``stiffness`` its spring. ``symmetric``: the bounds are opposite numbers.
     """
 
     force: Value
@@ -45,6 +48,10 @@ class Law(NamedTuple):
     least: Value | None = None
     most: Value | None = None
     scale: Value = 1.0
+    role: str = ""
+    depth: Value = 0.0
+    stiffness: Value = 0.0
+    symmetric: bool = False
 
     @property
     def bends(self) -> bool:
@@ -203,7 +210,7 @@ class Impedance:
     def _neutral(self, coordinate: int) -> Value:
         return float(self.scene.neutral_q[coordinate])
 
-    def _inertia(self, dof: int) -> float:
+    def inertia(self, dof: int) -> float:
         """Return the inertia at a dof in the neutral configuration of world 0, all other dofs being free."""
         if self._inertias is None:
             self._inertias = neutral_inertias(self.scene)
@@ -238,7 +245,7 @@ class Impedance:
         effort, law = self._most("joint_effort_limit", dof), add_laws(laws)
         if effort is not None and is_number(effort, 0.0):
             return []
-        return [law] if effort is None else [law._replace(least=-effort, most=effort)]
+        return [law] if effort is None else [law._replace(least=-effort, most=effort, symmetric=True)]
 
     def _limits(self, link: Link, i: int) -> list[Law]:
         """Return springs that push back into the range and never pull; outside the range with dampers."""
@@ -262,13 +269,13 @@ class Impedance:
             d = select(less(0.0, depth), d, 0.0)
             force = k * (depth - inward * self.ahead(dof)) - d * (inward * self.qd(dof))
             least, most = (0.0, None) if inward > 0.0 else (None, 0.0)
-            laws.append(Law(inward * force, self.h * k + d, least, most))
+            laws.append(Law(inward * force, self.h * k + d, least, most, 1.0, LIMIT, depth, k))
         return laws
 
     def _friction(self, dof: int) -> list[Law]:
         """Return a force of at most ``joint_friction`` against the motion; a damper below CREEP."""
         f = self.value("joint_friction", dof)
-        return [] if is_number(f, 0.0) else [Law(-(1.0 / CREEP) * self.qd(dof), 1.0 / CREEP, -1.0, 1.0, f)]
+        return [] if is_number(f, 0.0) else [Law(-(1.0 / CREEP) * self.qd(dof), 1.0 / CREEP, -1.0, 1.0, f, FRICTION)]
 
     def _rate_limit(self, dof: int, others: list[Law]) -> list[Law]:
         """Return dampers on the excess over the velocity limit, HOLD times the inertia over the step.
@@ -278,7 +285,7 @@ class Impedance:
         bound = self._most("joint_velocity_limit", dof)
         if bound is None or is_number(self.h, 0.0):
             return []
-        qd, inertia = self.qd(dof), self._inertia(dof)
+        qd, inertia = self.qd(dof), self.inertia(dof)
         r = HOLD * inertia * reciprocal(self.h)
         if inertia == 0.0:
             r = HOLD * total(law.scale * law.resistance for law in others)

@@ -11,7 +11,7 @@ from typing import Any
 
 from ..trace.emission import Store
 from ..trace.scalars import Value
-from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross
+from ..trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Vector, cross
 from . import messages, motion, newton_euler
 from .links import Link, Links, Placed, place_link
 from .motion import STILL, Motion
@@ -39,6 +39,8 @@ class Trace:
         news: messages that a piece sends apart from the others, because pieces of equal structure do not all send them.
         rounds: what a piece stores after it has received all news, in turns of which many may be alike.
         ahead: values that the passes of a loop share, formed once before the loop.
+        begin: stores before the passes of a loop, of the variables that they read.
+        dampers, pushes: by id of the link: what contacts add to its articulated inertia, and to the forces on it.
         checks: stores that check a pass; they read their inputs anew, so that no register is kept for them.
     """
 
@@ -55,6 +57,9 @@ class Trace:
         self.news: list[Store] = []
         self.rounds: list[list[Store]] = []
         self.ahead: list[Value] = []
+        self.begin: list[Store] = []
+        self.dampers: dict[int, Articulated] = {}
+        self.pushes: dict[int, Vector] = {}
         self.checks: list[Store] = []
         self._mail: dict[tuple[str, int], list[Value]] = {}  # messages between pieces of this trace
         self.own = set(map(id, links.links if piece is None else piece.links))

@@ -318,7 +318,7 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
             d = DAMPING * np.sqrt(k * mass / shared)
         for name, value in zip(CONTACT_VALUES, (contact.friction, k, d), strict=True):
             values[name][0, i] = value
-    return values
+    return {name: read_only(value) for name, value in values.items()}
 
 
 def _sole_stiffness(points: np.ndarray, weight: float, com: np.ndarray, up: np.ndarray) -> float:
@@ -332,7 +332,7 @@ def _sole_stiffness(points: np.ndarray, weight: float, com: np.ndarray, up: np.n
     return MARGIN * weight * height / (len(points) * width**2) if width > 0.0 else 0.0
 
 
-def describe(scene: Any) -> str:
+def contact_figures(scene: Any) -> str:
     """Return a line on the scene's contacts."""
     points = scene.contact_points
     if not points:

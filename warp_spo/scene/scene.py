@@ -140,10 +140,7 @@ class Scene(Stored):
         self.loops, self.couplings = _parts("loops", loops, Loop), _parts("couplings", couplings, Coupling)
         self.actuators = _parts("actuators", actuators, Actuator)
         self._check_indices()
-        self.contacts: tuple[Contact, ...] = _parts("contacts", contacts, Contact)
-        check_contacts(self.contacts, ground, self.bodies)
-        self.ground = Plane() if ground is None and self.contacts else ground
-        self.contact_points: tuple[ContactPoint, ...] = contact_points(self.contacts)
+        self._set_contacts(contacts, ground)
         self.hinges = tuple(with_modes(hinge, self.bodies[hinge.child].modes, HINGE_VALUES) for hinge in self.hinges)
         self.hinge_of = np.empty(len(self.bodies), dtype=np.int32)
         for index, hinge in enumerate(self.hinges):
@@ -365,6 +362,20 @@ class Scene(Stored):
         worlds = max(part.shape[0] for part in (mass, com, inertia))
         parts = [np.broadcast_to(x, (worlds, *x.shape[1:])) for x in (mass, mass * com, *entries)]
         return np.concatenate(parts, axis=-1).reshape(worlds, -1)
+
+    def with_contacts(self, contacts: Sequence[Contact], ground: Plane | HeightField | None = None) -> Scene:
+        """Return a copy of the scene with these contacts in place of its own; arguments as those of the class."""
+        scene = object.__new__(Scene)
+        scene.__dict__.update(self.__dict__)
+        scene._set_contacts(contacts, ground)
+        scene.values = MappingProxyType({**self.values, **contact_values(scene)})
+        return scene
+
+    def _set_contacts(self, contacts: Sequence[Contact], ground: Plane | HeightField | None) -> None:
+        self.contacts: tuple[Contact, ...] = _parts("contacts", contacts, Contact)
+        check_contacts(self.contacts, ground, self.bodies)
+        self.ground = Plane() if ground is None and self.contacts else ground
+        self.contact_points: tuple[ContactPoint, ...] = contact_points(self.contacts)
 
     def with_values(self, **values: Any) -> Scene:
         """Return a copy of the scene with other ``values``, [...] for all worlds or [worlds, ...] for each world.

@@ -1,0 +1,110 @@
+"""Steps of Go2 and G1 on the ground: time of a step with contacts beside one without, and errors against float64.
+
+    python -m benchmarks.contacts [--device cuda:0] [--worlds 4096 65536] [--json FILE]
+
+Go2 has a sphere at each foot and the trunk's eight corners; G1 four points at each sole and ten points on its body.
+Drives hold the joints with effort limits; worlds stand on the ground in different states, dt is 5 ms, three passes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+import warp_spo as spo
+from warp_spo.reference_contact import ContactStep
+
+from . import robots
+from .capabilities import SETS, measure_time
+
+DT = 5e-3
+GO2_STAND = np.array([0.0, 0.8, -1.5] * 4)
+SOLE = [(x, y, -0.03) for x in (-0.05, 0.12) for y in (-0.03, 0.03)]
+
+
+def scene(name: str) -> spo.Scene:
+    """Return a robot on the ground, with drives."""
+    bare = robots.scene(name)
+    labels = [label.split("/")[-1] for label in bare.body_labels]
+    if name == "go2":
+        feet = [spo.Contact(labels.index(f"{leg}_foot"), sphere=((0, 0, 0), 0.022)) for leg in ("FL", "FR", "RL", "RR")]
+        contacts = [*feet, spo.Contact(labels.index("base"), box=(0.19, 0.05, 0.06))]
+    else:
+        feet = [labels.index(f"{side}_ankle_roll_link") for side in ("left", "right")]
+        contacts = [spo.Contact(foot, point=point) for foot in feet for point in SOLE]
+        body = [f"{side}_{part}" for side in ("left", "right") for part in
+                ("knee_link", "elbow_link", "rubber_hand", "hip_yaw_link", "shoulder_yaw_link")]  # fmt: skip
+        contacts += [spo.Contact(labels.index(label), sphere=((0, 0, 0), 0.05)) for label in body if label in labels]
+    free, n = 6, bare.dof_count
+    drive = np.r_[np.zeros(free), np.ones(n - free)]
+    gains = dict(joint_target_ke=60.0 * drive, joint_target_kd=2.0 * drive, joint_armature=0.01 * drive,
+                 joint_effort_limit=np.where(drive > 0.0, 33.0 if name == "go2" else 100.0, 1e6))  # fmt: skip
+    return bare.with_values(**gains).with_contacts(contacts)
+
+
+def states(one: spo.Scene, worlds: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return q, qd of worlds that stand or are about to, rounded to float32."""
+    rng, n = np.random.default_rng(seed), one.dof_count
+    q = np.tile(one.neutral_q, (worlds, 1))
+    if n == 18:
+        q[:, 7:] = GO2_STAND
+    q[:, 7:] += 0.1 * rng.normal(size=(worlds, n - 6))
+    low, high = one.values["joint_limit_lower"][0, 6:], one.values["joint_limit_upper"][0, 6:]
+    q[:, 7:] = np.clip(q[:, 7:], low, high)
+    base = q[0].copy()
+    depth = ContactStep(one, base, np.zeros(n), DT).points.depth.max()
+    q[:, 2] += depth + rng.uniform(-5e-3, 5e-3, worlds)
+    return q.astype(np.float32), (0.3 * rng.normal(size=(worlds, n))).astype(np.float32)
+
+
+def measure(one: spo.Scene, worlds: int, device: wp.Device) -> dict[str, float]:
+    """Return times [us] of a step with and without contacts, and errors of one world in a few."""
+    found = {}
+    sets = [[wp.array(x, dtype=wp.float32, device=device) for x in states(one, worlds, s)] for s in range(SETS)]
+    for name, subject in (("with contacts", one), ("without", one.with_contacts([]))):
+        dyn = spo.Dynamics(subject, worlds, device=device)
+        out = [wp.empty_like(x) for x in sets[0]]
+        found[name] = measure_time(lambda i, dyn=dyn, out=out: dyn.step(*sets[i], None, DT, out=tuple(out)), device)
+        if subject.contacts:
+            force = wp.empty((worlds, len(subject.contact_points), 3), dtype=wp.float32, device=device)
+            after = dyn.step(*sets[0], None, DT, contact_f=force)[1].numpy()
+            weight = 9.81 * subject.values["body_mass"].sum()
+            start = [x.numpy().astype(np.float64) for x in sets[0]]
+            checked = range(0, worlds, max(1, worlds // 4))
+            errors = []
+            for w in checked:
+                wanted = ContactStep(subject, start[0][w], start[1][w], DT).run()[1]
+                errors.append((np.abs(after[w] - wanted.v).max() / np.abs(wanted.v).max(),
+                               np.abs(force.numpy()[w] - wanted.f).max() / weight))  # fmt: skip
+            found["velocity error"], found["force error"] = np.max(errors, axis=0).tolist()
+            (found["operations"],) = dyn.operation_counts.values()
+            lines = [line for line in dyn.explain().split("\n") if line.startswith("contact_step")]
+            print("   ", lines[0])
+    return found
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default=None)
+    parser.add_argument("--worlds", type=int, nargs="+", default=[4096, 65536])
+    parser.add_argument("--robots", nargs="+", default=["go2", "g1"])
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args(arguments)
+    device, results = wp.get_device(options.device), {}
+    for name in options.robots:
+        one = scene(name)
+        for worlds in options.worlds:
+            found = results[f"{name}, {worlds}"] = measure(one, worlds, device)
+            print(f"{name} {worlds:6d}  " + "  ".join(f"{key} {value:.3g}" for key, value in found.items()), flush=True)
+    if options.json:
+        options.json.write_text(json.dumps(results, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

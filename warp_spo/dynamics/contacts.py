@@ -1,0 +1,66 @@
+"""What steps of scenes with contacts accept and report."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from ..arrays import Call
+from ..errors import UnsupportedError, as_integer
+from ..kernels import combination
+from ..recursions.contact.step import PASSES, REPORTS
+from ..scene.contacts import HeightField, contact_figures
+from .operation import Argument
+
+if TYPE_CHECKING:
+    from .dynamics import Dynamics
+
+ARGUMENTS = tuple(
+    Argument(name, axes, optional=True, asked=True, written=True)
+    for name, axes in zip(REPORTS, ("world, contact, 3", "world, contact", "world, contact", "world, 3"), strict=True)
+)
+
+
+def check_step(dyn: Dynamics, call: Call, integrator: str, passes: Any, asked: dict[str, Any]) -> int | None:
+    """Return the number of passes, None without contacts; raise an error for what a step with contacts cannot do.
+
+    Args:
+        passes: as the caller gives it. asked: arrays of REPORTS by name; None where the caller gives none.
+    """
+    if not dyn.scene.contacts:
+        for name, value in (("passes", passes), *asked.items()):
+            if value is not None:
+                raise ValueError(f"{call.name}: {name} is given, and the scene has no contacts; expected None")
+        return None
+    count = PASSES if passes is None else as_integer(passes)
+    if count is None or count < 1:
+        raise ValueError(f"{call.name}: passes is {passes!r}; expected an integer, 1 or more")
+    refuse(dyn, call, integrator)
+    return count
+
+
+def refuse(dyn: Dynamics, call: Call, integrator: str) -> None:
+    """Raise UnsupportedError for a step with contacts that has no kernel."""
+    forced = dyn._options["granularity"]
+    if integrator != "semi_implicit":
+        raise UnsupportedError(call.name, f"integrator={integrator!r} with contacts", "use 'semi_implicit'")
+    if dyn.closed:
+        raise UnsupportedError(call.name, "closing loops in a scene with contacts", "use loops='cut'")
+    if forced not in (None, "tree"):
+        raise UnsupportedError(call.name, f"granularity={forced!r} with contacts", "use 'tree', or leave it out")
+    if isinstance(dyn.scene.ground, HeightField):
+        raise UnsupportedError(call.name, "a HeightField", "use spo.Plane")
+
+
+def add_share(dyn: Dynamics, substep: int, count: int, now: wp.array, mean: wp.array) -> None:
+    """Launch ``mean`` += ``now`` / count, [world, contact, 3]; in the first substep ``mean`` holds nothing yet."""
+    flat = [array.reshape((dyn.worlds, 3 * array.shape[1])) for array in (now, mean)]
+    shares = [1.0 / count, flat[0], 1.0, flat[1]] if substep else [1.0 / count, flat[0], 0.0, flat[0]]
+    dyn.recursions.launch(combination.combine, flat[0].shape, shares, [flat[1]])
+
+
+def explain(dyn: Dynamics) -> str:
+    """Return a line on the scene's contacts."""
+    figures = contact_figures(dyn.scene)
+    return f"{figures}; {PASSES} passes of a step unless passes= says otherwise" if dyn.scene.contacts else figures

@@ -1,0 +1,1 @@
+"""Contact of bodies with the ground inside the articulated-body recursion."""

@@ -1,0 +1,135 @@
+"""Contact points at a configuration: where the ground is, how they move, and what a damper there adds to the sweep.
+
+A contact pushes with f = f0 - G v, where v is the point's velocity after the step. With v = v_before + h J qdd, the
+damper h G is an inertia at the point and f0 - G v_before a load. G = across I + (along - across) n n* is isotropic
+across the normal n, so that no tangent directions are needed. Vectors are in the axes of the point's link.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...scene.contacts import Plane
+from ...scene.scene import Scene
+from ...trace.evaluation import evaluate
+from ...trace.scalars import Value
+from ...trace.spatial import ZERO, Articulated, Vector, cross, dot, skew, upper
+from ..composite import mass_matrix
+from ..kinematics import carried_velocity, frame_on_link, jacobian
+from ..links import Link, Links
+from ..motion import hinge_motion
+from ..tracing import Trace
+
+if TYPE_CHECKING:
+    from ..impedance import Impedance
+
+SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
+
+
+@dataclasses.dataclass
+class Point:
+    """A contact point of a link.
+
+    Attributes:
+        arm: from the link's origin. normal: of the ground there. depth: how far the point is below ground [m].
+        velocity: before the step. k, d, mu: stiffness, damping, friction. eps: speed below which friction is a damper.
+        weight: inverse weight that predicts slip [1/kg].
+    """
+
+    link: Link | None
+    arm: Vector
+    normal: Vector
+    depth: Value
+    velocity: Vector
+    k: Value
+    d: Value
+    mu: Value
+    eps: float
+    weight: float
+
+    @property
+    def state(self) -> list[Value]:
+        """What all passes read."""
+        return [*self.arm, *self.normal, self.depth, *self.velocity]
+
+    def inertia(self, across: Value, along: Value) -> Articulated:
+        """Return the damper ``across`` I + (``along`` - ``across``) n n* at the point as an inertia of the link."""
+        n, c, r = self.normal, cross(self.arm, self.normal), self.arm
+        more, square = along - across, dot(r, r)
+        turn = skew(r)
+        J = upper(lambda i, j: across * ((square if i == j else 0.0) - r[i] * r[j]) + more * (c[i] * c[j]))
+        C = [[across * turn[i][j] + more * (c[i] * n[j]) for j in range(3)] for i in range(3)]
+        m = upper(lambda i, j: (across if i == j else 0.0) + more * (n[i] * n[j]))
+        return Articulated(J, type(m).of(C), m)
+
+    def wrench(self, force: Vector) -> Vector:
+        """Return (n; f) of a force at the point, about the link's origin."""
+        return Vector((*cross(self.arm, force), *force))
+
+    def moved(self, w: Vector, v: Vector) -> Vector:
+        """Return the velocity of the point, or its acceleration, when the link moves with (w; v)."""
+        return v + cross(w, self.arm)
+
+
+def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value]) -> list[Point]:
+    """Return the contact points of a scene that stands on a plane, those that move, with None for the others."""
+    scene = trace.links.scene
+    ground, weights = scene.ground, inverse_weights(scene)
+    assert isinstance(ground, Plane)
+    seats = [frame_on_link(trace, point.body, point.position) for point in scene.contact_points]
+    needed = _with_ancestors([link for link, _ in seats])
+    normals: dict[int | None, Vector] = {None: Vector(ground.normal)}
+    heights: dict[int | None, Value] = {None: 0.0}  # of the link's origin along the ground's normal
+    twists: dict[int | None, tuple[Vector, Vector]] = {None: (ZERO, ZERO)}
+    for link in trace.links.links:
+        if id(link) not in needed:
+            continue
+        trace.label(link, "n")
+        key, over, place = id(link), None if link.parent is None else id(link.parent), trace.places[id(link)]
+        normals[key] = place.pose.to_child(normals[over])
+        heights[key] = heights[over] + dot(normals[over], place.pose.l)
+        twists[key] = carried_velocity(place, twists[over], hinge_motion(link, place, qd))
+    found = []
+    for number, (point, (on, centre)) in enumerate(zip(scene.contact_points, seats, strict=True)):
+        carrier = None if on is None else id(on)
+        trace.graph.step = f"contact {number}|c"
+        normal = normals[carrier]
+        depth = (ground.height + point.radius) - (heights[carrier] + dot(normal, centre))
+        arm = centre - normal * point.radius if point.radius else centre
+        w, v = twists[carrier]
+        k, d, mu = (impedance.value(f"contact_{name}", number) for name in ("stiffness", "damping", "friction"))
+        velocity = v + cross(w, arm)
+        found.append(Point(on, arm, normal, depth, velocity, k, d, mu, point.eps, weights[number]))
+    return found
+
+
+def _with_ancestors(links: list[Link | None]) -> set[int]:
+    found: set[int] = set()
+    for one in links:
+        link = one
+        while link is not None and id(link) not in found:
+            found.add(id(link))
+            link = link.parent
+    return found
+
+
+def inverse_weights(scene: Scene) -> list[float]:
+    """Return SLIP times the mean of J Mass^-1 J* over three directions, of each point, neutral, in world 0 [1/kg]."""
+    one = scene.with_values(**{name: array[:1] for name, array in scene.values.items()})
+    inverse = np.linalg.pinv(_evaluated(one, mass_matrix, (scene.dof_count, scene.dof_count)))
+    frames = tuple((point.body, point.position) for point in scene.contact_points)
+    J = _evaluated(one, lambda trace: jacobian(trace, frames), (len(frames), 6, scene.dof_count))[:, :3]
+    return (SLIP / 3.0 * np.einsum("pai,ij,paj->p", J, inverse, J)).tolist()
+
+
+def _evaluated(scene: Scene, trace: Callable, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the result of a trace in the neutral configuration."""
+    stores, found = trace(Trace(Links(scene), "float64", ("q",))), np.zeros(shape)
+    values = evaluate([item.value for item in stores], lambda array, index: scene.neutral_q[index[0]])
+    for item, value in zip(stores, values, strict=True):
+        found[item.index] = value
+    return found

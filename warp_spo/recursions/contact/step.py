@@ -1,0 +1,244 @@
+"""One time step of a scene with contacts: a fixed number of passes, each one sweep with the dampers of the pass before.
+
+Velocity terms, gravity and loads become forces of the hinges once, before the passes. A pass solves
+
+    (Mass + h S + h J* G J) qdd = tau - bias_force + l - S qd + J* (f0 - G J qd),
+
+where S, l are the hinges' laws (:mod:`.secants`) and G, f0 the contacts' (:mod:`.points`). The first pass closes every
+point that may touch; later passes open those that pull, and close those that the pass before carried below ground; the
+last of three or more opens none. :mod:`warp_spo.reference_contact` is the specification.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from ...status import Status
+from ...trace.emission import Store
+from ...trace.scalars import Value, is_constant, less, reciprocal, select, sqrt
+from ...trace.spatial import ZERO, Vector, dot, total
+from ..articulated_sweeps import expand, reduce
+from ..impedance import Law, add_laws
+from ..integration import integrate_link
+from ..kinematics import zero
+from ..links import Link
+from ..newton_euler import inverse_dynamics
+from ..step import GAIN, Step
+from .points import Point, place_points
+from .secants import Kept, Secant, largest
+
+if TYPE_CHECKING:
+    from ..tracing import Trace
+
+PASSES = 3  # what a step with contacts takes if the caller does not say
+TOLERANCE = 0.1  # share of the weight, or of an effort limit, by which the last pass may exceed its laws without a word
+REPORTS = ("contact_f", "contact_gap", "contact_slip", "contact_excess")
+
+
+class Touch(NamedTuple):
+    """Variables of a contact point between passes: friction's damper; 1 where it is closed, where it is a candidate."""
+
+    across: Value
+    closed: Value
+    candidate: Value
+
+
+class ContactStep(Step):
+    """One time step with contacts as a trace.
+
+    Args:
+        trace: the evaluation. reports: names among REPORTS of what the step stores beside the state.
+    """
+
+    def __init__(self, trace: Trace, reports: tuple[str, ...]):
+        super().__init__(trace)
+        self.reports, self.kept = reports, Kept(trace.graph)
+        self.secants: dict[int, list[Secant]] = {}  # by dof
+        self.excess: list[Value] = []  # of cone, adhesion and effort
+        self.finished: dict[str, list[Store]] = {name: [] for name in reports}
+
+    def stores(self, qdd: bool, status: bool) -> list[Store]:
+        """Return the stores of a pass, then those after the last one; ``trace.begin`` are those before the first."""
+        trace, kept = self.trace, self.kept
+        bias = {item.index[0]: item.value for item in inverse_dynamics(trace, qdd=zero)}
+        points = place_points(trace, self.impedance, self.qd)
+        trace.ahead = [*bias.values(), *(value for point in points for value in point.state)]
+        touches = [self._begin(point) for point in points]
+        for point, touch in zip(points, touches, strict=True):
+            if point.link is not None:
+                self._press(point, touch)
+        trace.stiffened = self._stiffened
+        tau = trace.vector("tau")
+        done, rates, _ = reduce(trace, lambda dof: tau(dof) + self.forces[dof] - bias[dof], moves=False, loads=False)
+        alpha: dict[int, tuple[Vector, Vector]] = {}
+        found = expand(trace, done, rates, (ZERO, ZERO), alpha=alpha)
+        gains = {item.index[0]: self.h * item.value for item in found}
+        passed = [Store(GAIN, (dof,), gain) for dof, gain in gains.items()]
+        efforts = []
+        for link in self.links:
+            trace.label(link, "u")
+            efforts += [law.finish(gains[dof]) for dof in link.dofs for law in self.secants[dof]]
+        cones, pulls = [], []
+        for number, (point, touch) in enumerate(zip(points, touches, strict=True)):
+            trace.graph.step = f"contact {number}|f"
+            cone, pull = self._finish(number, point, touch, alpha)
+            cones.append(cone)
+            pulls.append(pull)
+        if status or "contact_excess" in self.reports:
+            self._keep_excess(cones, pulls, efforts, status)
+        trace.begin = kept.begin
+        return passed + kept.end + self._after(qdd, status)
+
+    # -- hinges ----------------------------------------------------------------------------------------------------
+    def _pieces(self, link: Link) -> list[Law]:
+        """Return the laws of each dof in this pass, added up."""
+        found = []
+        for dof, laws in zip(link.dofs, self.impedance.laws(link), strict=True):
+            if dof not in self.secants:
+                step_weight = self.h * reciprocal(self.impedance.inertia(dof))
+                u = self._kept_as(GAIN, dof)
+                bent = [law for law in laws if law.bends]
+                self.secants[dof] = [Secant(self.kept, law, self.qd(dof), u, step_weight) for law in bent]
+            pieces = [secant.piece() for secant in self.secants[dof]]
+            found.append(add_laws([law for law in laws if not law.bends] + pieces))
+        self.forces |= {dof: piece.force for dof, piece in zip(link.dofs, found, strict=True)}
+        return found
+
+    # -- contacts --------------------------------------------------------------------------------------------------
+    def _begin(self, point: Point) -> Touch:
+        """Return the variables of a point, which begin as a candidate's if the step may reach the ground."""
+        kept, h = self.kept, self.h
+        normal = dot(point.normal, point.velocity)
+        squares = total(x * x for x in self.trace.links.gravity)
+        reach = (0.5 * sqrt(squares)) * (h * h)
+        falls = select(less(normal, 0.0), -(h * normal), 0.0)
+        candidate = less(0.0, point.depth + falls + reach)
+        push = point.k * point.depth - (point.k * h + point.d) * normal
+        fn = candidate * select(less(0.0, push), push, 0.0)
+        across = self._secant(point, fn, self._slip(point, point.velocity, normal))
+        return Touch(kept.variable(across), kept.variable(candidate), kept.variable(candidate))
+
+    @staticmethod
+    def _slip(point: Point, x: Vector, normal: Value) -> Value:
+        """Return the size of a vector's part across the normal."""
+        rest = x - point.normal * normal
+        return sqrt(dot(rest, rest))
+
+    @staticmethod
+    def _secant(point: Point, fn: Value, w: Value) -> Value:
+        """Return the damper that gives friction's bound at the speed ``w``."""
+        return point.mu * fn * reciprocal(sqrt(w * w + point.eps * point.eps))
+
+    def _press(self, point: Point, touch: Touch) -> None:
+        """Add the damper and the load of a point to its link."""
+        assert point.link is not None
+        trace, key = self.trace, id(point.link)
+        trace.label(point.link, "c")
+        along = touch.closed * (point.k * self.h + point.d)
+        damper, push = point.inertia(self.h * touch.across, self.h * along), point.wrench(self._load(point, touch))
+        trace.dampers[key] = trace.dampers[key] + damper if key in trace.dampers else damper
+        trace.pushes[key] = trace.pushes[key] + push if key in trace.pushes else push
+
+    def _load(self, point: Point, touch: Touch) -> Vector:
+        """Return f0 - G v before the step."""
+        return self._force(point, touch, point.velocity)
+
+    def _force(self, point: Point, touch: Touch, v: Vector) -> Vector:
+        """Return f0 - G v."""
+        normal = dot(point.normal, v)
+        push = touch.closed * (point.k * point.depth - (point.k * self.h + point.d) * normal)
+        return point.normal * (push + touch.across * normal) - v * touch.across
+
+    def _finish(self, number: int, point: Point, touch: Touch, alpha: dict) -> tuple[Value, Value]:
+        """Keep what the next pass reads of a point; return by how much its force leaves the cone, and pulls."""
+        kept, h = self.kept, self.h
+        change = ZERO if point.link is None else point.moved(*alpha[id(point.link)])
+        v = point.velocity + change * h
+        normal = dot(point.normal, v)
+        force = self._force(point, touch, v) if point.link is not None else ZERO
+        pushed, across = dot(point.normal, force), 0.0
+        slip = self._slip(point, v, normal)
+        across = touch.across * slip
+        fn = select(less(0.0, pushed), pushed, 0.0)
+        cone = across - point.mu * fn
+        over = select(less(0.0, cone), cone, 0.0)
+        kept.keep(touch.across, self._secant(point, fn, slip + (h * point.weight) * over))
+        reached = less(0.0, point.depth - h * normal)
+        candidate = select(touch.candidate, touch.candidate, reached)
+        pushes = less(0.0, point.k * point.depth - (point.k * h + point.d) * normal)
+        kept.keep(touch.candidate, candidate)
+        stays = kept.closing * touch.closed
+        kept.keep(touch.closed, select(stays, 1.0, candidate * pushes))
+        self._report(number, point, force, slip)
+        return over, select(less(pushed, 0.0), -pushed, 0.0)
+
+    # -- results ---------------------------------------------------------------------------------------------------
+    def _report(self, number: int, point: Point, force: Vector, slip: Value) -> None:
+        """Keep what the caller asks for of a point."""
+        if "contact_f" in self.reports:
+            held = Vector(self._last(x) for x in force)
+            world, over = held, point.link
+            while over is not None:
+                world, over = self.trace.places[id(over)].pose.to_parent(world), over.parent
+            self.finished["contact_f"] += [Store("contact_f", (number, c), x) for c, x in enumerate(world)]
+        if "contact_gap" in self.reports:
+            self.finished["contact_gap"].append(Store("contact_gap", (number,), -point.depth))
+        if "contact_slip" in self.reports:
+            self.finished["contact_slip"].append(Store("contact_slip", (number,), self._last(slip)))
+
+    def _last(self, value: Value) -> Value:
+        """Return the variable that has, after the last pass, what ``value`` is in it."""
+        if is_constant(value):
+            return value
+        variable = self.kept.variable(0.0)
+        self.kept.keep(variable, value)
+        return variable
+
+    def _keep_excess(self, cones: list[Value], pulls: list[Value], efforts: list[Value], status: bool) -> None:
+        self.trace.graph.step = "excess|e"
+        self.excess = [self._last(largest(values)) for values in (cones, pulls, efforts)]
+        if "contact_excess" in self.reports:
+            stores = [Store("contact_excess", (i,), value) for i, value in enumerate(self.excess)]
+            self.finished["contact_excess"] = stores
+
+    def _after(self, qdd: bool, status: bool) -> list[Store]:
+        """Return the stores after the last pass."""
+        trace = self.trace
+        gains = {dof: self._kept_as(GAIN, dof) for link in self.links for dof in link.dofs}
+        rates = {dof: self.qd(dof) + gain for dof, gain in gains.items()}
+        stores: list[Store] = []
+        for link in self.links:
+            trace.label(link, "q")
+            stores += [Store("out", (dof,), rates[dof]) for dof in link.dofs]
+            coordinates = integrate_link(link, self.q, rates.__getitem__, self.h)
+            stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
+            if qdd:
+                stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
+        results = [item.value for item in stores]
+        if status:
+            trace.graph.step = "status|s"
+            stores.append(Store("status", (), self._word(results, False)))
+        return stores + [item for name in self.reports for item in self.finished[name]]
+
+    def _word(self, results: list[Value], looped: bool) -> Value:
+        """Return the most severe status of the world."""
+        word = super()._word(results, looped)
+        scene = self.trace.links.scene
+        weight = float(scene.values["body_mass"].sum(axis=1).max()) * 9.81
+        cone, pull, effort = self.excess
+        bounds = scene.values["joint_effort_limit"]
+        most = float(bounds[bounds > 0.0].min()) if (bounds > 0.0).any() else 1.0
+        excess = less(TOLERANCE * weight, cone) + less(TOLERANCE * weight, pull) + less(TOLERANCE * most, effort)
+        return select(word, word, select(excess, Status.CONTACT, 0.0))
+
+    def _inputs(self) -> list[Value]:
+        """Return all inputs, with those values of contacts that are no constants."""
+        points = range(len(self.trace.links.scene.contact_points))
+        names = ("contact_friction", "contact_stiffness", "contact_damping")
+        values = [self.impedance.value(name, point) for name in names for point in points]
+        return super()._inputs() + [value for value in values if not is_constant(value)]
+
+
+def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> list[Store]:
+    """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world; and the ``reports``"""
+    return ContactStep(trace, reports).stores(qdd, status)
