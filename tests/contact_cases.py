@@ -117,3 +117,26 @@ def pressed(case):
     M, laws, limits, points, v, h = case
     limits, points = (part._replace(depth=np.abs(part.depth)) for part in (limits, points))
     return M, laws, limits, points, v, h
+
+
+def touching(scene, seed, worlds, h=5e-3):
+    """Return q, qd, tau [world, ...] with the lowest points just above or in the ground."""
+    rng, n = np.random.default_rng(seed), scene.dof_count
+    q = np.tile(scene.neutral_q, (worlds, 1))
+    turns = np.concatenate([0.3 * rng.normal(size=(worlds, 3)), np.ones((worlds, 1))], axis=1)
+    q[:, 3:7] = turns / np.linalg.norm(turns, axis=1)[:, None]
+    q[:, 7:] = (STAND + 0.4 * rng.normal(size=(worlds, 12))) if n > 6 else 0.0
+    for world in range(worlds):
+        q[world, 2] += ContactStep(scene, q[world], np.zeros(n), h).points.depth.max() - rng.uniform(-2e-3, 8e-3)
+    return tuple(np.float64(np.float32(x)) for x in (q, rng.normal(size=(worlds, n)), rng.normal(size=(worlds, n))))
+
+
+def everywhere(scene, seed):
+    """The scene with points, a sphere and a capsule on random bodies, above a plane of any normal."""
+    rng = np.random.default_rng(seed)
+    shapes = [dict(point=0.2 * rng.normal(size=3)) for _ in range(3)]
+    shapes += [dict(sphere=(0.2 * rng.normal(size=3), 0.1), friction=0.3)]
+    shapes += [dict(capsule=(0.2 * rng.normal(size=3), 0.2 * rng.normal(size=3), 0.1), stiffness=1e5)]
+    contacts = [spo.Contact(int(rng.integers(scene.body_count)), **shape) for shape in shapes]
+    normal = rng.normal(size=3)
+    return scene.with_contacts(contacts, spo.Plane(0.1, normal / np.linalg.norm(normal)))

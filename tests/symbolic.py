@@ -28,10 +28,12 @@ from warp_spo.recursions import (
     regressor,
     step,
 )
+from warp_spo.recursions.contact import step as contact
+from warp_spo.recursions.contact.secants import SECANT
 from warp_spo.recursions.derivatives import adjoints, inverse_dynamics
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.loops import closed_step, embedded, embedded_adjoints, minimal, multipliers, projection
-from warp_spo.recursions.step import LOOPED, MISSED
+from warp_spo.recursions.step import GAIN, LOOPED, MISSED
 from warp_spo.recursions.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
 from warp_spo.trace.scalars import ordered as ordered
@@ -106,6 +108,31 @@ def advance(scene, arrays, h, dtype="float64", most=16, **options):
     known["out"] = np.zeros((worlds, scene.dof_count))
     done = stored([item for item in stores if item.array not in LOOPED])
     return done["q_out"], done["out"], passes
+
+
+def contact_step(scene, arrays, h, passes=3, dtype="float64"):
+    """One step with contacts: results by name, [world, ...]; arrays: q, qd and what else it gets, [world, ...]."""
+    trace, worlds = Trace(Links(scene), dtype, (*arrays, "dt", "passes")), len(arrays["q"])
+    stores = contact.step(trace, True, True, contact.REPORTS)
+    known = arrays | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
+    known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(trace.begin)))}
+
+    def stored(some, found):
+        values = evaluate([item.value for item in some], lambda name, at: known[name][(slice(None), *at)], dtype)
+        for item, value in zip(some, values, strict=True):
+            found[item.array][(slice(None), *item.index)] = value
+        return found
+
+    known |= stored(trace.begin, {SECANT: known[SECANT]})
+    looped = [item for item in stores if item.array in (GAIN, SECANT)]
+    for number in range(passes):
+        known["pass"] = np.full((worlds, 1), float(number))
+        known |= stored(looped, {name: known[name].copy() for name in (GAIN, SECANT)})
+    points, n = len(scene.contact_points), scene.dof_count
+    shapes = {"out": (n,), "q_out": (scene.coord_count,), "qdd_out": (n,), "status": (), "contact_f": (points, 3),
+              "contact_gap": (points,), "contact_slip": (points,), "contact_excess": (3,)}  # fmt: skip
+    last = [item for item in stores if item.array not in (GAIN, SECANT)]
+    return stored(last, {name: np.full((worlds, *shape), np.nan) for name, shape in shapes.items()})
 
 
 def plant(monkeypatch, owner, name, old, new):

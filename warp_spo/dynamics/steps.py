@@ -67,7 +67,7 @@ def _pull_step(
 def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
     """Return what a call of a step asks for that has no gradient, and what is expected; "" if nothing."""
     if dyn.scene.contacts:
-        return "the scene has contacts; expected a scene without, whose steps have gradients"
+        return "the scene has contacts; expected a scene without contacts, whose steps have gradients"
     if arguments.get("integrator", "semi_implicit") != "semi_implicit":
         return f"integrator is {arguments['integrator']!r}; expected integrator='semi_implicit', which has gradients"
     if arguments.get("qdd") is not None:

@@ -1,0 +1,199 @@
+"""Steps with contacts against the dense step, in every world; what they report; and calls that have no kernel."""
+
+import functools
+
+import numpy as np
+import pytest
+import symbolic
+import zoo
+from contact_cases import box, everywhere, quadruped, touching
+from step_scenes import furnished, states
+
+import warp_spo as spo
+from warp_spo.recursions.contact import points, secants, step
+from warp_spo.reference_contact import ContactStep
+
+H, WORLDS = 5e-3, 4
+TOLERANCE = {"float64": (1e-10, 1e-10), "float32": (1e-4, 5e-4)}
+"""Of velocities, over the largest one, and of forces, over the weight; 2e-5 and 5e-5 measured on G1 in float32."""
+SIZES = {"contact_f": (3,), "contact_gap": (), "contact_slip": ()}
+
+
+def trees():
+    yield "fork", everywhere(furnished(zoo.fork()), 0)
+    yield "tree", everywhere(furnished(zoo.random_tree(8, 1)), 1)
+
+
+TREES = dict(trees())
+
+
+def assert_is_dense(scene, a, passes):
+    """The recursion, evaluated without compiling, is the dense step in every world."""
+    found = symbolic.contact_step(scene, a, H, passes)
+    for w in range(len(a["q"])):
+        given = {name: a[name][w] for name in a}
+        at = ContactStep(scene, given["q"], given["qd"], H, given.get("target_q"), given.get("target_qd"))
+        q, wanted = at.run(given.get("tau"), given.get("body_f"), passes)
+        np.testing.assert_allclose(found["out"][w], wanted.v, atol=1e-10 * np.abs(wanted.v).max())
+        np.testing.assert_allclose(found["q_out"][w], q, atol=1e-10)
+        np.testing.assert_allclose(found["contact_f"][w], wanted.f, atol=1e-10 * max(1.0, np.abs(wanted.f).max()))
+        np.testing.assert_allclose(found["contact_gap"][w], -at.points.depth, atol=1e-12)
+        np.testing.assert_allclose(found["contact_excess"][w], wanted.excess, atol=1e-9 * np.abs(wanted.f).max() + 1e-9)
+
+
+@pytest.mark.parametrize(("name", "passes"), [("fork", 1), ("fork", 4), ("tree", 2), ("tree", 3)])
+def test_the_recursion_is_the_dense_step(name, passes):
+    """Random trees of every hinge, with every law, contacts anywhere."""
+    scene = TREES[name]
+    assert_is_dense(scene, states(scene, WORLDS), passes)
+
+
+TELLING = (148, 173, 186, 193, 253, 329, 502, 579)
+"""Seeds of throws in which points open and close between passes: found as those whose step a planted bug changes."""
+
+
+def test_a_cube_that_is_thrown():
+    scene, a = box(friction=0.3, stiffness=1e6, damping=300.0), {"q": [], "qd": []}
+    for seed in TELLING:
+        rng = np.random.default_rng(seed)
+        turn = np.append(0.1 * rng.normal(size=3), 1.0)
+        q = np.concatenate([np.zeros(3), turn / np.linalg.norm(turn)])
+        depth = ContactStep(scene, q, np.zeros(6), H).points.depth.max()
+        q[2] = depth - np.random.default_rng([seed]).uniform(-1e-3, 4e-3)
+        a["q"].append(q)
+        a["qd"].append(rng.normal(size=6) * np.repeat([1.0, 6.0], 3))
+    assert_is_dense(scene, {name: np.array(rows) for name, rows in a.items()}, 3)
+
+
+BUGS = {
+    "active set": (secants.Secant, "finish", "quotient(bound, share), 1.0", "0.0, 1.0"),
+    "candidates frozen": (step.ContactStep, "_finish", "select(touch.candidate, touch.candidate, reached)",
+                          "touch.candidate"),
+    "dampers above ground": (step.ContactStep, "_finish", "candidate * pushes", "pushes"),
+    "last pass opens": (step.ContactStep, "_finish", "kept.closing * touch.closed", "0.0"),
+    "wrong lever": (points.Point, "inertia", "across * turn[i][j] + more", "more"),
+    "tangent friction": (step.ContactStep, "_secant", "reciprocal(sqrt(w * w + point.eps * point.eps))",
+                         "reciprocal(w * w + point.eps * point.eps) * point.eps"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("bug", BUGS)
+def test_a_planted_bug_is_seen(monkeypatch, bug):
+    owner, name, old, new = BUGS[bug]
+    symbolic.plant(monkeypatch, owner, name, old, new)
+    with pytest.raises(AssertionError):
+        test_a_cube_that_is_thrown()
+        test_the_recursion_is_the_dense_step("fork", 4)
+
+
+@functools.cache
+def dynamics(device, dtype):
+    return spo.Dynamics(quadruped(), WORLDS, device=device, dtype=dtype, variable=("contact_friction",))
+
+
+def stepped(dyn, state, passes=None, **more):
+    """One step with all reports, which begin as NaN."""
+    count, dtype = len(dyn.scene.contact_points), dyn.dtype.__name__
+    found = {name: np.full((WORLDS, count, *size), np.nan, dtype) for name, size in SIZES.items()}
+    found |= {"contact_excess": np.full((WORLDS, 3), np.nan, dtype), "status": np.full(WORLDS, -1, np.int32)}
+    q, qd, tau = (x.astype(dtype) for x in state)
+    found["q"], found["qd"] = dyn.step(q, qd, tau, H, passes=passes, **found, **more)
+    return found
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_quadruped_that_lands(device, dtype):
+    """All that a step reports, with another friction in each world."""
+    dyn, state = dynamics(str(device), dtype), touching(quadruped(), 3, WORLDS)
+    friction = np.linspace(0.1, 0.9, WORLDS)[:, None] * np.ones((1, 12))
+    dyn.set(contact_friction=friction.astype(dtype))
+    scene = dyn.scene.with_values(contact_friction=friction)
+    weight, (velocity, force) = 9.81 * scene.values["body_mass"].sum(), TOLERANCE[dtype]
+    for passes in (None, 1):
+        found = stepped(dyn, state, passes)
+        for w in range(WORLDS):
+            at = ContactStep(scene, state[0][w], state[1][w], H, world=w)
+            q, wanted = at.run(state[2][w], passes=passes or 3)
+            np.testing.assert_allclose(found["qd"][w], wanted.v, atol=velocity * np.abs(wanted.v).max())
+            np.testing.assert_allclose(found["q"][w], q, atol=velocity)
+            np.testing.assert_allclose(found["contact_f"][w], wanted.f, atol=force * weight)
+            np.testing.assert_allclose(found["contact_gap"][w], -at.points.depth, atol=1e-6)
+            np.testing.assert_allclose(found["contact_excess"][w], wanted.excess, atol=force * weight)
+            v = np.einsum("pai,i->pa", at.points.J, wanted.v)
+            slip = np.linalg.norm(v[:, :2], axis=1)
+            np.testing.assert_allclose(found["contact_slip"][w], slip, atol=velocity * np.abs(wanted.v).max())
+            over = (wanted.excess > 0.1 * np.array([weight, weight, 33.0])).any()
+            assert found["status"][w] == (spo.Status.CONTACT if over else spo.Status.OK)
+    assert (found["status"] == spo.Status.CONTACT).any()  # of one pass
+
+
+def test_nan_stays_in_its_world(device):
+    dyn, state = dynamics(str(device), "float32"), touching(quadruped(), 3, WORLDS)
+    friction = np.full((WORLDS, 12), 0.5, np.float32)
+    dyn.set(contact_friction=friction)
+    clean = stepped(dyn, state)
+    friction[1, 3], q = np.nan, state[0].copy()
+    q[2, 9] = np.nan
+    dyn.set(contact_friction=friction)
+    found = stepped(dyn, (q, *state[1:]))
+    assert found["status"].tolist()[1:3] == [spo.Status.NOT_FINITE] * 2 and np.isnan(found["qd"][1:3]).any(axis=1).all()
+    for name in ("q", "qd", "contact_f", "status"):
+        np.testing.assert_array_equal(found[name][[0, 3]], clean[name][[0, 3]])
+
+
+def test_substeps_report_the_mean_force(device):
+    """To the bit the state that as many calls compute; gap, slip and excess of the last."""
+    dyn, (q, qd, tau) = dynamics(str(device), "float32"), touching(quadruped(), 3, WORLDS)
+    dyn.set(contact_friction=np.full((WORLDS, 12), 0.8, np.float32))
+    found, forces, state = stepped(dyn, (q, qd, tau), substeps=3), [], (q, qd, tau)
+    for _ in range(3):
+        one = stepped(dyn, state)
+        forces.append(one["contact_f"])
+        state = one["q"], one["qd"], tau
+    for name in ("q", "qd", "contact_gap", "contact_slip", "contact_excess"):
+        np.testing.assert_array_equal(found[name], one[name])
+    np.testing.assert_allclose(found["contact_f"], np.mean(forces, axis=0), rtol=1e-5, atol=1e-4)
+
+
+def test_impulse_is_the_change_of_momentum(device):
+    """Of a quadruped that falls on its feet and trunk: sum of forces and weight, times dt."""
+    dyn, (q, qd, tau) = dynamics(str(device), "float64"), touching(quadruped(), 5, WORLDS)
+    dyn.set(contact_friction=np.full((WORLDS, 12), 0.8))
+    found = stepped(dyn, (q, qd, np.zeros_like(tau)))
+    matrices = dyn.centroidal_momentum_matrix(q)[:, :3]  # at the pose at which the step solves
+    bias = np.array(
+        [ContactStep(dyn.scene, q[w], qd[w], H).dense.centroidal_momentum_bias()[:3] for w in range(WORLDS)]
+    )
+    change = np.einsum("wij,wj->wi", matrices, found["qd"] - qd) / H + bias
+    weight = np.array([0.0, 0.0, -9.81 * dyn.scene.values["body_mass"].sum()])
+    np.testing.assert_allclose(change, found["contact_f"].sum(axis=1) + weight, atol=1e-8)
+
+
+REFUSALS = {
+    "integrator": (dict(integrator="rk4"), spo.UnsupportedError, "integrator='rk4' with contacts"),
+    "passes": (dict(passes=0), ValueError, "passes is 0; expected an integer, 1 or more"),
+    "shape": (dict(contact_f=np.zeros((WORLDS, 3, 3), np.float32)), ValueError, "contact_f"),
+}
+
+
+@pytest.mark.parametrize("mistake", REFUSALS)
+def test_calls_without_a_kernel_have_names(device, mistake):
+    more, kind, message = REFUSALS[mistake]
+    q, qd = np.tile(quadruped().neutral_q, (WORLDS, 1)).astype(np.float32), np.zeros((WORLDS, 18), np.float32)
+    with pytest.raises(kind, match=message):
+        dynamics(str(device), "float32").step(q, qd, None, H, **more)
+
+
+def test_scenes_without_a_kernel_have_names(device):
+    q, qd = np.array([[0, 0, 1, 0, 0, 0, 1]], np.float32), np.zeros((1, 6), np.float32)
+    with pytest.raises(spo.UnsupportedError, match="granularity='node' with contacts"):
+        spo.Dynamics(box(), device=device, granularity="node").step(q, qd, None, H)
+    with pytest.raises(spo.UnsupportedError, match="a HeightField"):
+        spo.Dynamics(box(ground=spo.HeightField(np.zeros((2, 2)), 1.0)), device=device).step(q, qd, None, H)
+    bare = spo.Dynamics(box().with_contacts([]), device=device)
+    for name, value in (("passes", 3), ("contact_gap", np.zeros((1, 0), np.float32))):
+        with pytest.raises(ValueError, match=f"{name} is given, and the scene has no contacts"):
+            bare.step(q, qd, None, H, **{name: value})
+    torch = pytest.importorskip("torch")
+    with pytest.raises(ValueError, match="the scene has contacts and an input requires grad"):
+        spo.Dynamics(box(), device="cpu").step(torch.tensor(q, requires_grad=True), torch.tensor(qd), None, H)
