@@ -26,8 +26,8 @@ def prepare(self: Dynamics, operation: str, **options: Any) -> None:
         operation: name of a method, such as "forward_dynamics".
         options: ``frames=`` for operations that take frames, ``columns=`` for solve_mass_matrix, ``prescribed=`` for
             hybrid_dynamics, ``integrator=`` for step, ``hold=`` for project, ``seeds=`` for inverse_kinematics, and
-            ``body_f=True``, ``status=True``, ``qdd=True``, ``target_q=True``, ``target_qd=True``, ``ctrl=True``, and
-            ``q=True`` for inverse_kinematics, if they will be passed.
+            ``body_f=True``, ``status=True``, ``qdd=True``, ``target_q=True``, ``target_qd=True``, ``ctrl=True``,
+            ``contact_f=True`` and the like, and ``q=True`` for inverse_kinematics, if they will be passed.
 
     Raises:
         ValueError: no such operation or option.
