@@ -15,7 +15,7 @@ from warp_spo.__main__ import find_device
 from warp_spo.trials import drawing
 
 from . import cases as data
-from . import everything, evidence, parts, pictures, report, roofline, runner, table
+from . import commits, everything, evidence, history, parts, pictures, report, roofline, runner, table
 from .cases import case_name
 from .precisions import PRECISIONS
 
@@ -57,8 +57,25 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--table", type=Path, metavar="JSON", help="print the Markdown table of a run, and run nothing")
     p.add_argument(
-        "--compare", type=Path, nargs=2, metavar=("A", "B"), help="print the differences of two runs; run nothing"
+        "--compare", nargs=2, metavar=("A", "B"), help="print the differences of two runs, JSON files; or measure two "
+        "commits in turns, in the cases that FILTER matches"
+    )  # fmt: skip
+    p.add_argument(
+        "--rounds", type=int, default=commits.ROUNDS, metavar="N", help="processes of each commit to compare"
     )
+    p.add_argument(
+        "--history",
+        nargs="?",
+        type=Path,
+        const=history.FOLDER,
+        metavar="DIR",
+        help="measure this commit, keep its run times in a folder (default: benchmarks/results/history), and draw the "
+        "page of charts",
+    )
+    p.add_argument(
+        "--commits", nargs="*", metavar="C", help="commits for --history to measure; none: only draw the page"
+    )
+    p.add_argument("--past", action="store_true", help="for --history: take the committed results of earlier commits")
     p.add_argument(
         "--readme",
         nargs="?",
@@ -84,7 +101,11 @@ def main(argv: list[str] | None = None) -> int:
             print(*one.sources, table.markdown(one), sep="\n\n", end="")
             return 0
         if options.compare:
-            return compare(*options.compare)
+            if any(name.endswith(".json") for name in options.compare):
+                return compare(*map(Path, options.compare))
+            return compare_commits(options)
+        if options.history:
+            return keep_history(options, drawing.load_pyplot("--history"))
         for option, out in (("--json", options.json), ("--report", options.report and options.report / report.FILE)):
             if out:
                 runner.check_place(option, out)
@@ -174,6 +195,38 @@ def compare(a: Path, b: Path) -> int:
     beyond = sum(difference > ALLOWED for difference, _, _ in found)
     print(f"{len(found)} cases of 20 us or more; {beyond} differ by more than {ALLOWED:.0%}")
     return 1 if beyond else 0
+
+
+def _cases_of_commits(options: Any, device: wp.Device) -> list[dict]:
+    """Return the cases for commits that the options select."""
+    return commits.cases(options.filter, options.worlds or (commits.WORLDS if device.is_cuda else commits.CPU_WORLDS))
+
+
+def compare_commits(options: Any) -> int:
+    """Measure two commits in turns and print a verdict on each case; return 1 if one is slower, else 0."""
+    if options.rounds < 2:
+        raise ValueError(f"benchmarks: --rounds is {options.rounds}; expected 2 or more")
+    device = find_device(options.device)
+    chosen = _cases_of_commits(options, device)
+    verdicts, noise = commits.compare(*options.compare, chosen, device.alias, options.rounds)
+    print(*verdicts, sep="\n")
+    words = [verdict.word for verdict in verdicts]
+    counts = ", ".join(f"{words.count(word)} {word}" for word in ("slower", "faster", "same", "skipped"))
+    print(f"{counts}; {noise}")
+    return 1 if "slower" in words else 0
+
+
+def keep_history(options: Any, pyplot: Any) -> int:
+    """Measure commits, keep their run times and draw the page; return 0."""
+    runner.check_place("--history", options.history)
+    device = find_device(options.device)
+    if options.past:
+        print(f"wrote {len(history.harvest(options.history))} files", file=sys.stderr)
+    for commit in [None] if options.commits is None and not options.past else options.commits or []:
+        file = history.measure(commit, _cases_of_commits(options, device), device, options.history)
+        print(f"wrote {file}", file=sys.stderr)
+    print(f"wrote {history.write_page(pyplot, options.history)}", file=sys.stderr)
+    return 0
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ def written(svg):
     return set(re.findall(r"<!-- (.*?) -->", svg))
 
 
-@pytest.mark.parametrize("file", sorted(RESULTS.glob("*.svg")), ids=lambda file: file.name)
+@pytest.mark.parametrize("file", sorted(RESULTS.rglob("*.svg")), ids=lambda file: file.name)
 def test_committed_pictures_are_whole(file):
     assert_is_whole(file.read_text())
 
