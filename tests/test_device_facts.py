@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 import zoo
 
@@ -9,7 +10,7 @@ import warp_spo as spo
 from warp_spo.dynamics.inertia import SOLVE_MASS_MATRIX
 from warp_spo.execution import device_facts, plan
 from warp_spo.execution.device_facts import CPU, MEASURED, DeviceFacts
-from warp_spo.kernels import native
+from warp_spo.kernels import native, straight
 
 L4 = DeviceFacts("NVIDIA L4", multiprocessors=58, shared_bytes=100 * 1024)
 
@@ -41,7 +42,7 @@ def test_registers_are_capped_only_where_shared_memory_holds_the_blocks(kilobyte
     """A solve by limbs wants four blocks on a multiprocessor; without shared memory for them a cap would only spill."""
     facts, caps, worlds = dataclasses.replace(MEASURED, shared_bytes=kilobytes * 1024), {}, 1 << 16
 
-    def note(name, text, arrays, T, registers=None, wide=()):
+    def note(name, text, arrays, T, registers=None, **more):
         caps[name] = registers
 
     monkeypatch.setattr("warp_spo.dynamics.dynamics.read_facts", lambda device: facts)
@@ -50,3 +51,27 @@ def test_registers_are_capped_only_where_shared_memory_holds_the_blocks(kilobyte
     shape = (worlds, dyn.scene.dof_count)
     dyn.programs.find(SOLVE_MASS_MATRIX.routine, {"q": (worlds, dyn.scene.coord_count), "b": shape}, shape)
     assert (caps["solve_mass_matrix"] is not None) == capped
+
+
+@pytest.mark.parametrize("kilobytes, room", [(228, 92), (80, 77), (48, 46)])
+def test_float64_has_room_for_as_many_scalars_as_float32(kilobytes, room, monkeypatch):
+    """Where the GPU has the memory; a block asks for what it may not declare."""
+    facts = dataclasses.replace(MEASURED, shared_bytes=kilobytes * 1024)
+    monkeypatch.setattr("warp_spo.dynamics.dynamics.read_facts", lambda device: facts)
+    rooms = {dtype: spo.Dynamics(zoo.star(2), 2, "cpu", dtype=dtype).programs.room for dtype in ("float32", "float64")}
+    assert rooms == {"float32": 46 * 1024, "float64": room * 1024}
+
+
+@pytest.mark.parametrize("bodies, asked", [(8, False), (40, True)])
+def test_rows_that_a_block_may_not_declare_are_asked_for(bodies, asked, monkeypatch):
+    kernels, make = [], native.kernel
+    monkeypatch.setattr("warp_spo.dynamics.dynamics.read_facts", lambda device: MEASURED)
+    monkeypatch.setattr(
+        native, "kernel", lambda *given, **more: kernels.append((more, given[1])) or make(*given, **more)
+    )
+    dyn = spo.Dynamics(zoo.planar_chain(bodies), 2, "cpu", dtype="float64", granularity="tree")
+    x = np.zeros((2, 6 * bodies))
+    dyn.operators(np.zeros((2, bodies))).phi.apply(x)
+    [(more, text)] = kernels
+    assert bool(more["shared"]) == asked == ("extern __shared__" in text)
+    assert not asked or straight.SHARED_BYTES < more["shared"] <= 2 * straight.SHARED_BYTES

@@ -42,7 +42,11 @@ def test_in_place_and_without_allocation(device):
 def test_a_step_in_place_reads_its_state_once(device, monkeypatch):
     """No second try for far angles after the state has been written over: they are looked at first."""
     texts, kernel = [], native.kernel
-    monkeypatch.setattr(native, "kernel", lambda name, text, *more: texts.append(text) or kernel(name, text, *more))
+    monkeypatch.setattr(
+        native,
+        "kernel",
+        lambda name, text, *more, **options: texts.append(text) or kernel(name, text, *more, **options),
+    )
     scene = zoo.chain(3)
     scene = scene.with_values(joint_stiffness=np.zeros(3))
     dyn = spo.Dynamics(scene, 2, device=device, dtype="float64")

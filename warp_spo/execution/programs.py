@@ -309,7 +309,7 @@ class Programs:
     def room(self) -> int:
         """Bytes of shared memory that a block may have: for as many scalars in float64 as in float32 if the GPU can."""
         wanted = straight.SHARED_BYTES * wp.types.type_size_in_bytes(self.run.dtype) // 4
-        allowed = self.plan.device.shared_bytes - 2 * RESERVED
+        allowed = self.plan.device.shared_bytes - 3 * RESERVED  # Warp takes a share, too
         return min(wanted, max(allowed, straight.SHARED_BYTES)) if self.plan.device.cuda else wanted
 
     def _registers(self, warps: int) -> int:
