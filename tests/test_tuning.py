@@ -193,6 +193,26 @@ def test_a_choice_that_another_process_wrote_meanwhile_counts(device, times, mon
     assert choice.granularity == "tree" and not choice.measured
 
 
+def test_the_solver_tunes_what_its_integrator_calls(device, monkeypatch):
+    """A solver without ``tune`` measures nothing."""
+    pytest.importorskip("newton")
+    import newton
+    from solver_models import replicated
+
+    from warp_spo.newton import SolverSPO
+
+    asked = []
+    monkeypatch.setattr(SolverSPO, "_prepare", lambda self: None)
+    monkeypatch.setattr(spo.Dynamics, "tune", lambda self, operations: asked.append(operations))
+    builder = newton.ModelBuilder()
+    link = builder.add_link(mass=1.0)
+    builder.add_articulation([builder.add_joint_revolute(-1, link, axis=newton.Axis.Z)])
+    model = replicated(builder, 2)
+    for options in ({}, {"tune": True}, {"tune": True, "integrator": "rk4"}):
+        SolverSPO(model, **options)
+    assert asked == ["step", "forward_dynamics"]
+
+
 # -- what may be chosen ------------------------------------------------------------------------------------------------
 def test_only_what_the_plan_knows_is_a_candidate():
     routines = {name: spo.Dynamics._operations[name].routine for name in ("forward_dynamics", "step", "jacobian")}

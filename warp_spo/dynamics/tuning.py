@@ -72,7 +72,8 @@ def tune(self: Dynamics, operations: Sequence[str] | None = None) -> dict[str, T
             known = ", ".join(name for name, one in self._operations.items() if one.routine and not one.product)
             raise ValueError(f"Dynamics.tune: operations names {name!r}; expected some of {known}")
         try:
-            found[name] = _tune_one(self, operation)
+            with self.recursions.turn.lock:  # calls of other threads would be timed, too
+                found[name] = _tune_one(self, operation)
         except UnsupportedError:
             if operations is not None:
                 raise
