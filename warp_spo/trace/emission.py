@@ -151,7 +151,7 @@ class Emitter:
             else:
                 values.append(item.value)
                 due.setdefault(item.value.key, []).append(item)
-        needed = [scalar for scalar in ordered(values) if scalar.key not in self._names]
+        needed = self._find_needed(values)
         lines += self._reduce_angles(needed)
         needed = [scalar for scalar in needed if not self._is_late(scalar) or scalar.key in due]
         fused: set[tuple] = set()  # products without a statement of their own
@@ -171,6 +171,15 @@ class Emitter:
         for item in known:
             self._emit_store(item)
         return Listing("\n".join(lines), self._constants, self._indices, self._labels)
+
+    def _find_needed(self, values: list[Scalar]) -> list[Scalar]:
+        """Return the scalars without a name on which ``values`` depend, other than through scalars with a name."""
+        unknown = [scalar for scalar in ordered(values) if scalar.key not in self._names]
+        used = {value.key for value in values}
+        for scalar in sorted(unknown, key=lambda scalar: -scalar.number):
+            if scalar.key in used:
+                used.update(value.key for value in scalar.args if value.__class__ is Scalar)
+        return [scalar for scalar in unknown if scalar.key in used]
 
     def _reduce_angles(self, needed: list[Scalar]) -> list[str]:
         """Return statements that subtract full turns from coordinates beyond the reach of the branch-free sine.
