@@ -11,6 +11,7 @@ from benchmark_results import NODE, REFINED, ROOF
 
 import warp_spo as spo
 from benchmarks import (
+    breakdown,
     capabilities,
     cases,
     operation_counts,
@@ -190,6 +191,12 @@ def test_capabilities_are_compared_with_references(tmp_path, capsys, device, mon
         for op in ("forward_dynamics", "forward_dynamics_derivatives", "forward_dynamics_vjp", "mass_matrix_inverse")
     ]
     assert all(0.0 < row["error"] <= TOLERANCE["float32"] and row["us"] > 0.0 for row in rows)
+    breakdown.inputs_of.cache_clear()
+    breakdown.expected.cache_clear()
+    assert breakdown.main(["--robots", "arm", *where, "--json", str(file)]) == 0
+    (row,) = json.loads(file.read_text())["rows"]
+    assert row["error"] <= TOLERANCE["float32"]
+    assert all(any(name.startswith(part) for name in row["us"]) for part in ("call", "forward", "mass", "negative"))
     right = OPERATIONS["mass_matrix_inverse"]
     wrong = dataclasses.replace(right, reference=lambda dense, q: 1.1 * right.reference(dense, q))
     monkeypatch.setattr(capabilities, "OPERATIONS", {right.name: wrong})

@@ -8,14 +8,17 @@ import oracles
 import pytest
 import symbolic
 import warp as wp
+import warp_machine
 import zoo
 from allocations import no_warp_allocation
 from robots import ROBOTS
 from routines import ROUTINES
+from test_trace_pieces import TREES
 
 import warp_spo as spo
 from benchmarks import cases
 from warp_spo.execution.plan import MOST_DOFS
+from warp_spo.kernels import straight
 from warp_spo.recursions.derivatives import inverse_dynamics as dense
 from warp_spo.recursions.derivatives import sensitivity
 from warp_spo.reference import Dense
@@ -108,6 +111,23 @@ def test_mass_matrix_derivative_by_central_differences(name):
     here = Dense(scene, a["q"][0])
     wanted = difference(lambda q: Dense(scene, q).mass_matrix, here.integrate, np.eye(n))
     assert laws.error(got, wanted) <= DIFFERENCES
+
+
+@pytest.mark.parametrize("given", [("qd", "qdd", "body_f"), ("qdd",)])
+@pytest.mark.parametrize("name", ["fork", "comb", "forest"])
+def test_limbs_side_by_side(name, given, monkeypatch):
+    """The CUDA text, warp by warp in either order, gives what one thread gives for the whole tree."""
+    monkeypatch.setattr(straight, "SHARED_BYTES", 1 << 20)
+    scene, texts = TREES[name]() if name in TREES else scene_of(name), warp_machine.recorded(monkeypatch)
+    n, a = scene.dof_count, laws.states(scene, 3)
+    dyn = spo.Dynamics(scene, 3, device="cpu", dtype="float64", granularity="segment")
+    shapes = {key: a[key].shape for key in ("q", *given)}
+    program = dyn.programs.find(ROUTINES["inverse_dynamics_derivatives"], shapes, (3, 3, n, n))
+    assert program.warps > 1
+    wanted = inverse(scene, a, ("q", *given)).swapaxes(0, 1)
+    for backwards in (False, True):
+        got = warp_machine.run(texts[-1], a, backwards).reshape(wanted.shape)
+        assert laws.error(got, wanted) <= laws.TOLERANCE["float64"]
 
 
 def test_mass_matrix_derivative_is_that_of_inverse_dynamics():

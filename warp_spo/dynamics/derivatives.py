@@ -63,7 +63,13 @@ INVERSE_DYNAMICS_DERIVATIVES = Operation(
     "inverse_dynamics_derivatives",
     arguments=(Q, QD, QDD, BODY_F),
     results=tuple(Result(name, SQUARE) for name in ("q", "qd", "qdd")),
-    routine=Routine("inverse_dynamics_derivatives", recursion.inverse_dynamics_derivatives, tiled=True),
+    routine=Routine(
+        "inverse_dynamics_derivatives",
+        recursion.inverse_dynamics_derivatives,
+        letters=recursion.LETTERS,
+        long_result=True,
+        tiled=True,
+    ),
     embed=NO_DERIVATIVE,
     multipliers=NO_DERIVATIVE,
     trial=Trial(lambda dense, q, qd, qdd: inverse_dynamics_rates(dense, qd, qdd)[0]),
@@ -103,7 +109,7 @@ def inverse_dynamics_derivatives(
         outs = engine.outs(call, INVERSE_DYNAMICS_DERIVATIVES, out)
         given = engine.read(call, INVERSE_DYNAMICS_DERIVATIVES, q=q, qd=qd, qdd=qdd, body_f=body_f)
         results: list[wp.array] = engine.write(call, INVERSE_DYNAMICS_DERIVATIVES, outs, given)
-        program, found = _tiled(self, INVERSE_DYNAMICS_DERIVATIVES, (3, *results[0].shape[1:]), **given)
+        program, found = _tiled(self, INVERSE_DYNAMICS_DERIVATIVES, (3, *results[0].shape[1:]), {}, **given)
         for block, result in enumerate(results):
             _spread(self, program, found, block, result)
     return InverseDynamicsDerivatives(*call.result)
@@ -157,11 +163,10 @@ def forward_dynamics_derivatives(
             _differentiate_by_rows(self, {**given, "qdd": qdd}, results)
         elif n:
             given = {"q": given["q"], "qd": given["qd"], "qdd": qdd, "body_f": given["body_f"]}
-            program, rates = _tiled(self, INVERSE_DYNAMICS_DERIVATIVES, (3, n, n), **given)
+            program, rates = _tiled(self, INVERSE_DYNAMICS_DERIVATIVES, (2, n, n), {"mass": False}, **given)
             assert program is not None and rates is not None
             engine.launch(MASS_MATRIX_INVERSE, inverse, q=given["q"])
-            inputs = [inverse, rates, program.entry.reshape((3, n, n))]
-            self.recursions.launch(tiles.negative_product, (len(rates), n, n), inputs, [by_q, by_qd])
+            self.programs.product(program, n).launch(inverse, rates, by_q, by_qd)
     return ForwardDynamicsDerivatives(*call.result)
 
 
@@ -190,7 +195,7 @@ def mass_matrix_derivative(self: Dynamics, q: ArrayT, out: ArrayT | None = None)
         self._gradients.check_size(call)
         given = engine.read(call, MASS_MATRIX_DERIVATIVE, q=q)
         (result,) = engine.write(call, MASS_MATRIX_DERIVATIVE, (out,), given)
-        program, found = _tiled(self, MASS_MATRIX_DERIVATIVE, result.shape[1:], **given)
+        program, found = _tiled(self, MASS_MATRIX_DERIVATIVE, result.shape[1:], {}, **given)
         _spread(self, program, found, 0, result)
     return call.result
 
@@ -211,7 +216,7 @@ def _differentiate_by_rows(dyn: Dynamics, given: dict[str, Any], outs: Sequence[
 
 
 def _tiled(
-    dyn: Dynamics, operation: Operation, shape: tuple[int, ...], **given: Any
+    dyn: Dynamics, operation: Operation, shape: tuple[int, ...], options: dict[str, Any], **given: Any
 ) -> tuple[Program | None, wp.array | None]:
     """Run a kernel whose result, of ``shape`` in a world, is left in tiles; return its program and the tiles."""
     if dyn.scene.dof_count == 0:
@@ -219,10 +224,10 @@ def _tiled(
     assert operation.routine is not None
     arrays = {name: array for name, array in given.items() if array is not None}
     shapes = {name: array.shape for name, array in arrays.items()}
-    program = dyn.programs.find(operation.routine, shapes, (dyn.worlds, *shape))
+    program = dyn.programs.find(operation.routine, shapes, (dyn.worlds, *shape), **options)
     assert program is not None
     count = -(-dyn.worlds // TILE)
-    found = dyn.recursions.array(("tiles", operation.name, *shapes), count, max(program.slots, 1), TILE)
+    found = dyn.recursions.array(("tiles", operation.name, *shapes, *options), count, max(program.slots, 1), TILE)
     dyn.programs.launch(program, arrays, found)
     return program, found
 

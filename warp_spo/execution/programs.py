@@ -15,7 +15,7 @@ from .. import launches
 from ..kernels import native, straight
 from ..kernels.native import INTEGERS
 from ..kernels.slots import WARP_SIZE
-from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout, Result
+from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout
 from ..recursions import messages
 from ..recursions.contact.secants import SECANT
 from ..recursions.flexible import attach
@@ -25,7 +25,7 @@ from ..recursions.pieces import Pieces
 from ..recursions.step import GAIN, GUESS, LOOPED, MISSED
 from ..recursions.tracing import Trace
 from ..trace.emission import PREFIX, Emitter, RangeReduction, Store, render
-from . import link_values, searches, staging
+from . import link_values, products, searches, staging
 from .device_facts import RESERVED
 from .plan import MOST_WARPS, Plan
 from .routine import Routine
@@ -46,8 +46,8 @@ class Program(NamedTuple):
         rows: names of the callers' arrays, and then numbers, that it reads. fields: of FIELDS.
         tables: arrays of its own.
         operations: floating-point operations of one world.
-        slots: values of one world in the tiles that it writes; entry: where each entry of the result is among them, -1
-            being zero. See :mod:`.kernels.tiles`.
+        slots: values of one world in the tiles that it writes; places, entry: where each entry of the result is among
+            them, -1 being zero, on the host and on the device. See :mod:`warp_spo.kernels.tiles`.
     """
 
     kernel: wp.Kernel
@@ -58,6 +58,7 @@ class Program(NamedTuple):
     block: int
     operations: int
     slots: int = 0
+    places: tuple[int, ...] = ()
     entry: Any = None
 
 
@@ -76,6 +77,7 @@ class Programs:
         self.run, self.plan = run, plan
         self.relays = run.device.is_cuda
         self._programs: dict[tuple, Program | None] = {}
+        self._products: dict[tuple[int, ...], products.Product] = {}
         self._links: Links | None = None
 
     def forget(self, name: str = "") -> None:
@@ -84,6 +86,7 @@ class Programs:
             self._programs = {key: program for key, program in self._programs.items() if key[0].name != name}
             return
         self._programs.clear()
+        self._products.clear()
         self._links = None
 
     def find(
@@ -122,6 +125,13 @@ class Programs:
         launches.launch(
             program.kernel, threads, [worlds, *inputs], [out, *more], device=self.run.device, block_dim=block
         )
+
+    def product(self, program: Program, size: int) -> products.Product:
+        """Return the kernel of -A B for the first two matrices [``size``, ``size``] of a program's result in tiles."""
+        if program.places not in self._products:
+            found = products.build(size, program.places, program.slots, self.run.dtype, self.run.device)
+            self._products[program.places] = found
+        return self._products[program.places]
 
     def field(self, name: str) -> wp.array:
         """One of FIELDS."""
@@ -185,9 +195,6 @@ class Programs:
         apart = [item for item in stores if item.array in more]  # each straight to memory
         outs = [item for item in stores if item.array == "out"]
         layout = self._layout(routine, outs, trace.begin + stores, shapes, more)
-        if routine.tiled:
-            result = Result(TILED, layout.result.array, slots=staging.count_slots(stores))
-            layout = layout._replace(staged=self.plan.at(routine).staged, result=result)
         once = routine.passes or any(item.array in LOOPED for item in stores)  # may write over what it reads
         layout = layout._replace(
             retries=not once and not layout.staged and layout.result.way in (DIRECT, TILED, RELAYED)
@@ -211,7 +218,8 @@ class Programs:
     def _segment_program(
         self, routine: Routine, shapes: dict, pieces: Pieces, more: tuple, options: dict
     ) -> Program | None:
-        dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(routine.letters, pieces)
+        letters = messages.needed(routine.letters, shapes)
+        dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(letters, pieces)
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         everything: list[Store] = []
         traced: list[list[Store]] = []
@@ -243,7 +251,7 @@ class Programs:
             later = self._emitter(shapes, layout) if passes else emitter
             inward = [item for item in stores if item.array == INWARD]
             outward = [item for item in stores if item.array == OUTWARD]
-            last = outward if set(routine.letters) & set(messages.OUTWARD_LETTERS) else inward
+            last = outward if set(letters) & set(messages.OUTWARD_LETTERS) else inward
             last += by_slot(items)
             last += [item for item in stores if item.array in (*more, GAIN)]
             regions = emitter.region(inward), emitter.region(outward)
@@ -286,7 +294,7 @@ class Programs:
         rows, fields = (*(row.name for row in layout.rows), *layout.numbers), tuple(layout.fields)
         arrays = [(row.name, row.ndim) for row in layout.rows] + [(name, 0) for name in layout.numbers]
         arrays += [(name, 2) for name in fields]
-        result, entry = layout.result, None
+        result, entry, places = layout.result, None, ()
         if result.way in BY_TABLE:
             tables = tables | {"place": result.slot_layout.table(tables["place"], self.run.dtype)}
         held: dict[str, wp.array] = {
@@ -294,7 +302,7 @@ class Programs:
             for name, values in tables.items()
         }
         if result.way == TILED:
-            entry = held.pop("place")
+            entry, places = held.pop("place"), tuple(tables["place"])
         arrays += [(name, array.ndim) for name, array in held.items()]
         arrays += [("out", result.array.ndim if entry is None else 3)] + [
             (row.name, row.ndim) for row in layout.further
@@ -302,7 +310,16 @@ class Programs:
         asks = layout.shared_bytes(self.run.dtype) if layout.asks_for_shared_memory(self.run.dtype) else 0
         kernel = native.kernel(routine.name, text, arrays, self.run.dtype, registers, shared=asks)
         return Program(
-            kernel, rows, fields, tuple(held.values()), layout.warps, layout.block, operations, result.slots, entry
+            kernel,
+            rows,
+            fields,
+            tuple(held.values()),
+            layout.warps,
+            layout.block,
+            operations,
+            result.slots,
+            places,
+            entry,
         )
 
     @property
@@ -326,7 +343,7 @@ class Programs:
         sent: int = 0,
         warps: int = 1,
     ) -> KernelLayout:
-        ways = self.plan.stages(routine, warps), self.plan.gathers(routine, warps, 1 + len(more))
+        ways = self.plan.stages(routine, warps), self.plan.gathers(routine, warps, 1 + len(more)), routine.tiled
         return staging.choose_layout(
             stores, everything, shapes, more, sent, warps, self.run.dtype, *ways, self.relays, self.room
         )

@@ -44,6 +44,7 @@ def choose_layout(
     T: type,
     staged: bool,
     gathered: bool,
+    tiled: bool,
     relays: bool,
     room: int,
 ) -> KernelLayout:
@@ -59,6 +60,7 @@ def choose_layout(
         T: the scalar type.
         staged: rows are read through shared memory if it has room for them.
         gathered: short results are written through shared memory even if rows are not read through it.
+        tiled: the result is left in tiles.
         room: the bytes of shared memory that a block may have.
         relays: a result without room in shared memory may wait in its own rows, see :mod:`warp_spo.kernels.slots`.
     """
@@ -85,6 +87,8 @@ def choose_layout(
         ways = [(staged, mapped), (False, mapped), *ways]
         if relays and _may_write_early(rows, out):
             ways.insert(-1, (False, Result(RELAYED, out, slots=slots)))
+    if tiled:
+        ways = [(way, Result(TILED, out, slots=slots)) for way in sorted({staged, False}, reverse=True)]
     other_results = tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in further)
     layouts = [
         KernelLayout(

@@ -1,19 +1,24 @@
 """What the pieces of a robot send each other, and where each message lies among those of an operation.
 
 Letters: inward P = phi P+ phi*, z and y = phi z+ or a force, f = a force, R = the composite inertia, B = how a sum
-changes with the parent's motion; outward a and b = alpha, and for Mass^-1 N = the rates of all pivots further in for
-each unit force on the last link, D = the piece's own pivots, V = its columns of Y, Y = the part of them that lies
-further in. From all to the first piece, when all is done: S = a status word.
+changes with the parent's motion, U = the flow and momentum of what a link carries, L = its load and pull; outward a and
+b = alpha, and for Mass^-1 N = the rates of all pivots further in for each unit force on the last link, D = the piece's
+own pivots, V = its columns of Y, Y = the part of them that lies further in. From all to the first piece, when all is
+done: S = a status word.
 """
 
 from __future__ import annotations
+
+from collections.abc import Collection
 
 from .pieces import Piece, Pieces
 
 INWARD, OUTWARD = "sent", "returned"
 """The array that messages go through, by either name."""
 OUTWARD_LETTERS = "abNDVY"
-SIZES = {"P": 21, "z": 6, "f": 6, "y": 6, "R": 10, "B": 24, "a": 6, "b": 6, "S": 1}
+SIZES = {"P": 21, "z": 6, "f": 6, "y": 6, "R": 10, "B": 24, "U": 12, "L": 12, "a": 6, "b": 6, "S": 1}
+NEEDS = {"U": "qd", "L": "body_f"}
+"""The array without which a message is zero and is not sent, by letter."""
 
 
 def way(letter: str) -> str:
@@ -27,6 +32,11 @@ def size(letter: str, piece: Piece) -> int:
     further = sum(one.weight for one in piece.ancestors)
     whole = further + piece.weight
     return {"N": 6 * whole, "D": piece.weight, "V": whole * piece.weight, "Y": further * piece.weight}[letter]
+
+
+def needed(letters: str, inputs: Collection[str]) -> str:
+    """Return those of the letters that are sent where these arrays are read."""
+    return "".join(letter for letter in letters if letter not in NEEDS or NEEDS[letter] in inputs)
 
 
 def slots(letters: str, pieces: Pieces) -> tuple[dict[tuple[str, int], int], int]:

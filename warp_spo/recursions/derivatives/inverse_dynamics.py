@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from ...trace.emission import Store, merge
 from ...trace.scalars import Value
 from ...trace.spatial import ZERO, Rigid, Vector, cross, dot
-from .. import composite, motion, newton_euler
+from .. import composite, messages, motion, newton_euler
 from ..links import Link, Placed
 from ..motion import STILL, Motion
 from . import sensitivity
@@ -22,16 +22,18 @@ if TYPE_CHECKING:
     from ..tracing import Trace
 
 Q, QD, QDD = range(3)  # blocks of the result
+LETTERS = "RULf"
+"""Messages: sums over all that a link carries and the force that its hinge transmits, in the parent's frame."""
 
 
-def inverse_dynamics_derivatives(trace: Trace) -> list[Store]:
-    """out [3, dof, dof] = d tau / d q along the tangent coordinates, d tau / d qd, Mass"""
+def inverse_dynamics_derivatives(trace: Trace, mass: bool = True) -> list[Store]:
+    """out [3, dof, dof] = d tau / d q along the tangent coordinates, d tau / d qd, Mass; [2, ...] without ``mass``"""
     qdd, moves = trace.vector("qdd"), "qd" in trace.inputs
     rates = trace.vector("qd") if moves else None
     alpha: dict[int, tuple[Vector, Vector]] = {}
     own: dict[int, tuple[list[Sensitivity], list[Sensitivity]]] = {}
-    carried: dict[int, CarriedSums] = {}
-    forces: dict[int, tuple[Vector, Vector]] = {}
+    letters = messages.needed(LETTERS, trace.inputs)
+    inner: dict[str, dict[int, list[Value]]] = {letter: {} for letter in letters}  # what links hand to their parents
     drifts: dict[int, Vector] = {}
     shared: dict[int, tuple[Row, list]] = {}  # of groups, by dof
     stores: list[Store] = []
@@ -61,16 +63,21 @@ def inverse_dynamics_derivatives(trace: Trace) -> list[Store]:
         for arm, pull, torque in _wrenches(trace, link):
             all_in = all_in + sensitivity.under_load(arm, pull, torque)
             n, f = n - torque - cross(arm, pull), f - pull
-        for child in link.children:
-            all_in = all_in + carried[id(child)]
-            n, f = n + forces[id(child)][0], f + forces[id(child)][1]
+        for parts in zip(*(trace.from_children(link, letter, inner[letter], list) for letter in letters), strict=True):
+            values = dict(zip(letters, parts, strict=True))
+            all_in = all_in + CarriedSums.unpacked(values)
+            n, f = n + Vector(values["f"][:3]), f + Vector(values["f"][3:])
         if over is not None:
-            carried[key] = sensitivity.to_parent(place, drifts[key], all_in)
-            forces[key] = place.pose.force_to_parent(n, f)
+            n_over, f_over = place.pose.force_to_parent(n, f)
+            values = sensitivity.to_parent(place, drifts[key], all_in).packed | {"f": [*n_over, *f_over]}
+            for letter in letters:
+                inner[letter][key] = values[letter]
+                stores += trace.send_to_parent(letter, link, values[letter])
         stores += _entries(trace, link, all_in, (n, f), own, drifts, shared)
         for (i, j), x in link.coupled.items():
             a, b = link.dofs[i], link.dofs[j]
             stores += [Store("out", (QDD, a, b), x), Store("out", (QDD, b, a), x)]
+    stores = [item for item in stores if mass or item.array != "out" or item.index[0] != QDD]
     return merge(stores) if trace.links.shared else stores
 
 

@@ -9,6 +9,7 @@ Coriolis matrix of S. Singh, R. Russo, P. Wensing 2022 without the part that suc
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from ...trace.scalars import Value
@@ -51,6 +52,21 @@ class CarriedSums(NamedTuple):
 
     def __add__(self, other: tuple) -> CarriedSums:
         return CarriedSums(*(a + b for a, b in zip(self, other, strict=True)))
+
+    @property
+    def packed(self) -> dict[str, list[Value]]:
+        """The numbers, by the letter of the message that takes them to the parent; see :mod:`..messages`."""
+        flow, load = ([x for row in rows for x in row] for rows in (self.flow, self.load))
+        return {"R": self.body.packed, "U": [*flow, *self.momentum], "L": [*load, *self.pull]}
+
+    @classmethod
+    def unpacked(cls, values: Mapping[str, list[Value]]) -> CarriedSums:
+        """Return the sums with these numbers, in the order of :attr:`packed`; those that are missing are zero."""
+        parts: list[Any] = [Rigid.unpacked(values["R"])]
+        for letter in "UL":
+            x = values.get(letter, [0.0] * 12)
+            parts += [Matrix.of([x[0:3], x[3:6], x[6:9]]), Vector(x[9:])]
+        return cls(*parts)
 
     @property
     def coriolis(self) -> Matrix:
