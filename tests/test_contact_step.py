@@ -10,6 +10,7 @@ from contact_cases import box, everywhere, quadruped, touching
 from step_scenes import furnished, states
 
 import warp_spo as spo
+from warp_spo.dynamics import contacts
 from warp_spo.recursions.contact import points, secants, step
 from warp_spo.reference_contact import ContactStep
 
@@ -27,6 +28,15 @@ def trees():
 TREES = dict(trees())
 
 
+def by_point(at, forces):
+    """Return force and gap of each point: of a wall and a floor the sum, and the nearer one."""
+    count = len(at.scene.contact_points)
+    force, gap = np.zeros((count, 3)), np.full(count, np.inf)
+    np.add.at(force, at.numbers, forces)
+    np.minimum.at(gap, at.numbers, -at.points.depth)
+    return force, gap
+
+
 def assert_is_dense(scene, a, passes):
     """The recursion, evaluated without compiling, is the dense step in every world."""
     found = symbolic.contact_step(scene, a, H, passes)
@@ -36,8 +46,9 @@ def assert_is_dense(scene, a, passes):
         q, wanted = at.run(given.get("tau"), given.get("body_f"), passes)
         np.testing.assert_allclose(found["out"][w], wanted.v, atol=1e-10 * np.abs(wanted.v).max())
         np.testing.assert_allclose(found["q_out"][w], q, atol=1e-10)
-        np.testing.assert_allclose(found["contact_f"][w], wanted.f, atol=1e-10 * max(1.0, np.abs(wanted.f).max()))
-        np.testing.assert_allclose(found["contact_gap"][w], -at.points.depth, atol=1e-12)
+        force, gap = by_point(at, wanted.f)
+        np.testing.assert_allclose(found["contact_f"][w], force, atol=1e-10 * max(1.0, np.abs(wanted.f).max()))
+        np.testing.assert_allclose(found["contact_gap"][w], gap, atol=1e-12)
         np.testing.assert_allclose(found["contact_excess"][w], wanted.excess, atol=1e-9 * np.abs(wanted.f).max() + 1e-9)
 
 
@@ -63,6 +74,72 @@ def test_a_cube_that_is_thrown():
         a["q"].append(q)
         a["qd"].append(rng.normal(size=6) * np.repeat([1.0, 6.0], 3))
     assert_is_dense(scene, {name: np.array(rows) for name, rows in a.items()}, 3)
+
+
+def steps(cell=0.05):
+    """Risers of 10 cm every quarter of a metre along x, which climb to y."""
+    rise = 0.1 * np.floor(np.arange(30) * cell / 0.25)
+    return spo.HeightField(rise[:, None] + 0.02 * np.arange(20)[None, :] * cell, cell, (-0.7, -0.5, 0.02))
+
+
+FIELDS = {
+    "rough": spo.HeightField(0.01 * np.random.default_rng(0).normal(size=(30, 20)), 0.1, (-1.5, -1.0)),
+    "stairs": steps(),
+}
+
+
+def above(scene, seed, worlds):
+    """Return states of a body whose lowest point is just above or in a field, beyond its edge in the last world."""
+    rng = np.random.default_rng(seed)
+    q, qd = np.zeros((worlds, 7)), rng.normal(size=(worlds, 6))
+    turns = np.concatenate([0.5 * rng.normal(size=(worlds, 3)), np.ones((worlds, 1))], axis=1)
+    q[:, 3:] = turns / np.linalg.norm(turns, axis=1)[:, None]
+    q[:, :2] = rng.uniform(-0.4, 0.4, (worlds, 2))
+    q[-1, :2] = 5.0
+    for world in range(worlds):
+        q[world, 2] = 1.0
+        depth = ContactStep(scene, q[world], qd[world], H).points.depth.max()
+        q[world, 2] += depth + rng.uniform(-0.02, 5e-3)
+    return {"q": np.float64(np.float32(q)), "qd": np.float64(np.float32(qd))}
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_height_field(name):
+    scene = box(ground=FIELDS[name])
+    a = above(scene, 1, 12)
+    assert_is_dense(scene, a, 3)
+    touched = [ContactStep(scene, *(a[part][w] for part in ("q", "qd")), H) for w in range(12)]
+    assert any(len(at.numbers) > 8 for at in touched) == (name == "stairs")  # walls
+
+
+def test_a_tilted_field_is_a_tilted_plane():
+    slope = np.array([0.2, -0.1])
+    x, y = np.arange(21) * 0.1 - 1.0, np.arange(31) * 0.1 - 1.5
+    field = spo.HeightField(slope[0] * x[:, None] + slope[1] * y[None, :], 0.1, (-1.0, -1.5))
+    normal = np.array([*-slope, 1.0]) / np.sqrt(1.0 + slope @ slope)
+    a = above(box(ground=field), 2, 6)
+    a = {name: rows[:-1] for name, rows in a.items()}
+    found, wanted = (symbolic.contact_step(box(ground=g), a, H) for g in (field, spo.Plane(normal=normal)))
+    for name in ("out", "contact_f", "contact_gap"):
+        np.testing.assert_allclose(found[name], wanted[name], atol=1e-9)
+
+
+def test_the_kernel_of_a_height_field(device):
+    ball = spo.Contact(0, sphere=((0.1, 0.0, 0.0), 0.05))
+    scene = box(ground=FIELDS["stairs"]).with_contacts([ball], FIELDS["stairs"])
+    a = above(scene, 3, WORLDS)
+    dyn = spo.Dynamics(scene, WORLDS, device=device)
+    force = np.full((WORLDS, 1, 3), np.nan, np.float32)
+    q, qd = dyn.step(a["q"].astype(np.float32), a["qd"].astype(np.float32), None, H, contact_f=force)
+    weight, (velocity, pushed) = 5.0 * 9.81, TOLERANCE["float32"]
+    for w in range(WORLDS):
+        at = ContactStep(scene, a["q"][w], a["qd"][w], H)
+        after, wanted = at.run()
+        np.testing.assert_allclose(qd[w], wanted.v, atol=velocity * np.abs(wanted.v).max())
+        np.testing.assert_allclose(q[w], after, atol=velocity)
+        np.testing.assert_allclose(
+            force[w], by_point(at, wanted.f)[0], atol=pushed * max(weight, np.abs(wanted.f).max())
+        )
 
 
 BUGS = {
@@ -101,7 +178,7 @@ def stepped(dyn, state, passes=None, **more):
     return found
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def test_a_quadruped_that_lands(device, dtype):
     """All that a step reports, with another friction in each world."""
     dyn, state = dynamics(str(device), dtype), touching(quadruped(), 3, WORLDS)
@@ -155,6 +232,7 @@ def test_substeps_report_the_mean_force(device):
     np.testing.assert_allclose(found["contact_f"], np.mean(forces, axis=0), rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_impulse_is_the_change_of_momentum(device):
     """Of a quadruped that falls on its feet and trunk: sum of forces and weight, times dt."""
     dyn, (q, qd, tau) = dynamics(str(device), "float64"), touching(quadruped(), 5, WORLDS)
@@ -184,12 +262,13 @@ def test_calls_without_a_kernel_have_names(device, mistake):
         dynamics(str(device), "float32").step(q, qd, None, H, **more)
 
 
-def test_scenes_without_a_kernel_have_names(device):
+def test_scenes_without_a_kernel_have_names(device, monkeypatch):
     q, qd = np.array([[0, 0, 1, 0, 0, 0, 1]], np.float32), np.zeros((1, 6), np.float32)
     with pytest.raises(spo.UnsupportedError, match="granularity='node' with contacts"):
         spo.Dynamics(box(), device=device, granularity="node").step(q, qd, None, H)
-    with pytest.raises(spo.UnsupportedError, match="a HeightField"):
-        spo.Dynamics(box(ground=spo.HeightField(np.zeros((2, 2)), 1.0)), device=device).step(q, qd, None, H)
+    monkeypatch.setitem(contacts.MOST_HEIGHTS, "float32", 600)
+    with pytest.raises(spo.UnsupportedError, match="a HeightField of 600 points in float32"):
+        spo.Dynamics(box(ground=FIELDS["stairs"]), device=device).step(q, qd, None, H)
     bare = spo.Dynamics(box().with_contacts([]), device=device)
     for name, value in (("passes", 3), ("contact_gap", np.zeros((1, 0), np.float32))):
         with pytest.raises(ValueError, match=f"{name} is given, and the scene has no contacts"):

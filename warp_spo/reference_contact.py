@@ -156,11 +156,33 @@ def _slip(n, x):
     return np.linalg.norm(x - _along(n, x)[:, None] * n, axis=1)
 
 
+def surfaces(field, at):
+    """Return normal and depth of the surfaces of a height field near a point: the field's own, or a floor and a wall.
+
+    The second one, a wall, is there where the middle slope of the cell exceeds 1, and ends at the highest corner.
+    """
+    h, place = field.heights, (at[:2] - field.origin[:2]) / field.cell
+    place = np.clip(place, 0.0, np.array(h.shape) - 1.0)
+    i, j = np.minimum(place.astype(int), np.array(h.shape) - 2)
+    s, t = place - (i, j)
+    corners, z = h[i : i + 2, j : j + 2], at[2] - field.origin[2]
+    height = np.array([1.0 - s, s]) @ corners @ np.array([1.0 - t, t])
+    slope = np.array([np.array([1.0 - t, t]) @ (corners[1] - corners[0]),
+                      np.array([1.0 - s, s]) @ (corners[:, 1] - corners[:, 0])]) / field.cell  # fmt: skip
+    middle = np.array([corners[1] - corners[0], corners[:, 1] - corners[:, 0]]).mean(axis=1) / field.cell
+    upward = lambda slope: np.array([*-slope, 1.0]) / np.sqrt(1.0 + slope @ slope)  # noqa: E731
+    if np.linalg.norm(middle) <= 1.0:
+        return [(upward(slope), (height - z) * upward(slope)[2])]
+    floor = (np.array([0.0, 0.0, 1.0]), corners.min() - z)
+    plane = corners.mean() + field.cell * middle @ (np.array([s, t]) - 0.5)
+    return [floor, (upward(middle), (plane - z) * upward(middle)[2])] if z <= corners.max() else [floor]
+
+
 class ContactStep:
     """One step of a scene with contacts in one world.
 
     Args:
-        scene: a Scene with contact_points and a ground that is a plane.
+        scene: a Scene with contact_points and a ground.
         q, qd: the state [coordinate], [dof]. h: length of the step [s].
         target_q, target_qd: of the drives; None: the neutral q, zero.
     """
@@ -182,19 +204,22 @@ class ContactStep:
         return dense.integrate(found.v, self.h), found
 
     def _points(self):
-        dense, ground, points = self.dense, self.scene.ground, self.scene.contact_points
-        normal = np.asarray(ground.normal)
-        inverse, weights = np.linalg.pinv(self.neutral.mass_matrix), []
-        J, depth = np.zeros((len(points), 3, dense.dof_count)), np.zeros(len(points))
-        for i, point in enumerate(points):
+        """Return the points; one that may touch a wall and a floor is two, and ``numbers`` says of which point."""
+        dense, ground, rows, self.numbers = self.dense, self.scene.ground, [], []
+        plane = not hasattr(ground, "heights")
+        inverse = np.linalg.pinv(self.neutral.mass_matrix)
+        for number, point in enumerate(self.scene.contact_points):
             at = (dense.body_matrix[point.body] @ homogeneous([*point.position, 0, 0, 0, 1]))[:3, 3]
-            at = at - point.radius * normal
-            J[i], depth[i] = dense._jacobian_at(point.body, at)[:3], ground.height - normal @ at
+            at = at - point.radius * np.array(ground.normal if plane else (0.0, 0.0, 1.0))
             there = self.neutral.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
-            weights.append(SLIP * np.trace(there @ inverse @ there.T) / 3.0)
-        k, d, mu = (dense.value(f"contact_{name}") for name in ("stiffness", "damping", "friction"))
-        eps = np.array([point.eps for point in points])
-        return Points(J, np.tile(normal, (len(points), 1)), depth, k, d, mu, eps, np.array(weights))
+            weight = SLIP * np.trace(there @ inverse @ there.T) / 3.0
+            k, d, mu = (dense.value(f"contact_{name}")[number] for name in ("stiffness", "damping", "friction"))
+            touched = [(np.array(ground.normal), ground.height - at @ ground.normal)] if plane else surfaces(ground, at)
+            for normal, depth in touched:
+                J = dense._jacobian_at(point.body, at)[:3]
+                rows.append((J, normal, depth, k, d, mu, point.eps, weight))
+                self.numbers.append(number)
+        return Points(*(np.array(column) for column in zip(*rows, strict=True)))
 
     def _positions(self):
         """Return the coordinate of each dof; NaN of those without one."""

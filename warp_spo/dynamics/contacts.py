@@ -22,6 +22,9 @@ ARGUMENTS = tuple(
 )
 
 
+MOST_HEIGHTS = {"float32": 2**24, "float64": 2**31}  # points of a field whose numbers the dtype tells apart
+
+
 def check_step(dyn: Dynamics, call: Call, integrator: str, passes: Any, asked: dict[str, Any]) -> int | None:
     """Return the number of passes, None without contacts; raise an error for what a step with contacts cannot do.
 
@@ -49,8 +52,9 @@ def refuse(dyn: Dynamics, call: Call, integrator: str) -> None:
         raise UnsupportedError(call.name, "closing loops in a scene with contacts", "use loops='cut'")
     if forced not in (None, "tree"):
         raise UnsupportedError(call.name, f"granularity={forced!r} with contacts", "use 'tree', or leave it out")
-    if isinstance(dyn.scene.ground, HeightField):
-        raise UnsupportedError(call.name, "a HeightField", "use spo.Plane")
+    if isinstance(dyn.scene.ground, HeightField) and dyn.scene.ground.heights.size >= MOST_HEIGHTS[dyn.dtype.__name__]:
+        way = "use dtype='float64', or a coarser field"
+        raise UnsupportedError(call.name, f"a HeightField of {dyn.scene.ground.heights.size} points in float32", way)
 
 
 def add_share(dyn: Dynamics, substep: int, count: int, now: wp.array, mean: wp.array) -> None:

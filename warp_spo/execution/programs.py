@@ -17,6 +17,7 @@ from ..kernels.native import INTEGERS
 from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout
 from ..recursions import messages
+from ..recursions.contact.ground import GROUND
 from ..recursions.contact.secants import SECANT
 from ..recursions.flexible import attach
 from ..recursions.links import TABLES, Links
@@ -24,6 +25,7 @@ from ..recursions.messages import INWARD, OUTWARD
 from ..recursions.pieces import Pieces
 from ..recursions.step import GAIN, GUESS, LOOPED, MISSED
 from ..recursions.tracing import Trace
+from ..scene.contacts import HeightField
 from ..trace.emission import PREFIX, Emitter, RangeReduction, Store, render
 from . import link_values, products, searches, staging
 from .device_facts import RESERVED
@@ -213,6 +215,9 @@ class Programs:
         block = PAIR * WARP_SIZE if self.plan.few and not layout.shared_scalars else WARP_SIZE
         layout = layout._replace(retries=layout.retries and "farthest" in body, block=block)
         tables = {} if table is None else {"place": table}
+        ground = self.run.scene.ground
+        if isinstance(ground, HeightField) and trace.begin:
+            tables[GROUND] = ground.heights.ravel()
         return self._finished(routine, layout, body, body, tables, emitter.operations)
 
     def _segment_program(

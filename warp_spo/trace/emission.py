@@ -13,7 +13,7 @@ import numpy as np
 from .scalars import Scalar, Value, is_constant, ordered
 
 C_TYPE = {"float32": "float", "float64": "double"}
-LIBRARY = {"exponential": "exp", "logarithm": "log", "power": "pow"}  # functions of C, also on CUDA
+LIBRARY = {"exponential": "exp", "logarithm": "log", "power": "pow", "floor": "floor"}  # functions of C, also on CUDA
 BINARY = {"add": "+", "sub": "-", "mul": "*", "quotient": "/"}
 COST = {  # floating-point operations of a statement
     "add": 1,
@@ -27,6 +27,8 @@ COST = {  # floating-point operations of a statement
     "less": 1,
     "lost": 1,
     "input": 0,
+    "lookup": 1,
+    "floor": 1,
 }
 COST_ELSE = 8  # of the other statements: sines, roots and reciprocals take about as long as 8 additions
 
@@ -252,6 +254,9 @@ class Emitter:
             return [f"{T} {sine}, {cosine};", f"on::{which}({angle}, {sine}, {cosine});"]
         if scalar.key in self._products:
             return self._fused_statement(scalar, self._products[scalar.key], step)
+        if op == "lookup":
+            place = self._text(args[1])
+            return [f"const {T} {self._name(scalar, step)} = {args[0]}.data[(int){place} + {args[2]}];"]
         texts = [self._text(a) for a in args]
         name = self._name(scalar, step)
         if op in BINARY:

@@ -22,6 +22,7 @@ FUNCTIONS: dict[str, Callable] = {
     "reciprocal": lambda a: 1.0 / a,
     "reduced": lambda a: a,
     "absolute": np.abs,
+    "floor": np.floor,
     "lost": lambda a: a - a,
     "guarded": lambda a, least: np.where(a > least, a, np.nan),
     "less": lambda a, b: np.where(a < b, 1.0, 0.0),
@@ -46,6 +47,10 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
     for scalar in ordered(outputs):
         if scalar.op == "input":
             values[scalar.key] = np.asarray(load(scalar.args[0], scalar.args[1:]), dtype=dtype)
+        elif scalar.op == "lookup":
+            table, place, step = scalar.args
+            place = place if is_constant(place) else values[place.key]
+            values[scalar.key] = np.asarray(load(table, ()), dtype=dtype)[np.asarray(place, dtype=np.int64) + step]
         else:
             args = [np.asarray(a, dtype=dtype) if is_constant(a) else values[a.key] for a in scalar.args]
             values[scalar.key] = np.asarray(FUNCTIONS[scalar.op](*args), dtype=dtype)

@@ -219,6 +219,16 @@ def less(x: Value, y: Value) -> Value:
     return graph.make("less", x, y)
 
 
+def floor(x: Value) -> Value:
+    """Return the largest whole number that is not above ``x``."""
+    return math.floor(x) * 1.0 if is_constant(x) else x.graph.make("floor", x)
+
+
+def lookup(graph: Graph, table: str, place: Value, step: int) -> Value:
+    """Return entry ``place`` + ``step`` of a table of the kernel's own; ``place`` is a whole number at run time."""
+    return graph.make("lookup", table, place, step)
+
+
 def arctangent(y: Value, x: Value) -> Value:
     """Return the angle of the point (x, y) [rad]."""
     if is_constant(x) and is_constant(y):

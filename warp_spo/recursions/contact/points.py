@@ -1,5 +1,7 @@
 """Contact points at a configuration: where the ground is, how they move, and what a damper there adds to the sweep.
 
+A point that may touch two surfaces, a wall and a floor, counts as two.
+
 A contact pushes with f = f0 - G v, where v is the point's velocity after the step. With v = v_before + h J qdd, the
 damper h G is an inertia at the point and f0 - G v_before a load. G = across I + (along - across) n n* is isotropic
 across the normal n, so that no tangent directions are needed. Vectors are in the axes of the point's link.
@@ -13,16 +15,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...scene.contacts import Plane
 from ...scene.scene import Scene
 from ...trace.evaluation import evaluate
 from ...trace.scalars import Value
-from ...trace.spatial import ZERO, Articulated, Vector, cross, dot, skew, upper
+from ...trace.spatial import ZERO, Articulated, Vector, cross, dot, skew, total, upper
 from ..composite import mass_matrix
 from ..kinematics import carried_velocity, frame_on_link, jacobian
 from ..links import Link, Links
 from ..motion import hinge_motion
 from ..tracing import Trace
+from .ground import directions, lowest, surfaces
 
 if TYPE_CHECKING:
     from ..impedance import Impedance
@@ -35,11 +37,12 @@ class Point:
     """A contact point of a link.
 
     Attributes:
-        arm: from the link's origin. normal: of the ground there. depth: how far the point is below ground [m].
-        velocity: before the step. k, d, mu: stiffness, damping, friction. eps: speed below which friction is a damper.
-        weight: inverse weight that predicts slip [1/kg].
+        number: of the scene's contact point. arm: from the link's origin. normal: of the ground there.
+        depth: how far the point is below ground [m]. velocity: before the step. k, d, mu: stiffness, damping, friction.
+        eps: speed below which friction is a damper. weight: inverse weight that predicts slip [1/kg].
     """
 
+    number: int
     link: Link | None
     arm: Vector
     normal: Vector
@@ -76,34 +79,36 @@ class Point:
 
 
 def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value]) -> list[Point]:
-    """Return the contact points of a scene that stands on a plane, those that move, with None for the others."""
+    """Return the contact points of a scene, one for each surface that a point may touch."""
     scene = trace.links.scene
     ground, weights = scene.ground, inverse_weights(scene)
-    assert isinstance(ground, Plane)
+    assert ground is not None
     seats = [frame_on_link(trace, point.body, point.position) for point in scene.contact_points]
     needed = _with_ancestors([link for link, _ in seats])
-    normals: dict[int | None, Vector] = {None: Vector(ground.normal)}
-    heights: dict[int | None, Value] = {None: 0.0}  # of the link's origin along the ground's normal
+    axes: dict[int | None, list[Vector]] = {None: directions(ground)}
+    origins: dict[int | None, list[Value]] = {None: [0.0] * len(axes[None])}  # along each direction
     twists: dict[int | None, tuple[Vector, Vector]] = {None: (ZERO, ZERO)}
     for link in trace.links.links:
         if id(link) not in needed:
             continue
         trace.label(link, "n")
         key, over, place = id(link), None if link.parent is None else id(link.parent), trace.places[id(link)]
-        normals[key] = place.pose.to_child(normals[over])
-        heights[key] = heights[over] + dot(normals[over], place.pose.l)
+        axes[key] = [place.pose.to_child(axis) for axis in axes[over]]
+        origins[key] = [at + dot(axis, place.pose.l) for at, axis in zip(origins[over], axes[over], strict=True)]
         twists[key] = carried_velocity(place, twists[over], hinge_motion(link, place, qd))
     found = []
     for number, (point, (on, centre)) in enumerate(zip(scene.contact_points, seats, strict=True)):
         carrier = None if on is None else id(on)
         trace.graph.step = f"contact {number}|c"
-        normal = normals[carrier]
-        depth = (ground.height + point.radius) - (heights[carrier] + dot(normal, centre))
-        arm = centre - normal * point.radius if point.radius else centre
+        arm = centre - axes[carrier][lowest(ground)] * point.radius if point.radius else centre
+        at = [origin + dot(axis, centre) for origin, axis in zip(origins[carrier], axes[carrier], strict=True)]
+        at[lowest(ground)] = at[lowest(ground)] - point.radius
         w, v = twists[carrier]
         k, d, mu = (impedance.value(f"contact_{name}", number) for name in ("stiffness", "damping", "friction"))
         velocity = v + cross(w, arm)
-        found.append(Point(on, arm, normal, depth, velocity, k, d, mu, point.eps, weights[number]))
+        for normal, depth in surfaces(trace.graph, ground, at):
+            inward = Vector(total(n * axis[c] for n, axis in zip(normal, axes[carrier], strict=True)) for c in range(3))
+            found.append(Point(number, on, arm, inward, depth, velocity, k, d, mu, point.eps, weights[number]))
     return found
 
 

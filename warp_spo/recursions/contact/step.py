@@ -79,11 +79,15 @@ class ContactStep(Step):
             trace.label(link, "u")
             efforts += [law.finish(gains[dof]) for dof in link.dofs for law in self.secants[dof]]
         cones, pulls = [], []
-        for number, (point, touch) in enumerate(zip(points, touches, strict=True)):
-            trace.graph.step = f"contact {number}|f"
-            cone, pull = self._finish(number, point, touch, alpha)
+        forces: dict[int, list[tuple[Point, Vector, Value]]] = {}  # by point
+        for point, touch in zip(points, touches, strict=True):
+            trace.graph.step = f"contact {point.number}|f"
+            force, slip, cone, pull = self._finish(point, touch, alpha)
             cones.append(cone)
             pulls.append(pull)
+            forces.setdefault(point.number, []).append((point, force, slip))
+        for number, surfaces in forces.items():
+            self._report(number, surfaces)
         if status or "contact_excess" in self.reports:
             self._keep_excess(cones, pulls, efforts, status)
         trace.begin = kept.begin
@@ -149,8 +153,8 @@ class ContactStep(Step):
         push = touch.closed * (point.k * point.depth - (point.k * self.h + point.d) * normal)
         return point.normal * (push + touch.across * normal) - v * touch.across
 
-    def _finish(self, number: int, point: Point, touch: Touch, alpha: dict) -> tuple[Value, Value]:
-        """Keep what the next pass reads of a point; return by how much its force leaves the cone, and pulls."""
+    def _finish(self, point: Point, touch: Touch, alpha: dict) -> tuple[Vector, Value, Value, Value]:
+        """Keep what the next pass reads of a point; return its force, its slip, and its excess of cone and pull."""
         kept, h = self.kept, self.h
         change = ZERO if point.link is None else point.moved(*alpha[id(point.link)])
         v = point.velocity + change * h
@@ -169,20 +173,22 @@ class ContactStep(Step):
         kept.keep(touch.candidate, candidate)
         stays = kept.closing * touch.closed
         kept.keep(touch.closed, select(stays, 1.0, candidate * pushes))
-        self._report(number, point, force, slip)
-        return over, select(less(pushed, 0.0), -pushed, 0.0)
+        return force, slip, over, select(less(pushed, 0.0), -pushed, 0.0)
 
     # -- results ---------------------------------------------------------------------------------------------------
-    def _report(self, number: int, point: Point, force: Vector, slip: Value) -> None:
-        """Keep what the caller asks for of a point."""
+    def _report(self, number: int, surfaces: list[tuple[Point, Vector, Value]]) -> None:
+        """Keep what the caller asks for of a point; of several surfaces the sum of forces, the gap to the nearest."""
+        point, force, slip = surfaces[0]
+        depth = point.depth
+        for other, more, _ in surfaces[1:]:
+            force, depth = force + more, select(less(depth, other.depth), other.depth, depth)
         if "contact_f" in self.reports:
-            held = Vector(self._last(x) for x in force)
-            world, over = held, point.link
+            world, over = Vector(self._last(x) for x in force), point.link
             while over is not None:
                 world, over = self.trace.places[id(over)].pose.to_parent(world), over.parent
             self.finished["contact_f"] += [Store("contact_f", (number, c), x) for c, x in enumerate(world)]
         if "contact_gap" in self.reports:
-            self.finished["contact_gap"].append(Store("contact_gap", (number,), -point.depth))
+            self.finished["contact_gap"].append(Store("contact_gap", (number,), -depth))
         if "contact_slip" in self.reports:
             self.finished["contact_slip"].append(Store("contact_slip", (number,), self._last(slip)))
 

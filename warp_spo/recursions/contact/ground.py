@@ -1,0 +1,93 @@
+"""The ground under a point: its normals, and how deep the point is below it.
+
+A plane has one normal. A height field is bilinear in each cell: the depth is (H - z) n_z with the normal n of the field
+under the point, held over the step. Where a cell is steeper than STEEP, the point has two surfaces instead: the wall,
+which is the cell's plane and ends at its highest corner, and the floor, which is flat at the height of its lowest one.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...scene.contacts import HeightField, Plane
+from ...trace.scalars import Graph, Value, floor, less, lookup, reciprocal, select, sqrt
+from ...trace.spatial import IDENTITY, Vector
+
+STEEP = 1.0  # slope beyond which a cell is a wall and a floor
+AWAY = -1e3  # depth of a surface that is not there [m]; no step reaches so far
+GROUND = "ground"
+"""Name of the table of heights, row after row."""
+
+
+class Surface(NamedTuple):
+    """A surface near a point: its normal in the axes that :func:`directions` names, and the point's depth below it."""
+
+    normal: Vector
+    depth: Value
+
+
+def directions(ground: Plane | HeightField) -> list[Vector]:
+    """Return the directions, inertial axes, along which a point's place must be known."""
+    return [Vector(ground.normal)] if isinstance(ground, Plane) else list(IDENTITY)
+
+
+def lowest(ground: Plane | HeightField) -> int:
+    """Return which of the directions leads from the lowest point of a sphere to its centre."""
+    return 0 if isinstance(ground, Plane) else 2
+
+
+def surfaces(graph: Graph, ground: Plane | HeightField, at: list[Value]) -> list[Surface]:
+    """Return the surfaces near a point, whose place along each direction is ``at``."""
+    if isinstance(ground, Plane):
+        return [Surface(Vector((1.0,)), ground.height - at[0])]
+    x, y, z = at
+    rows, columns = ground.heights.shape
+    rate = 1.0 / ground.cell
+    i, s = _cell((x - ground.origin[0]) * rate, rows)
+    j, t = _cell((y - ground.origin[1]) * rate, columns)
+    first = i * float(columns) + j
+    h00, h01, h10, h11 = (lookup(graph, GROUND, first, step) for step in (0, 1, columns, columns + 1))
+    z = z - ground.origin[2]
+    base, run, rise, twist = h00, h10 - h00, h01 - h00, h00 - h10 - h01 + h11
+    height = base + run * s + rise * t + twist * (s * t)
+    smooth = _facing((run + twist * t) * rate, (rise + twist * s) * rate)
+    if not has_walls(ground):
+        return [Surface(smooth, (height - z) * smooth[2])]
+    slope_x, slope_y = ((a + 0.5 * twist) * rate for a in (run, rise))
+    steep = less(STEEP * STEEP, slope_x * slope_x + slope_y * slope_y)
+    low, high = h00, h00
+    for corner in (h01, h10, h11):
+        low, high = select(less(corner, low), corner, low), select(less(high, corner), corner, high)
+    flat = Vector(select(steep, a, b) for a, b in zip(IDENTITY[2], smooth, strict=True))
+    bottom = Surface(flat, (select(steep, low, height) - z) * flat[2])
+    wall = _facing(slope_x, slope_y)
+    middle = 0.25 * (h00 + h01 + h10 + h11) + (run + 0.5 * twist) * (s - 0.5) + (rise + 0.5 * twist) * (t - 0.5)
+    there = steep * (1.0 - less(high, z))
+    return [bottom, Surface(wall, select(there, (middle - z) * wall[2], AWAY))]
+
+
+def _cell(x: Value, points: int) -> tuple[Value, Value]:
+    """Return the cell of a place in cells, and how far in it the place is; the last cell beyond the edges."""
+    x = select(less(0.0, x), x, 0.0)
+    x = select(less(x, points - 1.0), x, points - 1.0)
+    cell = floor(x)
+    cell = select(less(cell, points - 1.5), cell, points - 2.0)
+    return cell, x - cell
+
+
+def _facing(slope_x: Value, slope_y: Value) -> Vector:
+    """Return the upward unit normal of a surface with these slopes."""
+    size = reciprocal(sqrt(slope_x * slope_x + slope_y * slope_y + 1.0))
+    return Vector((-(slope_x * size), -(slope_y * size), size))
+
+
+def has_walls(ground: Plane | HeightField) -> bool:
+    """Return whether some cell of a height field is so steep that it has a wall."""
+    if isinstance(ground, Plane):
+        return False
+    h = ground.heights
+    twist = h[:-1, :-1] - h[1:, :-1] - h[:-1, 1:] + h[1:, 1:]
+    x, y = h[1:, :-1] - h[:-1, :-1] + 0.5 * twist, h[:-1, 1:] - h[:-1, :-1] + 0.5 * twist
+    return bool((np.hypot(x, y) > STEEP * ground.cell).any())
