@@ -1,6 +1,9 @@
 """Plans on GPUs of other sizes: numbers of worlds in proportion to multiprocessors, blocks that shared memory holds."""
 
 import dataclasses
+import json
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -77,3 +80,17 @@ def test_rows_that_a_block_may_not_declare_are_asked_for(bodies, asked, monkeypa
     [(more, text)] = kernels
     assert bool(more["shared"]) == asked == ("extern __shared__" in text)
     assert not asked or straight.SHARED_BYTES < more["shared"] <= 2 * straight.SHARED_BYTES
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_plans_times_candidates_and_checks_results(device, capsys, tmp_path):
+    sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed; behind an installed warp_spo
+    from benchmarks import plans
+
+    call = ["--device", device.alias, "--scenes", "2", "--operations", "mass_matrix", "step", "--worlds", "2"]
+    plans.main([*call, "--json", str(tmp_path / "plans.json")])  # the exit code depends on times
+    text = capsys.readouterr().out
+    assert "2 mass_matrix, 15 dofs, " in text and "2 step, " in text and "; 0 wrong results" in text
+    first, second = json.loads((tmp_path / "plans.json").read_text())["rows"]
+    assert {"tree", "node"} <= first["us"].keys() and first["chosen"] in first["us"]
+    assert first["ratio"] >= 1.0 and 0.0 < first["error"] < 1e-4 and second["operation"] == "step"

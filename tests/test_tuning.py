@@ -55,7 +55,11 @@ def test_the_fastest_is_used_and_kept(device, times, folder):
     q = zoo.random_state(dyn.scene, WORLDS).q
     expected = made(device, dtype="float64").mass_matrix(q)
     before = dyn.mass_matrix(q)
+    kept = list(dyn.programs._programs.values())
+    assert "mass_matrix  tree" in dyn.explain() and NAME in dyn.operation_counts
     choice = dyn.tune(NAME)[NAME]
+    assert all(one in dyn.programs._programs.values() for one in kept)  # a graph may hold their tables
+    assert "mass_matrix  tree" not in dyn.explain() and NAME not in dyn.operation_counts
     assert choice.granularity == "node" and choice.measured and choice.us["node"] == pytest.approx(1.0)
     assert dyn.plan.of(dyn._operations[NAME].routine) == "node" and dyn.granularity == "tree"
     assert "tuned        mass_matrix: node 1 us, tree 2 us" in dyn.explain() and dyn.explain().count("tuned") == 1

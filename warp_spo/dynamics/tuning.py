@@ -123,7 +123,6 @@ def _switch(dyn: Dynamics, name: str, granularity: str | None) -> None:
     if granularity is not None and any(plan.of(one) != granularity for one in routines):
         asked = choose(dyn.scene, dyn.worlds, plan.device, plan.dtype, granularity, plan.varies)
         plan.instead.update(dict.fromkeys(names, asked))
-    dyn.programs.forget(name)
     dyn._replays.forget()
     dyn._gradients.forget()
 

@@ -82,11 +82,8 @@ class Programs:
         self._products: dict[tuple[int, ...], products.Product] = {}
         self._links: Links | None = None
 
-    def forget(self, name: str = "") -> None:
-        """Drop all programs, because values that they folded have changed, or those of the routine of this name."""
-        if name:
-            self._programs = {key: program for key, program in self._programs.items() if key[0].name != name}
-            return
+    def forget(self) -> None:
+        """Drop all programs: values that they folded have changed."""
         self._programs.clear()
         self._products.clear()
         self._links = None
@@ -107,7 +104,7 @@ class Programs:
             options: of the routine's trace.
         """
         names = (name if shape else f"{name}, a number" for name, shape in shapes.items())
-        key = routine, (*names, *(more or ())), out[1:], *options.values()
+        key = routine, (*names, *(more or ())), out[1:], self.plan.of(routine), *options.values()
         if key in self._programs:
             return self._programs[key]
         if self.plan.of(routine) == "node":
@@ -144,14 +141,18 @@ class Programs:
     @property
     def operation_counts(self) -> dict[str, int]:
         """Floating-point operations of one world, by operation."""
-        return {_title(key): program.operations for key, program in self._programs.items() if program is not None}
+        return {_title(key): program.operations for key, program in self._used}
+
+    @property
+    def _used(self) -> list[tuple[tuple, Program]]:
+        """The programs at the granularity that the plan gives now; others stay for graphs that hold them."""
+        found = self._programs.items()
+        return [(key, program) for key, program in found if program is not None and key[3] == self.plan.of(key[0])]
 
     def described(self) -> list[str]:
         """A line for each kernel: its granularity, its operations in one world, and on CUDA what it takes."""
         lines = []
-        for key, program in self._programs.items():
-            if program is None:
-                continue
+        for key, program in self._used:
             granularity = f"segment, {program.warps} warps" if program.warps > 1 else "tree"
             line = f"{_title(key)}  {granularity}, {program.operations} operations a world"
             if self.run.device.is_cuda:
@@ -398,5 +399,5 @@ class Programs:
 
 def _title(key: tuple) -> str:
     """Return what the user calls the computation of a program."""
-    routine, inputs, _, *options = key
+    routine, inputs, _, _, *options = key
     return routine.name if routine.title is None else routine.title(inputs, *options)
