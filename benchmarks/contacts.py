@@ -1,4 +1,4 @@
-"""Steps of Go2 and G1 on the ground: time of a step with contacts beside one without, and errors against float64.
+"""Steps of Go2 and G1 on a plane and on a height field: time of a step, and errors against float64.
 
     python -m benchmarks.contacts [--device cuda:0] [--worlds 4096 65536] [--json FILE]
 
@@ -23,6 +23,7 @@ from . import robots
 from .capabilities import SETS, measure_time
 
 DT = 5e-3
+SAMPLE = 4  # worlds that are compared with the dense step
 GO2_STAND = np.array([0.0, 0.8, -1.5] * 4)
 SOLE = [(x, y, -0.03) for x in (-0.05, 0.12) for y in (-0.03, 0.03)]
 
@@ -62,30 +63,32 @@ def states(one: spo.Scene, worlds: int, seed: int) -> tuple[np.ndarray, np.ndarr
     return q.astype(np.float32), (0.3 * rng.normal(size=(worlds, n))).astype(np.float32)
 
 
-def measure(one: spo.Scene, worlds: int, device: wp.Device) -> dict[str, float]:
-    """Return times [us] of a step with and without contacts, and errors of one world in a few."""
-    found = {}
-    sets = [[wp.array(x, dtype=wp.float32, device=device) for x in states(one, worlds, s)] for s in range(SETS)]
-    for name, subject in (("with contacts", one), ("without", one.with_contacts([]))):
-        dyn = spo.Dynamics(subject, worlds, device=device)
-        out = [wp.empty_like(x) for x in sets[0]]
-        found[name] = measure_time(lambda i, dyn=dyn, out=out: dyn.step(*sets[i], None, DT, out=tuple(out)), device)
-        if subject.contacts:
-            force = wp.empty((worlds, len(subject.contact_points), 3), dtype=wp.float32, device=device)
-            after = dyn.step(*sets[0], None, DT, contact_f=force)[1].numpy()
-            weight = 9.81 * subject.values["body_mass"].sum()
-            start = [x.numpy().astype(np.float64) for x in sets[0]]
-            checked = range(0, worlds, max(1, worlds // 4))
-            errors = []
-            for w in checked:
-                wanted = ContactStep(subject, start[0][w], start[1][w], DT).run()[1]
-                errors.append((np.abs(after[w] - wanted.v).max() / np.abs(wanted.v).max(),
-                               np.abs(force.numpy()[w] - wanted.f).max() / weight))  # fmt: skip
-            found["velocity error"], found["force error"] = np.max(errors, axis=0).tolist()
-            (found["operations"],) = dyn.operation_counts.values()
-            lines = [line for line in dyn.explain().split("\n") if line.startswith("contact_step")]
-            print("   ", lines[0])
-    return found
+def subject(robot: str, worlds: int, device: wp.Device, field: bool = False) -> tuple[spo.Dynamics, list]:
+    """Return a robot on the ground, a plane or rough ground of 2 cm, and the states of its sets of inputs."""
+    one = scene(robot)
+    sets = [[wp.array(x, dtype=wp.float32, device=device) for x in states(one, worlds, seed)] for seed in range(SETS)]
+    if field:
+        one = one.with_contacts(one.contacts, spo.terrain.rough((16.0, 16.0), 0.1, 0.02))
+    return spo.Dynamics(one, worlds, device), sets
+
+
+def measure(robot: str, worlds: int, device: wp.Device, field: bool = False) -> dict[str, float]:
+    """Return ``us`` of a step, and its errors against the dense step: of velocities, and of forces over the weight."""
+    dyn, sets = subject(robot, worlds, device, field)
+    out, (q, qd) = tuple(wp.empty_like(x) for x in sets[0]), sets[0]
+    found = {"us": measure_time(lambda i: dyn.step(*sets[i], None, DT, out=out), device)}
+    force = wp.empty((worlds, len(dyn.scene.contact_points), 3), dtype=wp.float32, device=device)
+    after = dyn.step(q, qd, None, DT, contact_f=force)[1].numpy()
+    weight, start = 9.81 * dyn.scene.values["body_mass"].sum(), [x.numpy().astype(np.float64) for x in (q, qd)]
+    errors = []
+    for w in range(0, worlds, max(1, worlds // SAMPLE)):
+        at = ContactStep(dyn.scene, start[0][w], start[1][w], DT)
+        wanted, forces = at.run()[1], np.zeros(force.shape[1:])
+        np.add.at(forces, at.numbers, wanted.f)
+        errors.append((np.abs(after[w] - wanted.v).max() / np.abs(wanted.v).max(),
+                       np.abs(force.numpy()[w] - forces).max() / weight))  # fmt: skip
+    found["error"], found["force error"] = np.max(errors, axis=0).tolist()
+    return found | {"operations": dyn.operation_counts["contact_step"]}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -96,11 +99,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     device, results = wp.get_device(options.device), {}
-    for name in options.robots:
-        one = scene(name)
+    for robot in options.robots:
         for worlds in options.worlds:
-            found = results[f"{name}, {worlds}"] = measure(one, worlds, device)
-            print(f"{name} {worlds:6d}  " + "  ".join(f"{key} {value:.3g}" for key, value in found.items()), flush=True)
+            for field in (False, True):
+                name = f"{robot}, {worlds} worlds, {'height field' if field else 'plane'}"
+                results[name] = found = measure(robot, worlds, device, field)
+                print(name, "  ".join(f"{key} {value:.3g}" for key, value in found.items()), flush=True)
     if options.json:
         options.json.write_text(json.dumps(results, indent=1))
     return 0

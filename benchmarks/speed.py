@@ -29,11 +29,13 @@ import warp_spo as spo
 from warp_spo.trials.operations import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, Trial
 
-from . import robots, runner
+from . import contacts, robots, runner
 from .resources import record_launches, resources
 
 FEW, MANY, MOST = 4096, 65536, 1 << 20
 INERTIAS = ("body_mass", "body_com", "body_inertia")
+ON_PLANE, ON_FIELD = "contact_step", "contact_step on a height field"
+CONTACT_TOLERANCE = 1e-4  # of velocities after a step with contacts, in float32
 SETS, SAMPLE, REPEATS, WARM_UP, BUDGET = 3, 2, 15, 0.1, 0.3
 
 
@@ -94,6 +96,9 @@ LINES = (
     Line(Call("g1", "mass_matrix_inverse", FEW, "float64"), "us", 60.0),
     *(_over_float32(robot, name, FEW, 2.5) for robot in ("go2", "g1") for name in ("phi", "phi.T", "psi")),
     *(_over_folded(robot, 1.4) for robot in ("panda", "go2", "g1")),
+    *(Line(Call("go2", ON_PLANE, worlds), "us", limit) for worlds, limit in ((FEW, 25.0), (MANY, 150.0))),
+    *(Line(Call("g1", ON_PLANE, worlds), "us", limit) for worlds, limit in ((FEW, 70.0), (MANY, 500.0))),
+    Line(Call("go2", ON_FIELD, MANY), "ratio", 1.15, Call("go2", ON_PLANE, MANY)),
 )
 
 
@@ -107,6 +112,9 @@ def trial_of(call: Call, device: wp.Device, sets: int = SETS) -> Trial:
 
 def measure(call: Call, device: wp.Device) -> dict:
     """Return ``us``, percentiles, ``error``, and what the call's kernels take."""
+    if call.operation in (ON_PLANE, ON_FIELD):
+        found = contacts.measure(call.robot, call.worlds, device, call.operation == ON_FIELD)
+        return dataclasses.asdict(call) | found | {"tolerance": CONTACT_TOLERANCE}
     with record_launches() as launched:
         trial = trial_of(call, device)
         del launched[:]
@@ -123,6 +131,12 @@ def calls_of(lines: list[Line]) -> list[Call]:
 
 
 def _compile(call: Call, device: str) -> None:
+    if call.operation in (ON_PLANE, ON_FIELD):
+        dyn, ((q, qd), *_) = contacts.subject(
+            call.robot, call.worlds, wp.get_device(device), call.operation == ON_FIELD
+        )
+        dyn.step(q, qd, None, contacts.DT)
+        return
     trial_of(call, wp.get_device(device), sets=1)
 
 
@@ -161,7 +175,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
     if options.json:
         print(f"wrote {runner.save(runner.record(rows, device), options.json)}")
-    wrong = [row for row in rows if not row["error"] <= TOLERANCE[row["dtype"]]]
+    wrong = [row for row in rows if not row["error"] <= row.get("tolerance", TOLERANCE[row["dtype"]])]
     for row in wrong:
         print(f"error {row['error']:.1e} exceeds its tolerance in {row}", file=sys.stderr)
     return 1 if wrong else 0

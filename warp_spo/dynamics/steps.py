@@ -218,9 +218,9 @@ def step(
               did not close it. Bars turn too far in the step (half a radian), which wants a shorter dt; or the step
               started open, see :meth:`project`; or angles of many turns, or positions 100 m away, are rounded by as
               much, which wants float64, angles without full turns, or an origin nearby.
-            * 8, CONTACT: the last pass of a scene with contacts ended outside of a friction cone or with a pulling
-              contact by more than 0.1 of the weight of all bodies, or outside of an effort limit by more than 0.1 of
-              the least such limit.
+            * 8, CONTACT: the last pass of a scene with contacts ended outside of a friction cone, with a pulling
+              contact, or without the push of a point that it carried below ground, by more than 0.1 of the weight of
+              all bodies, or outside of an effort limit by more than 0.1 of the least such limit.
             * 5, NOT_SETTLED: the last pass still found a law in another part than it had assumed. The step stands, with
               a force that a shorter dt would correct.
             * 0, OK: none of these.

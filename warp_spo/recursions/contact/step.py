@@ -55,6 +55,7 @@ class ContactStep(Step):
         self.reports, self.kept = reports, Kept(trace.graph)
         self.secants: dict[int, list[Secant]] = {}  # by dof
         self.excess: list[Value] = []  # of cone, adhesion and effort
+        self.missed: Value = 0.0  # largest push of a point that the last pass left open
         self.finished: dict[str, list[Store]] = {name: [] for name in reports}
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
@@ -78,18 +79,20 @@ class ContactStep(Step):
         for link in self.links:
             trace.label(link, "u")
             efforts += [law.finish(gains[dof]) for dof in link.dofs for law in self.secants[dof]]
-        cones, pulls = [], []
+        cones, pulls, missed = [], [], []
         forces: dict[int, list[tuple[Point, Vector, Value]]] = {}  # by point
         for point, touch in zip(points, touches, strict=True):
             trace.graph.step = f"contact {point.number}|f"
-            force, slip, cone, pull = self._finish(point, touch, alpha)
+            force, slip, cone, pull, push = self._finish(point, touch, alpha)
             cones.append(cone)
             pulls.append(pull)
+            missed.append(push)
             forces.setdefault(point.number, []).append((point, force, slip))
         for number, surfaces in forces.items():
             self._report(number, surfaces)
         if status or "contact_excess" in self.reports:
-            self._keep_excess(cones, pulls, efforts, status)
+            self._keep_excess(cones, pulls, efforts)
+        self.missed = self._last(largest(missed)) if status else 0.0
         trace.begin = kept.begin
         return passed + kept.end + self._after(qdd, status)
 
@@ -153,8 +156,9 @@ class ContactStep(Step):
         push = touch.closed * (point.k * point.depth - (point.k * self.h + point.d) * normal)
         return point.normal * (push + touch.across * normal) - v * touch.across
 
-    def _finish(self, point: Point, touch: Touch, alpha: dict) -> tuple[Vector, Value, Value, Value]:
-        """Keep what the next pass reads of a point; return its force, its slip, and its excess of cone and pull."""
+    def _finish(self, point: Point, touch: Touch, alpha: dict) -> tuple[Vector, Value, Value, Value, Value]:
+        """Keep what the next pass reads of a point; return its force, its slip, by how much the force leaves the cone,
+        how much it pulls, and the push that it lacks because the pass left the point open."""
         kept, h = self.kept, self.h
         change = ZERO if point.link is None else point.moved(*alpha[id(point.link)])
         v = point.velocity + change * h
@@ -169,11 +173,13 @@ class ContactStep(Step):
         kept.keep(touch.across, self._secant(point, fn, slip + (h * point.weight) * over))
         reached = less(0.0, point.depth - h * normal)
         candidate = select(touch.candidate, touch.candidate, reached)
-        pushes = less(0.0, point.k * point.depth - (point.k * h + point.d) * normal)
+        push = point.k * point.depth - (point.k * h + point.d) * normal
+        pushes = less(0.0, push)
         kept.keep(touch.candidate, candidate)
         stays = kept.closing * touch.closed
         kept.keep(touch.closed, select(stays, 1.0, candidate * pushes))
-        return force, slip, over, select(less(pushed, 0.0), -pushed, 0.0)
+        lacking = select(touch.closed, 0.0, candidate * select(pushes, push, 0.0))
+        return force, slip, over, select(less(pushed, 0.0), -pushed, 0.0), lacking
 
     # -- results ---------------------------------------------------------------------------------------------------
     def _report(self, number: int, surfaces: list[tuple[Point, Vector, Value]]) -> None:
@@ -200,7 +206,7 @@ class ContactStep(Step):
         self.kept.keep(variable, value)
         return variable
 
-    def _keep_excess(self, cones: list[Value], pulls: list[Value], efforts: list[Value], status: bool) -> None:
+    def _keep_excess(self, cones: list[Value], pulls: list[Value], efforts: list[Value]) -> None:
         self.trace.graph.step = "excess|e"
         self.excess = [self._last(largest(values)) for values in (cones, pulls, efforts)]
         if "contact_excess" in self.reports:
@@ -234,7 +240,8 @@ class ContactStep(Step):
         cone, pull, effort = self.excess
         bounds = scene.values["joint_effort_limit"]
         most = float(bounds[bounds > 0.0].min()) if (bounds > 0.0).any() else 1.0
-        excess = less(TOLERANCE * weight, cone) + less(TOLERANCE * weight, pull) + less(TOLERANCE * most, effort)
+        forces = (cone, pull, self.missed)
+        excess = total(less(TOLERANCE * weight, force) for force in forces) + less(TOLERANCE * most, effort)
         return select(word, word, select(excess, Status.CONTACT, 0.0))
 
     def _inputs(self) -> list[Value]:
