@@ -64,7 +64,7 @@ def expected(exact: spo.Dynamics, operation: str, given: list[np.ndarray]) -> li
 
 def measure(scene: spo.Scene, operation: str, worlds: int, dtype: str, device: wp.Device) -> dict[str, Any]:
     """Return times of an operation, its error, and what its kernels take."""
-    dyn, exact = spo.Dynamics(scene, worlds, device, dtype), spo.Dynamics(scene, SAMPLE, "cpu", "float64")
+    dyn, exact = spo.Dynamics(scene, worlds, device, dtype), spo.Dynamics(scene, min(SAMPLE, worlds), "cpu", "float64")
     sets = [inputs(scene, worlds, seed) for seed in range(SETS)]
     on = [[wp.array(array, dtype=dyn.dtype, device=device) for array in arrays] for arrays in sets]
     call: Callable[..., Any] = getattr(dyn, operation)
