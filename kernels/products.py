@@ -1,8 +1,9 @@
 """Products -A B of a symmetric matrix and matrices in tiles, whose columns are zero but for the dofs that a dof meets.
 
-A thread works on one row of the result in one world: it holds a row of A in registers and reads the entries of B, the
-same for all threads of a world, from shared memory, 16 bytes at a time. Columns with equal rows that may differ from
-zero share one loop. The rows of the result leave through shared memory. See :mod:`.tiles` for the tiles.
+A block works on one matrix B in a few worlds, a thread on a row or two of the result in one world: it holds these rows
+of A in registers and reads the entries of B, the same for all threads of a world, from shared memory, 16 bytes at a
+time. Columns with equal rows that may differ from zero share one loop. The rows of the result leave through shared
+memory. See :mod:`.tiles` for the tiles.
 """
 
 import itertools
@@ -16,6 +17,7 @@ from .slots import STREAMING_STORE, VECTORS, WARP_SIZE
 from .straight import SHARED_BYTES, TILE
 
 MOST_THREADS = 320  # of a block; ten warps, whose registers leave room for other blocks
+MOST_BYTES = 96 * 4  # of two rows of A, which a thread then holds: a value from shared memory serves both
 BLOCKS = 2  # matrices B in a tile
 
 
@@ -34,12 +36,14 @@ class ProductLayout(NamedTuple):
         chunks: the columns that are in shared memory at the same time, by groups.
         worlds: the worlds of a block, a divisor of TILE.
         wide: the number of scalars in 16 bytes.
+        rows: the number of rows of a thread, 1 or 2.
     """
 
     size: int
     chunks: tuple[tuple[Columns, ...], ...]
     worlds: int
     wide: int
+    rows: int
 
     def length(self, group: Columns) -> int:
         """Return the scalars of shared memory for a column: whole vectors of 16 bytes."""
@@ -66,7 +70,12 @@ class ProductLayout(NamedTuple):
     @property
     def block(self) -> int:
         """The number of threads."""
-        return -(-self.worlds * self.size // WARP_SIZE) * WARP_SIZE
+        return -(-self.worlds * self.lanes // WARP_SIZE) * WARP_SIZE
+
+    @property
+    def lanes(self) -> int:
+        """The number of threads that share a world."""
+        return -(-self.size // self.rows)
 
     def place_entries(self, slots: Sequence[int]) -> list[int]:
         """Return the slot of every scalar of the entries of B; ``slots`` gives those of [matrix, row, column]."""
@@ -87,6 +96,7 @@ class ProductLayout(NamedTuple):
 def choose_layout(size: int, slots: Sequence[int], T: type) -> ProductLayout:
     """Return the layout for B whose entries [matrix, row, column] have these ``slots``, -1 being zero."""
     bytes_of = wp.types.type_size_in_bytes(T)
+    held = 2 if 2 * size * bytes_of <= MOST_BYTES else 1
     rows = {
         column: tuple(r for r in range(size) if any(slots[(b * size + r) * size + column] >= 0 for b in range(BLOCKS)))
         for column in range(size)
@@ -99,13 +109,13 @@ def choose_layout(size: int, slots: Sequence[int], T: type) -> ProductLayout:
         return tuple(Columns(tuple(some), key) for key, some in found.items())
 
     for worlds in (TILE, 4, 2, 1):
-        layout = ProductLayout(size, (chunks(range(size)),), worlds, 16 // bytes_of)
+        layout = ProductLayout(size, (chunks(range(size)),), worlds, 16 // bytes_of, held)
         if layout.scalars * bytes_of <= SHARED_BYTES and layout.block <= MOST_THREADS:
             return layout
     for count in range(2, size + 1):
         bounds = [size * at // count for at in range(count + 1)]
         parts = tuple(chunks(range(low, high)) for low, high in itertools.pairwise(bounds))
-        layout = ProductLayout(size, parts, 1, 16 // bytes_of)
+        layout = ProductLayout(size, parts, 1, 16 // bytes_of, held)
         if layout.scalars * bytes_of <= SHARED_BYTES:
             return layout
     raise AssertionError("a column fits into shared memory, because a scene that comes here has at most 128 dofs")
@@ -115,30 +125,34 @@ def assemble(layout: ProductLayout, slots: int, T: type) -> str:
     """Return the native code of a thread: arguments a, b, place, columns, q_out, qd_out."""
     c, n, W = C_TYPE[T], layout.size, layout.worlds
     total = sum(map(layout.packed, layout.chunks))
+    last = f"(row < {n - layout.lanes} ? row + {layout.lanes} : {n - 1})"  # two threads may share the last row
+    rows = ["row", last][: layout.rows]
     text = ["#if defined(__CUDA_ARCH__)"]
-    text += [f"const int member = threadIdx.x, first = blockIdx.x * {W};"]
+    text += [f"const int member = threadIdx.x, block = blockIdx.x % {BLOCKS}, first = blockIdx.x / {BLOCKS} * {W};"]
     text += [f"const int present = worlds - first < {W} ? worlds - first : {W};"]
     text += [f"__shared__ __align__(16) {c} shared[{layout.scalars}];"]
     text += [f"{c}* stage = shared + {W * layout.pitch};"]
-    text += [f"const int own = member / {n}, row = member % {n};", "const bool mine = own < present;"]
-    text += [f"const {c}* factors = a.data + (long long)(first + (mine ? own : 0)) * {n * n} + row;"]
+    text += [f"const int own = member / {layout.lanes}, row = member % {layout.lanes};"]
+    text += ["const bool mine = own < present;"]
+    text += [f"const {c}* factors = a.data + (long long)(first + (mine ? own : 0)) * {n * n};"]
     text += [f"const {c}* from = b.data + (long long)(first / {TILE}) * {slots * TILE} + first % {TILE};"]
-    text += [f"{c} w[{n}];", "#pragma unroll", f"for (int k = 0; k < {n}; ++k) w[k] = factors[k * {n}];"]
-    text += ["#pragma unroll 1", f"for (int block = 0; block < {BLOCKS}; ++block) {{"]
+    for r, at_row in enumerate(rows):
+        text += [f"{c} w{r}[{n}];", "#pragma unroll"]
+        text += [f"for (int k = 0; k < {n}; ++k) w{r}[k] = factors[k * {n} + {at_row}];"]
     text += [f"{c}* to = (block ? qd_out.data : q_out.data) + (long long)first * {n * n};"]
     at, column = 0, 0
     for chunk in layout.chunks:
         text += [_fill(layout, chunk, f"place.data + block * {total} + {at}", c)]
         text += ["__syncthreads();", "if (mine) {", f"const {c}* x = shared + own * {layout.pitch};"]
         width = layout.width(chunk)
-        text += [f"{c}* sums = stage + own * {n * width} + row * {width};"]
+        text += [f"{c}* sums{r} = stage + (own * {n} + {at_row}) * {width};" for r, at_row in enumerate(rows)]
         low = min(column for group in chunk for column in group.columns)
         for group in chunk:
             text += [_multiply(layout, group, column, low, c)]
             column += len(group.columns)
         text += ["}", "__syncthreads();", _copy_out(layout, width, low, c)]
         at += layout.packed(chunk)
-    text += ["}", "#else", _on_cpu(layout, slots, total, c), "#endif", ""]
+    text += ["#else", _on_cpu(layout, slots, total, c), "#endif", ""]
     return "\n".join(text)
 
 
@@ -164,21 +178,24 @@ def _fill(layout: ProductLayout, chunk: tuple[Columns, ...], place: str, c: str)
 
 def _multiply(layout: ProductLayout, group: Columns, first: int, low: int, c: str) -> str:
     """Return the loop over the columns of a group, the first of which is number ``first`` of all."""
-    vector, _, parts = VECTORS[c]
+    (vector, _, parts), held = VECTORS[c], range(layout.rows)
     if not group.rows:
-        body = [f"{c} sum = 0;"]
+        body = [f"{c} sum{r} = 0;" for r in range(layout.rows)]
     else:
         reads = range(-(-len(group.rows) // layout.wide))
         body = [f"const {vector} v{u} = ((const {vector}*)x)[{u}];" for u in reads]
-        factors = [f"w[{k}], v{i // layout.wide}.{parts[i % layout.wide]}" for i, k in enumerate(group.rows)]
         fused = "fmaf" if c == "float" else "fma"  # kernels are compiled without contraction
-        body += [f"{c} sum = 0;", *(f"sum = {fused}({pair}, sum);" for pair in factors)]
+        body += [f"{c} sum{r} = 0;" for r in held]
+        for i, k in enumerate(group.rows):
+            value = f"v{i // layout.wide}.{parts[i % layout.wide]}"
+            body += [f"sum{r} = {fused}(w{r}[{k}], {value}, sum{r});" for r in held]
     return "\n".join(
         [
             "#pragma unroll 2",
             f"for (int turn = 0; turn < {len(group.columns)}; ++turn, x += {layout.length(group)}) {{",
             *body,
-            f"sums[__ldg(shifts.data + {first} + turn) - {low}] = -sum;",
+            f"const int column = __ldg(shifts.data + {first} + turn) - {low};",
+            *(f"sums{r}[column] = -sum{r};" for r in held),
             "}",
         ]
     )

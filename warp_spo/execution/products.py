@@ -23,7 +23,7 @@ class Product(NamedTuple):
     def launch(self, inverse: wp.array, tiles: wp.array, q_out: wp.array, qd_out: wp.array) -> None:
         """Launch the kernel: ``inverse`` [world, dof, dof], ``tiles`` [tile, slot, world of the tile]."""
         worlds = len(inverse)
-        threads = -(-worlds // self.worlds) * self.block if self.device.is_cuda else worlds
+        threads = products.BLOCKS * -(-worlds // self.worlds) * self.block if self.device.is_cuda else worlds
         inputs = [worlds, inverse, tiles, *self.tables]
         launches.launch(self.kernel, threads, inputs, [q_out, qd_out], device=self.device, block_dim=self.block)
 
