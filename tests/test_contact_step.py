@@ -2,6 +2,7 @@
 
 import functools
 
+import actuated
 import numpy as np
 import pytest
 import symbolic
@@ -57,6 +58,21 @@ def test_the_recursion_is_the_dense_step(name, passes):
     """Random trees of every hinge, with every law, contacts anywhere."""
     scene = TREES[name]
     assert_is_dense(scene, states(scene, WORLDS), passes)
+
+
+def test_without_ground_passes_settle_on_the_exact_step():
+    """Drives, limits and actuators: dampers that give the bound end where the step without contacts is."""
+    rng, far = np.random.default_rng(1), [spo.Contact(0, point=(0.0, 0.0, 0.0))]
+    motors, fork = actuated.everything(), furnished(zoo.fork())
+    fork = fork.with_values(joint_friction=np.zeros(11), joint_velocity_limit=np.full(11, 1e6))
+    given = {name: rng.normal(size=(8, 3)) for name in ("q", "qd", "tau")}
+    given["ctrl"] = 3.0 * rng.normal(size=(8, len(motors.actuators)))
+    for scene, a, three in ((fork, states(fork, WORLDS), 1e-5), (motors, given, 2e-3)):
+        _, wanted, _ = symbolic.advance(scene, a, H)
+        below = scene.with_contacts(far, spo.Plane(-1e3))
+        for passes, tolerance in ((3, three), (12, 1e-10)):
+            found = symbolic.contact_step(below, a, H, passes)["out"]
+            np.testing.assert_allclose(found, wanted, atol=tolerance * np.abs(wanted).max())
 
 
 TELLING = (148, 173, 186, 193, 253, 329, 502, 579)

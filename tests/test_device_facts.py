@@ -26,6 +26,8 @@ def test_a_small_gpu_is_full_with_fewer_worlds():
         assert (few.granularity, many.granularity) == ("segment", "tree") and few.few and not many.few
         assert f"up to {limit} worlds" in few.reason and f"more than {limit} worlds" in many.reason
     assert CPU.scaled(100) == 100
+    few, many = (plan.choose(zoo.star(4), 17997 + more, L4, "float32") for more in (0, 1))  # limbs of one code
+    assert (few.granularity, many.granularity) == ("segment", "tree") and not few.few
 
 
 def test_a_thread_of_a_scan_takes_more_nodes_on_a_small_gpu():

@@ -23,6 +23,7 @@ COLUMN_BYTES = 1 << 28  # workspace of a solve with many right-hand sides; more 
 # Measured on an H200, 2026-11-21; see CONTRIBUTING. Numbers of worlds and of threads are in proportion to its
 # multiprocessors on another GPU, see DeviceFacts.scaled.
 FEW_WORLDS = 32768  # so many leave a GPU waiting: a warp for each limb, and rows read where they are
+ALIKE_WORLDS = 40960  # up to so many, a warp for each limb is faster if limbs share code (Go2 on 58 multiprocessors)
 MOST_DOFS = 128  # straight-line code of more takes too long to compile
 SPILLS = {"float32": 32, "float64": 15}  # dofs at which one thread no longer holds a whole tree in registers,
 SOLVES = {"float32": 32, "float64": 20}  # and at which it does not without velocities
@@ -32,7 +33,7 @@ SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as throug
 LONG_ROWS = 24  # in segments; longer rows come in together already at fewer worlds
 FEW_RESULTS = 2  # short ones that a thread writes by itself
 MOST_WARPS = 16
-NODE_WORLDS = 1024  # beyond which a launch for each level is never the fastest, and its workspace large
+NODE_WORLDS = 1024  # of a CPU, beyond which a launch for each level only takes a large workspace
 DEEPEST = 12  # dofs from a root to a leaf, a free hinge one, up to which velocity terms that come first are as accurate
 APART = {"chain": 2048, "tree": 4 * FEW_WORLDS, "segment": FEW_WORLDS}  # worlds beyond which they are faster
 
@@ -131,7 +132,7 @@ class Plan:
         if self.forced or self.dofs > MOST_DOFS or not self.dofs:
             return (first,)
         divides = self.device.cuda and bool(routine.letters) and 1 < self.limbs <= MOST_WARPS
-        sweeps = routine.has_node_form and self.worlds <= NODE_WORLDS
+        sweeps = routine.has_node_form and not self.device.cuda and self.worlds <= NODE_WORLDS
         found = ["tree", *["segment"] * divides, *["node"] * sweeps]
         return (first, *(name for name in found if name != first))
 
@@ -245,7 +246,7 @@ def _depth(scene: Scene) -> int:
 def _chosen(
     dofs: int, limbs: int, alike: bool, worlds: int, device: DeviceFacts, dtype: str, varies: bool
 ) -> tuple[str, str]:
-    few_worlds = device.scaled(FEW_WORLDS)
+    few_worlds = device.scaled(ALIKE_WORLDS if alike else FEW_WORLDS)
     if dofs == 0:
         return "node", "nothing moves"
     if dofs > MOST_DOFS:
