@@ -299,6 +299,18 @@ def test_fingerprints_differ_where_kernels_do():
     assert fingerprint(named) == fingerprint(spo.Scene([spo.Body(1.0, label="b")], [spo.Hinge("free", -1, 0)]))
 
 
+def test_heights_of_the_ground_are_no_code():
+    def on(ground):
+        free = spo.Hinge("free", -1, 0)
+        return spo.Scene(
+            [spo.Body(1.0, inertia=np.eye(3))], [free], contacts=[spo.Contact(0, point=(0, 0, 0))], ground=ground
+        )
+
+    low, high, large = (spo.HeightField(np.full((n, n), height), 0.1) for n, height in ((5, 0.0), (5, 0.3), (6, 0.0)))
+    assert fingerprint(on(low)) == fingerprint(on(high))
+    assert len({fingerprint(on(ground)) for ground in (low, large, spo.Plane(), spo.Plane(0.1))}) == 4
+
+
 def test_functions_of_the_user_count_by_what_they_return():
     def slider(length):
         pose = lambda q: ([length * q[0], 0.0, 0.0], np.eye(3).tolist())  # noqa: E731
