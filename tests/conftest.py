@@ -55,9 +55,9 @@ def pytest_collection_modifyitems(items):
 def without_optimization(make):
     """Return ``make`` with kernels that the CPU's compiler does not optimize; a GPU's compiler does.
 
-    Most of the time of a run without a kernel cache would go into optimizing straight-line kernels. Each of their
-    statements is one operation, so that results keep their bits. Kernels at node granularity, whose functions are fused
-    when they are inlined, are compiled as users compile them.
+    Most of the time of a run without a kernel cache would go into optimizing straight-line kernels. The compiler may
+    not fuse their products and sums, so that results keep their bits. Kernels at node granularity, whose functions are
+    fused when they are inlined, are compiled as users compile them.
     """
 
     def make_unoptimized(*arguments, **options):

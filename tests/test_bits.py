@@ -17,6 +17,7 @@ import warp_spo as spo
 from benchmarks import robots, shapes
 from warp_spo.errors import UnsupportedError
 from warp_spo.execution import plan
+from warp_spo.execution.device_facts import MEASURED
 from warp_spo.trials.operations import APPLICATIONS, DT, OPERATIONS, Inputs, Operation
 from warp_spo.trials.trial import Subject, Trial
 
@@ -149,3 +150,16 @@ def test_every_text_of_a_routine_has_the_same_bits(granularity, monkeypatch):
         first, *others = results.values()
         for other in others:
             np.testing.assert_array_equal(other, first)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("granularity", GRANULARITIES)
+def test_formulas_do_not_depend_on_the_number_of_worlds(granularity, dtype):
+    """Forward dynamics with velocity terms first is another algorithm, whose bits differ."""
+    found = set()
+    for links in (7, 40):
+        scene = shapes.random_tree(links)
+        plans = [plan.choose(scene, worlds, MEASURED, dtype, granularity) for worlds in (1, 1000, 65536, 1 << 20)]
+        assert len({one.apart for one in plans}) == 1
+        found.add(plans[0].apart)
+    assert True in found

@@ -35,7 +35,7 @@ FEW_RESULTS = 2  # short ones that a thread writes by itself
 MOST_WARPS = 16
 NODE_WORLDS = 1024  # of a CPU, beyond which a launch for each level only takes a large workspace
 DEEPEST = 12  # dofs from a root to a leaf, a free hinge one, up to which velocity terms that come first are as accurate
-APART = {"chain": 2048, "tree": 4 * FEW_WORLDS, "segment": FEW_WORLDS}  # worlds beyond which they are faster
+VELOCITIES_FIRST = {"tree": {"float32": HELD, "float64": HELD}, "segment": SPILLS}  # dofs beyond which they are faster
 
 # Measured on an H200, 2026-11-22, see benchmarks/depth.py. In a graph, a launch of a sweep takes 3.4 us and one of a
 # scan 5 to 7 us, because a round of a scan is a product of two elements. A scan does three to five times the work of a
@@ -65,7 +65,8 @@ class Plan:
         dtype: "float32" or "float64".
         dofs: of the scene.
         limbs: serial chains that end in a leaf; counted where it matters.
-        apart: forward dynamics takes velocity terms and loads first, and keeps no link's velocity for the rest.
+        apart: forward dynamics takes velocity terms and loads first, and keeps no link's velocity for the rest. It does
+            not depend on the number of worlds, because the results have other bits.
         varies: inertias or hinge frames come from memory.
         stretch: at node granularity, scans do the work of most sweeps, with so many nodes for a thread, see
             :mod:`.scan`; 0: sweeps do.
@@ -200,8 +201,7 @@ def choose(
     for level in scene.tree.levels:
         outward.append((first, len(level)))
         first += len(level)
-    apart = side_by_side and not varies and worlds > device.scaled(APART["chain" if limbs == 1 else chosen])
-    apart = apart and _depth(scene) <= DEEPEST
+    apart = side_by_side and not varies and _takes_velocities_first(scene, "tree" if limbs == 1 else chosen, dtype)
     levels, dofs = tuple(outward), scene.dof_count
     if recursion is not None:
         stretch = STRETCH if recursion == "scan" else 0, "asked for"
@@ -231,6 +231,11 @@ def _stretch(scene: Scene, worlds: int, device: DeviceFacts, varies: bool) -> tu
     if worlds * threads > most:
         return 0, f"with {worlds} worlds the work takes longer than launches; scans would be {counts}"
     return length, f"{counts}, a thread takes up to {length} nodes"
+
+
+def _takes_velocities_first(scene: Scene, granularity: str, dtype: str) -> bool:
+    """Return whether forward dynamics with velocity terms first is faster at a granularity, and as accurate."""
+    return scene.dof_count > VELOCITIES_FIRST[granularity][dtype] and _depth(scene) <= DEEPEST
 
 
 def _depth(scene: Scene) -> int:
