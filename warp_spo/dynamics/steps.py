@@ -179,7 +179,7 @@ def step(
     A scene with ``contacts`` takes a fixed number of passes instead, each one sweep. The first closes all points that
     may touch, later ones open those that pull, and the last of three or more only closes. Friction, effort limits and
     dry friction are then dampers that give their bound at the velocity of the pass before: a pass that ends outside of
-    a bound does so by what :attr:`contact_excess` says, and gains no energy at a held pose. The normal force of a point
+    a bound does so by what ``contact_excess`` says, and gains no energy at a held pose. The normal force of a point
     is stiffness times depth plus damping times the speed inward, both after the step; there is no restitution. A point
     that sticks creeps, by eps rho / sqrt(1 - rho^2) for the share rho of friction that is used. Contacts need
     integrator="semi_implicit", no closed loops, and granularity None or "tree"; they have no gradients.
