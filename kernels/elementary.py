@@ -11,11 +11,14 @@ import warp as wp
 C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
 FUSED = """
 #if defined(__CUDA_ARCH__)
-#define FUSED(a, b, c) on::fused(a, b, c)
+#define FUSED_float(a, b, c) __fmaf_rn(a, b, c)
+#define FUSED_double(a, b, c) __fma_rn(a, b, c)
 #else
-#define FUSED(a, b, c) ((a) * (b) + (c))
+#define FUSED_float(a, b, c) ((a) * (b) + (c))
+#define FUSED_double(a, b, c) ((a) * (b) + (c))
 #endif
 """
+"""a b + c, rounded once on CUDA; of intrinsics, because NVRTC takes minutes to inline a function so often."""
 NATIVE = {
     "float": FUSED
     + r"""

@@ -131,8 +131,9 @@ def _sincos(x):
 FUNCTIONS = {
     "where": np.where, "nan": np.nan, "infinity": np.inf, "reciprocal": lambda x: 1.0 / x, "sqrt": np.sqrt,
     "absolute": np.abs, "reduced": lambda x: x, "within_reach": lambda x: x,
-    "FUSED": lambda a, b, c: a * b + c, "log": np.log, "sincos": _sincos, "sincos_any": _sincos, "mine": True,
-    "again": False, "arctangent": np.arctan2, "sin": np.sin, "cos": np.cos,
+    "FUSED_float": lambda a, b, c: a * b + c, "FUSED_double": lambda a, b, c: a * b + c,
+    "log": np.log, "sincos": _sincos, "sincos_any": _sincos, "mine": True, "again": False,
+    "arctangent": np.arctan2, "sin": np.sin, "cos": np.cos,
 }  # fmt: skip
 
 

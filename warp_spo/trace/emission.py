@@ -103,7 +103,7 @@ class Emitter:
         angles: when full turns are subtracted from large angles.
         late: the names of the arrays whose entries are loaded where they are first used, instead of where the trace
             first read them.
-        fuses: a product and the sum that takes it are one statement, FUSED(a, b, c) = a b + c, rounded once on CUDA.
+        fuses: a product and the sum that takes it are one statement, FUSED_T(a, b, c) = a b + c, rounded once on CUDA.
             Otherwise the compiler decides, and may decide differently in another kernel with the same formulas.
     """
 
@@ -286,7 +286,8 @@ class Emitter:
         a, b, c = (self._text(value) for value in (*product.args, scalar.args[1 if first else 0]))
         if scalar.op == "sub":
             a, c = (a, f"-({c})") if first else (f"-({a})", c)
-        return [f"const {C_TYPE[self.dtype]} {self._name(scalar, step)} = FUSED({a}, {b}, {c});"]
+        T = C_TYPE[self.dtype]
+        return [f"const {T} {self._name(scalar, step)} = FUSED_{T}({a}, {b}, {c});"]
 
 
 def choose_products(scalars: list[Scalar], stored: set[tuple]) -> tuple[dict[tuple, Scalar], set[tuple]]:
