@@ -241,7 +241,8 @@ def test_numbers_of_equal_limbs_do_not_grow_the_code(monkeypatch):
     two, five = (built(texts, hand(fingers, spread=0.3), "forward_dynamics")[0] for fingers in (2, 5))
     count = lambda text: text.cuda.count(" = ")  # noqa: E731
     leaf = lambda text: text.cuda.split(warp_machine.BARRIER)[0].count("const double")  # noqa: E731
-    assert abs(leaf(five) - leaf(two)) < 5 and count(five) < 1.5 * count(two)
+    assert abs(leaf(five) - leaf(two)) <= 0.02 * leaf(two)  # a few numbers of two fingers are equal, of five none
+    assert count(five) < 1.5 * count(two)
     assert five.operations > 1.8 * two.operations
 
 
