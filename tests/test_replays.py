@@ -16,6 +16,7 @@ from mechanisms import MECHANISMS
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 import warp_spo as spo
+from warp_spo import launches
 from warp_spo.dynamics.operation import Argument
 
 WORLDS = 3
@@ -305,3 +306,38 @@ def test_threads_share_a_dynamics(granularity, device):
 @pytest.mark.parametrize("granularity", ["tree", "segment", "node"])
 def test_eight_threads_of_a_thousand_calls(granularity, kind, device):
     assert not wrong_calls(dynamics(device.alias, "fork", granularity), 8, 1000, kind)
+
+
+def test_work_waits_until_all_kernels_are_compiled(device):
+    """Work in the block is done at its end, in order, and nothing is repeated from a call that did nothing yet."""
+    dyn = spo.Dynamics(zoo.fork(), WORLDS, device, "float64")
+    rng, scene = np.random.default_rng(5), dyn.scene
+    sizes = scene.coord_count, scene.dof_count, scene.dof_count
+    q, qd, tau = (wp.array(rng.normal(size=(WORLDS, n)), dtype=dyn.dtype, device=dyn.device) for n in sizes)
+    expected = dyn.forward_dynamics(q, qd, tau).numpy()
+    arrays = [wp.zeros(expected.shape, dtype=dyn.dtype, device=dyn.device) for _ in range(3)]
+    first, second, third = arrays
+    with launches.compile_side_by_side():
+        for _ in range(4):
+            dyn.forward_dynamics(q, qd, tau, out=first)
+        launches.copy(second, first)
+        launches.fill(first, 2.0)
+        with launches.compile_side_by_side():
+            launches.copy(third, first)
+        assert not any(array.numpy().any() for array in arrays)
+    np.testing.assert_array_equal(second.numpy(), expected)
+    assert (first.numpy() == 2.0).all() and (third.numpy() == 2.0).all()
+    for _ in range(4):
+        first.zero_()
+        dyn.forward_dynamics(q, qd, tau, out=first)
+        np.testing.assert_array_equal(first.numpy(), expected)
+
+
+def test_nothing_of_a_block_that_fails_is_done(device):
+    array = wp.zeros(3, device=device)
+    with pytest.raises(ZeroDivisionError), launches.compile_side_by_side():
+        launches.fill(array, 2.0)
+        raise ZeroDivisionError
+    assert not array.numpy().any()
+    launches.fill(array, 3.0)
+    assert (array.numpy() == 3.0).all()

@@ -7,10 +7,13 @@ arrays in the packed arguments of the kernels and packs nothing else, which take
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
+import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import warp as wp
@@ -20,6 +23,8 @@ from .memory import size_in_bytes, view
 
 class _Thread(threading.local):
     recording: Recording | None = None
+    waiting: list[Callable[[], None]] | None = None
+    kernels: set[tuple[wp.Kernel, str, int]] | None = None
 
 
 _thread = _Thread()
@@ -29,6 +34,9 @@ def launch(
     kernel: wp.Kernel, dim: Any, inputs: Sequence[Any], outputs: Sequence[Any], *, device: Any, block_dim: int = 256
 ) -> None:
     """Launch a kernel, as ``wp.launch``."""
+    if _thread.waiting is not None and _thread.kernels is not None:
+        _thread.kernels.add((kernel, wp.get_device(device).alias, block_dim))
+        return _wait(functools.partial(launch, kernel, dim, inputs, outputs, device=device, block_dim=block_dim))
     command = wp.launch(
         kernel, dim, inputs, outputs, device=device, block_dim=block_dim, record_cmd=_thread.recording is not None
     )
@@ -39,6 +47,8 @@ def launch(
 
 def copy(out: wp.array, array: wp.array) -> None:
     """Copy one array to another, as ``wp.copy``."""
+    if _thread.waiting is not None:
+        return _wait(functools.partial(copy, out, array))
     wp.copy(out, array)
     if _thread.recording is not None:
         _thread.recording.keep(_Copy, out, array)
@@ -46,9 +56,46 @@ def copy(out: wp.array, array: wp.array) -> None:
 
 def fill(array: wp.array, value: float) -> None:
     """Set all entries of an array."""
+    if _thread.waiting is not None:
+        return _wait(functools.partial(fill, array, value))
     _set_all(array, value)
     if _thread.recording is not None:
         _thread.recording.keep(_Fill, array, value)
+
+
+@contextlib.contextmanager
+def compile_side_by_side() -> Iterator[None]:
+    """Let the launches, copies and fills in the ``with`` block wait, and do them in order at its end.
+
+    On CUDA, the kernels of the launches are compiled before, on all cores of the host. Inside the block nothing is
+    computed, so that results must not be read there, and arrays that callers pass must outlive it. No graph may be
+    captured.
+    """
+    if _thread.waiting is not None:  # an outer block does all of it
+        yield
+        return
+    waiting: list[Callable[[], None]] = []
+    kernels: set[tuple[wp.Kernel, str, int]] = set()
+    _thread.waiting, _thread.kernels = waiting, kernels
+    try:
+        yield
+    finally:
+        _thread.waiting = _thread.kernels = None
+    modules = dict.fromkeys((kernel.module, alias, block_dim) for kernel, alias, block_dim in kernels)
+    on_gpus = [one for one in modules if wp.get_device(one[1]).is_cuda]
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        for load in [pool.submit(module.load, wp.get_device(on), block_dim=block) for module, on, block in on_gpus]:
+            load.result()
+    for each in waiting:
+        each()
+
+
+def _wait(work: Callable[[], None]) -> None:
+    """Keep work for the end of :func:`compile_side_by_side`; a call that is recorded cannot be repeated then."""
+    assert _thread.waiting is not None
+    _thread.waiting.append(work)
+    if _thread.recording is not None:
+        _thread.recording.complete = False
 
 
 def _set_all(array: wp.array, value: float) -> None:

@@ -17,6 +17,7 @@ from ..trace.scalars import ordered
 from .parameters import DerivedArrays, Parameters
 
 CACHE_LINE, CROWDED = 64, 1024  # bytes
+LONGEST = 96  # entries that one kernel computes: twice as many take much more than twice as long to compile
 
 
 def table(parameters: Parameters, links: Links, name: str) -> wp.array:
@@ -28,9 +29,15 @@ def table(parameters: Parameters, links: Links, name: str) -> wp.array:
         T, device, worlds = parameters.dtype, parameters.device, parameters.rows(sources)
         width = _width(worlds, T, device)
         own = wp.empty((len(values), width), dtype=T, device=device)
-        inputs = [width, *(parameters.entries(source, worlds) for source in sources)]
-        kernel = _kernel(name, values, sources, T)
-        fill = lambda: launches.launch(kernel, worlds, inputs, [own], device=device)  # noqa: E731
+        parts = []
+        for first in range(0, len(values), LONGEST):
+            kernel, read = _kernel(name, values, range(first, min(first + LONGEST, len(values))), T)
+            parts.append((kernel, [width, *(parameters.entries(source, worlds) for source in read)]))
+
+        def fill() -> None:
+            for kernel, inputs in parts:
+                launches.launch(kernel, worlds, inputs, [own], device=device)
+
         rows = own if width == worlds else own[:, :worlds]
         return DerivedArrays([broadcast_worlds(rows, 1, parameters.worlds)], sources, fill)
 
@@ -48,8 +55,13 @@ def _width(worlds: int, T: type, device: wp.Device) -> int:
     return worlds + CACHE_LINE // size if crowded else worlds
 
 
-def _kernel(name: str, values: list, sources: list[str], T: type) -> wp.Kernel:
-    """Return the kernel that computes a table [entry, world] from Newton's values, one thread a world."""
+def _kernel(name: str, values: list, entries: range, T: type) -> tuple[wp.Kernel, list[str]]:
+    """Return the kernel that computes ``entries`` of a table [entry, world], and the names of the values it reads.
+
+    One thread works on a world.
+    """
+    read = ordered([values[entry] for entry in entries])
+    sources = list(dict.fromkeys(scalar.args[0] for scalar in read if scalar.op == "input"))
     emitter = Emitter(
         "float64",
         lambda array, entry: f"FIELD({array}, {entry})",
@@ -58,10 +70,10 @@ def _kernel(name: str, values: list, sources: list[str], T: type) -> wp.Kernel:
         late=sources,
         fuses=True,
     )
-    listing = emitter.region([Store("out", (entry,), value) for entry, value in enumerate(values)])
+    listing = emitter.region([Store("out", (entry,), values[entry]) for entry in entries])
     text = straight.assemble_per_world(sources, render(listing, "float64"))
     arrays = [(source, 2) for source in sources] + [("out", 2)]
-    return native.kernel(f"links_{name}", text, arrays, T, wide=tuple(sources))
+    return native.kernel(f"links_{name}", text, arrays, T, wide=tuple(sources)), sources
 
 
 def pull_back(parameters: Parameters, links: Links, cotangent: wp.array, gradients: dict[str, wp.array]) -> None:

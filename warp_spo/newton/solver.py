@@ -13,6 +13,7 @@ import warp as wp
 from newton import ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
+from .. import launches
 from ..dynamics.dynamics import Dynamics
 from ..dynamics.steps import INTEGRATORS
 from ..errors import UnsupportedError, as_names
@@ -187,10 +188,12 @@ class SolverSPO(Plugs, SolverBase):
     def _prepare(self) -> None:
         """Run a step and a reset, so that later calls compile and allocate nothing."""
         state, control = self.model.state(), self.model.control()
-        if self.integrator == "semi_implicit":
-            self.step(state, state, control, None, 1e-3, observables=self.observables(self.supported_observables))
-        self.step(state, state, control, None, 1e-3)
-        self.reset(state)
+        seen = self.observables(self.supported_observables)  # all arrays must outlive the block
+        with launches.compile_side_by_side():
+            if self.integrator == "semi_implicit":
+                self.step(state, state, control, None, 1e-3, observables=seen)
+            self.step(state, state, control, None, 1e-3)
+            self.reset(state)
         self._arrays.set(self.dynamics, self.dynamics.variable)
 
     def __reduce__(self) -> NoReturn:
