@@ -19,9 +19,9 @@ DEFINE_ASYNC_COPY = """\
 #define ON_ITS_WAY(to, from) asm volatile("cp.async.ca.shared.global [%0], [%1], %2;" \
     :: "r"((unsigned)__cvta_generic_to_shared(to)), "l"(from), "n"(sizeof(*(to))) : "memory")"""
 WAIT_FOR_COPIES = 'asm volatile("cp.async.wait_all;" ::: "memory");'
-SHARED_BYTES = (
-    46 * 1024
-)  # shared memory that a block may declare: 48 KiB less the share that Warp uses; more is asked for
+# shared memory that a block may declare: 48 KiB less the share that Warp uses; more is asked for at the launch
+SHARED_BYTES = 46 * 1024
+WIDE_BYTES = 110 * 1024  # shared memory of a block with long rows, of which two fit into an H100's 228 KiB
 MOST_PASSES = 16  # limit for the passes of a loop; 13 was the largest count ever measured, see CONTRIBUTING
 IN_PLACE, STAGED, MAPPED, RELAYED, TILED, DIRECT = "in place", "staged", "mapped", "relayed", "tiled", "direct"
 BY_TABLE = (MAPPED, RELAYED)  # the ways in which a table says which value each entry of a row receives

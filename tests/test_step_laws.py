@@ -185,4 +185,4 @@ def test_a_free_hinge_without_laws_keeps_its_short_way():
         stores = symbolic.step.step(symbolic.Trace(symbolic.Links(scene), "float64", ("q", "qd")))
         return len(symbolic.ordered(item.value for item in stores))
 
-    assert count(scene) * 2 < count(scene.with_values(joint_damping=np.arange(6.0)))
+    assert count(scene) * 3 < 2 * count(scene.with_values(joint_damping=np.arange(6.0)))

@@ -189,6 +189,31 @@ def test_a_world_that_does_not_settle_says_so(monkeypatch):
     assert (more["status"][:, 0] == 5 * (passes > 1)).all() and (passes > 1).any()
 
 
+@pytest.mark.parametrize("name", ["hand", "forest"])
+def test_bodies_of_each_limb(name, monkeypatch):
+    """Poses and velocities of bodies by limbs, which send each other nothing, equal those by whole trees."""
+    texts, scene = warp_machine.recorded(monkeypatch), scene_of(name)
+    a = {key: array for key, array in states(scene, WORLDS).items() if key in ("q", "qd")}
+    expected = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="tree").body_states(*a.values())
+    dyn = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="segment")
+    bodies = (WORLDS, scene.body_count)
+    shapes = {key: array.shape for key, array in a.items()}
+    dyn.programs.find(ROUTINES["body_states"], shapes, (*bodies, 7), {"velocities_out": (*bodies, 6)})
+    for backwards in (False, True):
+        poses = warp_machine.run(texts[-1], a, backwards, further=(more := {}))
+        for got, right in zip((poses, more["velocities_out"]), expected, strict=True):
+            np.testing.assert_allclose(got.reshape(right.shape), right, rtol=0.0, atol=TOLERANCE["float64"])
+
+
+def test_passes_share_what_does_not_change(monkeypatch):
+    """It is stored before the loop and read in it, and all passes give what the dense step gives."""
+    text, a, (_, qd, passes) = texts_of(monkeypatch, "hand")
+    before, loop = text.cuda.split("for (int turn")
+    assert "held_row[0] =" in before and "held_row[0]" in loop and "held_row[0] =" not in loop
+    np.testing.assert_allclose(warp_machine.run(text, a, further={}), qd, rtol=0.0, atol=TOLERANCE["float64"])
+    assert passes.max() > 1
+
+
 # -- planted bugs ------------------------------------------------------------------------------------------------------
 WAIT = """\'asm volatile("bar.sync 0;" ::: "memory");\', """
 BUGS = {

@@ -33,7 +33,7 @@ def _divides(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
     return recursion.by_pieces(scene)
 
 
-STEP = Routine("step", recursion.step, letters="PzaS", divides=_divides, passes=True)
+STEP = Routine("step", recursion.step, letters="PzaS", divides=_divides, passes=True, wide=True)
 CONTACT_STEP = Routine("contact_step", contact.step, passes=True)
 EMBEDDED_STEP = Routine("step", closed_step.step, passes=True)
 STEP_UNDER_MULTIPLIERS = Routine("step", closed_step.step_with_multipliers, passes=True)

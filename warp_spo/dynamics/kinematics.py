@@ -107,7 +107,9 @@ BODY_STATES = Operation(
     "body_states",
     arguments=(Q, required(QD)),
     results=(POSES, VELOCITIES),
-    routine=Routine("body_states", recursion.body_states, nodes.body_states, suits=_anchors_fixed),
+    routine=Routine(
+        "body_states", recursion.body_states, nodes.body_states, suits=_anchors_fixed, alone=True, wide=True
+    ),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,
 )

@@ -106,11 +106,11 @@ class Plan:
         """Return the granularity of one routine: the plan's own where the routine has that form."""
         if routine.name in self.instead:
             return self.instead[routine.name].of(routine)
-        if not routine.letters and not routine.has_node_form:
+        if not routine.has_segment_form and not routine.has_node_form:
             return "tree"
         chosen = self.granularity if self.forced else self._rule(routine)
         if chosen == "segment":
-            return "segment" if routine.letters else "tree"
+            return "segment" if routine.has_segment_form else "tree"
         return chosen if routine.has_node_form else "tree"
 
     def _rule(self, routine: Routine) -> str:

@@ -26,14 +26,15 @@ from ..recursions.pieces import Pieces
 from ..recursions.step import GAIN, GUESS, LOOPED, MISSED
 from ..recursions.tracing import Trace
 from ..scene.contacts import HeightField
-from ..trace.emission import PREFIX, Emitter, RangeReduction, Store, render
+from ..trace.emission import Store, render
+from ..trace.scalars import Scalar, is_constant
 from . import link_values, products, searches, staging
+from .access import make_emitter
 from .device_facts import RESERVED
 from .plan import MOST_WARPS, Plan
 from .routine import Routine
-from .staging import FIELDS
 from .sweeps import Sweeps
-from .teams import Passes, Team, Work
+from .teams import HELD, Passes, Team, Work
 
 PASSED = (*LOOPED, SECANT)  # variables of the loops over passes
 PARTS = 4  # of a multiprocessor
@@ -204,7 +205,10 @@ class Programs:
         )
         placed, table = staging.arrange_stores(outs, layout.result)
         placed += apart
-        emitter, looped = self._emitter(shapes, layout), [item for item in stores if item.array in PASSED]
+        emitter, looped = (
+            make_emitter(self.run.dtype.__name__, shapes, layout),
+            [item for item in stores if item.array in PASSED],
+        )
         regions = [emitter.region(trace.begin, trace.ahead), emitter.branch(looped)] if looped else []
         *before, body = (render(each, self.run.dtype.__name__) for each in [*regions, emitter.region(placed)])
         if trace.begin:
@@ -230,6 +234,7 @@ class Programs:
         everything: list[Store] = []
         traced: list[list[Store]] = []
         apart: list[tuple[list[Store], list[Store], list[list[Store]]]] = []
+        held: list[list[Scalar]] = []  # what each piece computes once before its passes
         for index in range(len(pieces.pieces)):
             links = self._copied(options)  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
@@ -237,24 +242,31 @@ class Programs:
             rounds = [[self._flattened(item, shapes) for item in turn] for turn in trace.rounds]
             news = [self._flattened(item, shapes) for item in trace.news]
             apart.append((trace.checks, news, rounds))
+            held.append(list({x.key: x for x in trace.ahead if not is_constant(x) and x.op != "input"}.values()))
             everything += traced[-1] + trace.checks + news + [item for turn in rounds for item in turn]
         bends = any(item.array == MISSED for item in everything)
-        passes = Passes((GUESS, GAIN), sent if bends else None) if routine.passes else None
+        held = held if bends else [[] for _ in held]
+        sizes = {index: len(values) for index, values in enumerate(held)}
+        passes = Passes((GUESS, GAIN), sent if bends else None, sizes) if routine.passes else None
         sent += 2 * pieces.warps if bends else 0
         whole = [item for item in everything if item.array == "out"]
         layout = self._layout(routine, whole, everything, shapes, more, sent, pieces.warps)
         if layout.result.way == DIRECT and layout.result.array.entries > staging.LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
-        if not layout.fits(self.run.dtype, self.room):
+        if not layout.fits(self.run.dtype, self.room(routine.wide)):
             return None  # nor for what limbs tell each other
         team = Team(pieces, dtype, passes)
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
         placed, table = staging.arrange_stores(whole, layout.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
         by_slot = lambda found: found if table is None else staging.stores_by_slot(found, table)  # noqa: E731
-        for piece, stores, items, (checks, news, rounds) in zip(pieces.pieces, traced, outs, apart, strict=True):
-            emitter, checking = self._emitter(shapes, layout), self._emitter(shapes, layout)
-            later = self._emitter(shapes, layout) if passes else emitter
+        for piece, stores, items, (checks, news, rounds), values in zip(
+            pieces.pieces, traced, outs, apart, held, strict=True
+        ):
+            first, emitter, checking, later = (make_emitter(dtype, shapes, layout) for _ in range(4))
+            ahead = first.region([Store(HELD, (at,), value) for at, value in enumerate(values)])
+            later = later if passes else emitter
+            emitter.keep(HELD, values)
             inward = [item for item in stores if item.array == INWARD]
             outward = [item for item in stores if item.array == OUTWARD]
             last = outward if set(letters) & set(messages.OUTWARD_LETTERS) else inward
@@ -265,8 +277,8 @@ class Programs:
             news = [item for item in news if item.array != "out"] + by_slot(ends)
             branches = later.branch(news), [later.branch(by_slot(turn)) for turn in rounds]
             team.add(
-                Work(piece, *regions, checking.region(checks), *branches),
-                sum(each.operations for each in {emitter, checking, later}),
+                Work(piece, *regions, checking.region(checks), *branches, ahead),
+                sum(each.operations for each in {first, emitter, checking, later}),
             )
         cuda = team.cuda()  # fills the tables
         registers = self._registers(pieces.warps)
@@ -328,10 +340,16 @@ class Programs:
             entry,
         )
 
-    @property
-    def room(self) -> int:
-        """Bytes of shared memory that a block may have: for as many scalars in float64 as in float32 if the GPU can."""
-        wanted = straight.SHARED_BYTES * wp.types.type_size_in_bytes(self.run.dtype) // 4
+    def room(self, wide: bool = False) -> int:
+        """Bytes of shared memory that a block may have: for as many scalars in float64 as in float32 if the GPU can.
+
+        ``wide``: for long rows that all go through it.
+        """
+        wanted = (
+            max(straight.SHARED_BYTES, straight.WIDE_BYTES if wide else 0)
+            * wp.types.type_size_in_bytes(self.run.dtype)
+            // 4
+        )
         allowed = self.plan.device.shared_bytes - 3 * RESERVED  # Warp takes a share, too
         return min(wanted, max(allowed, straight.SHARED_BYTES)) if self.plan.device.cuda else wanted
 
@@ -350,51 +368,9 @@ class Programs:
         warps: int = 1,
     ) -> KernelLayout:
         ways = self.plan.stages(routine, warps), self.plan.gathers(routine, warps, 1 + len(more)), routine.tiled
-        return staging.choose_layout(
-            stores, everything, shapes, more, sent, warps, self.run.dtype, *ways, self.relays, self.room
-        )
-
-    def _emitter(self, shapes: dict, layout: KernelLayout) -> Emitter:
-        result = layout.result
-        angles = RangeReduction.AGAIN if layout.retries else RangeReduction.FIRST
-        angles = RangeReduction.IN_PLACE if layout.staged else angles
-        guard = "if (mine) " if result.way == DIRECT else ""
-
-        def load(array: str, entry: str) -> str:
-            if array in (INWARD, OUTWARD):
-                return f"SENT({entry})"
-            if array in LOOPED and layout.warps > 1:
-                return f"{'' if array == MISSED else PREFIX}{array}_row[{entry}]"
-            if array in FIELDS:
-                return f"FIELD({array}, {entry})"
-            return f"{array}_row[{entry}]"
-
-        def store(array: str, entry: str, value: str) -> str:
-            if array in (INWARD, OUTWARD):
-                return f"SENT({entry}) = {value};"
-            if array == "out" and result.way == RELAYED:
-                return f"RELAY({entry}) = {value};"
-            if array == MISSED and layout.warps > 1:
-                return f"missed_row[0] += {value};"
-            if array in LOOPED and layout.warps > 1:
-                return f"{'if (open) ' if array == GUESS else ''}{load(array, entry)} = {value};"
-            if array == "out" and result.way == TILED:
-                return f"if (mine) result_row[({entry}) * {straight.TILE}] = {value};"
-            if array == "out":
-                return f"{guard}result_row[{entry}] = {value};"
-            return f"if (mine) {array}_row[{entry}] = {value};"
-
-        places = {
-            name: {entry: place for place, entry in enumerate(entries)}
-            for name, entries in zip(layout.fields, layout.cached, strict=False)
-        }
-
-        def flat(array: str, index: tuple) -> int:
-            if array in places:
-                return places[array][index[0]]
-            return index[0] if len(index) == 1 else staging.flat_index(index, shapes[array][1:])
-
-        return Emitter(self.run.dtype.__name__, load, store, flat, angles, FIELDS, fuses=True)
+        wide = routine.wide and warps > 1
+        dtype, relays, room = self.run.dtype, self.relays, self.room(wide)
+        return staging.choose_layout(stores, everything, shapes, more, sent, warps, dtype, *ways, relays, room, wide)
 
 
 def _title(key: tuple) -> str:

@@ -26,8 +26,9 @@ class Routine:
         sweeps: ``sweeps(run, out, **arrays)`` launches the same computation at node granularity; None: there is only
             the traced kernel of the scene.
         blocks: at node granularity the caller applies stored blocks instead of this routine.
-        letters: messages that limbs send each other, see :mod:`warp_spo.recursions.messages`. "": limbs cannot share
-            the work, and one thread works on a whole world.
+        letters: messages that limbs send each other, see :mod:`warp_spo.recursions.messages`. "": they send none.
+        alone: limbs share the work without messages. Where they do not, and without letters, one thread works on a
+            whole world.
         divides: ``divides(scene, inputs, **options)``, whether limbs can share the work for these inputs and options.
         suits: ``suits(links, shapes, **options)``, whether the traced kernel serves this scene; if not, the sweeps do.
         short: the code is short, so that one thread holds a large tree without spilling registers.
@@ -40,6 +41,7 @@ class Routine:
         occupancy: (blocks, registers): by limbs in float32 with many worlds, a multiprocessor holds so many blocks if
             a thread then still has so many registers.
         variants: at most so many different options get a kernel of their own where sweeps serve the others.
+        wide: its rows are long, so that a team asks for as much shared memory as they need.
         start: ``start(trace, **options)`` returns what a search starts from; None: the kernel is no search, see
             :mod:`.searches`.
         title: ``title(inputs, **options)``, what a user calls this computation; None: the name.
@@ -50,6 +52,7 @@ class Routine:
     sweeps: Callable[..., None] | None = None
     blocks: bool = False
     letters: str = ""
+    alone: bool = False
     divides: Callable[..., bool] = _always
     suits: Callable[..., bool] = _always
     short: bool = False
@@ -61,8 +64,14 @@ class Routine:
     bias_first: Routine | None = None
     occupancy: tuple[int, int] | None = None
     variants: int = VARIANTS
+    wide: bool = False
     start: Callable[..., list[Store]] | None = None
     title: Callable[..., str] | None = None
+
+    @property
+    def has_segment_form(self) -> bool:
+        """Whether limbs can share the work."""
+        return bool(self.letters) or self.alone
 
     @functools.cached_property
     def has_node_form(self) -> bool:

@@ -47,6 +47,7 @@ def choose_layout(
     tiled: bool,
     relays: bool,
     room: int,
+    wide: bool = False,
 ) -> KernelLayout:
     """Return the first layout in the order of preference that fits into shared memory.
 
@@ -63,6 +64,7 @@ def choose_layout(
         tiled: the result is left in tiles.
         room: the bytes of shared memory that a block may have.
         relays: a result without room in shared memory may wait in its own rows, see :mod:`warp_spo.kernels.slots`.
+        wide: there is room for long results as they are, without a table of their distinct values.
     """
     used = read_entries(everything)
     rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used and shape]
@@ -82,7 +84,7 @@ def choose_layout(
         ways = [(staged, Result(STAGED, out)), (False, Result(STAGED, out)), *ways]
     if dense and staged:
         ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), *ways]
-    if out.entries > LONG_ROW and not (dense and staged and over == ["x"]):
+    if out.entries > LONG_ROW and not (wide and dense) and not (dense and staged and over == ["x"]):
         mapped = Result(MAPPED, out, slots=slots)
         ways = [(staged, mapped), (False, mapped), *ways]
         if relays and _may_write_early(rows, out):

@@ -14,6 +14,8 @@ from ..kernels import straight
 from ..recursions.pieces import Piece, Pieces
 from ..trace.emission import C_TYPE, Listing, fill_in, literal, render
 
+HELD = "held"
+"""Name of the values that a piece computes once before its passes."""
 BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
 CACHED = 8192  # largest number of operations of a world whose code fits into the instruction cache
 
@@ -28,6 +30,7 @@ class Work(NamedTuple):
         check: the check whether the guesses of a pass were right.
         news: what the piece sends to the others after the outward sweep; in work with passes, after the last pass.
         rounds: what the piece computes, message by message, from the news of the other pieces.
+        ahead: in work with passes, what the piece computes once before them and keeps.
     """
 
     piece: Piece
@@ -36,11 +39,12 @@ class Work(NamedTuple):
     check: Listing
     news: Listing
     rounds: list[Listing]
+    ahead: Listing = Listing("", [], [], [])
 
     @property
-    def text(self) -> tuple[str, str, str]:
+    def text(self) -> tuple[str, ...]:
         """The statements without their numbers and entries; equal for pieces of equal structure."""
-        return self.inward.text, self.outward.text, self.check.text
+        return self.ahead.text, self.inward.text, self.outward.text, self.check.text
 
 
 class Passes(NamedTuple):
@@ -49,17 +53,23 @@ class Passes(NamedTuple):
     Attributes:
         kept: the names of the values that a piece keeps from pass to pass, one for each of its dofs. They are arrays of
             the thread with constant indices, which the compiler keeps in registers.
+        held: how many values each piece computes once before the passes, by its index; kept likewise.
         flags: the place of the flags in the memory that the warps share; None if one pass suffices, because there is
             nothing to guess.
     """
 
     kept: tuple[str, ...]
     flags: int | None
+    held: dict[int, int]
 
-    def declare(self, entries: dict[str, int], c: str) -> str:
-        """Return declarations of the kept values; ``entries`` gives their number by the prefix of their names."""
-        sizes = entries.items()
-        return "\n".join(f"{c} {prefix}{name}_row[{count}] = {{}};" for prefix, count in sizes for name in self.kept)
+    def declare(self, pieces: dict[str, list[Piece]], c: str) -> str:
+        """Return declarations of what pieces keep; ``pieces`` gives, by prefix of the names, those that use them."""
+        text = []
+        for prefix, some in pieces.items():
+            dofs, held = max(piece.weight for piece in some), max(self.held.get(piece.index, 0) for piece in some)
+            text += [f"{c} {prefix}{name}_row[{dofs}] = {{}};" for name in self.kept]
+            text += [f"{c} {prefix}{HELD}_row[{held}] = {{}};"] if held else []
+        return "\n".join(text)
 
 
 class Team:
@@ -92,10 +102,10 @@ class Team:
     def _last(self) -> int:
         """The last stage that has statements."""
         stages = [0]
-        for piece, inward, outward, _, _, rounds in self._work.values():
-            stages += [piece.inward] if inward.text else []
-            stages += [piece.outward] if outward.text else []
-            if rounds and not self.passes:
+        for work in self._work.values():
+            stages += [work.piece.inward] if work.inward.text else []
+            stages += [work.piece.outward] if work.outward.text else []
+            if work.rounds and not self.passes:
                 stages.append(self.pieces.stages - 1)  # inner pieces read the news in the last stage
         return max(stages)
 
@@ -116,8 +126,9 @@ class Team:
         for work in self._work.values():
             later += [self._branch(work.piece, listing) for listing in work.rounds]
         if self.passes:
-            kept = {f"p{piece.index}_": piece.weight for piece in self.pieces.pieces}
-            text = [self.passes.declare(kept, self.c), straight.repeat_thread_passes("\n".join(text), self.c)]
+            kept = {f"p{piece.index}_": [piece] for piece in self.pieces.pieces}
+            ahead = [self._branch(work.piece, work.ahead) for work in self._work.values() if work.ahead.text]
+            text = [self.passes.declare(kept, self.c), *ahead, straight.repeat_thread_passes("\n".join(text), self.c)]
         return "\n".join(text + later)
 
     def _branch(self, piece: Piece, listing: Listing) -> str:
@@ -153,8 +164,12 @@ class Team:
                 ranks.append(free := {})
             free[warp] = work
         names = ["", *(f"i{at}_" for at in range(len(ranks) - 1))]
-        kept = {name: max(work.piece.weight for work in rank.values()) for name, rank in zip(names, ranks, strict=True)}
+        kept = {name: [work.piece for work in rank.values()] for name, rank in zip(names, ranks, strict=True)}
         text = [self.passes.declare(kept, self.c)]
+        for at, (name, rank) in enumerate(zip(names, ranks, strict=True)):
+            works = [rank.get(leaf.piece.warp) for leaf in leaves]
+            turns = [[] if work is None else [work.ahead] for work in works]
+            text.append(self._take_turns(leaves, turns, f"h{at}_", name))
         text += [
             straight.run_one_pass(a_pass, BARRIER, self.c)
             if self.passes.flags is None

@@ -26,17 +26,24 @@ NO_INERTIA = Articulated(NONE, NONE, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 
 
 class Pivot(NamedTuple):
-    """One eliminated column: H*, or the entry where it is 1; U = P H*; 1 / D; Delta."""
+    """One eliminated column: H*, or the entry where it is 1; U = P H*; D; 1 / D; whether other axes have the entry."""
 
     unit: int | None
     column: Vector
     U: Vector
     D: Value
     inverse: Value
+    turned: bool = False
+
+    def in_axes_of(self, pose: Pose) -> Pivot:
+        """Return the pivot in the axes of a link, given its ``pose`` in the axes of this pivot's column and U."""
+        halves = (self.column[:3], self.column[3:]), (self.U[:3], self.U[3:])
+        column, U = (Vector((*pose.to_child(angular), *pose.to_child(linear))) for angular, linear in halves)
+        return Pivot(None, column, U, self.D, self.inverse, turned=True)
 
     def share(self, x: Value) -> Value:
         """D^-1 x"""
-        return quotient(x, self.D) if self.unit is None else x * self.inverse
+        return quotient(x, self.D) if self.unit is None and not self.turned else x * self.inverse
 
 
 @dataclasses.dataclass
@@ -48,6 +55,8 @@ class Factor:
         P: P+ in the link's frame. in_parent: phi P+ phi*.
         whole: the hinge is free and has no armature: D = P, and no inertia acts on the parent.
         turned: the hinge's dofs are eliminated in the link's axes, not in the hinge's.
+        in_hinge: the same pivots in the hinge's axes, where their columns are unit vectors; None where they are not
+            computed there.
         nothing: zero, or NaN where the link moves no inertia and has no armature; added to the world's results.
     """
 
@@ -57,6 +66,7 @@ class Factor:
     whole: bool
     turned: bool
     nothing: Value
+    in_hinge: list[Pivot] | None = None
 
 
 def factor(
@@ -81,16 +91,15 @@ def factor(
     hinge = link.hinge
     turned = hinge.rates_in_parent and alike
     whole = hinge.unconstrained and all(is_constant(a) and a == 0.0 for a in link.armature)
-    pivots = []
+    pivots: list[Pivot] = []
+    in_hinge: list[Pivot] | None = None
     if hinge.units is not None and (turned or not hinge.rates_in_parent):
-        units = list(hinge.units[::-1])
-        sizes = cancellation_sizes(link, P, units, through)
-        for at, (unit, armature) in enumerate(zip(units, link.armature[::-1], strict=True)):
-            pivot, P = eliminate_unit(P, unit, armature, LEAST * epsilon * sizes[at])
-            pivots.append(pivot)
-            for later in range(at + 1, len(units) if hinge.cancels else 0):
-                U = pivot.U[units[later]]
-                sizes[later] = sizes[later] + cancellation(U, U * pivot.inverse, sizes[at])
+        pivots, P = eliminate_units(link, P, through, epsilon)
+    elif hinge.units is not None and link.parent is None and link.inertia is not None:
+        pose = Pose(None, place.turned, ZERO)
+        in_hinge, P = eliminate_units(link, pose.articulated_to_parent(P), through, epsilon)
+        pivots = [pivot.in_axes_of(pose) for pivot in in_hinge]
+        P = Pose(None, pose.matrix.T, ZERO).articulated_to_parent(P)  # type: ignore[union-attr]
     else:
         H, whole_P = columns(link, place)[::-1], P
         sizes = [magnitude(h, P, h) + absolute(a) for h, a in zip(H, link.armature[::-1], strict=True)]
@@ -105,7 +114,24 @@ def factor(
         nothing = total(zero_or_nan(pivot.D) for pivot in pivots)
         P = P + Articulated.build(lambda i, j: nothing if i == j else 0.0)
     in_parent = NO_INERTIA if link.parent is None or whole else place.pose.articulated_to_parent(P)
-    return Factor(pivots, P, in_parent, whole, turned, nothing)
+    return Factor(pivots, P, in_parent, whole, turned, nothing, in_hinge)
+
+
+def eliminate_units(
+    link: Link, P: Articulated, through: list[tuple[Pose, Articulated]], epsilon: float
+) -> tuple[list[Pivot], Articulated]:
+    """Eliminate the dofs of a link whose columns are unit vectors in the axes of P; return its pivots and P+."""
+    assert link.hinge.units is not None
+    units = list(link.hinge.units[::-1])
+    pivots: list[Pivot] = []
+    sizes = cancellation_sizes(link, P, units, through)
+    for at, (unit, armature) in enumerate(zip(units, link.armature[::-1], strict=True)):
+        pivot, P = eliminate_unit(P, unit, armature, LEAST * epsilon * sizes[at])
+        pivots.append(pivot)
+        for later in range(at + 1, len(units) if link.hinge.cancels else 0):
+            U = pivot.U[units[later]]
+            sizes[later] = sizes[later] + cancellation(U, U * pivot.inverse, sizes[at])
+    return pivots, P
 
 
 def columns(link: Link, place: Placed) -> list[Vector]:
@@ -226,6 +252,8 @@ def reduce_link(
     link: Link, place: Placed, done: Factor, motion: Motion, force: Vector, tau: Any
 ) -> tuple[list[Value], Vector]:
     """Return D^-1 eps of each pivot, and z+ in the parent's frame; ``force`` is z: (n; f) in the link's frame."""
+    if done.in_hinge is not None:
+        return _reduce_root(place, done.in_hinge, force, tau), ZERO
     eps, z = [], force
     given = list(tau)
     for first in range(len(given) - 3, -1, -3) if done.turned else ():
@@ -270,6 +298,8 @@ def expand_link(
     link: Link, place: Placed, done: Factor, rates: list[Value], motion: Motion, acceleration: tuple[Vector, Vector]
 ) -> tuple[list[Value], tuple[Vector, Vector]]:
     """Return qdd of the link's dofs and its acceleration, for D^-1 eps and the ``acceleration`` of its parent."""
+    if done.in_hinge is not None:
+        return _expand_root(link, place, done.in_hinge, rates, motion, acceleration)
     w, v = carry_acceleration(place, motion, acceleration)
     bias = (*motion.bias_w, *motion.bias_v)
     alpha = [0.0] * 6 if done.whole else [a + b for a, b in zip((*w, *v), bias, strict=True)]
@@ -287,6 +317,32 @@ def expand_link(
     elif done.turned:
         qdd = hinge_entries(link, place, Vector(qdd[-3:]), Vector(qdd[:3]))
     return qdd, (w, v)
+
+
+def _reduce_root(place: Placed, pivots: list[Pivot], force: Vector, tau: Any) -> list[Value]:
+    """Return D^-1 eps of each pivot of a root with pivots in its hinge's axes, which leaves nothing for a parent."""
+    pose, eps = Pose(None, place.turned, ZERO), []
+    z = Vector((*pose.to_parent(force[:3]), *pose.to_parent(force[3:])))
+    for pivot, b in zip(pivots, reversed(list(tau)), strict=True):
+        rate, z = reduce_pivot(pivot, z, b)
+        eps.append(rate)
+    return eps
+
+
+def _expand_root(
+    link: Link, place: Placed, pivots: list[Pivot], rates: list[Value], motion: Motion, base: tuple[Vector, Vector]
+) -> tuple[list[Value], tuple[Vector, Vector]]:
+    """Return the same for a root with pivots in its hinge's axes; ``base`` is the inertial frame's acceleration."""
+    pose = Pose(None, place.turned, ZERO)
+    alpha, to_hinge = [], IDENTITY if link.matrix is None else link.matrix.T
+    w, v = base[0], base[1] + cross(base[0], place.pose.l) + motion.bias_l
+    for moved, bias in ((w, motion.bias_w), (v, motion.bias_v)):
+        alpha += to_hinge @ moved + pose.to_parent(bias)
+    qdd = []
+    for pivot, rate in zip(pivots[::-1], rates[::-1], strict=True):
+        one, alpha = expand_pivot(pivot, alpha, rate)
+        qdd.append(one)
+    return qdd, (pose.to_child(alpha[:3]), pose.to_child(alpha[3:]))
 
 
 def gyroscopic(inertia: Rigid | None, motion: Motion) -> Vector:

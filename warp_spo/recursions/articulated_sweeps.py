@@ -106,6 +106,8 @@ def reduce(
         z = articulated.gyroscopic(link.inertia, move)
         if loads:
             z = z - trace.external_wrench(link)
+        bias = *move.bias_w, *move.bias_v, *move.bias_l
+        trace.ahead += [*(place.pose.turn or ()), *bias, *z]  # the passes of a step share them
         if key in trace.pushes:
             z = z - trace.pushes[key]
         for force in trace.from_children(link, letters[-1], forces, Vector):

@@ -87,7 +87,7 @@ def link_poses(trace: Trace) -> tuple[dict[int | None, Vector], dict[int | None,
     q = trace.vector("q")
     at: dict[int | None, Vector] = {None: ZERO}
     turns: dict[int | None, Quaternion] = {None: NEUTRAL}
-    for link in trace.links.links:
+    for link in trace.active_links:
         trace.label(link, "p")
         over = None if link.parent is None else id(link.parent)
         trace.places[id(link)] = place = place_link(link, q)
@@ -124,8 +124,8 @@ def body_poses(trace: Trace) -> list[Store]:
     """out [body, 7] = position, quaternion xyzw"""
     (at, turns), within = link_poses(trace), quaternions_in_links(trace.links)
     stores = []
-    for body, seat in trace.links.seats.items():
-        R, p = trace.links.nodes[body].anchor
+    for body in trace.own_bodies:
+        seat, (R, p) = trace.links.seats[body], trace.links.nodes[body].anchor
         key = None if seat.link is None else id(seat.link)
         axes = seat.matrix @ R.T
         position = at[key] + turned(turns[key], seat.offset - axes @ p)
@@ -152,7 +152,7 @@ def frame_poses(trace: Trace, frames: tuple) -> list[Store]:
 def link_velocities(trace: Trace) -> dict[int | None, tuple[Vector, Vector]]:
     """Place every link, and return its (omega; v) in its axes, by id; None is the inertial frame."""
     velocities: dict[int | None, tuple[Vector, Vector]] = {None: (ZERO, ZERO)}
-    for link in trace.links.links:
+    for link in trace.active_links:
         place_axes(trace, link)
         trace.label(link, "v")
         place, over = trace.places[id(link)], None if link.parent is None else id(link.parent)
@@ -178,7 +178,7 @@ def frame_velocities(trace: Trace, frames: tuple) -> list[Store]:
 def body_velocities(trace: Trace) -> list[Store]:
     """out [body, 6] = velocity of the CoM, angular velocity, in inertial axes"""
     velocities, stores = link_velocities(trace), []
-    for body in trace.links.seats:
+    for body in trace.own_bodies:
         link, com = trace.links.center(body)
         key = None if link is None else id(link)
         w, v = velocities[key]

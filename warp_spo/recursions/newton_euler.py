@@ -42,10 +42,34 @@ def body_force(inertia: Rigid, motion: Motion, w: Vector, v: Vector) -> Vector:
     return Vector((*n, *(inertia.mass * v + rotation @ inertia.moment)))
 
 
+SEVERAL = 3  # wrenches on one link from which it takes fewer operations to add them up in inertial axes
+
+
 def wrench(axes: Matrix, com: Vector, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
     """Return (n; f) about the frame's origin, in its ``axes``, for a force at ``com`` and a torque in inertial axes."""
     f, n = axes.T @ force, axes.T @ torque
     return n + cross(com, f), f
+
+
+def add_wrenches(axes: Matrix, acting: list[tuple[Vector, Vector, Vector]]) -> tuple[Vector, Vector]:
+    """Return the sum of :func:`wrench` for several (com, force, torque).
+
+    Of several bodies, the products com_i force_j in mixed axes are added up before they are turned: sum of com x R* f =
+    the skew part of (sum of com f*) R.
+    """
+    if len(acting) < SEVERAL:
+        n, f = ZERO, ZERO
+        for com, force, torque in acting:
+            n_body, f_body = wrench(axes, com, force, torque)
+            n, f = n + n_body, f + f_body
+        return n, f
+    force, torque, products = ZERO, ZERO, Matrix.of([ZERO] * 3)
+    for com, own_force, own_torque in acting:
+        force, torque = force + own_force, torque + own_torque
+        products = products + Matrix.of([x * own_force for x in com])
+    turned = products @ axes
+    moment = Vector(turned[i][j] - turned[j][i] for i, j in ((1, 2), (2, 0), (0, 1)))
+    return axes.T @ torque + moment, axes.T @ force
 
 
 def hinge_force(link: Link, place: Placed, n: Vector, f: Vector, qdd: Any) -> list[Value]:

@@ -115,12 +115,12 @@ class Trace:
             n, f = cross(link.lift.moment, up), up * link.lift.mass
         if "body_f" not in self.inputs:
             return Vector((*n, *f))
-        axes = self.axes[id(link)]
+        acting = []
         for body in self.bodies.get(id(link), ()):
-            entries = Vector(self.graph.input("body_f", body, c) for c in range(6))
-            _, com = self.links.center(body)
-            n_body, f_body = newton_euler.wrench(axes, com, Vector(entries[:3]), Vector(entries[3:]))
-            n, f = n + n_body, f + f_body
+            entries = [self.graph.input("body_f", body, c) for c in range(6)]
+            acting.append((self.links.center(body)[1], Vector(entries[:3]), Vector(entries[3:])))
+        n_bodies, f_bodies = newton_euler.add_wrenches(self.axes[id(link)], acting)
+        n, f = n + n_bodies, f + f_bodies
         return Vector((*n, *f))
 
     @property
@@ -139,6 +139,18 @@ class Trace:
     def own_links(self) -> list[Link]:
         """The links of this piece, parents first; all links where the whole tree is traced."""
         return [link for link in self.links.links if id(link) in self.own]
+
+    @property
+    def active_links(self) -> list[Link]:
+        """The links of this piece and those that it moves on, parents first."""
+        return [link for link in self.links.links if id(link) in self.active]
+
+    @property
+    def own_bodies(self) -> list[int]:
+        """The bodies on the links of this piece; bodies that do not move count as the first piece's."""
+        carriers = {body: seat.link for body, seat in self.links.seats.items()}
+        rest = self.piece is None or self.piece.index == 0
+        return [body for body, link in carriers.items() if (rest if link is None else id(link) in self.own)]
 
     def send(self, letter: str, piece: Piece, values: Iterable[Value]) -> list[Store]:
         """Return the stores that send a message of ``piece``; a trace of the whole tree keeps the values instead."""

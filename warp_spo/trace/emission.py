@@ -129,6 +129,10 @@ class Emitter:
         self._lines: list[str] = []
         self._place: str | None = None
 
+    def keep(self, array: str, values: Iterable[Scalar]) -> None:
+        """Let later regions read ``values`` as consecutive entries of an array of the thread."""
+        self._names.update((scalar.key, f"{PREFIX}{array}_row[{entry}]") for entry, scalar in enumerate(values))
+
     def branch(self, stores: Iterable[Store]) -> Listing:
         """Return the statements of a region inside braces, whose values later regions do not see."""
         known, count = dict(self._names), self._count

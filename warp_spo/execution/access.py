@@ -1,0 +1,64 @@
+"""How the statements of a kernel read and write arrays, messages between warps, and what a thread keeps."""
+
+from __future__ import annotations
+
+from ..kernels import straight
+from ..kernels.straight import DIRECT, RELAYED, TILED, KernelLayout
+from ..recursions.messages import INWARD, OUTWARD
+from ..recursions.step import GUESS, LOOPED, MISSED
+from ..trace.emission import PREFIX, Emitter, RangeReduction
+from . import staging
+from .staging import FIELDS
+from .teams import HELD
+
+
+def make_emitter(dtype: str, shapes: dict, layout: KernelLayout) -> Emitter:
+    """Return an emitter of statements for a kernel of this layout.
+
+    Args:
+        dtype: "float32" or "float64".
+        shapes: of the arrays that the kernel reads and writes, [world, ...], by name.
+        layout: how it reads and writes them.
+    """
+    result = layout.result
+    angles = RangeReduction.AGAIN if layout.retries else RangeReduction.FIRST
+    angles = RangeReduction.IN_PLACE if layout.staged else angles
+    guard = "if (mine) " if result.way == DIRECT else ""
+
+    def load(array: str, entry: str) -> str:
+        if array in (INWARD, OUTWARD):
+            return f"SENT({entry})"
+        if array == HELD or (array in LOOPED and layout.warps > 1):
+            return f"{'' if array == MISSED else PREFIX}{array}_row[{entry}]"
+        if array in FIELDS:
+            return f"FIELD({array}, {entry})"
+        return f"{array}_row[{entry}]"
+
+    def store(array: str, entry: str, value: str) -> str:
+        if array in (INWARD, OUTWARD):
+            return f"SENT({entry}) = {value};"
+        if array == "out" and result.way == RELAYED:
+            return f"RELAY({entry}) = {value};"
+        if array == HELD:
+            return f"{load(array, entry)} = {value};"
+        if array == MISSED and layout.warps > 1:
+            return f"missed_row[0] += {value};"
+        if array in LOOPED and layout.warps > 1:
+            return f"{'if (open) ' if array == GUESS else ''}{load(array, entry)} = {value};"
+        if array == "out" and result.way == TILED:
+            return f"if (mine) result_row[({entry}) * {straight.TILE}] = {value};"
+        if array == "out":
+            return f"{guard}result_row[{entry}] = {value};"
+        return f"if (mine) {array}_row[{entry}] = {value};"
+
+    places = {
+        name: {entry: place for place, entry in enumerate(entries)}
+        for name, entries in zip(layout.fields, layout.cached, strict=False)
+    }
+
+    def flat(array: str, index: tuple) -> int:
+        if array in places:
+            return places[array][index[0]]
+        return index[0] if len(index) == 1 else staging.flat_index(index, shapes[array][1:])
+
+    return Emitter(dtype, load, store, flat, angles, FIELDS, fuses=True)
