@@ -29,9 +29,10 @@ import warp_spo as spo
 from warp_spo.trials.operations import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, Trial
 
-from . import contacts, robots, runner
+from . import contacts, robots, runner, step_parts
 from .resources import record_launches, resources
 
+SOLVER_STEP = "SolverSPO.step"  # with drives and limits, of benchmarks.step_parts
 FEW, MANY, MOST = 4096, 65536, 1 << 20
 INERTIAS = ("body_mass", "body_com", "body_inertia")
 ON_PLANE, ON_FIELD = "contact_step", "contact_step on a height field"
@@ -80,12 +81,17 @@ def _over_float32(robot: str, operation: str, worlds: int, limit: float) -> Line
     return Line(call, "ratio", limit, dataclasses.replace(call, dtype="float32"))
 
 
+def _step_over_forward_dynamics(robot: str, worlds: int, limit: float) -> Line:
+    return Line(Call(robot, SOLVER_STEP, worlds), "ratio", limit, Call(robot, "forward_dynamics", worlds))
+
+
 def _over_folded(robot: str, limit: float) -> Line:
     call = Call(robot, "forward_dynamics", MOST, variable=INERTIAS)
     return Line(call, "ratio", limit, dataclasses.replace(call, variable=()))
 
 
 LINES = (
+    *(_step_over_forward_dynamics(robot, FEW, 2.5) for robot in step_parts.NAMES),
     *(_over_float32("centauro", "forward_dynamics", worlds, 3.0) for worlds in (FEW, MANY)),
     Line(Call("centauro", "forward_dynamics", MOST), "rate", 0.8),
     Line(Call("g1", "forward_dynamics", MOST), "rate", 1.6),
@@ -102,8 +108,10 @@ LINES = (
 )
 
 
-def trial_of(call: Call, device: wp.Device, sets: int = SETS) -> Trial:
+def trial_of(call: Call, device: wp.Device, sets: int = SETS) -> Trial | step_parts.SolverTrial:
     """Return the trial of a call, after its first evaluation."""
+    if call.operation == SOLVER_STEP:
+        return step_parts.SolverTrial(call.robot, call.worlds, device)
     scene = robots.scene(call.robot)
     dyn = spo.Dynamics(scene, call.worlds, device, call.dtype, variable=call.variable)
     inputs = [Inputs(scene, call.worlds, seed) for seed in range(sets)]
@@ -137,7 +145,9 @@ def _compile(call: Call, device: str) -> None:
         )
         dyn.step(q, qd, None, contacts.DT)
         return
-    trial_of(call, wp.get_device(device), sets=1)
+    trial = trial_of(call, wp.get_device(device), sets=1)
+    if isinstance(trial, step_parts.SolverTrial):
+        trial.check()  # with kernels in float64 on the CPU
 
 
 def main(arguments: list[str] | None = None) -> int:
