@@ -21,6 +21,9 @@ def of(body=0, **contact):
 def test_points_of_every_shape():
     assert [p.position for p in of(point=(1, 2, 3))] == [(1.0, 2.0, 3.0)]
     assert [(p.position, p.radius) for p in of(sphere=((1, 2, 3), 0.5))] == [((1.0, 2.0, 3.0), 0.5)]
+    for sphere in ((1, 2, 3, 0.5), ([1, 2, 3], 0.5)):
+        assert of(sphere=sphere) == of(sphere=((1, 2, 3), 0.5))
+    assert of(sphere=0.5) == of(sphere=((0, 0, 0), 0.5))
     assert [(p.position, p.radius) for p in of(capsule=((0, 0, 1), (0, 0, -1), 0.5))] == [
         ((0.0, 0.0, 1.0), 0.5), ((0.0, 0.0, -1.0), 0.5)]  # fmt: skip
     corners = {
@@ -78,7 +81,7 @@ MISTAKES = {
     "no shape": (lambda: spo.Contact(0), ValueError, "no shape given; expected one of point, sphere"),
     "two shapes": (lambda: spo.Contact(0, point=(0, 0, 0), box=(1, 1, 1)), ValueError, "point, box given"),
     "NaN": (lambda: spo.Contact(0, point=(0, np.nan, 0)), ValueError, "point .m. is .*expected finite"),
-    "sphere": (lambda: spo.Contact(0, sphere=0.1), ValueError, "sphere is 0.1; expected"),
+    "sphere": (lambda: spo.Contact(0, sphere=(0, 0, 1)), ValueError, "sphere is .0, 0, 1.; expected"),
     "radius": (lambda: spo.Contact(0, sphere=((0, 0, 0), -1.0)), ValueError, "radius of sphere is -1.0 m"),
     "box": (lambda: spo.Contact(0, box=(1, -1, 1)), ValueError, "half the sizes of box"),
     "hull": (lambda: spo.Contact(0, hull=[1, 2, 3]), ValueError, r"hull has shape \(3,\); expected \(points, 3\)"),

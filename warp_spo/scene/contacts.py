@@ -95,7 +95,7 @@ class Contact(StoredPart):
     Args:
         body: index of the body.
         point: (x, y, z) [m], in the body frame, as all that follow.
-        sphere: ((x, y, z), radius) [m].
+        sphere: ((x, y, z), radius) or (x, y, z, radius), or a radius about the body frame's origin [m].
         capsule: ((x, y, z) of one end of its axis, (x, y, z) of the other, radius) [m].
         box: half its sizes (x, y, z) [m], about the body frame's origin; or (half its sizes, its pose in the body).
         hull: points [n, 3], [m].
@@ -191,7 +191,12 @@ def _radius(call: str, name: str, value: Any) -> float:
 
 
 def _sphere(call: str, value: Any) -> Points:
-    centre, radius = _parts(call, "sphere", value, 2, "((x, y, z), radius)")
+    if isinstance(value, int | float | np.number):
+        value = (0.0, 0.0, 0.0), value
+    if np.ndim(_first(value)) == 0:
+        value = _parts(call, "sphere", value, 4, "((x, y, z), radius), (x, y, z, radius), or a radius")
+        value = value[:3], value[3]
+    centre, radius = _parts(call, "sphere", value, 2, "((x, y, z), radius), (x, y, z, radius), or a radius")
     return checked_array(call, "the centre [m] of sphere", centre, (3,))[None], _radius(call, "sphere", radius)
 
 
