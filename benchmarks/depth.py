@@ -1,6 +1,6 @@
 """Recursions parallel in depth beside sweeps: forward dynamics of chains and tethers over bodies and worlds.
 
-    python -m benchmarks.depth --device cuda:0 --json benchmarks/results/
+    python -m benchmarks.depth --device cuda:0 --json benchmarks/results/depth/
     python -m benchmarks.depth --bodies 64 --worlds 1 16        # some sizes
     python -m benchmarks.depth --draw RESULTS.json docs/_static/depth.svg    # the picture of an earlier run's chains
 
