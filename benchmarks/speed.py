@@ -154,7 +154,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="benchmarks.speed", description="Times beside limits.")
     parser.add_argument("pattern", nargs="?", default="", help="regular expression on the names of lines")
     parser.add_argument("--device", help="Warp device, default: the current one")
-    parser.add_argument("--json", type=Path, help="file or folder for the rows")
+    parser.add_argument("--json", type=Path, help="file for the rows, written after each line")
     parser.add_argument("--compile", action="store_true", help="compile all kernels, and time nothing")
     options = parser.parse_args(arguments)
     device = wp.get_device(options.device)
@@ -162,8 +162,10 @@ def main(arguments: list[str] | None = None) -> int:
     if options.compile:
         context = multiprocessing.get_context("spawn")
         with concurrent.futures.ProcessPoolExecutor(os.cpu_count(), context) as pool:
-            for task in [pool.submit(_compile, call, str(device)) for call in calls_of(lines)]:
-                task.result()
+            tasks = {call: pool.submit(_compile, call, str(device)) for call in calls_of(lines)}
+        for call, task in tasks.items():
+            if task.exception() is not None:
+                print(f"{call}: {task.exception()!r}")
         return 0
     rows: list[dict] = []
 
@@ -173,8 +175,15 @@ def main(arguments: list[str] | None = None) -> int:
         rows.append(measure(call, device))
         return rows[-1]["us"]
 
+    failed = 0
     for line in lines:
-        figure, unit = line.figure(time), {"us": "us", "rate": "1e9/s", "ratio": "times"}[line.kind]
+        try:
+            figure = line.figure(time)
+        except Exception as error:  # the other lines go on
+            print(f"{line.call!s}: {type(error).__name__}: {str(error)[:200]}", flush=True)
+            failed += 1
+            continue
+        unit = {"us": "us", "rate": "1e9/s", "ratio": "times"}[line.kind]
         error = max(row["error"] for row in rows if Call(*(row[f.name] for f in dataclasses.fields(Call))) == line.call)
         limit = f"{'at least' if line.kind == 'rate' else 'at most'} {line.limit:g}"
         beside = f" of {line.beside}, {time(line.beside):.4g} us" if line.beside else ""
@@ -183,12 +192,12 @@ def main(arguments: list[str] | None = None) -> int:
             f"{line.call!s}: {time(line.call):.4g} us, error {error:.1e}; {figure:.4g} {unit}{beside}; {limit}: {word}",
             flush=True,
         )
-    if options.json:
-        print(f"wrote {runner.save(runner.record(rows, device), options.json)}")
+        if options.json:
+            runner.save(runner.record(rows, device), options.json)
     wrong = [row for row in rows if not row["error"] <= row.get("tolerance", TOLERANCE[row["dtype"]])]
     for row in wrong:
         print(f"error {row['error']:.1e} exceeds its tolerance in {row}", file=sys.stderr)
-    return 1 if wrong else 0
+    return 1 if wrong or failed else 0
 
 
 if __name__ == "__main__":
