@@ -132,7 +132,7 @@ class Plan:
         first = self.of(routine)
         if self.forced or self.dofs > MOST_DOFS or not self.dofs:
             return (first,)
-        divides = self.device.cuda and bool(routine.letters) and 1 < self.limbs <= MOST_WARPS
+        divides = self.device.cuda and routine.has_segment_form and 1 < self.limbs <= MOST_WARPS
         sweeps = routine.has_node_form and not self.device.cuda and self.worlds <= NODE_WORLDS
         found = ["tree", *["segment"] * divides, *["node"] * sweeps]
         return (first, *(name for name in found if name != first))
