@@ -10,15 +10,10 @@ from typing import NamedTuple
 import warp as wp
 
 from .elementary import C_TYPE, NATIVE
-from .native import INTEGERS, MASKS
-from .slots import RELAY_WORLDS, VECTORS, WARP_SIZE, SlotLayout
+from .native import INTEGERS
+from .slots import RELAY_WORLDS, WARP_SIZE, SlotLayout
+from .staged_rows import DEFINE_ASYNC_COPY, LONG_COPY, WAIT_FOR_COPIES, Row, copy_rows_in, copy_rows_out, pitch, source
 
-LONG_COPY = 64  # rows of this many entries or more are copied to shared memory without passing through registers
-# defines ON_ITS_WAY(to, from), which starts the asynchronous copy of one scalar from global to shared memory
-DEFINE_ASYNC_COPY = """\
-#define ON_ITS_WAY(to, from) asm volatile("cp.async.ca.shared.global [%0], [%1], %2;" \
-    :: "r"((unsigned)__cvta_generic_to_shared(to)), "l"(from), "n"(sizeof(*(to))) : "memory")"""
-WAIT_FOR_COPIES = 'asm volatile("cp.async.wait_all;" ::: "memory");'
 # shared memory that a block may declare: 48 KiB less the share that Warp uses; more is asked for at the launch
 SHARED_BYTES = 46 * 1024
 WIDE_BYTES = 110 * 1024  # shared memory of a block with long rows, of which two fit into an H100's 228 KiB
@@ -26,14 +21,6 @@ MOST_PASSES = 16  # limit for the passes of a loop; 13 was the largest count eve
 IN_PLACE, STAGED, MAPPED, RELAYED, TILED, DIRECT = "in place", "staged", "mapped", "relayed", "tiled", "direct"
 BY_TABLE = (MAPPED, RELAYED)  # the ways in which a table says which value each entry of a row receives
 TILE = 8  # worlds in a tile of a TILED result
-
-
-class Row(NamedTuple):
-    """An array with one row a world: its name, its number of axes, and the number of entries in a row."""
-
-    name: str
-    ndim: int
-    entries: int
 
 
 class Result(NamedTuple):
@@ -60,11 +47,6 @@ class Result(NamedTuple):
     def slot_layout(self) -> SlotLayout:
         """How the values of a MAPPED or RELAYED result lie in shared memory."""
         return SlotLayout(self.array.entries, self.slots, WARP_SIZE if self.way == MAPPED else RELAY_WORLDS)
-
-
-def pitch(entries: int) -> int:
-    """Return the distance of rows in shared memory at which at most two threads of a warp use the same memory bank."""
-    return entries | 1 if entries % 4 == 0 else entries
 
 
 class KernelLayout(NamedTuple):
@@ -172,7 +154,7 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
     if layout.staged:
         if any(row.entries >= LONG_COPY for row in layout.rows):
             text += [DEFINE_ASYNC_COPY]
-        text += [_copy_rows_in(row, offset[row.name], c, team) for row in layout.rows]
+        text += [copy_rows_in(layout.rows, offset, c, team)] if layout.rows else []
         if any(row.entries >= LONG_COPY for row in layout.rows):
             text += [WAIT_FOR_COPIES, "#undef ON_ITS_WAY"]
         text += [sync]
@@ -196,8 +178,8 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
         cuda = f"for (int again = 0;; ++again) {{\n{cuda}\nif (again || !(farthest > on::reach())) break;\n}}"
     text += [*([] if layout.cached else define_fields(layout.fields, c)), cuda]
     if result.way in (IN_PLACE, STAGED):
-        text += [sync, _copy_rows_out(out, start, width, c, team)]
-        text += [_copy_rows_out(row, offset[row.name], pitch(row.entries), c, team) for row in layout.staged_further]
+        text += [sync, copy_rows_out(out, start, width, c, team)]
+        text += [copy_rows_out(row, offset[row.name], pitch(row.entries), c, team) for row in layout.staged_further]
     if result.way == MAPPED:
         text += ["const int done = 0;", f"result_row[{result.slots}] = 0;", sync]
         text += [result.slot_layout.write_rows(f"(stage + {start})", team, T)]
@@ -232,14 +214,9 @@ def assemble_per_world(fields: list[str], statements: str) -> str:
     return "\n".join(text)
 
 
-def _source(row: Row, c: str) -> tuple[str, str]:
-    """Return the C type of an array's entries, and C++ for the address of the first one."""
-    return ("unsigned char", f"(const unsigned char*){row.name}.data") if row.name in MASKS else (c, f"{row.name}.data")
-
-
 def _own_row(row: Row, c: str) -> str:
     """Return the declaration of ``name_row``, the row of the thread's own world in an array that is read."""
-    kind, first = _source(row, c)
+    kind, first = source(row, c)
     return f"const {kind}* {row.name}_row = {first} + world * {row.entries};"
 
 
@@ -294,63 +271,6 @@ def _copy_cached_fields(layout: KernelLayout, c: str) -> list[str]:
             text += [f"ON_ITS_WAY({name}_at + {32 * place}, {name}_from + {entry}ll * {name}.strides[0]);"]
         at += WARP_SIZE * len(entries)
     return text
-
-
-def _loop_over_entries(n: int, team: int, caller: str, one: str, several: str = "", wide: int = 1) -> str:
-    """Return a loop in which a team executes ``one`` for every entry i of the rows of the worlds that are present.
-
-    Args:
-        n: the number of entries in a row.
-        team: the number of threads that share the loop.
-        caller: the name of the pointer into the caller's array.
-        one: a statement for entry i.
-        several: a statement for ``wide`` entries, 16 bytes, from entry ``wide`` i on. It is used where all 32 worlds
-            are present and the caller's array begins at a multiple of 16 bytes.
-    """
-    count, aligned = (WARP_SIZE * n // wide, f" && ((size_t){caller} & 15) == 0") if several else (WARP_SIZE * n, "")
-    turns = -(-count // team)
-    some = "" if turns * team == count else f"if (i < {count}) "
-    return f"""if (present == 32{aligned}) {{
-    #pragma unroll
-    for (int k = 0; k < {turns}; ++k) {{ const int i = member + {team} * k; {some}{several or one} }}
-}} else {{
-    for (int i = member; i < present * {n}; i += {team}) {{ {one} }}
-}}"""
-
-
-def _copy_rows_in(row: Row, offset: int, c: str, team: int) -> str:
-    """Return code that copies the rows of an array to shared memory, from the scalar ``offset`` on."""
-    n, (kind, start), (vector, _, names) = row.entries, _source(row, c), VECTORS[c]
-    padded, to_one = n != pitch(n), f"to + {_padded('i', n, pitch(n))}"
-    one, several = f"*({to_one}) = __ldg(from + i);", f"(({vector}*)to)[i] = __ldg((const {vector}*)from + i);"
-    if padded:
-        parts = " ".join(f"at[{k}] = v.{name};" for k, name in enumerate(names))
-        at = _padded(f"({len(names)} * i)", n, pitch(n))
-        several = f"{{ const {vector} v = __ldg((const {vector}*)from + i); {c}* at = to + {at}; {parts} }}"
-    if row.name in MASKS:
-        several = ""
-    elif n >= LONG_COPY:
-        one = f"{{ ON_ITS_WAY({to_one}, from + i); }}"
-        several = "" if padded else f"{{ ON_ITS_WAY(({vector}*)to + i, (const {vector}*)from + i); }}"
-    copy = _loop_over_entries(n, team, "from", one, several, len(names))
-    return f"{{\nconst {kind}* from = {start} + first * {n};\n{c}* to = stage + {offset};\n{copy}\n}}"
-
-
-def _copy_rows_out(out: Row, offset: int, width: int, c: str, team: int) -> str:
-    """Return code that copies rows, ``width`` scalars apart, from shared memory to the array ``out``."""
-    n, (vector, _, names) = out.entries, VECTORS[c]
-    several = f"(({vector}*)to)[i] = (({vector}*)from)[i];"
-    if n != width:
-        parts = ", ".join(f"at[{k}]" for k in range(len(names)))
-        at = _padded(f"({len(names)} * i)", n, width)
-        several = f"{{ const {c}* at = from + {at}; (({vector}*)to)[i] = make_{vector}({parts}); }}"
-    copy = _loop_over_entries(n, team, "to", f"to[i] = from[{_padded('i', n, width)}];", several, len(names))
-    return f"{{\n{c}* to = {out.name}.data + first * {n};\nconst {c}* from = stage + {offset};\n{copy}\n}}"
-
-
-def _padded(i: str, entries: int, distance: int) -> str:
-    """Return C++ for the place of entry ``i`` of consecutive rows that lie ``distance`` scalars apart."""
-    return i if entries == distance else f"({i} / {entries}) * {distance} + {i} % {entries}"
 
 
 def repeat_passes(ahead: str, a_pass: str, last: str, names: tuple[str, str, str], entries: int, T: type) -> str:

@@ -11,7 +11,7 @@ import warp as wp
 import zoo
 
 import warp_spo as spo
-from warp_spo.kernels import native, straight
+from warp_spo.kernels import native, staged_rows, straight
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.tracing import Trace
 from warp_spo.trace import scalars as g
@@ -24,9 +24,9 @@ TYPES = {"float32": wp.float32, "float64": wp.float64}
 def compiled(values, rows, dtype, device, fuses=False):
     """``values`` of inputs ("x", i) for rows [world, i], by a kernel."""
     T, count = TYPES[dtype], len(values)
-    out = straight.Row("out", 2, count)
+    out = staged_rows.Row("out", 2, count)
     frame = straight.KernelLayout(
-        rows=[straight.Row("x", 2, rows.shape[1])], staged=False, fields=[],
+        rows=[staged_rows.Row("x", 2, rows.shape[1])], staged=False, fields=[],
         result=straight.Result(straight.DIRECT, out), messages=0, warps=1, block=32)  # fmt: skip
     emitter = Emitter(dtype, lambda array, entry: f"{array}_row[{entry}]",
                       lambda array, entry, value: f"if (mine) result_row[{entry}] = {value};",

@@ -9,6 +9,7 @@ import math
 from collections.abc import Hashable, Mapping, Sequence
 
 from ..kernels.slots import WARP_SIZE
+from ..kernels.staged_rows import Row
 from ..kernels.straight import (
     BY_TABLE,
     DIRECT,
@@ -19,7 +20,6 @@ from ..kernels.straight import (
     TILED,
     KernelLayout,
     Result,
-    Row,
 )
 from ..recursions.links import TABLES
 from ..scene.actuators import ACTUATOR_VALUES

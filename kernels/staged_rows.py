@@ -1,0 +1,128 @@
+"""Rows in shared memory: code with which a team copies the rows of its 32 worlds there and back.
+
+The rows of 32 worlds are contiguous in the callers' arrays, so that neighbouring threads copy neighbouring 16 bytes.
+"""
+
+from typing import NamedTuple
+
+from .native import MASKS
+from .slots import VECTORS, WARP_SIZE
+
+LONG_COPY = 64  # rows of this many entries or more are copied to shared memory without passing through registers
+# defines ON_ITS_WAY(to, from), which starts the asynchronous copy of one scalar from global to shared memory
+DEFINE_ASYNC_COPY = """\
+#define ON_ITS_WAY(to, from) asm volatile("cp.async.ca.shared.global [%0], [%1], %2;" \
+    :: "r"((unsigned)__cvta_generic_to_shared(to)), "l"(from), "n"(sizeof(*(to))) : "memory")"""
+WAIT_FOR_COPIES = 'asm volatile("cp.async.wait_all;" ::: "memory");'
+
+
+class Row(NamedTuple):
+    """An array with one row a world: its name, its number of axes, and the number of entries in a row."""
+
+    name: str
+    ndim: int
+    entries: int
+
+
+class Copy(NamedTuple):
+    """Code that copies the rows of 32 worlds between an array and shared memory.
+
+    Attributes:
+        declared: the declaration of the pointers ``NAME_from`` and ``NAME_to``.
+        entries: of a row.
+        wide: entries in 16 bytes; 0 where single entries are copied.
+        array: the name of the pointer into the caller's array.
+        one: a statement for entry i. several: a statement for ``wide`` entries, from entry ``wide`` i on.
+    """
+
+    declared: str
+    entries: int
+    wide: int
+    array: str
+    one: str
+    several: str
+
+    def whole(self, team: int) -> str:
+        """Return the loop of a team over the entries of 32 worlds, 16 bytes at a time where that can be."""
+        count, statement = WARP_SIZE * self.entries // (self.wide or 1), self.several if self.wide else self.one
+        turns = -(-count // team)
+        some = "" if turns * team == count else f"if (i < {count}) "
+        return f"""    #pragma unroll
+    for (int k = 0; k < {turns}; ++k) {{ const int i = member + {team} * k; {some}{statement} }}"""
+
+    def part(self, team: int) -> str:
+        """Return the loop of a team over the entries of the worlds that are present, one at a time."""
+        return f"    for (int i = member; i < present * {self.entries}; i += {team}) {{ {self.one} }}"
+
+
+def pitch(entries: int) -> int:
+    """Return the distance of rows in shared memory at which at most two threads of a warp use the same memory bank."""
+    return entries | 1 if entries % 4 == 0 else entries
+
+
+def source(row: Row, c: str) -> tuple[str, str]:
+    """Return the C type of an array's entries, and C++ for the address of the first one."""
+    return ("unsigned char", f"(const unsigned char*){row.name}.data") if row.name in MASKS else (c, f"{row.name}.data")
+
+
+def copy_rows_in(rows: list[Row], offset: dict[str, int], c: str, team: int) -> str:
+    """Return code that copies the rows of arrays to shared memory, each from its scalar ``offset`` on.
+
+    All arrays are read behind one test, because a thread that tests for each of them waits for each.
+    """
+    return _run([_copy_in(row, offset[row.name], c) for row in rows], team)
+
+
+def copy_rows_out(out: Row, offset: int, width: int, c: str, team: int) -> str:
+    """Return code that copies rows, ``width`` scalars apart, from shared memory to the array ``out``."""
+    n, (vector, _, names) = out.entries, VECTORS[c]
+    several = f"(({vector}*)to)[i] = (({vector}*)from)[i];"
+    if n != width:
+        parts = ", ".join(f"at[{k}]" for k in range(len(names)))
+        at = _padded(f"({len(names)} * i)", n, width)
+        several = f"{{ const {c}* at = from + {at}; (({vector}*)to)[i] = make_{vector}({parts}); }}"
+    declared = f"{c}* to = {out.name}.data + first * {n};\nconst {c}* from = stage + {offset};"
+    return _run([Copy(declared, n, len(names), "to", f"to[i] = from[{_padded('i', n, width)}];", several)], team)
+
+
+def _run(copies: list[Copy], team: int) -> str:
+    """Return code that makes all copies: wide ones if 32 worlds are present and all arrays begin at 16 bytes."""
+    aligned = "".join(f" && ((size_t){one.array} & 15) == 0" for one in copies if one.wide)
+    return "\n".join(
+        [
+            "{",
+            *(one.declared for one in copies),
+            f"if (present == 32{aligned}) {{",
+            *(one.whole(team) for one in copies),
+            "} else {",
+            *(one.part(team) for one in copies),
+            "}",
+            "}",
+        ]
+    )
+
+
+def _copy_in(row: Row, offset: int, c: str) -> Copy:
+    n, (kind, start), (vector, _, names) = row.entries, source(row, c), VECTORS[c]
+    origin, to = f"{row.name}_from", f"{row.name}_to"
+    padded, to_one = n != pitch(n), f"{to} + {_padded('i', n, pitch(n))}"
+    one = f"*({to_one}) = __ldg({origin} + i);"
+    several = f"(({vector}*){to})[i] = __ldg((const {vector}*){origin} + i);"
+    if padded:
+        parts = " ".join(f"at[{k}] = v.{name};" for k, name in enumerate(names))
+        at = _padded(f"({len(names)} * i)", n, pitch(n))
+        several = f"{{ const {vector} v = __ldg((const {vector}*){origin} + i); {c}* at = {to} + {at}; {parts} }}"
+    wide = len(names)
+    if row.name in MASKS:
+        wide = 0
+    elif n >= LONG_COPY:
+        one = f"{{ ON_ITS_WAY({to_one}, {origin} + i); }}"
+        several = f"{{ ON_ITS_WAY(({vector}*){to} + i, (const {vector}*){origin} + i); }}"
+        wide = 0 if padded else wide
+    declared = f"const {kind}* {origin} = {start} + first * {n};\n{c}* {to} = stage + {offset};"
+    return Copy(declared, n, wide, origin, one, several)
+
+
+def _padded(i: str, entries: int, distance: int) -> str:
+    """Return C++ for the place of entry ``i`` of consecutive rows that lie ``distance`` scalars apart."""
+    return i if entries == distance else f"({i} / {entries}) * {distance} + {i} % {entries}"
