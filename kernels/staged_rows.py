@@ -9,6 +9,7 @@ from .native import MASKS
 from .slots import VECTORS, WARP_SIZE
 
 LONG_COPY = 64  # rows of this many entries or more are copied to shared memory without passing through registers
+FEW = 4  # turns of a loop that is hardly ever run, side by side; the compiler would take 16, which is more code
 # defines ON_ITS_WAY(to, from), which starts the asynchronous copy of one scalar from global to shared memory
 DEFINE_ASYNC_COPY = """\
 #define ON_ITS_WAY(to, from) asm volatile("cp.async.ca.shared.global [%0], [%1], %2;" \
@@ -52,7 +53,8 @@ class Copy(NamedTuple):
 
     def part(self, team: int) -> str:
         """Return the loop of a team over the entries of the worlds that are present, one at a time."""
-        return f"    for (int i = member; i < present * {self.entries}; i += {team}) {{ {self.one} }}"
+        loop = f"for (int i = member; i < present * {self.entries}; i += {team}) {{ {self.one} }}"
+        return f"    #pragma unroll {FEW}\n    {loop}"
 
 
 def pitch(entries: int) -> int:
