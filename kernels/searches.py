@@ -8,14 +8,14 @@ import functools
 import warp as wp
 
 from .elementary import C_TYPE, NATIVE
-from .straight import define_fields
+from .fields import define_fields
 
 
 def assemble_search(fields: list[str], start: str, step: str, coordinates: int, given: bool, T: type) -> str:
     """Return the native code of one thread.
 
     Args:
-        fields: names of the arrays [entry, world] that the statements read, as ``FIELD(name, entry)``.
+        fields: names of the arrays of :mod:`.fields` that the statements read, as ``FIELD(name, entry)``.
         start: statements that set ``next_row`` from ``share_row``, ``given_row`` and ``first_row``.
         step: statements that set ``error_row[0]``, of ``q_row``, and ``next_row``, what follows it.
         coordinates: entries of q.

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import warp as wp
 
 from .elementary import C_TYPE, NATIVE
+from .fields import copy_cached_fields, define_fields
 from .native import INTEGERS
 from .slots import RELAY_WORLDS, WARP_SIZE, SlotLayout
 from .staged_rows import DEFINE_ASYNC_COPY, LONG_COPY, WAIT_FOR_COPIES, Row, copy_rows_in, copy_rows_out, pitch, source
@@ -55,7 +56,7 @@ class KernelLayout(NamedTuple):
     Attributes:
         rows: the arrays of the caller that the statements read, as ``name_row[i]``.
         staged: the block copies rows to shared memory; else each thread reads its row, faster for few or short rows.
-        fields: the names of the arrays [entry, world] that the statements read, as ``FIELD(name, entry)``.
+        fields: the names of the arrays of :mod:`.fields` that the statements read, as ``FIELD(name, entry)``.
         result: how ``result_row[i]`` is written.
         messages: the number of scalars that the warps of a team send each other, as ``SENT(i)``.
         warps: the number of warps that work on 32 worlds.
@@ -97,6 +98,11 @@ class KernelLayout(NamedTuple):
         if self.result.way == RELAYED:
             return max(scalars, self.result.slot_layout.scalars)
         return scalars + (self.result.slot_layout.scalars if self.result.way == MAPPED else 0)
+
+    @property
+    def cached_at(self) -> int:
+        """Where the cached entries begin in the shared memory of a group: they are its last part."""
+        return self.shared_scalars - WARP_SIZE * sum(map(len, self.cached))
 
     @property
     def staged_further(self) -> tuple[Row, ...]:
@@ -147,7 +153,11 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
         else:
             text += [_own_result(row, c)]
     if layout.cached:
-        text += [DEFINE_ASYNC_COPY, *_copy_cached_fields(layout, c), "#undef ON_ITS_WAY"]
+        text += [
+            DEFINE_ASYNC_COPY,
+            *copy_cached_fields(layout.fields, layout.cached, layout.cached_at, c),
+            "#undef ON_ITS_WAY",
+        ]
         lines = cuda.split("\n")
         lines.insert(next(i for i, line in enumerate(lines) if "FIELD(" in line), WAIT_FOR_COPIES)
         cuda = "\n".join(lines)
@@ -196,8 +206,7 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
     if layout.messages:
         text += [f"{c} sent[{layout.messages}];", "#define SENT(i) sent[i]"]
     text += [
-        *(_cached_entries(layout) if layout.cached else []),
-        *define_fields(layout.fields, c, bool(layout.cached)),
+        *define_fields(layout.fields, c, layout.cached),
         cpu,
     ]
     if result.way in BY_TABLE:
@@ -224,53 +233,6 @@ def _own_result(row: Row, c: str) -> str:
     """Return the declaration of ``name_row``, the row of the thread's own world in a further result."""
     kind = "int" if row.name in INTEGERS else c
     return f"{kind}* {row.name}_row = {row.name}.data + world * {row.entries};"
-
-
-def _cached_entries(layout: KernelLayout) -> list[str]:
-    """Return tables of the entries that CUDA caches; the CPU reads these entries from the fields themselves."""
-    return [
-        f"static const int {name}_entry[] = {{{', '.join(map(str, entries))}}};"
-        for name, entries in zip(layout.fields, layout.cached, strict=True)
-    ]
-
-
-def define_fields(names: list[str], c: str, by_place: bool = False) -> list[str]:
-    """Return the definition of FIELD for fields in global memory.
-
-    FIELD takes an entry, or with ``by_place`` the place of an entry in the tables of :func:`_cached_entries`.
-    """
-    if not names:
-        return []
-    return [
-        "#if defined(__CUDA_ARCH__)",
-        "#define FIELD(name, entry) __ldg(name##_at + (entry) * name##_part)",
-        "#else",
-        f"#define FIELD(name, entry) name##_at[{'name##_entry[entry]' if by_place else '(entry)'} * name##_part]",
-        "#endif",
-        *(
-            f"const {c}* {name}_at = (const {c}*)((const char*){name}.data + world * {name}.strides[1]);\n"
-            f"const long long {name}_part = {name}.strides[0] / (int)sizeof({c});"
-            for name in names
-        ),
-    ]
-
-
-def _copy_cached_fields(layout: KernelLayout, c: str) -> list[str]:
-    """Return the definition of FIELD for cached entries, and code with which each thread copies those of its world.
-
-    The cached entries are the last part of the shared memory.
-    """
-    text = ["#define FIELD(name, place) name##_at[(place) * 32]"]
-    at = layout.shared_scalars - WARP_SIZE * sum(map(len, layout.cached))
-    for name, entries in zip(layout.fields, layout.cached, strict=True):
-        text += [
-            f"{c}* {name}_at = stage + {at} + lane;",
-            f"const char* {name}_from = (const char*){name}.data + world * {name}.strides[1];",
-        ]
-        for place, entry in enumerate(entries):
-            text += [f"ON_ITS_WAY({name}_at + {32 * place}, {name}_from + {entry}ll * {name}.strides[0]);"]
-        at += WARP_SIZE * len(entries)
-    return text
 
 
 def repeat_passes(ahead: str, a_pass: str, last: str, names: tuple[str, str, str], entries: int, T: type) -> str:

@@ -214,3 +214,9 @@ def sweep_is_the_dense_resolvent(resolvent, worlds, tolerance, seed=0):
             wanted = np.linalg.solve(matrix, x[chunk, :, None].astype(np.float64))[..., 0]
             distance = np.linalg.norm(got[chunk] - wanted, axis=1) / np.linalg.norm(wanted, axis=1)
             assert distance.max() <= tolerance, f"world {first + distance.argmax()}: {distance.max():.1e}"
+
+
+def entries(field):
+    """A field of the scene's values as [entry, world], whether it lies in tiles of worlds or not."""
+    values = field.numpy()
+    return values if values.ndim == 2 else values.transpose(1, 0, 2).reshape(values.shape[1], -1)

@@ -8,7 +8,8 @@ from routines import ROUTINES
 
 import warp_spo as spo
 from warp_spo import reference
-from warp_spo.recursions.links import Links
+from warp_spo.kernels import fields
+from warp_spo.recursions.links import TABLES, Links
 from warp_spo.trace.scalars import ordered
 
 INERTIAS = ("body_mass", "body_com", "body_inertia")
@@ -83,9 +84,13 @@ def test_values_are_rounded_once(device):
     for dtype in ("float64", "float32"):
         dyn = spo.Dynamics(scene, device=device, dtype=dtype, granularity="tree")
         find(dyn)
-        tables.append([dyn.programs.field(name).numpy() for name in ("value", "node_value")])
+        tables.append([laws.entries(dyn.programs.field(name)) for name in ("value", "node_value")])
     for wide, narrow in zip(*tables, strict=True):
         np.testing.assert_array_equal(narrow, wide.astype(np.float32))
+
+
+def test_all_tables_of_links_lie_in_tiles():
+    assert fields.TILED == TABLES
 
 
 def test_what_no_graph_knew_of_is_derived_at_each_request(device):

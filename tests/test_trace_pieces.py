@@ -96,7 +96,7 @@ def built(texts, scene, operation, worlds=3, dtype="float64", given=None, **opti
     dofs = scene.dof_count
     out = (worlds, dofs, dofs) if operation.startswith("mass_matrix") else (worlds, dofs)
     program = dyn.programs.find(ROUTINES[operation], shapes, out)
-    fields = {name: dyn.programs.field(name).numpy() for name in program.fields}
+    fields = {name: laws.entries(dyn.programs.field(name))[:, :worlds] for name in program.fields}
     state = {name: array if name in ("q", *names) else np.zeros_like(array) for name, array in arrays.items()}
     return texts[-1], state | fields, np.array([laws.expected(dyn, operation, state, w) for w in range(worlds)])
 

@@ -9,6 +9,8 @@ import warp as wp
 
 from .. import launches
 from ..kernels import native, straight
+from ..kernels.fields import place_in_tile
+from ..kernels.slots import WARP_SIZE
 from ..memory import broadcast_worlds
 from ..recursions.links import Links
 from ..trace.differentiation import reverse
@@ -16,47 +18,36 @@ from ..trace.emission import Emitter, Store, render
 from ..trace.scalars import ordered
 from .parameters import DerivedArrays, Parameters
 
-CACHE_LINE, CROWDED = 64, 1024  # bytes
 LONGEST = 96  # entries that one kernel computes: twice as many take much more than twice as long to compile
 
 
 def table(parameters: Parameters, links: Links, name: str) -> wp.array:
-    """Return the scalars ``links.tables[name]`` as [entry, world], with stride 0 where all worlds share them."""
+    """Return the scalars ``links.tables[name]`` as [tile, entry, world of the tile], with 32 worlds in a tile.
+
+    Where all worlds share them, the stride of tiles is 0.
+    """
 
     def build() -> DerivedArrays:
         values = list(links.tables[name])
         sources = list(dict.fromkeys(scalar.args[0] for scalar in ordered(values) if scalar.op == "input"))
         T, device, worlds = parameters.dtype, parameters.device, parameters.rows(sources)
-        width = _width(worlds, T, device)
-        own = wp.empty((len(values), width), dtype=T, device=device)
-        parts = []
+        filled, parts = WARP_SIZE if worlds == 1 else worlds, []
+        own = wp.zeros((-(-filled // WARP_SIZE), len(values), WARP_SIZE), dtype=T, device=device)
         for first in range(0, len(values), LONGEST):
             kernel, read = _kernel(name, values, range(first, min(first + LONGEST, len(values))), T)
-            parts.append((kernel, [width, *(parameters.entries(source, worlds) for source in read)]))
+            parts.append((kernel, [filled, *(parameters.entries(source, filled) for source in read)]))
 
         def fill() -> None:
             for kernel, inputs in parts:
-                launches.launch(kernel, worlds, inputs, [own], device=device)
+                launches.launch(kernel, filled, inputs, [own], device=device)
 
-        rows = own if width == worlds else own[:, :worlds]
-        return DerivedArrays([broadcast_worlds(rows, 1, parameters.worlds)], sources, fill)
+        return DerivedArrays([broadcast_worlds(own, 0, -(-parameters.worlds // WARP_SIZE))], sources, fill)
 
     return parameters.derived_arrays(name, build)[0]
 
 
-def _width(worlds: int, T: type, device: wp.Device) -> int:
-    """Return how far apart rows of a table lie, in entries.
-
-    On the CPU a world's entries must not lie multiples of 1 KiB apart: they then share few lines of the cache, and a
-    table of 98 entries took four times as long.
-    """
-    size = wp.types.type_size_in_bytes(T)
-    crowded = not device.is_cuda and worlds > 1 and worlds * size % CROWDED == 0
-    return worlds + CACHE_LINE // size if crowded else worlds
-
-
 def _kernel(name: str, values: list, entries: range, T: type) -> tuple[wp.Kernel, list[str]]:
-    """Return the kernel that computes ``entries`` of a table [entry, world], and the names of the values it reads.
+    """Return the kernel that computes ``entries`` of a table, and the names of Newton's values that it reads.
 
     One thread works on a world.
     """
@@ -65,14 +56,14 @@ def _kernel(name: str, values: list, entries: range, T: type) -> tuple[wp.Kernel
     emitter = Emitter(
         "float64",
         lambda array, entry: f"FIELD({array}, {entry})",
-        lambda array, entry, value: f"out.data[({entry}) * (long long)worlds + world] = ({straight.C_TYPE[T]}){value};",
+        lambda array, entry, value: f"out.data[{place_in_tile(entry, len(values))}] = ({straight.C_TYPE[T]}){value};",
         lambda array, index: index[0],
         late=sources,
         fuses=True,
     )
     listing = emitter.region([Store("out", (entry,), values[entry]) for entry in entries])
     text = straight.assemble_per_world(sources, render(listing, "float64"))
-    arrays = [(source, 2) for source in sources] + [("out", 2)]
+    arrays = [(source, 2) for source in sources] + [("out", 3)]
     return native.kernel(f"links_{name}", text, arrays, T, wide=tuple(sources)), sources
 
 

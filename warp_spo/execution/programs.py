@@ -13,6 +13,7 @@ import warp as wp
 
 from .. import launches
 from ..kernels import native, straight
+from ..kernels.fields import axes
 from ..kernels.native import INTEGERS
 from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout
@@ -311,7 +312,7 @@ class Programs:
         text = straight.assemble(layout, cuda, cpu, self.run.dtype)
         rows, fields = (*(row.name for row in layout.rows), *layout.numbers), tuple(layout.fields)
         arrays = [(row.name, row.ndim) for row in layout.rows] + [(name, 0) for name in layout.numbers]
-        arrays += [(name, 2) for name in fields]
+        arrays += [(name, axes(name)) for name in fields]
         result, entry, places = layout.result, None, ()
         if result.way in BY_TABLE:
             tables = tables | {"place": result.slot_layout.table(tables["place"], self.run.dtype)}

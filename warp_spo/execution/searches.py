@@ -8,6 +8,7 @@ import warp as wp
 
 from .. import launches
 from ..kernels import native, searches
+from ..kernels.fields import axes
 from ..recursions.links import Links
 from ..recursions.tracing import Trace
 from ..trace.emission import Emitter, render
@@ -40,7 +41,7 @@ def build(programs: Programs, routine: Routine, links: Links, given: bool, optio
     text = searches.assemble_search(fields, first, again, run.scene.coord_count, given, run.dtype)
     rows = ROWS if given else ROWS[:-1]
     arrays = [("weight", 0), ("iterations", 0), ("target", 3), ("share", 2), ("given", 2)][: 2 + len(rows)]
-    arrays += [(name, 2) for name in fields] + [("found", 2), ("errors", 1)]
+    arrays += [(name, axes(name)) for name in fields] + [("found", 2), ("errors", 1)]
     kernel = native.kernel(routine.name, text, arrays, run.dtype)
     return Program(kernel, rows, tuple(fields), (), 1, BLOCK, at_step.operations)
 
