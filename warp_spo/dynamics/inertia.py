@@ -99,7 +99,7 @@ SOLVE_MASS_MATRIX = Operation(
         nodes.solve_mass_matrix,
         letters="Pza",
         velocities=False,
-        occupancy=(4, 128),
+        occupancy=((4, 128),),
     ),
     embed=Routine("embedded_solve_mass_matrix", minimal.solve_mass_matrix),
     multipliers=AS_WRITTEN,

@@ -23,7 +23,7 @@ from ..recursions.contact.secants import SECANT
 from ..recursions.flexible import attach
 from ..recursions.links import TABLES, Links
 from ..recursions.messages import INWARD, OUTWARD
-from ..recursions.pieces import Pieces
+from ..recursions.pieces import PARTS, Pieces
 from ..recursions.step import GAIN, GUESS, LOOPED, MISSED
 from ..recursions.tracing import Trace
 from ..scene.contacts import HeightField
@@ -38,7 +38,6 @@ from .sweeps import Sweeps
 from .teams import HELD, Passes, Team, Work
 
 PASSED = (*LOOPED, SECANT)  # variables of the loops over passes
-PARTS = 4  # of a multiprocessor
 MOST_REGISTERS = 255  # of a thread
 PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
 
@@ -283,11 +282,13 @@ class Programs:
             )
         cuda = team.cuda()  # fills the tables
         registers = self._registers(pieces.warps)
-        if routine.occupancy is not None and dtype == "float32" and not self.plan.few:
-            blocks, enough = routine.occupancy
-            fewer = self._registers(blocks * pieces.warps)
-            room = blocks * (layout.shared_bytes(self.run.dtype) + RESERVED) <= self.plan.device.shared_bytes
-            registers = fewer if fewer >= enough and room else registers
+        if dtype == "float32" and not self.plan.few:
+            for blocks, enough in routine.occupancy:
+                fewer = self._registers(blocks * pieces.warps)
+                room = blocks * (layout.shared_bytes(self.run.dtype) + RESERVED) <= self.plan.device.shared_bytes
+                if fewer >= enough and room:
+                    registers = fewer
+                    break
         lists = {"place": table, "table": team.table, "shifts": team.shifts}
         tables = {name: values for name, values in lists.items() if values}
         cap = registers if registers < MOST_REGISTERS else None

@@ -38,8 +38,8 @@ class Routine:
         passes: the recursion is repeated until the laws of the joints hold, and its results may overwrite its inputs.
         tiled: the result is left in tiles for the kernels of :mod:`warp_spo.kernels.tiles` to finish.
         bias_first: variant that computes velocity terms and loads first, for many worlds of shallow trees.
-        occupancy: (blocks, registers): by limbs in float32 with many worlds, a multiprocessor holds so many blocks if
-            a thread then still has so many registers.
+        occupancy: pairs (blocks, registers): by limbs in float32 with many worlds, a multiprocessor holds so many
+            blocks if a thread then still has so many registers; the first pair that applies.
         variants: at most so many different options get a kernel of their own where sweeps serve the others.
         wide: its rows are long, so that a team asks for as much shared memory as they need.
         start: ``start(trace, **options)`` returns what a search starts from; None: the kernel is no search, see
@@ -62,7 +62,7 @@ class Routine:
     passes: bool = False
     tiled: bool = False
     bias_first: Routine | None = None
-    occupancy: tuple[int, int] | None = None
+    occupancy: tuple[tuple[int, int], ...] = ()
     variants: int = VARIANTS
     wide: bool = False
     start: Callable[..., list[Store]] | None = None

@@ -9,7 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 
+from ..trace.scalars import is_constant
 from .links import Link, Links
+
+PARTS = 4  # of a multiprocessor, which divide its warps among them
 
 
 @dataclasses.dataclass(eq=False)
@@ -54,6 +57,11 @@ class Piece:
         """The dofs that move its last link, from the root out."""
         return [dof for piece in reversed([self, *self.ancestors]) for dof in piece.dofs]
 
+    @property
+    def root(self) -> Piece:
+        """The first piece of its tree."""
+        return self.ancestors[-1] if self.ancestors else self
+
     def fork(self, other: Piece) -> Piece | None:
         """Return the last piece that carries both, or None."""
         mine = [self, *self.ancestors]
@@ -97,14 +105,13 @@ class Pieces:
                     above.children.append(piece)
             piece.links.append(link)
             self.of[id(link)] = piece
-        self.warps = 0
+        leaves = [piece for piece in reversed(self.pieces) if not piece.children]
+        self.warps = len(leaves)
+        for warp, piece in zip(_parted(leaves), leaves, strict=True):
+            piece.warp = warp
         for piece in reversed(self.pieces):
-            if not piece.children:
-                piece.warp, self.warps = self.warps, self.warps + 1
-                continue
-            heir = max(piece.children, key=lambda child: (child.inward, child.weight))
-            piece.warp = heir.warp
-            piece.inward = max(child.inward + (child is not heir) for child in piece.children)
+            if piece.children:
+                self._hand_over(piece)
         for piece in self.pieces:
             if piece.parent is not None:
                 piece.outward = piece.parent.outward + (piece.warp != piece.parent.warp)
@@ -115,6 +122,24 @@ class Pieces:
                 piece.outward = last  # equal limbs share their code, so they come out together
         self.stages = last + 1
 
+    def _hand_over(self, piece: Piece) -> None:
+        """Give an inner piece to the warp of the one child that is done last; of several, to the warp with least work.
+
+        Work is compared by the part of a multiprocessor first, because each part issues instructions for its own warps.
+        """
+        last = max(child.inward for child in piece.children)
+        awaited = [child for child in piece.children if child.inward == last]
+        if len(awaited) == 1:
+            piece.warp = awaited[0].warp
+        else:
+            load = [0] * self.warps
+            for other in self.pieces:
+                if other.index > piece.index or not other.children:
+                    load[other.warp] += other.weight
+            below = {other.warp for other in self.pieces if piece.root is other.root and not other.children}
+            piece.warp = min(below, key=lambda warp: (sum(load[warp % PARTS :: PARTS]), load[warp], -warp))
+        piece.inward = max(child.inward + (child.warp != piece.warp) for child in piece.children)
+
     @property
     def alike(self) -> float:
         """Share of the limbs' dofs that is in limbs of which there is another with the same hinges: they share code."""
@@ -122,3 +147,22 @@ class Pieces:
         kinds = [tuple(link.hinge.shape for link in piece.links) for piece in limbs]
         twice = sum(piece.weight for piece, kind in zip(limbs, kinds, strict=True) if kinds.count(kind) > 1)
         return twice / sum(piece.weight for piece in limbs)
+
+
+def _parted(leaves: list[Piece]) -> list[int]:
+    """Return the warp of each leaf: leaves of one kind share a part of the multiprocessor, which fetches its own code.
+
+    Warp w runs on part w % PARTS. Up to PARTS leaves have a part each, in their order.
+    """
+    kinds = [_kind(piece) for piece in leaves]
+    grouped = sorted(range(len(leaves)), key=lambda at: (-kinds.count(kinds[at]), kinds.index(kinds[at])))
+    places = sorted(range(len(leaves)), key=lambda warp: (warp % PARTS, warp))
+    warps = dict(zip(grouped, places, strict=True)) if len(leaves) > PARTS else dict(enumerate(range(len(leaves))))
+    return [warps[at] for at in range(len(leaves))]
+
+
+def _kind(piece: Piece) -> tuple:
+    """Return what is equal for pieces that share their code: hinges, and which entries of rotations are 0, 1 or -1."""
+    entries = [[x for row in link.matrix or () for x in row] for link in piece.links]
+    folded = [tuple(x if is_constant(x) and x in (0.0, 1.0, -1.0) else None for x in each) for each in entries]
+    return tuple(zip((link.hinge.shape for link in piece.links), folded, strict=True))
