@@ -67,12 +67,22 @@ def source(row: Row, c: str) -> tuple[str, str]:
     return ("unsigned char", f"(const unsigned char*){row.name}.data") if row.name in MASKS else (c, f"{row.name}.data")
 
 
-def copy_rows_in(rows: list[Row], offset: dict[str, int], c: str, team: int) -> str:
+def copy_rows_in(rows: list[Row], offset: dict[str, int], c: str, team: int, direct: bool = False) -> str:
     """Return code that copies the rows of arrays to shared memory, each from its scalar ``offset`` on.
 
-    All arrays are read behind one test, because a thread that tests for each of them waits for each.
+    All arrays are read behind one test, because a thread that tests for each of them waits for each. Rows that do not
+    pass through registers come first; with ``direct`` they are all that lie in shared memory as they do in the array.
     """
-    return _run([_copy_in(row, offset[row.name], c) for row in rows], team)
+    on_their_way = [row for row in rows if _is_asynchronous(row, direct)]
+    copies = [_copy_in(row, offset[row.name], c, True) for row in on_their_way]
+    copies += [_copy_in(row, offset[row.name], c, False) for row in rows if row not in on_their_way]
+    text = _run(copies, team)
+    return "\n".join([DEFINE_ASYNC_COPY, text, WAIT_FOR_COPIES, "#undef ON_ITS_WAY"]) if on_their_way else text
+
+
+def _is_asynchronous(row: Row, direct: bool) -> bool:
+    """Return whether a row is copied without passing through registers."""
+    return row.name not in MASKS and (row.entries >= LONG_COPY or (direct and row.entries == pitch(row.entries)))
 
 
 def copy_rows_out(out: Row, offset: int, width: int, c: str, team: int) -> str:
@@ -104,7 +114,7 @@ def _run(copies: list[Copy], team: int) -> str:
     )
 
 
-def _copy_in(row: Row, offset: int, c: str) -> Copy:
+def _copy_in(row: Row, offset: int, c: str, asynchronous: bool) -> Copy:
     n, (kind, start), (vector, _, names) = row.entries, source(row, c), VECTORS[c]
     origin, to = f"{row.name}_from", f"{row.name}_to"
     padded, to_one = n != pitch(n), f"{to} + {_padded('i', n, pitch(n))}"
@@ -117,7 +127,7 @@ def _copy_in(row: Row, offset: int, c: str) -> Copy:
     wide = len(names)
     if row.name in MASKS:
         wide = 0
-    elif n >= LONG_COPY:
+    elif asynchronous:
         one = f"{{ ON_ITS_WAY({to_one}, {origin} + i); }}"
         several = f"{{ ON_ITS_WAY(({vector}*){to} + i, (const {vector}*){origin} + i); }}"
         wide = 0 if padded else wide

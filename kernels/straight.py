@@ -13,7 +13,7 @@ from .elementary import C_TYPE, NATIVE
 from .fields import copy_cached_fields, define_fields
 from .native import INTEGERS
 from .slots import RELAY_WORLDS, WARP_SIZE, SlotLayout
-from .staged_rows import DEFINE_ASYNC_COPY, LONG_COPY, WAIT_FOR_COPIES, Row, copy_rows_in, copy_rows_out, pitch, source
+from .staged_rows import DEFINE_ASYNC_COPY, WAIT_FOR_COPIES, Row, copy_rows_in, copy_rows_out, pitch, source
 
 # shared memory that a block may declare: 48 KiB less the share that Warp uses; more is asked for at the launch
 SHARED_BYTES = 46 * 1024
@@ -68,6 +68,7 @@ class KernelLayout(NamedTuple):
         cached: for each field, the entries that the threads copy to shared memory before the statements run. A compiler
             that loads these entries from global memory does so long before their use, and runs out of registers.
         numbers: the names of the numbers that all worlds share, read as ``name_row[0]``.
+        direct: short rows, too, are copied to shared memory without passing through registers.
     """
 
     rows: list[Row]
@@ -82,6 +83,7 @@ class KernelLayout(NamedTuple):
     retries: bool = False
     cached: tuple[tuple[int, ...], ...] = ()
     numbers: tuple[str, ...] = ()
+    direct: bool = False
 
     @property
     def groups(self) -> int:
@@ -162,11 +164,7 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
         lines.insert(next(i for i, line in enumerate(lines) if "FIELD(" in line), WAIT_FOR_COPIES)
         cuda = "\n".join(lines)
     if layout.staged:
-        if any(row.entries >= LONG_COPY for row in layout.rows):
-            text += [DEFINE_ASYNC_COPY]
-        text += [copy_rows_in(layout.rows, offset, c, team)] if layout.rows else []
-        if any(row.entries >= LONG_COPY for row in layout.rows):
-            text += [WAIT_FOR_COPIES, "#undef ON_ITS_WAY"]
+        text += [copy_rows_in(layout.rows, offset, c, team, layout.direct)] if layout.rows else []
         text += [sync]
     if result.way == IN_PLACE:
         start, width = offset[result.row], pitch(next(row.entries for row in layout.rows if row.name == result.row))

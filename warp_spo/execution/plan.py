@@ -36,6 +36,7 @@ MOST_WARPS = 16
 NODE_WORLDS = 1024  # of a CPU, beyond which a launch for each level only takes a large workspace
 DEEPEST = 12  # dofs from a root to a leaf, a free hinge one, up to which velocity terms that come first are as accurate
 VELOCITIES_FIRST = {"tree": {"float32": HELD, "float64": HELD}, "segment": SPILLS}  # dofs beyond which they are faster
+AT_ONCE = 65536  # worlds that a GPU runs at once, a thread each with up to 128 registers
 
 # Measured on an H200, 2026-11-22, see benchmarks/depth.py. In a graph, a launch of a sweep takes 3.4 us and one of a
 # scan 5 to 7 us, because a round of a scan is a product of two elements. A scan does three to five times the work of a
@@ -141,6 +142,13 @@ class Plan:
         """Whether rows come in through shared memory, for kernels in which ``warps`` share 32 worlds."""
         enough = self.worlds > self.device.scaled(FEW_WORLDS // 4)
         return self.at(routine).staged and (warps == 1 or enough or routine.passes)
+
+    def copies_directly(self, routine: Routine) -> bool:
+        """Whether rows reach shared memory without passing through registers, with a thread a world.
+
+        They come sooner, but the compiler then takes more registers; that costs nothing where all worlds run at once.
+        """
+        return routine.short and not self.varies and not self.few and self.worlds <= self.device.scaled(AT_ONCE)
 
     def gathers(self, routine: Routine, warps: int, results: int) -> bool:
         """Whether short results leave through shared memory though rows do not come in through it.

@@ -218,7 +218,8 @@ class Programs:
             ahead, a_pass = before
             body = straight.repeat_passes(ahead, a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
         block = PAIR * WARP_SIZE if self.plan.few and not layout.shared_scalars else WARP_SIZE
-        layout = layout._replace(retries=layout.retries and "farthest" in body, block=block)
+        direct = self.plan.copies_directly(routine)
+        layout = layout._replace(retries=layout.retries and "farthest" in body, block=block, direct=direct)
         tables = {} if table is None else {"place": table}
         ground = self.run.scene.ground
         if isinstance(ground, HeightField) and trace.begin:
