@@ -1,8 +1,9 @@
 """Pieces: a scene's links cut into serial chains that warps work on side by side, and their order.
 
 A piece is a segment of the paper's strictly canonical tree: it ends where the tree branches. One warp works on each
-leaf piece; a piece further in is taken on by the warp of its deepest child. Work proceeds in stages with a barrier
-between them: a piece goes inward in the first stage in which all that it carries is done, and outward after its parent.
+leaf piece; a piece further in is taken on by the warp of the child that is done last, or by the one with least work
+where several are. Work proceeds in stages with a barrier between them: a piece goes inward in the first stage in which
+all that it carries is done, and outward after its parent.
 """
 
 from __future__ import annotations
