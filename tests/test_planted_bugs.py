@@ -178,7 +178,8 @@ def team_error(monkeypatch, operation="forward_dynamics", name="star"):
 
 TEAM_MUTANTS = {
     "a slot too near": (messages, "slots", "at += size(letter, piece)", "at += size(letter, piece) - 1"),
-    "no barrier before the trunk": (pieces.Pieces, "__init__", "child.inward + (child is not heir)", "child.inward"),
+    "no barrier before the trunk": (pieces.Pieces, "_hand_over",
+                                    "child.inward + (child.warp != piece.warp)", "child.inward"),
     "no barrier after the trunk": (pieces.Pieces, "__init__",
                                    "piece.parent.outward + (piece.warp != piece.parent.warp)", "piece.parent.outward"),
     "another limb's entries": (teams.Team, "_fill_in", "zip(*shifts.columns, strict=True)",
