@@ -219,7 +219,7 @@ def test_what_is_left_out_is_said_once():
         spo.from_mujoco(compiled(text))
     (one,) = caught
     assert one.filename == __file__
-    for words in ("geom 'floor' among them (pass contact forces as body_f)", "mocap body 'm'", "1 camera(s)"):
+    for words in ("geom 'floor' among them (scene.with_contacts adds points", "mocap body 'm'", "1 camera(s)"):
         assert words in str(one.message)
 
 

@@ -140,7 +140,7 @@ def _warn(source: Source) -> None:
     if solid.size and not source.disabled("CONTACT") and not source.disabled("CONSTRAINT"):
         planes = [source.words("geom", int(geom)) for geom in solid if m.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE]
         among = f", {', '.join(planes)} among them" if planes else ""
-        found.append(f"contacts of {solid.size} geom(s){among} (say which points touch the ground with scene.with_contacts)")
+        found.append(f"contacts of {solid.size} geom(s){among} (scene.with_contacts adds points that touch the ground)")
     for mocap in np.flatnonzero(m.body_mocapid >= 0):
         found.append(f"the motion of mocap {source.words('body', int(mocap))}, which stands where the file puts it")
     for name in ("camera", "sensor"):
