@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from .scalars import Scalar, Value, cos, is_constant, logarithm, ordered, power, reciprocal, select, sin
 
 UNIT_DERIVATIVE = ("add", "cut", "reduced", "guarded")  # by each argument, except the limit of "guarded"
-ZERO_DERIVATIVE = ("input", "lost", "less")  # piecewise constant; "lost" is 0 or NaN
+ZERO_DERIVATIVE = ("input", "lost", "less", "floor", "lookup")  # piecewise constant; "lost" is 0 or NaN
 
 
 def forward(outputs: Iterable[Value], inputs: Iterable[Scalar], seeds: Iterable[Value]) -> list[Value]:
