@@ -115,7 +115,7 @@ RULES = {
     "lost": lambda x, y: x.graph.make("lost", x) + x * y,
     "select": lambda x, y: g.select(x, x * y, y) + g.select(x.graph.make("lost", x), x, y * y),
     "less": lambda x, y: g.less(x, y) + x * y,
-    "floor": lambda x, y: g.floor(x * 5.0) + x * y,
+    "floor": lambda x, y: g.floor(x) + x * y,
     "arctangent": lambda x, y: g.arctangent(x * x + 1.0, y),
     "exponential": lambda x, y: g.exponential(x * y),
     "logarithm": lambda x, y: g.logarithm(x * x + y * y),
