@@ -1,4 +1,4 @@
-"""What steps of scenes with contacts accept and report."""
+"""Options and reports of a step of a scene with contacts: passes, forces, gaps, slips, excess."""
 
 from __future__ import annotations
 

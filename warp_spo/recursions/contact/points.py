@@ -56,7 +56,7 @@ class Point:
 
     @property
     def state(self) -> list[Value]:
-        """What all passes read."""
+        """The values that every pass reads: arm, normal, depth and velocity."""
         return [*self.arm, *self.normal, self.depth, *self.velocity]
 
     def inertia(self, across: Value, along: Value) -> Articulated:
@@ -73,7 +73,7 @@ class Point:
         """Return (n; f) of a force at the point, about the link's origin."""
         return Vector((*cross(self.arm, force), *force))
 
-    def moved(self, w: Vector, v: Vector) -> Vector:
+    def rate(self, w: Vector, v: Vector) -> Vector:
         """Return the velocity of the point, or its acceleration, when the link moves with (w; v)."""
         return v + cross(w, self.arm)
 

@@ -160,7 +160,7 @@ class ContactStep(Step):
         """Keep what the next pass reads of a point; return its force, its slip, by how much the force leaves the cone,
         how much it pulls, and the push that it lacks because the pass left the point open."""
         kept, h = self.kept, self.h
-        change = ZERO if point.link is None else point.moved(*alpha[id(point.link)])
+        change = ZERO if point.link is None else point.rate(*alpha[id(point.link)])
         v = point.velocity + change * h
         normal = dot(point.normal, v)
         force = self._force(point, touch, v) if point.link is not None else ZERO
