@@ -46,6 +46,7 @@ ROOMS = (
     "mujoco",
     "newton",
     "trials",
+    "env",
     "examples",
     "__main__",
 )

@@ -1,0 +1,121 @@
+"""Robots of the tasks: MJCF files of our own, which name the source and the licence of their figures.
+
+A file has joints, inertias, armature, effort limits, servos and primitives; MuJoCo reads the same file. Primitives of
+class "touch" touch the ground, those of class "look" are drawn.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ... import Contact, Plane, Scene, from_mujoco
+
+FILES = Path(__file__).parent
+NAMES = ("cartpole", "ant", "panda", "go2", "g1")
+LOOK, TOUCH = 2, 3  # groups of geoms in the files
+SHAPES = {2: ("sphere", 1), 3: ("capsule", 2), 6: ("box", 3)}
+"""MuJoCo's number of a kind of geom -> its name and how many sizes it has."""
+
+
+class Primitive(NamedTuple):
+    """A shape that is drawn, fixed to a body.
+
+    Attributes:
+        kind: "sphere", "capsule" or "box". body: index of the body; -1: the world.
+        size: radius [m]; radius and half length along z; half the sizes.
+        pose: position [m] and quaternion (xyzw) in the body frame [7]. color: red, green, blue, 0 to 1.
+    """
+
+    kind: str
+    body: int
+    size: tuple[float, ...]
+    pose: tuple[float, ...]
+    color: tuple[float, float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Robot:
+    """A scene with contacts and actuators, its standing pose, and what it looks like.
+
+    Attributes:
+        name: of the file. path: of the file, which MuJoCo reads, too.
+        scene: with contacts that carry the names of the file's shapes, and servos or motors as actuators.
+        q: coordinates of the pose "stand" [coordinate]. ctrl: its controls [actuator].
+        primitives: shapes to draw.
+    """
+
+    name: str
+    path: Path
+    scene: Scene
+    q: np.ndarray
+    ctrl: np.ndarray
+    primitives: tuple[Primitive, ...]
+
+    def points(self, *names: str) -> list[int]:
+        """Return the rows of contact points, as in ``contact_f``, whose contact's label contains one of the names."""
+        labels = [self.scene.contacts[point.contact].label for point in self.scene.contact_points]
+        found = [i for i, label in enumerate(labels) if any(name in label for name in names)]
+        if not found:
+            raise ValueError(f"Robot.points: no contact of {self.name!r} is named like {names}; it has {labels}")
+        return found
+
+
+def load(name: str, ground: Any = None, contacts: tuple[str, ...] | None = None) -> Robot:
+    """Return a robot by name, on the ground.
+
+    Args:
+        name: one of ``NAMES``.
+        ground: spo.Plane or spo.HeightField; None: the plane z = 0.
+        contacts: parts of the names of contacts to keep; None keeps all.
+
+    Raises:
+        ValueError: the name is unknown.
+        ImportError: the package mujoco, which reads the file, is missing.
+    """
+    if name not in NAMES:
+        raise ValueError(f"robots.load: {name!r} is unknown; expected one of {', '.join(NAMES)}")
+    from ...mujoco.files import compiled
+
+    path = FILES / f"{name}.xml"
+    model, _ = compiled(path)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*left out: contacts")  # which are added here
+        scene = from_mujoco(model)
+    touch = [_contact(model, geom) for geom in range(model.ngeom) if model.geom_group[geom] == TOUCH]
+    if contacts is not None:
+        touch = [contact for contact in touch if any(part in contact.label for part in contacts)]
+    if touch:
+        scene = scene.with_contacts(touch, Plane() if ground is None else ground)
+    look = [_primitive(model, geom) for geom in range(model.ngeom) if model.geom_group[geom] == LOOK]
+    feet = [_primitive(model, geom) for geom in range(model.ngeom) if "_foot" in model.geom(geom).name]
+    stand = scene.keyframes["stand"]
+    return Robot(name, path, scene, np.array(stand.q), np.array(stand.ctrl), (*look, *feet))
+
+
+def _contact(model: Any, geom: int) -> Contact:
+    """Return a contact with the shape of a geom: a sphere or a capsule."""
+    kind, body, size, pose, _ = _primitive(model, geom)
+    centre = np.array(pose[:3])
+    shape: dict[str, Any] = {"sphere": (centre, size[0])}
+    if kind == "capsule":
+        half = size[1] * _z_axis(pose[3:])
+        shape = {"capsule": (centre - half, centre + half, size[0])}
+    return Contact(body, **shape, friction=float(model.geom_friction[geom, 0]), label=model.geom(geom).name)
+
+
+def _primitive(model: Any, geom: int) -> Primitive:
+    kind, used = SHAPES[int(model.geom_type[geom])]
+    w, x, y, z = model.geom_quat[geom].tolist()
+    pose = (*model.geom_pos[geom].tolist(), x, y, z, w)
+    color = tuple(model.geom_rgba[geom, :3].tolist())
+    return Primitive(kind, int(model.geom_bodyid[geom]) - 1, tuple(model.geom_size[geom, :used].tolist()), pose, color)
+
+
+def _z_axis(quaternion: Any) -> np.ndarray:
+    x, y, z, w = quaternion
+    return np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
