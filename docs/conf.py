@@ -1,5 +1,7 @@
 """Sphinx configuration: ``python -m sphinx -W -b html docs docs/_build``, without network."""
 
+from pathlib import Path
+
 import warp as wp
 
 wp.config.log_level = wp.LOG_WARNING  # before newton is imported
@@ -33,12 +35,8 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": [],
 }
-html_sidebars = {
-    page: []
-    for page in (
-        "index", "start", "concepts", "joints", "actuators", "closed_loops", "robot_files", "jax", "theory", "results"
-    )
-}  # fmt: skip
+PROJECT = ("project", "contributing", "measured_facts", "log", "changelog")  # pages that list each other
+html_sidebars = {page.stem: [] for page in Path(__file__).parent.glob("*.md") if page.stem not in PROJECT}
 html_static_path = ["_static"]
 html_css_files = ["page.css"]
 html_show_sourcelink = False

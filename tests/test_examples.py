@@ -170,3 +170,12 @@ def test_a_mistaken_option_is_one_line(arguments, expected, monkeypatch, capsys)
 def test_pictures_are_asked_for_by_name():
     done = subprocess.run([sys.executable, "-m", "warp_spo.examples.reach", "--help"], capture_output=True, text=True)
     assert "--picture FILE" in done.stdout
+
+
+def test_the_list_names_every_example(capsys):
+    importlib.import_module("warp_spo.examples.__main__").main()
+    lines = capsys.readouterr().out.splitlines()[2:]
+    assert {line.split()[0] for line in lines} == {
+        path.stem for path in FOLDER.glob("[a-z]*.py") if path.stem not in ("parts", "options")
+    }
+    assert all(len(line.split()) > 3 for line in lines)

@@ -1,0 +1,54 @@
+"""Run every example and write docs/gallery.md: its sentences, its picture, and the command that makes them.
+
+    python -m benchmarks.gallery [NAME ...]
+
+With names, only these examples run; the page keeps what it says of the others.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from warp_spo.examples.__main__ import examples
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+PAGE, PICTURES = DOCS / "gallery.md", DOCS / "_static" / "gallery"
+HEAD = """# Gallery
+
+Every example runs as it stands, on a CPU in a minute at most, and draws its picture with `--picture FILE`.
+`python -m warp_spo.examples` lists them. This page was written by `python -m benchmarks.gallery`, with the sentences
+that each example printed.
+"""
+ENTRY = re.compile(r"^## (\w+)\n.*?(?=^## |\Z)", re.MULTILINE | re.DOTALL)
+
+
+def run(name: str, line: str) -> str:
+    """Run an example; return its section of the page."""
+    picture = PICTURES / f"{name}.svg"
+    command = [sys.executable, "-m", f"warp_spo.examples.{name}", "--picture", str(picture)]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return (
+        f"## {name}\n\n{line}\n\n    python -m warp_spo.examples.{name}\n\n"
+        f"![what the example {name} draws](_static/gallery/{picture.name})\n\n```text\n{printed.strip()}\n```\n"
+    )
+
+
+def main(names: list[str]) -> None:
+    """Run the named examples, or all, and write the page."""
+    PICTURES.mkdir(exist_ok=True)
+    known = examples()
+    if unknown := sorted(set(names) - set(known)):
+        sys.exit(f"python -m benchmarks.gallery: no example {', '.join(unknown)}; expected some of {', '.join(known)}")
+    sections = {found[1]: found[0] for found in ENTRY.finditer(PAGE.read_text())} if PAGE.exists() else {}
+    for name, line in known.items():
+        if not names or name in names or name not in sections:
+            print(name, flush=True)
+            sections[name] = run(name, line)
+    PAGE.write_text(HEAD + "\n" + "\n".join(sections[name].strip() + "\n" for name in known))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
