@@ -10,11 +10,12 @@ from typing import Any
 import mujoco
 
 from ..scene.scene import Scene
+from ..scene.shapes import NONE, Choice
 from .model import scene_of
 from .source import Source
 
 
-def read_mjcf(file: Path, floating: bool | None, repair: bool = True) -> Scene:
+def read_mjcf(file: Path, floating: bool | None, repair: bool = True, choice: Choice = NONE) -> Scene:
     """Return the scene of an MJCF file; see :func:`warp_spo.load`. ``repair`` changes nothing: MuJoCo repairs nothing.
 
     Raises:
@@ -30,7 +31,7 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool = True) -> Scene:
     model, dropped = compiled(file)
     source = Source(model, "load", str(file))
     source.left_out += dropped
-    return scene_of(source, floating)
+    return scene_of(source, floating, choice)
 
 
 def compiled(file: Path) -> tuple[mujoco.MjModel, list[str]]:

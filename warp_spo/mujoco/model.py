@@ -11,14 +11,16 @@ import numpy as np
 from ..errors import UnsupportedError
 from ..scene.actuators import Keyframe
 from ..scene.scene import Scene
+from ..scene.shapes import NONE, POINTS, Choice
 from .actuators import read_actuators
 from .mechanism import BALL, FREE, SIZES, Mechanism, rotation, scene_entries, xyzw
 from .refusals import refuse_unsupported
+from .shapes import collision_shapes
 from .source import Source
 from .ties import read_ties
 
 
-def from_mujoco(model: Any) -> Scene:
+def from_mujoco(model: Any, contacts: Any = None, ground: Any = None, points: int = POINTS) -> Scene:
     """Return the scene of a compiled MuJoCo model, its numbers in float64.
 
     Every joint becomes a hinge of its own, in the model's order and with the model's name; a body without a joint has a
@@ -37,6 +39,9 @@ def from_mujoco(model: Any) -> Scene:
 
     Args:
         model: a ``mujoco.MjModel``, of MuJoCo 3.11 or newer.
+        contacts, ground, points: which geoms touch which ground, as in :func:`load`. Friction is MuJoCo's of the geom
+            on the model's ground; ``solref`` and ``solimp`` are not read: stiffness and damping are chosen as
+            :class:`Contact` says.
 
     Raises:
         TypeError: the argument is not a ``mujoco.MjModel``.
@@ -56,11 +61,14 @@ def from_mujoco(model: Any) -> Scene:
             f"from_mujoco: got {type(model).__name__}; expected mujoco.MjModel, which "
             "mujoco.MjModel.from_xml_path(path) and mujoco.MjSpec.compile() return"
         )
-    return scene_of(Source(model), None)
+    return scene_of(Source(model), None, Choice(contacts, ground, points))
 
 
-def scene_of(source: Source, floating: bool | None) -> Scene:
-    """Return the scene of a source, its base as ``floating`` says; warn once of what it leaves out."""
+def scene_of(source: Source, floating: bool | None, choice: Choice = NONE) -> Scene:
+    """Return the scene of a source, its base as ``floating`` says, with contacts by ``choice``.
+
+    A warning says once what is left out.
+    """
     refuse_unsupported(source)
     if source.model.nbody == 1:
         raise ValueError(f"{source.title}: the model has no bodies; expected one or more")
@@ -70,7 +78,9 @@ def scene_of(source: Source, floating: bool | None) -> Scene:
         raise
     except ValueError as error:  # of a body, a hinge or the scene, which know neither call nor file
         raise ValueError(f"{source.title}: {error}; correct the model") from None
-    _warn(source)
+    scene, lost = choice.applied(source.title, scene, lambda: collision_shapes(source))
+    source.left_out += lost
+    _warn(source, choice.contacts is not None)
     return scene
 
 
@@ -132,15 +142,16 @@ def _state(source: Source, mechanism: Mechanism, qpos: np.ndarray, qvel: np.ndar
     return np.concatenate(q), np.concatenate(qd)
 
 
-def _warn(source: Source) -> None:
-    """Warn of what the scene does not hold, all of it in one message."""
+def _warn(source: Source, touches: bool) -> None:
+    """Warn of what the scene does not hold, all of it in one message; ``touches``: it has the source's contacts."""
     m = source.model
     found = list(source.left_out)
     solid = np.flatnonzero(m.geom_contype | m.geom_conaffinity)
-    if solid.size and not source.disabled("CONTACT") and not source.disabled("CONSTRAINT"):
+    if solid.size and not touches and not source.disabled("CONTACT") and not source.disabled("CONSTRAINT"):
         planes = [source.words("geom", int(geom)) for geom in solid if m.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE]
         among = f", {', '.join(planes)} among them" if planes else ""
-        found.append(f"contacts of {solid.size} geom(s){among} (scene.with_contacts adds points that touch the ground)")
+        way = "scene.with_contacts adds points that touch the ground, contacts=True takes these"
+        found.append(f"contacts of {solid.size} geom(s){among} ({way})")
     for mocap in np.flatnonzero(m.body_mocapid >= 0):
         found.append(f"the motion of mocap {source.words('body', int(mocap))}, which stands where the file puts it")
     for name in ("camera", "sensor"):

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import newton
 import numpy as np
 
 from ..scene.scene import Scene
+from ..scene.shapes import NONE, Choice
+from .collision_shapes import ModelShapes
 from .model import from_newton
 from .repair import repair_bodies
+from .worlds import Worlds
 
 
-def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool) -> Scene:
+def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool, choice: Choice = NONE) -> Scene:
     """Return the scene of a builder that read a file; errors name the file.
 
     With ``repair``, masses and inertias that no rigid body can have are replaced, and a warning names the bodies.
@@ -25,10 +29,15 @@ def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool) -> Scene:
             builder.body_inertia[:] = inertias  # type: ignore[assignment]  # matrices, as Newton's own
         # from_newton checks the topology itself, and it accepts joints outside articulations, which USD files have.
         model = builder.finalize(device="cpu", skip_validation_joints=True, skip_validation_inertia=True)
-        return from_newton(model)
+        scene = from_newton(model)
     except ValueError as error:
         error.args = (f"load: {str(file)!r}: {error}",)
         raise
+    call = f"load: {str(file)!r}"
+    scene, lost = choice.applied(call, scene, lambda: ModelShapes(model, Worlds(model), materials=False).first())
+    if lost:
+        warnings.warn(f"{call}: left out: {', '.join(lost)}", UserWarning, stacklevel=4)
+    return scene
 
 
 def unreadable(file: Path, error: Exception) -> ValueError:

@@ -16,6 +16,7 @@ import newton
 
 from ..errors import UnsupportedError
 from ..scene.scene import Scene
+from ..scene.shapes import NONE, Choice
 from .imported import scene_of, unreadable
 from .mjcf_differences import MISREAD, find_misread, left_out
 from .worlds import quote_labels
@@ -97,7 +98,7 @@ def mjcf_source(file: Path, root: ET.Element) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-def read_mjcf(file: Path, floating: bool | None, repair: bool) -> Scene:
+def read_mjcf(file: Path, floating: bool | None, repair: bool, choice: Choice = NONE) -> Scene:
     """Return the scene of an MJCF file; UnsupportedError if it uses a feature that Newton misreads."""
     root = mjcf_tree(file)
     try:
@@ -110,7 +111,8 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool) -> Scene:
         ways_out = dict.fromkeys(MISREAD[feature] for feature in misread)
         raise UnsupportedError("load", f"{str(file)!r} with {', '.join(features)}", "; ".join(ways_out))
 
-    source, needs_meshes = mjcf_source(file, root), mjcf_needs_meshes(root)
+    source = mjcf_source(file, root)
+    needs_meshes = mjcf_needs_meshes(root) or (choice.contacts is not None and root.find(".//geom[@mesh]") is not None)
     if needs_meshes and source != str(file):
         raise UnsupportedError(
             "load",
@@ -148,11 +150,11 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool) -> Scene:
     if lost:
         warnings.warn(
             f"load: {str(file)!r}: {', '.join(lost)} left out; install the package mujoco, with which load reads "
-            "actuators, keyframes and sites; scenes of robot files have no contacts",
+            "actuators, keyframes and sites",
             UserWarning,
             stacklevel=3,
         )
-    return scene_of(file, builder, repair)
+    return scene_of(file, builder, repair, choice)
 
 
 def _holder(feature: str) -> str:

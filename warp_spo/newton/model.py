@@ -17,12 +17,14 @@ from newton import JointType
 from ..errors import DirectedLoopError, UnsupportedError
 from ..scene.parts import DOF_VALUES, UNLIMITED, Body, Coupling, Hinge, Loop, checked_inertia
 from ..scene.scene import Scene
+from ..scene.shapes import POINTS, Choice
+from .collision_shapes import with_model_contacts
 from .worlds import KINDS, Worlds, flat_entries, quote_labels, to_numpy, unit_pose
 
 ASYMMETRY = 1e-6  # relative asymmetry of an inertia that counts as rounding: R I R^T in float32 leaves a few 1e-7
 
 
-def from_newton(model: newton.Model) -> Scene:
+def from_newton(model: newton.Model, contacts: Any = None, ground: Any = None, points: int = POINTS) -> Scene:
     """Return the scene of a finalized model.
 
     Bodies and hinges keep the order that the model's bodies and tree joints have within a world. Labels are those of
@@ -36,6 +38,12 @@ def from_newton(model: newton.Model) -> Scene:
 
     A model does not record whether ``finalize`` repaired an inertia, so heed the warning of ``finalize``.
     :func:`load` warns with the names of the bodies.
+
+    Args:
+        model: The model.
+        contacts, ground, points: Which shapes touch which ground, as in :func:`load`. ``ke``, ``kd`` and ``mu`` of a
+            shape's material are stiffness [N/m], damping [N s/m] and friction of each of its points, the mean of the
+            shape's and the ground's if the ground is the model's; a margin lies around its surface.
 
     Raises:
         TypeError: The argument is not a Newton model.
@@ -106,7 +114,7 @@ def from_newton(model: newton.Model) -> Scene:
     differing = {name: array for name, array in values.items() if (array != array[:1]).any()}
     scene = scene.with_values(**differing)
     scene.q_index, scene.dof_index = q_index, dof_index
-    return scene
+    return with_model_contacts(model, worlds, scene, Choice(contacts, ground, points))
 
 
 def _refuse_tendons_and_constraints(model: newton.Model) -> None:

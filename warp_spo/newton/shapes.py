@@ -26,7 +26,7 @@ def mass_of_shapes(link: Element) -> tuple[float, np.ndarray, np.ndarray]:
     for shape in link.findall("collision"):
         alone.append(copy.deepcopy(shape))
         for old, new in zip(shape.iter("mesh"), alone[-1].iter("mesh"), strict=True):
-            new.set("filename", str(_mesh_file(old)))  # type: ignore[arg-type]
+            new.set("filename", str(mesh_file(old, "because its link has no mass; write <inertial>")))  # type: ignore[arg-type]
     builder = newton.ModelBuilder()
     try:
         builder.add_urdf(ET.tostring(robot, encoding="unicode"))
@@ -36,8 +36,11 @@ def mass_of_shapes(link: Element) -> tuple[float, np.ndarray, np.ndarray]:
     return float(builder.body_mass[0]), np.array(builder.body_com[0], dtype=np.float64), 0.5 * (inertia + inertia.T)
 
 
-def _mesh_file(mesh: Element) -> Path:
-    """Return the file of a <mesh>. A package is a folder of that name above the URDF, or beside one above it."""
+def mesh_file(mesh: Element, why: str) -> Path:
+    """Return the file of a <mesh>. A package is a folder of that name above the URDF, or beside one above it.
+
+    ``why`` says in the error what the file is needed for, and a way out.
+    """
     name = mesh.needed("filename")
     folder = mesh.file.resolve().parent
     scheme, separator, rest = name.partition("://")
@@ -50,4 +53,4 @@ def _mesh_file(mesh: Element) -> Path:
     for candidate in candidates:
         if candidate.is_file():
             return candidate
-    raise mesh.error(f"there is no file {name!r}; expected a mesh, because its link has no mass; write <inertial>")
+    raise mesh.error(f"there is no file {name!r}; expected a mesh, {why}")

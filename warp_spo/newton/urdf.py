@@ -18,6 +18,8 @@ import numpy as np
 from ..errors import UnsupportedError
 from ..scene.parts import UNLIMITED, Body, Coupling, Hinge
 from ..scene.scene import Scene
+from ..scene.shapes import NONE, Choice
+from .collision_shapes import urdf_shapes
 from .repair import repair_bodies
 from .shapes import mass_of_shapes
 from .worlds import quote_labels
@@ -40,7 +42,7 @@ TYPED = 5e-10  # an angle this close to a multiple of a quarter turn [rad] is on
 Inertial = tuple[float, np.ndarray, np.ndarray]  # mass [kg], centre of mass [m, 3], inertia about it [kg m^2, 3 x 3]
 
 
-def read_urdf(file: Path, floating: bool | None, repair: bool) -> Scene:
+def read_urdf(file: Path, floating: bool | None, repair: bool, choice: Choice = NONE) -> Scene:
     """Return the scene of a URDF file. See :func:`warp_spo.newton.load`.
 
     Raises:
@@ -68,9 +70,15 @@ def read_urdf(file: Path, floating: bool | None, repair: bool) -> Scene:
             Body(mass, com, inertia, label(link), any_inertia=not repair)
             for mass, (_, com, _), inertia, link in zip(masses, inertials, inertias, number, strict=True)
         ]
-        return Scene(bodies, hinges, couplings=couplings)
+        scene = Scene(bodies, hinges, couplings=couplings)
     except ValueError as error:
         raise ValueError(f"load: {str(file)!r}: {error}") from error
+    ordered = [links[link] for link in number]
+    call = f"load: {str(file)!r}"
+    scene, lost = choice.applied(call, scene, lambda: urdf_shapes(robot, ordered, list(map(label, number)), _origin))
+    if lost:
+        warnings.warn(f"{call}: left out: {', '.join(lost)}", UserWarning, stacklevel=3)
+    return scene
 
 
 def _check_robot(robot: Element) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import UnsupportedError
 from ..scene.scene import Scene
+from ..scene.shapes import NONE, Choice
 from .imported import scene_of, unreadable
 from .worlds import quote_labels
 
@@ -30,7 +31,7 @@ DIMENSIONS = {
 """Powers of mass and length in the unit of each value, for a dof that slides and for one that turns."""
 
 
-def read_usd(file: Path, floating: bool | None, repair: bool) -> Scene:
+def read_usd(file: Path, floating: bool | None, repair: bool, choice: Choice = NONE) -> Scene:
     """Return the scene of a USD file, in SI units.
 
     Raises:
@@ -70,7 +71,7 @@ def read_usd(file: Path, floating: bool | None, repair: bool) -> Scene:
             f"{str(file)!r} with bodies that are body1 of no joint ({quote_labels(loose)})",
             "join each to the world by a joint without body0, or put an articulation root above them all",
         )
-    return scene_of(file, builder, repair)
+    return scene_of(file, builder, repair, choice)
 
 
 def _rigid_bodies(stage: Any) -> list[str]:
@@ -97,9 +98,11 @@ def _convert(builder: newton.ModelBuilder, metre: float, kilogram: float, gravit
     ]
     if gravity:
         values.gravity = metre * np.array(values.gravity)
-    for poses in (values.joint_X_p, values.joint_X_c):
-        for joint, pose in enumerate(poses):
-            poses[joint] = np.concatenate([metre * np.array(pose)[:3], np.array(pose)[3:]])
+    for poses in (values.joint_X_p, values.joint_X_c, values.shape_transform):
+        for index, pose in enumerate(poses):
+            poses[index] = np.concatenate([metre * np.array(pose)[:3], np.array(pose)[3:]])
+    for lengths in (values.shape_scale, values.shape_margin):
+        lengths[:] = [metre * np.array(length) for length in lengths]
     default = values.default_joint_cfg
     slides = [turn for linear, angular in values.joint_dof_dim for turn in [True] * linear + [False] * angular]
     for name, powers in DIMENSIONS.items():

@@ -81,6 +81,7 @@ def read_xml(file: Path) -> Element:
     builder = ET.TreeBuilder(element_factory=element)
     parser.StartElementHandler = builder.start
     parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
     try:
         parser.Parse(file.read_bytes(), True)
     except (expat.ExpatError, ValueError, LookupError) as error:  # the last two: of an encoding

@@ -53,7 +53,7 @@ class HeightField(StoredPart):
 
     Args:
         heights: [m], shape (points along x, points along y), two or more each.
-        cell: distance between neighbours [m].
+        cell: distance between neighbours [m], or one along x and one along y.
         origin: x and y of the point (0, 0) [m], and a height that is added to all [m] if there are three numbers.
 
     Raises:
@@ -61,7 +61,7 @@ class HeightField(StoredPart):
     """
 
     heights: Any
-    cell: float
+    cell: Any
     origin: Any = (0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -75,12 +75,19 @@ class HeightField(StoredPart):
             i, j = np.argwhere(~np.isfinite(heights))[0].tolist()
             raise ValueError(f"HeightField: heights[{i}, {j}] is {heights[i, j]}; expected finite numbers")
         object.__setattr__(self, "heights", checked_array("HeightField", "heights [m]", self.heights, shape))
-        object.__setattr__(self, "cell", float(checked_array("HeightField", "cell [m]", self.cell, ())))
-        if not self.cell > 0.0:
+        sizes = (2,) if np.shape(self.cell) == (2,) else ()
+        cell = checked_array("HeightField", "cell [m]", self.cell, sizes).tolist()
+        object.__setattr__(self, "cell", tuple(cell) if sizes else cell)
+        if not min(self.cells) > 0.0:
             raise ValueError(f"HeightField: cell is {self.cell} m; expected more than zero")
         count = 3 if np.shape(self.origin) == (3,) else 2
         origin = checked_array("HeightField", "origin [m]", self.origin, (count,))
         object.__setattr__(self, "origin", (*origin.tolist(), 0.0)[:3])
+
+    @property
+    def cells(self) -> tuple[float, float]:
+        """Distances between neighbours along x and along y [m]."""
+        return self.cell if isinstance(self.cell, tuple) else (self.cell, self.cell)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -214,7 +221,7 @@ def _box(call: str, value: Any) -> Points:
     half = checked_array(call, "half the sizes [m] of box", sizes, (3,))
     if not (half >= 0.0).all():
         raise ValueError(f"{call}: half the sizes of box are {half.tolist()} m; expected none below zero")
-    place = _matrix(checked_pose(call, "the pose of box", pose))
+    place = pose_matrix(checked_pose(call, "the pose of box", pose))
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
     return corners @ place[:3, :3].T + place[:3, 3], 0.0
 
@@ -239,13 +246,17 @@ SHAPES = {"point": _point, "sphere": _sphere, "capsule": _capsule, "box": _box, 
 
 def extreme_points(points: np.ndarray) -> np.ndarray:
     """Return the indices, ascending, of the points that lie farthest in some of many directions."""
-    turn = np.arange(DIRECTIONS) * (np.pi * (3.0 - np.sqrt(5.0)))  # spread evenly over the sphere
-    z = 1.0 - (2.0 * np.arange(DIRECTIONS) + 1.0) / DIRECTIONS
-    r = np.sqrt(1.0 - z * z)
-    spread = np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)
     centred = points - points.mean(axis=0)
-    outward = np.concatenate([spread, np.eye(3), -np.eye(3), centred])
+    outward = np.concatenate([spread_directions(), np.eye(3), -np.eye(3), centred])
     return np.unique((centred @ outward.T).argmax(axis=0))
+
+
+def spread_directions(count: int = DIRECTIONS) -> np.ndarray:
+    """Return unit vectors spread evenly over the sphere [count, 3]."""
+    turn = np.arange(count) * (np.pi * (3.0 - np.sqrt(5.0)))
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    r = np.sqrt(1.0 - z * z)
+    return np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)
 
 
 # -- scenes ------------------------------------------------------------------------------------------------------------
@@ -283,7 +294,7 @@ class Stand(Stored):
         for body in (body for level in scene.tree.levels for body in level):
             hinge = scene.hinge_of[body]
             parent = scene.tree.parent[body]
-            place = _matrix(values["joint_X_p"][hinge]) @ np.linalg.inv(_matrix(values["joint_X_c"][hinge]))
+            place = pose_matrix(values["joint_X_p"][hinge]) @ np.linalg.inv(pose_matrix(values["joint_X_c"][hinge]))
             if parent >= 0:
                 place, self.roots[body] = self.places[parent] @ place, self.roots[parent]
             self.places[body] = place
@@ -351,7 +362,7 @@ def contact_figures(scene: Any) -> str:
     return f"{len(points)} points of {bodies} bodies with the {ground}; {', '.join(figures)}"
 
 
-def _matrix(pose: np.ndarray) -> np.ndarray:
+def pose_matrix(pose: np.ndarray) -> np.ndarray:
     """Return the 4 x 4 matrix of a pose (x, y, z, qx, qy, qz, qw) with a unit quaternion."""
     x, y, z, w = pose[3:]
     axis, found = np.array([x, y, z]), np.eye(4)

@@ -44,18 +44,18 @@ def surfaces(graph: Graph, ground: Plane | HeightField, at: list[Value]) -> list
         return [Surface(Vector((1.0,)), ground.height - at[0])]
     x, y, z = at
     rows, columns = ground.heights.shape
-    rate = 1.0 / ground.cell
-    i, s = _cell((x - ground.origin[0]) * rate, rows)
-    j, t = _cell((y - ground.origin[1]) * rate, columns)
+    rate_x, rate_y = (1.0 / cell for cell in ground.cells)
+    i, s = _cell((x - ground.origin[0]) * rate_x, rows)
+    j, t = _cell((y - ground.origin[1]) * rate_y, columns)
     first = i * float(columns) + j
     h00, h01, h10, h11 = (lookup(graph, GROUND, first, step) for step in (0, 1, columns, columns + 1))
     z = z - ground.origin[2]
     base, run, rise, twist = h00, h10 - h00, h01 - h00, h00 - h10 - h01 + h11
     height = base + run * s + rise * t + twist * (s * t)
-    smooth = _facing((run + twist * t) * rate, (rise + twist * s) * rate)
+    smooth = _facing((run + twist * t) * rate_x, (rise + twist * s) * rate_y)
     if not has_walls(ground):
         return [Surface(smooth, (height - z) * smooth[2])]
-    slope_x, slope_y = ((a + 0.5 * twist) * rate for a in (run, rise))
+    slope_x, slope_y = (run + 0.5 * twist) * rate_x, (rise + 0.5 * twist) * rate_y
     steep = less(STEEP * STEEP, slope_x * slope_x + slope_y * slope_y)
     low, high = h00, h00
     for corner in (h01, h10, h11):
@@ -87,7 +87,7 @@ def has_walls(ground: Plane | HeightField) -> bool:
     """Return whether some cell of a height field is so steep that it has a wall."""
     if isinstance(ground, Plane):
         return False
-    h = ground.heights
+    h, (cell_x, cell_y) = ground.heights, ground.cells
     twist = h[:-1, :-1] - h[1:, :-1] - h[:-1, 1:] + h[1:, 1:]
     x, y = h[1:, :-1] - h[:-1, :-1] + 0.5 * twist, h[:-1, 1:] - h[:-1, :-1] + 0.5 * twist
-    return bool((np.hypot(x, y) > STEEP * ground.cell).any())
+    return bool((np.hypot(x, y * (cell_x / cell_y)) > STEEP * cell_x).any())

@@ -1,0 +1,345 @@
+"""Collision shapes of a robot file or a model, and the contacts with the ground that stand for them.
+
+Loaders describe what a source holds as :class:`Shape`; :class:`Choice` takes some of them by name and puts their points
+on the scene. A sphere and the ends of a capsule touch with their lowest point, exactly. A box has its corners.
+Everything else is the hull of points on its surface, at most so many as the caller says.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ..errors import UnsupportedError, as_integer
+from .contacts import Contact, HeightField, Plane, Stand, pose_matrix, spread_directions
+
+if TYPE_CHECKING:
+    from .scene import Scene
+
+POINTS = 8
+"""Points of a shape that is the hull of points, if the caller does not say."""
+SPREAD = 256  # points on a round surface, of which those of a hull are chosen
+RIM = 64  # points on the rim of a cylinder, of which those of a hull are chosen
+UPRIGHT = 0.5  # least cosine between the normal of a ground and the upward direction
+TURNED = 1e-6  # by which axes of a height field may differ from the inertial ones
+GROUNDS = ("plane", "height field")
+MATERIAL = ("friction", "stiffness", "damping")
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """A collision shape of a source.
+
+    Attributes:
+        label: its name in messages, and for patterns.
+        body: index of its body in the scene; -1: the inertial frame.
+        kind: one of ``KINDS``, or "plane" (the ground x, y of its pose), "height field", or what the source calls a
+            kind that no contact represents.
+        pose: in the body frame, (x, y, z, qx, qy, qz, qw) [m].
+        sizes: [m]; of a sphere its radius; of a capsule, cylinder or cone its radius and half its length along z; of a
+            box and an ellipsoid half their lengths; of a hull its points [n, 3]; of a height field a
+            :class:`HeightField` about the pose.
+        rounding: by how much the surface lies outside of these sizes [m].
+        friction, stiffness, damping: of its material; None where the source has none.
+        names: other names that patterns match, such as that of its mesh. index: its number in the source.
+    """
+
+    label: str
+    body: int
+    kind: str
+    pose: Any
+    sizes: Any = ()
+    rounding: float = 0.0
+    friction: float | None = None
+    stiffness: float | None = None
+    damping: float | None = None
+    names: tuple[str, ...] = ()
+    index: int = -1
+
+    def on(self, soil: Shape | None) -> Shape:
+        """Return the shape with the means of its material and that of the ground, where both have one."""
+        if soil is None:
+            return self
+        pairs = {name: (getattr(self, name), getattr(soil, name)) for name in MATERIAL}
+        means = {name: 0.5 * (own + other) for name, (own, other) in pairs.items() if None not in (own, other)}
+        return dataclasses.replace(self, **means)
+
+    def matches(self, pattern: str, body: str) -> bool:
+        """Whether a pattern is the shape's name or its body's, in any case; a name is also known by what follows its
+        last slash."""
+        names = {self.label, body, *self.names}
+        names |= {name.rpartition("/")[2] for name in names}
+        return any(fnmatch.fnmatchcase(name.lower(), pattern.lower()) for name in names if name)
+
+    def words(self, bodies: Sequence[str]) -> str:
+        """Return the shape's kind, name and body for a message; ``bodies`` are the labels of a scene's."""
+        name = f"{self.kind} {self.label!r}" if self.label else f"a {self.kind}"
+        return f"{name} of {'the world' if self.body < 0 else f'body {bodies[self.body]!r}'}"
+
+
+class Chosen(NamedTuple):
+    """What a :class:`Choice` makes of a source.
+
+    Attributes:
+        taken: each chosen shape with its contacts. ground: what they touch, None: the plane at height zero.
+        soil: the shape of the source that is the ground, None if the caller gives one or there is none.
+        left_out: in words.
+    """
+
+    taken: list[tuple[Shape, list[Contact]]]
+    ground: Plane | HeightField | None
+    soil: Shape | None
+    left_out: list[str]
+
+
+class Choice(NamedTuple):
+    """Which shapes of a source touch which ground, as :func:`warp_spo.load` takes it.
+
+    Attributes:
+        contacts: None: none. True, a pattern, several, or points by pattern.
+        ground: None: that of the source, or the plane at height zero.
+        points: of a hull at most.
+    """
+
+    contacts: Any = None
+    ground: Any = None
+    points: Any = POINTS
+
+    def applied(self, call: str, scene: Scene, shapes: Callable[[], Sequence[Shape]]) -> tuple[Scene, list[str]]:
+        """Return the scene with contacts for the chosen shapes, and in words what is left out, such as "box 'table'".
+
+        Args:
+            call: for errors. shapes: returns those of the source; called only if some are wanted.
+
+        Raises:
+            ValueError: a pattern matches no shape of a body that can move, a number of points is invalid, or there is a
+                ground without contacts.
+            UnsupportedError: a pattern, not True, matches a shape that no contact represents; or several grounds.
+        """
+        if not self.wants(call):
+            return scene, []
+        found = self.resolve(call, scene, shapes())
+        return scene.with_contacts([one for _, made in found.taken for one in made], found.ground), found.left_out
+
+    def wants(self, call: str) -> bool:
+        """Return whether contacts are wanted; ValueError for a ground without any."""
+        if self.contacts is None and self.ground is not None:
+            raise ValueError(
+                f"{call}: ground is given without contacts; expected contacts=True or a pattern of names beside it; "
+                "scene.with_contacts takes contacts of your own"
+            )
+        return self.contacts is not None
+
+    def resolve(
+        self, call: str, scene: Scene, shapes: Sequence[Shape], touches: Callable[[Shape, Shape], bool] | None = None
+    ) -> Chosen:
+        """Return the contacts of the chosen shapes, and what is left out; errors as :meth:`applied`.
+
+        ``touches`` says whether a shape collides with the ground of the source.
+        """
+        moving = moving_bodies(scene)
+        still = [shape for shape in shapes if shape.body < 0 or not moving[shape.body]]
+        ground, soil, others = self.ground, None, [shape for shape in still if shape.kind not in GROUNDS]
+        if ground is None:
+            ground, soil, others = find_ground(call, scene, still)
+        solid = [shape for shape in shapes if shape.body >= 0 and moving[shape.body]]
+        if soil is not None and touches is not None:
+            solid = [shape for shape in solid if touches(shape, soil)]
+        taken, left_out = self._chosen(call, scene.body_labels, solid)
+        words = [shape.words(scene.body_labels) for shape in left_out]
+        words += [shape.words(scene.body_labels) + (", not level" if shape.kind in GROUNDS else "") for shape in others]
+        return Chosen([(shape, contacts_of(shape.on(soil), most)) for shape, most in taken], ground, soil, words)
+
+    def _chosen(
+        self, call: str, names: list[str], solid: Sequence[Shape]
+    ) -> tuple[list[tuple[Shape, int]], list[Shape]]:
+        """Return the chosen shapes with the most points of each, and those that no contact represents."""
+        most: dict[int, int] = {}  # by index of the shape; the first pattern that matches it counts
+        for pattern, count in self._patterns(call).items():
+            found = [i for i, shape in enumerate(solid) if shape.matches(pattern, names[shape.body])]
+            if not found and self.contacts is not True:
+                known = ", ".join(dict.fromkeys(repr(names[shape.body]) for shape in solid)) or "none"
+                raise ValueError(
+                    f"{call}: contacts={pattern!r} matches no collision shape of a body that can move; "
+                    f"expected a pattern of the names of bodies or shapes; bodies with shapes: {known}"
+                )
+            for i in found:
+                most.setdefault(i, count)
+        taken = [(shape, most[i]) for i, shape in enumerate(solid) if i in most and shape.kind in KINDS]
+        others = [shape for i, shape in enumerate(solid) if i in most and shape.kind not in KINDS]
+        if others and self.contacts is not True:
+            raise UnsupportedError(
+                call,
+                f"contacts={self.contacts!r}, which matches {others[0].words(names)}",
+                f"expected one of {', '.join(KINDS)}; choose other shapes, or add points with scene.with_contacts",
+            )
+        return taken, others
+
+    def _patterns(self, call: str) -> dict[str, int]:
+        """Return the most points of a hull by pattern."""
+        given = self.contacts
+        patterns = ["*"] if given is True else [given] if isinstance(given, str) else given
+        if isinstance(patterns, Sequence):
+            patterns = dict.fromkeys(patterns, self.points)
+        if not isinstance(patterns, Mapping) or not patterns or not all(isinstance(name, str) for name in patterns):
+            raise TypeError(
+                f"{call}: contacts is {given!r}; expected True, a pattern such as '*foot*', a list of patterns, or "
+                "points by pattern"
+            )
+        for count in patterns.values():
+            if (as_integer(count) or 0) < 1:
+                raise ValueError(f"{call}: points is {count!r}; expected an integer, 1 or more")
+        return {name: int(count) for name, count in patterns.items()}
+
+
+NONE = Choice()
+"""No contacts."""
+
+
+def moving_bodies(scene: Scene) -> np.ndarray:
+    """Return whether each body can move, bool [body]."""
+    moving = np.zeros(len(scene.bodies), dtype=bool)
+    for body in (body for level in scene.tree.levels for body in level):
+        parent = scene.tree.parent[body]
+        moving[body] = scene.hinges[scene.hinge_of[body]].dof_count > 0 or (parent >= 0 and moving[parent])
+    return moving
+
+
+# -- points ------------------------------------------------------------------------------------------------------------
+def contacts_of(shape: Shape, most: int = POINTS) -> list[Contact]:
+    """Return the contacts that stand for a shape, none for one that has no points."""
+    place = pose_matrix(shape.pose)
+    at = lambda points: np.asarray(points, dtype=np.float64) @ place[:3, :3].T + place[:3, 3]  # noqa: E731
+    values: dict[str, Any] = {"stiffness": shape.stiffness, "damping": shape.damping, "label": shape.label}
+    if shape.friction is not None:
+        values["friction"] = shape.friction
+    if shape.kind == "sphere":
+        return [Contact(shape.body, sphere=(place[:3, 3], shape.sizes[0] + shape.rounding), **values)]
+    if shape.kind == "capsule":
+        radius, half = shape.sizes
+        ends = at([[0.0, 0.0, half], [0.0, 0.0, -half]])
+        return [Contact(shape.body, capsule=(*ends, radius + shape.rounding), **values)]
+    if shape.kind == "box" and not shape.rounding:
+        return [Contact(shape.body, box=(shape.sizes, shape.pose), **values)]
+    points = at(KINDS[shape.kind](shape.sizes, most))
+    if not shape.rounding:
+        return [Contact(shape.body, hull=points, **values)] if len(points) else []
+    return [Contact(shape.body, sphere=(point, shape.rounding), **values) for point in points]
+
+
+def _box(half: Any, most: int) -> np.ndarray:
+    return np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * np.asarray(half)
+
+
+def _cylinder(sizes: Any, most: int) -> np.ndarray:
+    """Return points on both rims, as many on one as on the other, evenly spread."""
+    radius, half = sizes
+    ring = _ring(max(1, most // 2), radius)
+    return np.concatenate([ring + np.array([0.0, 0.0, z]) for z in (half, -half)])
+
+
+def _cone(sizes: Any, most: int) -> np.ndarray:
+    """Return the tip, at +z, and points on the rim."""
+    radius, half = sizes
+    tip = np.array([0.0, 0.0, half])
+    return np.concatenate([tip[None], _ring(max(1, most - 1), radius) - tip])
+
+
+def _ring(count: int, radius: float) -> np.ndarray:
+    angles = 2.0 * np.pi * np.arange(count) / count
+    return radius * np.stack([np.cos(angles), np.sin(angles), np.zeros(count)], axis=1)
+
+
+def _ellipsoid(axes: Any, most: int) -> np.ndarray:
+    axes = np.asarray(axes, dtype=np.float64)
+    return _hull(axes * np.concatenate([np.eye(3), -np.eye(3), spread_directions(SPREAD)]), most)
+
+
+def _hull(points: Any, most: int) -> np.ndarray:
+    points = np.asarray(points, dtype=np.float64)
+    return points[reduced(points, most)] if len(points) else np.zeros((0, 3))
+
+
+KINDS: dict[str, Any] = {
+    "sphere": None,
+    "capsule": None,
+    "box": _box,
+    "cylinder": _cylinder,
+    "cone": _cone,
+    "ellipsoid": _ellipsoid,
+    "hull": _hull,
+}
+"""Kinds of shapes that have points, and how they are found where it takes more than their sizes."""
+
+
+def reduced(points: np.ndarray, most: int) -> np.ndarray:
+    """Return the indices, ascending, of at most so many points whose hull comes near that of all.
+
+    Each further point is the one that the hull of those before misses most, in one of many directions: what a plane
+    would sink into the body before it touches. Where several are as far, the first counts, so that the choice does not
+    depend on rounding.
+    """
+    outward = np.concatenate([-np.eye(3), np.eye(3), spread_directions()])  # downward directions before others
+    outward = outward[[2, 5, 0, 1, 3, 4, *range(6, len(outward))]]
+    heights = (points - points.mean(axis=0)) @ outward.T
+    far, reach = heights.argmax(axis=0), heights.max(axis=0)
+    size = float(np.ptp(points, axis=0).max())
+    chosen = [int(far[0])]
+    covered = heights[chosen[0]].copy()
+    while len(chosen) < most:
+        missing = reach - covered
+        worst = int(np.argmax(missing > missing.max() - 1e-9 * size))
+        if missing[worst] <= 1e-9 * size:
+            break
+        chosen.append(int(far[worst]))
+        covered = np.maximum(covered, heights[chosen[-1]])
+    return np.unique(chosen)
+
+
+# -- grounds -----------------------------------------------------------------------------------------------------------
+def find_ground(
+    call: str, scene: Scene, fixed: Sequence[Shape]
+) -> tuple[Plane | HeightField | None, Shape | None, list[Shape]]:
+    """Return the ground among the shapes that stand still and its shape, None without one, and the other shapes.
+
+    Raises:
+        UnsupportedError: several shapes may be the ground, or a height field that is not level.
+    """
+    stand = Stand(scene)
+    grounds: list[tuple[Shape, np.ndarray]] = []
+    others: list[Shape] = []
+    for shape in fixed:
+        place = pose_matrix(shape.pose)
+        if shape.body >= 0:
+            place = stand.places[shape.body] @ place
+        level = shape.kind in GROUNDS and place[:3, 2] @ stand.up > UPRIGHT
+        if level:
+            grounds.append((shape, place))
+        else:
+            others.append(shape)
+    if len(grounds) > 1:
+        names = ", ".join(shape.words(scene.body_labels) for shape, _ in grounds)
+        raise UnsupportedError(call, f"several grounds: {names}", "pass ground=spo.Plane(...) or spo.HeightField(...)")
+    if not grounds:
+        return None, None, others
+    soil, place = grounds[0]
+    return ground_of(call, soil, place, scene.body_labels), soil, others
+
+
+def ground_of(call: str, shape: Shape, place: np.ndarray, bodies: Sequence[str] = ()) -> Plane | HeightField:
+    """Return the ground that a plane or a height field is, which stands at ``place`` [4, 4]."""
+    if shape.kind == "plane":
+        normal = place[:3, 2] / np.linalg.norm(place[:3, 2])
+        normal[np.abs(normal) < np.finfo(np.float64).eps] = 0.0
+        return Plane(float(normal @ place[:3, 3]) + shape.rounding, normal)
+    if np.abs(place[:3, :3] - np.eye(3)).max() > TURNED:
+        raise UnsupportedError(
+            call, f"{shape.words(bodies)}, whose axes are turned", "pass ground=spo.HeightField(...) of your own"
+        )
+    field = shape.sizes
+    origin = np.asarray(field.origin) + place[:3, 3] + [0.0, 0.0, shape.rounding]
+    return dataclasses.replace(field, origin=origin)
