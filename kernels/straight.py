@@ -253,8 +253,7 @@ def repeat_counted_passes(parts: list[str], entries: dict[str, int], T: type) ->
     """
     c, (begin, a_pass, last) = C_TYPE[T], parts
     declared = [f"{c} {name}_row[{count}] = {{}};" for name, count in entries.items()]
-    loop = "for (int turn = 0; turn < (int)passes_row[0]; ++turn) {"
-    return "\n".join([*declared, begin, loop, f"const {c} pass_row[1] = {{({c})turn}};", a_pass, "}", last])
+    return "\n".join([*declared, begin, count_team_passes(a_pass, "", c), last])
 
 
 def repeat_team_passes(a_pass: str, flags: int, warps: int, c: str) -> str:
@@ -282,6 +281,16 @@ def repeat_team_passes(a_pass: str, flags: int, warps: int, c: str) -> str:
             "}",
         ]
     )
+
+
+def count_team_passes(a_pass: str, barrier: str, c: str) -> str:
+    """Return code in which a team, or a thread with the work of one, runs ``a_pass`` as often as ``passes`` says.
+
+    ``pass_row[0]`` counts the passes from zero. Nothing separates them but the barriers in ``a_pass``: a message that
+    another warp reads in a stage is written again in an earlier one.
+    """
+    loop = "for (int turn = 0; turn < (int)passes_row[0]; ++turn) {"
+    return "\n".join([loop, f"const {c} pass_row[1] = {{({c})turn}};", a_pass, "}", barrier])
 
 
 def run_one_pass(a_pass: str, barrier: str, c: str) -> str:

@@ -12,7 +12,7 @@ from step_scenes import furnished, states
 
 import warp_spo as spo
 from warp_spo.dynamics import contacts
-from warp_spo.recursions.contact import points, secants, step
+from warp_spo.recursions.contact import dampers, secants, step
 from warp_spo.reference_contact import ContactStep
 
 H, WORLDS = 5e-3, 4
@@ -164,7 +164,7 @@ BUGS = {
                           "touch.candidate"),
     "dampers above ground": (step.ContactStep, "_finish", "candidate * pushes", "pushes"),
     "last pass opens": (step.ContactStep, "_finish", "kept.closing * touch.closed", "0.0"),
-    "wrong lever": (points.Point, "inertia", "across * turn[i][j] + more", "more"),
+    "wrong lever": (dampers, "_mass", "r * weight", "r * (2.0 * weight)"),
     "tangent friction": (step.ContactStep, "_secant", "reciprocal(sqrt(w * w + point.eps * point.eps))",
                          "reciprocal(w * w + point.eps * point.eps) * point.eps"),
 }  # fmt: skip
@@ -180,8 +180,9 @@ def test_a_planted_bug_is_seen(monkeypatch, bug):
 
 
 @functools.cache
-def dynamics(device, dtype):
-    return spo.Dynamics(quadruped(), WORLDS, device=device, dtype=dtype, variable=("contact_friction",))
+def dynamics(device, dtype, granularity=None):
+    options = dict(device=device, dtype=dtype, granularity=granularity)
+    return spo.Dynamics(quadruped(), WORLDS, variable=("contact_friction",), **options)
 
 
 def stepped(dyn, state, passes=None, **more):
@@ -194,10 +195,11 @@ def stepped(dyn, state, passes=None, **more):
     return found
 
 
+@pytest.mark.parametrize("granularity", ["tree", "segment"])
 @pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
-def test_a_quadruped_that_lands(device, dtype):
+def test_a_quadruped_that_lands(device, dtype, granularity):
     """All that a step reports, with another friction in each world."""
-    dyn, state = dynamics(str(device), dtype), touching(quadruped(), 3, WORLDS)
+    dyn, state = dynamics(str(device), dtype, granularity), touching(quadruped(), 3, WORLDS)
     friction = np.linspace(0.1, 0.9, WORLDS)[:, None] * np.ones((1, 12))
     dyn.set(contact_friction=friction.astype(dtype))
     scene = dyn.scene.with_values(contact_friction=friction)
@@ -220,10 +222,11 @@ def test_a_quadruped_that_lands(device, dtype):
             over = (np.append(wanted.excess, lacking.max()) > 0.1 * np.array([weight, weight, 33.0, weight])).any()
             assert found["status"][w] == (spo.Status.CONTACT if over else spo.Status.OK)
     assert (found["status"] == spo.Status.CONTACT).any()  # of one pass
+    assert all(f"contact_step  {granularity}" in line for line in dyn.programs.described())
 
 
 def test_nan_stays_in_its_world(device):
-    dyn, state = dynamics(str(device), "float32"), touching(quadruped(), 3, WORLDS)
+    dyn, state = dynamics(str(device), "float32", "segment"), touching(quadruped(), 3, WORLDS)
     friction = np.full((WORLDS, 12), 0.5, np.float32)
     dyn.set(contact_friction=friction)
     clean = stepped(dyn, state)
@@ -238,7 +241,7 @@ def test_nan_stays_in_its_world(device):
 
 def test_substeps_report_the_mean_force(device):
     """To the bit the state that as many calls compute; gap, slip and excess of the last."""
-    dyn, (q, qd, tau) = dynamics(str(device), "float32"), touching(quadruped(), 3, WORLDS)
+    dyn, (q, qd, tau) = dynamics(str(device), "float32", "tree"), touching(quadruped(), 3, WORLDS)
     dyn.set(contact_friction=np.full((WORLDS, 12), 0.8, np.float32))
     found, forces, state = stepped(dyn, (q, qd, tau), substeps=3), [], (q, qd, tau)
     for _ in range(3):
@@ -277,7 +280,7 @@ def test_calls_without_a_kernel_have_names(device, mistake):
     more, kind, message = REFUSALS[mistake]
     q, qd = np.tile(quadruped().neutral_q, (WORLDS, 1)).astype(np.float32), np.zeros((WORLDS, 18), np.float32)
     with pytest.raises(kind, match=message):
-        dynamics(str(device), "float32").step(q, qd, None, H, **more)
+        dynamics(str(device), "float32", "tree").step(q, qd, None, H, **more)
 
 
 def test_scenes_without_a_kernel_have_names(device, monkeypatch):

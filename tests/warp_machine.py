@@ -144,6 +144,7 @@ FORMS = [
     (r"^if \(!going\) break;$", "if not going: break"),
     (r"^const int going = (.*);$", r"going = (\1).any()"),
     (r"^(?:const )?(?:float|double) (\w+)\[(\d+)\] = \{\};$", r"\1 = [0.0 * worlds] * \2"),
+    (r"^const (?:float|double) pass_row\[1\] = \{(.*)\};$", r"pass_row = [\1 + 0.0 * worlds]"),
     (r"^const int (now) = (.*);$", r"\1 = \2"),
     (r"^const \w+\* (\w+) = table\.data \+ (.*);$", r"\1 = \2"),
     (r"^int (\w+)\[\d+\];$", r"\1 = {}"),
@@ -170,7 +171,8 @@ def translated(cuda):
             continue
         loop = re.match(r"^for \(int (\w+) = 0; \w+ < (.*); \+\+\w+\) \{$", line)
         if loop:
-            lines.append("    " * depth + f"for {loop[1]} in range({_chosen(loop[2])}):")
+            count = loop[2].replace("(int)passes_row[0]", "int(passes_row[0])")
+            lines.append("    " * depth + f"for {loop[1]} in range({_chosen(count)}):")
             depth += 1
             continue
         branch = re.match(r"^(else )?(?:if \((.*)\) )?\{$", line)

@@ -50,8 +50,8 @@ def refuse(dyn: Dynamics, call: Call, integrator: str) -> None:
         raise UnsupportedError(call.name, f"integrator={integrator!r} with contacts", "use 'semi_implicit'")
     if dyn.closed:
         raise UnsupportedError(call.name, "closing loops in a scene with contacts", "use loops='cut'")
-    if forced not in (None, "tree"):
-        raise UnsupportedError(call.name, f"granularity={forced!r} with contacts", "use 'tree', or leave it out")
+    if forced == "node":
+        raise UnsupportedError(call.name, f"granularity={forced!r} with contacts", "use another one, or leave it out")
     if isinstance(dyn.scene.ground, HeightField) and dyn.scene.ground.heights.size >= MOST_HEIGHTS[dyn.dtype.__name__]:
         way = "use dtype='float64', or a coarser field"
         raise UnsupportedError(call.name, f"a HeightField of {dyn.scene.ground.heights.size} points in float32", way)

@@ -34,7 +34,7 @@ def _divides(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
 
 
 STEP = Routine("step", recursion.step, letters="PzaS", divides=_divides, passes=True, wide=True)
-CONTACT_STEP = Routine("contact_step", contact.step, passes=True)
+CONTACT_STEP = Routine("contact_step", contact.step, letters="PzafSE", passes=True, counted=True, wide=True)
 EMBEDDED_STEP = Routine("step", closed_step.step, passes=True)
 STEP_UNDER_MULTIPLIERS = Routine("step", closed_step.step_with_multipliers, passes=True)
 STEP_SYSTEM = Routine("step_system", closed_step.step_system)

@@ -182,7 +182,7 @@ def step(
     a bound does so by what ``contact_excess`` says, and gains no energy at a held pose. The normal force of a point
     is stiffness times depth plus damping times the speed inward, both after the step; there is no restitution. A point
     that sticks creeps, by eps rho / sqrt(1 - rho^2) for the share rho of friction that is used. Contacts need
-    integrator="semi_implicit", no closed loops, and granularity None or "tree"; they have no gradients.
+    integrator="semi_implicit", no closed loops, and another granularity than "node"; they have no gradients.
 
     Where Dynamics closes loops, accelerations obey the closures, with all of the above on every dof, those that a loop
     moves included. Two Newton steps then move q', and qd' there, onto the closures; they leave O((h rate)^6), 1e-10 at

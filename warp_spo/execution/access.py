@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ..kernels import straight
 from ..kernels.straight import DIRECT, RELAYED, TILED, KernelLayout
+from ..recursions.contact.secants import SECANT
 from ..recursions.messages import INWARD, OUTWARD
 from ..recursions.step import GUESS, LOOPED, MISSED
 from ..trace.emission import PREFIX, Emitter, RangeReduction
@@ -28,7 +29,7 @@ def make_emitter(dtype: str, shapes: dict, layout: KernelLayout) -> Emitter:
     def load(array: str, entry: str) -> str:
         if array in (INWARD, OUTWARD):
             return f"SENT({entry})"
-        if array == HELD or (array in LOOPED and layout.warps > 1):
+        if array == HELD or (array in (*LOOPED, SECANT) and layout.warps > 1):
             return f"{'' if array == MISSED else PREFIX}{array}_row[{entry}]"
         if array in FIELDS:
             return f"FIELD({array}, {entry})"
@@ -39,7 +40,7 @@ def make_emitter(dtype: str, shapes: dict, layout: KernelLayout) -> Emitter:
             return f"SENT({entry}) = {value};"
         if array == "out" and result.way == RELAYED:
             return f"RELAY({entry}) = {value};"
-        if array == HELD:
+        if array in (HELD, SECANT):
             return f"{load(array, entry)} = {value};"
         if array == MISSED and layout.warps > 1:
             return f"missed_row[0] += {value};"

@@ -221,10 +221,13 @@ class Programs:
         direct = self.plan.copies_directly(routine)
         layout = layout._replace(retries=layout.retries and "farthest" in body, block=block, direct=direct)
         tables = {} if table is None else {"place": table}
-        ground = self.run.scene.ground
-        if isinstance(ground, HeightField) and trace.begin:
-            tables[GROUND] = ground.heights.ravel()
+        tables |= self._heights(routine)
         return self._finished(routine, layout, body, body, tables, emitter.operations)
+
+    def _heights(self, routine: Routine) -> dict[str, Any]:
+        """Return the table of the ground's heights, for a step that reads it."""
+        ground = self.run.scene.ground
+        return {GROUND: ground.heights.ravel()} if routine.counted and isinstance(ground, HeightField) else {}
 
     def _segment_program(
         self, routine: Routine, shapes: dict, pieces: Pieces, more: tuple, options: dict
@@ -235,6 +238,7 @@ class Programs:
         everything: list[Store] = []
         traced: list[list[Store]] = []
         apart: list[tuple[list[Store], list[Store], list[list[Store]]]] = []
+        begins: list[list[Store]] = []  # what each piece stores and sends before its passes
         held: list[list[Scalar]] = []  # what each piece computes once before its passes
         for index in range(len(pieces.pieces)):
             links = self._copied(options)  # its own: pieces of equal structure then give equal text
@@ -243,12 +247,16 @@ class Programs:
             rounds = [[self._flattened(item, shapes) for item in turn] for turn in trace.rounds]
             news = [self._flattened(item, shapes) for item in trace.news]
             apart.append((trace.checks, news, rounds))
+            begins.append(trace.begin)
             held.append(list({x.key: x for x in trace.ahead if not is_constant(x) and x.op != "input"}.values()))
-            everything += traced[-1] + trace.checks + news + [item for turn in rounds for item in turn]
+            everything += trace.begin + traced[-1] + trace.checks + news + [item for turn in rounds for item in turn]
         bends = any(item.array == MISSED for item in everything)
-        held = held if bends else [[] for _ in held]
+        held = held if bends or routine.counted else [[] for _ in held]
         sizes = {index: len(values) for index, values in enumerate(held)}
         passes = Passes((GUESS, GAIN), sent if bends else None, sizes) if routine.passes else None
+        if routine.counted:
+            counts = [sum(item.array == SECANT for item in begin) for begin in begins]
+            passes = Passes((GAIN,), None, sizes, dict(enumerate(counts)))
         sent += 2 * pieces.warps if bends else 0
         whole = [item for item in everything if item.array == "out"]
         layout = self._layout(routine, whole, everything, shapes, more, sent, pieces.warps)
@@ -261,18 +269,20 @@ class Programs:
         placed, table = staging.arrange_stores(whole, layout.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
         by_slot = lambda found: found if table is None else staging.stores_by_slot(found, table)  # noqa: E731
-        for piece, stores, items, (checks, news, rounds), values in zip(
-            pieces.pieces, traced, outs, apart, held, strict=True
+        for piece, stores, items, (checks, news, rounds), begin, values in zip(
+            pieces.pieces, traced, outs, apart, begins, held, strict=True
         ):
             first, emitter, checking, later = (make_emitter(dtype, shapes, layout) for _ in range(4))
-            ahead = first.region([Store(HELD, (at,), value) for at, value in enumerate(values)])
+            ahead = first.region([*begin, *(Store(HELD, (at,), value) for at, value in enumerate(values))])
             later = later if passes else emitter
             emitter.keep(HELD, values)
+            if routine.counted:
+                later.keep(HELD, values)  # other pieces may have written over what these come from
             inward = [item for item in stores if item.array == INWARD]
             outward = [item for item in stores if item.array == OUTWARD]
             last = outward if set(letters) & set(messages.OUTWARD_LETTERS) else inward
             last += by_slot(items)
-            last += [item for item in stores if item.array in (*more, GAIN)]
+            last += [item for item in stores if item.array in (*more, GAIN, SECANT)]
             regions = emitter.region(inward), emitter.region(outward)
             ends = [item for item in news if item.array == "out"]
             news = [item for item in news if item.array != "out"] + by_slot(ends)
@@ -291,7 +301,7 @@ class Programs:
                     registers = fewer
                     break
         lists = {"place": table, "table": team.table, "shifts": team.shifts}
-        tables = {name: values for name, values in lists.items() if values}
+        tables = {name: values for name, values in lists.items() if values} | self._heights(routine)
         cap = registers if registers < MOST_REGISTERS else None
         return self._finished(routine, layout, cuda, team.cpu(), tables, team.operations, cap)
 

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from ..kernels import straight
+from ..recursions.contact.secants import SECANT
 from ..recursions.pieces import Piece, Pieces
 from ..trace.emission import C_TYPE, Listing, fill_in, literal, render
 
@@ -30,7 +31,8 @@ class Work(NamedTuple):
         check: the check whether the guesses of a pass were right.
         news: what the piece sends to the others after the outward sweep; in work with passes, after the last pass.
         rounds: what the piece computes, message by message, from the news of the other pieces.
-        ahead: in work with passes, what the piece computes once before them and keeps.
+        ahead: in work with passes, what the piece computes once before them and keeps. Where a fixed number of passes
+            is counted, pieces send each other messages inward ahead, too.
     """
 
     piece: Piece
@@ -55,12 +57,20 @@ class Passes(NamedTuple):
             the thread with constant indices, which the compiler keeps in registers.
         held: how many values each piece computes once before the passes, by its index; kept likewise.
         flags: the place of the flags in the memory that the warps share; None if one pass suffices, because there is
-            nothing to guess.
+            nothing to guess, or if passes are counted.
+        variables: how many more values each piece keeps from pass to pass, by its index, if passes are counted: their
+            number is an argument of the kernel. None: they go on until the guesses were right.
     """
 
     kept: tuple[str, ...]
     flags: int | None
     held: dict[int, int]
+    variables: dict[int, int] | None = None
+
+    @property
+    def counted(self) -> bool:
+        """Whether the number of passes is an argument."""
+        return self.variables is not None
 
     def declare(self, pieces: dict[str, list[Piece]], c: str) -> str:
         """Return declarations of what pieces keep; ``pieces`` gives, by prefix of the names, those that use them."""
@@ -69,6 +79,8 @@ class Passes(NamedTuple):
             dofs, held = max(piece.weight for piece in some), max(self.held.get(piece.index, 0) for piece in some)
             text += [f"{c} {prefix}{name}_row[{dofs}] = {{}};" for name in self.kept]
             text += [f"{c} {prefix}{HELD}_row[{held}] = {{}};"] if held else []
+            more = max((self.variables or {}).get(piece.index, 0) for piece in some)
+            text += [f"{c} {prefix}{SECANT}_row[{more}] = {{}};"] if more else []
         return "\n".join(text)
 
 
@@ -127,8 +139,13 @@ class Team:
             later += [self._branch(work.piece, listing) for listing in work.rounds]
         if self.passes:
             kept = {f"p{piece.index}_": [piece] for piece in self.pieces.pieces}
-            ahead = [self._branch(work.piece, work.ahead) for work in self._work.values() if work.ahead.text]
-            text = [self.passes.declare(kept, self.c), *ahead, straight.repeat_thread_passes("\n".join(text), self.c)]
+            order = reversed(self._work.values()) if self.passes.counted else self._work.values()  # children first
+            ahead = [self._branch(work.piece, work.ahead) for work in order if work.ahead.text]
+            one, counted = "\n".join(text), self.passes.counted
+            loop = (
+                straight.count_team_passes(one, "", self.c) if counted else straight.repeat_thread_passes(one, self.c)
+            )
+            text = [self.passes.declare(kept, self.c), *ahead, loop]
         return "\n".join(text + later)
 
     def _branch(self, piece: Piece, listing: Listing) -> str:
@@ -166,15 +183,13 @@ class Team:
         names = ["", *(f"i{at}_" for at in range(len(ranks) - 1))]
         kept = {name: [work.piece for work in rank.values()] for name, rank in zip(names, ranks, strict=True)}
         text = [self.passes.declare(kept, self.c)]
-        for at, (name, rank) in enumerate(zip(names, ranks, strict=True)):
-            works = [rank.get(leaf.piece.warp) for leaf in leaves]
-            turns = [[] if work is None else [work.ahead] for work in works]
-            text.append(self._take_turns(leaves, turns, f"h{at}_", name))
-        text += [
-            straight.run_one_pass(a_pass, BARRIER, self.c)
-            if self.passes.flags is None
-            else straight.repeat_team_passes(a_pass, self.passes.flags, self.pieces.warps, self.c)
-        ]
+        text += self._ahead(leaves, dict(zip(names, ranks, strict=True)))
+        if self.passes.counted:
+            text.append(straight.count_team_passes(a_pass, BARRIER, self.c))
+        elif self.passes.flags is None:
+            text.append(straight.run_one_pass(a_pass, BARRIER, self.c))
+        else:
+            text.append(straight.repeat_team_passes(a_pass, self.passes.flags, self.pieces.warps, self.c))
         for last in (False, True):
             text_of_ranks = []
             for at, (name, rank) in enumerate(zip(names, ranks, strict=True)):
@@ -185,6 +200,26 @@ class Team:
                 text.append(BARRIER)
             text += text_of_ranks
         return "\n".join(text)
+
+    def _ahead(self, leaves: list[Work], ranks: dict[str, dict[int, Work]]) -> list[str]:
+        """Return what pieces compute before the passes; counted passes begin with messages inward, stage by stage.
+
+        ``ranks``: by prefix of the names, one piece of each warp.
+        """
+        assert self.passes is not None
+        text: list[str] = []
+        if not self.passes.counted:
+            for at, (name, rank) in enumerate(ranks.items()):
+                works = [rank.get(leaf.piece.warp) for leaf in leaves]
+                text.append(self._take_turns(leaves, [[] if x is None else [x.ahead] for x in works], f"h{at}_", name))
+            return text
+        for stage in range(1 + max(work.piece.inward for work in self._work.values())):
+            text += [BARRIER] if stage else []
+            for at, (name, rank) in reversed(list(enumerate(ranks.items()))):  # children before their parents
+                works = [rank.get(leaf.piece.warp) for leaf in leaves]
+                turns = [[x.ahead] if x is not None and x.piece.inward == stage else [] for x in works]
+                text.append(self._take_turns(leaves, turns, f"h{stage}_{at}_", name))
+        return text
 
     def _inner(self, warps: list[int]) -> str:
         """Return the stages between the inward and outward sweeps of the leaves, for the inner pieces of ``warps``."""

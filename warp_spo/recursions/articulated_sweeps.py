@@ -120,8 +120,9 @@ def reduce(
             if link.closes:
                 leader, right = id(link.group.links[0]), [tau(dof) for dof in link.dofs]
                 rates[leader], _, forces[key] = groups.reduce(done[leader], trace.places, trace.motions, waiting, right)
-        stores += trace.send_to_parent("P", link, inner[key].packed) if "P" in letters else []
-        stores += trace.send_to_parent(letters[-1], link, forces[key])
+        carried, force = trace.add_contacts(link, inner[key], forces[key])
+        stores += trace.send_to_parent("P", link, carried.packed) if "P" in letters else []
+        stores += trace.send_to_parent(letters[-1], link, force)
     return done, rates, stores
 
 
@@ -136,7 +137,7 @@ def expand(
 ) -> list[Store]:
     """Sweep outward: return stores of qdd in the array ``name``, for ``rates`` of :func:`reduce`.
 
-    ``alpha`` receives the acceleration of every link, by id.
+    ``alpha`` receives the acceleration of every link, by id, and of the link that a piece moves on.
     """
     alpha = {} if alpha is None else alpha
     shared: dict[int, Value] = {}  # qdd of groups
@@ -150,7 +151,7 @@ def expand(
             above = alpha[id(link.parent)]
         else:
             received = trace.receive(letter, trace.piece.parent)  # type: ignore[union-attr, arg-type]
-            above = Vector(received[:3]), Vector(received[3:])
+            above = alpha[id(link.parent)] = Vector(received[:3]), Vector(received[3:])
         place, move = trace.places[key], trace.motions[key]
         if link.group is None:
             qdd, alpha[key] = articulated.expand_link(link, place, done[key], rates[key], move, above)

@@ -4,7 +4,7 @@ Letters: inward P = phi P+ phi*, z and y = phi z+ or a force, f = a force, R = t
 changes with the parent's motion, U = the flow and momentum of what a link carries, L = its load and pull; outward a and
 b = alpha, and for Mass^-1 N = the rates of all pivots further in for each unit force on the last link, D = the piece's
 own pivots, V = its columns of Y, Y = the part of them that lies further in. From all to the first piece, when all is
-done: S = a status word.
+done: S = a status word, E = by how much the last pass of a step with contacts exceeds its laws.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from .pieces import Piece, Pieces
 INWARD, OUTWARD = "sent", "returned"
 """The array that messages go through, by either name."""
 OUTWARD_LETTERS = "abNDVY"
-SIZES = {"P": 21, "z": 6, "f": 6, "y": 6, "R": 10, "B": 24, "U": 12, "L": 12, "a": 6, "b": 6, "S": 1}
+SIZES = {"P": 21, "z": 6, "f": 6, "y": 6, "R": 10, "B": 24, "U": 12, "L": 12, "a": 6, "b": 6, "S": 1, "E": 4}
 NEEDS = {"U": "qd", "L": "body_f"}
 """The array without which a message is zero and is not sent, by letter."""
 
@@ -62,7 +62,7 @@ def slots(letters: str, pieces: Pieces) -> tuple[dict[tuple[str, int], int], int
 
 
 def _sends(letter: str, piece: Piece, tree: list[Piece]) -> bool:
-    if letter == "S":
+    if letter in "SE":
         return True
     if letter == "Y":
         return any(other.looks_at(piece) for other in tree)

@@ -216,9 +216,13 @@ class Step:
             for piece in Pieces(trace.links).pieces:
                 (word,) = trace.receive("S", piece)
                 worst = select(less(worst, word), word, worst)
-            settled = less(graph.input(MISSED, 0), 0.5)
-            trace.rounds = [[Store("status", (), select(worst, worst, select(settled, 0.0, Status.NOT_SETTLED)))]]
+            trace.rounds = [[Store("status", (), self._verdict(worst))]]
         return trace.send("S", own, [finite])
+
+    def _verdict(self, worst: Value) -> Value:
+        """Return ``worst``, the most severe word of all pieces, or what the last pass adds where they are well."""
+        settled = less(self.trace.graph.input(MISSED, 0), 0.5)
+        return select(worst, worst, select(settled, 0.0, Status.NOT_SETTLED))
 
     def _inputs(self) -> list[Value]:
         """Return all inputs of the piece's links; for the first piece also those of bodies that do not move."""

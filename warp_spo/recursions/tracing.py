@@ -40,7 +40,8 @@ class Trace:
         rounds: what a piece stores after it has received all news, in turns of which many may be alike.
         ahead: values that the passes of a loop share, formed once before the loop.
         begin: stores before the passes of a loop, of the variables that they read.
-        dampers, pushes: by id of the link: what contacts add to its articulated inertia, and to the forces on it.
+        dampers, pushes: by id of the link: what contacts add to its articulated inertia, and to the forces on it; of a
+            piece also for the link that it moves on.
         checks: stores that check a pass; they read their inputs anew, so that no register is kept for them.
     """
 
@@ -174,6 +175,13 @@ class Trace:
         if self.piece is None or id(link.children[0] if link.children else link) in self.own:
             return [known[id(child)] for child in link.children]
         return [build(self.receive(letter, piece)) for piece in self.piece.children]
+
+    def add_contacts(self, link: Link, P: Articulated, z: Vector) -> tuple[Articulated, Vector]:
+        """Return P+ and z+ for a link's parent, with what contacts add to the parent if another piece works on it."""
+        key = id(link.parent)
+        if key in self.own or key not in self.dampers:
+            return P, z
+        return P + self.dampers[key], z - self.pushes[key]
 
     def send_to_parent(self, letter: str, link: Link, values: Iterable[Value]) -> list[Store]:
         """Return the stores that send a result of a link to its parent, if another piece works on the parent."""

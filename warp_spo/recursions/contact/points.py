@@ -3,8 +3,12 @@
 A point that may touch two surfaces, a wall and a floor, counts as two.
 
 A contact pushes with f = f0 - G v, where v is the point's velocity after the step. With v = v_before + h J qdd, the
-damper h G is an inertia at the point and f0 - G v_before a load. G = across I + (along - across) n n* is isotropic
-across the normal n, so that no tangent directions are needed. Vectors are in the axes of the point's link.
+damper h G is an inertia at the point and f0 - G v_before a load, see :mod:`.dampers`. G = across I + (along - across)
+n n* is isotropic across the normal n, so that no tangent directions are needed. Vectors are in the axes of the point's
+link.
+
+A piece works on the points of its links. Those of the link on which other pieces begin are shared among these in equal
+numbers, and only the rest stays: they know that link's motion, and their messages to it carry what the points add.
 """
 
 from __future__ import annotations
@@ -15,10 +19,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...scene.contacts import ContactPoint
 from ...scene.scene import Scene
 from ...trace.evaluation import evaluate
 from ...trace.scalars import Value
-from ...trace.spatial import ZERO, Articulated, Vector, cross, dot, skew, total, upper
+from ...trace.spatial import IDENTITY, ZERO, Vector, cross, dot, total
 from ..composite import mass_matrix
 from ..kinematics import carried_velocity, frame_on_link, jacobian
 from ..links import Link, Links
@@ -38,8 +43,9 @@ class Point:
 
     Attributes:
         number: of the scene's contact point. arm: from the link's origin. normal: of the ground there.
-        depth: how far the point is below ground [m]. velocity: before the step. k, d, mu: stiffness, damping, friction.
-        eps: speed below which friction is a damper. weight: inverse weight that predicts slip [1/kg].
+        depth: how far the point is below ground [m]. twist: (w; v) of the link before the step.
+        k, d, mu: stiffness, damping, friction. eps: speed below which friction is a damper.
+        weight: inverse weight that predicts slip [1/kg]. axes: of the inertial frame, in the link, where asked.
     """
 
     number: int
@@ -47,27 +53,23 @@ class Point:
     arm: Vector
     normal: Vector
     depth: Value
-    velocity: Vector
+    twist: tuple[Vector, Vector]
     k: Value
     d: Value
     mu: Value
     eps: float
     weight: float
+    axes: list[Vector]
 
     @property
     def state(self) -> list[Value]:
-        """The values that every pass reads: arm, normal, depth and velocity."""
-        return [*self.arm, *self.normal, self.depth, *self.velocity]
+        """The values that every pass reads: arm, normal, depth, and the link's motion before the step."""
+        return [*self.arm, *self.normal, self.depth, *self.twist[0], *self.twist[1]]
 
-    def inertia(self, across: Value, along: Value) -> Articulated:
-        """Return the damper ``across`` I + (``along`` - ``across``) n n* at the point as an inertia of the link."""
-        n, c, r = self.normal, cross(self.arm, self.normal), self.arm
-        more, square = along - across, dot(r, r)
-        turn = skew(r)
-        J = upper(lambda i, j: across * ((square if i == j else 0.0) - r[i] * r[j]) + more * (c[i] * c[j]))
-        C = [[across * turn[i][j] + more * (c[i] * n[j]) for j in range(3)] for i in range(3)]
-        m = upper(lambda i, j: (across if i == j else 0.0) + more * (n[i] * n[j]))
-        return Articulated(J, type(m).of(C), m)
+    @property
+    def velocity(self) -> Vector:
+        """The point's velocity before the step."""
+        return self.rate(*self.twist)
 
     def wrench(self, force: Vector) -> Vector:
         """Return (n; f) of a force at the point, about the link's origin."""
@@ -78,37 +80,64 @@ class Point:
         return v + cross(w, self.arm)
 
 
-def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value]) -> list[Point]:
-    """Return the contact points of a scene, one for each surface that a point may touch."""
+def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value], oriented: bool = False) -> list[Point]:
+    """Return the contact points that a trace works on, one for each surface that a point may touch.
+
+    ``oriented``: with the inertial directions x, y, z in the axes of their links.
+    """
     scene = trace.links.scene
     ground, weights = scene.ground, inverse_weights(scene)
     assert ground is not None
-    seats = [frame_on_link(trace, point.body, point.position) for point in scene.contact_points]
-    needed = _with_ancestors([link for link, _ in seats])
-    axes: dict[int | None, list[Vector]] = {None: directions(ground)}
-    origins: dict[int | None, list[Value]] = {None: [0.0] * len(axes[None])}  # along each direction
+    seats = {number: frame_on_link(trace, point.body, point.position) for number, point in own_points(trace)}
+    needed = _with_ancestors([link for link, _ in seats.values()])
+    asked = directions(ground)
+    count = len(asked)
+    asked = [*asked, *IDENTITY] if oriented and count < len(IDENTITY) else asked
+    axes: dict[int | None, list[Vector]] = {None: asked}
+    origins: dict[int | None, list[Value]] = {None: [0.0] * count}  # along each direction of the ground
     twists: dict[int | None, tuple[Vector, Vector]] = {None: (ZERO, ZERO)}
-    for link in trace.links.links:
+    for link in trace.active_links:
         if id(link) not in needed:
             continue
         trace.label(link, "n")
         key, over, place = id(link), None if link.parent is None else id(link.parent), trace.places[id(link)]
         axes[key] = [place.pose.to_child(axis) for axis in axes[over]]
-        origins[key] = [at + dot(axis, place.pose.l) for at, axis in zip(origins[over], axes[over], strict=True)]
+        origins[key] = [at + dot(axis, place.pose.l) for at, axis in zip(origins[over], axes[over], strict=False)]
         twists[key] = carried_velocity(place, twists[over], hinge_motion(link, place, qd))
     found = []
-    for number, (point, (on, centre)) in enumerate(zip(scene.contact_points, seats, strict=True)):
-        carrier = None if on is None else id(on)
+    for number, (on, centre) in seats.items():
+        point, carrier = scene.contact_points[number], None if on is None else id(on)
         trace.graph.step = f"contact {number}|c"
-        arm = centre - axes[carrier][lowest(ground)] * point.radius if point.radius else centre
-        at = [origin + dot(axis, centre) for origin, axis in zip(origins[carrier], axes[carrier], strict=True)]
+        toward = axes[carrier][:count]
+        arm = centre - toward[lowest(ground)] * point.radius if point.radius else centre
+        at = [origin + dot(axis, centre) for origin, axis in zip(origins[carrier], toward, strict=True)]
         at[lowest(ground)] = at[lowest(ground)] - point.radius
-        w, v = twists[carrier]
         k, d, mu = (impedance.value(f"contact_{name}", number) for name in ("stiffness", "damping", "friction"))
-        velocity = v + cross(w, arm)
+        shape = k, d, mu, point.eps, weights[number], axes[carrier][-len(IDENTITY) :] if oriented else []
         for normal, depth in surfaces(trace.graph, ground, at):
-            inward = Vector(total(n * axis[c] for n, axis in zip(normal, axes[carrier], strict=True)) for c in range(3))
-            found.append(Point(number, on, arm, inward, depth, velocity, k, d, mu, point.eps, weights[number]))
+            inward = Vector(total(n * axis[c] for n, axis in zip(normal, toward, strict=True)) for c in range(3))
+            found.append(Point(number, on, arm, inward, depth, twists[carrier], *shape))
+    return found
+
+
+def own_points(trace: Trace) -> list[tuple[int, ContactPoint]]:
+    """Return the contact points that a trace works on, with their numbers."""
+    points, piece = list(enumerate(trace.links.scene.contact_points)), trace.piece
+    if piece is None:
+        return points
+    on: dict[int | None, list[tuple[int, ContactPoint]]] = {}
+    for number, point in points:
+        link = trace.links.seats[point.body].link
+        on.setdefault(None if link is None else id(link), []).append((number, point))
+    found = on.get(None, []) if piece.index == 0 else []
+    for link in piece.links:
+        mine = on.get(id(link), [])
+        each = len(mine) // len(piece.children) if piece.children and link is piece.links[-1] else 0
+        found += mine[each * len(piece.children) :]
+    if piece.parent is not None:
+        shared, sharers = on.get(id(piece.parent.links[-1]), []), piece.parent.children
+        each, first = len(shared) // len(sharers), sharers.index(piece)
+        found += shared[first * each : (first + 1) * each]
     return found
 
 

@@ -23,8 +23,10 @@ from ..integration import integrate_link
 from ..kinematics import zero
 from ..links import Link
 from ..newton_euler import inverse_dynamics
+from ..pieces import Piece, Pieces
 from ..step import GAIN, Step
-from .points import Point, place_points
+from .dampers import SEVERAL, damper, load
+from .points import Point, own_points, place_points
 from .secants import Kept, Secant, largest
 
 if TYPE_CHECKING:
@@ -54,27 +56,29 @@ class ContactStep(Step):
         super().__init__(trace)
         self.reports, self.kept = reports, Kept(trace.graph)
         self.secants: dict[int, list[Secant]] = {}  # by dof
-        self.excess: list[Value] = []  # of cone, adhesion and effort
-        self.missed: Value = 0.0  # largest push of a point that the last pass left open
+        self.excess: list[Value] = []  # of cone, adhesion, effort; largest push of a point that the last pass left open
         self.finished: dict[str, list[Store]] = {name: [] for name in reports}
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
-        """Return the stores of a pass, then those after the last one; ``trace.begin`` are those before the first."""
+        """Return the stores of a pass, then those after the last one; ``trace.begin`` are those before the first.
+
+        For a piece, those after the last pass are the trace's ``news``.
+        """
         trace, kept = self.trace, self.kept
-        bias = {item.index[0]: item.value for item in inverse_dynamics(trace, qdd=zero)}
-        points = place_points(trace, self.impedance, self.qd)
+        found = inverse_dynamics(trace, qdd=zero, letter="f")
+        bias = {item.index[0]: item.value for item in found if item.array == "out"}
+        points = place_points(trace, self.impedance, self.qd, "contact_f" in self.reports)
         trace.ahead = [*bias.values(), *(value for point in points for value in point.state)]
         touches = [self._begin(point) for point in points]
-        for point, touch in zip(points, touches, strict=True):
-            if point.link is not None:
-                self._press(point, touch)
+        self._press(points, touches)
         trace.stiffened = self._stiffened
         tau = trace.vector("tau")
-        done, rates, _ = reduce(trace, lambda dof: tau(dof) + self.forces[dof] - bias[dof], moves=False, loads=False)
+        done, rates, sent = reduce(trace, lambda dof: tau(dof) + self.forces[dof] - bias[dof], moves=False, loads=False)
         alpha: dict[int, tuple[Vector, Vector]] = {}
-        found = expand(trace, done, rates, (ZERO, ZERO), alpha=alpha)
-        gains = {item.index[0]: self.h * item.value for item in found}
-        passed = [Store(GAIN, (dof,), gain) for dof, gain in gains.items()]
+        moved = expand(trace, done, rates, (ZERO, ZERO), alpha=alpha)
+        gains = {item.index[0]: self.h * item.value for item in moved if item.array == "out"}
+        passed = [item for item in moved if item.array != "out"]
+        passed += [Store(GAIN, (self._kept.get(dof, dof),), gain) for dof, gain in gains.items()]
         efforts = []
         for link in self.links:
             trace.label(link, "u")
@@ -90,11 +94,16 @@ class ContactStep(Step):
             forces.setdefault(point.number, []).append((point, force, slip))
         for number, surfaces in forces.items():
             self._report(number, surfaces)
+        trace.ahead += [item.value for item in self.finished.get("contact_gap", ())]  # of the state before the step
         if status or "contact_excess" in self.reports:
-            self._keep_excess(cones, pulls, efforts)
-        self.missed = self._last(largest(missed)) if status else 0.0
-        trace.begin = kept.begin
-        return passed + kept.end + self._after(qdd, status)
+            trace.graph.step = "excess|e"
+            self.excess = [self._last(largest(values)) for values in (cones, pulls, efforts, missed)]
+        trace.begin = [item for item in found if item.array != "out"] + kept.begin
+        after = self._after(qdd, status)
+        if trace.piece is None:
+            return passed + kept.end + after
+        trace.news = after
+        return sent + passed + kept.end
 
     # -- hinges ----------------------------------------------------------------------------------------------------
     def _pieces(self, link: Link) -> list[Law]:
@@ -120,7 +129,7 @@ class ContactStep(Step):
         reach = (0.5 * sqrt(squares)) * (h * h)
         falls = select(less(normal, 0.0), -(h * normal), 0.0)
         candidate = less(0.0, point.depth + falls + reach)
-        push = point.k * point.depth - (point.k * h + point.d) * normal
+        push = self._push(point, normal)
         fn = candidate * select(less(0.0, push), push, 0.0)
         across = self._secant(point, fn, self._slip(point, point.velocity, normal))
         return Touch(kept.variable(across), kept.variable(candidate), kept.variable(candidate))
@@ -136,15 +145,29 @@ class ContactStep(Step):
         """Return the damper that gives friction's bound at the speed ``w``."""
         return point.mu * fn * reciprocal(sqrt(w * w + point.eps * point.eps))
 
-    def _press(self, point: Point, touch: Touch) -> None:
-        """Add the damper and the load of a point to its link."""
-        assert point.link is not None
-        trace, key = self.trace, id(point.link)
-        trace.label(point.link, "c")
-        along = touch.closed * (point.k * self.h + point.d)
-        damper, push = point.inertia(self.h * touch.across, self.h * along), point.wrench(self._load(point, touch))
-        trace.dampers[key] = trace.dampers[key] + damper if key in trace.dampers else damper
-        trace.pushes[key] = trace.pushes[key] + push if key in trace.pushes else push
+    def _push(self, point: Point, speed: Value) -> Value:
+        """Return the normal force of a closed point that leaves the ground at ``speed`` after the step."""
+        return point.k * point.depth - (point.k * self.h + point.d) * speed
+
+    def _press(self, points: list[Point], touches: list[Touch]) -> None:
+        """Add dampers and loads of the points to their links."""
+        trace, h = self.trace, self.h
+        on: dict[int, list[tuple[Point, Touch]]] = {}
+        for point, touch in zip(points, touches, strict=True):
+            if point.link is not None:
+                on.setdefault(id(point.link), []).append((point, touch))
+        for key, pressed in on.items():
+            trace.label(pressed[0][0].link, "c")  # type: ignore[arg-type]
+            mine = [point for point, _ in pressed]
+            along = [h * (touch.closed * (point.k * h + point.d)) for point, touch in pressed]
+            trace.dampers[key] = P = damper(mine, [h * touch.across for _, touch in pressed], along)
+            if len(pressed) < SEVERAL:
+                wrenches = [point.wrench(self._load(point, touch)) for point, touch in pressed]
+                trace.pushes[key] = Vector(total(wrench[i] for wrench in wrenches) for i in range(6))
+            else:
+                trace.pushes[key] = load(
+                    mine, [touch.closed * self._push(point, 0.0) for point, touch in pressed], P, h
+                )
 
     def _load(self, point: Point, touch: Touch) -> Vector:
         """Return f0 - G v before the step."""
@@ -153,15 +176,18 @@ class ContactStep(Step):
     def _force(self, point: Point, touch: Touch, v: Vector) -> Vector:
         """Return f0 - G v."""
         normal = dot(point.normal, v)
-        push = touch.closed * (point.k * point.depth - (point.k * self.h + point.d) * normal)
+        push = touch.closed * self._push(point, normal)
         return point.normal * (push + touch.across * normal) - v * touch.across
 
     def _finish(self, point: Point, touch: Touch, alpha: dict) -> tuple[Vector, Value, Value, Value, Value]:
         """Keep what the next pass reads of a point; return its force, its slip, by how much the force leaves the cone,
         how much it pulls, and the push that it lacks because the pass left the point open."""
         kept, h = self.kept, self.h
-        change = ZERO if point.link is None else point.rate(*alpha[id(point.link)])
-        v = point.velocity + change * h
+        v = point.velocity
+        if point.link is not None:
+            v = point.rate(
+                *(before + change * h for before, change in zip(point.twist, alpha[id(point.link)], strict=True))
+            )
         normal = dot(point.normal, v)
         force = self._force(point, touch, v) if point.link is not None else ZERO
         pushed, across = dot(point.normal, force), 0.0
@@ -173,7 +199,7 @@ class ContactStep(Step):
         kept.keep(touch.across, self._secant(point, fn, slip + (h * point.weight) * over))
         reached = less(0.0, point.depth - h * normal)
         candidate = select(touch.candidate, touch.candidate, reached)
-        push = point.k * point.depth - (point.k * h + point.d) * normal
+        push = self._push(point, normal)
         pushes = less(0.0, push)
         kept.keep(touch.candidate, candidate)
         stays = kept.closing * touch.closed
@@ -189,9 +215,7 @@ class ContactStep(Step):
         for other, more, _ in surfaces[1:]:
             force, depth = force + more, select(less(depth, other.depth), other.depth, depth)
         if "contact_f" in self.reports:
-            world, over = Vector(self._last(x) for x in force), point.link
-            while over is not None:
-                world, over = self.trace.places[id(over)].pose.to_parent(world), over.parent
+            world = [self._last(dot(axis, force)) for axis in point.axes]
             self.finished["contact_f"] += [Store("contact_f", (number, c), x) for c, x in enumerate(world)]
         if "contact_gap" in self.reports:
             self.finished["contact_gap"].append(Store("contact_gap", (number,), -depth))
@@ -205,13 +229,6 @@ class ContactStep(Step):
         variable = self.kept.variable(0.0)
         self.kept.keep(variable, value)
         return variable
-
-    def _keep_excess(self, cones: list[Value], pulls: list[Value], efforts: list[Value]) -> None:
-        self.trace.graph.step = "excess|e"
-        self.excess = [self._last(largest(values)) for values in (cones, pulls, efforts)]
-        if "contact_excess" in self.reports:
-            stores = [Store("contact_excess", (i,), value) for i, value in enumerate(self.excess)]
-            self.finished["contact_excess"] = stores
 
     def _after(self, qdd: bool, status: bool) -> list[Store]:
         """Return the stores after the last pass."""
@@ -227,26 +244,49 @@ class ContactStep(Step):
             if qdd:
                 stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
         results = [item.value for item in stores]
+        for name in self.reports:
+            stores += self.finished[name]
+        if trace.piece is not None:
+            return stores + self._sent_to_the_first(trace.piece, results, status)
+        stores += self._excess_stores()
         if status:
             trace.graph.step = "status|s"
-            stores.append(Store("status", (), self._word(results, False)))
-        return stores + [item for name in self.reports for item in self.finished[name]]
+            stores.append(Store("status", (), self._verdict(self._word(results, False))))
+        return stores
 
-    def _word(self, results: list[Value], looped: bool) -> Value:
-        """Return the most severe status of the world."""
-        word = super()._word(results, looped)
+    def _sent_to_the_first(self, own: Piece, results: list[Value], status: bool) -> list[Store]:
+        """Return the stores that send a piece's excess and status to the first piece, which stores the world's."""
+        trace, sent = self.trace, []
+        if self.excess:
+            sent += trace.send("E", own, self.excess)
+            if own.index == 0:
+                pieces = Pieces(trace.links).pieces
+                kinds = zip(*(trace.receive("E", piece) for piece in pieces), strict=True)
+                self.excess = [largest(list(values)) for values in kinds]
+        sent += self._words(own, results) if status else []
+        if own.index == 0 and "contact_excess" in self.reports:
+            trace.rounds = [[*self._excess_stores(), *(item for turn in trace.rounds for item in turn)]]
+        return sent
+
+    def _excess_stores(self) -> list[Store]:
+        asked = self.excess[:3] if "contact_excess" in self.reports else []
+        return [Store("contact_excess", (i,), value) for i, value in enumerate(asked)]
+
+    def _verdict(self, worst: Value) -> Value:
+        """Return ``worst``, or CONTACT where the last pass exceeds its laws by too much."""
         scene = self.trace.links.scene
         weight = float(scene.values["body_mass"].sum(axis=1).max()) * 9.81
-        cone, pull, effort = self.excess
+        cone, pull, effort, missed = self.excess
         bounds = scene.values["joint_effort_limit"]
         most = float(bounds[bounds > 0.0].min()) if (bounds > 0.0).any() else 1.0
-        forces = (cone, pull, self.missed)
-        excess = total(less(TOLERANCE * weight, force) for force in forces) + less(TOLERANCE * most, effort)
-        return select(word, word, select(excess, Status.CONTACT, 0.0))
+        excess = total(less(TOLERANCE * weight, force) for force in (cone, pull, missed)) + less(
+            TOLERANCE * most, effort
+        )
+        return select(worst, worst, select(excess, Status.CONTACT, 0.0))
 
     def _inputs(self) -> list[Value]:
         """Return all inputs, with those values of contacts that are no constants."""
-        points = range(len(self.trace.links.scene.contact_points))
+        points = [number for number, _ in own_points(self.trace)]
         names = ("contact_friction", "contact_stiffness", "contact_damping")
         values = [self.impedance.value(name, point) for name in names for point in points]
         return super()._inputs() + [value for value in values if not is_constant(value)]

@@ -1,0 +1,104 @@
+"""Steps with contacts by limbs side by side: the step by whole trees, races, and neighbours."""
+
+import numpy as np
+import pytest
+import symbolic
+import warp_machine
+import zoo
+from contact_cases import everywhere, quadruped, touching
+from step_scenes import furnished, states
+
+import warp_spo as spo
+from warp_spo.dynamics.integrators import CONTACT_STEP
+from warp_spo.execution import plan, teams
+from warp_spo.kernels import straight
+from warp_spo.recursions.contact import points, step
+from warp_spo.recursions.contact.step import REPORTS
+from warp_spo.recursions.tracing import Trace
+
+H, WORLDS = 5e-3, 4
+SIZES = {"contact_f": (3,), "contact_gap": (), "contact_slip": ()}
+
+
+def case(name):
+    """A scene and states. The quadruped's legs share the points of its trunk; the tree has points anywhere."""
+    if name == "quadruped":
+        scene = quadruped()
+        return scene, dict(zip(("q", "qd", "tau"), touching(scene, 3, WORLDS), strict=True))
+    scene = everywhere(furnished(zoo.random_tree(8, 1)), 1) if name == "tree" else everywhere(furnished(zoo.fork()), 0)
+    return scene, states(scene, WORLDS)
+
+
+def text_of(monkeypatch, name, staged=False):
+    """The CUDA text of a step with all reports, a state, and what the step by a whole tree gives."""
+    for limit in ("FEW_WORLDS", "LONG_ROWS") if staged else ():
+        monkeypatch.setattr(plan, limit, 0)
+    monkeypatch.setattr(straight, "SHARED_BYTES", 1 << 20)
+    texts, (scene, a) = warp_machine.recorded(monkeypatch), case(name)
+    if not staged:
+        a.pop("body_f", None)  # long rows always come through shared memory
+    dyn = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="segment")
+    rate, count = (WORLDS, scene.dof_count), len(scene.contact_points)
+    shapes = {key: array.shape for key, array in a.items()} | {"dt": (), "passes": ()}
+    more = {"q_out": (WORLDS, scene.coord_count), "qdd_out": rate, "status": (WORLDS,)}
+    more |= {key: (WORLDS, count, *size) for key, size in SIZES.items()} | {"contact_excess": (WORLDS, 3)}
+    options = dict(reports=REPORTS, qdd=True, status=True)
+    program = dyn.programs.find(CONTACT_STEP, shapes, rate, more, **options)
+    assert program.warps > 1 and texts[-1].frame.staged == staged
+    return texts[-1], a | {"dt": H, "passes": 3.0}, symbolic.contact_step(scene, a, H)
+
+
+def assert_alike(got, more, wanted):
+    for key, array in {"out": got, **more}.items():
+        right = wanted[key].reshape(len(array), -1)
+        np.testing.assert_allclose(array, right, atol=1e-9 * max(1.0, np.abs(right).max()), err_msg=key)
+
+
+@pytest.mark.parametrize(
+    ("name", "staged"), [("quadruped", True), ("fork", False), pytest.param("tree", True, marks=pytest.mark.slow)]
+)
+def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
+    """Warp by warp in either order, written over the state."""
+    text, a, wanted = text_of(monkeypatch, name, staged)
+    assert wanted["contact_f"].any()
+    for backwards in (False, True):
+        for over in (None, {"q_out": "q", "out": "qd"}):
+            assert_alike(warp_machine.run(text, a, backwards, more := {}, over), more, wanted)
+
+
+def test_neighbours_change_nothing(monkeypatch):
+    """Bit by bit: alone, a world gives what it gives among others; NaN stays alone."""
+    text, a, wanted = text_of(monkeypatch, "quadruped")
+    a["q"][2, 9] = np.nan
+    together = warp_machine.run(text, a, further=(more := {}))
+    assert more["status"][2] == spo.Status.NOT_FINITE
+    for w in (0, 1, 3):
+        one = {name: array if name in ("dt", "passes") else array[w : w + 1] for name, array in a.items()}
+        np.testing.assert_array_equal(warp_machine.run(text, one, further=(alone := {}))[0], together[w])
+        for name, array in alone.items():
+            np.testing.assert_array_equal(array[0], more[name][w])
+            np.testing.assert_allclose(array[0], wanted[name][w].ravel(), atol=1e-6)
+
+
+def test_legs_share_one_text_and_the_points_of_the_trunk(monkeypatch):
+    text, _, _ = text_of(monkeypatch, "quadruped")
+    assert 2 * len(text.cuda) < len(text.cpu)
+    numbers = "contact 4, contact 6, contact 8, contact 10"
+    assert numbers in text.cuda
+
+
+BUGS = {
+    "a point that nobody takes": (points, "own_points", "first * each", "(first + 1) * each"),
+    "a point that two take": (points, "own_points", "mine[each * len(piece.children) :]", "mine"),
+    "what a message leaves out": (Trace, "add_contacts", "z - self.pushes[key]", "z"),
+    "excess of one limb": (step.ContactStep, "_sent_to_the_first", "largest(list(values))", "values[0]"),
+    "no barrier after the passes": (straight, "count_team_passes", '"}", barrier]', '"}"]'),
+    "no barrier ahead": (teams.Team, "_ahead", "[BARRIER] if stage else []", "[]"),
+}
+
+
+@pytest.mark.parametrize("bug", BUGS)
+def test_a_planted_bug_is_seen(bug, monkeypatch):
+    symbolic.plant(monkeypatch, *BUGS[bug])
+    with pytest.raises(AssertionError):
+        test_warps_meet_at_barriers_alone("quadruped", True, monkeypatch)

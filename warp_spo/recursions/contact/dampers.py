@@ -1,0 +1,76 @@
+"""What the contacts of one link add to it in a pass: dampers to its articulated inertia, and loads to the force on it.
+
+The part across is that of point masses, as many as points, and adds up to one rigid inertia. The part along a normal
+that several points share, as all do on a plane, depends on sums of m, m r and m r r* only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ...trace.scalars import Value, is_constant, reciprocal
+from ...trace.spatial import Articulated, Matrix, Rigid, Vector, cross, dot, skew, total, upper
+from .points import Point
+
+SEVERAL = 3  # points of one normal from which sums take fewer operations
+
+
+def damper(points: Sequence[Point], across: Sequence[Value], along: Sequence[Value]) -> Articulated:
+    """Return the sum of the dampers ``across`` I + (``along`` - ``across``) n n* at points of one link."""
+    found = None
+    for point, weight in zip(points, across, strict=True):
+        found = _mass(point.arm, weight) if found is None else found + _mass(point.arm, weight)
+    assert found is not None
+    P = found.articulated
+    for each in _by_normal(points, [b - a for a, b in zip(across, along, strict=True)]):
+        P = P + _along(each)
+    return P
+
+
+def _mass(r: Vector, weight: Value) -> Rigid:
+    """Return the rigid inertia of a point mass."""
+    square = dot(r, r)
+    return Rigid(weight, r * weight, upper(lambda i, j: ((square if i == j else 0.0) - r[i] * r[j]) * weight))
+
+
+def _along(weighted: list[tuple[Point, Value]]) -> Articulated:
+    """Return the sum of dampers of these weights along one normal."""
+    n, whole = weighted[0][0].normal, total(weight for _, weight in weighted)
+    if len(weighted) < SEVERAL:
+        levers = [(cross(point.arm, n), weight) for point, weight in weighted]
+        scaled = [(c, c * weight) for c, weight in levers]
+        lever = Vector(total(c[i] for _, c in scaled) for i in range(3))
+        J = upper(lambda i, j: total(c[i] * d[j] for c, d in scaled))
+    else:
+        lever, turn = cross(_moment(weighted), n), skew(n)
+        second = upper(lambda i, j: total((point.arm[i] * point.arm[j]) * weight for point, weight in weighted))
+        half = turn @ second
+        J = upper(lambda i, j: dot(half[i], turn[j]))
+    return Articulated(J, Matrix.of([c * x for x in n] for c in lever), upper(lambda i, j: whole * (n[i] * n[j])))
+
+
+def load(points: Sequence[Point], pushes: Sequence[Value], P: Articulated, h: Value) -> Vector:
+    """Return the sum of f0 - G v before the step of points of one link, as (n; f) on it.
+
+    Args:
+        pushes: the normal force that each point would have at rest. P: the sum of their dampers h G.
+    """
+    n, f = (-x for x in P.apply(*(part * reciprocal(h) for part in points[0].twist)))
+    for each in _by_normal(points, pushes):
+        normal, moment = each[0][0].normal, _moment(each)
+        n, f = n + cross(moment, normal), f + normal * total(push for _, push in each)
+    return Vector((*n, *f))
+
+
+def _by_normal(points: Sequence[Point], values: Sequence[Value]) -> list[list[tuple[Point, Value]]]:
+    """Return the points and their values, together those of one normal."""
+    found: dict[tuple, list[tuple[Point, Value]]] = {}
+    for point, value in zip(points, values, strict=True):
+        key = tuple(x if is_constant(x) else x.key for x in point.normal)
+        found.setdefault(key, []).append((point, value))
+    return list(found.values())
+
+
+def _moment(weighted: list[tuple[Point, Value]]) -> Vector:
+    """Return the sum of arms times their weights."""
+    return Vector(total(point.arm[i] * weight for point, weight in weighted) for i in range(3))
