@@ -1,1 +1,59 @@
-"""Environments for reinforcement learning."""
+"""Environments for reinforcement learning: thousands of worlds, and a step that is one CUDA graph.
+
+::
+
+    env = Env(
+        scene, worlds=4096, device="cuda:0", dt=5e-3, decimation=4,
+        actions=actions.Effort("slide", scale=10.0),
+        observations={"actor": [lambda w: w.q, Observation(lambda w: w.qd, noise=0.1)]},
+        rewards={"up": (1.0, lambda w: np.cos(w.q[1]))},                          # weight, term
+        terminations={"out": lambda w: abs(w.q[0]) > 2.4},
+        events=[events.joints(position=(-0.1, 0.1))],
+        episode_length_s=10.0,
+    )
+    observed, rewards, dones, extras = env.step(actions)                          # an rsl_rl VecEnv
+
+**A term is a function of one world**, :class:`World`, whose attributes are abstract scalars and NumPy arrays of them:
+``w.q``, ``w.joint_q("hip.*")``, ``w.base_velocity``, ``w.command``, ``w.contact_force``,
+``w.feet("calf.*").air_time``, ``w.frame("hand").position``. It is traced once, when the environment is made, like the
+pose of a custom hinge: written with arithmetic, comparisons and NumPy's functions, with ``spo.where`` and ``spo.clip``
+in place of branches. All terms of a stage become one kernel. Ready terms are in :mod:`.observations`, :mod:`.rewards`
+and :mod:`.terminations`.
+
+**What a step does**, arrays [world, ...], kernels in capitals::
+
+    actions ──ACT──> ctrl, target_q or tau                       scale, offset, clip; action history
+            dyn.step(substeps=decimation) ──> q, qd, contact_f, contact_gap, contact_slip
+            JUDGE: q, qd, contacts, memory ──> reward, done, time_out; and in worlds that are done new q, qd;
+                   commands, pushes, timers, sums of episodes, air times
+            dyn.reset_actuator_state(done)
+            OBSERVE: q, qd, command, memory ──> a row of each group, with noise
+
+``memory`` [number, world] holds all that a world remembers from step to step: actions, commands, timers, air times,
+sums. A term may have its own: ``w.memory(name, size)`` reads it, ``w.keep(name, values)`` changes it, and a reset
+clears it. Random numbers are Philox 4x32-10 of (seed; number of the world in the whole run, step of the world, stage,
+number of the draw), so that a world's course depends neither on the device nor on the other worlds.
+
+A world whose actions, state or reward are not finite starts anew, ends with ``terminated``, reward 0, and is counted by
+its first cause; see ``env.log()``. Other worlds do not notice.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from . import actions, commands, events, observations, rewards, terminations
+from .observations import Observation
+from .world import World
+
+if TYPE_CHECKING:
+    from .environment import Env
+
+__all__ = ["Env", "Observation", "World", "actions", "commands", "events", "observations", "rewards", "terminations"]
+
+
+def __getattr__(name: str) -> Any:
+    """Return :class:`Env`, which imports torch; robots and terms alone do not."""
+    if name == "Env":
+        from .environment import Env
+
+        return Env
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

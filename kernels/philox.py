@@ -1,0 +1,61 @@
+"""Philox 4x32-10: random numbers that are a function of a key and a counter, the same on every device.
+
+Salmon, Moraes, Dror and Shaw 2011, "Parallel random numbers: as easy as 1, 2, 3", algorithm Philox4x32 with 10 rounds.
+"""
+
+from .elementary import C_TYPE
+
+KEY = 2  # 32-bit words
+COUNTER = 4
+
+NATIVE = r"""
+struct philox
+{
+    static CUDA_CALLABLE inline void random(const unsigned int* key, const unsigned int* counter, unsigned int* out)
+    {
+        unsigned int k0 = key[0], k1 = key[1];
+        unsigned int a = counter[0], b = counter[1], c = counter[2], d = counter[3];
+#if defined(__CUDA_ARCH__)
+        #pragma unroll
+#endif
+        for (int turn = 0; turn < 10; ++turn) {
+            const unsigned long long x = 0xD2511F53ull * a, y = 0xCD9E8D57ull * c;
+            a = (unsigned int)(y >> 32) ^ b ^ k0;
+            b = (unsigned int)y;
+            c = (unsigned int)(x >> 32) ^ d ^ k1;
+            d = (unsigned int)x;
+            k0 += 0x9E3779B9u;
+            k1 += 0xBB67AE85u;
+        }
+        out[0] = a; out[1] = b; out[2] = c; out[3] = d;
+    }
+};
+"""
+"""``philox::random(key, counter, out)``: four random words of 32 bits."""
+
+
+def draws(count: int, seed: tuple[int, int], stream: int, world: str, step: str, T: type) -> str:
+    """Return code that fills ``draw[i]``, i below ``count``, with numbers in [0, 1), multiples of 2^-24.
+
+    Args:
+        count: how many.
+        seed: two words, the key. stream: a number that tells kernels of one seed apart.
+        world: C++ of the world's number in the whole run. step: C++ of the number of the step; both 32 bits.
+    """
+    if not count:
+        return ""
+    blocks, c = -(-count // 4), C_TYPE[T]
+    return f"""{NATIVE}{c} draw[{4 * blocks}];
+{{
+const unsigned int key[2] = {{{seed[0]}u, {seed[1]}u}};
+#if defined(__CUDA_ARCH__)
+#pragma unroll
+#endif
+for (int block = 0; block < {blocks}; ++block) {{
+    const unsigned int counter[4] = {{(unsigned int)({world}), (unsigned int)({step}), {stream}u, (unsigned int)block}};
+    unsigned int word[4];
+    philox::random(key, counter, word);
+    for (int i = 0; i < 4; ++i) draw[4 * block + i] = ({c})(word[i] >> 8) * ({c})5.9604644775390625e-8;
+}}
+}}
+"""

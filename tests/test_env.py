@@ -1,0 +1,157 @@
+"""Environments against what they are made of: the dynamics, NumPy, and themselves with other worlds."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from env_scenes import cart_env, walker_env
+
+import warp_spo as spo
+from warp_spo.kernels import native, philox
+
+FLOAT32 = 2e-6  # a few roundings of numbers of size one
+
+
+def random_words(key, counter):
+    """Return one block of the generator."""
+    text = f"""{philox.NATIVE}
+    const unsigned int key[2] = {{{key[0]}u, {key[1]}u}};
+    const unsigned int counter[4] = {{{", ".join(f"{c}u" for c in counter)}}};
+    philox::random(key, counter, (unsigned int*)place.data);
+    """
+    kernel, out = native.kernel("philox_test", text, [("place", 1)], wp.float32), wp.zeros(4, dtype=int, device="cpu")
+    wp.launch(kernel, 1, [1, out], device="cpu")
+    return out.numpy().astype(np.uint32)
+
+
+def test_random_words_are_those_of_the_paper():
+    """Known answers of Random123, file kat_vectors."""
+    ones = 0xFFFFFFFF
+    assert random_words([0, 0], [0] * 4).tolist() == [0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8]
+    assert random_words([ones] * 2, [ones] * 4).tolist() == [0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD]
+
+
+def test_a_step_is_the_dynamics_and_the_terms():
+    env = cart_env()
+    dyn = spo.Dynamics(env.scene, env.num_envs, "cpu")
+    generator, sums, ended = torch.Generator().manual_seed(1), torch.zeros(8), 0
+    for _ in range(60):
+        q, qd, length = env.q.clone(), env.qd.clone(), env.episode_length_buf + 1
+        given = 3.0 * torch.randn(8, 1, generator=generator)
+        tau = torch.cat([10.0 * given, torch.zeros(8, 1)], dim=1)
+        q, qd = dyn.step(q, qd, tau, 5e-3, substeps=4)
+        observed, reward, done, extras = env.step(given)
+        expected = 0.02 * (torch.cos(q[:, 1]) - 0.1 * qd[:, 0] ** 2)
+        assert torch.allclose(reward, expected, rtol=FLOAT32, atol=FLOAT32)
+        out = q[:, 0].abs() > 0.5
+        assert done.bool().equal(out | (length >= 20)) and extras["time_outs"].bool().equal((length >= 20) & ~out)
+        assert env.episode_length_buf.equal(torch.where(done.bool(), 0, length))
+        kept = ~done.bool()
+        state = observed["actor"]
+        assert state[kept].equal(torch.cat([q, qd], dim=1)[kept])  # to the bit
+        assert (state[~kept, :2].abs() <= 0.1).all() and (state[~kept, 2:].abs() <= 0.2).all()
+        ended += int(done.sum())
+        sums += reward
+        last = env.memory("last reward up")[:, 0] + env.memory("last reward slow")[:, 0]
+        assert torch.allclose(last[~kept], sums[~kept], atol=20 * FLOAT32)
+        sums[~kept] = 0.0
+    assert ended > 20 and 0 < float(env.log()["/termination/out"]) < 1
+
+
+def rollout(env, worlds, steps=15):
+    """Return observations, rewards and ends of some worlds; actions depend on the world and the step alone."""
+    numbers, found = torch.arange(env.num_envs) + env.first_world, []
+    for step in range(steps):
+        wave = torch.sin(numbers[:, None] + 1.7 * step + torch.arange(env.num_actions))
+        observed, reward, done, _ = env.step(wave)
+        found.append(
+            torch.cat([*(observed[group] for group in env.num_obs), reward[:, None], done[:, None]], 1)[worlds]
+        )
+    return torch.stack(found)
+
+
+def test_the_course_of_a_world_does_not_depend_on_where_it_runs():
+    whole = rollout(walker_env(6, seed=7), slice(3, 6))
+    part = rollout(walker_env(3, seed=7, first_world=3), slice(0, 3))
+    assert torch.isfinite(whole).all() and whole.equal(part)
+    assert not whole[:, 0].equal(whole[:, 1])
+
+
+def matrix(quaternion):
+    """Return the rotation matrix of a quaternion, xyzw."""
+    x, y, z, w = quaternion / np.linalg.norm(quaternion)
+    across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2.0 * w * across + 2.0 * across @ across
+
+
+def test_terms_of_a_walker():
+    """Base velocity, gravity and joint terms beside dyn.frame_velocities, air time beside its definition."""
+    env = walker_env(4, seed=3)
+    dyn, air = env.dyn, torch.zeros(4, 4)
+    seen = False
+    for step in range(40):
+        observed, _, done, _ = env.step(0.5 * torch.sin(torch.arange(32.0).view(4, 8) + 0.9 * step))
+        q, qd = env.q, env.qd
+        rates = dyn.frame_velocities(q, qd, [0])[:, 0]
+        turn = np.array([matrix(x) for x in q[:, 3:7].double().numpy()])
+        back = lambda v: torch.as_tensor(np.einsum("wji,wj->wi", turn, v.double().numpy())).float()  # noqa: B023, E731
+        critic, actor = observed["critic"], observed["actor"]
+        assert torch.allclose(critic[:, :3], back(rates[:, :3]), atol=1e-5)
+        assert ((actor[:, :3] - back(rates[:, 3:])).abs() <= 0.1 + 1e-5).all()
+        assert torch.allclose(actor[:, 3:6], back(torch.tensor([[0.0, 0, -1]] * 4)), atol=1e-6)
+        force = critic[:, 7:].view(4, 4, 3)
+        touches = force.norm(dim=-1) > 1.0
+        air = torch.where(touches | done.bool()[:, None], 0.0, air + 0.02)
+        assert torch.allclose(critic[:, 3:7], air, atol=1e-5)
+        seen |= bool((air > 0.05).any()) and bool(touches.any())
+    assert seen
+
+
+def test_what_is_not_finite_stays_in_its_world():
+    env, twin = cart_env(4), cart_env(4)
+    for step in range(6):
+        given = torch.zeros(4, 1)
+        if step == 2:
+            given[1] = float("nan")
+        if step == 4:
+            env.qd[3, 1] = float("inf")
+        observed, reward, done, _ = env.step(given)
+        expected, _, _, _ = twin.step(torch.zeros(4, 1))
+        assert torch.isfinite(observed["actor"]).all() and torch.isfinite(reward).all()
+        assert observed["actor"][0].equal(expected["actor"][0]) and observed["actor"][2].equal(expected["actor"][2])
+        assert done.tolist() == [0, step == 2, 0, step == 4]
+    log = env.log()
+    assert float(log["/not finite/action"]) == 1 and float(log["/not finite/state"]) == 1
+    assert float(log["/termination/not finite"]) == 1  # of the worlds with a finished episode
+
+
+def test_reset_of_chosen_worlds():
+    env = walker_env(4)
+    for _ in range(3):
+        env.step(torch.ones(4, 8))
+    before, mask = env.q.clone(), torch.tensor([True, False, True, False])
+    env.reset(mask)
+    assert env.q[~mask].equal(before[~mask]) and not (env.q[mask] == before[mask]).all()
+    assert env.episode_length_buf.tolist() == [0, 3, 0, 3]
+    assert env.memory("action")[:, 0].tolist() == [0, 1, 0, 1]
+    again = env.q.clone()
+    env.reset(mask)
+    assert not (env.q[mask] == again[mask]).all()  # new random numbers
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: cart_env().step(torch.zeros(8, 2)), r"actions has shape \(8, 2\); expected \(8, 1\).*slide"),
+        (lambda: cart_env().reset(torch.ones(3, dtype=torch.bool)), r"mask is torch.bool \(3,\); expected bool \(8,\)"),
+        (lambda: cart_env(rewards={"x": (1.0, lambda w: w.q)}), "reward 'x' returned ndarray; expected one number"),
+        (lambda: cart_env(rewards={"x": (1.0, lambda w: w.command[0])}), "reads commands"),
+        (lambda: cart_env(rewards={"x": (1.0, lambda w: w.contact_force[0, 0])}), "reads contacts"),
+        (lambda: cart_env(rewards={"x": (1.0, lambda w: w.joint_q("knee")[0])}), "'knee' matches no joint"),
+        (lambda: cart_env(default_q=np.zeros(3)), r"default_q has shape \(3,\); expected \(2,\)"),
+        (lambda: cart_env(rewards={"x": (1.0, lambda w: 1.0 if w.q[0] > 0 else 0.0)}), "does not take an abstract"),
+    ],
+)
+def test_refusals(call, words):
+    with pytest.raises((ValueError, TypeError), match=words):
+        call()

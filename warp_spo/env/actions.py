@@ -1,0 +1,143 @@
+"""Actions: how a policy's numbers become controls, targets of drives, or forces."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from ..hinges.functions import clip
+from ..scene.scene import Scene
+from .world import Vector, find
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Control:
+    """Controls of the scene's actuators: ``ctrl = offset + scale action``.
+
+    Args:
+        actuators: regular expressions of labels; None: all. The order is the scene's.
+        scale: one number, one for each actuator, or a dictionary of numbers by regular expression.
+        offset: the same; "default": where each actuator's hinge is in ``default_q``, for position servos.
+        clip: (lowest, highest) action.
+    """
+
+    actuators: Any = None
+    scale: Any = 1.0
+    offset: Any = 0.0
+    clip: tuple[float, float] | None = None
+    array = "ctrl"
+
+    def labels(self, scene: Scene) -> list[str]:
+        """Return the names of the actions."""
+        return [_actuator_label(scene, i) for i in self.entries(scene)]
+
+    def entries(self, scene: Scene) -> list[int]:
+        """Return which entries of the array the actions set."""
+        if not scene.actuators:
+            raise ValueError("actions.Control: the scene has no actuators; use actions.Position or actions.Effort")
+        every = range(len(scene.actuators))
+        labels = [_actuator_label(scene, i) for i in every]
+        return list(every) if self.actuators is None else find("actions.Control", "actuator", labels, self.actuators)
+
+    def defaults(self, scene: Scene, default_q: np.ndarray) -> np.ndarray:
+        """Return the default coordinate of each action's hinge."""
+        hinges = [scene.actuators[i].hinges for i in self.entries(scene)]
+        if any(len(each) != 1 for each in hinges):
+            raise ValueError("actions.Control: offset is 'default' with an actuator of several hinges; give numbers")
+        gears = np.array([scene.actuators[i].gear[0] for i in self.entries(scene)])
+        return gears * default_q[[int(scene.q_start[h[0]]) for h in hinges]]
+
+    def trace(self, scene: Scene, default_q: np.ndarray, action: Vector) -> list[tuple[int, Any]]:
+        """Return (entry, value) of what the actions set."""
+        labels = self.labels(scene)
+        scale = spread(type(self).__name__, "scale", self.scale, labels)
+        if isinstance(self.offset, str) and self.offset == "default":
+            offset = self.defaults(scene, default_q)
+        else:
+            offset = spread(type(self).__name__, "offset", self.offset, labels)
+        limited = action if self.clip is None else [clip(x, *self.clip) for x in action]
+        values = [float(o) + float(s) * x for o, s, x in zip(offset, scale, limited, strict=True)]
+        return list(zip(self.entries(scene), values, strict=True))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Position:
+    """Position targets of the joints' drives (``target_ke``, ``target_kd``): ``target = offset + scale action``.
+
+    Args:
+        joints: regular expressions of labels; None: all joints of one coordinate that have a drive.
+        scale, offset, clip: as :class:`Control`.
+    """
+
+    joints: Any = None
+    scale: Any = 1.0
+    offset: Any = "default"
+    clip: tuple[float, float] | None = None
+    array = "target_q"
+
+    def _hinges(self, scene: Scene) -> list[int]:
+        single = [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == hinge.dof_count == 1]
+        if self.joints is None:
+            gains = scene.values["joint_target_ke"][0]
+            return [i for i in single if gains[scene.qd_start[i]] > 0.0]
+        labels = [scene.joint_labels[i] for i in single]
+        return [single[i] for i in find(f"actions.{type(self).__name__}", "joint", labels, self.joints)]
+
+    def labels(self, scene: Scene) -> list[str]:
+        """Return the names of the actions."""
+        return [scene.joint_labels[i] for i in self._hinges(scene)]
+
+    def entries(self, scene: Scene) -> list[int]:
+        """Return which entries of the array the actions set."""
+        return [int(scene.q_start[i]) for i in self._hinges(scene)]
+
+    def defaults(self, scene: Scene, default_q: np.ndarray) -> np.ndarray:
+        """Return the default coordinate of each action's joint."""
+        return default_q[[int(scene.q_start[i]) for i in self._hinges(scene)]]
+
+    trace = Control.trace
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Effort(Position):
+    """Forces of joints: ``tau = offset + scale action`` [N m or N].
+
+    Args:
+        joints: regular expressions of labels; None: all joints of one coordinate.
+        scale, offset, clip: as :class:`Control`.
+    """
+
+    offset: Any = 0.0
+    array = "tau"
+
+    def _hinges(self, scene: Scene) -> list[int]:
+        if self.joints is None:
+            return [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == hinge.dof_count == 1]
+        return super()._hinges(scene)
+
+    def entries(self, scene: Scene) -> list[int]:
+        """Return which entries of the array the actions set."""
+        return [int(scene.qd_start[i]) for i in self._hinges(scene)]
+
+
+def spread(call: str, name: str, value: Any, labels: list[str]) -> np.ndarray:
+    """Return one number for each label, from one number, from one each, or from a dictionary by regular expression."""
+    if isinstance(value, dict):
+        out = np.full(len(labels), np.nan)
+        for pattern, number in value.items():
+            out[find(f"actions.{call}", "label", labels, pattern)] = number
+        if np.isnan(out).any():
+            left = [label for label, number in zip(labels, out, strict=True) if np.isnan(number)]
+            raise ValueError(f"actions.{call}: {name} has no number for {', '.join(left)}; add an expression for them")
+        return out
+    out = np.asarray(value, dtype=np.float64)
+    if out.shape not in ((), (len(labels),)):
+        raise ValueError(f"actions.{call}: {name} has shape {out.shape}; expected one number or {len(labels)}")
+    return np.broadcast_to(out, (len(labels),))
+
+
+def _actuator_label(scene: Scene, i: int) -> str:
+    label = scene.actuators[i].label
+    return label or "+".join(scene.joint_labels[hinge] for hinge in scene.actuators[i].hinges)

@@ -1,0 +1,88 @@
+"""Commands: what the policy is asked to do, drawn anew from time to time."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from ..hinges.functions import clip, where
+from .world import Vector, World, vector
+
+Range = tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Velocity:
+    """Velocity of the base in its own axes: forward, to the left [m/s], and rate of turning [rad/s].
+
+    Args:
+        forward, left, turn: ranges of uniform numbers.
+        heading: None, or the range of a direction [rad] that replaces ``turn``: the rate of turning is then
+            ``gain`` times what is missing, within the range ``turn``.
+        gain: [1/s].
+        standing: share of commands that are zero.
+        still: commands slower than this are zero [m/s].
+        seconds: range of the time until the next command.
+    """
+
+    forward: Range = (-1.0, 1.0)
+    left: Range = (-1.0, 1.0)
+    turn: Range = (-1.0, 1.0)
+    heading: Range | None = None
+    gain: float = 0.5
+    standing: float = 0.0
+    still: float = 0.0
+    seconds: Range = (10.0, 10.0)
+
+    @property
+    def size(self) -> int:
+        """How many numbers a command has."""
+        return 3
+
+    def draw(self, w: World) -> dict[str, Vector]:
+        """Return a new command, and what belongs to it, by the name of the memory."""
+        stands = w.uniform() < self.standing
+        values = [w.uniform(*self.forward), w.uniform(*self.left), w.uniform(*self.turn)]
+        if self.still > 0.0:
+            slow = np.hypot(values[0], values[1]) < self.still
+            values[:2] = [where(slow, 0.0, x) for x in values[:2]]
+        found = {"command": vector(where(stands, 0.0, x) for x in values)}
+        if self.heading is not None:
+            found["command heading"] = vector([w.uniform(*self.heading), where(stands, 0.0, 1.0)])
+        return found
+
+    def update(self, w: World, command: Vector) -> Vector:
+        """Return the command of this step."""
+        if self.heading is None:
+            return command
+        heading, moves = w.memory("command heading", 2)
+        missing = heading - w.heading
+        missing = np.arctan2(np.sin(missing), np.cos(missing))
+        return vector([command[0], command[1], moves * clip(self.gain * missing, *self.turn)])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Uniform:
+    """Numbers, each uniform in its range, such as the place that a hand is to reach.
+
+    Args:
+        ranges: one for each number.
+        seconds: range of the time until the next command.
+    """
+
+    ranges: tuple[Range, ...]
+    seconds: Range = (4.0, 4.0)
+
+    @property
+    def size(self) -> int:
+        """How many numbers a command has."""
+        return len(self.ranges)
+
+    def draw(self, w: World) -> dict[str, Vector]:
+        """Return a new command, by the name of the memory."""
+        return {"command": vector(w.uniform(*each) for each in self.ranges)}
+
+    def update(self, w: World, command: Vector) -> Vector:
+        """Return the command of this step."""
+        return command

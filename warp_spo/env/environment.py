@@ -1,0 +1,347 @@
+"""An environment of many worlds: :class:`Env`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from ..arrays import parse_device
+from ..dynamics.dynamics import Dynamics
+from ..scene.scene import Scene
+from .layout import Layout
+from .observations import Observation
+from .stage import CHOSEN, COLUMN, INT, LONG, ROW, Buffer
+from .tracing import Tracing
+
+try:
+    from rsl_rl.env import VecEnv
+    from tensordict import TensorDict
+except ImportError:  # optional packages
+    VecEnv, TensorDict = object, None  # type: ignore[assignment,misc]
+
+CONTACT_ARRAYS = {"contact_f": 3, "contact_gap": 1, "contact_slip": 1}  # entries of each point
+ALIGNMENT = 4  # scalars
+
+
+class Env(VecEnv):
+    """An environment of many worlds for reinforcement learning; an rsl_rl ``VecEnv``.
+
+    A step takes ``decimation`` steps of the dynamics with the same controls, computes rewards and terminations, starts
+    worlds anew whose episode has ended, and observes. The observation of such a world is the first of its new episode.
+    On CUDA all of it is one graph.
+
+    Args:
+        scene: the scene, of one world.
+        worlds: number of worlds.
+        device: Warp or torch device.
+        dt: length of a step of the dynamics [s].
+        decimation: steps of the dynamics in one step of the environment.
+        actions: one of :mod:`warp_spo.env.actions`, or several; the policy's numbers are theirs, one after the other.
+        observations: for each group a list of terms, functions of a :class:`World` or :class:`Observation`.
+        rewards: (weight, term) by name. The reward is the sum of weight times term times the length of the step.
+        terminations: terms by name.
+        commands: None, or one of :mod:`warp_spo.env.commands`.
+        events: of :mod:`warp_spo.env.events`.
+        episode_length_s: after this time an episode ends with a time-out [s].
+        default_q: coordinates that episodes start from, and that joints and actions are relative to [coordinate];
+            None: the scene's neutral q.
+        seed: of all random numbers, 64 bits.
+        first_world: number of world 0 in a run on several devices; a world's numbers depend on its own number alone.
+        passes: of steps with contacts, see :meth:`Dynamics.step`.
+        granularity: of the dynamics.
+        graph: whether a step is one CUDA graph; None: on CUDA it is.
+        log_interval: steps after which ``extras["log"]`` comes again.
+
+    Attributes:
+        q, qd: state, torch tensors [world, coordinate] and [world, dof].
+        dyn: the :class:`Dynamics`.
+        num_envs, num_actions, num_obs, max_episode_length, episode_length_buf, device, cfg: as rsl_rl names them.
+
+    Raises:
+        ValueError, TypeError: an argument is invalid; the message names it.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        worlds: int,
+        device: Any = None,
+        *,
+        dt: float = 5e-3,
+        decimation: int = 4,
+        actions: Any,
+        observations: Mapping[str, Sequence[Any]],
+        rewards: Mapping[str, tuple[float, Callable]],
+        terminations: Mapping[str, Callable] | None = None,
+        commands: Any = None,
+        events: Sequence[Any] = (),
+        episode_length_s: float = 20.0,
+        default_q: Any = None,
+        seed: int = 0,
+        first_world: int = 0,
+        passes: int | None = None,
+        granularity: str | None = None,
+        graph: bool | None = None,
+        log_interval: int = 24,
+        cfg: Any = None,
+    ):
+        self.scene, self.num_envs = scene, worlds
+        self.warp_device = parse_device(str(device) if device is not None else None, "Env")
+        self.device = torch.device(wp.device_to_torch(self.warp_device))
+        self.dt, self.decimation, self.step_dt = float(dt), int(decimation), float(dt) * int(decimation)
+        self.max_episode_length = max(1, round(episode_length_s / self.step_dt))
+        self.seed, self.first_world, self.cfg = int(seed), int(first_world), {} if cfg is None else cfg
+        self._passes, self.log_interval = passes, log_interval
+        self._graph_wanted = self.warp_device.is_cuda if graph is None else bool(graph) and self.warp_device.is_cuda
+        self._graph: Any = None
+        self._steps = 0
+
+        default = np.asarray(scene.neutral_q if default_q is None else default_q, dtype=np.float64)
+        if default.shape != (scene.coord_count,):
+            raise ValueError(f"Env: default_q has shape {default.shape}; expected ({scene.coord_count},) [coordinate]")
+        layout = self._layout = Layout(scene, default, self.step_dt, commands, ())
+        parts = list(actions) if isinstance(actions, list | tuple) else [actions]
+        self.action_labels = [label for part in parts for label in part.labels(scene)]
+        self.num_actions = layout.action_count = len(self.action_labels)
+        groups = {
+            name: [term if isinstance(term, Observation) else Observation(term) for term in terms]
+            for name, terms in observations.items()
+        }
+        tracing = Tracing(layout, parts, groups, dict(rewards), dict(terminations or {}), commands, list(events))
+        tracing.run(self.max_episode_length)
+        self.reward_names, self.termination_names = list(rewards), tracing.ends
+        self.num_obs = {name: len(values) for name, values in tracing.group_sizes.items()}
+        self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", granularity=granularity)
+        self._allocate(parts, tracing)
+        stages = tracing.stages
+        self._kernels = {
+            name: stage.build(self._buffers, self.seed, self.first_world, self.warp_device)
+            for name, stage in stages.items()
+        }
+        self.reset()
+
+    # -- arrays ----------------------------------------------------------------------------------------------------
+    def _allocate(self, parts: list, tracing: Tracing) -> None:
+        scene, worlds, layout = self.scene, self.num_envs, self._layout
+        zeros = lambda *shape, dtype=torch.float32: torch.zeros(shape, dtype=dtype, device=self.device)  # noqa: E731
+        self.q = torch.tensor(layout.default_q, dtype=torch.float32, device=self.device).repeat(worlds, 1)
+        self.qd = zeros(worlds, scene.dof_count)
+        self.actions = zeros(worlds, self.num_actions)
+        self._memory = zeros(max(1, layout.memory_size), worlds)
+        self._tick = zeros(worlds, dtype=torch.int32)
+        self._episode_length = zeros(worlds, dtype=torch.int64)
+        self.chosen = zeros(worlds, dtype=torch.bool)
+        buffers = {
+            "q": Buffer(self.q),
+            "qd": Buffer(self.qd),
+            "actions": Buffer(self.actions),
+            "memory": Buffer(self._memory, COLUMN),
+            "tick": Buffer(self._tick, INT),
+            "episode_length": Buffer(self._episode_length, LONG),
+            "chosen": Buffer(self.chosen, CHOSEN),
+        }
+        read = tracing.arrays
+        self._step_arrays: dict[str, torch.Tensor] = {}
+        for name, each in CONTACT_ARRAYS.items():
+            if name in read:
+                count = len(scene.contact_points)
+                tensor = zeros(*((worlds, count, 3) if each == 3 else (worlds, count)))
+                self._step_arrays[name] = tensor
+                buffers[name] = Buffer(tensor.view(worlds, -1))
+        self._controls: dict[str, torch.Tensor] = {}
+        default = torch.tensor(layout.default_q, dtype=torch.float32, device=self.device)
+        for part in parts:
+            if part.array not in self._controls:
+                size = {"ctrl": len(scene.actuators), "tau": scene.dof_count, "target_q": scene.coord_count}[part.array]
+                made = zeros(worlds, size) if part.array != "target_q" else default.repeat(worlds, 1)
+                self._controls[part.array] = made
+                buffers[part.array] = Buffer(made)
+        if "actuator_force" in read:
+            if "ctrl" not in self._controls:
+                raise ValueError(
+                    "Env: a term reads the actuators' forces, and no action sets ctrl; use actions.Control"
+                )
+            self._actuator_force = zeros(worlds, scene.dof_count)
+            buffers["actuator_force"] = Buffer(self._actuator_force)
+        self._frames = layout.frames
+        if layout.frames:
+            self._frame_pose = zeros(worlds, len(layout.frames), 7)
+            self._frame_velocity = zeros(worlds, len(layout.frames), 6)
+            buffers["frame_pose"] = Buffer(self._frame_pose.view(worlds, -1))
+            buffers["frame_velocity"] = Buffer(self._frame_velocity.view(worlds, -1))
+        self._actuator_state = None
+        if "ctrl" in self._controls and any(actuator.delay for actuator in scene.actuators):
+            self._actuator_state = self.dyn.actuator_state(like=self.q)
+        self._places: dict[str, tuple[int, int]] = {}
+        at = 0
+        for name, size in (("reward", 1), ("done", 1), ("time_out", 1), *self.num_obs.items()):
+            self._places[name] = at, size
+            at += -(-worlds * size // ALIGNMENT) * ALIGNMENT
+        self._out = zeros(at)
+        for name, (start, size) in self._places.items():
+            part = self._out[start : start + worlds * size]
+            part = part.view(torch.int32) if name == "done" else part.view(worlds, size)
+            buffers[f"out_{name}"] = Buffer(part, INT if name == "done" else ROW)
+        self._buffers = buffers
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Steps since the start of the episode, int64 [world]; it may be written."""
+        return self._episode_length
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: torch.Tensor) -> None:
+        self._episode_length.copy_(value)
+
+    @property
+    def unwrapped(self) -> Env:
+        """This environment."""
+        return self
+
+    def memory(self, name: str) -> torch.Tensor:
+        """Return what worlds remember under a name, such as "command", as a tensor that may be written [world, n]."""
+        if name not in self._layout.memory:
+            raise ValueError(f"Env.memory: unknown name {name!r}; expected one of {', '.join(self._layout.memory)}")
+        start, size, _ = self._layout.memory[name]
+        return self._memory[start : start + size].t()
+
+    @property
+    def command(self) -> torch.Tensor:
+        """The commands [world, command]; they may be written."""
+        return self.memory("command")
+
+    # -- stepping --------------------------------------------------------------------------------------------------
+    def get_observations(self) -> Any:
+        """Return the observations of the present state, a TensorDict of [world, number] by group."""
+        return self._observations(self._out.clone())
+
+    def reset(self, mask: torch.Tensor | None = None) -> tuple[Any, dict]:
+        """Start worlds anew: those where ``mask`` [world] is True, or all; return observations and an empty dict."""
+        if mask is None:
+            self.chosen.fill_(True)
+        else:
+            mask = torch.as_tensor(mask, device=self.device)
+            if mask.shape != (self.num_envs,) or mask.dtype != torch.bool:
+                raise ValueError(
+                    f"Env.reset: mask is {mask.dtype} {tuple(mask.shape)}; expected bool ({self.num_envs},) [world]"
+                )
+            self.chosen.copy_(mask)
+        with self._stream():
+            self._launch("reset")
+            self._after_reset()
+        return self.get_observations(), {}
+
+    def step(self, actions: torch.Tensor) -> tuple[Any, torch.Tensor, torch.Tensor, dict]:
+        """Take one step in all worlds.
+
+        Args:
+            actions: float32 [world, action]. A world whose actions are not finite starts anew, and is counted.
+
+        Returns:
+            Observations by group; rewards [world]; whether the episode ended, int [world]; a dictionary with
+            ``time_outs`` [world], 1 where it ended for its length alone, and now and then ``log``.
+        """
+        if tuple(actions.shape) != (self.num_envs, self.num_actions):
+            raise ValueError(
+                f"Env.step: actions has shape {tuple(actions.shape)}; expected ({self.num_envs}, {self.num_actions}) "
+                f"[world, action]: {', '.join(self.action_labels)}"
+            )
+        self.actions.copy_(actions)
+        if self._graph is not None:
+            self._graph.replay()
+        elif self._graph_wanted and self._steps > 0:
+            self._graph = self._capture()
+            self._graph.replay()
+        else:
+            self._run()
+        self._steps += 1
+        out = self._out.clone()
+        extras: dict[str, Any] = {"time_outs": self._part(out, "time_out").view(-1)}
+        if self._steps % self.log_interval == 0:
+            extras["log"] = self.log()
+        done = self._part(out, "done").view(-1).view(torch.int32)
+        return self._observations(out), self._part(out, "reward").view(-1), done, extras
+
+    def log(self) -> dict[str, torch.Tensor]:
+        """Return means over the worlds' last finished episodes by name, and counts of what was not finite."""
+        episodes = self.memory("episodes")[:, 0]
+        finished = (episodes > 0).float()
+        share = finished / finished.sum().clamp(min=1.0)
+        found = {f"/reward/{name}": f"last reward {name}" for name in self.reward_names}
+        found |= {f"/termination/{name}": f"last end {name}" for name in self.termination_names}
+        found["/episode/seconds"] = "last seconds"
+        values = {key: (self.memory(name)[:, 0] * share).sum() for key, name in found.items()}
+        for cause in ("action", "state", "reward"):
+            values[f"/not finite/{cause}"] = self.memory(f"bad {cause}")[:, 0].sum()
+        return values
+
+    def close(self) -> None:
+        """Do nothing: memory is freed with the object."""
+
+    # -- inside ----------------------------------------------------------------------------------------------------
+    def _part(self, out: torch.Tensor, name: str) -> torch.Tensor:
+        start, size = self._places[name]
+        return out[start : start + self.num_envs * size].view(self.num_envs, size)
+
+    def _observations(self, out: torch.Tensor) -> Any:
+        groups = {name: self._part(out, name) for name in self.num_obs}
+        return groups if TensorDict is None else TensorDict(groups, batch_size=[self.num_envs], device=self.device)
+
+    def _stream(self) -> Any:
+        """Return a context in which Warp launches on torch's current stream."""
+        if not self.warp_device.is_cuda:
+            return wp.ScopedDevice(self.warp_device)
+        return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.device)), sync_enter=False)
+
+    def _launch(self, name: str) -> None:
+        kernel = self._kernels[name]
+        if kernel is not None:
+            kernel(self.num_envs)
+
+    def _run(self) -> None:
+        with self._stream():
+            self._launch("act")
+            controls = self._controls
+            options: dict[str, Any] = dict(self._step_arrays)
+            if self._passes is not None:
+                options["passes"] = self._passes
+            if self._actuator_state is not None:
+                options["actuator_state"] = self._actuator_state
+            self.dyn.step(
+                self.q,
+                self.qd,
+                controls.get("tau"),
+                self.dt,
+                target_q=controls.get("target_q"),
+                ctrl=controls.get("ctrl"),
+                substeps=self.decimation,
+                out=(self.q, self.qd),
+                **options,
+            )
+            if "actuator_force" in self._buffers:
+                self.dyn.actuator_force(self.q, self.qd, controls["ctrl"], out=self._actuator_force)
+            self._find_frames("judge")
+            self._launch("judge")
+            self._after_reset()
+
+    def _after_reset(self) -> None:
+        if self._actuator_state is not None:
+            self.dyn.reset_actuator_state(self.chosen, self._actuator_state)
+        self._find_frames("observe")
+        self._launch("observe")
+
+    def _find_frames(self, stage: str) -> None:
+        kernel = self._kernels[stage]
+        if kernel is not None and kernel.reads_frames:
+            self.dyn.frame_poses(self.q, self._frames, out=self._frame_pose)
+            self.dyn.frame_velocities(self.q, self.qd, self._frames, out=self._frame_velocity)
+
+    def _capture(self) -> Any:
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            self._run()
+        return graph

@@ -1,0 +1,53 @@
+"""What the stages of an environment agree on while they are traced: memory, frames, values, counts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..scene.scene import Scene
+
+
+class Layout:
+    """The arrangement of an environment's arrays.
+
+    Attributes:
+        memory: (start, size, value at a reset) of what worlds remember, by name. frames: that terms ask for.
+        sensors: (size, value at a reset, function that keeps it) of memory that each step brings up to date, by name.
+        values: names of the scene's values that differ between worlds.
+    """
+
+    def __init__(self, scene: Scene, default_q: np.ndarray, step_dt: float, commands: Any, values: tuple[str, ...]):
+        self.scene, self.default_q, self.step_dt, self.commands, self.values = (
+            scene,
+            default_q,
+            step_dt,
+            commands,
+            values,
+        )
+        self.action_count = 0
+        self.memory: dict[str, tuple[int, int, float | None]] = {}
+        self.memory_size = 0
+        self.frames: list[Any] = []
+        self.sensors: dict[str, tuple[int, float | None, Any]] = {}
+
+    def remember(self, name: str, size: int, reset: float | None) -> int:
+        """Return where ``size`` numbers of this name are in the memory."""
+        if name not in self.memory:
+            self.memory[name] = self.memory_size, size, reset
+            self.memory_size += size
+        start, known, _ = self.memory[name]
+        if known != size:
+            raise ValueError(f"Env: memory {name!r} has {known} numbers; a term asks for {size}")
+        return start
+
+    def frame(self, name: Any) -> int:
+        """Return the number of a frame among those that terms ask for."""
+        if isinstance(name, str) and name not in self.scene.sites:
+            from .world import find
+
+            (name,) = find("Env", "site or body", self.scene.body_labels, name)[:1]
+        if name not in self.frames:
+            self.frames.append(name)
+        return self.frames.index(name)

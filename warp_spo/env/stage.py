@@ -1,0 +1,164 @@
+"""Stages: the work of an environment on one world as one traced kernel."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from .. import launches
+from ..kernels import native, philox
+from ..kernels.elementary import C_TYPE
+from ..kernels.elementary import NATIVE as ELEMENTARY
+from ..trace.emission import Emitter, RangeReduction, Store, render
+from ..trace.scalars import Graph, Scalar, ordered
+
+ROW, COLUMN, INT, LONG, CHOSEN, SHARED = "row", "column", "int", "long", "chosen", "shared"
+DRAW = "draw"  # random numbers of the thread's own
+BLOCK = 64  # threads
+
+
+class Buffer(NamedTuple):
+    """An array of the environment as kernels see it.
+
+    Attributes:
+        tensor: torch tensor; its memory is the array's.
+        way: ROW: float32 [world, entry]. COLUMN: float32 [entry, world], which neighbouring threads read side by side.
+            SHARED: float32 [entry], the same for all worlds. INT: int32 [world]. LONG: int64 [world]. CHOSEN: bool
+            [world].
+    """
+
+    tensor: Any
+    way: str = ROW
+
+    def place(self, name: str, entry: str) -> str:
+        """Return C++ for an entry in the thread's world."""
+        entries = self.tensor.shape[-1] if self.way == ROW else 0
+        return {
+            ROW: f"{name}.data[world * {entries} + {entry}]",
+            COLUMN: f"{name}.data[(long long)({entry}) * worlds + world]",
+            SHARED: f"{name}.data[{entry}]",
+            INT: f"((int*){name}.data)[world]",
+            LONG: f"((long long*){name}.data)[world]",
+            CHOSEN: f"{name}.data[world]",
+        }[self.way]
+
+    def load(self, name: str, entry: str) -> str:
+        """Return C++ that reads an entry as float."""
+        place = self.place(name, entry)
+        return place if self.way in (ROW, COLUMN, SHARED) else f"(float)({place})"
+
+    def store(self, name: str, entry: str, value: str) -> str:
+        """Return C++ that writes an entry."""
+        kind = {INT: "(int)", LONG: "(long long)", CHOSEN: "0 != "}.get(self.way, "")
+        return f"{self.place(name, entry)} = {kind}({value});"
+
+    def warp(self) -> Any:
+        """Return the flat Warp array over the same memory."""
+        import torch
+
+        flat = self.tensor.reshape(-1)
+        if self.way == CHOSEN:
+            return wp.from_torch(flat, dtype=wp.bool)
+        return wp.from_torch(flat.view(torch.float32), dtype=wp.float32)
+
+
+class Stage:
+    """One kernel, a thread a world, made of the values that terms store.
+
+    Args:
+        name: of the kernel.
+        stream: number that tells this stage's random numbers from those of others.
+
+    Attributes:
+        graph: of the trace.
+        stores: what the kernel writes, in order.
+        draws: how many random numbers it uses.
+        ticks: it ends with another step counted, so that all later random numbers are new ones. In the stage that
+            resets on request the chosen worlds alone count one.
+    """
+
+    def __init__(self, name: str, stream: int):
+        self.name, self.stream = name, stream
+        self.graph = Graph()
+        self.graph.step = name
+        self.stores: list[Store] = []
+        self.draws = 0
+        self.ticks: bool | str = False
+
+    def draw(self) -> Scalar:
+        """Return a new random number, uniform in [0, 1)."""
+        self.draws += 1
+        return self.graph.input(DRAW, self.draws - 1)
+
+    def store(self, array: str, entry: int, value: Any) -> None:
+        """Write a value to an entry of an array of the environment."""
+        self.stores.append(Store(array, (entry,), value))
+
+    def read_arrays(self) -> set[str]:
+        """Return the names of the arrays that the stored values depend on."""
+        return {scalar.args[0] for scalar in ordered(item.value for item in self.stores) if scalar.op == "input"}
+
+    def build(self, buffers: dict[str, Buffer], seed: int, first: int, device: wp.Device) -> Launch | None:
+        """Return the launch of the kernel; None if it writes nothing.
+
+        Args:
+            buffers: arrays of the environment by name; ``tick`` counts the steps of each world.
+            seed: of the random numbers. first: number of world 0 in the whole run.
+        """
+        if not self.stores:
+            return None
+        emitter = Emitter(
+            "float32",
+            lambda array, entry: f"draw[{entry}]" if array == DRAW else buffers[array].load(array, entry),
+            lambda array, entry, value: buffers[array].store(array, entry, value),
+            lambda array, index: index[0],
+            RangeReduction.FIRST,
+            fuses=True,
+        )
+        changed = {item.array for item in self.stores if item.array in self.read_arrays()}
+        late = [item for item in self.stores if item.array in changed]  # after all reads of what they overwrite
+        listings = [
+            emitter.region([item for item in self.stores if item.array not in changed], [x.value for x in late]),
+            emitter.region(late),
+        ]
+        body = "\n".join(render(listing, "float32") for listing in listings)
+        touched = {array for listing in listings for array, _ in listing.indices if array != DRAW}
+        words = (seed & 0xFFFFFFFF, seed >> 32 & 0xFFFFFFFF)
+        world, step = f"{first} + world", buffers["tick"].place("tick", "0")
+        random = philox.draws(self.draws, words, self.stream, world, step, wp.float32)
+        if self.draws or self.ticks:
+            touched.add("tick")
+        count = (
+            f"((unsigned int*)tick.data)[world] += {'1u' if self.ticks is True else self.ticks};" if self.ticks else ""
+        )
+        names = sorted(touched)
+        text = "\n".join(
+            [
+                ELEMENTARY[C_TYPE[wp.float32]],
+                "if (thread >= worlds) return;",
+                "const long long world = thread;",
+                random,
+                body,
+                count,
+                "",
+            ]
+        )
+        kernel = native.kernel(f"env_{self.name}", text, [(name, 1) for name in names], wp.float32)
+        frames = "frame_pose" in touched or "frame_velocity" in touched
+        return Launch(kernel, [buffers[name].warp() for name in names], emitter.operations, device, frames)
+
+
+class Launch(NamedTuple):
+    """A kernel with its arguments; ``operations`` of one world; whether it reads frames."""
+
+    kernel: wp.Kernel
+    arrays: list[wp.array]
+    operations: int
+    device: wp.Device
+    reads_frames: bool
+
+    def __call__(self, worlds: int) -> None:
+        """Launch the kernel on Warp's current stream."""
+        threads = -(-worlds // BLOCK) * BLOCK if self.device.is_cuda else worlds
+        launches.launch(self.kernel, threads, [worlds, *self.arrays], [], device=self.device, block_dim=BLOCK)

@@ -1,0 +1,331 @@
+"""The symbolic state of one world, which the terms of an environment are functions of: :class:`World`."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ..hinges.functions import AbstractScalar, Condition, where
+from .feet import Feet, feet
+from .stage import Stage
+
+if TYPE_CHECKING:
+    from .layout import Layout
+
+Vector = np.ndarray  # of abstract scalars
+
+
+class Frame(NamedTuple):
+    """A frame of the scene, inertial axes.
+
+    Attributes:
+        position: (3,) [m]. quaternion: xyzw (4,). velocity: of its origin (3,) [m/s]. angular_velocity: (3,) [rad/s].
+    """
+
+    position: Vector
+    quaternion: Vector
+    velocity: Vector
+    angular_velocity: Vector
+
+
+def vector(values: Iterable[Any]) -> Vector:
+    """Return an array of abstract scalars."""
+    values = list(values)
+    out = np.empty(len(values), dtype=object)
+    for i, value in enumerate(values):
+        out[i] = value
+    return out
+
+
+def cross(a: Any, b: Any) -> Vector:
+    """Return the vector product of two vectors of three entries."""
+    return vector([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def rotate(quaternion: Any, v: Any) -> Vector:
+    """Return ``v`` turned by a unit quaternion, xyzw."""
+    u, w = quaternion[:3], quaternion[3]
+    twice = 2.0 * cross(u, v)
+    return vector(v) + w * twice + cross(u, twice)
+
+
+def rotate_back(quaternion: Any, v: Any) -> Vector:
+    """Return ``v`` turned by the inverse of a unit quaternion, xyzw."""
+    return rotate(vector([-quaternion[0], -quaternion[1], -quaternion[2], quaternion[3]]), v)
+
+
+def find(call: str, what: str, labels: Sequence[str], names: Any) -> list[int]:
+    """Return the indices of the labels that a regular expression, or one of several, matches; in their own order.
+
+    An expression matches the whole label, or all of it that follows the last "/".
+
+    Raises:
+        ValueError: an expression matches nothing.
+    """
+    patterns = [names] if isinstance(names, str) else list(names)
+    found: set[int] = set()
+    for pattern in patterns:
+        ends = [label.rsplit("/", 1)[-1] for label in labels]
+        hits = {
+            i
+            for i, (label, end) in enumerate(zip(labels, ends, strict=True))
+            if re.fullmatch(pattern, label) or re.fullmatch(pattern, end)
+        }
+        if not hits:
+            raise ValueError(f"{call}: {pattern!r} matches no {what}; expected one of {', '.join(labels)}")
+        found |= hits
+    return sorted(found)
+
+
+class World:
+    """One world while a term is traced. Its attributes are abstract scalars, or NumPy arrays of them.
+
+    Terms are written with + - * / **, comparisons, NumPy's sin, cos, exp, log, sqrt, arctan2, abs and the like, and
+    :func:`warp_spo.where`, :func:`warp_spo.clip` in place of branches.
+
+    Attributes:
+        scene: the scene.
+        q, qd: coordinates [coordinate] and velocities [dof]; events assign to their entries.
+        action, last_action, action_before: actions of this step, of the step before, and of the one before that.
+        contact_force: [point, 3], inertial axes, mean over substeps [N]. contact_gap: [point] distance from the ground
+            [m]. contact_slip: [point], speed along the ground [m/s]. Points are those of ``scene.contact_points``.
+        time: since the last reset [s].
+        dt: of a step of the environment [s].
+    """
+
+    def __init__(self, layout: Layout, stage: Stage, fresh: Any = None, own_action: Any = None):
+        self._layout, self._stage, self._fresh, self._own_action = layout, stage, fresh, own_action
+        self.scene = layout.scene
+        self.dt = layout.step_dt
+        self.kept: dict[str, Vector] = {}
+
+    # -- state -----------------------------------------------------------------------------------------------------
+    @functools.cached_property
+    def q(self) -> Vector:
+        return self.read("q", self.scene.coord_count)
+
+    @functools.cached_property
+    def qd(self) -> Vector:
+        return self.read("qd", self.scene.dof_count)
+
+    @property
+    def default_q(self) -> np.ndarray:
+        """The q that resets start from [coordinate], numbers."""
+        return self._layout.default_q
+
+    @functools.cached_property
+    def time(self) -> Any:
+        return self.read("episode_length", 1)[0] * self.dt
+
+    # -- actions and commands --------------------------------------------------------------------------------------
+    @property
+    def action(self) -> Vector:
+        return self.memory("action", self._layout.action_count)
+
+    @property
+    def last_action(self) -> Vector:
+        return self.memory("action 1", self._layout.action_count)
+
+    @property
+    def action_before(self) -> Vector:
+        return self.memory("action 2", self._layout.action_count)
+
+    @property
+    def command(self) -> Vector:
+        """The commands that the environment gives [command]."""
+        if self._layout.commands is None:
+            raise ValueError("Env: a term reads commands, and the environment has none; expected Env(commands=...)")
+        return self.memory("command", self._layout.commands.size)
+
+    # -- contacts --------------------------------------------------------------------------------------------------
+    @functools.cached_property
+    def contact_force(self) -> np.ndarray:
+        count = self._point_count()
+        return self._quiet(self.read("contact_f", 3 * count)).reshape(count, 3)
+
+    @functools.cached_property
+    def contact_gap(self) -> Vector:
+        return self.read("contact_gap", self._point_count())
+
+    @functools.cached_property
+    def contact_slip(self) -> Vector:
+        return self._quiet(self.read("contact_slip", self._point_count()))
+
+    def points(self, bodies: Any) -> list[list[int]]:
+        """Return, for each body whose label matches, the indices of its contact points; numbers."""
+        found = find("Env", "body", self.scene.body_labels, bodies)
+        return [[i for i, point in enumerate(self.scene.contact_points) if point.body == body] for body in found]
+
+    def feet(self, bodies: Any, threshold: float = 1.0) -> Feet:
+        """Return forces and times of bodies that touch the ground.
+
+        Args:
+            bodies: regular expressions of body labels. threshold: force above which a body touches [N].
+        """
+        return feet(self, bodies, threshold)
+
+    # -- base ------------------------------------------------------------------------------------------------------
+    @property
+    def base(self) -> int:
+        """Index of the free hinge that carries the robot on the inertial frame."""
+        for index, hinge in enumerate(self.scene.hinges):
+            if hinge.kind == "free" and hinge.parent == -1:
+                return index
+        raise ValueError("Env: a term reads the base, and no hinge of the scene is free on the inertial frame")
+
+    @property
+    def base_position(self) -> Vector:
+        """Position of the base's origin (3,), inertial axes [m]."""
+        start = self.scene.q_start[self.base]
+        return self.q[start : start + 3]
+
+    @property
+    def base_quaternion(self) -> Vector:
+        """Orientation of the base, xyzw (4,)."""
+        start = self.scene.q_start[self.base]
+        return self.q[start + 3 : start + 7]
+
+    @property
+    def base_angular_velocity(self) -> Vector:
+        """Angular velocity in the base's axes (3,) [rad/s]."""
+        start = self.scene.qd_start[self.base]
+        return rotate_back(self.base_quaternion, self.qd[start + 3 : start + 6])
+
+    @property
+    def base_velocity(self) -> Vector:
+        """Velocity of the base's origin in the base's axes (3,) [m/s]."""
+        start = self.scene.qd_start[self.base]
+        com = self.value("body_com")[self.scene.hinges[self.base].child]
+        return rotate_back(self.base_quaternion, self.qd[start : start + 3]) - cross(self.base_angular_velocity, com)
+
+    @property
+    def projected_gravity(self) -> Vector:
+        """Unit vector along gravity in the base's axes (3,)."""
+        return rotate_back(self.base_quaternion, np.array([0.0, 0.0, -1.0]))
+
+    @property
+    def heading(self) -> Any:
+        """Angle of the base about the vertical [rad]."""
+        forward = rotate(self.base_quaternion, np.array([1.0, 0.0, 0.0]))
+        return np.arctan2(forward[1], forward[0])
+
+    # -- joints ----------------------------------------------------------------------------------------------------
+    def joints(self, names: Any = None) -> list[int]:
+        """Return the indices of the hinges of one coordinate whose labels match; None: all of them. Numbers."""
+        single = [i for i, hinge in enumerate(self.scene.hinges) if hinge.coord_count == hinge.dof_count == 1]
+        if names is None:
+            return single
+        labels = [self.scene.joint_labels[i] for i in single]
+        return [single[i] for i in find("Env", "joint of one coordinate", labels, names)]
+
+    def joint_q(self, names: Any = None) -> Vector:
+        """Return the coordinates of :meth:`joints`."""
+        return self.q[[int(self.scene.q_start[i]) for i in self.joints(names)]]
+
+    def joint_default(self, names: Any = None) -> np.ndarray:
+        """Return the default coordinates of :meth:`joints`, numbers."""
+        return self.default_q[[int(self.scene.q_start[i]) for i in self.joints(names)]]
+
+    def joint_qd(self, names: Any = None) -> Vector:
+        """Return the velocities of :meth:`joints`."""
+        return self.qd[[int(self.scene.qd_start[i]) for i in self.joints(names)]]
+
+    @property
+    def joint_force(self) -> Vector:
+        """Forces of the scene's actuators on each dof, in the state after the step [dof] [N m or N]."""
+        return self.read("actuator_force", self.scene.dof_count)
+
+    # -- frames, values --------------------------------------------------------------------------------------------
+    def frame(self, name: Any) -> Frame:
+        """Return a frame: the name of a site or of a body, a body, or (body, pose in the body)."""
+        at = self._layout.frame(name)
+        count = len(self._layout.frames)  # grows while terms are traced; rows are sized at the end
+        pose = vector(self._scalar("frame_pose", 7 * at + i) for i in range(7))
+        rates = vector(self._scalar("frame_velocity", 6 * at + i) for i in range(6))
+        assert at < count
+        return Frame(pose[:3], pose[3:], rates[:3], rates[3:])
+
+    def value(self, name: str) -> np.ndarray:
+        """Return a value of the scene, such as "body_com" [body, 3]: of this world where it is randomised."""
+        shape = self.scene.values[name].shape[1:]
+        if name not in self._layout.values:
+            if self.scene.values[name].shape[0] > 1:
+                raise ValueError(f"Env: a term reads {name}, which differs between worlds; expected it in variable=")
+            return self.scene.values[name][0]
+        return self.read(f"value_{name}", int(np.prod(shape))).reshape(shape)
+
+    # -- random numbers --------------------------------------------------------------------------------------------
+    def uniform(self, low: Any = 0.0, high: Any = 1.0) -> Any:
+        """Return a new random number between ``low`` and ``high``."""
+        return low + (high - low) * AbstractScalar(self._stage.draw())
+
+    def normal(self, deviation: Any = 1.0) -> Any:
+        """Return a new normal random number of mean zero."""
+        radius = np.sqrt(-2.0 * np.log(1.0 - self.uniform()))  # Box and Muller
+        return deviation * radius * np.cos(2.0 * np.pi * self.uniform())
+
+    # -- memory ----------------------------------------------------------------------------------------------------
+    def memory(self, name: str, size: int, reset: float | None = 0.0) -> Vector:
+        """Return numbers that this world keeps from step to step [size]; :meth:`keep` changes them.
+
+        Args:
+            name: of the numbers, the same in all terms that share them.
+            size: how many.
+            reset: their value at the start of an episode; None: a reset leaves them alone, and they start from zero.
+        """
+        if name in self.kept:
+            return self.kept[name]
+        start = self._layout.remember(name, size, reset)
+        return vector(self._scalar("memory", start + i) for i in range(size))
+
+    def keep(self, name: str, values: Any) -> None:
+        """Set numbers of :meth:`memory`; a reset sets those without a :meth:`memory` call to zero."""
+        self.kept[name] = vector(values)
+        if name not in self._layout.memory:
+            self._layout.remember(name, len(self.kept[name]), 0.0)
+
+    def sensor(self, name: str, size: int, update: Callable[[World], None], reset: float | None = 0.0) -> Vector:
+        """Return numbers of :meth:`memory` that ``update`` keeps once in each step, after the dynamics.
+
+        Args:
+            name, size, reset: as :meth:`memory`.
+            update: function of a :class:`World` that calls :meth:`keep` with this name.
+        """
+        self._layout.sensors[name] = size, reset, update
+        self._layout.remember(name, size, reset)
+        if self._stage.name == "judge" and name not in self.kept:
+            update(self)
+        return self.memory(name, size, reset)
+
+    # -- inside ----------------------------------------------------------------------------------------------------
+    def read(self, array: str, size: int) -> Vector:
+        """Return the entries of an array of the environment."""
+        return vector(self._scalar(array, i) for i in range(size))
+
+    def _scalar(self, array: str, entry: int) -> AbstractScalar:
+        return AbstractScalar(self._stage.graph.input(array, entry))
+
+    def _quiet(self, values: Vector) -> Vector:
+        """Return values of the last step, zero in a world that was reset since."""
+        if self._fresh is None:
+            return values
+        return vector(where(self._fresh, 0.0, value) for value in values)
+
+    def _point_count(self) -> int:
+        count = len(self.scene.contact_points)
+        if not count:
+            raise ValueError("Env: a term reads contacts, and the scene has none; expected scene.with_contacts(...)")
+        return count
+
+
+def as_condition(x: Any) -> Condition:
+    """Return what a termination returned as a condition."""
+    if isinstance(x, Condition):
+        return x
+    if isinstance(x, bool | np.bool_):
+        return Condition(1.0 if x else 0.0)
+    raise TypeError(f"Env: a termination returned {type(x).__name__}; expected a comparison, such as w.q[1] > 0.3")
