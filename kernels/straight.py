@@ -14,6 +14,7 @@ from .fields import copy_cached_fields, define_fields
 from .native import INTEGERS
 from .slots import RELAY_WORLDS, WARP_SIZE, SlotLayout
 from .staged_rows import DEFINE_ASYNC_COPY, WAIT_FOR_COPIES, Row, copy_rows_in, copy_rows_out, pitch, source
+from .substeps import STATE, hold_state, move_state, repeat_on_cuda, repeat_substeps, replace_state, write_state
 
 # shared memory that a block may declare: 48 KiB less the share that Warp uses; more is asked for at the launch
 SHARED_BYTES = 46 * 1024
@@ -69,6 +70,7 @@ class KernelLayout(NamedTuple):
             that loads these entries from global memory does so long before their use, and runs out of registers.
         numbers: the names of the numbers that all worlds share, read as ``name_row[0]``.
         direct: short rows, too, are copied to shared memory without passing through registers.
+        repeats: the statements are those of a substep, see :mod:`.substeps`.
     """
 
     rows: list[Row]
@@ -84,6 +86,17 @@ class KernelLayout(NamedTuple):
     cached: tuple[tuple[int, ...], ...] = ()
     numbers: tuple[str, ...] = ()
     direct: bool = False
+    repeats: bool = False
+
+    @property
+    def state(self) -> list[Row]:
+        """The rows that a substep writes for the next one; in a team, always in shared memory."""
+        return [row for row in self.rows if row.name in STATE] if self.repeats else []
+
+    @property
+    def shared_rows(self) -> list[Row]:
+        """The rows that are in shared memory."""
+        return self.rows if self.staged else self.state if self.warps > 1 else []
 
     @property
     def groups(self) -> int:
@@ -93,7 +106,7 @@ class KernelLayout(NamedTuple):
     @property
     def shared_scalars(self) -> int:
         """The scalars of shared memory that a group needs; tiles of a RELAYED result reuse the space of the rows."""
-        rows = sum(pitch(row.entries) for row in self.rows) if self.staged else 0
+        rows = sum(pitch(row.entries) for row in self.shared_rows)
         rows += sum(pitch(row.entries) for row in self.staged_further)
         rows += pitch(self.result.array.entries) if self.result.way == STAGED else 0
         scalars = WARP_SIZE * (rows + self.messages + sum(map(len, self.cached)))
@@ -109,7 +122,12 @@ class KernelLayout(NamedTuple):
     @property
     def staged_further(self) -> tuple[Row, ...]:
         """The further results that go to memory through shared memory."""
-        return tuple(row for row in self.further if self.further_staged and row.name not in INTEGERS)
+        return tuple(row for row in self.apart if self.further_staged and row.name not in INTEGERS)
+
+    @property
+    def apart(self) -> tuple[Row, ...]:
+        """The further results that do not take the place of a row."""
+        return tuple(row for row in self.further if row.name not in [STATE[one.name] for one in self.state])
 
     def fits(self, T: type, room: int) -> bool:
         """Return whether a block with ``room`` bytes of shared memory holds this layout, for scalars of type ``T``."""
@@ -143,12 +161,12 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
             text += [f"__shared__ __align__(16) {c} shared[{layout.groups * layout.shared_scalars}];"]
         text += [f"{c}* stage = shared + (threadIdx.x / {team}) * {layout.shared_scalars};"]
     for row in layout.rows:
-        if layout.staged:
+        if row in layout.shared_rows:
             offset[row.name], at = at, at + WARP_SIZE * pitch(row.entries)
             text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
         else:
-            text += [_own_row(row, c)]
-    for row in layout.further:
+            text += [hold_state(row, c) if row in layout.state else _own_row(row, c)]
+    for row in layout.apart:
         if row in layout.staged_further:
             offset[row.name], at = at, at + WARP_SIZE * pitch(row.entries)
             text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
@@ -163,10 +181,12 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
         lines = cuda.split("\n")
         lines.insert(next(i for i, line in enumerate(lines) if "FIELD(" in line), WAIT_FOR_COPIES)
         cuda = "\n".join(lines)
-    if layout.staged:
-        text += [copy_rows_in(layout.rows, offset, c, team, layout.direct)] if layout.rows else []
+    if layout.staged or layout.shared_rows:
+        text += [copy_rows_in(layout.shared_rows, offset, c, team, layout.direct)] if layout.shared_rows else []
         text += [sync]
-    if result.way == IN_PLACE:
+    if layout.repeats:
+        start, width = 0, 0
+    elif result.way == IN_PLACE:
         start, width = offset[result.row], pitch(next(row.entries for row in layout.rows if row.name == result.row))
     else:
         width = result.slot_layout.pitch if result.way == MAPPED else pitch(out.entries)
@@ -174,7 +194,9 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
     own_row = f"{c}* result_row = out.data + world * {out.entries};"
     if result.way == TILED:
         own_row = f"{c}* result_row = out.data + world / {TILE} * {result.slots * TILE} + world % {TILE};"
-    if result.way in (DIRECT, TILED):
+    if layout.repeats:
+        text += [replace_state(row, c) for row in layout.state]
+    elif result.way in (DIRECT, TILED):
         text += [own_row]
     elif result.way == RELAYED:
         text += [result.slot_layout.define_relay(T)]
@@ -184,9 +206,14 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
         text += [f"{c}* sent = stage + {at} + lane;", "#define SENT(i) sent[(i) * 32]"]
     if layout.retries:
         cuda = f"for (int again = 0;; ++again) {{\n{cuda}\nif (again || !(farthest > on::reach())) break;\n}}"
+    if layout.repeats:
+        cuda, cpu = repeat_on_cuda(cuda, layout.warps > 1), repeat_substeps(cpu)
     text += [*([] if layout.cached else define_fields(layout.fields, c)), cuda]
-    if result.way in (IN_PLACE, STAGED):
+    if layout.repeats:
+        text += [sync, *(_write_state(row, offset, c, team) for row in layout.state)]
+    elif result.way in (IN_PLACE, STAGED):
         text += [sync, copy_rows_out(out, start, width, c, team)]
+    if result.way in (IN_PLACE, STAGED):
         text += [copy_rows_out(row, offset[row.name], pitch(row.entries), c, team) for row in layout.staged_further]
     if result.way == MAPPED:
         text += ["const int done = 0;", f"result_row[{result.slots}] = 0;", sync]
@@ -195,10 +222,12 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
         text += [result.slot_layout.write_tiles("stage", team, sync, T)]
     text += ["#undef FIELD"] if layout.cached else []
     text += ["#else", "const long long world = thread;", "const bool mine = true;"]
-    text += [_own_row(row, c) for row in layout.rows]
-    text += [_own_result(row, c) for row in layout.further]
+    text += [move_state(row, c) if row in layout.state else _own_row(row, c) for row in layout.rows]
+    text += [_own_result(row, c) for row in layout.apart]
     if result.way in BY_TABLE:
         text += [f"{c} result_row[{result.slots + 1}];", "#define RELAY(i) result_row[i]"]
+    elif layout.repeats:
+        text += [replace_state(row, c) for row in layout.state]
     else:
         text += [own_row]
     if layout.messages:
@@ -231,6 +260,13 @@ def _own_result(row: Row, c: str) -> str:
     """Return the declaration of ``name_row``, the row of the thread's own world in a further result."""
     kind = "int" if row.name in INTEGERS else c
     return f"{kind}* {row.name}_row = {row.name}.data + world * {row.entries};"
+
+
+def _write_state(row: Row, offset: dict[str, int], c: str, team: int) -> str:
+    """Return code that writes a row of the state to the result that takes its place."""
+    if row.name not in offset:
+        return write_state(row, c)
+    return copy_rows_out(row._replace(name=STATE[row.name]), offset[row.name], pitch(row.entries), c, team)
 
 
 def repeat_passes(ahead: str, a_pass: str, last: str, names: tuple[str, str, str], entries: int, T: type) -> str:

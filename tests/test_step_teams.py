@@ -18,6 +18,7 @@ from step_scenes import FORCES, TOLERANCE, H, furnished, states
 import warp_spo as spo
 from warp_spo.execution import plan, teams
 from warp_spo.kernels import straight
+from warp_spo.kernels.substeps import repeat_on_cuda
 from warp_spo.recursions.step import SHORT, Step, by_pieces
 
 WORLDS = 4
@@ -125,7 +126,7 @@ def test_what_stays_a_thread_a_world(device):
 
 
 # -- warps -------------------------------------------------------------------------------------------------------------
-def texts_of(monkeypatch, name, staged=False, **options):
+def texts_of(monkeypatch, name, staged=False, substeps=None, **options):
     """The CUDA text of a step by warps, a state, what the step should give, and how many passes each world needs."""
     for limit in ("FEW_WORLDS", "LONG_ROWS") if staged else ():
         monkeypatch.setattr(plan, limit, 0)
@@ -139,11 +140,13 @@ def texts_of(monkeypatch, name, staged=False, **options):
         del a["body_f"]  # long rows always come through shared memory
     rate, wide = (WORLDS, scene.dof_count), (WORLDS, scene.coord_count)
     shapes = {key: array.shape for key, array in a.items()} | {"dt": ()}
+    shapes |= {} if substeps is None else {"substeps": ()}
     more = {"q_out": wide} | ({"qdd_out": rate} if "qdd" in options else {})
     more |= {"status": (WORLDS,)} if "status" in options else {}
     program = dyn.programs.find(ROUTINES["step"], shapes, rate, more, **options)
     assert program.warps > 1 and texts[-1].frame.staged == staged
-    return texts[-1], a | {"dt": H}, symbolic.advance(scene, a, H)
+    numbers = {"dt": H} | ({} if substeps is None else {"substeps": substeps})
+    return texts[-1], a | numbers, symbolic.advance(scene, a, H)
 
 
 @pytest.mark.parametrize("staged", [False, True])
@@ -212,6 +215,33 @@ def test_passes_share_what_does_not_change(monkeypatch):
     assert "held_row[0] =" in before and "held_row[0]" in loop and "held_row[0] =" not in loop
     np.testing.assert_allclose(warp_machine.run(text, a, further={}), qd, rtol=0.0, atol=TOLERANCE["float64"])
     assert passes.max() > 1
+
+
+@pytest.mark.parametrize(("name", "staged"), [("hand", True), ("roots", False), ("still", False), ("driven", False)])
+def test_substeps_meet_at_barriers_alone(name, staged, monkeypatch):
+    """The state stays where warps share it; the last of several substeps gives what as many runs give."""
+    text, a, _ = texts_of(monkeypatch, name, staged, qdd=True, status=True, substeps=3)
+    assert text.frame.repeats and [row.name for row in text.frame.state] == ["q", "qd"]
+    looped = text._replace(cuda=repeat_on_cuda(text.cuda, True))
+    once, over = dict(a), {"q_out": "q", "out": "qd"}
+    for _ in range(3):
+        once["qd"] = warp_machine.run(looped, once | {"substeps": 1}, further=(wanted := {}), over=over)
+        once["q"] = wanted["q_out"]
+    for backwards in (False, True):
+        more = {}
+        got = warp_machine.run(looped, a, backwards, more, over)
+        np.testing.assert_array_equal(got, once["qd"])
+        for key in ("q_out", "qdd_out", "status"):
+            np.testing.assert_array_equal(more[key], wanted[key])
+
+
+@pytest.mark.parametrize("name", ["hand", "roots"])
+def test_a_substep_begins_behind_a_barrier(name, monkeypatch):
+    """Without it a limb reads the state, or a vote, while another still writes or reads it."""
+    text, a, _ = texts_of(monkeypatch, name, substeps=2)
+    with pytest.raises(warp_machine.Race):
+        looped = text._replace(cuda=repeat_on_cuda(text.cuda, False))
+        warp_machine.run(looped, a, further={}, over={"q_out": "q", "out": "qd"})
 
 
 # -- planted bugs ------------------------------------------------------------------------------------------------------

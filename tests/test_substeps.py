@@ -8,8 +8,11 @@ import zoo
 from actuated import CURVES, KINDS, arm, states
 from allocations import no_warp_allocation
 from mechanisms import MECHANISMS
+from step_scenes import furnished
+from step_scenes import states as step_states
 
 import warp_spo as spo
+from benchmarks.resources import record_launches
 
 H, COUNT = 2e-3, 3
 
@@ -45,6 +48,46 @@ def test_bits_are_those_of_calls(integrator, device):
             *dyn.step(*before, tau, H, substeps=COUNT - 1, **given), tau, H, qdd=np.empty_like(qdd), **given
         )
         np.testing.assert_allclose(qdd, (last[1] - dyn.step(*before, tau, H, substeps=2, **given)[1]) / H, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("granularity", "dtype"),
+    [("tree", "float32"), ("segment", "float32"), pytest.param("segment", "float64", marks=pytest.mark.slow)],
+)
+def test_one_launch_takes_them_all(granularity, dtype, device):
+    """Of a tree with all laws and forces, in as many launches as one step takes; another number compiles nothing."""
+    scene, worlds = furnished(zoo.fork()), 35  # more than a warp has threads
+    dyn = spo.Dynamics(scene, worlds, device=device, dtype=dtype, granularity=granularity)
+    a = {name: array.astype(dtype) for name, array in step_states(scene, worlds, dtype).items()}
+    a["q"][1, 0], a["tau"][2, -1] = np.nan, np.inf
+    given = {name: a[name] for name in ("body_f", "target_q", "target_qd")}
+    word, qdd = np.full(worlds, -1, np.int32), np.full(a["qd"].shape, np.nan, dtype)
+    given |= {"status": word, "qdd": qdd}
+    for count in (2, COUNT, COUNT):
+        with record_launches() as launched:
+            found = dyn.step(a["q"], a["qd"], a["tau"], H, substeps=count, **given)
+    assert len(launched) == len(dyn.programs.described()) == 1
+    wanted, words = in_calls(dyn, a["q"], a["qd"], a["tau"], **(given | {"qdd": (last := np.full_like(qdd, np.nan))}))
+    for x, y in zip((*found, qdd), (*wanted, last), strict=True):
+        np.testing.assert_array_equal(x, y)
+    severity = np.array([spo.Status(one).severity for one in range(len(spo.Status))])
+    np.testing.assert_array_equal(severity[word], np.max(severity[np.array(words)], axis=0))
+    assert word[1] == word[2] == spo.Status.NOT_FINITE and np.isfinite(np.delete(wanted[1], (1, 2), 0)).all()
+    dyn.step(a["q"], a["qd"], a["tau"], H, substeps=COUNT, **given, out=(a["q"], a["qd"]))
+    np.testing.assert_array_equal(a["q"], wanted[0])
+    np.testing.assert_array_equal(a["qd"], wanted[1])
+
+
+def test_explain_says_how_many_launches():
+    scene = arm([KINDS["position"][0]])
+
+    def line(scene, **more):
+        return spo.Dynamics(scene, 1, "cpu", **more).explain().split("substeps     ")[1].split("\n")[0]
+
+    assert line(scene) == "one launch takes all of a semi-implicit step"
+    delayed = arm([spo.Actuator(0, delay=2)])
+    assert line(delayed).startswith("a launch each: delays of actuators count substeps, where ctrl is given; otherwise")
+    assert line(MECHANISMS["fourbar"](), loops="multipliers").startswith("a launch each: loops='multipliers'")
 
 
 @pytest.mark.parametrize("loops", ["embed", "multipliers"])

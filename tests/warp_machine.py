@@ -10,9 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+import warp_spo as spo
 from warp_spo.execution.programs import Programs
 from warp_spo.execution.teams import BARRIER
 from warp_spo.kernels.straight import BY_TABLE, IN_PLACE, TILED, KernelLayout
+from warp_spo.kernels.substeps import FENCE, SYNC
 
 NOBODY = (-1, -1)
 
@@ -128,7 +130,15 @@ def _sincos(x):
     return np.sin(x), np.cos(x)
 
 
+def _worst(substep, status, word):
+    """The most severe word; a state that an earlier substep lost is no input that is not finite."""
+    rank = np.array([spo.Status(one).severity for one in range(len(spo.Status))])
+    before, word = (np.asarray(status[0] if substep else word, int), np.asarray(word, int))
+    return np.where((rank[word] > rank[before]) & ((word != 2) | (before == 0)), word, before)
+
+
 FUNCTIONS = {
+    "worst": _worst,
     "where": np.where, "nan": np.nan, "infinity": np.inf, "reciprocal": lambda x: 1.0 / x, "sqrt": np.sqrt,
     "absolute": np.abs, "reduced": lambda x: x, "within_reach": lambda x: x,
     "FUSED_float": lambda a, b, c: a * b + c, "FUSED_double": lambda a, b, c: a * b + c,
@@ -149,6 +159,7 @@ FORMS = [
     (r"^const \w+\* (\w+) = table\.data \+ (.*);$", r"\1 = \2"),
     (r"^int (\w+)\[\d+\];$", r"\1 = {}"),
     (r"^on::(sincos\w*)\((\w+), (\w+), (\w+)\);$", r"\3, \4 = \1(\2)"),
+    (r"^if \(mine\) \{ const int word = (\w+); .* \}$", r"status_row[0] = worst(substep, status_row, \1)"),
     (r"^if \(mine\) (.*);$", r"\1"),
     (r"^(?:const )?(?:float|double) (\w+) = (.*) (>|!=|<) (.*) \? (.*) : (.*);$", r"\1 = where(\2 \3 \4, \5, \6)"),
     (r"^(?:const )?(?:float|double) (\w+ = .*);$", r"\1"),
@@ -161,18 +172,18 @@ def translated(cuda):
     """``def work(warp)``: the statements for CUDA in Python."""
     lines, depth = ["def work(warp):"], 1
     for line in map(str.strip, cuda.split("\n")):
-        if not line or line.startswith(("//", "#")):
+        if not line or line.startswith(("//", "#")) or line == FENCE:
             continue
         if line == "}":
             depth -= 1
             continue
-        if line == BARRIER:
+        if line in (BARRIER, SYNC):
             lines.append("    " * depth + "yield")
             continue
         loop = re.match(r"^for \(int (\w+) = 0; \w+ < (.*); \+\+\w+\) \{$", line)
         if loop:
-            count = loop[2].replace("(int)passes_row[0]", "int(passes_row[0])")
-            lines.append("    " * depth + f"for {loop[1]} in range({_chosen(count)}):")
+            count = re.sub(r"^\(int\)(.*)$", r"int(\1)", _chosen(loop[2]))
+            lines.append("    " * depth + f"for {loop[1]} in range({count}):")
             depth += 1
             continue
         branch = re.match(r"^(else )?(?:if \((.*)\) )?\{$", line)

@@ -310,6 +310,7 @@ class Dynamics:
             f"loops        {self._closures.explain()}",
             f"actuators    {actuators.explain(self)}",
             f"contacts     {contacts.explain(self)}",
+            f"substeps     {steps.explain(self)}",
             f"workspace    {memory:.1f} MiB so far",
         ]
         if self.plan.scan_reason:

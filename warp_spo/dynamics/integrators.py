@@ -12,6 +12,7 @@ from ..arrays import Call
 from ..errors import UnsupportedError
 from ..execution.routine import Routine
 from ..kernels import combination, loops
+from ..kernels.substeps import SUBSTEPS
 from ..recursions import coordinates, hinge_forces
 from ..recursions import step as recursion
 from ..recursions.contact import step as contact
@@ -62,13 +63,14 @@ def semi_implicit(
     status: wp.array | None = None,
     reports: dict[str, wp.array] | None = None,
     passes: int | None = None,
+    substeps: int = 1,
     **given: Any,
 ) -> None:
     """Launch the implicit step of order 1.
 
     Args:
         qdd, status: arrays to fill, see :meth:`Dynamics.step`; reports: others, by name. passes: of scenes with
-            contacts.
+            contacts. substeps: more than one only where :func:`several_launches` names no reason against it.
         given: forces and targets by name. With ``q_from``, ``qd_from`` the step starts from that state, while its sweep
             and the laws of its joints are evaluated at q, qd.
     """
@@ -78,6 +80,7 @@ def semi_implicit(
     if dyn.scene.dof_count == 0 and status is not None:
         launches.fill(status, 0)
     launch, more = dyn._engine.launch_routine, {"q_out": q_out, **asked}
+    given |= {SUBSTEPS: float(substeps)} if substeps > 1 else {}
     if dyn.scene.contacts:
         count = float(contact.PASSES if passes is None else passes)
         given |= {"passes": count, "reports": tuple(reports or ()), **option}
@@ -88,6 +91,24 @@ def semi_implicit(
         launch(EMBEDDED_STEP, qd_out, more, q=q, qd=qd, dt=dt, embedding=dyn.embedding, **given, **option)
     else:
         _step_under_multipliers(dyn, q_out, qd_out, asked, option, q=q, qd=qd, dt=dt, **given)
+
+
+def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool) -> str:
+    """Return why substeps take a launch each; "" if one kernel takes all of them.
+
+    Args:
+        acts: controls are given. delays: some are delayed.
+    """
+    if integrator != "semi_implicit":
+        return f"integrator={integrator!r} takes several"
+    if dyn.closed and dyn.embedding is None:
+        return "loops='multipliers' takes several"
+    if delays:
+        return "delays of actuators count substeps"
+    tendons = acts and any(len(actuator.hinges) > 1 for actuator in dyn.scene.actuators)
+    if tendons and not dyn.scene.values["body_mass"].all() and not dyn.closed and dyn.plan.of(STEP) == "segment":
+        return "limbs read each other's hinges last, for actuators of several hinges and links without mass"
+    return ""
 
 
 def _step_under_multipliers(

@@ -39,6 +39,7 @@ from .operation import (
 )
 from .samples import rotations
 
+MOST_FUSED = 1 << 20  # substeps in one kernel, to which their number is a number of the scene's dtype
 SEVERITY = [Status(word).severity for word in range(len(Status))]
 
 if TYPE_CHECKING:
@@ -229,7 +230,9 @@ def step(
         actuator_state: the buffers of :meth:`actuator_state`, which the step changes. Needed where actuators delay
             their controls; a scene without delays leaves them alone.
         substeps: how many steps of ``dt`` to take, with the same forces, targets and controls: to the bit what as many
-            calls compute, each on the state that the one before returned. The time that passes is substeps dt. Delays
+            calls compute, each on the state that the one before returned. The time that passes is substeps dt. One
+            launch takes all, and holds the state meanwhile; its number is no constant of the kernel. Other integrators,
+            loops="multipliers" and delays of actuators take launches for each substep, see :meth:`explain`. Delays
             count substeps. With a tensor that requires grad, every substep is recorded.
         passes: of a scene with contacts; None: 3. One is stable and coarse; more than three gain little, a shorter dt
             gains more.
@@ -282,12 +285,17 @@ def _launch(
     given: dict[str, Any],
     buffers: tuple[wp.array, wp.array] | None,
 ) -> None:
-    """Launch ``count`` steps, each on the state after the one before.
+    """Launch ``count`` steps, each on the state after the one before: one kernel, where it can take them all.
 
     Args:
         given: forces, targets, controls, and arrays to fill, by name. buffers: of delayed controls; None: no delays.
     """
     ctrl, status = given.pop("ctrl"), given.get("status")
+    several = integrators.several_launches(dyn, integrator, ctrl is not None, buffers is not None)
+    if 1 < count <= MOST_FUSED and not several:
+        ctrl = ctrl if dyn.scene.actuators else None
+        INTEGRATORS[integrator](dyn, call, interval, **given, ctrl=ctrl, substeps=count)
+        return
     force = given.get("reports", {}).get("contact_f") if count > 1 else None
     if force is not None:
         given["reports"]["contact_f"] = dyn.recursions.array("contact force", *force.shape)
@@ -302,6 +310,17 @@ def _launch(
         if substep and status is not None:
             dyn.recursions.launch(combination.worst, dyn.worlds, [SEVERITY, dyn._later_status], [status])
         interval = interval._replace(q=interval.q_out, qd=interval.qd_out)
+
+
+def explain(dyn: Dynamics) -> str:
+    """Return a line on the substeps of a step."""
+    why = integrators.several_launches(dyn, "semi_implicit", False, False)
+    acting = integrators.several_launches(dyn, "semi_implicit", True, actuators.delays_controls(dyn))
+    if acting and not why:
+        why, otherwise = f"{acting}, where ctrl is given", "; otherwise one launch takes all"
+    else:
+        otherwise = ""
+    return f"a launch each: {why}{otherwise}" if why else "one launch takes all of a semi-implicit step"
 
 
 INTEGRATE = Operation(

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from ..kernels import straight
 from ..kernels.straight import DIRECT, RELAYED, TILED, KernelLayout
+from ..kernels.substeps import SUBSTEPS
 from ..recursions.contact.secants import SECANT
 from ..recursions.messages import INWARD, OUTWARD
 from ..recursions.step import GUESS, LOOPED, MISSED
-from ..trace.emission import PREFIX, Emitter, RangeReduction
+from ..status import Status
+from ..trace.emission import C_TYPE, PREFIX, Emitter, RangeReduction
 from . import staging
 from .staging import FIELDS
 from .teams import HELD
+
+_SEVERITIES = hex(sum(word.severity << (4 * word) for word in Status)) + "ull"
+_SEVERITY = f"({_SEVERITIES} >> 4 * {{}} & 15)".format
+_IS_WORSE = (  # as kernels.combination.worst: a state that an earlier substep lost is no input that is not finite
+    f"!substep || ({_SEVERITY('word')} > {_SEVERITY('status_row[0]')} && "
+    f"(word != {Status.NOT_FINITE:d} || !status_row[0]))"
+)
 
 
 def make_emitter(dtype: str, shapes: dict, layout: KernelLayout) -> Emitter:
@@ -48,6 +57,11 @@ def make_emitter(dtype: str, shapes: dict, layout: KernelLayout) -> Emitter:
             return f"{'if (open) ' if array == GUESS else ''}{load(array, entry)} = {value};"
         if array == "out" and result.way == TILED:
             return f"if (mine) result_row[({entry}) * {straight.TILE}] = {value};"
+        if layout.repeats and array == "status":
+            return f"if (mine) {{ const int word = {value}; if ({_IS_WORSE}) status_row[0] = word; }}"
+        if layout.repeats and array == "contact_f":  # the mean over substeps
+            before, share = f"substep ? {array}_row[{entry}] : 0", f"1 / {SUBSTEPS}_row[0]"
+            return f"if (mine) {array}_row[{entry}] = FUSED_{C_TYPE[dtype]}({value}, {share}, {before});"
         if array == "out":
             return f"{guard}result_row[{entry}] = {value};"
         return f"if (mine) {array}_row[{entry}] = {value};"

@@ -17,6 +17,7 @@ from ..kernels.fields import axes
 from ..kernels.native import INTEGERS
 from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout
+from ..kernels.substeps import SUBSTEPS
 from ..recursions import messages
 from ..recursions.contact.ground import GROUND
 from ..recursions.contact.secants import SECANT
@@ -389,4 +390,5 @@ class Programs:
 def _title(key: tuple) -> str:
     """Return what the user calls the computation of a program."""
     routine, inputs, _, _, *options = key
-    return routine.name if routine.title is None else routine.title(inputs, *options)
+    title = routine.name if routine.title is None else routine.title(inputs, *options)
+    return f"{title} of substeps" if f"{SUBSTEPS}, a number" in inputs else title

@@ -21,6 +21,7 @@ from ..kernels.straight import (
     KernelLayout,
     Result,
 )
+from ..kernels.substeps import SUBSTEPS
 from ..recursions.links import TABLES
 from ..scene.actuators import ACTUATOR_VALUES
 from ..scene.contacts import CONTACT_VALUES
@@ -68,7 +69,7 @@ def choose_layout(
     """
     used = read_entries(everything)
     rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used and shape]
-    numbers = tuple(name for name, shape in shapes.items() if name in used and not shape)
+    numbers = tuple(name for name, shape in shapes.items() if (name in used or name == SUBSTEPS) and not shape)
     out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
     dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
     read_by_others = ["q", "body_f", "ctrl"]  # entries that another piece than the one that writes them may read last
@@ -89,6 +90,8 @@ def choose_layout(
         ways = [(staged, mapped), (False, mapped), *ways]
         if relays and _may_write_early(rows, out):
             ways.insert(-1, (False, Result(RELAYED, out, slots=slots)))
+    if SUBSTEPS in shapes:
+        ways = [(way, Result(IN_PLACE, out, "qd")) for way in sorted({staged, False}, reverse=True)]
     if tiled:
         ways = [(way, Result(TILED, out, slots=slots)) for way in sorted({staged, False}, reverse=True)]
     other_results = tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in further)
@@ -105,6 +108,7 @@ def choose_layout(
             further_staged=together,
             cached=entries,
             numbers=numbers,
+            repeats=SUBSTEPS in shapes,
         )
         for staged, result in ways
         for together in ((True, False) if other_results and result.way in (IN_PLACE, STAGED) else (False,))
