@@ -12,6 +12,7 @@ import warp_spo as spo
 from warp_spo.dynamics.integrators import CONTACT_STEP
 from warp_spo.execution import plan, teams
 from warp_spo.kernels import straight
+from warp_spo.kernels.substeps import repeat_on_cuda
 from warp_spo.recursions.contact import points, step
 from warp_spo.recursions.contact.step import REPORTS
 from warp_spo.recursions.tracing import Trace
@@ -29,7 +30,7 @@ def case(name):
     return scene, states(scene, WORLDS)
 
 
-def text_of(monkeypatch, name, staged=False):
+def text_of(monkeypatch, name, staged=False, **numbers):
     """The CUDA text of a step with all reports, a state, and what the step by a whole tree gives."""
     for limit in ("FEW_WORLDS", "LONG_ROWS") if staged else ():
         monkeypatch.setattr(plan, limit, 0)
@@ -39,13 +40,13 @@ def text_of(monkeypatch, name, staged=False):
         a.pop("body_f", None)  # long rows always come through shared memory
     dyn = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="segment")
     rate, count = (WORLDS, scene.dof_count), len(scene.contact_points)
-    shapes = {key: array.shape for key, array in a.items()} | {"dt": (), "passes": ()}
+    shapes = {key: array.shape for key, array in a.items()} | {"dt": (), "passes": (), **dict.fromkeys(numbers, ())}
     more = {"q_out": (WORLDS, scene.coord_count), "qdd_out": rate, "status": (WORLDS,)}
     more |= {key: (WORLDS, count, *size) for key, size in SIZES.items()} | {"contact_excess": (WORLDS, 3)}
     options = dict(reports=REPORTS, qdd=True, status=True)
     program = dyn.programs.find(CONTACT_STEP, shapes, rate, more, **options)
     assert program.warps > 1 and texts[-1].frame.staged == staged
-    return texts[-1], a | {"dt": H, "passes": 3.0}, symbolic.contact_step(scene, a, H)
+    return texts[-1], a | {"dt": H, "passes": 3.0, **numbers}, symbolic.contact_step(scene, a, H)
 
 
 def assert_alike(got, more, wanted):
@@ -64,6 +65,23 @@ def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
     for backwards in (False, True):
         for over in (None, {"q_out": "q", "out": "qd"}):
             assert_alike(warp_machine.run(text, a, backwards, more := {}, over), more, wanted)
+
+
+def test_substeps_meet_at_barriers_alone(monkeypatch):
+    """State, reports and the mean force of two substeps are those of two runs, to the bit."""
+    text, a, _ = text_of(monkeypatch, "quadruped", substeps=2)
+    text, over = text._replace(cuda=repeat_on_cuda(text.cuda, True)), {"q_out": "q", "out": "qd"}
+    once, forces = a | {"substeps": 1}, []
+    for _ in range(2):
+        once["qd"] = warp_machine.run(text, once, further=(wanted := {}), over=over)
+        once["q"] = wanted["q_out"]
+        forces.append(wanted["contact_f"])
+    wanted["contact_f"] = 0.5 * forces[1] + 0.5 * forces[0]
+    assert np.abs(forces[1] - forces[0]).max() > 1.0
+    for backwards in (False, True):
+        np.testing.assert_array_equal(warp_machine.run(text, a, backwards, more := {}, over), once["qd"])
+        for name, array in wanted.items():
+            np.testing.assert_array_equal(more[name], array, err_msg=name)
 
 
 def test_neighbours_change_nothing(monkeypatch):

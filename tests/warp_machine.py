@@ -208,6 +208,7 @@ def _statement(line):
         if re.match(form, line):
             line = re.sub(form, python, line)
             break
+    line = re.sub(r"\bsubstep \? (.*) : 0\)", r"\1 if substep else 0)", line)
     line = re.sub(r"\((?:float|double)\)", "", line).replace("on::", "")
     line = re.sub(r"(?<![\w.])(\d+\.?\d*(?:e[-+]?\d+)?)f\b", r"\1", line)
     line = re.sub(r"FIELD\((\w+), ([^()]*)\)", r"\1[\2]", line)
