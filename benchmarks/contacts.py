@@ -1,6 +1,7 @@
 """Steps of Go2 and G1 on a plane and on a height field: time of a step, and errors against float64.
 
-    python -m benchmarks.contacts [--device cuda:0] [--worlds 4096 65536] [--json FILE]
+    python -m benchmarks.contacts [--device cuda:0] [--worlds 4096 65536] [--granularity tree segment]
+                                  [--dtype float32 float64] [--ground plane field none] [--json FILE]
 
 Go2 has a sphere at each foot and the trunk's eight corners; G1 four points at each sole and ten points on its body.
 Drives hold the joints with effort limits; worlds stand on the ground in different states, dt is 5 ms, three passes.
@@ -9,9 +10,11 @@ Drives hold the joints with effort limits; worlds stand on the ground in differe
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -24,6 +27,7 @@ from .capabilities import SETS, measure_time
 
 DT = 5e-3
 SAMPLE = 4  # worlds that are compared with the dense step
+GROUNDS: dict[str, dict] = {"plane": {}, "field": {"field": True}, "none": {"contacts": False}}
 GO2_STAND = np.array([0.0, 0.8, -1.5] * 4)
 SOLE = [(x, y, -0.03) for x in (-0.05, 0.12) for y in (-0.03, 0.03)]
 
@@ -63,21 +67,35 @@ def states(one: spo.Scene, worlds: int, seed: int) -> tuple[np.ndarray, np.ndarr
     return q.astype(np.float32), (0.3 * rng.normal(size=(worlds, n))).astype(np.float32)
 
 
-def subject(robot: str, worlds: int, device: wp.Device, field: bool = False) -> tuple[spo.Dynamics, list]:
-    """Return a robot on the ground, a plane or rough ground of 2 cm, and the states of its sets of inputs."""
+def subject(
+    robot: str, worlds: int, device: wp.Device, field: bool = False, contacts: bool = True, **options: Any
+) -> tuple[spo.Dynamics, list]:
+    """Return a robot on the ground, a plane or rough ground of 2 cm, and the states of its sets of inputs.
+
+    ``contacts``: False leaves the ground out, and keeps the states. ``options``: of the Dynamics.
+    """
     one = scene(robot)
-    sets = [[wp.array(x, dtype=wp.float32, device=device) for x in states(one, worlds, seed)] for seed in range(SETS)]
+    dtype = wp.dtype_from_numpy(np.dtype(options.get("dtype", "float32")))
+    sets = [[wp.array(x, dtype=dtype, device=device) for x in states(one, worlds, seed)] for seed in range(SETS)]
     if field:
         one = one.with_contacts(one.contacts, spo.terrain.rough((16.0, 16.0), 0.1, 0.02))
-    return spo.Dynamics(one, worlds, device), sets
+    return spo.Dynamics(one if contacts else one.with_contacts([]), worlds, device, **options), sets
 
 
-def measure(robot: str, worlds: int, device: wp.Device, field: bool = False) -> dict[str, float]:
-    """Return ``us`` of a step, and its errors against the dense step: of velocities, and of forces over the weight."""
-    dyn, sets = subject(robot, worlds, device, field)
+def measure(
+    robot: str, worlds: int, device: wp.Device, field: bool = False, contacts: bool = True, **options: Any
+) -> dict[str, Any]:
+    """Return ``us`` of a step, and its errors against the dense step: of velocities, and of forces over the weight.
+
+    ``contacts``: False measures the time of the step without ground, where drives and limits settle in passes.
+    """
+    dyn, sets = subject(robot, worlds, device, field, contacts, **options)
     out, (q, qd) = tuple(wp.empty_like(x) for x in sets[0]), sets[0]
-    found = {"us": measure_time(lambda i: dyn.step(*sets[i], None, DT, out=out), device)}
-    force = wp.empty((worlds, len(dyn.scene.contact_points), 3), dtype=wp.float32, device=device)
+    found: dict[str, Any] = {"us": measure_time(lambda i: dyn.step(*sets[i], None, DT, out=out), device)}
+    found["kernel"] = dyn.programs.described()[0]
+    if not contacts:
+        return found
+    force = wp.empty((worlds, len(dyn.scene.contact_points), 3), dtype=q.dtype, device=device)
     after = dyn.step(q, qd, None, DT, contact_f=force)[1].numpy()
     weight, start = 9.81 * dyn.scene.values["body_mass"].sum(), [x.numpy().astype(np.float64) for x in (q, qd)]
     errors = []
@@ -88,7 +106,7 @@ def measure(robot: str, worlds: int, device: wp.Device, field: bool = False) -> 
         errors.append((np.abs(after[w] - wanted.v).max() / np.abs(wanted.v).max(),
                        np.abs(force.numpy()[w] - forces).max() / weight))  # fmt: skip
     found["error"], found["force error"] = np.max(errors, axis=0).tolist()
-    return found | {"operations": dyn.operation_counts["contact_step"]}
+    return found
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -96,17 +114,22 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--device", default=None)
     parser.add_argument("--worlds", type=int, nargs="+", default=[4096, 65536])
     parser.add_argument("--robots", nargs="+", default=["go2", "g1"])
+    parser.add_argument("--granularity", nargs="+", default=["planned"], help="planned, tree, segment")
+    parser.add_argument("--dtype", nargs="+", default=["float32"])
+    parser.add_argument("--ground", nargs="+", choices=GROUNDS, default=["plane", "field"])
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     device, results = wp.get_device(options.device), {}
-    for robot in options.robots:
-        for worlds in options.worlds:
-            for field in (False, True):
-                name = f"{robot}, {worlds} worlds, {'height field' if field else 'plane'}"
-                results[name] = found = measure(robot, worlds, device, field)
-                print(name, "  ".join(f"{key} {value:.3g}" for key, value in found.items()), flush=True)
-    if options.json:
-        options.json.write_text(json.dumps(results, indent=1))
+    for dtype, robot, worlds, form, ground in itertools.product(
+        options.dtype, options.robots, options.worlds, options.granularity, options.ground
+    ):
+        name = f"{robot}, {worlds} worlds, ground: {ground}, {form}, {dtype}"
+        asked = dict(granularity=None if form == "planned" else form, dtype=dtype)
+        results[name] = found = measure(robot, worlds, device, **GROUNDS[ground], **asked)
+        figures = (f"{key} {value if isinstance(value, str) else format(value, '.3g')}" for key, value in found.items())
+        print(name, "  ".join(figures), flush=True)
+        if options.json:
+            options.json.write_text(json.dumps(results, indent=1))
     return 0
 
 
