@@ -25,6 +25,7 @@ from ..trace.scalars import Value, absolute, is_constant, less, reciprocal, sele
 from ..trace.spatial import total
 from .composite import mass_matrix
 from .links import Link, Links
+from .remembered import remembered
 from .tracing import Trace
 
 CREEP = 1e-4  # rate [rad/s, m/s] below which dry friction is a damper; it saturates at this rate
@@ -149,7 +150,6 @@ class Impedance:
         self.ahead = ahead or (lambda dof: h * qd(dof))
         self.target_q, self.target_qd = target_q or self._neutral, target_qd
         self.actuators = actuators or (lambda dof: [])
-        self._inertias: np.ndarray | None = None
 
     def laws(self, link: Link) -> list[list[Law]]:
         """Return all laws of each dof of a link; those without bounds come first, added up."""
@@ -212,9 +212,7 @@ class Impedance:
 
     def inertia(self, dof: int) -> float:
         """Return the inertia at a dof in the neutral configuration of world 0, all other dofs being free."""
-        if self._inertias is None:
-            self._inertias = neutral_inertias(self.scene)
-        return float(self._inertias[dof])
+        return float(neutral_inertias(self.scene)[dof])
 
     # -- laws ------------------------------------------------------------------------------------------------------
     def _damper(self, dof: int) -> list[Law]:
@@ -296,6 +294,7 @@ def is_number(x: Value, number: float) -> bool:
     return is_constant(x) and x == number
 
 
+@remembered
 def neutral_inertias(scene: Scene) -> np.ndarray:
     """Return 1 / diagonal of Mass^-1 at the neutral configuration of world 0 [dof]; of Mass where it is singular."""
     one = scene.with_values(**{name: array[:1] for name, array in scene.values.items()})

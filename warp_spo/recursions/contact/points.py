@@ -28,6 +28,7 @@ from ..composite import mass_matrix
 from ..kinematics import carried_velocity, frame_on_link, jacobian
 from ..links import Link, Links
 from ..motion import hinge_motion
+from ..remembered import remembered
 from ..tracing import Trace
 from .ground import directions, lowest, surfaces
 
@@ -151,6 +152,7 @@ def _with_ancestors(links: list[Link | None]) -> set[int]:
     return found
 
 
+@remembered
 def inverse_weights(scene: Scene) -> list[float]:
     """Return SLIP times the mean of J Mass^-1 J* over three directions, of each point, neutral, in world 0 [1/kg]."""
     one = scene.with_values(**{name: array[:1] for name, array in scene.values.items()})
