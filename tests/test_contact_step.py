@@ -158,6 +158,73 @@ def test_the_kernel_of_a_height_field(device):
         )
 
 
+def grounds():
+    """A plane, and a set of two fields, one with walls; each world's is moved, and worlds stand on different fields."""
+    sets = spo.HeightField(np.stack([FIELDS["stairs"].heights, 0.05 * np.random.default_rng(1).normal(size=(30, 20))]),
+                           (0.05, 0.08), FIELDS["stairs"].origin)  # fmt: skip
+    yield "plane", spo.Plane(0.1, np.array([0.6, 0.0, 0.8])), {}
+    yield "set", sets, {"ground_field": np.array([[0.0], [1.0], [1.0], [0.0]])}
+
+
+def on_grounds(ground, values):
+    """Return a scene whose worlds have grounds of their own, and states near them."""
+    scene = box(ground=ground)
+    moved = np.random.default_rng(4).uniform(-0.1, 0.1, (WORLDS, 3))
+    scene = scene.with_values(ground_origin=np.float64(np.float32(moved)), **values)
+    rng, q, qd = np.random.default_rng(5), np.zeros((WORLDS, 7)), np.random.default_rng(6).normal(size=(WORLDS, 6))
+    q[:, :2], q[:, 3:] = rng.uniform(-0.3, 0.3, (WORLDS, 2)), [0.1, 0.2, 0.0, 0.9]
+    for world in range(WORLDS):
+        for _ in range(2):
+            q[world, 2] += ContactStep(scene, q[world], qd[world], H, world=world).points.depth.max() - 5e-3
+    return scene, {"q": np.float64(np.float32(q)), "qd": np.float64(np.float32(qd))}
+
+
+@pytest.mark.parametrize("name, ground, values", list(grounds()))
+def test_grounds_of_worlds(name, ground, values, device):
+    """Each world's is where its values say: the kernel against the dense step, values folded or set at run time."""
+    scene, a = on_grounds(ground, values)
+    given = {part: scene.values[part] for part in ("ground_origin", *values)}
+    later = spo.Dynamics(box(ground=ground), WORLDS, device, variable=tuple(given))
+    later.set(**{part: np.float32(value) for part, value in given.items()})
+    for dyn in (spo.Dynamics(scene, WORLDS, device), later):
+        force = np.full((WORLDS, 8, 3), np.nan, np.float32)
+        _, qd = dyn.step(np.float32(a["q"]), np.float32(a["qd"]), None, H, contact_f=force)
+        assert (np.abs(force).sum(axis=(1, 2)) > 1.0).all()
+        for w in range(WORLDS):
+            at = ContactStep(scene, a["q"][w], a["qd"][w], H, world=w)
+            _, wanted = at.run()
+            np.testing.assert_allclose(qd[w], wanted.v, atol=2e-4 * np.abs(wanted.v).max())
+            np.testing.assert_allclose(force[w], by_point(at, wanted.f)[0], atol=1e-3 * np.abs(wanted.f).max())
+
+
+def test_a_ground_that_is_nowhere_leaves_other_worlds_alone(device):
+    """NaN origins make that world NaN; numbers beyond a set's end stay within the table."""
+    _, ground, values = list(grounds())[1]
+    scene, a = on_grounds(ground, values)
+    dyn = spo.Dynamics(scene, WORLDS, device, variable=("ground_origin", "ground_field"))
+    q, qd = np.float32(a["q"]), np.float32(a["qd"])
+    _, before = dyn.step(q, qd, None, H)
+    moved, field = np.float32(scene.values["ground_origin"]), np.float32(scene.values["ground_field"])
+    moved[1, 2], field[2], field[3] = np.nan, 7.0, np.nan
+    dyn.set(ground_origin=moved, ground_field=field)
+    status = np.zeros(WORLDS, np.int32)
+    _, after = dyn.step(q, qd, None, H, status=status)
+    assert np.isnan(after[1]).all() and status[1] == spo.Status.NOT_FINITE
+    assert (after[[0, 2]] == before[[0, 2]]).all() and np.isfinite(after[2]).all()
+
+
+@pytest.mark.parametrize("values, words", [
+    (dict(ground_field=[2.0]), r"ground_field holds 2 to 2; expected integers below 2"),
+    (dict(ground_field=[0.5]), r"expected integers below 2"),
+    (dict(ground_origin=[0.0, np.nan, 0.0]), r"ground_origin holds NaN or infinity"),
+    (dict(ground_origin=[0.0, 0.0]), r"ground_origin has shape \(2,\); expected \(3,\)"),
+])  # fmt: skip
+def test_a_ground_that_is_not_there_is_an_error(values, words):
+    scene = box(ground=list(grounds())[1][1])
+    with pytest.raises(ValueError, match=words):
+        scene.with_values(**values)
+
+
 BUGS = {
     "active set": (secants.Secant, "finish", "quotient(bound, share), 1.0", "0.0, 1.0"),
     "candidates frozen": (step.ContactStep, "_finish", "select(touch.candidate, touch.candidate, reached)",

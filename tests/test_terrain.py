@@ -105,3 +105,24 @@ def test_tiles_meet_and_grow_harder_by_row():
 def test_what_cannot_be_is_refused_by_name(call, words):
     with pytest.raises(ValueError, match=rf"terrain\.\w+: .*{words}"):
         call()
+
+
+def test_worlds_start_on_tiles():
+    """As many worlds on each kind; rows random up to the hardest; places are the tiles' origins."""
+    tiles = terrain.tiles(rows=4, columns=3, size=(3.0, 3.0), cell=0.1, seed=1)
+    rows, columns, places = tiles.starts(300, hardest=2, seed=5)
+    assert (np.bincount(columns) == 100).all() and set(rows.tolist()) == {0, 1, 2}
+    np.testing.assert_array_equal(places, tiles.origins[rows, columns])
+    np.testing.assert_array_equal(tiles.starts(300, hardest=2, seed=5)[0], rows)
+    for bad in (dict(worlds=0), dict(worlds=3, hardest=4), dict(worlds=3, hardest=-1)):
+        with pytest.raises(ValueError, match=r"Tiles.starts: (worlds|hardest) is"):
+            tiles.starts(**bad)
+
+
+def test_a_stack_holds_its_fields():
+    fields = [terrain.rough((3.0, 3.0), 0.1, seed=seed) for seed in range(3)]
+    ground = terrain.stack(fields)
+    assert ground.count == 3 and ground.cell == fields[0].cell and ground.origin == fields[0].origin
+    np.testing.assert_array_equal(ground.heights[2], fields[2].heights)
+    with pytest.raises(ValueError, match="2 fields of 2 kinds"):
+        terrain.stack([fields[0], terrain.rough((3.0, 4.0), 0.1)])

@@ -156,12 +156,14 @@ def _slip(n, x):
     return np.linalg.norm(x - _along(n, x)[:, None] * n, axis=1)
 
 
-def surfaces(field, at):
+def surfaces(field, at, number=0):
     """Return normal and depth of the surfaces of a height field near a point: the field's own, or a floor and a wall.
+
+    Of a set of fields it is that of this number.
 
     The second one, a wall, is there where the middle slope of the cell exceeds 1, and ends at the highest corner.
     """
-    h, place = field.heights, (at[:2] - field.origin[:2]) / field.cell
+    h, place = field.heights.reshape(-1, *field.heights.shape[-2:])[number], (at[:2] - field.origin[:2]) / field.cell
     place = np.clip(place, 0.0, np.array(h.shape) - 1.0)
     i, j = np.minimum(place.astype(int), np.array(h.shape) - 2)
     s, t = place - (i, j)
@@ -206,7 +208,8 @@ class ContactStep:
     def _points(self):
         """Return the points; one that may touch a wall and a floor is two, and ``numbers`` says of which point."""
         dense, ground, rows, self.numbers = self.dense, self.scene.ground, [], []
-        plane = not hasattr(ground, "heights")
+        plane, moved = not hasattr(ground, "heights"), dense.value("ground_origin")
+        field = dense.value("ground_field")
         inverse = np.linalg.pinv(self.neutral.mass_matrix)
         for number, point in enumerate(self.scene.contact_points):
             at = (dense.body_matrix[point.body] @ homogeneous([*point.position, 0, 0, 0, 1]))[:3, 3]
@@ -214,7 +217,10 @@ class ContactStep:
             there = self.neutral.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
             weight = SLIP * np.trace(there @ inverse @ there.T) / 3.0
             k, d, mu = (dense.value(f"contact_{name}")[number] for name in ("stiffness", "damping", "friction"))
-            touched = [(np.array(ground.normal), ground.height - at @ ground.normal)] if plane else surfaces(ground, at)
+            if plane:
+                touched = [(np.array(ground.normal), ground.height - (at - moved) @ ground.normal)]
+            else:
+                touched = surfaces(ground, at - moved, int(field[0]) if len(field) else 0)
             for normal, depth in touched:
                 J = dense._jacobian_at(point.body, at)[:3]
                 rows.append((J, normal, depth, k, d, mu, point.eps, weight))

@@ -18,7 +18,7 @@ from ..kernels.spatial import POSE, RIGID
 from ..kernels.topology import Topology
 from ..memory import broadcast_worlds
 from ..scene.actuators import ACTUATOR_VALUES
-from ..scene.contacts import CONTACT_VALUES
+from ..scene.contacts import CONTACT_VALUES, GROUND_VALUES
 from ..scene.scene import Scene
 from .node_functions import node_functions
 from .rows import as_rows, copy_rows
@@ -46,6 +46,7 @@ VARIABLE = (
     "gravity",
     *ACTUATOR_VALUES,
     *CONTACT_VALUES,
+    *GROUND_VALUES,
 )
 RIGID_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c")
 

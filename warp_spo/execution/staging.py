@@ -24,12 +24,12 @@ from ..kernels.straight import (
 from ..kernels.substeps import SUBSTEPS
 from ..recursions.links import TABLES
 from ..scene.actuators import ACTUATOR_VALUES
-from ..scene.contacts import CONTACT_VALUES
+from ..scene.contacts import CONTACT_VALUES, GROUND_VALUES
 from ..scene.parts import DOF_VALUES
 from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant, ordered
 
-FIELDS = (*TABLES, *DOF_VALUES, "joint_rest_q", *ACTUATOR_VALUES, *CONTACT_VALUES)
+FIELDS = (*TABLES, *DOF_VALUES, "joint_rest_q", *ACTUATOR_VALUES, *CONTACT_VALUES, *GROUND_VALUES)
 """Names of the values of the scene that kernels read as [entry, world]: tables of the links, and Newton's values."""
 SHORT_ROW = 36  # largest number of entries of a result that each thread writes directly
 LONG_ROW = 64  # largest number of entries of a result whose zeros and repeated values take room in shared memory

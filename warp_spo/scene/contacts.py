@@ -14,6 +14,8 @@ from .storage import Stored, StoredPart
 
 CONTACT_VALUES = ("contact_friction", "contact_stiffness", "contact_damping")
 """Names of a scene's values that come from its contacts, one entry a point."""
+GROUND_VALUES = ("ground_origin", "ground_field")
+"""Names of a scene's values that come from its ground."""
 SINK = 1.7e-3  # how far a robot sinks in [m] that rests on its points, where the stiffness is chosen
 RESTS = 4  # points at most on which a robot rests
 STANCE = 2  # bodies at most whose points, up to RESTS each, carry a robot
@@ -49,10 +51,11 @@ class HeightField(StoredPart):
     """Ground whose height over x and y is given on a grid, bilinear between its points.
 
     Point (i, j) of the grid lies at x = origin[0] + i cell, y = origin[1] + j cell, inertial axes. Beyond its edges the
-    field goes on as it is at the edge.
+    field goes on as it is at the edge. A set of fields of one size has a first axis more: world w stands on the field
+    ``ground_field[w]`` of the scene's values.
 
     Args:
-        heights: [m], shape (points along x, points along y), two or more each.
+        heights: [m], shape (points along x, points along y), two or more each; or (fields, points along x, along y).
         cell: distance between neighbours [m], or one along x and one along y.
         origin: x and y of the point (0, 0) [m], and a height that is added to all [m] if there are three numbers.
 
@@ -66,14 +69,15 @@ class HeightField(StoredPart):
 
     def __post_init__(self) -> None:
         shape = np.shape(self.heights)
-        if len(shape) != 2 or min(shape) < 2:
+        if len(shape) not in (2, 3) or min(shape[-2:]) < 2 or shape[0] == 0:
             raise ValueError(
-                f"HeightField: heights has shape {shape}; expected (points along x, points along y), two or more each"
+                f"HeightField: heights has shape {shape}; expected (points along x, points along y), two or more each, "
+                "or (fields, points along x, points along y)"
             )
         heights = np.asarray(self.heights)
         if heights.dtype.kind == "f" and not np.isfinite(heights).all():
-            i, j = np.argwhere(~np.isfinite(heights))[0].tolist()
-            raise ValueError(f"HeightField: heights[{i}, {j}] is {heights[i, j]}; expected finite numbers")
+            place = np.argwhere(~np.isfinite(heights))[0].tolist()
+            raise ValueError(f"HeightField: heights{place} is {heights[tuple(place)]}; expected finite numbers")
         object.__setattr__(self, "heights", checked_array("HeightField", "heights [m]", self.heights, shape))
         sizes = (2,) if np.shape(self.cell) == (2,) else ()
         cell = checked_array("HeightField", "cell [m]", self.cell, sizes).tolist()
@@ -83,6 +87,11 @@ class HeightField(StoredPart):
         count = 3 if np.shape(self.origin) == (3,) else 2
         origin = checked_array("HeightField", "origin [m]", self.origin, (count,))
         object.__setattr__(self, "origin", (*origin.tolist(), 0.0)[:3])
+
+    @property
+    def count(self) -> int:
+        """Number of fields."""
+        return len(self.heights) if self.heights.ndim == 3 else 1
 
     @property
     def cells(self) -> tuple[float, float]:
@@ -284,6 +293,14 @@ def check_contacts(contacts: Sequence[Contact], ground: Any, bodies: Sequence[An
             raise UnsupportedError(f"Scene: {name}", "a contact of a body with modes", "put it on a rigid body")
 
 
+def check_field(call: str, name: str, array: np.ndarray, ground: Any) -> None:
+    """Raise ValueError unless ``ground_field`` holds numbers of fields."""
+    if name == "ground_field" and array.size and not np.isin(array, np.arange(ground.count)).all():
+        raise ValueError(
+            f"{call}: {name} holds {array.min():g} to {array.max():g}; expected integers below {ground.count}"
+        )
+
+
 class Stand(Stored):
     """A scene in its neutral configuration, as the constants of contacts need it."""
 
@@ -311,9 +328,14 @@ class Stand(Stored):
 
 
 def contact_values(scene: Any) -> dict[str, np.ndarray]:
-    """Return the values of a scene that come from its contacts, [1, point] by name; what is None is chosen."""
+    """Return the values of a scene that come from its contacts, [1, point] by name, and from its ground.
+
+    What is None is chosen.
+    """
     points = scene.contact_points
     values = {name: np.zeros((1, len(points))) for name in CONTACT_VALUES}
+    sets = isinstance(scene.ground, HeightField) and scene.ground.heights.ndim == 3
+    values |= {"ground_origin": np.zeros((1, 3 if points else 0)), "ground_field": np.zeros((1, 1 if sets else 0))}
     if not points:
         return values
     stand = Stand(scene)

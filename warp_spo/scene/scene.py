@@ -22,6 +22,7 @@ from .contacts import (
     HeightField,
     Plane,
     check_contacts,
+    check_field,
     contact_points,
     contact_values,
 )
@@ -108,7 +109,8 @@ class Scene(Stored):
             joint_velocity_limit. Of actuators: actuator_gain, actuator_strength, actuator_delay [actuator],
             actuator_bias [actuator, 3], actuator_ctrl_range, actuator_force_range [actuator, 2], and actuator_gear, of
             the hinges of the first actuator, of the second, and so on. Of contacts: contact_friction,
-            contact_stiffness [N/m], contact_damping [N s/m] [point].
+            contact_stiffness [N/m], contact_damping [N s/m] [point]; ground_origin [3], where the ground's own origin
+            is [m], zero at first; ground_field [1], which field of a set of height fields, the first at first.
         contact_points: the points (``ContactPoint``) of all contacts, contact after contact; other
             calls mean them where axes say "contact".
         dof_axis: axis of each dof, in the parent anchor frame [dof, 3].
@@ -418,6 +420,7 @@ class Scene(Stored):
                 f"{', '.join(map(str, shape))})"
             )
         check_actuator_value(call, name, array)
+        check_field(call, name, array, self.ground)
         if name not in RANGES and not np.isfinite(array).all():
             raise ValueError(f"{call}: {name} holds NaN or infinity; expected finite numbers")
         if name in ("joint_X_p", "joint_X_c"):

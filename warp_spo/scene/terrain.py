@@ -9,7 +9,7 @@ cliff. A seed gives the same field in every process.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +33,26 @@ class Tiles(NamedTuple):
 
     field: HeightField
     origins: np.ndarray
+
+    def starts(
+        self, worlds: int, hardest: int | None = None, seed: int = 0
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return rows [world], columns [world] and places [world, 3] [m] at which worlds start.
+
+        Columns go round, so that each kind of tile has as many worlds as another; rows are random, up to ``hardest``.
+        A curriculum changes the rows and reads the places again, ``tiles.origins[rows, columns]``.
+
+        Args:
+            worlds: number of worlds. hardest: largest row; None: the last one. seed: of the random rows.
+        """
+        count, row = as_integer(worlds), len(self.origins) - 1 if hardest is None else as_integer(hardest)
+        if count is None or count < 1:
+            raise ValueError(f"Tiles.starts: worlds is {worlds!r}; expected an integer, 1 or more")
+        if row is None or not 0 <= row < len(self.origins):
+            raise ValueError(f"Tiles.starts: hardest is {hardest!r}; expected a row, 0 to {len(self.origins) - 1}")
+        rows = np.random.default_rng(seed).integers(0, row + 1, count)
+        columns = np.arange(count) % self.origins.shape[1]
+        return rows, columns, self.origins[rows, columns]
 
 
 def slope(size: Any = SIZE, cell: float = CELL, angle: float = 0.3, platform: float = PLATFORM) -> HeightField:
@@ -218,6 +238,21 @@ def tiles(
             origins[row, column] = *middle, made[near].max()
     origins.flags.writeable = False
     return Tiles(whole.field(heights), origins)
+
+
+def stack(fields: Sequence[HeightField]) -> HeightField:
+    """Return a set of fields, of which each world has one: ``ground_field`` of the scene's values says which.
+
+    Raises:
+        ValueError: the fields differ in the number of points, in their cells or in where they lie.
+    """
+    kinds = {(field.heights.shape, field.cells, field.origin) for field in fields}
+    if len(kinds) != 1 or fields[0].heights.ndim != 2:
+        raise ValueError(
+            f"terrain.stack: {len(fields)} fields of {len(kinds)} kinds (points, cells, origin): {sorted(kinds)[:3]}; "
+            "expected single fields that differ in their heights alone"
+        )
+    return HeightField(np.stack([field.heights for field in fields]), fields[0].cell, fields[0].origin)
 
 
 class _Grid:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...scene.contacts import HeightField, Plane
 from ...trace.scalars import Graph, Value, floor, less, lookup, reciprocal, select, sqrt
-from ...trace.spatial import IDENTITY, Vector
+from ...trace.spatial import IDENTITY, Vector, dot
 
 STEEP = 1.0  # slope beyond which a cell is a wall and a floor
 AWAY = -1e3  # depth of a surface that is not there [m]; no step reaches so far
@@ -38,16 +38,27 @@ def lowest(ground: Plane | HeightField) -> int:
     return 0 if isinstance(ground, Plane) else 2
 
 
-def surfaces(graph: Graph, ground: Plane | HeightField, at: list[Value]) -> list[Surface]:
+class Place(NamedTuple):
+    """Where a world's ground is: by how much it is moved, inertial axes [m], and which field of a set it is."""
+
+    origin: Vector
+    field: Value
+
+
+def surfaces(graph: Graph, ground: Plane | HeightField, at: list[Value], place: Place) -> list[Surface]:
     """Return the surfaces near a point, whose place along each direction is ``at``."""
+    at = [a - dot(axis, place.origin) for a, axis in zip(at, directions(ground), strict=True)]
     if isinstance(ground, Plane):
         return [Surface(Vector((1.0,)), ground.height - at[0])]
     x, y, z = at
-    rows, columns = ground.heights.shape
+    rows, columns = ground.heights.shape[-2:]
     rate_x, rate_y = (1.0 / cell for cell in ground.cells)
     i, s = _cell((x - ground.origin[0]) * rate_x, rows)
     j, t = _cell((y - ground.origin[1]) * rate_y, columns)
     first = i * float(columns) + j
+    if ground.count > 1:
+        field = floor(_between(place.field, ground.count - 1.0))
+        first = field * float(rows * columns) + first
     h00, h01, h10, h11 = (lookup(graph, GROUND, first, step) for step in (0, 1, columns, columns + 1))
     z = z - ground.origin[2]
     base, run, rise, twist = h00, h10 - h00, h01 - h00, h00 - h10 - h01 + h11
@@ -70,11 +81,16 @@ def surfaces(graph: Graph, ground: Plane | HeightField, at: list[Value]) -> list
 
 def _cell(x: Value, points: int) -> tuple[Value, Value]:
     """Return the cell of a place in cells, and how far in it the place is; the last cell beyond the edges."""
-    x = select(less(0.0, x), x, 0.0)
-    x = select(less(x, points - 1.0), x, points - 1.0)
+    x = _between(x, points - 1.0)
     cell = floor(x)
     cell = select(less(cell, points - 1.5), cell, points - 2.0)
     return cell, x - cell
+
+
+def _between(x: Value, most: float) -> Value:
+    """Return a number between zero and ``most``, so that no table is read beyond its end; NaN becomes zero."""
+    x = select(less(0.0, x), x, 0.0)
+    return select(less(x, most), x, most)
 
 
 def _facing(slope_x: Value, slope_y: Value) -> Vector:
@@ -88,6 +104,7 @@ def has_walls(ground: Plane | HeightField) -> bool:
     if isinstance(ground, Plane):
         return False
     h, (cell_x, cell_y) = ground.heights, ground.cells
-    twist = h[:-1, :-1] - h[1:, :-1] - h[:-1, 1:] + h[1:, 1:]
-    x, y = h[1:, :-1] - h[:-1, :-1] + 0.5 * twist, h[:-1, 1:] - h[:-1, :-1] + 0.5 * twist
+    low, right, far, corner = h[..., :-1, :-1], h[..., 1:, :-1], h[..., :-1, 1:], h[..., 1:, 1:]
+    twist = low - right - far + corner
+    x, y = right - low + 0.5 * twist, far - low + 0.5 * twist
     return bool((np.hypot(x, y * (cell_x / cell_y)) > STEEP * cell_x).any())

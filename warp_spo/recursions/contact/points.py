@@ -30,7 +30,7 @@ from ..links import Link, Links
 from ..motion import hinge_motion
 from ..remembered import remembered
 from ..tracing import Trace
-from .ground import directions, lowest, surfaces
+from .ground import Place, directions, lowest, surfaces
 
 if TYPE_CHECKING:
     from ..impedance import Impedance
@@ -89,6 +89,7 @@ def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value],
     scene = trace.links.scene
     ground, weights = scene.ground, inverse_weights(scene)
     assert ground is not None
+    place_of_ground = ground_place(impedance)
     seats = {number: frame_on_link(trace, point.body, point.position) for number, point in own_points(trace)}
     needed = _with_ancestors([link for link, _ in seats.values()])
     asked = directions(ground)
@@ -115,7 +116,7 @@ def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value],
         at[lowest(ground)] = at[lowest(ground)] - point.radius
         k, d, mu = (impedance.value(f"contact_{name}", number) for name in ("stiffness", "damping", "friction"))
         shape = k, d, mu, point.eps, weights[number], axes[carrier][-len(IDENTITY) :] if oriented else []
-        for normal, depth in surfaces(trace.graph, ground, at):
+        for normal, depth in surfaces(trace.graph, ground, at, place_of_ground):
             inward = Vector(total(n * axis[c] for n, axis in zip(normal, toward, strict=True)) for c in range(3))
             found.append(Point(number, on, arm, inward, depth, twists[carrier], *shape))
     return found
@@ -140,6 +141,13 @@ def own_points(trace: Trace) -> list[tuple[int, ContactPoint]]:
         each, first = len(shared) // len(sharers), sharers.index(piece)
         found += shared[first * each : (first + 1) * each]
     return found
+
+
+def ground_place(impedance: Impedance) -> Place:
+    """Return where the ground is, from the scene's values."""
+    sets = impedance.scene.values["ground_field"].size
+    origin = Vector(impedance.value("ground_origin", i) for i in range(3))
+    return Place(origin, impedance.value("ground_field", 0) if sets else 0.0)
 
 
 def _with_ancestors(links: list[Link | None]) -> set[int]:

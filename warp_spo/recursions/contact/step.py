@@ -26,7 +26,7 @@ from ..newton_euler import inverse_dynamics
 from ..pieces import Piece, Pieces
 from ..step import GAIN, Step
 from .dampers import SEVERAL, damper, load
-from .points import Point, own_points, place_points
+from .points import Point, ground_place, own_points, place_points
 from .secants import Kept, Secant, largest
 
 if TYPE_CHECKING:
@@ -285,10 +285,12 @@ class ContactStep(Step):
         return select(worst, worst, select(excess, Status.CONTACT, 0.0))
 
     def _inputs(self) -> list[Value]:
-        """Return all inputs, with those values of contacts that are no constants."""
+        """Return all inputs, with those values of contacts and of the ground that are no constants."""
         points = [number for number, _ in own_points(self.trace)]
         names = ("contact_friction", "contact_stiffness", "contact_damping")
         values = [self.impedance.value(name, point) for name in names for point in points]
+        place = ground_place(self.impedance)
+        values += [*place.origin, place.field]
         return super()._inputs() + [value for value in values if not is_constant(value)]
 
 
