@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from env_scenes import cart_env, walker_env
+from env_scenes import FEET, cart_env, walker_env
 
 import warp_spo as spo
+from warp_spo.env import TorchTerm, events, observations
 from warp_spo.kernels import native, philox
 
 FLOAT32 = 2e-6  # a few roundings of numbers of size one
@@ -155,3 +156,82 @@ def test_reset_of_chosen_worlds():
 def test_refusals(call, words):
     with pytest.raises((ValueError, TypeError), match=words):
         call()
+
+
+def test_terms_in_torch():
+    """A reward, a termination and an observation of the user's in torch are those of the same terms, traced."""
+    slow = TorchTerm(lambda env: env.qd[:, 0] ** 2, name="slow")
+    out = TorchTerm(lambda env: env.q[:, 0].abs() > 0.5, name="out")
+    state = TorchTerm(lambda env: torch.cat([env.q, env.qd], dim=1), size=4)
+    traced = cart_env()
+    rewards = {"up": (1.0, lambda w: np.cos(w.q[1])), "slow": (-0.1, slow)}
+    mixed = cart_env(rewards=rewards, terminations={"out": out}, observations={"actor": [state]})
+    for step in range(30):
+        given = 6.0 * torch.cos(torch.arange(8.0)[:, None] + 0.01 * step)
+        (a, ra, da, _), (b, rb, db, _) = traced.step(given), mixed.step(given)
+        assert a["actor"].equal(b["actor"]) and torch.allclose(ra, rb, atol=FLOAT32) and da.equal(db)
+    assert float(mixed.log()["/termination/out"]) > 0
+    wrong = cart_env(rewards={"x": (1.0, TorchTerm(lambda env: env.q, name="wide"))})
+    with pytest.raises(ValueError, match=r"the term wide returned \(8, 2\); expected a tensor \(8,\)"):
+        wrong.step(torch.zeros(8, 1))
+
+
+def pseudo_inertias(mass, com, inertia):
+    """Return the smallest eigenvalue of each body's 4 x 4 pseudo-inertia."""
+    spread = 0.5 * np.trace(inertia, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - inertia
+    spread = spread + mass[..., None, None] * com[..., :, None] * com[..., None, :]
+    whole = np.zeros((*mass.shape, 4, 4))
+    whole[..., :3, :3], whole[..., 3, 3] = spread, mass
+    whole[..., :3, 3] = whole[..., 3, :3] = mass[..., None] * com
+    return np.linalg.eigvalsh(whole)[..., 0]
+
+
+def test_randomised_values_are_those_of_the_dynamics():
+    changes = [
+        events.randomise("contact_friction", (0.3, 1.2), "set", FEET, alike=True),
+        events.pseudo_inertia("trunk", 0.2, 0.3, 0.1, 0.02),
+        events.randomise("joint_armature", (0.5, 2.0)),
+        events.randomise("actuator_gain", (0.8, 1.2), when="reset"),
+        events.delays((0, 3)),
+        events.encoder_bias(0.02),
+    ]
+    env = walker_env(
+        6, events=[events.joints((-0.1, 0.1)), *changes], observations={"a": [observations.joint_position()]}
+    )
+    friction = env.values["contact_friction"]
+    assert (friction[:, :4] == friction[:, :1]).all() and friction[:, 0].unique().numel() == 6
+    assert (friction >= 0.3).all() and (friction[:, :4] <= 1.2).all() and (friction[:, 4] == 0.8).all()
+    mass, com, inertia = (env.values[f"body_{name}"].double().numpy() for name in ("mass", "com", "inertia"))
+    assert (pseudo_inertias(mass, com, inertia) > 0).all() and np.ptp(mass[:, 0]) > 0.5 and np.ptp(mass[:, 1]) == 0
+    delay = env.values["actuator_delay"]
+    assert set(delay.unique().tolist()) <= {0.0, 1.0, 2.0, 3.0} and delay.unique().numel() > 1
+    gains, bias = env.values["actuator_gain"].clone(), env.memory("encoder bias").clone()
+    assert 0.01 < bias.abs().max() <= 0.02
+    names = tuple(env.values)
+    dyn = spo.Dynamics(env.scene, 6, "cpu", variable=names)
+    dyn.set(**env.values)
+    state, force = dyn.actuator_state(like=env.q, longest=3), torch.zeros(6, 5, 3)
+    q, qd = env.q.clone(), env.qd.clone()
+    for step in range(3):
+        given = torch.sin(torch.arange(48.0).view(6, 8) + step)
+        stand = torch.as_tensor(env.default_q[7:], dtype=torch.float32)
+        ctrl = (stand - bias + 0.25 * given).contiguous()
+        dyn.step(
+            q,
+            qd,
+            None,
+            5e-3,
+            ctrl=ctrl,
+            substeps=4,
+            actuator_state=state,
+            contact_f=force,
+            out=(q, qd),
+        )
+        observed, _, done, _ = env.step(given)
+        assert not done.any() and torch.allclose(env.q, q, atol=1e-5) and torch.allclose(env.qd, qd, atol=1e-3)
+        assert torch.allclose(observed["a"], env.q[:, 7:] + bias - stand, atol=FLOAT32)
+    env.reset(torch.tensor([True] * 2 + [False] * 4))
+    changed = (env.values["actuator_gain"] != gains).any(dim=1)
+    assert changed.tolist() == [True] * 2 + [False] * 4 and env.memory("encoder bias").equal(bias)
+    with pytest.raises(ValueError, match="two events change entry 0 of body_mass"):
+        walker_env(events=[events.randomise("body_mass", (0.9, 1.1)), events.pseudo_inertia("trunk")])

@@ -41,13 +41,24 @@ its first cause; see ``env.log()``. Other worlds do not notice.
 from typing import TYPE_CHECKING, Any
 
 from . import actions, commands, events, observations, rewards, terminations
-from .observations import Observation
+from .observations import Observation, TorchTerm
 from .world import World
 
 if TYPE_CHECKING:
     from .environment import Env
 
-__all__ = ["Env", "Observation", "World", "actions", "commands", "events", "observations", "rewards", "terminations"]
+__all__ = [
+    "Env",
+    "Observation",
+    "TorchTerm",
+    "World",
+    "actions",
+    "commands",
+    "events",
+    "observations",
+    "rewards",
+    "terminations",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..hinges.functions import clip
 from ..scene.scene import Scene
-from .world import Vector, find
+from .world import Vector, World, find
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -19,7 +19,8 @@ class Control:
     Args:
         actuators: regular expressions of labels; None: all. The order is the scene's.
         scale: one number, one for each actuator, or a dictionary of numbers by regular expression.
-        offset: the same; "default": where each actuator's hinge is in ``default_q``, for position servos.
+        offset: the same; "default": where each actuator's hinge is in ``default_q``, for position servos. A bias of the
+            hinge's encoder is then subtracted: the servo sees what the encoder reads.
         clip: (lowest, highest) action.
     """
 
@@ -31,35 +32,40 @@ class Control:
 
     def labels(self, scene: Scene) -> list[str]:
         """Return the names of the actions."""
-        return [_actuator_label(scene, i) for i in self.entries(scene)]
+        return [actuator_labels(scene)[i] for i in self.entries(scene)]
 
     def entries(self, scene: Scene) -> list[int]:
         """Return which entries of the array the actions set."""
         if not scene.actuators:
             raise ValueError("actions.Control: the scene has no actuators; use actions.Position or actions.Effort")
         every = range(len(scene.actuators))
-        labels = [_actuator_label(scene, i) for i in every]
+        labels = actuator_labels(scene)
         return list(every) if self.actuators is None else find("actions.Control", "actuator", labels, self.actuators)
 
-    def defaults(self, scene: Scene, default_q: np.ndarray) -> np.ndarray:
-        """Return the default coordinate of each action's hinge."""
+    def gears(self, scene: Scene) -> np.ndarray:
+        """Return the factor from each hinge's coordinate to its actuator's length."""
+        return np.array([scene.actuators[i].gear[0] for i in self.entries(scene)])
+
+    def hinges(self, scene: Scene) -> list[int]:
+        """Return the hinge of each action."""
         hinges = [scene.actuators[i].hinges for i in self.entries(scene)]
         if any(len(each) != 1 for each in hinges):
             raise ValueError("actions.Control: offset is 'default' with an actuator of several hinges; give numbers")
-        gears = np.array([scene.actuators[i].gear[0] for i in self.entries(scene)])
-        return gears * default_q[[int(scene.q_start[h[0]]) for h in hinges]]
+        return [each[0] for each in hinges]
 
-    def trace(self, scene: Scene, default_q: np.ndarray, action: Vector) -> list[tuple[int, Any]]:
+    def trace(self, w: World, action: Vector) -> list[tuple[int, Any]]:
         """Return (entry, value) of what the actions set."""
-        labels = self.labels(scene)
+        labels = self.labels(w.scene)
         scale = spread(type(self).__name__, "scale", self.scale, labels)
+        offset: Any
         if isinstance(self.offset, str) and self.offset == "default":
-            offset = self.defaults(scene, default_q)
+            at = [int(w.scene.q_start[hinge]) for hinge in self.hinges(w.scene)]
+            offset = self.gears(w.scene) * (w.default_q[at] - w.encoder_bias(self.hinges(w.scene)))
         else:
             offset = spread(type(self).__name__, "offset", self.offset, labels)
         limited = action if self.clip is None else [clip(x, *self.clip) for x in action]
-        values = [float(o) + float(s) * x for o, s, x in zip(offset, scale, limited, strict=True)]
-        return list(zip(self.entries(scene), values, strict=True))
+        values = [o + float(s) * x for o, s, x in zip(offset, scale, limited, strict=True)]
+        return list(zip(self.entries(w.scene), values, strict=True))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -77,7 +83,8 @@ class Position:
     clip: tuple[float, float] | None = None
     array = "target_q"
 
-    def _hinges(self, scene: Scene) -> list[int]:
+    def hinges(self, scene: Scene) -> list[int]:
+        """Return the hinge of each action."""
         single = [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == hinge.dof_count == 1]
         if self.joints is None:
             gains = scene.values["joint_target_ke"][0]
@@ -87,15 +94,15 @@ class Position:
 
     def labels(self, scene: Scene) -> list[str]:
         """Return the names of the actions."""
-        return [scene.joint_labels[i] for i in self._hinges(scene)]
+        return [scene.joint_labels[i] for i in self.hinges(scene)]
 
     def entries(self, scene: Scene) -> list[int]:
         """Return which entries of the array the actions set."""
-        return [int(scene.q_start[i]) for i in self._hinges(scene)]
+        return [int(scene.q_start[i]) for i in self.hinges(scene)]
 
-    def defaults(self, scene: Scene, default_q: np.ndarray) -> np.ndarray:
-        """Return the default coordinate of each action's joint."""
-        return default_q[[int(scene.q_start[i]) for i in self._hinges(scene)]]
+    def gears(self, scene: Scene) -> np.ndarray:
+        """Return the factor from each hinge's coordinate to its target."""
+        return np.ones(len(self.hinges(scene)))
 
     trace = Control.trace
 
@@ -112,14 +119,15 @@ class Effort(Position):
     offset: Any = 0.0
     array = "tau"
 
-    def _hinges(self, scene: Scene) -> list[int]:
+    def hinges(self, scene: Scene) -> list[int]:
+        """Return the hinge of each action."""
         if self.joints is None:
             return [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == hinge.dof_count == 1]
-        return super()._hinges(scene)
+        return super().hinges(scene)
 
     def entries(self, scene: Scene) -> list[int]:
         """Return which entries of the array the actions set."""
-        return [int(scene.qd_start[i]) for i in self._hinges(scene)]
+        return [int(scene.qd_start[i]) for i in self.hinges(scene)]
 
 
 def spread(call: str, name: str, value: Any, labels: list[str]) -> np.ndarray:
@@ -138,6 +146,7 @@ def spread(call: str, name: str, value: Any, labels: list[str]) -> np.ndarray:
     return np.broadcast_to(out, (len(labels),))
 
 
-def _actuator_label(scene: Scene, i: int) -> str:
-    label = scene.actuators[i].label
-    return label or "+".join(scene.joint_labels[hinge] for hinge in scene.actuators[i].hinges)
+def actuator_labels(scene: Scene) -> list[str]:
+    """Return the labels of the scene's actuators; those without one are named after their hinges."""
+    joints = scene.joint_labels
+    return [each.label or "+".join(joints[hinge] for hinge in each.hinges) for each in scene.actuators]

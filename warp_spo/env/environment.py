@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -12,8 +13,11 @@ import warp as wp
 from ..arrays import parse_device
 from ..dynamics.dynamics import Dynamics
 from ..scene.scene import Scene
+from ..torch import stream
+from .events import Delays, Values
+from .graphs import Part, Replay
 from .layout import Layout
-from .observations import Observation
+from .observations import Observation, TorchTerm
 from .stage import CHOSEN, COLUMN, INT, LONG, ROW, Buffer
 from .tracing import Tracing
 
@@ -58,6 +62,8 @@ class Env(VecEnv):
 
     Attributes:
         q, qd: state, torch tensors [world, coordinate] and [world, dof].
+        replay: runs a step without its inputs and results; ``replay.captured`` says of how many graphs it is made.
+        values: what events have made of the scene's values, torch tensors [world, ...] by name.
         dyn: the :class:`Dynamics`.
         num_envs, num_actions, num_obs, max_episode_length, episode_length_buf, device, cfg: as rsl_rl names them.
 
@@ -96,14 +102,12 @@ class Env(VecEnv):
         self.max_episode_length = max(1, round(episode_length_s / self.step_dt))
         self.seed, self.first_world, self.cfg = int(seed), int(first_world), {} if cfg is None else cfg
         self._passes, self.log_interval = passes, log_interval
-        self._graph_wanted = self.warp_device.is_cuda if graph is None else bool(graph) and self.warp_device.is_cuda
-        self._graph: Any = None
         self._steps = 0
 
         default = np.asarray(scene.neutral_q if default_q is None else default_q, dtype=np.float64)
         if default.shape != (scene.coord_count,):
             raise ValueError(f"Env: default_q has shape {default.shape}; expected ({scene.coord_count},) [coordinate]")
-        layout = self._layout = Layout(scene, default, self.step_dt, commands, ())
+        layout = self._layout = Layout(scene, default, self.step_dt, commands, _changed_values(scene, events))
         parts = list(actions) if isinstance(actions, list | tuple) else [actions]
         self.action_labels = [label for part in parts for label in part.labels(scene)]
         self.num_actions = layout.action_count = len(self.action_labels)
@@ -115,13 +119,18 @@ class Env(VecEnv):
         tracing.run(self.max_episode_length)
         self.reward_names, self.termination_names = list(rewards), tracing.ends
         self.num_obs = {name: len(values) for name, values in tracing.group_sizes.items()}
-        self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", granularity=granularity)
+        self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=layout.values, granularity=granularity)
         self._allocate(parts, tracing)
         stages = tracing.stages
         self._kernels = {
             name: stage.build(self._buffers, self.seed, self.first_world, self.warp_device)
             for name, stage in stages.items()
         }
+        self._launch("start")
+        self._set_values()
+        self._values_later = any(isinstance(event, Values) and event.when != "start" for event in events)
+        wanted = self.warp_device.is_cuda if graph is None else bool(graph) and self.warp_device.is_cuda
+        self.replay = Replay(self._parts(), wanted)
         self.reset()
 
     # -- arrays ----------------------------------------------------------------------------------------------------
@@ -167,6 +176,9 @@ class Env(VecEnv):
                 )
             self._actuator_force = zeros(worlds, scene.dof_count)
             buffers["actuator_force"] = Buffer(self._actuator_force)
+        if layout.users:
+            self._user = zeros(worlds, layout.user_size)
+            buffers["user"] = Buffer(self._user)
         self._frames = layout.frames
         if layout.frames:
             self._frame_pose = zeros(worlds, len(layout.frames), 7)
@@ -174,8 +186,15 @@ class Env(VecEnv):
             buffers["frame_pose"] = Buffer(self._frame_pose.view(worlds, -1))
             buffers["frame_velocity"] = Buffer(self._frame_velocity.view(worlds, -1))
         self._actuator_state = None
-        if "ctrl" in self._controls and any(actuator.delay for actuator in scene.actuators):
-            self._actuator_state = self.dyn.actuator_state(like=self.q)
+        delays = [int(each.delay) for each in scene.actuators]
+        delays += [event.longest for event in tracing.events if isinstance(event, Delays)]
+        if "ctrl" in self._controls and max(delays) > 0:
+            self._actuator_state = self.dyn.actuator_state(like=self.q, longest=max(delays))
+        self.values: dict[str, torch.Tensor] = {}
+        for name in layout.values:
+            own = torch.tensor(scene.values[name][0], dtype=torch.float32, device=self.device)
+            self.values[name] = own.expand(worlds, *own.shape).contiguous()
+            buffers[f"value_{name}"] = Buffer(self.values[name].view(worlds, -1))
         self._places: dict[str, tuple[int, int]] = {}
         at = 0
         for name, size in (("reward", 1), ("done", 1), ("time_out", 1), *self.num_obs.items()):
@@ -196,6 +215,11 @@ class Env(VecEnv):
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
         self._episode_length.copy_(value)
+
+    @property
+    def default_q(self) -> np.ndarray:
+        """The coordinates that episodes start from [coordinate]."""
+        return self._layout.default_q
 
     @property
     def unwrapped(self) -> Env:
@@ -230,9 +254,11 @@ class Env(VecEnv):
                     f"Env.reset: mask is {mask.dtype} {tuple(mask.shape)}; expected bool ({self.num_envs},) [world]"
                 )
             self.chosen.copy_(mask)
-        with self._stream():
-            self._launch("reset")
-            self._after_reset()
+        self._launch("reset")
+        self._after_reset()
+        for part in self._user_parts("observe"):
+            part.run()
+        self._launch("observe")
         return self.get_observations(), {}
 
     def step(self, actions: torch.Tensor) -> tuple[Any, torch.Tensor, torch.Tensor, dict]:
@@ -251,13 +277,7 @@ class Env(VecEnv):
                 f"[world, action]: {', '.join(self.action_labels)}"
             )
         self.actions.copy_(actions)
-        if self._graph is not None:
-            self._graph.replay()
-        elif self._graph_wanted and self._steps > 0:
-            self._graph = self._capture()
-            self._graph.replay()
-        else:
-            self._run()
+        self.replay()
         self._steps += 1
         out = self._out.clone()
         extras: dict[str, Any] = {"time_outs": self._part(out, "time_out").view(-1)}
@@ -295,53 +315,83 @@ class Env(VecEnv):
         """Return a context in which Warp launches on torch's current stream."""
         if not self.warp_device.is_cuda:
             return wp.ScopedDevice(self.warp_device)
-        return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.device)), sync_enter=False)
+        return wp.ScopedStream(stream(self.warp_device), sync_enter=False)
 
     def _launch(self, name: str) -> None:
         kernel = self._kernels[name]
         if kernel is not None:
-            kernel(self.num_envs)
+            with self._stream():
+                kernel(self.num_envs)
 
-    def _run(self) -> None:
-        with self._stream():
-            self._launch("act")
-            controls = self._controls
-            options: dict[str, Any] = dict(self._step_arrays)
-            if self._passes is not None:
-                options["passes"] = self._passes
-            if self._actuator_state is not None:
-                options["actuator_state"] = self._actuator_state
-            self.dyn.step(
-                self.q,
-                self.qd,
-                controls.get("tau"),
-                self.dt,
-                target_q=controls.get("target_q"),
-                ctrl=controls.get("ctrl"),
-                substeps=self.decimation,
-                out=(self.q, self.qd),
-                **options,
-            )
-            if "actuator_force" in self._buffers:
-                self.dyn.actuator_force(self.q, self.qd, controls["ctrl"], out=self._actuator_force)
-            self._find_frames("judge")
-            self._launch("judge")
-            self._after_reset()
+    def _parts(self) -> list[Part]:
+        """Return the parts of a step."""
+        after = [Part(lambda: self._after("judge")), *self._user_parts("judge")]
+        last = [Part(self._after_reset), *self._user_parts("observe"), Part(lambda: self._launch("observe"))]
+        return [Part(self._physics), *after, Part(lambda: self._launch("judge")), *last]
+
+    def _physics(self) -> None:
+        self._launch("act")
+        controls = self._controls
+        options: dict[str, Any] = dict(self._step_arrays)
+        if self._passes is not None:
+            options["passes"] = self._passes
+        if self._actuator_state is not None:
+            options["actuator_state"] = self._actuator_state
+        self.dyn.step(
+            self.q,
+            self.qd,
+            controls.get("tau"),
+            self.dt,
+            target_q=controls.get("target_q"),
+            ctrl=controls.get("ctrl"),
+            substeps=self.decimation,
+            out=(self.q, self.qd),
+            **options,
+        )
+        if "actuator_force" in self._buffers:
+            self.dyn.actuator_force(self.q, self.qd, controls["ctrl"], out=self._actuator_force)
+
+    def _set_values(self) -> None:
+        if self.values:
+            self.dyn.set(**self.values)
 
     def _after_reset(self) -> None:
+        if self._values_later:
+            self._set_values()
         if self._actuator_state is not None:
             self.dyn.reset_actuator_state(self.chosen, self._actuator_state)
-        self._find_frames("observe")
-        self._launch("observe")
+        self._after("observe")
 
-    def _find_frames(self, stage: str) -> None:
+    def _after(self, stage: str) -> None:
+        """Compute what a stage reads of the new state."""
         kernel = self._kernels[stage]
         if kernel is not None and kernel.reads_frames:
             self.dyn.frame_poses(self.q, self._frames, out=self._frame_pose)
             self.dyn.frame_velocities(self.q, self.qd, self._frames, out=self._frame_velocity)
 
-    def _capture(self) -> Any:
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            self._run()
-        return graph
+    def _user_parts(self, stage: str) -> list[Part]:
+        """Return the parts that fill in the numbers of the user's terms in torch that a stage reads."""
+        return [
+            Part(functools.partial(self._fill_in, term, start), term.name)
+            for term, (place, start) in self._layout.users.items()
+            if place == stage
+        ]
+
+    def _fill_in(self, term: TorchTerm, start: int) -> None:
+        found = term.function(self)
+        if not isinstance(found, torch.Tensor) or found.numel() != self.num_envs * term.size:
+            came = tuple(found.shape) if isinstance(found, torch.Tensor) else type(found).__name__
+            expected = (self.num_envs,) if term.size == 1 else (self.num_envs, term.size)
+            raise ValueError(f"Env: the term {term.name} returned {came}; expected a tensor {expected}")
+        self._user[:, start : start + term.size].copy_(found.reshape(self.num_envs, term.size))
+
+
+def _changed_values(scene: Scene, events: Sequence[Any]) -> tuple[str, ...]:
+    """Return the names of the values that events change; ValueError if one is none of a scene's."""
+    names = dict.fromkeys(name for event in events if isinstance(event, Values) for name in event.names)
+    for name in names:
+        if name not in scene.values:
+            raise ValueError(f"Env: an event changes {name!r}; expected one of {', '.join(scene.values)}")
+        if scene.values[name].shape[0] > 1:
+            raise ValueError(f"Env: an event changes {name}, which differs between worlds of the scene already")
+    return tuple(names)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from .world import World, cross, rotate, vector
+from .actions import actuator_labels
+from .world import World, cross, find, vector
 
 Range = tuple[float, float]
 
@@ -35,6 +36,45 @@ class Interval:
 
     change: Callable[[World], None]
     seconds: Range = (1.0, 3.0)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Values:
+    """A function that changes values of the scene in a world, such as masses and friction; nothing is compiled anew.
+
+    Args:
+        names: of the values that it changes, of those that ``Dynamics`` takes as ``variable``.
+        change: function of a :class:`World` that assigns to entries of ``w.values[name]``, which are the scene's own
+            numbers before; arrays [...] in Newton's layout.
+        when: "start": once, when the environment is made. "reset": at each start of an episode. Or the range of the
+            time from one change to the next [s].
+    """
+
+    names: tuple[str, ...]
+    change: Callable[[World], None]
+    when: str | Range = "start"
+
+    def __post_init__(self) -> None:
+        if isinstance(self.when, str) and self.when not in ("start", "reset"):
+            raise ValueError(f"events.Values: when is {self.when!r}; expected 'start', 'reset' or a range of seconds")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Start:
+    """A function that keeps what a world remembers for good, with ``w.keep``, when the environment is made.
+
+    Args:
+        change: function of a :class:`World`.
+    """
+
+    change: Callable[[World], None]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class EncoderBias(Start):
+    """See :func:`encoder_bias`."""
+
+    names: Any = None
 
 
 def joints(position: Range = (0.0, 0.0), velocity: Range = (0.0, 0.0), names: Any = None) -> Reset:
@@ -111,10 +151,146 @@ def push(
     return Interval(change, seconds)
 
 
+def randomise(
+    name: str,
+    span: Range | Sequence[Range],
+    how: str = "scale",
+    names: Any = None,
+    when: str | Range = "start",
+    alike: bool = False,
+) -> Values:
+    """Return an event that draws a value of the scene anew: the scene's own number times, plus, or replaced by a draw.
+
+    Args:
+        name: of the value, such as "body_mass", "contact_friction", "joint_armature", "actuator_gain", "gravity".
+        span: (lowest, highest) of the uniform draw; one pair for each number along the value's last axis, if it has
+            one, such as three of "body_com" [m].
+        how: "scale", "add" or "set".
+        names: regular expressions of bodies for values of bodies and contacts (those of their points), of joints for
+            values of joints, of actuators for values of actuators; None: all.
+        when: see :class:`Values`.
+        alike: all entries get the same draw.
+    """
+    if how not in ("scale", "add", "set"):
+        raise ValueError(f"events.randomise: how is {how!r}; expected 'scale', 'add' or 'set'")
+    spans: list[Any] = list(span) if np.ndim(span) == 2 else [span]
+    combine = {"scale": lambda x, d: x * d, "add": lambda x, d: x + d, "set": lambda x, d: d}[how]
+
+    def change(w: World) -> None:
+        array = w.values[name]
+        rows = array.reshape(1, -1) if name == "gravity" else array.reshape(len(array), -1)
+        if len(spans) not in (1, rows.shape[1]):
+            raise ValueError(f"events.randomise: {name} has {rows.shape[1]} numbers an entry; span has {len(spans)}")
+        entries = [0] if name == "gravity" else entries_of(w.scene, name, names)
+        draws: list[Any] = []
+        for i, entry in enumerate(entries):
+            if i == 0 or not alike:
+                draws = [w.uniform(*each) for each in spans]
+            for j in range(rows.shape[1]):
+                rows[entry, j] = combine(rows[entry, j], draws[j if len(draws) > 1 else 0])
+        w.values[name] = rows.reshape(array.shape)
+
+    return Values((name,), change, when)
+
+
+def pseudo_inertia(
+    names: Any = None,
+    size: float = 0.1,
+    stretch: float = 0.1,
+    shear: float = 0.0,
+    shift: float = 0.0,
+    when: Any = "start",
+) -> Values:
+    """Return an event that draws mass, centre of mass and inertia anew, as some body of positive density has them.
+
+    The 4 x 4 pseudo-inertia J of a body becomes T J T^T with T = exp(a) [[diag(exp(d)) + s, t], [0, 1]] and a strictly
+    upper triangular s: the body's matter is scaled by exp(2 a), stretched, sheared and shifted (Rucker and Wensing
+    2022, "Smooth parameterization of rigid-body inertia").
+
+    Args:
+        names: regular expressions of bodies; None: all that have mass.
+        size: largest a. stretch: largest d. shear: largest entry of s. shift: largest entry of t [m].
+        when: see :class:`Values`.
+    """
+    changed = ("body_mass", "body_com", "body_inertia")
+
+    def change(w: World) -> None:
+        mass, com, inertia = (w.values[name] for name in changed)
+        for body in entries_of(w.scene, "body_mass", names):
+            m = float(w.scene.values["body_mass"][0][body])
+            if m <= 0.0:
+                continue
+            c, about = w.scene.values["body_com"][0][body], w.scene.values["body_inertia"][0][body]
+            spread = 0.5 * np.trace(about) * np.eye(3) - about + m * np.outer(c, c)
+            J = np.block([[spread, m * c[:, None]], [m * c[None], np.array([[m]])]])
+            T = np.zeros((4, 4), dtype=object)
+            for i in range(3):
+                T[i, i] = np.exp(w.uniform(-stretch, stretch)) if stretch else 1.0
+                T[i, 3] = w.uniform(-shift, shift) if shift else 0.0
+                for j in range(i + 1, 3):
+                    T[i, j] = w.uniform(-shear, shear) if shear else 0.0
+            T[3, 3] = 1.0
+            new = T @ J @ T.T * (np.exp(2.0 * w.uniform(-size, size)) if size else 1.0)
+            mass[body] = new[3, 3]
+            com[body] = vector(new[i, 3] / new[3, 3] for i in range(3))
+            central = new[:3, :3] - new[3, 3] * np.outer(com[body], com[body])
+            inertia[body] = (central[0, 0] + central[1, 1] + central[2, 2]) * np.eye(3) - central
+
+    return Values(changed, change, when)
+
+
+def delays(steps: tuple[int, int], when: str | Range = "start", names: Any = None, alike: bool = True) -> Values:
+    """Return an event that draws the delay of actuators anew, in steps of the dynamics, both ends included."""
+
+    def change(w: World) -> None:
+        for i, entry in enumerate(entries_of(w.scene, "actuator_delay", names)):
+            if i == 0 or not alike:
+                drawn = w.integer(*steps)
+            w.values["actuator_delay"][entry] = drawn
+
+    return Delays(("actuator_delay",), change, when, int(steps[1]))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Delays(Values):
+    """See :func:`delays`."""
+
+    longest: int = 0
+
+
+def encoder_bias(size: float = 0.015, names: Any = None) -> EncoderBias:
+    """Return an event that draws once what joints' encoders read beyond the truth, up to ``size`` [rad or m]."""
+
+    def change(w: World) -> None:
+        w.keep("encoder bias", [w.uniform(-size, size) for _ in w.joints(names)])
+
+    return EncoderBias(change, names)
+
+
+def entries_of(scene: Any, name: str, names: Any) -> list[int]:
+    """Return the entries of a value that regular expressions name; None: all."""
+    family = name.split("_")[0]
+    if family == "contact":
+        every = list(range(len(scene.contact_points)))
+        if names is None:
+            return every
+        bodies = find("events.randomise", "body", scene.body_labels, names)
+        return [i for i in every if scene.contact_points[i].body in bodies]
+    if family == "joint":
+        start, count = (
+            (scene.q_start, scene.coord_count) if name == "joint_rest_q" else (scene.qd_start, scene.dof_count)
+        )
+        if name in ("joint_X_p", "joint_X_c"):
+            start, count = np.arange(len(scene.hinges) + 1), len(scene.hinges)
+        if names is None:
+            return list(range(count))
+        hinges = find("events.randomise", "joint", scene.joint_labels, names)
+        return [i for hinge in hinges for i in range(int(start[hinge]), int(start[hinge + 1]))]
+    labels = scene.body_labels if family == "body" else actuator_labels(scene)
+    return list(range(len(labels))) if names is None else find("events.randomise", family, labels, names)
+
+
 def multiply(a: Any, b: Any) -> np.ndarray:
     """Return the product of two quaternions, xyzw: the rotation ``b``, then ``a``."""
     u = a[3] * vector(b[:3]) + b[3] * vector(a[:3]) + cross(a, b)
     return vector([*u, a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2]])
-
-
-__all__ = ["Interval", "Reset", "base", "joints", "multiply", "push", "rotate"]

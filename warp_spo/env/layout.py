@@ -14,7 +14,9 @@ class Layout:
 
     Attributes:
         memory: (start, size, value at a reset) of what worlds remember, by name. frames: that terms ask for.
+        biased: hinges whose encoders have a bias.
         sensors: (size, value at a reset, function that keeps it) of memory that each step brings up to date, by name.
+        users: (stage, start) of the numbers of each user's term in torch.
         values: names of the scene's values that differ between worlds.
     """
 
@@ -27,9 +29,12 @@ class Layout:
             values,
         )
         self.action_count = 0
+        self.biased: list[int] = []
         self.memory: dict[str, tuple[int, int, float | None]] = {}
         self.memory_size = 0
         self.frames: list[Any] = []
+        self.users: dict[Any, tuple[str, int]] = {}
+        self.user_size = 0
         self.sensors: dict[str, tuple[int, float | None, Any]] = {}
 
     def remember(self, name: str, size: int, reset: float | None) -> int:
@@ -40,6 +45,17 @@ class Layout:
         start, known, _ = self.memory[name]
         if known != size:
             raise ValueError(f"Env: memory {name!r} has {known} numbers; a term asks for {size}")
+        return start
+
+    def user(self, term: Any, stage: str) -> int:
+        """Return where the numbers of a user's term in torch are that a stage reads."""
+        place, start = self.users.setdefault(term, (stage, self.user_size))
+        if place != stage:
+            raise ValueError(
+                f"Env: the term {term.name} is read by {place} and {stage}; expected two TorchTerm objects"
+            )
+        if start == self.user_size:
+            self.user_size += term.size
         return start
 
     def frame(self, name: Any) -> int:

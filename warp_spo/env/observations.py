@@ -39,6 +39,29 @@ class Observation:
         return values if self.clip is None else vector(clip(x, *self.clip) for x in values)
 
 
+class TorchTerm:
+    """A term written in torch: a reward, a termination or an observation.
+
+    It runs after the dynamics, an observation after resets, and is captured in the step's graph. If it waits for the
+    device, as ``.item()``, ``nonzero`` and branches on tensors do, it runs between graphs, with a warning that names
+    it. In a graph, Python runs once: what the function does beside tensors is not repeated.
+
+    Args:
+        function: of the :class:`Env`, which returns a tensor [world] or [world, size], of any dtype. It must not change
+            the environment.
+        size: how many numbers it returns for each world.
+        name: in errors and warnings; None: the function's.
+    """
+
+    def __init__(self, function: Callable[[Any], Any], size: int = 1, name: str | None = None):
+        self.function, self.size = function, size
+        self.name = name or getattr(function, "__name__", type(function).__name__)
+
+    def __call__(self, w: World) -> Any:
+        """Return its numbers; of one number, as a termination, whether it is not zero."""
+        return w.user(self)
+
+
 def base_velocity(w: World) -> Vector:
     """Return the velocity of the base in its axes (3,) [m/s]."""
     return w.base_velocity
@@ -64,9 +87,9 @@ def last_action(w: World) -> Vector:
     return w.action
 
 
-def joint_position(names: Any = None) -> Term:
-    """Return the term of joints' coordinates relative to the default [rad or m]."""
-    return lambda w: w.joint_q(names) - w.joint_default(names)
+def joint_position(names: Any = None, biased: bool = True) -> Term:
+    """Return the term of joints' coordinates less the default [rad or m]; as encoders read them if ``biased``."""
+    return lambda w: (w.encoder_q(names) if biased else w.joint_q(names)) - w.joint_default(names)
 
 
 def joint_velocity(names: Any = None) -> Term:

@@ -1,7 +1,8 @@
-"""The stages of an environment's step, traced: act, judge, observe, and reset on request.
+"""The stages of an environment's step, traced: start, act, judge, observe, and reset on request.
 
-act: actions -> controls. judge: the state after the step -> rewards, ends of episodes, new starts, commands, events.
-observe: the state that the next actions see -> observations. reset: new starts of chosen worlds alone.
+start: what is drawn once. act: actions -> controls. judge: the state after the step -> rewards, ends of episodes, new
+starts, commands, events. observe: the state that the next actions see -> observations. reset: new starts of chosen
+worlds alone.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import numpy as np
 
 from ..hinges.functions import AbstractScalar, Condition, where
 from ..trace.scalars import Value, absolute, less
-from .events import Interval, Reset
+from .events import EncoderBias, Interval, Reset, Start, Values
 from .layout import Layout
 from .observations import Observation
 from .stage import Stage
@@ -51,10 +52,12 @@ class Tracing:
         self.layout, self.actions, self.groups = layout, actions, groups
         self.rewards, self.terminations, self.commands, self.events = rewards, terminations, commands, events
         for event in events:
-            if not isinstance(event, Reset | Interval):
+            if not isinstance(event, Reset | Interval | Values | Start):
                 raise TypeError(f"Env: events holds {event!r}; expected those of warp_spo.env.events")
+            if isinstance(event, EncoderBias):
+                layout.biased = World(layout, Stage("none", 0)).joints(event.names)
         self.ends = [*terminations, NOT_FINITE]
-        names = ("act", "judge", "observe", "reset")
+        names = ("act", "judge", "observe", "reset", "start")
         self.stages = {name: Stage(name, stream) for stream, name in enumerate(names)}
         self.group_sizes: dict[str, list] = {}
 
@@ -70,6 +73,7 @@ class Tracing:
         self._observe()
         self._close()
         self._reset()
+        self._first()
 
     # -- act -------------------------------------------------------------------------------------------------------
     def _act(self) -> None:
@@ -89,7 +93,7 @@ class Tracing:
         at = 0
         for part in self.actions:
             size = len(part.labels(w.scene))
-            for entry, value in part.trace(w.scene, self.layout.default_q, action[at : at + size]):
+            for entry, value in part.trace(w, action[at : at + size]):
                 stage.store(part.array, entry, plain(value))
             at += size
 
@@ -139,6 +143,7 @@ class Tracing:
         """Start worlds anew where ``done`` holds; let events happen and draw commands in the others."""
         stage = w._stage
         fresh = World(self.layout, stage)
+        fresh.before = w if intervals else None
         fresh.__dict__["q"] = vector(float(x) for x in self.layout.default_q)
         fresh.__dict__["qd"] = vector(0.0 for _ in range(w.scene.dof_count))
         for event in self.events:
@@ -163,6 +168,10 @@ class Tracing:
         for name, values in (("q", q), ("qd", qd)):
             for i, value in enumerate(values):
                 stage.store(name, i, plain(value))
+        for name, values in fresh.kept.items():
+            old = w.memory(name, len(values), reset=None)
+            w.keep(name, [where(done, a, b) for a, b in zip(values, old, strict=True)])
+        self._draw_values(w, done, intervals)
         if self.commands is not None:
             self._command(w, done, q, qd, intervals)
 
@@ -179,6 +188,46 @@ class Tracing:
         later.kept = w.kept
         given, updated = w.kept["command"], self.commands.update(later, w.kept["command"])
         w.keep("command", updated if intervals else [where(done, a, b) for a, b in zip(updated, given, strict=True)])
+
+    # -- values ----------------------------------------------------------------------------------------------------
+    def _draw_values(self, w: World, done: Condition, intervals: bool) -> None:
+        """Draw values of the scene anew, at resets and from time to time."""
+        for number, event in enumerate(each for each in self.events if isinstance(each, Values)):
+            if event.when == "reset":
+                self._store_values(w, event, done)
+            elif not isinstance(event.when, str) and intervals:
+                left = w.memory(f"until values {number}", 1, reset=None)[0] - self.layout.step_dt
+                due = left <= 0.0
+                self._store_values(w, event, due)
+                w.keep(f"until values {number}", [where(due, w.uniform(*event.when), left)])
+
+    def _store_values(self, w: World, event: Values, due: Condition | None) -> None:
+        """Store what an event makes of values where ``due`` holds; None: everywhere."""
+        drawn = World(self.layout, w._stage)
+        drawn.values = {name: w.scene.values[name][0].astype(object) for name in event.names}
+        event.change(drawn)
+        for name in event.names:
+            own = w.scene.values[name][0].ravel()
+            for i, value in enumerate(drawn.values[name].ravel()):
+                if isinstance(value, AbstractScalar) or value != own[i]:
+                    array = f"value_{name}"
+                    if any(item.array == array and item.index == (i,) for item in w._stage.stores):
+                        raise ValueError(f"Env: two events change entry {i} of {name}; expected one")
+                    old = w._scalar(array, i) if due is not None else 0.0
+                    w._stage.store(array, i, plain(value if due is None else where(due, value, old)))
+
+    def _first(self) -> None:
+        """Draw what is drawn once: values of the scene, and memory."""
+        stage = self.stages["start"]
+        stage.ticks = True
+        w = World(self.layout, stage)
+        for event in self.events:
+            if isinstance(event, Values):
+                self._store_values(w, event, None)
+            if isinstance(event, Start):
+                event.change(w)
+        for name, values in w.kept.items():
+            self._keep(w, name, values)
 
     # -- observe ---------------------------------------------------------------------------------------------------
     def _observe(self) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..hinges.functions import AbstractScalar, Condition, where
+from ..trace.scalars import floor, is_constant
 from .feet import Feet, feet
 from .stage import Stage
 
@@ -95,6 +96,8 @@ class World:
             [m]. contact_slip: [point], speed along the ground [m/s]. Points are those of ``scene.contact_points``.
         time: since the last reset [s].
         dt: of a step of the environment [s].
+        values: in events that change values: arrays by name, of abstract scalars or numbers, whose entries they assign.
+        before: in resets: the world at the end of the episode; None at the start and in resets on request.
     """
 
     def __init__(self, layout: Layout, stage: Stage, fresh: Any = None, own_action: Any = None):
@@ -102,6 +105,8 @@ class World:
         self.scene = layout.scene
         self.dt = layout.step_dt
         self.kept: dict[str, Vector] = {}
+        self.values: dict[str, np.ndarray] = {}
+        self.before: World | None = None
 
     # -- state -----------------------------------------------------------------------------------------------------
     @functools.cached_property
@@ -230,6 +235,16 @@ class World:
         """Return the default coordinates of :meth:`joints`, numbers."""
         return self.default_q[[int(self.scene.q_start[i]) for i in self.joints(names)]]
 
+    def encoder_q(self, names: Any = None) -> Vector:
+        """Return the coordinates of :meth:`joints` as their encoders read them, see :func:`events.encoder_bias`."""
+        return self.joint_q(names) + self.encoder_bias(self.joints(names))
+
+    def encoder_bias(self, hinges: Sequence[int]) -> Vector:
+        """Return what the encoders of hinges read beyond the truth; zeros without :func:`events.encoder_bias`."""
+        biased = self._layout.biased
+        bias: Any = self.memory("encoder bias", len(biased), reset=None) if biased else []
+        return vector(bias[biased.index(hinge)] if hinge in biased else 0.0 for hinge in hinges)
+
     def joint_qd(self, names: Any = None) -> Vector:
         """Return the velocities of :meth:`joints`."""
         return self.qd[[int(self.scene.qd_start[i]) for i in self.joints(names)]]
@@ -251,12 +266,24 @@ class World:
 
     def value(self, name: str) -> np.ndarray:
         """Return a value of the scene, such as "body_com" [body, 3]: of this world where it is randomised."""
+        if name in self.values:
+            return self.values[name]
+        if name not in self.scene.values:
+            raise ValueError(f"World.value: unknown value {name!r}; expected one of {', '.join(self.scene.values)}")
         shape = self.scene.values[name].shape[1:]
         if name not in self._layout.values:
             if self.scene.values[name].shape[0] > 1:
-                raise ValueError(f"Env: a term reads {name}, which differs between worlds; expected it in variable=")
+                raise ValueError(
+                    f"Env: a term reads {name}, which differs between the scene's worlds; expected a scene of one world"
+                )
             return self.scene.values[name][0]
         return self.read(f"value_{name}", int(np.prod(shape))).reshape(shape)
+
+    def user(self, term: Any) -> Any:
+        """Return the numbers of a user's term in torch."""
+        start = self._layout.user(term, self._stage.name)
+        values = vector(self._scalar("user", start + i) for i in range(term.size))
+        return values[0] if term.size == 1 else values
 
     # -- random numbers --------------------------------------------------------------------------------------------
     def uniform(self, low: Any = 0.0, high: Any = 1.0) -> Any:
@@ -267,6 +294,10 @@ class World:
         """Return a new normal random number of mean zero."""
         radius = np.sqrt(-2.0 * np.log(1.0 - self.uniform()))  # Box and Muller
         return deviation * radius * np.cos(2.0 * np.pi * self.uniform())
+
+    def integer(self, low: int, high: int) -> Any:
+        """Return a new random whole number from ``low`` to ``high``, both included."""
+        return low + AbstractScalar(floor((high - low + 1.0) * self._stage.draw()))
 
     # -- memory ----------------------------------------------------------------------------------------------------
     def memory(self, name: str, size: int, reset: float | None = 0.0) -> Vector:
@@ -326,6 +357,8 @@ def as_condition(x: Any) -> Condition:
     """Return what a termination returned as a condition."""
     if isinstance(x, Condition):
         return x
+    if isinstance(x, AbstractScalar) and not is_constant(x.value) and x.value.op == "input":
+        return abs(x) > 0.0  # of a term in torch
     if isinstance(x, bool | np.bool_):
         return Condition(1.0 if x else 0.0)
     raise TypeError(f"Env: a termination returned {type(x).__name__}; expected a comparison, such as w.q[1] > 0.3")
