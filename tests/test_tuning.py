@@ -7,6 +7,7 @@ import subprocess
 import sys
 import warnings
 
+import contact_cases
 import numpy as np
 import pytest
 import warp as wp
@@ -14,6 +15,7 @@ import zoo
 
 import warp_spo as spo
 from warp_spo.dynamics import tuning
+from warp_spo.dynamics.integrators import CONTACT_STEP
 from warp_spo.examples import fourbar
 from warp_spo.execution import plan, tuned
 from warp_spo.execution.device_facts import CPU, MEASURED
@@ -80,6 +82,20 @@ def test_the_fastest_is_used_and_kept(device, times, folder):
     again = made(device).tune(NAME)[NAME]
     assert again.granularity == "node" and not again.measured and times["measured"] == measured
     assert again.file == choice.file and again.us == choice.us and again.date == choice.date
+
+
+def test_a_step_with_contacts_is_tuned_for_itself(monkeypatch, folder):
+    """Its candidates on a GPU are a thread a world and limbs; a step without contacts keeps its own choice."""
+    scene = contact_cases.quadruped()
+    dyn, times = made(wp.get_device("cpu"), scene), {"tree": 1.0, "segment": 2.0}
+    dyn.plan = plan.choose(scene, WORLDS, MEASURED, "float32")
+    monkeypatch.setattr(
+        tuning, "_measure", lambda dyn, operation, routine, names: {name: times[name] for name in names}
+    )
+    assert dyn.plan.of(CONTACT_STEP) == "segment"
+    choice = dyn.tune("step")["step"]
+    assert choice.granularity == "tree" and choice.us == {"segment": 2.0, "tree": 1.0}
+    assert dyn.plan.of(CONTACT_STEP) == "tree" and dyn.plan.of(dyn._operations["step"].routine) == "segment"
 
 
 def test_the_first_guess_stays_where_it_is_nearly_as_fast(device, times):

@@ -87,9 +87,7 @@ def explain(dyn: Dynamics) -> list[str]:
 
 def _tune_one(dyn: Dynamics, operation: Operation) -> Tuned:
     dyn._engine.refuse(operation.name, operation)
-    embedded = dyn.embedding is not None and isinstance(operation.embed, Routine)
-    routine = operation.embed if embedded else operation.routine
-    assert isinstance(routine, Routine)
+    routine = _routine(dyn, operation)
     if routine.name in dyn.plan.tuned:
         return dyn.plan.tuned[routine.name]
     candidates = dyn.plan.candidates(routine)
@@ -107,6 +105,16 @@ def _tune_one(dyn: Dynamics, operation: Operation) -> Tuned:
     return choice
 
 
+def _routine(dyn: Dynamics, operation: Operation) -> Routine:
+    """Return the kernel of an operation that this object launches."""
+    if operation.touching is not None and dyn.scene.contacts:
+        return operation.touching
+    embedded = dyn.embedding is not None and isinstance(operation.embed, Routine)
+    routine = operation.embed if embedded else operation.routine
+    assert isinstance(routine, Routine)
+    return routine
+
+
 def use(dyn: Dynamics, name: str, choice: Tuned) -> None:
     """Let the routine of this name run by a choice from now on."""
     _switch(dyn, name, choice.granularity)
@@ -116,7 +124,8 @@ def use(dyn: Dynamics, name: str, choice: Tuned) -> None:
 def _switch(dyn: Dynamics, name: str, granularity: str | None) -> None:
     """Let the routine of this name run as if a granularity were asked for; None, or that of the rules: by the rules."""
     plan = dyn.plan
-    routines = [one.routine for one in dyn._operations.values() if one.routine and one.routine.name == name]
+    every = [routine for one in dyn._operations.values() for routine in (one.routine, one.touching)]
+    routines = [one for one in every if one is not None and one.name == name]
     names = {name, *(one.bias_first.name for one in routines if one.bias_first is not None)}
     for each in names:
         plan.instead.pop(each, None)
