@@ -257,6 +257,11 @@ BAD_PREPARE = {
     "negative": (dict(operation="solve_mass_matrix", columns=-1), "columns is -1"),
     "true columns": (dict(operation="solve_mass_matrix", columns=True), "columns is True"),
     "a list": (dict(operation=["step"]), "no operation ['step']; expected one of forward_dynamics"),
+    "one of more": (dict(operation="step", more=["mass"]), "no operation 'mass'; expected one of forward_dynamics"),
+    "options of more": (
+        dict(operation="step", more=[("step", 2)]),
+        "options of 'step' are 2; expected a dict of options",
+    ),
     "along": (dict(operation="forward_dynamics_jvp", along=("dx",)), "along names 'dx'", "some of dq, dqd"),
 }
 
@@ -265,7 +270,7 @@ BAD_PREPARE = {
 def test_bad_prepare_is_refused_in_words(case, device):
     arguments, *words = BAD_PREPARE[case]
     with explained(ValueError, "Dynamics.prepare", *words):
-        dynamics(device).prepare(**arguments)
+        dynamics(device).prepare(arguments.pop("operation"), *arguments.pop("more", ()), **arguments)
 
 
 # -- scenes are what they were when they were checked ------------------------------------------------------------------

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
+from .. import launches
 from ..errors import as_integer, as_names
 from .operation import Argument, Operation, Option, derivative_of
 
@@ -15,8 +16,10 @@ if TYPE_CHECKING:
     from .dynamics import Dynamics
 
 
-def prepare(self: Dynamics, operation: str, **options: Any) -> None:
+def prepare(self: Dynamics, operation: str, *more: str | tuple[str, Mapping[str, Any]], **options: Any) -> None:
     """Compile and allocate all that ``operation`` needs, so that its next call only launches.
+
+    On CUDA all kernels, of several operations too, are compiled side by side, on all cores of the host.
 
     The name of the way back through an operation, torch's too, is "<operation>_vjp", such as "step_vjp", with ``wrt=``
     the names of arguments and then of values in their order; default: all arguments that are given. For
@@ -24,23 +27,35 @@ def prepare(self: Dynamics, operation: str, **options: Any) -> None:
 
     Args:
         operation: name of a method, such as "forward_dynamics".
-        options: ``frames=`` for operations that take frames, ``columns=`` for solve_mass_matrix, ``prescribed=`` for
-            hybrid_dynamics, ``integrator=`` for step, ``hold=`` for project, ``seeds=`` for inverse_kinematics, and
-            ``body_f=True``, ``status=True``, ``qdd=True``, ``target_q=True``, ``target_qd=True``, ``ctrl=True``,
-            ``contact_f=True`` and the like, and ``q=True`` for inverse_kinematics, if they will be passed.
+        more: further operations, each a name, or a pair of a name and a dict of its options.
+        options: of the first operation. ``frames=`` for operations that take frames, ``columns=`` for
+            solve_mass_matrix, ``prescribed=`` for hybrid_dynamics, ``integrator=`` for step, ``hold=``
+            for project, ``seeds=`` for inverse_kinematics, and ``body_f=True``, ``status=True``, ``qdd=True``,
+            ``target_q=True``, ``target_qd=True``, ``ctrl=True``, ``contact_f=True`` and the like, and ``q=True`` for
+            inverse_kinematics, if they will be passed.
 
     Raises:
         ValueError: no such operation or option.
     """
-    operations = self._operations
+    pairs = [one if isinstance(one, tuple) and len(one) == 2 else (one, {}) for one in more]
+    for name, own in pairs:
+        if not isinstance(own, Mapping):
+            raise ValueError(f"Dynamics.prepare: options of {name!r} are {own!r}; expected a dict of options by name")
+    with launches.compile_side_by_side():
+        for name, own in ((operation, options), *pairs):
+            _prepare(self, name, dict(own))
+
+
+def _prepare(dyn: Dynamics, operation: Any, options: dict[str, Any]) -> None:
+    operations = dyn._operations
     backwards = {f"{name}_vjp": one for name, one in operations.items() if one.derivative is not None}
     found = operations.get(operation) if isinstance(operation, str) else None
     if isinstance(operation, str) and operation in backwards:
-        _prepare_backwards(self, backwards[operation], options)
+        _prepare_backwards(dyn, backwards[operation], options)
     elif found is not None and found.results and found.product:
-        _prepare_product(self, found, options)
+        _prepare_product(dyn, found, options)
     elif found is not None and found.results:
-        _prepare_operation(self, found, options)
+        _prepare_operation(dyn, found, options)
     else:
         names = ", ".join(name for name, one in operations.items() if one.results and not one.product)
         raise ValueError(f"Dynamics.prepare: no operation {operation!r}; expected one of {names}")
