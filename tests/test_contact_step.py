@@ -12,7 +12,7 @@ from step_scenes import furnished, states
 
 import warp_spo as spo
 from warp_spo.dynamics import contacts
-from warp_spo.recursions.contact import dampers, secants, step
+from warp_spo.recursions.contact import dampers, points, secants, step
 from warp_spo.reference_contact import ContactStep
 
 H, WORLDS = 5e-3, 4
@@ -232,6 +232,8 @@ BUGS = {
     "dampers above ground": (step.ContactStep, "_finish", "candidate * pushes", "pushes"),
     "last pass opens": (step.ContactStep, "_finish", "kept.closing * touch.closed", "0.0"),
     "wrong lever": (dampers, "_mass", "r * weight", "r * (2.0 * weight)"),
+    "straight paths": (points, "place_points", "(0.5 * h) * faster", "0.0"),
+    "damper of straight paths": (points, "place_points", "k * below - d * faster", "k * below"),
     "tangent friction": (step.ContactStep, "_secant", "reciprocal(sqrt(w * w + point.eps * point.eps))",
                          "reciprocal(w * w + point.eps * point.eps) * point.eps"),
 }  # fmt: skip

@@ -2,7 +2,7 @@
 
 A contact is a spring, a damper and friction between a point of a body and the ground, all implicit: its force is
 f = f0 - G J v, with the velocity v = qd' after the step, a positive semidefinite G [3, 3] and the spring's load f0
-along the normal n. A step solves, with the pose held,
+along the normal n, both of which see the point's path bend as its links turn. A step solves, with the pose held,
 
     (Mass + h S + h J* G J) v = Mass qd + h (tau - bias + l + J* f0),
 
@@ -27,7 +27,9 @@ SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bou
 class Points(NamedTuple):
     """Contact points at one pose: J [point, 3, dof] and n [point, 3] in inertial axes, the others [point].
 
-    ``depth`` is the penetration [m], ``weight`` 0.6 of the inverse weight at the neutral pose [1/kg].
+    ``depth`` is the penetration [m], ``weight`` 0.6 of the inverse weight at the neutral pose [1/kg]. ``bend`` is
+    n* J' qd, the acceleration along the normal at rates that stay as they are [m/s^2]: after the step the point is
+    h n* J v + h^2 bend / 2 further out, and leaves the ground at n* J v + h bend.
     """
 
     J: np.ndarray
@@ -38,6 +40,15 @@ class Points(NamedTuple):
     mu: np.ndarray
     eps: np.ndarray
     weight: np.ndarray
+    bend: np.ndarray | float = 0.0
+
+    def after(self, at, h):
+        """Return the depths after the step, for the velocities ``at``."""
+        return self.depth - h * _along(self.n, at) - 0.5 * h * h * self.bend
+
+    def push(self, at, h):
+        """Return the normal forces of closed points after the step [N], negative where one would pull."""
+        return self.k * self.after(at, h) - self.d * (_along(self.n, at) + h * self.bend)
 
 
 class Limits(NamedTuple):
@@ -80,17 +91,17 @@ class Found(NamedTuple):
 def solve(M, laws, limits, points, v, load, h, passes=3, gravity=0.0):
     """Return what the passes find for the velocity ``v`` before the step and the hinges' forces ``load`` [dof]."""
     start, kd = v, points.k * h + points.d
-    at = points.J @ v
-    candidate = points.depth + h * np.maximum(0.0, -_along(points.n, at)) + 0.5 * gravity * h * h > 0.0
-    fn = candidate * np.maximum(0.0, points.k * points.depth - kd * _along(points.n, at))
+    at, still = points.J @ v, np.zeros_like(points.n)
+    candidate = np.maximum(points.after(at, h), points.after(still, h)) + 0.5 * gravity * h * h > 0.0
+    fn = candidate * np.maximum(0.0, points.push(at, h))
     w = _slip(points.n, at)
     drive_s, dry_w = laws.s, np.abs(v)
     on = limit_on = None
     for number in range(passes):
         first, last = number == 0, number == passes - 1 and passes >= 3
         if not first:
-            candidate = candidate | reached(points, at, h)
-        closed = candidate & (first | pushes(points, at, kd))
+            candidate = candidate | (points.after(at, h) > 0.0)
+        closed = candidate & (first | (points.push(at, h) > 0.0))
         inward = limits.way * v[limits.dof]
         held = limits.depth + h * np.maximum(0.0, -inward) > 0.0
         if not first:
@@ -100,7 +111,7 @@ def solve(M, laws, limits, points, v, load, h, passes=3, gravity=0.0):
             closed, by_rule = closed | on, limit_on & ~held
         on, limit_on = closed, held | by_rule
         G = dampers(points, on, kd, fn, w)
-        f0 = (on * points.k * points.depth)[:, None] * points.n
+        f0 = (on * points.push(still, h))[:, None] * points.n
         S, l = laws.resistance.copy(), laws.load.copy()
         S, l = S + drive_s, l + drive_s * laws.a
         dry_s = laws.dry / np.sqrt(dry_w**2 + CREEP**2)
@@ -123,16 +134,6 @@ def solve(M, laws, limits, points, v, load, h, passes=3, gravity=0.0):
     cone, adhesion = ft - points.mu * fn, -_along(points.n, f)
     excess = np.array([np.maximum(x, 0.0).max(initial=0.0) for x in (cone, adhesion, beyond)])
     return Found(v, f, excess, on)
-
-
-def reached(points, at, h):
-    """Return which points the velocities ``at`` carry below the ground within the step."""
-    return points.depth - h * _along(points.n, at) > 0.0
-
-
-def pushes(points, at, kd):
-    """Return which points push at the velocities ``at``."""
-    return points.k * points.depth - kd * _along(points.n, at) > 0.0
 
 
 def dampers(points, on, kd, fn, w):
@@ -213,6 +214,7 @@ class ContactStep:
         inverse = np.linalg.pinv(self.neutral.mass_matrix)
         for number, point in enumerate(self.scene.contact_points):
             at = (dense.body_matrix[point.body] @ homogeneous([*point.position, 0, 0, 0, 1]))[:3, 3]
+            turning = dense.jacobian_bias(self.qd, [(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
             at = at - point.radius * np.array(ground.normal if plane else (0.0, 0.0, 1.0))
             there = self.neutral.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
             weight = SLIP * np.trace(there @ inverse @ there.T) / 3.0
@@ -223,7 +225,7 @@ class ContactStep:
                 touched = surfaces(ground, at - moved, int(field[0]) if len(field) else 0)
             for normal, depth in touched:
                 J = dense._jacobian_at(point.body, at)[:3]
-                rows.append((J, normal, depth, k, d, mu, point.eps, weight))
+                rows.append((J, normal, depth, k, d, mu, point.eps, weight, normal @ turning))
                 self.numbers.append(number)
         return Points(*(np.array(column) for column in zip(*rows, strict=True)))
 

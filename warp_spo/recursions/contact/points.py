@@ -7,6 +7,11 @@ damper h G is an inertia at the point and f0 - G v_before a load, see :mod:`.dam
 n n* is isotropic across the normal n, so that no tangent directions are needed. Vectors are in the axes of the point's
 link.
 
+A point's path within the step is a parabola: at rates that stay as they are it accelerates by n* J' qd = ``bend`` along
+the normal, so that after the step it is h n* v + h^2 bend / 2 further out, and leaves the ground by h bend faster. The
+spring and the damper see that. Without it a point of a limb that turns fast ends up to h^2 bend / 2 deeper than the
+spring has worked for, and energy rises.
+
 A piece works on the points of its links. Those of the link on which other pieces begin are shared among these in equal
 numbers, and only the rest stays: they know that link's motion, and their messages to it carry what the points add.
 """
@@ -25,9 +30,10 @@ from ...trace.evaluation import evaluate
 from ...trace.scalars import Value
 from ...trace.spatial import IDENTITY, ZERO, Vector, cross, dot, total
 from ..composite import mass_matrix
-from ..kinematics import carried_velocity, frame_on_link, jacobian
+from ..kinematics import carried_velocity, frame_on_link, jacobian, zero
 from ..links import Link, Links
-from ..motion import hinge_motion
+from ..motion import Motion, hinge_motion, link_motion
+from ..newton_euler import link_acceleration
 from ..remembered import remembered
 from ..tracing import Trace
 from .ground import Place, directions, lowest, surfaces
@@ -44,16 +50,17 @@ class Point:
 
     Attributes:
         number: of the scene's contact point. arm: from the link's origin. normal: of the ground there.
-        depth: how far the point is below ground [m]. twist: (w; v) of the link before the step.
+        gap: distance from the ground [m]. twist: (w; v) of the link before the step.
         k, d, mu: stiffness, damping, friction. eps: speed below which friction is a damper.
         weight: inverse weight that predicts slip [1/kg]. axes: of the inertial frame, in the link, where asked.
+        depth, push: how far below ground it would be after a step that ends with n* J v = 0, and its normal force then.
     """
 
     number: int
     link: Link | None
     arm: Vector
     normal: Vector
-    depth: Value
+    gap: Value
     twist: tuple[Vector, Vector]
     k: Value
     d: Value
@@ -61,11 +68,13 @@ class Point:
     eps: float
     weight: float
     axes: list[Vector]
+    depth: Value
+    push: Value
 
     @property
     def state(self) -> list[Value]:
-        """The values that every pass reads: arm, normal, depth, and the link's motion before the step."""
-        return [*self.arm, *self.normal, self.depth, *self.twist[0], *self.twist[1]]
+        """The values that every pass reads: arm, normal, depth, push, and the link's motion before the step."""
+        return [*self.arm, *self.normal, self.depth, self.push, *self.twist[0], *self.twist[1]]
 
     @property
     def velocity(self) -> Vector:
@@ -98,6 +107,8 @@ def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value],
     axes: dict[int | None, list[Vector]] = {None: asked}
     origins: dict[int | None, list[Value]] = {None: [0.0] * count}  # along each direction of the ground
     twists: dict[int | None, tuple[Vector, Vector]] = {None: (ZERO, ZERO)}
+    motions: dict[int | None, Motion | None] = {None: None}
+    bends: dict[int | None, tuple[Vector, Vector]] = {None: (ZERO, ZERO)}  # accelerations at qdd = 0
     for link in trace.active_links:
         if id(link) not in needed:
             continue
@@ -106,6 +117,8 @@ def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value],
         axes[key] = [place.pose.to_child(axis) for axis in axes[over]]
         origins[key] = [at + dot(axis, place.pose.l) for at, axis in zip(origins[over], axes[over], strict=False)]
         twists[key] = carried_velocity(place, twists[over], hinge_motion(link, place, qd))
+        motions[key] = move = link_motion(link, place, motions[over], qd)
+        bends[key] = link_acceleration(link, place, move, bends[over], zero)
     found = []
     for number, (on, centre) in seats.items():
         point, carrier = scene.contact_points[number], None if on is None else id(on)
@@ -116,9 +129,14 @@ def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value],
         at[lowest(ground)] = at[lowest(ground)] - point.radius
         k, d, mu = (impedance.value(f"contact_{name}", number) for name in ("stiffness", "damping", "friction"))
         shape = k, d, mu, point.eps, weights[number], axes[carrier][-len(IDENTITY) :] if oriented else []
+        h, moving = impedance.h, motions[carrier]
+        bend = bends[carrier][1] + cross(bends[carrier][0], centre)
+        bend = bend if moving is None else bend + moving.whirl @ centre
         for normal, depth in surfaces(trace.graph, ground, at, place_of_ground):
             inward = Vector(total(n * axis[c] for n, axis in zip(normal, toward, strict=True)) for c in range(3))
-            found.append(Point(number, on, arm, inward, depth, twists[carrier], *shape))
+            faster = h * dot(inward, bend)
+            below = depth - (0.5 * h) * faster
+            found.append(Point(number, on, arm, inward, -depth, twists[carrier], *shape, below, k * below - d * faster))
     return found
 
 

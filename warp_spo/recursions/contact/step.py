@@ -147,7 +147,7 @@ class ContactStep(Step):
 
     def _push(self, point: Point, speed: Value) -> Value:
         """Return the normal force of a closed point that leaves the ground at ``speed`` after the step."""
-        return point.k * point.depth - (point.k * self.h + point.d) * speed
+        return point.push - (point.k * self.h + point.d) * speed
 
     def _press(self, points: list[Point], touches: list[Touch]) -> None:
         """Add dampers and loads of the points to their links."""
@@ -211,14 +211,14 @@ class ContactStep(Step):
     def _report(self, number: int, surfaces: list[tuple[Point, Vector, Value]]) -> None:
         """Keep what the caller asks for of a point; of several surfaces the sum of forces, the gap to the nearest."""
         point, force, slip = surfaces[0]
-        depth = point.depth
+        gap = point.gap
         for other, more, _ in surfaces[1:]:
-            force, depth = force + more, select(less(depth, other.depth), other.depth, depth)
+            force, gap = force + more, select(less(other.gap, gap), other.gap, gap)
         if "contact_f" in self.reports:
             world = [self._last(dot(axis, force)) for axis in point.axes]
             self.finished["contact_f"] += [Store("contact_f", (number, c), x) for c, x in enumerate(world)]
         if "contact_gap" in self.reports:
-            self.finished["contact_gap"].append(Store("contact_gap", (number,), -depth))
+            self.finished["contact_gap"].append(Store("contact_gap", (number,), gap))
         if "contact_slip" in self.reports:
             self.finished["contact_slip"].append(Store("contact_slip", (number,), self._last(slip)))
 
