@@ -48,7 +48,7 @@ def walker_q():
     return np.array([0, 0, 0.36, 0, 0, 0, 1, *[0.5, -1.0] * 4])
 
 
-def walker_env(worlds=4, **changes):
+def walker_env(worlds=4, scene=None, **changes):
     """Return a walker that is asked for velocities, and is pushed."""
     actor = [
         Observation(observations.base_angular_velocity, noise=0.1),
@@ -77,4 +77,4 @@ def walker_env(worlds=4, **changes):
         "default_q": walker_q(),
         "episode_length_s": 2.0,
     }
-    return Env(walker_scene(), worlds, "cpu", **(options | changes))
+    return Env(scene or walker_scene(), worlds, "cpu", **(options | changes))

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from env_scenes import FEET, cart_env, walker_env
+from env_scenes import FEET, cart_env, walker_env, walker_q, walker_scene
 
 import warp_spo as spo
-from warp_spo.env import TorchTerm, events, observations
+from warp_spo.env import TorchTerm, commands, events, observations, rewards
 from warp_spo.kernels import native, philox
 
 FLOAT32 = 2e-6  # a few roundings of numbers of size one
@@ -164,8 +164,8 @@ def test_terms_in_torch():
     out = TorchTerm(lambda env: env.q[:, 0].abs() > 0.5, name="out")
     state = TorchTerm(lambda env: torch.cat([env.q, env.qd], dim=1), size=4)
     traced = cart_env()
-    rewards = {"up": (1.0, lambda w: np.cos(w.q[1])), "slow": (-0.1, slow)}
-    mixed = cart_env(rewards=rewards, terminations={"out": out}, observations={"actor": [state]})
+    mixed_rewards = {"up": (1.0, lambda w: np.cos(w.q[1])), "slow": (-0.1, slow)}
+    mixed = cart_env(rewards=mixed_rewards, terminations={"out": out}, observations={"actor": [state]})
     for step in range(30):
         given = 6.0 * torch.cos(torch.arange(8.0)[:, None] + 0.01 * step)
         (a, ra, da, _), (b, rb, db, _) = traced.step(given), mixed.step(given)
@@ -235,3 +235,66 @@ def test_randomised_values_are_those_of_the_dynamics():
     assert changed.tolist() == [True] * 2 + [False] * 4 and env.memory("encoder bias").equal(bias)
     with pytest.raises(ValueError, match="two events change entry 0 of body_mass"):
         walker_env(events=[events.randomise("body_mass", (0.9, 1.1)), events.pseudo_inertia("trunk")])
+
+
+def bilinear(field, x, y):
+    """Return the heights of a field at points."""
+    found = []
+    for a, b in zip(x.ravel(), y.ravel(), strict=True):
+        u, v = (a - field.origin[0]) / field.cell, (b - field.origin[1]) / field.cell
+        i, j = (int(np.clip(np.floor(w), 0, n - 2)) for w, n in zip((u, v), field.heights.shape, strict=True))
+        s, t, h = np.clip(u - i, 0, 1), np.clip(v - j, 0, 1), field.heights[i : i + 2, j : j + 2]
+        found.append(h[0, 0] * (1 - s) * (1 - t) + h[1, 0] * s * (1 - t) + h[0, 1] * (1 - s) * t + h[1, 1] * s * t)
+    return np.array(found).reshape(x.shape)
+
+
+def test_terrain_levels_and_height_scan():
+    tiles = spo.terrain.tiles(4, 3, (6.0, 6.0), 0.1, seed=2)
+    scene = walker_scene()
+    scene = scene.with_contacts(scene.contacts, tiles.field)
+    env = walker_env(
+        8,
+        scene=scene,
+        observations={"a": [observations.height_scan((0.4, 0.2), 0.1, 0.5), lambda w: w.base_height]},
+        events=[events.terrain(tiles, rows=2), events.base(yaw=(-3.0, 3.0)), events.joints((-0.1, 0.1))],
+        commands=commands.Velocity(forward=(1.0, 1.0), left=(0.0, 0.0)),
+        terminations={},
+        rewards={"height": (1.0, rewards.base_height(0.3))},
+    )
+    row, column = env.memory("terrain").clone().unbind(1)
+    starts = tiles.origins[row.int().numpy(), column.int().numpy()]
+    assert set(row.tolist()) == {0.0, 1.0} and len(set(column.tolist())) > 1
+    assert np.allclose(env.q[:, :3].numpy() - walker_q()[:3], starts, atol=1e-5)
+    env.q[:, :2] += torch.linspace(-1.0, 1.0, 8)[:, None]
+    for _ in range(3):
+        observed, _, _, _ = env.step(torch.zeros(8, 8))
+    q = env.q.double().numpy()
+    x, y, z, w = q[:, 3:7].T
+    heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    grid = np.array([(a, b) for a in np.linspace(-0.2, 0.2, 5) for b in np.linspace(-0.1, 0.1, 3)]).T
+    c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
+    ground = bilinear(tiles.field, q[:, :1] + c * grid[0] - s * grid[1], q[:, 1:2] + s * grid[0] + c * grid[1])
+    assert np.allclose(observed["a"][:, :15].numpy(), q[:, 2:3] - 0.5 - ground, atol=1e-4)  # steep cells, float32
+    assert np.allclose(observed["a"][:, 15].numpy(), q[:, 2] - bilinear(tiles.field, q[:, 0], q[:, 1]), atol=1e-4)
+    env.episode_length_buf = torch.full((8,), 99)
+    far = torch.arange(8) % 2 == 0  # half of the worlds stand more than half a tile away, the others have gone nowhere
+    env.q[:, :2] = torch.as_tensor(starts[:, :2], dtype=torch.float32) + 3.5 * far[:, None] * torch.tensor([[1.0, 0.0]])
+    _, _, done, extras = env.step(torch.zeros(8, 8))
+    assert done.all() and extras["time_outs"].all()
+    expected = torch.where(far, row + 1, (row - 1).clamp(min=0))
+    assert env.memory("terrain")[:, 0].equal(expected) and env.memory("terrain")[:, 1].equal(column)
+
+
+def test_commands_grow_with_a_reward():
+    level = commands.Level("standing", share=0.5, first=0.2, step=0.1)
+    env = walker_env(
+        3,
+        commands=commands.Velocity(forward=(1.0, 1.0), left=(-1.0, -1.0), turn=(0.5, 0.5), level=level),
+        rewards={"standing": (2.0, TorchTerm(lambda env: torch.tensor([1.0, 0.2, 1.0])))},
+        terminations={},
+        episode_length_s=0.06,
+    )
+    for step in range(7):
+        shares = torch.tensor([1.0, 0.0, 1.0]) * (step // 3) * 0.1 + 0.2
+        assert torch.allclose(env.command, shares[:, None] * torch.tensor([1.0, -1.0, 0.5]), atol=1e-6)
+        env.step(torch.zeros(3, 8))

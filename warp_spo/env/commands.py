@@ -3,13 +3,45 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
-from ..hinges.functions import clip, where
+from ..hinges.functions import Condition, clip, where
 from .world import Vector, World, vector
 
 Range = tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Level:
+    """A curriculum: a world's share of the commands' ranges, which grows with a reward.
+
+    Args:
+        reward: name of the reward. share: of its largest sum, above which the level grows at the end of an episode.
+        first: level at the start. step: by which it grows, to 1.
+    """
+
+    reward: str
+    share: float = 0.8
+    first: float = 0.3
+    step: float = 0.05
+
+    def update(self, w: World, done: Condition | None) -> Any:
+        """Return the level, after an episode if ``done``."""
+        if "command level" in w.kept:
+            return self.first + w.kept["command level"][0]
+        if self.reward not in w.weights:
+            raise ValueError(f"commands.Level: no reward {self.reward!r}; expected one of {', '.join(w.weights)}")
+        level = self.first + w.memory("command level", 1, reset=None)[0]
+        if done is None:
+            return level
+        most = abs(w.weights[self.reward]) * w.time
+        up = done & (w.memory(f"sum reward {self.reward}", 1)[0] > self.share * most)
+        grown = level + where(up, self.step, 0.0)
+        grown = where(grown < 1.0, grown, 1.0)
+        w.keep("command level", [grown - self.first])
+        return grown
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -24,6 +56,8 @@ class Velocity:
         standing: share of commands that are zero.
         still: commands slower than this are zero [m/s].
         seconds: range of the time until the next command.
+        level: None, or a curriculum over the ranges; ``env.memory("command level")`` [world, 1] says by how much shares
+            have grown.
     """
 
     forward: Range = (-1.0, 1.0)
@@ -34,16 +68,22 @@ class Velocity:
     standing: float = 0.0
     still: float = 0.0
     seconds: Range = (10.0, 10.0)
+    level: Level | None = None
 
     @property
     def size(self) -> int:
         """How many numbers a command has."""
         return 3
 
-    def draw(self, w: World) -> dict[str, Vector]:
-        """Return a new command, and what belongs to it, by the name of the memory."""
+    def draw(self, w: World, done: Condition | None) -> dict[str, Vector]:
+        """Return a new command, and what belongs to it, by the name of the memory.
+
+        ``done`` says whether an episode has just ended; None: none has.
+        """
         stands = w.uniform() < self.standing
         values = [w.uniform(*self.forward), w.uniform(*self.left), w.uniform(*self.turn)]
+        if self.level is not None:
+            values = [self.level.update(w, done) * x for x in values]
         if self.still > 0.0:
             slow = np.hypot(values[0], values[1]) < self.still
             values[:2] = [where(slow, 0.0, x) for x in values[:2]]
@@ -56,7 +96,7 @@ class Velocity:
         """Return the command of this step."""
         if self.heading is None:
             return command
-        heading, moves = w.memory("command heading", 2)
+        heading, moves = w.memory("command heading", 2, reset=None)
         missing = heading - w.heading
         missing = np.arctan2(np.sin(missing), np.cos(missing))
         return vector([command[0], command[1], moves * clip(self.gain * missing, *self.turn)])
@@ -79,7 +119,7 @@ class Uniform:
         """How many numbers a command has."""
         return len(self.ranges)
 
-    def draw(self, w: World) -> dict[str, Vector]:
+    def draw(self, w: World, done: Condition | None) -> dict[str, Vector]:
         """Return a new command, by the name of the memory."""
         return {"command": vector(w.uniform(*each) for each in self.ranges)}
 

@@ -12,13 +12,15 @@ import warp as wp
 
 from ..arrays import parse_device
 from ..dynamics.dynamics import Dynamics
+from ..recursions.contact.ground import GROUND
+from ..scene.contacts import HeightField
 from ..scene.scene import Scene
 from ..torch import stream
 from .events import Delays, Values
 from .graphs import Part, Replay
 from .layout import Layout
 from .observations import Observation, TorchTerm
-from .stage import CHOSEN, COLUMN, INT, LONG, ROW, Buffer
+from .stage import CHOSEN, COLUMN, INT, LONG, ROW, SHARED, Buffer
 from .tracing import Tracing
 
 try:
@@ -176,6 +178,12 @@ class Env(VecEnv):
                 )
             self._actuator_force = zeros(worlds, scene.dof_count)
             buffers["actuator_force"] = Buffer(self._actuator_force)
+        tables = dict(layout.tables)
+        if isinstance(scene.ground, HeightField):
+            tables[GROUND] = scene.ground.heights
+        for name, numbers in tables.items():
+            flat = torch.tensor(np.asarray(numbers), dtype=torch.float32, device=self.device).reshape(-1)
+            buffers[name] = Buffer(flat, SHARED)
         if layout.users:
             self._user = zeros(worlds, layout.user_size)
             buffers["user"] = Buffer(self._user)

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ..hinges.functions import where
+from ..scene.terrain import Tiles
 from .actions import actuator_labels
 from .world import World, cross, find, vector
 
@@ -19,10 +21,13 @@ class Reset:
     """A function that changes ``w.q``, ``w.qd`` of a world whose episode starts; they are default_q and zero before.
 
     Args:
-        change: function of a :class:`World`, which assigns to entries of ``w.q`` and ``w.qd``.
+        change: function of a :class:`World`, which assigns to entries of ``w.q`` and ``w.qd``. ``w.before`` is the
+            world at the end of the episode. What it keeps with ``w.keep`` stays until the next reset.
+        first: None, or a function that keeps what worlds remember for good, when the environment is made.
     """
 
     change: Callable[[World], None]
+    first: Callable[[World], None] | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -130,6 +135,50 @@ def base(
                     w.qd[first + i] += w.uniform(*span)
 
     return Reset(change)
+
+
+def terrain(tiles: Tiles, rows: int | None = None, level: bool = True) -> Reset:
+    """Return a reset that moves the base to the middle of a tile; the row, the difficulty, follows success.
+
+    Worlds keep the column that they draw at first. A world that walked more than half the length of a tile in its
+    episode goes up a row; one that walked less than half of what its last command asked for goes down one. After the
+    last row the row is drawn anew. ``env.memory("terrain")`` [world, 2] has rows and columns.
+
+    Args:
+        tiles: from ``spo.terrain.tiles``, the scene's ground. rows: rows to start in; None: half of them.
+        level: whether rows change; otherwise they are drawn at each reset.
+    """
+    count, columns = tiles.origins.shape[:2]
+    first_rows = max(1, count // 2) if rows is None else rows
+    if not 1 <= first_rows <= count:
+        raise ValueError(f"events.terrain: rows is {rows!r}; expected 1 to {count}, the rows of the tiles")
+    field = tiles.field
+    length = field.cells[0] * (field.heights.shape[0] - 1) / count
+
+    def first(w: World) -> None:
+        w.keep("terrain", [w.integer(0, first_rows - 1), w.integer(0, columns - 1)])
+
+    def change(w: World) -> None:
+        row, column = w.memory("terrain", 2, reset=None)
+        origins = w.table("terrain", tiles.origins.reshape(-1, 3))
+        if not level:
+            row = w.integer(0, first_rows - 1)
+        elif w.before is not None:
+            old = w.before
+            way = old.base_position[:2] - origins(row * float(columns) + column)[:2]
+            walked = np.hypot(way[0], way[1])
+            up = walked > 0.5 * length
+            down = ~up
+            if old.has_commands:
+                down = down & (walked < 0.5 * np.hypot(old.command[0], old.command[1]) * old.time)
+            row = row + where(up, 1.0, 0.0) - where(down, 1.0, 0.0)
+            row = where(row > count - 0.5, w.integer(0, count - 1), where(row < 0.0, 0.0, row))
+        w.keep("terrain", [row, column])
+        start = int(w.scene.q_start[w.base])
+        for i, x in enumerate(origins(row * float(columns) + column)):
+            w.q[start + i] = w.q[start + i] + x
+
+    return Reset(change, first)
 
 
 def push(

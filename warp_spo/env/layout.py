@@ -17,6 +17,7 @@ class Layout:
         biased: hinges whose encoders have a bias.
         sensors: (size, value at a reset, function that keeps it) of memory that each step brings up to date, by name.
         users: (stage, start) of the numbers of each user's term in torch.
+        tables: numbers that all worlds share, by name. weights: of rewards.
         values: names of the scene's values that differ between worlds.
     """
 
@@ -33,6 +34,8 @@ class Layout:
         self.memory: dict[str, tuple[int, int, float | None]] = {}
         self.memory_size = 0
         self.frames: list[Any] = []
+        self.tables: dict[str, np.ndarray] = {}
+        self.weights: dict[str, float] = {}
         self.users: dict[Any, tuple[str, int]] = {}
         self.user_size = 0
         self.sensors: dict[str, tuple[int, float | None, Any]] = {}
@@ -42,10 +45,22 @@ class Layout:
         if name not in self.memory:
             self.memory[name] = self.memory_size, size, reset
             self.memory_size += size
-        start, known, _ = self.memory[name]
-        if known != size:
-            raise ValueError(f"Env: memory {name!r} has {known} numbers; a term asks for {size}")
+        start, *known = self.memory[name]
+        if known != [size, reset]:
+            raise ValueError(
+                f"World.memory: {name!r} has {known[0]} numbers, which a reset sets to {known[1]}; a term asks for "
+                f"{size}, set to {reset}; expected the same in all terms"
+            )
         return start
+
+    def table(self, name: str, numbers: np.ndarray) -> str:
+        """Return the name under which kernels read a table."""
+        held = f"table_{name}"
+        if not np.array_equal(self.tables.setdefault(held, numbers), numbers):
+            raise ValueError(
+                f"World.table: {name!r} is the name of two tables with different numbers; expected another"
+            )
+        return held
 
     def user(self, term: Any, stage: str) -> int:
         """Return where the numbers of a user's term in torch are that a stage reads."""

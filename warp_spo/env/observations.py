@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..hinges.functions import clip, where
-from .world import Vector, World, vector
+from .world import Vector, World, rotate, vector
 
 Term = Callable[[World], Any]
 
@@ -120,3 +120,22 @@ def feet_force(bodies: Any) -> Term:
 def feet_height(bodies: Any) -> Term:
     """Return the term of the distances of the bodies' lowest points from the ground [m]."""
     return lambda w: vector(w.feet(bodies).gap)
+
+
+def height_scan(size: tuple[float, float] = (1.6, 1.0), cell: float = 0.1, offset: float = 0.0) -> Term:
+    """Return the term of the base's height over the ground less ``offset`` [m], on a grid that turns with its heading.
+
+    Args:
+        size: of the grid along the heading and across [m]; its middle is under the base. cell: between points [m].
+    """
+    along, across = (np.linspace(-0.5 * each, 0.5 * each, round(each / cell) + 1) for each in size)
+
+    def term(w: World) -> Vector:
+        x, y, z = w.base_position
+        forward = rotate(w.base_quaternion, np.array([1.0, 0.0, 0.0]))
+        norm = 1.0 / np.sqrt(forward[0] ** 2 + forward[1] ** 2)
+        c, s = forward[0] * norm, forward[1] * norm
+        grid = [(float(a), float(b)) for a in along for b in across]
+        return vector(z - offset - w.ground_height(x + c * a - s * b, y + s * a + c * b) for a, b in grid)
+
+    return term

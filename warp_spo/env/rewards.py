@@ -49,8 +49,8 @@ def tilt(w: World) -> Any:
 
 
 def base_height(height: float) -> Term:
-    """Return the square of the base's height over or under ``height`` [m^2]."""
-    return lambda w: (w.base_position[2] - height) ** 2
+    """Return the square of the base's height over the ground less ``height`` [m^2]."""
+    return lambda w: (w.base_height - height) ** 2
 
 
 def action_rate(w: World) -> Any:

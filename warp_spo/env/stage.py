@@ -99,6 +99,10 @@ class Stage:
         """Return the names of the arrays that the stored values depend on."""
         return {scalar.args[0] for scalar in ordered(item.value for item in self.stores) if scalar.op == "input"}
 
+    def read_tables(self) -> set[str]:
+        """Return the names of the tables that the stored values depend on."""
+        return {scalar.args[0] for scalar in ordered(item.value for item in self.stores) if scalar.op == "lookup"}
+
     def build(self, buffers: dict[str, Buffer], seed: int, first: int, device: wp.Device) -> Launch | None:
         """Return the launch of the kernel; None if it writes nothing.
 
@@ -124,6 +128,7 @@ class Stage:
         ]
         body = "\n".join(render(listing, "float32") for listing in listings)
         touched = {array for listing in listings for array, _ in listing.indices if array != DRAW}
+        touched |= self.read_tables()
         words = (seed & 0xFFFFFFFF, seed >> 32 & 0xFFFFFFFF)
         world, step = f"{first} + world", buffers["tick"].place("tick", "0")
         random = philox.draws(self.draws, words, self.stream, world, step, wp.float32)

@@ -19,8 +19,8 @@ def tilted(angle: float) -> Term:
 
 
 def below(height: float) -> Term:
-    """Return the term that ends an episode where the base's origin is lower than ``height`` [m]."""
-    return lambda w: w.base_position[2] < height
+    """Return the term that ends an episode where the base's origin is lower than ``height`` over the ground [m]."""
+    return lambda w: w.base_height < height
 
 
 def touching(bodies: Any, force: float = 1.0) -> Term:

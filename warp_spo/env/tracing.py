@@ -17,7 +17,7 @@ from .events import EncoderBias, Interval, Reset, Start, Values
 from .layout import Layout
 from .observations import Observation
 from .stage import Stage
-from .world import Vector, World, as_condition, vector
+from .world import Vector, World, as_condition, as_value, vector
 
 LARGEST = 1e30  # numbers beyond it count as not finite
 CAUSES = ("action", "state", "reward")
@@ -50,6 +50,7 @@ class Tracing:
         events: list,
     ):
         self.layout, self.actions, self.groups = layout, actions, groups
+        layout.weights = {name: weight for name, (weight, _) in rewards.items()}
         self.rewards, self.terminations, self.commands, self.events = rewards, terminations, commands, events
         for event in events:
             if not isinstance(event, Reset | Interval | Values | Start):
@@ -94,7 +95,7 @@ class Tracing:
         for part in self.actions:
             size = len(part.labels(w.scene))
             for entry, value in part.trace(w, action[at : at + size]):
-                stage.store(part.array, entry, plain(value))
+                stage.store(part.array, entry, as_value(value))
             at += size
 
     # -- judge -----------------------------------------------------------------------------------------------------
@@ -120,11 +121,11 @@ class Tracing:
             terminated = terminated | ends[name]
         late = length >= float(steps)
         self.done = done = terminated | late
-        stage.store("out_reward", 0, plain(where(bad, 0.0, total)))
-        stage.store("out_done", 0, plain(where(done, 1.0, 0.0)))
-        stage.store("out_time_out", 0, plain(where(late & ~terminated, 1.0, 0.0)))
-        stage.store("chosen", 0, plain(where(done, 1.0, 0.0)))
-        stage.store("episode_length", 0, plain(where(done, 0.0, length)))
+        stage.store("out_reward", 0, as_value(where(bad, 0.0, total)))
+        stage.store("out_done", 0, as_value(where(done, 1.0, 0.0)))
+        stage.store("out_time_out", 0, as_value(where(late & ~terminated, 1.0, 0.0)))
+        stage.store("chosen", 0, as_value(where(done, 1.0, 0.0)))
+        stage.store("episode_length", 0, as_value(where(done, 0.0, length)))
         w.keep("episodes", w.memory("episodes", 1, reset=None) + where(done, 1.0, 0.0))
         self._remember_last(w, done, "seconds", w.time)
         for name in self.rewards:
@@ -167,7 +168,7 @@ class Tracing:
         qd = vector(where(done, a, b) for a, b in zip(fresh.qd, qd, strict=True))
         for name, values in (("q", q), ("qd", qd)):
             for i, value in enumerate(values):
-                stage.store(name, i, plain(value))
+                stage.store(name, i, as_value(value))
         for name, values in fresh.kept.items():
             old = w.memory(name, len(values), reset=None)
             w.keep(name, [where(done, a, b) for a, b in zip(values, old, strict=True)])
@@ -179,7 +180,7 @@ class Tracing:
         left = w.memory("until command", 1, reset=None)[0]
         due = done | (left <= self.layout.step_dt) if intervals else done
         passed = self.layout.step_dt if intervals else 0.0
-        for name, values in self.commands.draw(w).items():
+        for name, values in self.commands.draw(w, done if intervals else None).items():
             old = w.memory(name, len(values), reset=None)
             w.keep(name, [where(due, a, b) for a, b in zip(values, old, strict=True)])
         w.keep("until command", [where(due, w.uniform(*self.commands.seconds), left - passed)])
@@ -214,7 +215,7 @@ class Tracing:
                     if any(item.array == array and item.index == (i,) for item in w._stage.stores):
                         raise ValueError(f"Env: two events change entry {i} of {name}; expected one")
                     old = w._scalar(array, i) if due is not None else 0.0
-                    w._stage.store(array, i, plain(value if due is None else where(due, value, old)))
+                    w._stage.store(array, i, as_value(value if due is None else where(due, value, old)))
 
     def _first(self) -> None:
         """Draw what is drawn once: values of the scene, and memory."""
@@ -226,6 +227,8 @@ class Tracing:
                 self._store_values(w, event, None)
             if isinstance(event, Start):
                 event.change(w)
+            if isinstance(event, Reset) and event.first is not None:
+                event.first(w)
         for name, values in w.kept.items():
             self._keep(w, name, values)
 
@@ -239,7 +242,7 @@ class Tracing:
             values = [x for term in terms for x in term.trace(w)]
             self.group_sizes[group] = values
             for i, value in enumerate(values):
-                stage.store(f"out_{group}", i, plain(value))
+                stage.store(f"out_{group}", i, as_value(value))
 
     # -- memory ----------------------------------------------------------------------------------------------------
     def _close(self) -> None:
@@ -260,7 +263,7 @@ class Tracing:
     def _keep(self, w: World, name: str, values: Vector) -> None:
         start = self.layout.memory[name][0]
         for i, value in enumerate(values):
-            w._stage.store("memory", start + i, plain(value))
+            w._stage.store("memory", start + i, as_value(value))
 
     # -- reset on request ------------------------------------------------------------------------------------------
     def _reset(self) -> None:
@@ -269,18 +272,13 @@ class Tracing:
         stage.ticks = "(chosen.data[world] ? 1u : 0u)"
         w = World(self.layout, stage)
         self._start(w, chosen, intervals=False)
-        stage.store("episode_length", 0, plain(where(chosen, 0.0, w.read("episode_length", 1)[0])))
+        stage.store("episode_length", 0, as_value(where(chosen, 0.0, w.read("episode_length", 1)[0])))
         for name, (_, size, reset) in self.layout.memory.items():
             if name in w.kept or reset is not None:
                 values = w.memory(name, size, reset)
                 if reset is not None:
                     values = vector(where(chosen, reset, x) for x in values)
                 self._keep(w, name, values)
-
-
-def plain(x: Any) -> Value:
-    """Return the traced value of an abstract scalar, or a number."""
-    return x.value if isinstance(x, AbstractScalar) else float(x)
 
 
 def scalar(what: str, x: Any) -> Any:

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..hinges.functions import AbstractScalar, Condition, where
-from ..trace.scalars import floor, is_constant
+from ..recursions.contact.ground import Place, height
+from ..trace import spatial
+from ..trace.scalars import Value, floor, is_constant, lookup
 from .feet import Feet, feet
 from .stage import Stage
 
@@ -140,11 +142,21 @@ class World:
         return self.memory("action 2", self._layout.action_count)
 
     @property
+    def weights(self) -> dict[str, float]:
+        """The weights of the rewards by name, numbers."""
+        return self._layout.weights
+
+    @property
+    def has_commands(self) -> bool:
+        """Whether the environment gives commands."""
+        return self._layout.commands is not None
+
+    @property
     def command(self) -> Vector:
         """The commands that the environment gives [command]."""
         if self._layout.commands is None:
             raise ValueError("Env: a term reads commands, and the environment has none; expected Env(commands=...)")
-        return self.memory("command", self._layout.commands.size)
+        return self.memory("command", self._layout.commands.size, reset=None)
 
     # -- contacts --------------------------------------------------------------------------------------------------
     @functools.cached_property
@@ -187,6 +199,12 @@ class World:
         """Position of the base's origin (3,), inertial axes [m]."""
         start = self.scene.q_start[self.base]
         return self.q[start : start + 3]
+
+    @property
+    def base_height(self) -> Any:
+        """Height of the base's origin over the ground under it, or over z = 0 in a scene without ground [m]."""
+        x, y, z = self.base_position
+        return z - self.ground_height(x, y) if self.scene.ground is not None else z
 
     @property
     def base_quaternion(self) -> Vector:
@@ -254,6 +272,28 @@ class World:
         """Forces of the scene's actuators on each dof, in the state after the step [dof] [N m or N]."""
         return self.read("actuator_force", self.scene.dof_count)
 
+    # -- ground ----------------------------------------------------------------------------------------------------
+    def ground_height(self, x: Any, y: Any) -> Any:
+        """Return the height of the scene's ground at a point of the horizontal plane [m], inertial axes."""
+        if self.scene.ground is None:
+            raise ValueError("World.ground_height: the scene has no ground; expected scene.with_contacts(..., ground)")
+        origin, field = self.value("ground_origin"), self.value("ground_field")
+        moved = [as_value(each) for each in origin] if len(origin) else [0.0] * 3
+        place = Place(spatial.Vector(moved), as_value(field[0]) if len(field) else 0.0)
+        return AbstractScalar(height(self._stage.graph, self.scene.ground, as_value(x), as_value(y), place))
+
+    def table(self, name: str, numbers: np.ndarray) -> Callable[[Any], Vector]:
+        """Return a function from a row, a whole number, to that row of a table of numbers [row, n].
+
+        Args:
+            name: of the table. numbers: the same in all worlds.
+        """
+        held = self._layout.table(name, numbers)
+        width, graph = numbers.shape[1], self._stage.graph
+        return lambda row: vector(
+            AbstractScalar(lookup(graph, held, as_value(row) * float(width), step)) for step in range(width)
+        )
+
     # -- frames, values --------------------------------------------------------------------------------------------
     def frame(self, name: Any) -> Frame:
         """Return a frame: the name of a site or of a body, a body, or (body, pose in the body)."""
@@ -308,9 +348,9 @@ class World:
             size: how many.
             reset: their value at the start of an episode; None: a reset leaves them alone, and they start from zero.
         """
+        start = self._layout.remember(name, size, reset)
         if name in self.kept:
             return self.kept[name]
-        start = self._layout.remember(name, size, reset)
         return vector(self._scalar("memory", start + i) for i in range(size))
 
     def keep(self, name: str, values: Any) -> None:
@@ -351,6 +391,11 @@ class World:
         if not count:
             raise ValueError("Env: a term reads contacts, and the scene has none; expected scene.with_contacts(...)")
         return count
+
+
+def as_value(x: Any) -> Value:
+    """Return the traced value of an abstract scalar, or a number."""
+    return x.value if isinstance(x, AbstractScalar) else float(x)
 
 
 def as_condition(x: Any) -> Condition:

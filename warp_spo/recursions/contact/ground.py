@@ -79,6 +79,22 @@ def surfaces(graph: Graph, ground: Plane | HeightField, at: list[Value], place: 
     return [bottom, Surface(wall, select(there, (middle - z) * wall[2], AWAY))]
 
 
+def height(graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place: Place) -> Value:
+    """Return the height of the ground at a point of the horizontal plane [m]; the plane must not be vertical."""
+    x, y = x - place.origin[0], y - place.origin[1]
+    if isinstance(ground, Plane):
+        a, b, c = ground.normal
+        return (ground.height - a * x - b * y) * (1.0 / c) + place.origin[2]
+    rows, columns = ground.heights.shape[-2:]
+    i, s = _cell((x - ground.origin[0]) * (1.0 / ground.cells[0]), rows)
+    j, t = _cell((y - ground.origin[1]) * (1.0 / ground.cells[1]), columns)
+    first = i * float(columns) + j
+    if ground.count > 1:
+        first = floor(_between(place.field, ground.count - 1.0)) * float(rows * columns) + first
+    h00, h01, h10, h11 = (lookup(graph, GROUND, first, step) for step in (0, 1, columns, columns + 1))
+    return h00 + (h10 - h00) * s + (h01 - h00 + (h00 - h10 - h01 + h11) * s) * t + (ground.origin[2] + place.origin[2])
+
+
 def _cell(x: Value, points: int) -> tuple[Value, Value]:
     """Return the cell of a place in cells, and how far in it the place is; the last cell beyond the edges."""
     x = _between(x, points - 1.0)
