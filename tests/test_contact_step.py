@@ -1,5 +1,6 @@
 """Steps with contacts against the dense step, in every world; what they report; and calls that have no kernel."""
 
+import dataclasses
 import functools
 
 import actuated
@@ -73,6 +74,14 @@ def test_without_ground_passes_settle_on_the_exact_step():
         for passes, tolerance in ((3, three), (12, 1e-10)):
             found = symbolic.contact_step(below, a, H, passes)["out"]
             np.testing.assert_allclose(found, wanted, atol=tolerance * np.abs(wanted).max())
+
+
+def test_damping_that_grows_with_depth():
+    """Hunt and Crossley: of points in the ground, points above it, and all that lies in between."""
+    scene = TREES["tree"]
+    contacts = [dataclasses.replace(one, damping=None, dissipation=0.4) for one in scene.contacts]
+    scene = scene.with_contacts(contacts, scene.ground)
+    assert_is_dense(scene, states(scene, WORLDS), 3)
 
 
 TELLING = (148, 173, 186, 193, 253, 329, 502, 579)
@@ -233,7 +242,8 @@ BUGS = {
     "last pass opens": (step.ContactStep, "_finish", "kept.closing * touch.closed", "0.0"),
     "wrong lever": (dampers, "_mass", "r * weight", "r * (2.0 * weight)"),
     "straight paths": (points, "place_points", "(0.5 * h) * faster", "0.0"),
-    "damper of straight paths": (points, "place_points", "k * below - d * faster", "k * below"),
+    "damper of straight paths": (points, "place_points", "k * below - damping * faster", "k * below"),
+    "damping that does not grow": (points, "place_points", "d * (k * select(less(0.0, depth), depth, 0.0))", "d"),
     "tangent friction": (step.ContactStep, "_secant", "reciprocal(sqrt(w * w + point.eps * point.eps))",
                          "reciprocal(w * w + point.eps * point.eps) * point.eps"),
 }  # fmt: skip
@@ -246,6 +256,7 @@ def test_a_planted_bug_is_seen(monkeypatch, bug):
     with pytest.raises(AssertionError):
         test_a_cube_that_is_thrown()
         test_the_recursion_is_the_dense_step("fork", 4)
+        test_damping_that_grows_with_depth()
 
 
 @functools.cache

@@ -225,7 +225,8 @@ class ContactStep:
                 touched = surfaces(ground, at - moved, int(field[0]) if len(field) else 0)
             for normal, depth in touched:
                 J = dense._jacobian_at(point.body, at)[:3]
-                rows.append((J, normal, depth, k, d, mu, point.eps, weight, normal @ turning))
+                damping = d * k * max(depth, 0.0) if point.dissipates else d
+                rows.append((J, normal, depth, k, damping, mu, point.eps, weight, normal @ turning))
                 self.numbers.append(number)
         return Points(*(np.array(column) for column in zip(*rows, strict=True)))
 

@@ -121,6 +121,8 @@ class Contact(StoredPart):
             the points of one body can hold it up alone, if they span a sole. See ``contact_points`` of :class:`Scene`.
         damping: of each point [N s/m]; None: sqrt(stiffness mass) / 2, with the mass that rests on the point when the
             robot stands on two such bodies, or on four points.
+        dissipation: in place of ``damping``, c of Hunt and Crossley [s/m]: the damping is c ``stiffness`` times the
+            depth before the step, zero at the first touch. The scene's ``contact_damping`` of such points is c.
         eps: speed [m/s] below which friction is a damper. A point that sticks creeps by less than that.
         label: name in tables and errors.
 
@@ -139,6 +141,7 @@ class Contact(StoredPart):
     friction: float = 0.8
     stiffness: float | None = None
     damping: float | None = None
+    dissipation: float | None = None
     eps: float = 1e-3
     label: str = ""
     positions: np.ndarray = dataclasses.field(init=False, repr=False)  # of the points, in the body frame [point, 3]
@@ -151,9 +154,11 @@ class Contact(StoredPart):
             raise ValueError(f"{call}: {', '.join(given) or 'no shape'} given; expected one of {', '.join(SHAPES)}")
         if self.other is not None:
             raise UnsupportedError(call, f"other={self.other!r}, contact between bodies,", "leave out other=")
-        for name in ("friction", "stiffness", "damping", "eps"):
+        if self.damping is not None and self.dissipation is not None:
+            raise ValueError(f"{call}: damping and dissipation are given; expected one of them, or none")
+        for name in ("friction", "stiffness", "damping", "dissipation", "eps"):
             value = getattr(self, name)
-            if value is None and name in ("stiffness", "damping"):
+            if value is None and name in ("stiffness", "damping", "dissipation"):
                 continue
             value = float(checked_array(call, name, value, ()))
             if value < 0.0 or (value == 0.0 and name in ("stiffness", "eps")):
@@ -170,7 +175,7 @@ class ContactPoint(NamedTuple):
     Attributes:
         contact: index of its contact in ``Scene.contacts``. body: index of its body.
         position: of the point, or of the centre of its sphere, in the body frame [m]. radius: of the sphere, or 0 [m].
-        eps: speed below which friction is a damper [m/s].
+        eps: speed below which friction is a damper [m/s]. dissipates: its damping grows with the depth.
     """
 
     contact: int
@@ -178,6 +183,7 @@ class ContactPoint(NamedTuple):
     position: tuple[float, float, float]
     radius: float
     eps: float
+    dissipates: bool = False
 
 
 # -- shapes ------------------------------------------------------------------------------------------------------------
@@ -272,7 +278,7 @@ def spread_directions(count: int = DIRECTIONS) -> np.ndarray:
 def contact_points(contacts: Sequence[Contact]) -> tuple[ContactPoint, ...]:
     """Return the points of all contacts, contact after contact."""
     return tuple(
-        ContactPoint(index, contact.body, (x, y, z), contact.radius, contact.eps)
+        ContactPoint(index, contact.body, (x, y, z), contact.radius, contact.eps, contact.dissipation is not None)
         for index, contact in enumerate(contacts)
         for x, y, z in contact.positions.tolist()
     )
@@ -350,7 +356,7 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
         if k is None:
             k = max(mass * stand.gravity / (rests * SINK), _sole_stiffness(own, mass * stand.gravity, com, stand.up))
             k = k or 1.0  # of massless bodies
-        d = contact.damping
+        d = contact.damping if contact.dissipation is None else contact.dissipation
         if d is None:
             shared = max(rests, min(STANCE, len(set(bodies[tree[bodies]]))) * min(len(own), RESTS))
             d = DAMPING * np.sqrt(k * mass / shared)
@@ -376,11 +382,14 @@ def contact_figures(scene: Any) -> str:
     if not points:
         return "none"
     bodies, ground = len({point.body for point in points}), type(scene.ground).__name__
-    figures = []
-    for name, unit in zip(CONTACT_VALUES, ("", " N/m", " N s/m"), strict=True):
-        low, high = scene.values[name].min(), scene.values[name].max()
-        value = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
-        figures.append(f"{name.removeprefix('contact_')} {value}{unit}")
+    figures, graded = [], np.array([point.dissipates for point in points])
+    rows = [(name.removeprefix("contact_"), name, np.full(len(points), True)) for name in CONTACT_VALUES[:2]]
+    rows += [("damping", "contact_damping", ~graded), ("dissipation", "contact_damping", graded)]
+    for (label, name, which), unit in zip(rows, ("", " N/m", " N s/m", " s/m"), strict=True):
+        if which.any():
+            low, high = scene.values[name][:, which].min(), scene.values[name][:, which].max()
+            value = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+            figures.append(f"{label} {value}{unit}")
     return f"{len(points)} points of {bodies} bodies with the {ground}; {', '.join(figures)}"
 
 

@@ -27,7 +27,7 @@ import numpy as np
 from ...scene.contacts import ContactPoint
 from ...scene.scene import Scene
 from ...trace.evaluation import evaluate
-from ...trace.scalars import Value
+from ...trace.scalars import Value, is_constant, less, select
 from ...trace.spatial import IDENTITY, ZERO, Vector, cross, dot, total
 from ..composite import mass_matrix
 from ..kinematics import carried_velocity, frame_on_link, jacobian, zero
@@ -73,8 +73,9 @@ class Point:
 
     @property
     def state(self) -> list[Value]:
-        """The values that every pass reads: arm, normal, depth, push, and the link's motion before the step."""
-        return [*self.arm, *self.normal, self.depth, self.push, *self.twist[0], *self.twist[1]]
+        """The values that every pass reads: arm, normal, depth, push, damping, and the link's motion before it."""
+        damping = [] if is_constant(self.d) or self.d.op == "input" else [self.d]
+        return [*self.arm, *self.normal, self.depth, self.push, *damping, *self.twist[0], *self.twist[1]]
 
     @property
     def velocity(self) -> Vector:
@@ -128,7 +129,7 @@ def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value],
         at = [origin + dot(axis, centre) for origin, axis in zip(origins[carrier], toward, strict=True)]
         at[lowest(ground)] = at[lowest(ground)] - point.radius
         k, d, mu = (impedance.value(f"contact_{name}", number) for name in ("stiffness", "damping", "friction"))
-        shape = k, d, mu, point.eps, weights[number], axes[carrier][-len(IDENTITY) :] if oriented else []
+        turned = axes[carrier][-len(IDENTITY) :] if oriented else []
         h, moving = impedance.h, motions[carrier]
         bend = bends[carrier][1] + cross(bends[carrier][0], centre)
         bend = bend if moving is None else bend + moving.whirl @ centre
@@ -136,7 +137,10 @@ def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value],
             inward = Vector(total(n * axis[c] for n, axis in zip(normal, toward, strict=True)) for c in range(3))
             faster = h * dot(inward, bend)
             below = depth - (0.5 * h) * faster
-            found.append(Point(number, on, arm, inward, -depth, twists[carrier], *shape, below, k * below - d * faster))
+            damping = d * (k * select(less(0.0, depth), depth, 0.0)) if point.dissipates else d
+            material = k, damping, mu, point.eps, weights[number]
+            push = k * below - damping * faster
+            found.append(Point(number, on, arm, inward, -depth, twists[carrier], *material, turned, below, push))
     return found
 
 
