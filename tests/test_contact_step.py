@@ -374,6 +374,3 @@ def test_scenes_without_a_kernel_have_names(device, monkeypatch):
     for name, value in (("passes", 3), ("contact_gap", np.zeros((1, 0), np.float32))):
         with pytest.raises(ValueError, match=f"{name} is given, and the scene has no contacts"):
             bare.step(q, qd, None, H, **{name: value})
-    torch = pytest.importorskip("torch")
-    with pytest.raises(ValueError, match="the scene has contacts and an input requires grad"):
-        spo.Dynamics(box(), device="cpu").step(torch.tensor(q, requires_grad=True), torch.tensor(qd), None, H)

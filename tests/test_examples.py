@@ -18,6 +18,7 @@ from warp_spo.examples import (
     geared_arm,
     gripper,
     harmonic_drive,
+    hop,
     identify,
     identify_boom,
     options,
@@ -34,7 +35,7 @@ FOLDER = Path(parts.__file__).parent
 
 
 SHORT = {
-    **dict.fromkeys((floating_arm, identify, reach), 100),
+    **dict.fromkeys((floating_arm, hop, identify, reach), 100),
     **dict.fromkeys((crane, double_fourbar, harmonic_drive, identify_boom), 60),
     **dict.fromkeys((quasi_velocities, spinning_beam, star, tether), 60),
 }
@@ -50,6 +51,13 @@ def test_a_floating_arm_draws_its_circle(tmp_path):
     svg = (tmp_path / "arm.svg").read_text()
     assert_is_whole(svg)
     assert "hand in 4 worlds" in svg and "distance from the circle [mm]" in svg
+
+
+@pytest.mark.parametrize(("iterations", "left"), [(2, 0.99), pytest.param(60, 0.05, marks=pytest.mark.slow)])
+def test_a_leg_learns_to_hop(iterations, left, tmp_path, device):
+    losses = hop.main(iterations=iterations, device=str(device), picture=tmp_path / "hop.svg")
+    assert losses[-1] <= left * losses[0]  # 0.02 after 60 iterations here
+    assert_is_whole((tmp_path / "hop.svg").read_text())
 
 
 def test_a_double_fourbar_ends_where_the_benchmark_says(tmp_path, device):

@@ -36,6 +36,7 @@ class Gradients:
     def __init__(self, dyn: Dynamics):
         self.dyn = dyn
         self._checked: set[str] = set()  # names of operations that have gradients on this scene
+        self.pass_variables: dict[tuple[str, ...], int] = {}  # of steps with contacts, by their arguments
         self.latest: dict[str, Callable[[tuple, dict[str, Any]], Any]] = {}  # repeats a call that torch records
 
     # -- for torch -------------------------------------------------------------------------------------------------
@@ -61,6 +62,7 @@ class Gradients:
     def forget(self) -> None:
         """Forget what was checked: values that kernels fold have changed."""
         self._checked.clear()
+        self.pass_variables.clear()
         self.latest.clear()
 
     def remember(self, record: Any, tensors: list, written: tuple, guards: Any, apply: Callable[..., Any]) -> None:
@@ -239,7 +241,10 @@ class Gradients:
             results["value"] = dyn.recursions.array("value of derivatives", dyn.worlds, size)
         first, *more = results
         further = {f"{name}_bar": results[name] for name in more}
-        dyn._engine.launch(derivative, results[first], further, wrt=tuple(results), **given)
+        if derivative.launch is None:
+            dyn._engine.launch(derivative, results[first], further, wrt=tuple(results), **given)
+        else:
+            derivative.launch(dyn, derivative, results[first], further, wrt=tuple(results), **given)
         if values:
             flat = {name: array.reshape((dyn.worlds, math.prod(array.shape[1:]))) for name, array in values.items()}
             link_values.pull_back(dyn.recursions.parameters, dyn.programs.links, results["value"], flat)

@@ -42,6 +42,7 @@ from ..dlpack import settle
 from ..execution.routine import Routine
 from ..gradients import call_in_graph, call_with_gradient, is_exported, is_traced, records_gradient
 from ..recursions.links import LINK_VALUES, MOTION_VALUES, Links
+from ..scene.contacts import CONTACT_VALUES
 from ..scene.frames import check_frames, origins
 from ..scene.scene import Scene
 from . import samples
@@ -189,7 +190,7 @@ GAINS = ("joint_damping", "joint_stiffness", "joint_friction", "joint_target_ke"
          "joint_velocity_limit")  # fmt: skip
 KINEMATIC = (*ANCHORS, "body_com")  # values that enter poses, velocities and Jacobians
 ACTUATION = ("actuator_gain", "actuator_bias", "actuator_gear", "actuator_strength")
-DIFFERENTIABLE = (*LINK_VALUES, *GAINS, *ACTUATION)
+DIFFERENTIABLE = (*LINK_VALUES, *GAINS, *ACTUATION, *CONTACT_VALUES, "ground_origin")
 """All values of a scene by which some result can be differentiated."""
 
 
@@ -204,6 +205,8 @@ class Derivative:
         keeps: arguments that the operation fills because the way back reads them.
         recomputes: the kernel computes the result that it reads where the caller does not pass it.
         pull: what is launched; None: the kernel alone.
+        launch: ``launch(dyn, derivative, out, more, **given)`` launches it where one kernel does not do; None: the
+            kernel, by :meth:`.engine.Engine.launch`.
         refuses: ``refuses(dyn, arguments)``, "what came; what is expected" of arguments with which a call has no
             gradient; otherwise "".
         repeats: ``repeats(call, arguments)`` takes out of the arguments how often the operation runs on its own
@@ -221,6 +224,7 @@ class Derivative:
     keeps: tuple[str, ...] = ()
     recomputes: bool = False
     pull: Pull | None = None
+    launch: Callable[..., Any] | None = None
     refuses: Callable[[Any, dict[str, Any]], str] = lambda dyn, arguments: ""
     repeats: Callable[[str, dict[str, Any]], int] = lambda call, arguments: 1
     lacking: Callable[[Links], str] = lambda links: ""

@@ -13,7 +13,7 @@ from ..kernels import combination
 from ..recursions.derivatives import adjoints
 from ..recursions.loops import embedded_adjoints
 from ..status import Status
-from . import actuators, contacts, integrators
+from . import actuators, contact_gradients, contacts, integrators
 from .gradients import by_name
 from .integrators import INTEGRATORS, Interval
 from .operation import (
@@ -59,24 +59,35 @@ def _pull_step(
         for name, like, array in zip(("q_cotangent", "qd_cotangent"), ("q", "qd"), cotangents, strict=True):
             arrays[name] = call.read(name, array, shape[like])
         names, outs = gradients.outs(call, operation, arrays, wrt, None)
-        if dyn.embedding is None:
-            arrays.pop("tau", None)
+        if dyn.scene.contacts:
+            arrays["passes"] = options.get("passes")
         gradients.launch(derivative, names, outs, arrays)
     return by_name(names, call.result)
 
 
+def _launch_gradients(
+    dyn: Dynamics, derivative: Derivative, out: wp.array, more: dict[str, wp.array], **given: Any
+) -> None:
+    """Launch gradients of a step; that of an open tree without contacts does not read tau."""
+    if dyn.scene.contacts:
+        contact_gradients.launch(dyn, out, more, **given)
+        return
+    if dyn.embedding is None:
+        given.pop("tau", None)
+    dyn._engine.launch(derivative, out, more, **given)
+
+
 def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
     """Return what a call of a step asks for that has no gradient, and what is expected; "" if nothing."""
-    if dyn.scene.contacts:
-        return "the scene has contacts; expected a scene without contacts, whose steps have gradients"
     if arguments.get("integrator", "semi_implicit") != "semi_implicit":
         return f"integrator is {arguments['integrator']!r}; expected integrator='semi_implicit', which has gradients"
     if arguments.get("qdd") is not None:
         return "qdd is given; expected no qdd=, which the way back uses itself"
     if arguments.pop("actuator_state", None) is not None and actuators.delays_controls(dyn):
         return "actuators delay ctrl; expected a scene without delays, whose buffers have no gradients"
-    if arguments.get("status") is not None and arguments.get("substeps", 1) != 1:
-        return "status is given with substeps; expected one of the two"
+    for name in ("status", *contacts.REPORTS):
+        if arguments.get(name) is not None and arguments.get("substeps", 1) != 1:
+            return f"{name} is given with substeps; expected one of the two"
     return ""
 
 
@@ -121,6 +132,7 @@ STEP = Operation(
         multipliers=EMBEDDED_DERIVATIVE,
         keeps=("qdd",),
         pull=_pull_step,
+        launch=_launch_gradients,
         refuses=_without_gradient,
         repeats=_take_substeps,
     ),
@@ -184,7 +196,7 @@ def step(
     a bound does so by what ``contact_excess`` says, and gains no energy at a held pose. The normal force of a point
     is stiffness times depth plus damping times the speed inward, both after the step; there is no restitution. A point
     that sticks creeps, by eps rho / sqrt(1 - rho^2) for the share rho of friction that is used. Contacts need
-    integrator="semi_implicit", no closed loops, and another granularity than "node"; they have no gradients.
+    integrator="semi_implicit", no closed loops, and another granularity than "node".
 
     Where Dynamics closes loops, accelerations obey the closures, with all of the above on every dof, those that a loop
     moves included. Two Newton steps then move q', and qd' there, onto the closures; they leave O((h rate)^6), 1e-10 at

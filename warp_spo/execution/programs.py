@@ -222,13 +222,13 @@ class Programs:
         direct = self.plan.copies_directly(routine)
         layout = layout._replace(retries=layout.retries and "farthest" in body, block=block, direct=direct)
         tables = {} if table is None else {"place": table}
-        tables |= self._heights(routine)
+        tables |= self._heights(emitter.counts["lookup"] > 0)
         return self._finished(routine, layout, body, body, tables, emitter.operations)
 
-    def _heights(self, routine: Routine) -> dict[str, Any]:
-        """Return the table of the ground's heights, for a step that reads it."""
+    def _heights(self, reads: bool) -> dict[str, Any]:
+        """Return the table of the ground's heights, if a program ``reads`` it."""
         ground = self.run.scene.ground
-        return {GROUND: ground.heights.ravel()} if routine.counted and isinstance(ground, HeightField) else {}
+        return {GROUND: ground.heights.ravel()} if reads and isinstance(ground, HeightField) else {}
 
     def _segment_program(
         self, routine: Routine, shapes: dict, pieces: Pieces, more: tuple, options: dict
@@ -302,7 +302,7 @@ class Programs:
                     registers = fewer
                     break
         lists = {"place": table, "table": team.table, "shifts": team.shifts}
-        tables = {name: values for name, values in lists.items() if values} | self._heights(routine)
+        tables = {name: values for name, values in lists.items() if values} | self._heights(routine.counted)
         cap = registers if registers < MOST_REGISTERS else None
         return self._finished(routine, layout, cuda, team.cpu(), tables, team.operations, cap)
 

@@ -214,8 +214,6 @@ class StepRecord:
             outs = {ARGUMENTS[name]: self._buffer(name) for name in ARGUMENTS if name in names}
             values = {name: solver.arrays.gradient(name) for name in wanted if name in DIFFERENTIABLE}
             arrays = {**given, "dt": float(self._dt), "qdd": self.qdd, **cotangents}
-            if solver.dynamics.embedding is None:
-                arrays.pop("tau")
             self._pull(STEP, {**outs, **values}, **arrays)
             if "tau" in outs:
                 poses = layouts.poses.buffer("poses gradient") if taus and "joint_q" in wanted else None

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 
 from .scalars import Scalar, Value, cos, is_constant, logarithm, ordered, power, reciprocal, select, sin
 
+INFINITE = ("sqrt", "reciprocal", "quotient")  # may have an infinite derivative
 UNIT_DERIVATIVE = ("add", "cut", "reduced", "guarded")  # by each argument, except the limit of "guarded"
 ZERO_DERIVATIVE = ("input", "lost", "less", "floor", "lookup")  # piecewise constant; "lost" is 0 or NaN
 
@@ -34,13 +35,17 @@ def forward(outputs: Iterable[Value], inputs: Iterable[Scalar], seeds: Iterable[
     return [0.0 if is_constant(y) else rates[y.key] for y in outputs]
 
 
-def reverse(outputs: Iterable[Value], inputs: Iterable[Scalar], seeds: Iterable[Value]) -> list[Value]:
+def reverse(
+    outputs: Iterable[Value], inputs: Iterable[Scalar], seeds: Iterable[Value], sheltered: bool = False
+) -> list[Value]:
     """Return the derivative of the sum of seed times output with respect to each input.
 
     Args:
         outputs: values of one graph.
         inputs: the independent scalars, as in :func:`forward`.
         seeds: one value for each output.
+        sheltered: nothing goes back through a root or a quotient where the sum does not depend on it, even if its
+            derivative is infinite there, as that of the length of a zero vector, or of a quotient that is not selected.
     """
     outputs, inputs = list(outputs), list(inputs)
     duals: dict[tuple, Value] = {}
@@ -54,7 +59,9 @@ def reverse(outputs: Iterable[Value], inputs: Iterable[Scalar], seeds: Iterable[
         with _DerivativeNames(scalar):
             for at, argument in enumerate(scalar.args):
                 if _is_scalar(argument):
-                    duals[argument.key] = duals.get(argument.key, 0.0) + partial(scalar, at) * dual
+                    way = partial(scalar, at) * dual
+                    way = select(dual, way, 0.0) if sheltered and scalar.op in INFINITE else way
+                    duals[argument.key] = duals.get(argument.key, 0.0) + way
     return [duals.get(x.key, 0.0) for x in inputs]
 
 

@@ -22,13 +22,16 @@ class Kept:
     Attributes:
         begin: stores of what the first pass finds. end: stores at the end of a pass.
         first: 1 in the first pass, else 0. closing: 1 before a last pass that only closes, else 0.
+
+    Args:
+        counter: name of the input that counts the passes from zero.
     """
 
-    def __init__(self, graph: Graph):
+    def __init__(self, graph: Graph, counter: str = "pass"):
         self.graph = graph
         self.begin: list[Store] = []
         self.end: list[Store] = []
-        number, count = graph.input("pass", 0), graph.input("passes", 0)
+        number, count = graph.input(counter, 0), graph.input("passes", 0)
         self.first = less(number, 0.5)
         self.closing = less(count - 2.5, number) * less(2.5, count)
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...scene.actuators import ACTUATOR_VALUES
+from ...scene.contacts import CONTACT_VALUES, GROUND_VALUES
 from ...trace.differentiation import forward, reverse
 from ...trace.emission import Store
 from ...trace.scalars import Scalar, Value, ordered
@@ -275,7 +276,7 @@ def entries(trace: Trace, name: str, found: dict[tuple, Value]) -> Iterable[tupl
         places = [(i,) for i in range(len(trace.links.tables["value"]))]
     elif name == "ctrl":
         places = [(number,) for number in range(len(trace.links.scene.actuators))]
-    elif name in ACTUATOR_VALUES:
+    elif name in (*ACTUATOR_VALUES, *CONTACT_VALUES, *GROUND_VALUES):
         return _value_entries(trace, name, found)
     elif name in COORDINATES:
         places = [

@@ -1,0 +1,134 @@
+"""Gradients of steps with contacts, and of what they are compared with: central differences away from switches.
+
+Traces are evaluated by NumPy, the moved copies of all worlds at once; so are the answers of all their comparisons, by
+which a difference across a switch is known and left out.
+"""
+
+import numpy as np
+
+from warp_spo.recursions.contact import step as contact
+from warp_spo.recursions.contact.ground import GROUND
+from warp_spo.recursions.contact.secants import SECANT
+from warp_spo.recursions.derivatives import contact as back
+from warp_spo.recursions.links import Links
+from warp_spo.recursions.step import GAIN
+from warp_spo.recursions.tracing import Trace
+from warp_spo.trace.evaluation import evaluate
+from warp_spo.trace.scalars import ordered
+
+VALUES = ("contact_friction", "contact_stiffness", "contact_damping", "joint_target_ke", "joint_target_kd",
+          "ground_origin")  # fmt: skip
+STEP = {"q": 1e-6, "qd": 1e-6, "tau": 1e-3, "body_f": 1e-3, "target_q": 1e-4, "target_qd": 1e-4,
+        "ground_origin": 1e-6}  # fmt: skip
+"""Of the differences; values move by RELATIVE of themselves. Smaller ones drown in rounding errors."""
+RELATIVE = 3e-3
+FOURTH = ((1.0, 8.0), (-1.0, -8.0), (2.0, -1.0), (-2.0, 1.0))
+"""How far each copy moves, and its weight in twelve steps of the difference, which is of fourth order."""
+
+
+def furnish(scene, a):
+    """The arguments and the values of a scene by name, [world, ...]."""
+    worlds = len(a["q"])
+    return a | {name: np.tile(scene.values[name], (worlds, 1)) for name in VALUES}
+
+
+def trace_of(scene, names):
+    return Trace(Links(scene, VALUES), "float64", names)
+
+
+def store(stores, known, found):
+    """Evaluate stores into arrays by name; return the answers of all comparisons [world, comparison]."""
+    outputs = [item.value for item in stores]
+    asked = [x for x in ordered(outputs) if x.op in ("less", "floor")]
+    values = evaluate([*outputs, *asked], lambda name, at: known[name][(slice(None), *at)], "float64")
+    for item, value in zip(stores, values, strict=False):
+        found[item.array][(slice(None), *item.index)] = value
+    worlds = len(known["q"])
+    return np.array([np.broadcast_to(value, worlds) for value in values[len(outputs) :]]).T
+
+
+def step(scene, a, h, passes):
+    """q', qd' [world, ...] and the answers of all comparisons on the way [world, comparison]."""
+    arguments = tuple(name for name in a if name not in VALUES)
+    trace, worlds = trace_of(scene, (*arguments, "dt", "passes")), len(a["q"])
+    stores = contact.step(trace)
+    known = a | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
+    known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(trace.begin)))}
+    known[GROUND] = np.ravel(getattr(scene.ground, "heights", ()))
+    answers = [store(trace.begin, known, known)]
+    looped = [item for item in stores if item.array in (GAIN, SECANT)]
+    for number in range(passes):
+        known["pass"] = np.full((worlds, 1), float(number))
+        after = {name: known[name].copy() for name in (GAIN, SECANT)}
+        answers.append(store(looped, known, after))
+        known |= after
+    found = {"q_out": np.full((worlds, scene.coord_count), np.nan), "out": np.full((worlds, scene.dof_count), np.nan)}
+    store([item for item in stores if item.array in found], known, found)
+    return found["q_out"], found["out"], np.concatenate(answers, axis=1)
+
+
+def gradient(scene, a, h, passes, cotangents, wrt):
+    """The gradients of the sum of cotangents times results by name, from the kernels' traces."""
+    arguments, worlds, dofs = tuple(name for name in a if name not in VALUES), len(a["q"]), scene.dof_count
+    names = (*arguments, "dt", "passes", "number")
+    count = back.count_variables(trace_of(scene, names))
+    forward = back.contact_pass(trace_of(scene, names))
+    backward = back.contact_pass_vjp(trace_of(scene, (*names, "qdd", "q_cotangent", "qd_cotangent")), wrt)
+    blank = lambda size: np.full((worlds, size), np.nan)  # noqa: E731
+    known = a | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
+    known[GROUND] = np.ravel(getattr(scene.ground, "heights", ()))
+    rates, rows = [blank(dofs)], [blank(count)]
+    for number in range(passes):
+        known |= {"number": np.full((worlds, 1), float(number)), "row": rows[-1], "qdd_before": rates[-1]}
+        found = {"out": blank(dofs), "row_out": blank(count)}
+        store(forward, known, found)
+        rates.append(found["out"])
+        rows.append(found["row_out"])
+    known |= dict(zip(("q_cotangent", "qd_cotangent"), cotangents, strict=True), cotangent=blank(dofs + count))
+    known |= {f"{name}_later": np.full(a[name].shape, np.nan) for name in wrt}
+    for number in reversed(range(passes)):
+        known |= {"number": np.full((worlds, 1), float(number)), "row": rows[number], "qdd_before": rates[number],
+                  "qdd": rates[number + 1]}  # fmt: skip
+        found = {back.result_name(name, wrt): np.full(a[name].shape, np.nan) for name in wrt}
+        found["cotangent_out"] = blank(dofs + count)
+        store(backward, known, found)
+        known["cotangent"] = found["cotangent_out"]
+        known |= {f"{name}_later": found[back.result_name(name, wrt)] for name in wrt}
+    return {name: known[f"{name}_later"] for name in wrt}
+
+
+def differences(scene, a, h, passes, cotangents, name, advance=step):
+    """Differences by the entries of an argument or value [world, entry], NaN where one crosses a switch."""
+    flat = a[name].reshape(len(a[name]), -1)
+    worlds, entries = flat.shape
+    sizes = np.full(flat.shape, STEP[name]) if name in STEP else RELATIVE * np.maximum(abs(flat), 1e-2)
+    moved = np.tile(flat, (entries * len(FOURTH), 1, 1))  # [entry and copy, world, entry]
+    for at in range(entries):
+        for copy, (share, _) in enumerate(FOURTH):
+            moved[at * len(FOURTH) + copy, :, at] += share * sizes[:, at]
+    many = {n: np.tile(x, (entries * len(FOURTH), *[1] * (x.ndim - 1))) for n, x in a.items()}
+    many[name] = moved.reshape(-1, *a[name].shape[1:])
+    q, qd, answers = advance(scene, many, h, passes)
+    found = np.zeros((worlds, entries))
+    sums = sum((x.reshape(-1, worlds, x.shape[1]) * c).sum(axis=2) for x, c in zip((q, qd), cotangents, strict=True))
+    answers = answers.reshape(entries, len(FOURTH), worlds, -1)
+    crossed = (answers != answers[:, :1]).any(axis=(1, 3)).T
+    for at in range(entries):
+        weighted = sum(w * sums[at * len(FOURTH) + copy] for copy, (_, w) in enumerate(FOURTH))
+        found[:, at] = weighted / (12.0 * sizes[:, at])
+    return np.where(crossed, np.nan, found)
+
+
+def errors(scene, a, h, passes, seed=0, names=None):
+    """By name: the largest error of a gradient over the world's largest entry, and the share of entries at switches."""
+    rng = np.random.default_rng(seed)
+    cotangents = [rng.normal(size=a[name].shape) for name in ("q", "qd")]
+    wrt = tuple(names or a)
+    found, errors = gradient(scene, a, h, passes, cotangents, wrt), {}
+    for name in wrt:
+        wanted = differences(scene, a, h, passes, cotangents, name)
+        mine = found[name].reshape(wanted.shape)
+        assert np.isfinite(mine).all(), name
+        scale = np.maximum(abs(mine).max(axis=1, keepdims=True), 1e-12)
+        errors[name] = np.nanmax(abs(mine - wanted) / scale), np.isnan(wanted).mean()
+    return errors

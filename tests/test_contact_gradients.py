@@ -1,0 +1,154 @@
+"""Gradients of steps with contacts: every pass against differences away from switches, and through torch."""
+
+import contact_gradients
+import numpy as np
+import pytest
+import symbolic
+import zoo
+from contact_cases import EFFORT, box, everywhere, quadruped, touching
+from step_scenes import furnished, states
+from test_contact_step import FIELDS, above
+
+import warp_spo as spo
+from warp_spo.examples import hop
+from warp_spo.recursions.derivatives.contact import PassAdjoint
+from warp_spo.trace import differentiation
+
+torch = pytest.importorskip("torch")
+H, WORLDS = 5e-3, 4
+LARGEST = {"tau": 1e-6, "body_f": 1e-6}
+"""Error of a gradient by forces over the largest entry; 1e-7 measured. By anything else:"""
+LARGEST_ELSE = 1e-4  # 2e-5 measured, of gains that hardly matter
+
+
+def without_friction(scene):
+    """The scene without dry friction in its hinges, whose creep differences of this size do not resolve."""
+    return scene.with_values(joint_friction=np.zeros(scene.dof_count))
+
+
+def cases():
+    """Scenes with states in which points stick, slide, close and open, and drives are saturated."""
+    for name, friction, fast in (("stick", 0.8, 1.0), ("slide", 0.2, 3.0)):
+        scene = without_friction(quadruped(EFFORT, friction=friction))
+        q, qd, tau = touching(scene, 4, WORLDS)
+        yield name, scene, {"q": q, "qd": fast * qd, "tau": tau}
+    scene = without_friction(everywhere(furnished(zoo.random_tree(6, 1)), 1))
+    a = states(scene, WORLDS)
+    yield "tree", scene, a | {"qd": np.random.default_rng(0).normal(size=a["qd"].shape)}
+    for name, field in FIELDS.items():
+        scene = box(ground=field, friction=0.3)
+        yield name, scene, above(scene, 1, 2 * WORLDS)
+
+
+CASES = {name: (scene, contact_gradients.furnish(scene, a)) for name, scene, a in cases()}
+
+
+SLOW = ("stick", "slide", "tree")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in CASES])
+def test_gradients_are_differences(name):
+    """By state, forces, targets, gains and the contacts' values; hardly any difference crosses a switch."""
+    scene, a = CASES[name]
+    errors = contact_gradients.errors(scene, a, H, 3)
+    for argument, (error, crossed) in errors.items():
+        assert error <= LARGEST.get(argument, LARGEST_ELSE), (argument, errors)
+        assert crossed <= 0.01, (argument, errors)
+
+
+@pytest.mark.parametrize("passes", [1, 4])
+def test_any_number_of_passes_is_differentiated(passes):
+    scene, a = CASES["rough"]
+    errors = contact_gradients.errors(scene, a, H, passes, names=("q", "qd", "contact_friction"))
+    assert max(error for error, _ in errors.values()) <= LARGEST_ELSE
+
+
+BUGS = {
+    "earlier passes frozen": (PassAdjoint, "_results", "self._later(COTANGENT, len(self.qdd) + item.index[0])", "0.0"),
+    "what passes begin with": (
+        PassAdjoint,
+        "backward",
+        "select(kept.first, by_row[len(qdd) + item.index[0]], 0.0)",
+        "0.0",
+    ),
+    "a load held": (PassAdjoint, "backward", "[*seeds, 1.0]", "[*seeds, 0.0]"),
+    "dampers left out": (PassAdjoint, "_solve", "trace.pushes = {}", "trace.dampers = {}"),
+}
+
+
+@pytest.mark.parametrize("bug", BUGS)
+def test_planted_bugs(bug, monkeypatch):
+    symbolic.plant(monkeypatch, *BUGS[bug])
+    scene, a = CASES["rough"]
+    errors = contact_gradients.errors(scene, a, H, 3, names=("q", "qd", "contact_friction"))
+    assert max(error for error, _ in errors.values()) >= 1e-3, errors
+
+
+def test_a_cube_at_rest_has_a_gradient(monkeypatch):
+    """The length of no slip has an infinite slope, which counts for nothing."""
+    scene = box()
+    q = np.tile([0.0, 0, 0.0995, 0, 0, 0, 1], (2, 1))
+    a = contact_gradients.furnish(scene, {"q": q, "qd": np.zeros((2, 6)), "tau": np.zeros((2, 6))})
+    cotangents = [np.ones((2, 7)), np.ones((2, 6))]
+    found = contact_gradients.gradient(scene, a, H, 3, cotangents, ("q", "qd", "tau"))
+    assert all(np.isfinite(x).all() for x in found.values())
+    monkeypatch.setattr(differentiation, "INFINITE", ())
+    with np.errstate(all="ignore"):
+        found = contact_gradients.gradient(scene, a, H, 3, cotangents, ("qd",))
+    assert np.isnan(found["qd"]).all()
+
+
+# -- through torch -----------------------------------------------------------------------------------------------------
+VARIABLE = ("body_mass", "joint_friction", "joint_target_ke", "contact_friction", "contact_stiffness")
+
+
+def leg(dtype, device):
+    """The leg of the example with variable values, states in and above the ground, and its tensors by name."""
+    scene, rng = hop.scene().with_values(joint_friction=[0.0, 0.2, 0.0]), np.random.default_rng(3)
+    dyn = spo.Dynamics(scene, WORLDS, device, dtype, variable=VARIABLE)
+    kind = dict(dtype=getattr(torch, dtype), device=str(device).replace("cuda:0", "cuda"))
+    q = np.array([0.0, *hop.CROUCH]) + 0.2 * rng.normal(size=(WORLDS, 3))
+    q[:, 0] = hop.LINK * (np.cos(q[:, 1]) + np.cos(q[:, 1] + q[:, 2])) + hop.FOOT - [1e-3, 2e-3, 5e-4, -0.2]
+    a = {"q": q, "qd": rng.normal(size=(WORLDS, 3)), "tau": rng.normal(size=(WORLDS, 3)), "target_q": q[::-1].copy()}
+    a |= {name: np.tile(scene.values[name], (WORLDS, 1)) for name in VARIABLE}
+    return dyn, {name: torch.tensor(x, **kind, requires_grad=True) for name, x in a.items()}
+
+
+def loss(dyn, tensors, **more):
+    """A number of each world after a step."""
+    dyn.set(**{name: tensors[name] for name in VARIABLE})
+    q, qd = dyn.step(tensors["q"], tensors["qd"], tensors["tau"], H, target_q=tensors["target_q"], **more)
+    return (q * q).sum(1) + (qd * qd).sum(1)
+
+
+def test_torch_differentiates_the_step(device):
+    """Every input and value, by differences of the compiled step; substeps; float32 beside float64."""
+    dyn, tensors = leg("float64", device)
+    for more in ({"substeps": 3}, {"passes": 4}):
+        for tensor in tensors.values():
+            tensor.grad = None
+        loss(dyn, tensors, **more).sum().backward()
+        for name, tensor in tensors.items():
+            wanted, still = torch.zeros_like(tensor), {n: t.detach() for n, t in tensors.items()}
+            for at in range(tensor.shape[1]):
+                by = torch.zeros_like(tensor)
+                by[:, at] = 1e-6 * torch.clamp(abs(tensor[:, at].detach()), 1.0)
+                ends = [loss(dyn, still | {name: still[name] + sign * by}, **more) for sign in (1.0, -1.0)]
+                wanted[:, at] = (ends[0] - ends[1]) / (2.0 * by[:, at])
+            error = abs(tensor.grad - wanted).amax() / abs(wanted).amax()
+            assert error <= 1e-5, (name, more, error)  # 6e-7 measured: differences of second order
+    last = {name: tensor.grad for name, tensor in tensors.items()}
+    dyn, tensors = leg("float32", device)
+    loss(dyn, tensors, passes=4).sum().backward()
+    for name, tensor in tensors.items():
+        error = abs(tensor.grad - last[name]).amax() / abs(last[name]).amax()
+        assert error <= 1e-3, (name, error)  # 1e-4 measured: a depth of 0.5 mm is rounded to 6e-5 of itself
+
+
+def test_gradients_that_do_not_exist_have_names(device):
+    dyn, tensors = leg("float64", device)
+    force = torch.zeros((WORLDS, 1, 3), dtype=torch.float64, device=tensors["q"].device)
+    with pytest.raises(ValueError, match="contact_f is given with substeps and an input requires grad"):
+        loss(dyn, tensors, contact_f=force, substeps=2)
+    loss(dyn, tensors, contact_f=force)
+    assert (force[:, 0, 2] > 0.0).any()
