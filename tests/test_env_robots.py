@@ -73,6 +73,7 @@ def test_limits_are_the_sources(name):
     assert np.allclose(ours.values["actuator_force_range"][0, :, 1], theirs.values["joint_effort_limit"][0, -n:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "steps"), [("ant", 200), ("go2", 200), ("g1", 80)])
 def test_they_stand(name, steps):
     """On their feet alone, with the controls of the pose "stand"; a humanoid tips over after a while."""

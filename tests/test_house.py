@@ -47,6 +47,8 @@ ROOMS = (
     "newton",
     "trials",
     "env",
+    "train",
+    "play",
     "examples",
     "__main__",
 )

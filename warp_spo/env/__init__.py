@@ -55,6 +55,7 @@ __all__ = [
     "actions",
     "commands",
     "events",
+    "make",
     "observations",
     "rewards",
     "terminations",
@@ -68,3 +69,20 @@ def __getattr__(name: str) -> Any:
 
         return Env
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def make(name: str, worlds: int | None = None, device: Any = None, seed: int = 0, **options: Any) -> "Env":
+    """Return the environment of a task; nothing is downloaded.
+
+    Args:
+        name: "cartpole", "ant", "panda-reach", "go2-flat" or "g1-flat".
+        worlds: how many; None: as many as the task is trained with.
+        device: Warp or torch device. seed: of all random numbers. options: further arguments of :class:`Env`.
+
+    Raises:
+        ValueError: there is no task of this name.
+    """
+    from .tasks import task
+
+    chosen = task(name)
+    return chosen.build(chosen.LEARNER.worlds if worlds is None else worlds, device, seed, **options)

@@ -1,0 +1,184 @@
+"""Tasks, their training, films and exports, at small sizes."""
+
+import json
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("rsl_rl")
+
+from warp_spo import env as envs  # noqa: E402
+from warp_spo import play, train  # noqa: E402
+from warp_spo.env import evaluation, export, film, learning, recording, robots  # noqa: E402
+from warp_spo.env.tasks import TASKS, task  # noqa: E402
+
+
+def roll(env, steps, seed=0):
+    torch.manual_seed(seed)
+    rows = []
+    for _ in range(steps):
+        observed, reward, done, _ = env.step(0.5 * torch.randn(env.num_envs, env.num_actions))
+        rows.append((observed["actor"].clone(), reward.clone(), done.clone(), env.q.clone()))
+    return [torch.stack([row[i] for row in rows]) for i in range(4)]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A folder with a cart-pole training of three iterations, by the command line."""
+    folder = tmp_path_factory.mktemp("runs")
+    given = ["cartpole", "--worlds", "16", "--device", "cpu", "--iterations", "3", "--out", str(folder), "--seed", "3"]
+    assert train.main(given) == 0
+    return folder
+
+
+def test_cartpole_steps():
+    """Rewards are those of the formula, worlds differ, and the rail's end ends an episode."""
+    env = envs.make("cartpole", 8, "cpu", seed=1)
+    observed, reward, done, q = roll(env, 60)
+    assert observed.isfinite().all() and (q[-1].std(dim=0) > 1e-3).all()
+    fine = done[-1] == 0
+    x, theta = q[-1][fine].T
+    v, w = env.qd[fine].T
+    up = 0.5 * (1 + theta.cos()) * (0.3 + 0.7 * (-((x / 0.8) ** 2)).exp())
+    still = (-0.5 * ((1 - theta.cos()) / 0.02 + w**2 + v**2)).exp()
+    wanted = env.step_dt * (up + 2.0 * still - 0.02 * env.actions[fine, 0] ** 2)
+    assert torch.allclose(reward[-1][fine], wanted, atol=1e-6)
+    env.q[0, 0] = 1.9
+    assert env.step(torch.zeros(8, 1))[2][0] == 1
+
+
+def test_a_seed_repeats_a_course():
+    first, again, other = (roll(envs.make("cartpole", 4, "cpu", seed=seed), 20)[3] for seed in (5, 5, 6))
+    assert torch.equal(first, again) and not torch.equal(first, other)
+
+
+def test_an_unknown_task_is_refused():
+    with pytest.raises(ValueError, match=r"make: task 'walk' is unknown; expected one of cartpole, ant, panda-reach"):
+        envs.make("walk")
+
+
+def test_a_training_leaves_checkpoints_and_a_course(trained):
+    rows = learning.read_rows(trained / "progress.jsonl")
+    assert [row["iteration"] for row in rows] == [0, 1, 2] and all(
+        np.isfinite(list(row.values())).all() for row in rows
+    )
+    assert torch.load(trained / "model_2.pt", weights_only=True)["iter"] == 2
+    assert (trained / "curve.png").stat().st_size > 1000
+
+
+def test_a_training_resumes(trained, tmp_path):
+    """Where it stopped: the optimizer's steps go on; asking for no more iterations is an error."""
+    env = envs.make("cartpole", 16, "cpu")
+    learner = task("cartpole").LEARNER
+    runner = learning.train(env, learner, tmp_path, 4, resume=trained / "model_2.pt")
+    assert runner.current_learning_iteration == 3
+    steps = {int(state["step"]) for state in runner.alg.optimizer.state_dict()["state"].values()}
+    assert steps == {4 * learner.epochs * learner.batches}
+    with pytest.raises(ValueError, match="has 3 iterations; expected more"):
+        learning.train(env, learner, tmp_path, 3, resume=trained / "model_2.pt")
+
+
+def test_exports_act_as_the_policy(trained, tmp_path):
+    """ONNX and TorchScript give the actions of the policy, and their metadata the controls of the environment."""
+    onnx = pytest.importorskip("onnx")
+    from onnx.reference import ReferenceEvaluator
+
+    env = envs.make("cartpole", 16, "cpu")
+    runner = learning.make_runner(env, task("cartpole").LEARNER)
+    learning.load_checkpoint(runner, trained / "model_2.pt", learns=False)
+    files = export.save(runner, env, "cartpole", tmp_path / "policy")
+    observed = torch.randn(16, 5)
+    wanted = runner.alg.get_policy().as_jit()(observed).detach()
+    model = onnx.load(str(files[0]))
+    found = ReferenceEvaluator(model).run(None, {"obs": observed.numpy()})[0]
+    extra = {"metadata.json": ""}
+    script = torch.jit.load(str(files[1]), _extra_files=extra)
+    assert np.allclose(found, wanted, atol=1e-5) and torch.allclose(script(observed), wanted, atol=1e-6)
+    metadata = json.loads(extra["metadata.json"])
+    assert {each.key: json.loads(each.value) for each in model.metadata_props} == metadata
+    assert metadata["joints"] == ["slide", "hinge"] and metadata["actuators"] == ["slide"]
+    assert metadata["default_position"] == [0.0, np.pi]
+    assert np.allclose([metadata["action_scale"], metadata["action_offset"]], [[1.0], [0.0]], atol=1e-6)
+
+
+def test_play_draws_a_film(trained, tmp_path):
+    from PIL import Image
+
+    given = ["cartpole", str(trained / "model_2.pt"), "--seconds", "0.6", "--out", str(tmp_path / "film")]
+    assert play.main(given) == 0
+    with Image.open(tmp_path / "film.gif") as film_, Image.open(tmp_path / "film.png") as strip:
+        assert film_.n_frames > 3 and strip.size == (5 * 480, 2 * 300)
+        shown = np.asarray(strip).astype(int)
+    orange = (shown[..., 0] > shown[..., 2] + 60).mean()
+    assert 0.001 < orange < 0.1  # the pole
+
+
+def test_a_sphere_is_drawn_where_it_is():
+    """Its picture is a disc about the projected centre, of the radius that the opening angle gives."""
+    camera = film.Camera(distance=4.0, width=200, height=200, view=0.5)
+    ball = robots.Primitive("sphere", -1, (0.3,), (0.0, 0.0, 1.0, 0, 0, 0, 1), (1.0, 0.0, 0.0))
+    bare = robots.Robot("", robots.FILES, robots.load("cartpole").scene, np.zeros(2), np.zeros(1), ())
+    picture = np.asarray(film.draw(bare, np.zeros((2, 7)), camera, np.array([0.0, 0.0, 1.0]), [ball])).astype(int)
+    red = np.argwhere(picture[..., 0] > picture[..., 1] + 60)
+    radius = 100 * np.tan(np.arcsin(0.3 / 4.0)) / np.tan(0.25)
+    assert np.allclose(red.mean(axis=0), 99.5, atol=2.0)
+    assert len(red) == pytest.approx(np.pi * radius**2, rel=0.08)  # twelve corners: 0.95 of a disc
+
+
+def test_measures_of_a_known_course():
+    """A pole that is held upright by hand counts; worlds that end early do not."""
+    env = envs.make("cartpole", 4, "cpu")
+
+    def policy(observed):
+        env.q[:, 1] = torch.tensor([0.0, 0.05, 0.3, 0.0])
+        env.q[:3, 0], env.q[3, 0], env.qd[:] = 0.0, 2.0, 0.0
+        return torch.zeros(4, 1)
+
+    found = evaluation.balance(env, policy)
+    assert found["worlds"] == 4 and found["upright"] == 2 and found["least share"] == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TASKS)
+def test_every_task_steps(name):
+    env = envs.make(name, 4, "cpu")
+    observed, reward, _, _ = roll(env, 10)
+    assert observed.isfinite().all() and reward.isfinite().all()
+    assert (observed[-1].std(dim=0) > 0).float().mean() > 0.5  # worlds differ
+
+
+@pytest.mark.slow
+def test_go2_stands_in_mujoco(tmp_path):
+    """A policy of zeros holds the default pose there: controls, joint order and metadata agree."""
+    from warp_spo.mujoco import deployment
+
+    env = envs.make("go2-flat", 2, "cpu")
+    runner = learning.make_runner(env, task("go2-flat").LEARNER)
+    with torch.no_grad():
+        for parameter in runner.alg.get_policy().mlp[-1].parameters():
+            parameter.zero_()
+    file, _ = export.save(runner, env, "go2-flat", tmp_path / "go2")
+    robots_there = deployment.Deployment(file, robots.FILES / "go2.xml", 4)
+    found = deployment.trial(robots_there, seconds=2.0, period=10.0)
+    assert found["standing"] == 4
+    for data in robots_there.data:
+        assert data.qpos[2] > 0.25 and np.abs(data.qpos[robots_there.joint_q] - env._layout.default_q[7:]).max() < 0.3
+    ours = recording.record(env, lambda observed: torch.zeros(2, 12), 2.0)
+    assert np.allclose(ours.q[-1, 7:], robots_there.data[0].qpos[7:], atol=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", robots.NAMES)
+def test_newtons_viewer_gets_the_poses(name):
+    import newton
+
+    import warp_spo as spo
+    from warp_spo.newton.viewing import Viewer
+
+    robot = robots.load(name)
+    viewer = Viewer(robot.path, newton.viewer.ViewerNull(num_frames=2))
+    q = robot.q + np.where(np.arange(len(robot.q)) > 7, 0.1, 0.0)
+    viewer.show(q)
+    wanted = spo.Dynamics(robot.scene, 1, "cpu", "float64").body_poses(q[None])[0]
+    assert np.allclose(viewer.state.body_q.numpy()[:, :3], wanted[:, :3], atol=1e-5)

@@ -1,0 +1,215 @@
+"""Films of robots without a display: shaded primitives drawn in NumPy, as a GIF and as a strip of pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..scene.contacts import HeightField
+from .robots import Primitive, Robot
+
+SUN = np.array([0.35, -0.25, 0.9]) / np.linalg.norm([0.35, -0.25, 0.9])  # direction to the light
+SKY, GROUND, GROUND_DARK, SHADOW = (236, 240, 245), (214, 219, 224), (203, 209, 215), (160, 167, 175)
+CELL = 0.5  # edge of a square of the ground [m]
+FINE = 2  # pictures are drawn so many times as large, then made smaller
+AROUND = 12  # corners of a circle
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """A camera that looks at a point from a distance.
+
+    Attributes:
+        distance: [m]. azimuth: direction from the point to the camera, about the vertical, from x. elevation: above the
+            horizontal [rad]. width, height: of a picture [pixel]. view: vertical opening [rad]. above: height of the
+            point over the first body [m].
+    """
+
+    distance: float = 2.0
+    azimuth: float = -1.1
+    elevation: float = 0.3
+    width: int = 480
+    height: int = 300
+    view: float = 0.6
+    above: float = 0.0
+
+    def project(self, points: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the places [pixel] of points [n, 3] in the picture, and their depths [m]."""
+        ce, se, ca, sa = np.cos(self.elevation), np.sin(self.elevation), np.cos(self.azimuth), np.sin(self.azimuth)
+        back, right = np.array([ce * ca, ce * sa, se]), np.array([-sa, ca, 0.0])
+        offset = points - (target + self.distance * back)
+        depth = -(offset @ back)
+        scale = 0.5 * self.height / np.tan(0.5 * self.view) / np.maximum(depth, 0.05)
+        x, y = offset @ right * scale, offset @ np.cross(back, right) * scale
+        return np.stack([0.5 * self.width + x, 0.5 * self.height - y], axis=1), depth
+
+
+@functools.cache
+def mesh(kind: str, size: tuple[float, ...]) -> tuple[np.ndarray, list[list[int]]]:
+    """Return the corners [n, 3] of a primitive, and its faces: lists of corners, outward ones counter-clockwise."""
+    if kind == "box":
+        corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size
+        return corners, [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    radius, half = size[0], size[1] if kind == "capsule" else 0.0
+    rings = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 8)
+    rows = [(angle, -half) for angle in rings[:4]] + [(angle, half) for angle in rings[4:]]
+    turn = np.linspace(0.0, 2.0 * np.pi, AROUND, endpoint=False)
+    corners = np.array(
+        [
+            [radius * np.cos(up) * np.cos(t), radius * np.cos(up) * np.sin(t), radius * np.sin(up) + shift]
+            for up, shift in rows
+            for t in turn
+        ]
+    )
+    faces = [
+        [i * AROUND + j, i * AROUND + (j + 1) % AROUND, (i + 1) * AROUND + (j + 1) % AROUND, (i + 1) * AROUND + j]
+        for i in range(len(rows) - 1)
+        for j in range(AROUND)
+    ]
+    return corners, faces
+
+
+def rotation(quaternion: Any) -> np.ndarray:
+    """Return the matrix of a quaternion, xyzw."""
+    x, y, z, w = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(quaternion)
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+
+
+def draw(
+    robot: Robot, poses: np.ndarray, camera: Camera, target: np.ndarray, markers: Sequence[Primitive] = (),
+    caption: str = "",
+) -> Any:  # fmt: skip
+    """Return a picture (PIL image) of a robot.
+
+    Args:
+        robot: what to draw, and its ground.
+        poses: of its bodies [body, 7].
+        camera: from where. target: point that it looks at (3,) [m].
+        markers: shapes to draw beside the robot's, such as a target. caption: text in the corner.
+    """
+    from PIL import Image, ImageDraw
+
+    camera = dataclasses.replace(camera, width=FINE * camera.width, height=FINE * camera.height)
+    picture = Image.new("RGB", (camera.width, camera.height), SKY)
+    pen = ImageDraw.Draw(picture)
+    ground = robot.scene.ground
+    faces: list[tuple[float, Any, tuple[int, int, int]]] = []
+    squares = list(_ground_faces(ground, target, camera))
+    if isinstance(ground, HeightField):
+        faces += squares
+    else:
+        for _, places, color in squares:
+            pen.polygon(places, fill=color)
+    for shape in (*robot.primitives, *markers):
+        corners, sides = mesh(shape.kind, shape.size)
+        corners = corners @ rotation(shape.pose[3:]).T + shape.pose[:3]
+        if shape.body >= 0:
+            corners = corners @ rotation(poses[shape.body, 3:]).T + poses[shape.body, :3]
+        if not isinstance(ground, HeightField) and shape not in markers:
+            fallen = corners - corners[:, 2:] / SUN[2] * SUN
+            places, depth = camera.project(fallen, target)
+            if depth.min() > 0.1:
+                for side in sides:
+                    pen.polygon([tuple(places[i]) for i in side], fill=SHADOW)
+        places, depth = camera.project(corners, target)
+        if depth.min() < 0.1:
+            continue
+        for side in sides:
+            a, b, c = places[side[0]], places[side[1]], places[side[2]]
+            if (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) > 0.0:
+                continue  # seen from behind
+            normal = np.cross(corners[side[2]] - corners[side[0]], corners[side[-1]] - corners[side[1]])
+            size = float(np.linalg.norm(normal))
+            light = 0.55 + 0.45 * max(0.0, float(normal @ SUN) / size) if size > 0.0 else 0.8
+            color = tuple(int(255 * min(1.0, light * part)) for part in shape.color)
+            faces.append((depth[side].mean(), [tuple(places[i]) for i in side], color))
+    for _, places, color in sorted(faces, key=lambda face: -face[0]):
+        pen.polygon(places, fill=color)
+    picture = picture.resize((camera.width // FINE, camera.height // FINE), Image.Resampling.LANCZOS)
+    if caption:
+        ImageDraw.Draw(picture).text((8, 6), caption, fill=(40, 44, 52))
+    return picture
+
+
+def _ground_faces(ground: Any, target: np.ndarray, camera: Camera) -> Any:
+    """Yield (depth, places, colour) of the squares of the ground about the target."""
+    reach, cell = 2.5 * camera.distance, CELL
+    height = lambda x, y: np.zeros(np.broadcast(x, y).shape)  # noqa: E731
+    if isinstance(ground, HeightField):
+        reach, cell = 1.3 * camera.distance, float(ground.cell)
+        table, origin = np.asarray(ground.heights), np.asarray(ground.origin)
+
+        def height(x: Any, y: Any) -> Any:
+            i = np.clip(np.round((x - origin[0]) / cell).astype(int), 0, table.shape[0] - 1)
+            j = np.clip(np.round((y - origin[1]) / cell).astype(int), 0, table.shape[1] - 1)
+            return table[i, j] + origin[2]
+
+    first = np.floor((target[:2] - reach) / cell).astype(int)
+    count = int(np.ceil(2 * reach / cell)) + 1
+    for i in range(first[0], first[0] + count):
+        for j in range(first[1], first[1] + count):
+            x, y = cell * np.array([i, i + 1, i + 1, i]), cell * np.array([j, j, j + 1, j + 1])
+            corners = np.stack([x, y, height(x, y)], axis=1)
+            places, depth = camera.project(corners, target)
+            if depth.min() < 0.1:
+                continue
+            color: tuple[int, ...] = GROUND if (i + j) % 2 else GROUND_DARK
+            if isinstance(ground, HeightField):
+                normal = np.cross(corners[2] - corners[0], corners[3] - corners[1])
+                light = 0.6 + 0.4 * max(0.0, float(normal @ SUN / np.linalg.norm(normal)))
+                color = tuple(int(light * part) for part in GROUND)
+            yield depth.mean() + 0.05, [tuple(place) for place in places], color
+
+
+def pictures(
+    robot: Robot, q: np.ndarray, camera: Camera, follow: bool = True, markers: Sequence[Any] = (),
+    captions: Sequence[str] = (),
+) -> list:  # fmt: skip
+    """Return a picture of each state.
+
+    Args:
+        q: coordinates [picture, coordinate].
+        follow: whether the camera moves with the first body; otherwise it looks at the first body's first place.
+        markers, captions: for each picture, or none.
+    """
+    from .. import Dynamics
+
+    poses = Dynamics(robot.scene.with_contacts([]), len(q), "cpu", "float64").body_poses(np.asarray(q, np.float64))
+    looked = poses[:, 0, :3] + np.array([0.0, 0.0, camera.above])
+    if not follow:
+        looked[:] = looked[0]
+    elif not isinstance(robot.scene.ground, HeightField):
+        looked[:, 2] = looked[:, 2].mean()
+    return [
+        draw(
+            robot, poses[i], camera, looked[i], markers[i] if len(markers) else (), captions[i] if len(captions) else ""
+        )
+        for i in range(len(q))
+    ]
+
+
+def save_gif(frames: Sequence[Any], path: str | Path, seconds: float) -> None:
+    """Write pictures, ``seconds`` apart, as an endless GIF."""
+    reduced = [frame.quantize(64) for frame in frames]
+    reduced[0].save(path, save_all=True, append_images=reduced[1:], duration=round(1000 * seconds), loop=0)
+
+
+def save_strip(frames: Sequence[Any], path: str | Path, columns: int = 5) -> None:
+    """Write pictures side by side, in rows, as one PNG."""
+    from PIL import Image
+
+    width, height = frames[0].size
+    rows = -(-len(frames) // columns)
+    sheet = Image.new("RGB", (columns * width, rows * height), SKY)
+    for i, frame in enumerate(frames):
+        sheet.paste(frame, (i % columns * width, i // columns * height))
+    sheet.save(path)

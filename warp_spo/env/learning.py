@@ -1,0 +1,281 @@
+"""Training of a task by rsl_rl's PPO as it is released: settings, progress, checkpoints.
+
+On CUDA the policy's part of a rollout (actions, values, log-probabilities) is one graph, as the environment's step is.
+The learner, its losses and its storage are rsl_rl's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.modules.distribution import GaussianDistribution
+from rsl_rl.runners import OnPolicyRunner
+
+from .environment import Env
+
+
+@dataclasses.dataclass(frozen=True)
+class Learner:
+    """Settings of PPO for a task.
+
+    Attributes:
+        iterations: of collecting and learning. worlds: that a training takes if none are given.
+        steps: of each world in an iteration. hidden: widths of the layers of actor and critic.
+        deviation: of the first actions. discount, trace: gamma and lambda. rate: first learning rate; target: of the
+            KL divergence, to which the rate adapts. epochs, batches: of each iteration. entropy: weight of its bonus.
+    """
+
+    iterations: int = 300
+    worlds: int = 4096
+    steps: int = 24
+    hidden: tuple[int, ...] = (512, 256, 128)
+    deviation: float = 1.0
+    discount: float = 0.99
+    trace: float = 0.95
+    rate: float = 1e-3
+    target: float = 0.01
+    epochs: int = 5
+    batches: int = 4
+    entropy: float = 0.01
+    normalize: bool = True
+
+    def settings(self, env: Env, save_interval: int) -> dict[str, Any]:
+        """Return the settings in rsl_rl's words."""
+        model = {"class_name": "MLPModel", "hidden_dims": list(self.hidden), "activation": "elu",
+                 "obs_normalization": self.normalize}  # fmt: skip
+        distribution = {"class_name": Gaussian, "init_std": self.deviation, "std_range": (0.05, 2.0)}
+        return {
+            "num_steps_per_env": self.steps,
+            "save_interval": save_interval,
+            "check_for_nan": False,  # the environment's guard resets and counts such worlds, without waiting
+            "obs_groups": {"actor": ["actor"], "critic": ["critic" if "critic" in env.num_obs else "actor"]},
+            "actor": model | {"distribution_cfg": distribution},
+            "critic": dict(model),
+            "algorithm": {
+                "class_name": CapturedPPO, "num_learning_epochs": self.epochs, "num_mini_batches": self.batches,
+                "clip_param": 0.2, "gamma": self.discount, "lam": self.trace, "value_loss_coef": 1.0,
+                "entropy_coef": self.entropy, "learning_rate": self.rate, "max_grad_norm": 1.0, "schedule": "adaptive",
+                "desired_kl": self.target, "use_clipped_value_loss": True,
+            },
+        }  # fmt: skip
+
+
+class Gaussian(GaussianDistribution):
+    """Normal distribution whose samples need no check on the host, so that a graph can hold them."""
+
+    def sample(self) -> torch.Tensor:
+        """Return a random action for each row."""
+        return self.mean + self.std * torch.randn_like(self.mean)
+
+
+class CapturedPPO(PPO):
+    """rsl_rl's PPO, whose ``act`` is one CUDA graph after the first call; on a CPU it is PPO."""
+
+    graph: Any = None
+
+    def act(self, obs: Any) -> torch.Tensor:
+        """Sample actions and keep what the storage needs, as PPO does."""
+        if not torch.device(self.device).type == "cuda" or self.actor.is_recurrent:
+            return super().act(obs)
+        if self.graph is None:
+            super().act(obs)  # warms up
+            self.seen = obs.clone()
+            self.graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self.graph):
+                super().act(self.seen)
+            self.acted = {name: getattr(self.transition, name) for name in KEPT}
+        for name, value in self.seen.items():
+            value.copy_(obs[name])
+        self.graph.replay()
+        for name, value in self.acted.items():
+            setattr(self.transition, name, value)
+        self.transition.observations = obs
+        return self.transition.actions  # type: ignore[return-value]
+
+    def update(self) -> dict[str, float]:
+        """Learn, and keep the normalisers' deviations where the graph reads them."""
+        models = [model.obs_normalizer for model in (self.actor, self.critic) if model.obs_normalization]
+        places = [model._std for model in models]
+        losses = super().update()
+        with torch.inference_mode():
+            for model, place in zip(models, places, strict=True):
+                place.copy_(model._std)
+                model._std = place
+        return losses
+
+
+KEPT = ("actions", "values", "actions_log_prob", "distribution_params", "hidden_states")
+
+
+class Course:
+    """The course of a training, in place of rsl_rl's logger: a printed line and a row of JSON for an iteration.
+
+    Means of rewards and of lengths of episodes come from the environment, which gathers them in its graph; an iteration
+    reads them once.
+    """
+
+    def __init__(self, env: Env, folder: Path | None, every: int, began: float, writes: bool):
+        self.env, self.log_dir, self.every, self.began = env, folder and str(folder), every, began
+        self.writer = self if folder is not None and writes else None
+        self.rows: list[dict[str, float]] = []
+        self.git_status_repos: list[str] = []
+        self.worlds = env.num_envs * int(os.getenv("WORLD_SIZE", "1"))
+
+    def init_logging_writer(self) -> None:
+        """Continue the rows of an earlier training in the same folder."""
+        if self.writer is not None:
+            self.file = Path(self.log_dir) / "progress.jsonl"  # type: ignore[arg-type]
+            if self.file.exists():
+                self.rows = read_rows(self.file)
+            if self.rows:
+                self.began -= self.rows[-1]["seconds"]
+
+    def process_env_step(self, *_: Any) -> None:
+        """Do nothing."""
+
+    def log(
+        self, it: int, total_it: int, collect_time: float, learn_time: float, loss_dict: dict, **others: Any
+    ) -> None:
+        """Write an iteration."""
+        if self.writer is None:
+            return
+        found = self.env.log()
+        numbers = torch.stack([value.float() for value in found.values()]).tolist()
+        row: dict[str, float] = {
+            "iteration": it,
+            "seconds": time.time() - self.began,
+            "steps": (it + 1) * self.worlds * others["steps"] if "steps" in others else 0,
+            "collecting": collect_time,
+            "learning": learn_time,
+            "deviation": float(others["action_std"].detach().mean()),
+            "rate": float(others["learning_rate"]),
+            **{f"loss/{name}": float(value) for name, value in loss_dict.items()},
+            **dict(zip(found, numbers, strict=True)),
+        }
+        row["reward"] = sum(value for name, value in row.items() if name.startswith("/reward/"))
+        self.rows.append(row)
+        with self.file.open("a") as file:
+            file.write(json.dumps({name: float(f"{value:.6g}") for name, value in row.items()}) + "\n")
+        if it % self.every == 0 or it + 1 == total_it:
+            print(f"iteration {it:4d} of {total_it}  {row['seconds']:6.1f} s  reward {row['reward']:8.3f}  "
+                  f"episode {row['/episode/seconds']:5.1f} s  collecting {1e3 * collect_time:4.0f} ms  "
+                  f"learning {1e3 * learn_time:4.0f} ms", flush=True)  # fmt: skip
+
+    def save_model(self, *_: Any) -> None:
+        """Do nothing: checkpoints stay in the folder."""
+
+    def stop_logging_writer(self) -> None:
+        """Do nothing: each row is written when it is known."""
+
+
+def pick_device(asked: str | None) -> str:
+    """Return the device to learn on: what is asked for, or this process's GPU, or "cpu".
+
+    On a CPU torch takes one thread: networks are small, and several threads wait for each other.
+    """
+    local = os.environ.get("LOCAL_RANK", "0")
+    device = asked or (f"cuda:{local}" if torch.cuda.is_available() else "cpu")
+    if device == "cpu":
+        torch.set_num_threads(1)
+    return device
+
+
+def read_rows(file: Path) -> list[dict[str, float]]:
+    """Return the rows of a ``progress.jsonl``."""
+    return [json.loads(line) for line in file.read_text().splitlines()]
+
+
+def make_runner(
+    env: Env, learner: Learner, folder: Path | None = None, save_interval: int = 100, every: int = 10,
+    began: float | None = None,
+) -> OnPolicyRunner:  # fmt: skip
+    """Return rsl_rl's runner on an environment, with the course of the training in ``folder``."""
+    runner = OnPolicyRunner(env, learner.settings(env, save_interval), None, device=str(env.device))
+    began = time.time() if began is None else began
+    runner.logger = Course(env, folder, every, began, runner.gpu_global_rank == 0)  # type: ignore[assignment]
+    return runner
+
+
+def load_checkpoint(runner: OnPolicyRunner, file: str | Path, learns: bool = True) -> int:
+    """Load a checkpoint, tensors and numbers only, and return its iteration. ``learns``: the optimizer's state, too."""
+    found = torch.load(file, weights_only=True, map_location=runner.device)
+    parts = {"actor": True, "critic": True, "optimizer": learns, "iteration": True, "rnd": False}
+    runner.alg.load(found, parts, strict=True)
+    if learns:
+        runner.current_learning_iteration = found["iter"] + 1
+    return int(found["iter"])
+
+
+def train(
+    env: Env, learner: Learner, folder: str | Path, iterations: int | None = None, resume: str | Path | None = None,
+    seed: int = 0, save_interval: int = 100, every: int = 10, began: float | None = None,
+) -> OnPolicyRunner:  # fmt: skip
+    """Train, and leave checkpoints ``model_N.pt`` and ``progress.jsonl`` in a folder.
+
+    Args:
+        env: the environment.
+        learner: settings.
+        folder: is made; a training that resumes may continue in its own.
+        iterations: in all, those before ``resume`` included; None: as the settings say.
+        resume: checkpoint to continue from.
+        seed: of the learner's random numbers. save_interval: iterations from one checkpoint to the next. every:
+            iterations from one printed line to the next. began: time from which seconds count.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(seed)
+    runner = make_runner(env, learner, folder, save_interval, every, began)
+    first = load_checkpoint(runner, resume) + 1 if resume is not None else 0
+    total = learner.iterations if iterations is None else iterations
+    if first >= total:
+        raise ValueError(f"train: {str(resume)!r} has {first} iterations; expected more than that to be asked for")
+    runner.learn(total - first, init_at_random_ep_len=True)
+    return runner
+
+
+def policy_of(runner: OnPolicyRunner) -> Any:
+    """Return the function from observations (a TensorDict) to actions that the training has found."""
+    model = runner.get_inference_policy(str(runner.device))
+
+    def policy(observations: Any) -> torch.Tensor:
+        with torch.inference_mode():
+            return model(observations)
+
+    return policy
+
+
+def draw_curve(folder: str | Path, name: str) -> Path:
+    """Draw the learning curve of a folder's ``progress.jsonl`` as ``curve.png``, and return its path.
+
+    Without matplotlib the path returned is that of the rows.
+    """
+    folder = Path(folder)
+    rows = read_rows(folder / "progress.jsonl")
+    try:
+        from ..trials.drawing import OURS, load_pyplot, style
+
+        pyplot = load_pyplot("train")
+    except ImportError:
+        return folder / "progress.jsonl"
+    with style():
+        figure, panels = pyplot.subplots(1, 2, figsize=(9.0, 3.2), layout="constrained")
+        seconds = [row["seconds"] for row in rows]
+        terms = sorted((key for key in rows[-1] if key.startswith("/reward/")), key=lambda key: -abs(rows[-1][key]))
+        panels[0].plot(seconds, [row["reward"] for row in rows], color=OURS)
+        panels[0].set(title=f"{name}: reward of an episode", xlabel="seconds since the start of the process")
+        for key in terms[:6]:
+            panels[1].plot(seconds, [row.get(key, 0.0) for row in rows], label=key.removeprefix("/reward/"), lw=1.2)
+        panels[1].set(title="its largest terms", xlabel="seconds")
+        panels[1].legend(fontsize=8)
+        for panel in panels:
+            panel.grid(True)
+        figure.savefig(folder / "curve.png", dpi=110)
+        pyplot.close(figure)
+    return folder / "curve.png"

@@ -1,0 +1,74 @@
+"""G1 follows velocities on flat ground while it is pushed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .. import Env, actions, commands, evaluation, rewards, robots, terminations
+from ..film import Camera
+from ..learning import Learner
+from . import velocity
+
+ROBOT = "g1"
+CAMERA = Camera(distance=3.2)
+LEARNER = Learner(iterations=2000, worlds=4096, steps=24, entropy=8e-3)
+ACTOR = velocity.ACTOR
+FEET = ".*_ankle_roll_link"
+SCALE = 0.25  # of a joint's effort limit over its servo's stiffness is the share of an action of 1
+STANDING = {".*": 0.1}  # deviations of joints from the default [rad]
+WALKING = {
+    ".*hip_pitch.*": 0.3, ".*hip_roll.*": 0.15, ".*hip_yaw.*": 0.15, ".*knee.*": 0.35, ".*ankle_pitch.*": 0.25,
+    ".*ankle_roll.*": 0.1, "waist_yaw.*": 0.2, "waist_roll.*": 0.08, "waist_pitch.*": 0.1, ".*shoulder_pitch.*": 0.15,
+    ".*shoulder_roll.*": 0.15, ".*shoulder_yaw.*": 0.1, ".*elbow.*": 0.15, ".*wrist.*": 0.3,
+}  # fmt: skip
+
+
+def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env:
+    """Return the environment; ``options`` go to :class:`Env`."""
+    robot = robots.load(ROBOT, contacts=("sole", "knee"))
+    values = robot.scene.values
+    scale = SCALE * values["actuator_force_range"][0, :, 1] / values["actuator_gain"][0]
+    return Env(
+        robot.scene,
+        worlds,
+        device,
+        seed=seed,
+        dt=5e-3,
+        decimation=4,
+        default_q=robot.q,
+        actions=actions.Control(scale=scale, offset="default"),
+        commands=commands.Velocity(
+            forward=(-0.5, 1.0), left=(-0.4, 0.4), turn=(-0.6, 0.6), standing=0.1, seconds=(3.0, 8.0)
+        ),
+        observations=velocity.observed(FEET),
+        rewards={
+            "velocity": (2.0, rewards.track_velocity(0.4)),
+            "turning": (1.5, rewards.track_turning(0.5)),
+            "upright": (1.0, velocity.upright),
+            "pose": (1.0, velocity.pose(STANDING, WALKING)),
+            "alive": (0.5, rewards.alive),
+            "bouncing": (-0.5, rewards.vertical_velocity),
+            "tilting": (-0.05, rewards.tilting),
+            "action rate": (-0.05, rewards.action_rate),
+            "joint limits": (-1.0, rewards.joint_limits()),
+            "one foot": (0.5, velocity.one_foot(FEET)),
+            "foot clearance": (-1.0, rewards.foot_clearance(FEET, height=0.1)),
+            "swing height": (-0.25, velocity.swing_height(FEET, 0.1)),
+            "foot slip": (-0.2, rewards.foot_slip(FEET)),
+            "landing": (-1e-3, rewards.landing_force(FEET)),
+        },
+        terminations={
+            "fell over": terminations.tilted(np.radians(60.0)),
+            "too low": terminations.below(0.45),
+        },
+        events=[*velocity.starts(), *velocity.randomisation("torso_link")],
+        episode_length_s=20.0,
+        **options,
+    )
+
+
+def measure(env: Env, policy: Any) -> dict[str, float]:
+    """Return the errors of tracking, and how often the robot falls."""
+    return evaluation.tracking(env, policy)

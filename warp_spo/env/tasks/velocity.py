@@ -1,0 +1,120 @@
+"""What the tasks of velocity tracking share: observations, rewards and events as mjlab's velocity task has them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...hinges.functions import where
+from .. import Observation, World, events, rewards
+from .. import observations as obs
+
+ACTOR = (
+    ("base velocity", obs.base_velocity, 1.0, 0.2),
+    ("base angular velocity", obs.base_angular_velocity, 1.0, 0.2),
+    ("projected gravity", obs.projected_gravity, 1.0, 0.05),
+    ("joint position", obs.joint_position(), 1.0, 0.01),
+    ("joint velocity", obs.joint_velocity(), 0.1, 1.0),
+    ("last action", obs.last_action, 1.0, 0.0),
+    ("command", obs.command, 1.0, 0.0),
+)
+"""What the actor sees: name, term, scale, and the size of the noise before scaling."""
+
+
+def observed(feet: Any, *more: Any) -> dict[str, list]:
+    """Return what the actor sees, with noise, and what the critic sees: the truth, the base's height and the feet.
+
+    ``more``: further terms that both see.
+    """
+    truth = [
+        Observation(obs.joint_position(biased=False) if name == "joint position" else term, scale)
+        for name, term, scale, _ in ACTOR
+    ]
+    noisy = [Observation(term, scale, noise) for _, term, scale, noise in ACTOR]
+    return {"actor": [*noisy, *more], "critic": [*truth, *more, base_height, feet_state(feet)]}
+
+
+def base_height(w: World) -> Any:
+    """Return the height of the base's origin [m]."""
+    return w.base_position[2]
+
+
+def feet_state(bodies: Any) -> Any:
+    """Return the term of the feet's gaps [m], air times [s], contacts and vertical forces [100 N]."""
+
+    def term(w: World) -> list:
+        feet = w.feet(bodies)
+        contacts = [where(touches, 1.0, 0.0) for touches in feet.touches]
+        return [*feet.gap, *feet.air_time, *contacts, *(0.01 * force[2] for force in feet.force)]
+
+    return term
+
+
+def upright(w: World) -> Any:
+    """Return 1 with the base level; exp(-sin(tilt)^2 / 0.2)."""
+    return np.exp(rewards.tilt(w) * (-1.0 / 0.2))
+
+
+def pose(standing: Any, walking: Any, least_command: float = 0.05) -> Any:
+    """Return exp(-mean of (q - default)^2 / deviation^2), with other deviations while standing than on the move."""
+    still, moves = rewards.posture(standing), rewards.posture(walking)
+    return lambda w: where(rewards.moving(w, least_command), moves(w), still(w))
+
+
+def swing_height(bodies: Any, height: float, least_command: float = 0.05) -> Any:
+    """Return the sum over feet that land of (highest gap of the swing / height - 1)^2, while the command moves."""
+
+    def term(w: World) -> Any:
+        feet = w.feet(bodies)
+        name = f"highest {bodies}"
+        before = w.memory(name, len(feet.gap))
+        highest = [where(gap > top, gap, top) for gap, top in zip(feet.gap, before, strict=True)]
+        w.keep(name, [where(touches, 0.0, top) for touches, top in zip(feet.touches, highest, strict=True)])
+        missed = sum(
+            where(lands, (top * (1.0 / height) - 1.0) ** 2, 0.0) for lands, top in zip(feet.lands, highest, strict=True)
+        )
+        return where(rewards.moving(w, least_command), missed, 0.0)
+
+    return term
+
+
+def one_foot(bodies: Any, most: float = 0.5, least_command: float = 0.05) -> Any:
+    """Return the time of the present phase, up to ``most`` [s], while one foot alone touches the ground; 0 otherwise.
+
+    Steps of a walk earn it; standing and hopping do not.
+    """
+
+    def term(w: World) -> Any:
+        feet = w.feet(bodies)
+        single = sum(where(touches, 1.0, 0.0) for touches in feet.touches)
+        phases = [where(t, c, a) for t, c, a in zip(feet.touches, feet.contact_time, feet.air_time, strict=True)]
+        shortest = phases[0]
+        for phase in phases[1:]:
+            shortest = where(phase < shortest, phase, shortest)
+        shortest = where(shortest < most, shortest, most)
+        alone = (single > 0.5) & (single < 1.5) & rewards.moving(w, least_command)
+        return where(alone, shortest, 0.0)
+
+    return term
+
+
+def starts() -> list:
+    """Return where episodes start: anywhere within half a metre, in any direction, a little above the ground."""
+    turned = (-np.pi, np.pi)
+    return [events.base(x=(-0.5, 0.5), y=(-0.5, 0.5), z=(0.01, 0.05), yaw=turned), events.joints(position=(-0.1, 0.1))]
+
+
+def randomisation(trunk: str) -> list:
+    """Return what differs between worlds, in mjlab's ranges, and pushes of 0.5 m/s every 1 to 3 s.
+
+    Friction 0.3 to 1.2, the same at all points; the centre of mass of the trunk within 2.5 cm (3 cm along z); what the
+    encoders read within 0.015 rad; and the trunk's mass within 10 %.
+    """
+    return [
+        events.randomise("contact_friction", (0.3, 1.2), "set", alike=True),
+        events.randomise("body_com", ((-0.025, 0.025), (-0.025, 0.025), (-0.03, 0.03)), "add", names=trunk),
+        events.randomise("body_mass", (0.9, 1.1), "scale", names=trunk),
+        events.encoder_bias(0.015),
+        events.push(velocity=0.5, vertical=0.4, angular_velocity=0.5, seconds=(1.0, 3.0)),
+    ]

@@ -1,0 +1,61 @@
+"""Train a task, into checkpoints and a learning curve: ``python -m warp_spo.train TASK [--worlds N] [--device D]``.
+
+python -m warp_spo.train go2-flat                         # into runs/go2-flat
+python -m warp_spo.train go2-flat --resume runs/go2-flat/model_399.pt --iterations 800
+python -m warp_spo.train go2-flat --gpus 4                # one process a GPU, each with --worlds worlds
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+BEGAN = time.time()
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Train the task that the arguments name."""
+    from .env.tasks import TASKS, task
+
+    parser = argparse.ArgumentParser(
+        prog="python -m warp_spo.train", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("task", choices=sorted(TASKS))
+    parser.add_argument("--worlds", type=int, help="of each GPU; left out: as the task says")
+    parser.add_argument("--device", help="such as cuda:0 or cpu; left out: cuda:0 if there is one")
+    parser.add_argument("--gpus", type=int, default=1, help="processes, one a GPU (torchrun)")
+    parser.add_argument("--iterations", type=int, help="in all; left out: as the task says")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, help="folder; left out: runs/TASK")
+    parser.add_argument("--resume", type=Path, help="checkpoint to continue from")
+    parser.add_argument("--save-interval", type=int, default=100, help="iterations between checkpoints")
+    options = parser.parse_args(arguments)
+    if options.gpus > 1 and "LOCAL_RANK" not in os.environ:
+        given = sys.argv[1:] if arguments is None else arguments
+        run = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={options.gpus}"]
+        return subprocess.call([*run, "-m", "warp_spo.train", *given])
+
+    from .env import learning
+
+    rank = int(os.environ.get("RANK", 0))
+    device = learning.pick_device(options.device)
+    chosen = task(options.task)
+    worlds = options.worlds or chosen.LEARNER.worlds
+    folder = options.out or Path("runs") / options.task
+    env = chosen.build(worlds, device, seed=options.seed, first_world=rank * worlds)
+    print(f"{options.task}: {worlds} worlds on {device}, {time.time() - BEGAN:.1f} s", flush=True)
+    learning.train(
+        env, chosen.LEARNER, folder, options.iterations, options.resume, options.seed + rank, options.save_interval,
+        began=BEGAN,
+    )  # fmt: skip
+    if rank == 0:
+        print(f"{folder}: checkpoints, progress.jsonl, {learning.draw_curve(folder, options.task).name}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
