@@ -29,13 +29,15 @@ import warp_spo as spo
 from warp_spo.trials.operations import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, Trial
 
-from . import contacts, robots, runner, step_parts
+from . import contacts, robots, runner, step_parts, substeps
 from .resources import record_launches, resources
 
 SOLVER_STEP = "SolverSPO.step"  # with drives and limits, of benchmarks.step_parts
 FEW, MANY, MOST = 4096, 65536, 1 << 20
 INERTIAS = ("body_mass", "body_com", "body_inertia")
 ON_PLANE, ON_FIELD = "contact_step", "contact_step on a height field"
+SUBSTEPS = 4
+FUSED = {f"step of {SUBSTEPS} substeps": "", f"contact_step of {SUBSTEPS} substeps": substeps.ON_PLANE}
 CONTACT_TOLERANCE = 1e-4  # of velocities after a step with contacts, in float32
 SETS, SAMPLE, REPEATS, WARM_UP, BUDGET = 3, 2, 15, 0.1, 0.3
 
@@ -57,18 +59,21 @@ class Call:
 
 @dataclasses.dataclass(frozen=True)
 class Line:
-    """A call, and the limit of a figure: of "us", "ratio" (its time over that of ``beside``), or "rate" (at least)."""
+    """A call, and the limit of a figure: of "us", "ratio" (its time over that of ``beside``), or "rate" (at least).
+
+    The ratio of a call of several substeps is its time over that of as many calls.
+    """
 
     call: Call
     kind: str
     limit: float
     beside: Call | None = None
 
-    def figure(self, time: Callable[[Call], float]) -> float:
-        """Return the figure; ``time`` gives the time of a call [us]."""
-        us = time(self.call)
-        if self.beside is not None:
-            return us / time(self.beside)
+    def figure(self, time: Callable[[Call], dict]) -> float:
+        """Return the figure; ``time`` gives the times of a call [us]."""
+        us = time(self.call)["us"]
+        if self.kind == "ratio":
+            return us / (time(self.call)["calls_us"] if self.beside is None else time(self.beside)["us"])
         return 1e-3 * self.call.worlds / us if self.kind == "rate" else us
 
     def keeps(self, figure: float) -> bool:
@@ -105,6 +110,7 @@ LINES = (
     *(Line(Call("go2", ON_PLANE, worlds), "us", limit) for worlds, limit in ((FEW, 25.0), (MANY, 150.0))),
     *(Line(Call("g1", ON_PLANE, worlds), "us", limit) for worlds, limit in ((FEW, 70.0), (MANY, 500.0))),
     Line(Call("go2", ON_FIELD, MANY), "ratio", 1.15, Call("go2", ON_PLANE, MANY)),
+    *(Line(Call(robot, name, FEW), "ratio", 0.8) for name in FUSED for robot in ("go2", "g1")),
 )
 
 
@@ -123,6 +129,9 @@ def measure(call: Call, device: wp.Device) -> dict:
     if call.operation in (ON_PLANE, ON_FIELD):
         found = contacts.measure(call.robot, call.worlds, device, call.operation == ON_FIELD)
         return dataclasses.asdict(call) | found | {"tolerance": CONTACT_TOLERANCE}
+    if call.operation in FUSED:
+        name = call.robot + FUSED[call.operation]
+        return dataclasses.asdict(call) | substeps.measure(name, call.worlds, device, SUBSTEPS) | {"tolerance": 0.0}
     with record_launches() as launched:
         trial = trial_of(call, device)
         del launched[:]
@@ -144,6 +153,11 @@ def _compile(call: Call, device: str) -> None:
             call.robot, call.worlds, wp.get_device(device), call.operation == ON_FIELD
         )
         dyn.step(q, qd, None, contacts.DT)
+        return
+    if call.operation in FUSED:
+        dyn, (given, *_) = substeps.subject(call.robot + FUSED[call.operation], call.worlds, wp.get_device(device))
+        for count in (1, SUBSTEPS):
+            dyn.step(**given, dt=substeps.DT, substeps=count)
         return
     trial = trial_of(call, wp.get_device(device), sets=1)
     if isinstance(trial, step_parts.SolverTrial):
@@ -170,10 +184,10 @@ def main(arguments: list[str] | None = None) -> int:
     rows: list[dict] = []
 
     @functools.cache
-    def time(call: Call) -> float:
+    def time(call: Call) -> dict:
         gc.collect()
         rows.append(measure(call, device))
-        return rows[-1]["us"]
+        return rows[-1]
 
     failed = 0
     for line in lines:
@@ -186,12 +200,12 @@ def main(arguments: list[str] | None = None) -> int:
         unit = {"us": "us", "rate": "1e9/s", "ratio": "times"}[line.kind]
         error = max(row["error"] for row in rows if Call(*(row[f.name] for f in dataclasses.fields(Call))) == line.call)
         limit = f"{'at least' if line.kind == 'rate' else 'at most'} {line.limit:g}"
-        beside = f" of {line.beside}, {time(line.beside):.4g} us" if line.beside else ""
+        beside = f" of {line.beside}, {time(line.beside)['us']:.4g} us" if line.beside else ""
+        if line.call.operation in FUSED:
+            beside = f" of {SUBSTEPS} calls, {time(line.call)['calls_us']:.4g} us"
         word = "kept" if line.keeps(figure) else "MISSED"
-        print(
-            f"{line.call!s}: {time(line.call):.4g} us, error {error:.1e}; {figure:.4g} {unit}{beside}; {limit}: {word}",
-            flush=True,
-        )
+        own = f"{time(line.call)['us']:.4g} us, error {error:.1e}"
+        print(f"{line.call!s}: {own}; {figure:.4g} {unit}{beside}; {limit}: {word}", flush=True)
         if options.json:
             runner.save(runner.record(rows, device), options.json)
     wrong = [row for row in rows if not row["error"] <= row.get("tolerance", TOLERANCE[row["dtype"]])]

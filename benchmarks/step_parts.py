@@ -2,11 +2,12 @@
 
     python -m benchmarks.step_parts [ROBOT ...] [--device cuda:0] [--worlds 4096 16384] [--json FILE]
 
-For each robot and number of worlds, in microseconds: SolverSPO.step of states that drives hold near their targets, and
-of random states, some of them outside of their limits; Dynamics.step, with and without forces on bodies, and
-Dynamics.body_states, which the solver launches; forward dynamics of the same robot without laws. A line also has the
-ratio to forward dynamics, the number of launches, registers and stack of a thread, the seconds in which the solver was
-built, kernels included, and the largest error of a step from random states against float64 on the CPU.
+For each robot and number of worlds, in microseconds: SolverSPO.step of states that drives hold near their targets, of
+states of joints alone, without bodies and forces on them, and of random states, some of them outside of their limits;
+Dynamics.step, with and without forces on bodies, and Dynamics.body_states, which the solver launches; forward dynamics
+of the same robot without laws. A line also has the ratio to forward dynamics, the number of launches, registers and
+stack of a thread, the seconds in which the solver was built, kernels included, and the largest error of a step from
+random states against float64 on the CPU.
 """
 
 from __future__ import annotations
@@ -104,9 +105,14 @@ class SolverTrial:
             wp.copy(found.joint_qd, qd.flatten())
         return found
 
-    def driven(self) -> Callable[[int], None]:
-        """Return steps of a simulation, which drives soon hold near their targets."""
+    def driven(self, lean: bool = False) -> Callable[[int], None]:
+        """Return steps of a simulation, which drives soon hold near their targets.
+
+        ``lean``: states have joints alone, no bodies and no forces on them.
+        """
         states = [self.state(self.start), self.model.state()]
+        for state in states if lean else ():
+            state.body_q = state.body_qd = state.body_f = None
 
         def run(index: int) -> None:
             before, then = states if index % 2 == 0 else states[::-1]
@@ -175,6 +181,7 @@ def measure(name: str, worlds: int, device: wp.Device) -> dict[str, Any]:
     ]
     calls: dict[str, Callable[[int], Any]] = {
         "solver_step": driven,
+        "solver_lean": trial.driven(lean=True),
         "solver_random": trial.scattered(),
         "step": lambda i: dyn.step(trial.target, still, dt=DT, out=after, **given),
         "step_random": lambda i: dyn.step(trial.random[i], trial.rates[i], dt=DT, out=after, **given),

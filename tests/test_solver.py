@@ -1,5 +1,7 @@
 """SolverSPO's states: observables, steps in place, loop joints' entries, resets, NaN."""
 
+from unittest import mock
+
 import newton
 import numpy as np
 import pytest
@@ -120,6 +122,24 @@ def test_in_place_is_the_same_and_nothing_is_allocated(turned):
             solver.step(state, state, control, None, H)
     for name in ("joint_q", "joint_qd", "body_q", "body_qd"):
         np.testing.assert_array_equal(getattr(state, name).numpy(), getattr(wanted, name).numpy())
+
+
+def test_a_state_without_bodies(turned):
+    """Steps leave out what nobody reads: bodies' poses, their velocities, or both, and forces on bodies."""
+    model, solver = turned
+    wanted = advance(solver, moving(model), 1, model.control())
+    for left_out in (("body_q", "body_qd", "body_f"), ("body_q",), ("body_qd",)):
+        before, after = moving(model), model.state()
+        for name in left_out:
+            setattr(before, name, None)
+            setattr(after, name, None)
+        with mock.patch.object(
+            spo.Dynamics, "body_states", autospec=True, side_effect=spo.Dynamics.body_states
+        ) as bodies:
+            solver.step(before, after, model.control(), None, H)
+        assert bodies.call_count == (len(left_out) == 1)
+        for name in {"joint_q", "joint_qd", "body_q", "body_qd"}.difference(left_out):
+            np.testing.assert_array_equal(getattr(after, name).numpy(), getattr(wanted, name).numpy())
 
 
 @pytest.mark.filterwarnings("ignore:from_newton")

@@ -69,7 +69,8 @@ class SolverSPO(Plugs, SolverBase):
 
     A step writes ``joint_q``, ``joint_qd``, ``body_q`` and ``body_qd`` of its second state, which may be the first. It
     allocates nothing, reads nothing back and is bitwise repeatable, and a CUDA graph may capture any number of steps. A
-    NaN in one world stays in that world.
+    NaN in one world stays in that world. Who reads no poses of bodies sets ``body_q`` and ``body_qd`` of the second
+    state to None, which saves a launch; ``body_f = None`` of the first saves reading forces.
 
     Loop joints, which belong to no articulation, and mimics hold after every step to float32's rounding if ``loops`` is
     "embed" or "multipliers". A loop joint can only be a constraint. Its entries of joint_q and joint_qd keep their
@@ -300,10 +301,15 @@ class SolverSPO(Plugs, SolverBase):
         self._write_bodies(q_out, qd_out, state_out)
 
     def _write_bodies(self, q: wp.array, qd: wp.array, state: newton.State) -> None:
-        poses, rates = self._poses.target(state.body_q, "body_q"), self._wrenches.target(state.body_qd, "body_qd")
-        self.dynamics.body_states(q, qd, out=(poses, rates))
-        self._poses.write(poses, state.body_q)
-        self._wrenches.write(rates, state.body_qd)
+        """Launch the bodies' poses and velocities, unless the state has none."""
+        pairs = (self._poses, state.body_q, "body_q"), (self._wrenches, state.body_qd, "body_qd")
+        if all(flat is None for _, flat, _ in pairs):
+            return
+        out = tuple(at.buffer(name) if flat is None else at.target(flat, name) for at, flat, name in pairs)
+        self.dynamics.body_states(q, qd, out=out)
+        for (at, flat, _), array in zip(pairs, out, strict=True):
+            if flat is not None:
+                at.write(array, flat)
 
     def _observe(self, observables: Any, q: wp.array, qd: wp.array, qdd: wp.array, body_f: Any) -> None:
         kinds = SolverBase.ObservableKind

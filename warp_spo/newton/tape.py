@@ -110,7 +110,8 @@ class StepGradients:
             return None
         if integrator != "semi_implicit":
             raise UnsupportedError(CALL, f"integrator={integrator!r}", "only 'semi_implicit' has gradients")
-        written: dict[str, Any] = {name: getattr(state_out, name) for name in WRITTEN}
+        arrays = {name: getattr(state_out, name) for name in WRITTEN}
+        written: dict[str, Any] = {name: array for name, array in arrays.items() if array is not None}
         for name in ("joint_q", "joint_qd"):
             if written[name].ptr == read[name].ptr:
                 raise ValueError(
@@ -129,9 +130,9 @@ class StepGradients:
                 way_out = "allocate it with solver.observables(..., requires_grad=False)"
                 raise UnsupportedError(CALL, f"the observable {kind!r}, which requires grad", way_out)
         self.dynamics._gradients.check(STEP)
-        if written["body_q"].requires_grad or self.forces.turns_with_bodies:
+        if _requires_grad(written, "body_q") or self.forces.turns_with_bodies:
             self.dynamics._gradients.check(BODY_POSES)
-        if written["body_qd"].requires_grad:
+        if _requires_grad(written, "body_qd"):
             self.dynamics._gradients.check(BODY_VELOCITIES)
         return StepRecord(self, tape, read, written, wanted, dt)
 
@@ -157,6 +158,10 @@ class StepGradients:
             target_qd = read.get("joint_target_qd")
             given |= self.drives.read(read["joint_target_q"], target_qd, layouts.q, layouts.qd)
         return given
+
+
+def _requires_grad(arrays: Mapping[str, Any], name: str) -> bool:
+    return name in arrays and bool(arrays[name].requires_grad)
 
 
 class StepRecord:
@@ -248,10 +253,10 @@ class StepRecord:
                 out.zero_()
         q, qd = layouts.q.read(written["joint_q"], "q after"), layouts.qd.read(written["joint_qd"], "qd after")
         outs = {"q": layouts.q.buffer("gradient by bodies"), "qd": layouts.qd.buffer("gradient by bodies")}
-        if written["body_q"].requires_grad:
+        if _requires_grad(written, "body_q"):
             cotangent = layouts.poses.read(written["body_q"].grad, "body_q grad")
             self._pull_from_bodies(BODY_POSES, {"q": outs["q"]}, found, q=q, cotangent=cotangent)
-        if written["body_qd"].requires_grad:
+        if _requires_grad(written, "body_qd"):
             cotangent = layouts.wrenches.read(written["body_qd"].grad, "body_qd grad")
             self._pull_from_bodies(BODY_VELOCITIES, outs, found, q=q, qd=qd, cotangent=cotangent)
         return found
