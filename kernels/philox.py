@@ -34,12 +34,12 @@ struct philox
 """``philox::random(key, counter, out)``: four random words of 32 bits."""
 
 
-def draws(count: int, seed: tuple[int, int], stream: int, world: str, step: str, T: type) -> str:
+def draws(count: int, seed: tuple[str, str], stream: int, world: str, step: str, T: type) -> str:
     """Return code that fills ``draw[i]``, i below ``count``, with numbers in [0, 1), multiples of 2^-24.
 
     Args:
         count: how many.
-        seed: two words, the key. stream: a number that tells kernels of one seed apart.
+        seed: C++ of two words, the key. stream: a number that tells kernels of one seed apart.
         world: C++ of the world's number in the whole run. step: C++ of the number of the step; both 32 bits.
     """
     if not count:
@@ -47,14 +47,14 @@ def draws(count: int, seed: tuple[int, int], stream: int, world: str, step: str,
     blocks, c = -(-count // 4), C_TYPE[T]
     return f"""{NATIVE}{c} draw[{4 * blocks}];
 {{
-const unsigned int key[2] = {{{seed[0]}u, {seed[1]}u}};
+const unsigned int own_key[2] = {{{seed[0]}, {seed[1]}}};
 #if defined(__CUDA_ARCH__)
 #pragma unroll
 #endif
 for (int block = 0; block < {blocks}; ++block) {{
     const unsigned int counter[4] = {{(unsigned int)({world}), (unsigned int)({step}), {stream}u, (unsigned int)block}};
     unsigned int word[4];
-    philox::random(key, counter, word);
+    philox::random(own_key, counter, word);
     for (int i = 0; i < 4; ++i) draw[4 * block + i] = ({c})(word[i] >> 8) * ({c})5.9604644775390625e-8;
 }}
 }}

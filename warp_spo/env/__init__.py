@@ -38,6 +38,8 @@ A world whose actions, state or reward are not finite starts anew, ends with ``t
 its first cause; see ``env.log()``. Other worlds do not notice.
 """
 
+from __future__ import annotations
+
 from typing import TYPE_CHECKING, Any
 
 from . import actions, commands, events, observations, rewards, terminations
@@ -55,11 +57,42 @@ __all__ = [
     "actions",
     "commands",
     "events",
+    "gymnasium",
     "make",
     "observations",
     "rewards",
+    "skrl",
     "terminations",
 ]
+
+
+def gymnasium(env: Env, tensors: bool = False, single: bool = False) -> Any:
+    """Return an environment as a ``gymnasium.vector.VectorEnv``, whose worlds start anew in the step that ends them.
+
+    Observations are NumPy arrays [world, number], or a dictionary of them if there are several groups. Actions are
+    unbounded; their space says -1 to 1, from which random ones are drawn.
+
+    Args:
+        env: the environment. With ``final_observations=True`` the information holds "final_obs".
+        tensors: whether observations, rewards and ends are torch tensors on the environment's device.
+        single: return a ``gymnasium.Env`` of the one world of ``env`` instead, which waits for ``reset``.
+    """
+    from .interfaces import make_single, make_vector
+
+    return make_single(env) if single else make_vector(env, tensors)
+
+
+def skrl(env: Env, observations: str | None = None, states: str | None = None) -> Any:
+    """Return an environment as a wrapper of skrl.
+
+    Args:
+        env: the environment.
+        observations: the group that the policy sees; None: the first.
+        states: the group that the critic sees; None: the second, if there is one.
+    """
+    from .interfaces import make_skrl
+
+    return make_skrl(env, observations, states)
 
 
 def __getattr__(name: str) -> Any:
@@ -71,7 +104,7 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-def make(name: str, worlds: int | None = None, device: Any = None, seed: int = 0, **options: Any) -> "Env":
+def make(name: str, worlds: int | None = None, device: Any = None, seed: int = 0, **options: Any) -> Env:
     """Return the environment of a task; nothing is downloaded.
 
     Args:

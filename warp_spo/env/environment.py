@@ -60,10 +60,13 @@ class Env(VecEnv):
         passes: of steps with contacts, see :meth:`Dynamics.step`.
         granularity: of the dynamics.
         graph: whether a step is one CUDA graph; None: on CUDA it is.
+        final_observations: whether ``extras["final_observations"]`` holds what was observed after the step and before
+            new starts, the last observation of worlds whose episode has ended.
         log_interval: steps after which ``extras["log"]`` comes again.
 
     Attributes:
         q, qd: state, torch tensors [world, coordinate] and [world, dof].
+        final: the argument ``final_observations``.
         replay: runs a step without its inputs and results; ``replay.captured`` says of how many graphs it is made.
         values: what events have made of the scene's values, torch tensors [world, ...] by name.
         dyn: the :class:`Dynamics`.
@@ -95,6 +98,7 @@ class Env(VecEnv):
         granularity: str | None = None,
         graph: bool | None = None,
         log_interval: int = 24,
+        final_observations: bool = False,
         cfg: Any = None,
     ):
         self.scene, self.num_envs = scene, worlds
@@ -118,16 +122,14 @@ class Env(VecEnv):
             for name, terms in observations.items()
         }
         tracing = Tracing(layout, parts, groups, dict(rewards), dict(terminations or {}), commands, list(events))
-        tracing.run(self.max_episode_length)
+        tracing.run(self.max_episode_length, final_observations)
+        self.final = final_observations
         self.reward_names, self.termination_names = list(rewards), tracing.ends
         self.num_obs = {name: len(values) for name, values in tracing.group_sizes.items()}
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=layout.values, granularity=granularity)
         self._allocate(parts, tracing)
         stages = tracing.stages
-        self._kernels = {
-            name: stage.build(self._buffers, self.seed, self.first_world, self.warp_device)
-            for name, stage in stages.items()
-        }
+        self._kernels = {name: stage.build(self._buffers, self.warp_device) for name, stage in stages.items()}
         self._launch("start")
         self._set_values()
         self._values_later = any(isinstance(event, Values) and event.when != "start" for event in events)
@@ -144,6 +146,8 @@ class Env(VecEnv):
         self.actions = zeros(worlds, self.num_actions)
         self._memory = zeros(max(1, layout.memory_size), worlds)
         self._tick = zeros(worlds, dtype=torch.int32)
+        self._key = zeros(3, dtype=torch.int32)
+        self.set_seed(self.seed)
         self._episode_length = zeros(worlds, dtype=torch.int64)
         self.chosen = zeros(worlds, dtype=torch.bool)
         buffers = {
@@ -152,6 +156,7 @@ class Env(VecEnv):
             "actions": Buffer(self.actions),
             "memory": Buffer(self._memory, COLUMN),
             "tick": Buffer(self._tick, INT),
+            "key": Buffer(self._key, SHARED),
             "episode_length": Buffer(self._episode_length, LONG),
             "chosen": Buffer(self.chosen, CHOSEN),
         }
@@ -205,15 +210,23 @@ class Env(VecEnv):
             buffers[f"value_{name}"] = Buffer(self.values[name].view(worlds, -1))
         self._places: dict[str, tuple[int, int]] = {}
         at = 0
-        for name, size in (("reward", 1), ("done", 1), ("time_out", 1), *self.num_obs.items()):
+        finals = [(f"final {name}", size) for name, size in self.num_obs.items()] if self.final else []
+        for name, size in (("reward", 1), ("done", 1), ("time_out", 1), *self.num_obs.items(), *finals):
             self._places[name] = at, size
             at += -(-worlds * size // ALIGNMENT) * ALIGNMENT
         self._out = zeros(at)
         for name, (start, size) in self._places.items():
             part = self._out[start : start + worlds * size]
             part = part.view(torch.int32) if name == "done" else part.view(worlds, size)
-            buffers[f"out_{name}"] = Buffer(part, INT if name == "done" else ROW)
+            buffers[f"out_{name}".replace(" ", "_")] = Buffer(part, INT if name == "done" else ROW)
         self._buffers = buffers
+
+    def set_seed(self, seed: int) -> None:
+        """Set the seed of all later random numbers, 64 bits; the steps of the worlds count from zero again."""
+        self.seed = int(seed)
+        words = [self.seed & 0xFFFFFFFF, self.seed >> 32 & 0xFFFFFFFF, self.first_world]
+        self._key.copy_(torch.tensor(np.array(words, dtype=np.uint32).view(np.int32)))
+        self._tick.zero_()
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
@@ -291,6 +304,8 @@ class Env(VecEnv):
         extras: dict[str, Any] = {"time_outs": self._part(out, "time_out").view(-1)}
         if self._steps % self.log_interval == 0:
             extras["log"] = self.log()
+        if self.final:
+            extras["final_observations"] = self._observations(out, "final ")
         done = self._part(out, "done").view(-1).view(torch.int32)
         return self._observations(out), self._part(out, "reward").view(-1), done, extras
 
@@ -315,8 +330,8 @@ class Env(VecEnv):
         start, size = self._places[name]
         return out[start : start + self.num_envs * size].view(self.num_envs, size)
 
-    def _observations(self, out: torch.Tensor) -> Any:
-        groups = {name: self._part(out, name) for name in self.num_obs}
+    def _observations(self, out: torch.Tensor, kind: str = "") -> Any:
+        groups = {name: self._part(out, kind + name) for name in self.num_obs}
         return groups if TensorDict is None else TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def _stream(self) -> Any:
@@ -335,7 +350,8 @@ class Env(VecEnv):
         """Return the parts of a step."""
         after = [Part(lambda: self._after("judge")), *self._user_parts("judge")]
         last = [Part(self._after_reset), *self._user_parts("observe"), Part(lambda: self._launch("observe"))]
-        return [Part(self._physics), *after, Part(lambda: self._launch("judge")), *last]
+        final = [*self._user_parts("observe"), Part(self._observe_final)] if self.final else []
+        return [Part(self._physics), *final, *after, Part(lambda: self._launch("judge")), *last]
 
     def _physics(self) -> None:
         self._launch("act")
@@ -358,6 +374,10 @@ class Env(VecEnv):
         )
         if "actuator_force" in self._buffers:
             self.dyn.actuator_force(self.q, self.qd, controls["ctrl"], out=self._actuator_force)
+
+    def _observe_final(self) -> None:
+        self._after("final")
+        self._launch("final")
 
     def _set_values(self) -> None:
         if self.values:

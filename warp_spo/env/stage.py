@@ -103,12 +103,13 @@ class Stage:
         """Return the names of the tables that the stored values depend on."""
         return {scalar.args[0] for scalar in ordered(item.value for item in self.stores) if scalar.op == "lookup"}
 
-    def build(self, buffers: dict[str, Buffer], seed: int, first: int, device: wp.Device) -> Launch | None:
+    def build(self, buffers: dict[str, Buffer], device: wp.Device) -> Launch | None:
         """Return the launch of the kernel; None if it writes nothing.
 
         Args:
-            buffers: arrays of the environment by name; ``tick`` counts the steps of each world.
-            seed: of the random numbers. first: number of world 0 in the whole run.
+            buffers: arrays of the environment by name; ``tick`` counts the steps of each world, ``key`` holds the seed
+                in two words and the number of world 0 in the whole run.
+            device: where it runs.
         """
         if not self.stores:
             return None
@@ -129,11 +130,11 @@ class Stage:
         body = "\n".join(render(listing, "float32") for listing in listings)
         touched = {array for listing in listings for array, _ in listing.indices if array != DRAW}
         touched |= self.read_tables()
-        words = (seed & 0xFFFFFFFF, seed >> 32 & 0xFFFFFFFF)
-        world, step = f"{first} + world", buffers["tick"].place("tick", "0")
-        random = philox.draws(self.draws, words, self.stream, world, step, wp.float32)
-        if self.draws or self.ticks:
-            touched.add("tick")
+        words = [f"((unsigned int*)key.data)[{i}]" for i in range(3)]
+        world, step = f"{words[2]} + (unsigned int)world", buffers["tick"].place("tick", "0")
+        random = philox.draws(self.draws, (words[0], words[1]), self.stream, world, step, wp.float32)
+        touched |= {"key"} if self.draws else set()
+        touched |= {"tick"} if self.draws or self.ticks else set()
         count = (
             f"((unsigned int*)tick.data)[world] += {'1u' if self.ticks is True else self.ticks};" if self.ticks else ""
         )

@@ -1,8 +1,8 @@
-"""The stages of an environment's step, traced: start, act, judge, observe, and reset on request.
+"""The stages of an environment's step, traced: start, act, judge, observe; reset and final on request.
 
 start: what is drawn once. act: actions -> controls. judge: the state after the step -> rewards, ends of episodes, new
 starts, commands, events. observe: the state that the next actions see -> observations. reset: new starts of chosen
-worlds alone.
+worlds alone. final: observations of the state after the step, before new starts.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Tracing:
             if isinstance(event, EncoderBias):
                 layout.biased = World(layout, Stage("none", 0)).joints(event.names)
         self.ends = [*terminations, NOT_FINITE]
-        names = ("act", "judge", "observe", "reset", "start")
+        names = ("act", "judge", "observe", "reset", "start", "final")
         self.stages = {name: Stage(name, stream) for stream, name in enumerate(names)}
         self.group_sizes: dict[str, list] = {}
 
@@ -67,11 +67,13 @@ class Tracing:
         """Names of the arrays that the stages read."""
         return set().union(*(stage.read_arrays() for stage in self.stages.values()))
 
-    def run(self, steps: int) -> None:
-        """Trace all stages; ``steps`` are those of an episode."""
+    def run(self, steps: int, final: bool) -> None:
+        """Trace all stages; ``steps`` are those of an episode; ``final`` asks for the stage of that name."""
         self._act()
         self._judge(steps)
         self._observe()
+        if final:
+            self._final()
         self._close()
         self._reset()
         self._first()
@@ -243,6 +245,14 @@ class Tracing:
             self.group_sizes[group] = values
             for i, value in enumerate(values):
                 stage.store(f"out_{group}", i, as_value(value))
+
+    def _final(self) -> None:
+        """Observe the state in which an episode ends, before worlds start anew."""
+        w = World(self.layout, self.stages["final"])
+        w.__dict__["time"] = (w.read("episode_length", 1)[0] + 1.0) * self.layout.step_dt
+        for group, terms in self.groups.items():
+            for i, value in enumerate(x for term in terms for x in term.trace(w)):
+                w._stage.store(f"out_final_{group}", i, as_value(value))
 
     # -- memory ----------------------------------------------------------------------------------------------------
     def _close(self) -> None:

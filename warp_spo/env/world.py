@@ -321,7 +321,8 @@ class World:
 
     def user(self, term: Any) -> Any:
         """Return the numbers of a user's term in torch."""
-        start = self._layout.user(term, self._stage.name)
+        stage = self._stage.name
+        start = self._layout.user(term, "observe" if stage == "final" else stage)
         values = vector(self._scalar("user", start + i) for i in range(term.size))
         return values[0] if term.size == 1 else values
 
@@ -368,7 +369,7 @@ class World:
         """
         self._layout.sensors[name] = size, reset, update
         self._layout.remember(name, size, reset)
-        if self._stage.name == "judge" and name not in self.kept:
+        if self._stage.name in ("judge", "final") and name not in self.kept:
             update(self)
         return self.memory(name, size, reset)
 
