@@ -87,7 +87,6 @@ MISTAKES = {
     "hull": (lambda: spo.Contact(0, hull=[1, 2, 3]), ValueError, r"hull has shape \(3,\); expected \(points, 3\)"),
     "friction": (lambda: spo.Contact(0, point=(0, 0, 0), friction=-0.1), ValueError, "friction is -0.1"),
     "eps": (lambda: spo.Contact(0, point=(0, 0, 0), eps=0.0), ValueError, "eps is 0.0; expected a positive"),
-    "pair": (lambda: spo.Contact(0, point=(0, 0, 0), other=1), spo.UnsupportedError, "other=1, contact between"),
     "list": (lambda: spo.Scene([spo.Body(1.0)], [spo.Hinge("free", -1, 0)], contacts=[3]), TypeError, "contacts holds"),
     "ground": (lambda: spo.Scene([spo.Body(1.0)], [spo.Hinge("free", -1, 0)], ground=0.0), TypeError, "ground is of"),
     "field": (lambda: spo.HeightField([[0.0, 1.0], [np.nan, 0.0]], 0.1), ValueError, r"heights\[1, 0\] is nan"),

@@ -35,6 +35,7 @@ ROOMS = (
     "reference_rotors",
     "reference",
     "reference_contact",
+    "reference_pairs",
     "trace",
     "hinges",
     "scene",

@@ -338,6 +338,16 @@ def test_functions_of_the_user_count_by_what_they_return():
 def test_fingerprints_see_every_part_of_a_scene():
     """A new attribute of scenes belongs into the fingerprint, or into this list."""
     seen = {"bodies", "hinges", "loops", "couplings", "actuators", "contacts", "ground", "values"}
-    derived = {"contact_points", "hinge_of", "tree", "q_start", "qd_start", "dof_axis", "dof_angular", "dof_linear"}
+    derived = {
+        "contact_points",
+        "contact_pairs",
+        "hinge_of",
+        "tree",
+        "q_start",
+        "qd_start",
+        "dof_axis",
+        "dof_angular",
+        "dof_linear",
+    }
     of_callers = {"q_index", "dof_index", "sites", "keyframes"}  # kernels of frames are made for the frames of a call
     assert set(vars(zoo.fork())) == seen | derived | of_callers

@@ -9,7 +9,8 @@ import warp as wp
 from ..arrays import Call
 from ..errors import UnsupportedError, as_integer
 from ..kernels import combination
-from ..recursions.contact.step import PASSES, REPORTS
+from ..recursions.contact.pairs import default_passes
+from ..recursions.contact.step import REPORTS
 from ..scene.contacts import HeightField, contact_figures
 from .operation import Argument
 
@@ -36,7 +37,7 @@ def check_step(dyn: Dynamics, call: Call, integrator: str, passes: Any, asked: d
             if value is not None:
                 raise ValueError(f"{call.name}: {name} is given, and the scene has no contacts; expected None")
         return None
-    count = PASSES if passes is None else as_integer(passes)
+    count = default_passes(dyn.scene) if passes is None else as_integer(passes)
     if count is None or count < 1:
         raise ValueError(f"{call.name}: passes is {passes!r}; expected an integer, 1 or more")
     refuse(dyn, call, integrator)
@@ -67,4 +68,6 @@ def add_share(dyn: Dynamics, substep: int, count: int, now: wp.array, mean: wp.a
 def explain(dyn: Dynamics) -> str:
     """Return a line on the scene's contacts."""
     figures = contact_figures(dyn.scene)
-    return f"{figures}; {PASSES} passes of a step unless passes= says otherwise" if dyn.scene.contacts else figures
+    if not dyn.scene.contacts:
+        return figures
+    return f"{figures}; {default_passes(dyn.scene)} passes of a step unless passes= says otherwise"

@@ -196,7 +196,7 @@ class Engine:
             "dof": dyn.scene.dof_count,
             "body": dyn.scene.body_count,
             "actuator": len(dyn.scene.actuators),
-            "contact": len(dyn.scene.contact_points),
+            "contact": dyn.scene.contact_count,
             "frame": frames,
             "entry": entries,
         }[axis]

@@ -15,6 +15,7 @@ from ..kernels import combination, loops
 from ..kernels.substeps import SUBSTEPS
 from ..recursions import coordinates, hinge_forces
 from ..recursions import step as recursion
+from ..recursions.contact import pairs
 from ..recursions.contact import step as contact
 from ..recursions.impedance import DEFAULT_BOUND
 from ..recursions.loops import closed_step, multipliers
@@ -36,6 +37,7 @@ def _divides(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
 
 STEP = Routine("step", recursion.step, letters="PzaS", divides=_divides, passes=True, wide=True)
 CONTACT_STEP = Routine("contact_step", contact.step, letters="PzafSE", passes=True, counted=True, wide=True)
+PAIRED_STEP = Routine("paired_step", pairs.step, passes=True, counted=True)
 EMBEDDED_STEP = Routine("step", closed_step.step, passes=True)
 STEP_UNDER_MULTIPLIERS = Routine("step", closed_step.step_with_multipliers, passes=True)
 STEP_SYSTEM = Routine("step_system", closed_step.step_system)
@@ -82,9 +84,13 @@ def semi_implicit(
     launch, more = dyn._engine.launch_routine, {"q_out": q_out, **asked}
     given |= {SUBSTEPS: float(substeps)} if substeps > 1 else {}
     if dyn.scene.contacts:
-        count = float(contact.PASSES if passes is None else passes)
+        count = float(pairs.default_passes(dyn.scene) if passes is None else passes)
         given |= {"passes": count, "reports": tuple(reports or ()), **option}
-        launch(CONTACT_STEP, qd_out, more | (reports or {}), q=q, qd=qd, dt=dt, **given)
+        routine = CONTACT_STEP
+        if dyn._pairs is not None:
+            dyn._pairs.find(q)
+            routine = PAIRED_STEP
+        launch(routine, qd_out, more | (reports or {}), q=q, qd=qd, dt=dt, **given)
     elif not dyn.closed:
         launch(STEP, qd_out, more, q=q, qd=qd, dt=dt, **given, **option)
     elif dyn.embedding is not None:
@@ -103,6 +109,8 @@ def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool) -
         return f"integrator={integrator!r} takes several"
     if dyn.closed and dyn.embedding is None:
         return "loops='multipliers' takes several"
+    if dyn.scene.contact_pairs:
+        return "the points that bodies share are found before each"
     if delays:
         return "delays of actuators count substeps"
     tendons = acts and any(len(actuator.hinges) > 1 for actuator in dyn.scene.actuators)

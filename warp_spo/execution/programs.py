@@ -12,13 +12,14 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from .. import launches
-from ..kernels import native, straight
+from ..kernels import coupling, native, straight
 from ..kernels.fields import axes
 from ..kernels.native import INTEGERS
 from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout
 from ..kernels.substeps import SUBSTEPS
 from ..recursions import messages
+from ..recursions.contact import pairs
 from ..recursions.contact.ground import GROUND
 from ..recursions.contact.secants import SECANT
 from ..recursions.flexible import attach
@@ -210,10 +211,18 @@ class Programs:
             make_emitter(self.run.dtype.__name__, shapes, layout),
             [item for item in stores if item.array in PASSED],
         )
-        regions = [emitter.region(trace.begin, trace.ahead), emitter.branch(looped)] if looped else []
+        coupled = [item for item in stores if item.array in pairs.READ]
+        regions = [emitter.region(trace.begin, trace.ahead)] if looped else []
+        regions += emitter.branches([coupled, looped] if coupled else [looped]) if looped else []
         *before, body = (render(each, self.run.dtype.__name__) for each in [*regions, emitter.region(placed)])
         if trace.begin:
-            entries = {GAIN: self.run.scene.dof_count, SECANT: len(trace.begin)}
+            entries = {GAIN: self.run.scene.dof_count, SECANT: sum(item.array == SECANT for item in trace.begin)}
+            if coupled:
+                couples = self._couples(links)
+                entries |= coupling.shared_arrays(couples)
+                first, read, *rest = before
+                declared = coupling.declare(couples, self.run.dtype)
+                before = [f"{declared}\n{first}\n{coupling.BEGIN}", "\n".join([read, coupling.PASS, *rest])]
             body = straight.repeat_counted_passes([*before, body], entries, self.run.dtype)
         elif looped:
             ahead, a_pass = before
@@ -221,8 +230,10 @@ class Programs:
         block = PAIR * WARP_SIZE if self.plan.few and not layout.shared_scalars else WARP_SIZE
         direct = self.plan.copies_directly(routine)
         layout = layout._replace(retries=layout.retries and "farthest" in body, block=block, direct=direct)
-        tables = {} if table is None else {"place": table}
+        tables: dict[str, Any] = {} if table is None else {"place": table}
         tables |= self._heights(emitter.counts["lookup"] > 0)
+        if coupled:
+            tables["touches"] = self.run.array("touches", coupling.entries(couples.points)[-1], self.run.worlds)
         return self._finished(routine, layout, body, body, tables, emitter.operations)
 
     def _heights(self, reads: bool) -> dict[str, Any]:
@@ -307,8 +318,15 @@ class Programs:
         return self._finished(routine, layout, cuda, team.cpu(), tables, team.operations, cap)
 
     @staticmethod
+    def _couples(links: Links) -> coupling.Couples:
+        """Return the pairs of bodies of a scene as their native code needs them."""
+        scene, of_pairs = links.scene, pairs.members(links).of_pairs
+        points, eps = zip(*((pair.points, pair.eps) for pair in scene.contact_pairs), strict=True)
+        return coupling.Couples(of_pairs, points, eps, tuple(pairs.inverse_weights(scene)), pairs.blocks(links))
+
+    @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
-        if item.array in (INWARD, OUTWARD, *PASSED):
+        if item.array in (INWARD, OUTWARD, *PASSED, *pairs.READ):
             return item
         return item._replace(index=(staging.flat_index(item.index, shapes[item.array][1:]),))
 
@@ -330,7 +348,9 @@ class Programs:
         if result.way in BY_TABLE:
             tables = tables | {"place": result.slot_layout.table(tables["place"], self.run.dtype)}
         held: dict[str, wp.array] = {
-            name: wp.array(values, dtype=int if name in INTEGERS else self.run.dtype, device=self.run.device)
+            name: values
+            if isinstance(values, wp.array)
+            else wp.array(values, dtype=int if name in INTEGERS else self.run.dtype, device=self.run.device)
             for name, values in tables.items()
         }
         if result.way == TILED:

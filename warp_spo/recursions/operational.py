@@ -50,6 +50,16 @@ def operational_inertia_inverse_product(trace: Trace, frames: tuple) -> list[Sto
     forces: dict[int, Vector] = {id(link): NO_FORCE for link in trace.links.links}
     for key, wrench in wrenches_on_links(trace, frames).items():
         forces[key] = forces[key] - wrench
+    return accelerations_of_frames(trace, frames, respond(trace, done, forces)[1])
+
+
+def respond(
+    trace: Trace, done: dict, forces: dict[int, Vector]
+) -> tuple[dict[int, Value], dict[int, tuple[Vector, Vector]]]:
+    """Return what forces against the links, by id, make of the tree at rest: qdd by dof, accelerations of links by id.
+
+    The sweep inward adds forces of children to ``forces``.
+    """
     rates: dict[int, list[Value]] = {}
     for link in reversed(trace.links.links):
         trace.label(link, "z")
@@ -62,19 +72,20 @@ def operational_inertia_inverse_product(trace: Trace, frames: tuple) -> list[Sto
             continue
         if link.parent is not None:
             forces[id(link.parent)] = forces[id(link.parent)] + force
-    shared: dict[int, Value] = {}
+    qdd: dict[int, Value] = {}
     alpha: dict[int, tuple[Vector, Vector]] = {}
     for link in trace.links.links:
         trace.label(link, "a")
         above = (ZERO, ZERO) if link.parent is None else alpha[id(link.parent)]
         place = trace.places[id(link)]
         if link.group is None:
-            _, alpha[id(link)] = articulated.expand_link(link, place, done[id(link)], rates[id(link)], STILL, above)
+            own, alpha[id(link)] = articulated.expand_link(link, place, done[id(link)], rates[id(link)], STILL, above)
+            qdd |= zip(link.dofs, own, strict=True)
             continue
         if link.leads:
-            shared |= zip(link.dofs, groups.expand(done[id(link)], rates[id(link)], above)[0], strict=True)
-        alpha[id(link)] = link_acceleration(link, place, STILL, above, shared.__getitem__)
-    return accelerations_of_frames(trace, frames, alpha)
+            qdd |= zip(link.dofs, groups.expand(done[id(link)], rates[id(link)], above)[0], strict=True)
+        alpha[id(link)] = link_acceleration(link, place, STILL, above, qdd.__getitem__)
+    return qdd, alpha
 
 
 def wrenches_on_links(trace: Trace, frames: tuple) -> dict[int, Vector]:

@@ -1,4 +1,4 @@
-"""Contacts of bodies with the ground: their points, and the constants that a scene chooses where a user gives none."""
+"""Contacts of bodies: their shapes and points, the ground, and what a scene chooses where a user gives no constant."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import UnsupportedError, as_integer
 from .checks import checked_array, checked_unit, read_only
+from .pairs import pair_values
 from .storage import Stored, StoredPart
 
 CONTACT_VALUES = ("contact_friction", "contact_stiffness", "contact_damping")
@@ -101,12 +102,17 @@ class HeightField(StoredPart):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Contact(StoredPart):
-    """Points of a body that touch the scene's ground in :meth:`Dynamics.step`.
+    """Points of a body that touch the scene's ground in :meth:`Dynamics.step`, or a body that touches another one.
 
     One of the shapes says which points. A ``point`` is one. A ``sphere`` is its lowest point, which moves over the
     sphere as the body turns. A ``capsule`` is the two spheres at its ends; a ``box`` its eight corners; a ``hull``
     those of its points that lie on the convex hull. Each point is a spring and a damper along the ground's normal,
     which never pull, and friction in the ground's plane, at most ``friction`` times the normal force.
+
+    With ``other``, the two bodies touch each other instead, as the shapes that they are: points, spheres and capsules
+    among themselves, points and spheres with boxes, and boxes with boxes at the common part of two faces, up to eight
+    points. Where edges of two boxes cross, the faces still push, in a direction that is not the edges' own. The pair is
+    a spring and a damper that its points share equally, with friction at each.
 
     Args:
         body: index of the body.
@@ -115,20 +121,24 @@ class Contact(StoredPart):
         capsule: ((x, y, z) of one end of its axis, (x, y, z) of the other, radius) [m].
         box: half its sizes (x, y, z) [m], about the body frame's origin; or (half its sizes, its pose in the body).
         hull: points [n, 3], [m].
-        other: must be None, the ground; contacts between bodies are not supported.
+        other: None: the ground. A Contact that gives another body and its shape, and nothing else counts of it. An
+            index of a body: the shape of that body's one contact with the ground.
         friction: ratio of the largest friction force to the normal force.
         stiffness: of each point [N/m]; None: so that a robot that stands on up to four points sinks by 1.7 mm, and that
             the points of one body can hold it up alone, if they span a sole. See ``contact_points`` of :class:`Scene`.
+            With ``other``, of the pair; None: the lighter of the two, with all that is connected to it, sinks by 0.1 mm
+            where it rests on the other; of bodies connected to each other, with all that they carry.
         damping: of each point [N s/m]; None: sqrt(stiffness mass) / 2, with the mass that rests on the point when the
-            robot stands on two such bodies, or on four points.
+            robot stands on two such bodies, or on four points. With ``other``, of the pair; None: critical for that
+            mass.
         dissipation: in place of ``damping``, c of Hunt and Crossley [s/m]: the damping is c ``stiffness`` times the
-            depth before the step, zero at the first touch. The scene's ``contact_damping`` of such points is c.
+            depth before the step, zero at the first touch. The scene's ``contact_damping`` of such points is c. Not
+            with ``other``.
         eps: speed [m/s] below which friction is a damper. A point that sticks creeps by less than that.
         label: name in tables and errors.
 
     Raises:
         ValueError: a value is invalid, or not exactly one shape is given; the message names it.
-        UnsupportedError: ``other`` is not None.
     """
 
     body: int
@@ -146,14 +156,13 @@ class Contact(StoredPart):
     label: str = ""
     positions: np.ndarray = dataclasses.field(init=False, repr=False)  # of the points, in the body frame [point, 3]
     radius: float = dataclasses.field(init=False, repr=False)  # of the sphere about each
+    frame: Any = dataclasses.field(init=False, repr=False)  # of a box: its pose in the body and half its sizes
 
     def __post_init__(self) -> None:
         call = f"Contact({self.label!r})" if self.label else "Contact"
         given = [name for name in SHAPES if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"{call}: {', '.join(given) or 'no shape'} given; expected one of {', '.join(SHAPES)}")
-        if self.other is not None:
-            raise UnsupportedError(call, f"other={self.other!r}, contact between bodies,", "leave out other=")
         if self.damping is not None and self.dissipation is not None:
             raise ValueError(f"{call}: damping and dissipation are given; expected one of them, or none")
         for name in ("friction", "stiffness", "damping", "dissipation", "eps"):
@@ -167,6 +176,8 @@ class Contact(StoredPart):
         positions, radius = SHAPES[given[0]](call, getattr(self, given[0]))
         object.__setattr__(self, "positions", read_only(positions))
         object.__setattr__(self, "radius", radius)
+        frame = None if self.box is None else tuple(map(read_only, _box_frame(call, self.box)))
+        object.__setattr__(self, "frame", frame)
 
 
 class ContactPoint(NamedTuple):
@@ -228,7 +239,8 @@ def _capsule(call: str, value: Any) -> Points:
     return np.array(found), _radius(call, "capsule", radius)
 
 
-def _box(call: str, value: Any) -> Points:
+def _box_frame(call: str, value: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pose of a box in the body, and half its sizes."""
     from .parts import checked_pose
 
     parts = _parts(call, "box", value, 3 if np.ndim(_first(value)) == 0 else 2, "half its sizes, or (those, its pose)")
@@ -236,7 +248,12 @@ def _box(call: str, value: Any) -> Points:
     half = checked_array(call, "half the sizes [m] of box", sizes, (3,))
     if not (half >= 0.0).all():
         raise ValueError(f"{call}: half the sizes of box are {half.tolist()} m; expected none below zero")
-    place = pose_matrix(checked_pose(call, "the pose of box", pose))
+    return checked_pose(call, "the pose of box", pose), half
+
+
+def _box(call: str, value: Any) -> Points:
+    pose, half = _box_frame(call, value)
+    place = pose_matrix(pose)
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
     return corners @ place[:3, :3].T + place[:3, 3], 0.0
 
@@ -276,10 +293,11 @@ def spread_directions(count: int = DIRECTIONS) -> np.ndarray:
 
 # -- scenes ------------------------------------------------------------------------------------------------------------
 def contact_points(contacts: Sequence[Contact]) -> tuple[ContactPoint, ...]:
-    """Return the points of all contacts, contact after contact."""
+    """Return the points of all contacts with the ground, contact after contact."""
     return tuple(
         ContactPoint(index, contact.body, (x, y, z), contact.radius, contact.eps, contact.dissipation is not None)
         for index, contact in enumerate(contacts)
+        if contact.other is None
         for x, y, z in contact.positions.tolist()
     )
 
@@ -339,12 +357,19 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
     What is None is chosen.
     """
     points = scene.contact_points
-    values = {name: np.zeros((1, len(points))) for name in CONTACT_VALUES}
+    values = {name: np.zeros((1, scene.contact_count)) for name in CONTACT_VALUES}
     sets = isinstance(scene.ground, HeightField) and scene.ground.heights.ndim == 3
-    values |= {"ground_origin": np.zeros((1, 3 if points else 0)), "ground_field": np.zeros((1, 1 if sets else 0))}
-    if not points:
+    values |= {
+        "ground_origin": np.zeros((1, 3 if scene.contact_count else 0)),
+        "ground_field": np.zeros((1, 1 if sets else 0)),
+    }
+    if not scene.contact_count:
         return values
     stand = Stand(scene)
+    for i, pair in enumerate(scene.contact_pairs, start=len(points)):
+        found = pair_values(pair, scene, stand)
+        for name, value in zip(CONTACT_VALUES, found, strict=True):
+            values[name][0, i] = value
     at = np.array([stand.at(point) for point in points])
     bodies = np.array([point.body for point in points])
     for i, point in enumerate(points):
@@ -378,19 +403,21 @@ def _sole_stiffness(points: np.ndarray, weight: float, com: np.ndarray, up: np.n
 
 def contact_figures(scene: Any) -> str:
     """Return a line on the scene's contacts."""
-    points = scene.contact_points
-    if not points:
+    points, pairs = scene.contact_points, scene.contact_pairs
+    if not scene.contact_count:
         return "none"
     bodies, ground = len({point.body for point in points}), type(scene.ground).__name__
-    figures, graded = [], np.array([point.dissipates for point in points])
-    rows = [(name.removeprefix("contact_"), name, np.full(len(points), True)) for name in CONTACT_VALUES[:2]]
+    parts = [f"{len(points)} points of {bodies} bodies with the {ground}"] if points else []
+    parts += [f"{len(pairs)} pairs of bodies"] if pairs else []
+    figures, graded = [], np.array([point.dissipates for point in points] + [False] * len(pairs))
+    rows = [(name.removeprefix("contact_"), name, np.full(len(graded), True)) for name in CONTACT_VALUES[:2]]
     rows += [("damping", "contact_damping", ~graded), ("dissipation", "contact_damping", graded)]
     for (label, name, which), unit in zip(rows, ("", " N/m", " N s/m", " s/m"), strict=True):
         if which.any():
             low, high = scene.values[name][:, which].min(), scene.values[name][:, which].max()
             value = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
             figures.append(f"{label} {value}{unit}")
-    return f"{len(points)} points of {bodies} bodies with the {ground}; {', '.join(figures)}"
+    return f"{', '.join(parts)}; {', '.join(figures)}"
 
 
 def pose_matrix(pose: np.ndarray) -> np.ndarray:

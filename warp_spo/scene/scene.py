@@ -27,6 +27,7 @@ from .contacts import (
     contact_values,
 )
 from .modes import MASS_VALUES, check_modes, with_modes
+from .pairs import ContactPair, contact_pairs
 from .parts import (
     DOF_VALUES,
     Body,
@@ -92,7 +93,7 @@ class Scene(Stored):
         actuators: forces that control values command.
         sites: named frames, (body index, pose in the body (x, y, z, qx, qy, qz, qw)) by name.
         keyframes: named states.
-        contacts: points of bodies that touch the ground in :meth:`Dynamics.step`; other calls leave them out.
+        contacts: bodies that touch the ground or each other in :meth:`Dynamics.step`; other calls leave them out.
         ground: a :class:`Plane` or a :class:`HeightField`; None: the plane at height 0, where there are contacts.
 
     Attributes:
@@ -109,10 +110,11 @@ class Scene(Stored):
             joint_velocity_limit. Of actuators: actuator_gain, actuator_strength, actuator_delay [actuator],
             actuator_bias [actuator, 3], actuator_ctrl_range, actuator_force_range [actuator, 2], and actuator_gear, of
             the hinges of the first actuator, of the second, and so on. Of contacts: contact_friction,
-            contact_stiffness [N/m], contact_damping [N s/m] [point]; ground_origin [3], where the ground's own origin
+            contact_stiffness [N/m], contact_damping [N s/m] [contact]; ground_origin [3], where the ground's own origin
             is [m], zero at first; ground_field [1], which field of a set of height fields, the first at first.
-        contact_points: the points (``ContactPoint``) of all contacts, contact after contact; other
-            calls mean them where axes say "contact".
+        contact_points: the points (``ContactPoint``) of all contacts with the ground, contact after contact.
+        contact_pairs: the pairs of bodies (``ContactPair``) that touch each other. Where axes of arrays say "contact",
+            there is an entry for each of the points and then one for each of the pairs.
         dof_axis: axis of each dof, in the parent anchor frame [dof, 3].
         dof_angular: radians about the axis per unit of the coordinate [dof].
         dof_linear: metres along the axis per unit of the coordinate [dof].
@@ -378,6 +380,12 @@ class Scene(Stored):
         check_contacts(self.contacts, ground, self.bodies)
         self.ground = Plane() if ground is None and self.contacts else ground
         self.contact_points: tuple[ContactPoint, ...] = contact_points(self.contacts)
+        self.contact_pairs: tuple[ContactPair, ...] = contact_pairs(self.contacts, len(self.bodies))
+
+    @property
+    def contact_count(self) -> int:
+        """Points that touch the ground, and pairs of bodies that touch each other."""
+        return len(self.contact_points) + len(self.contact_pairs)
 
     def with_values(self, **values: Any) -> Scene:
         """Return a copy of the scene with other ``values``, [...] for all worlds or [worlds, ...] for each world.

@@ -135,10 +135,14 @@ class Emitter:
 
     def branch(self, stores: Iterable[Store]) -> Listing:
         """Return the statements of a region inside braces, whose values later regions do not see."""
+        return self.branches([stores])[0]
+
+    def branches(self, parts: Iterable[Iterable[Store]]) -> list[Listing]:
+        """Return the statements of regions inside the same braces, whose values regions after these do not see."""
         known, count = dict(self._names), self._count
-        listing = self.region(stores)
+        listings = [self.region(stores) for stores in parts]
         self._names, self._count = known, count
-        return listing
+        return listings
 
     def region(self, stores: Iterable[Store], ahead: Iterable[Value] = ()) -> Listing:
         """Return the statements that compute and store values, in the order in which the trace computed them.

@@ -101,7 +101,7 @@ def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value],
     assert ground is not None
     place_of_ground = ground_place(impedance)
     seats = {number: frame_on_link(trace, point.body, point.position) for number, point in own_points(trace)}
-    needed = _with_ancestors([link for link, _ in seats.values()])
+    needed = with_ancestors([link for link, _ in seats.values()])
     asked = directions(ground)
     count = len(asked)
     asked = [*asked, *IDENTITY] if oriented and count < len(IDENTITY) else asked
@@ -172,7 +172,7 @@ def ground_place(impedance: Impedance) -> Place:
     return Place(origin, impedance.value("ground_field", 0) if sets else 0.0)
 
 
-def _with_ancestors(links: list[Link | None]) -> set[int]:
+def with_ancestors(links: list[Link | None]) -> set[int]:
     found: set[int] = set()
     for one in links:
         link = one
@@ -186,13 +186,13 @@ def _with_ancestors(links: list[Link | None]) -> set[int]:
 def inverse_weights(scene: Scene) -> list[float]:
     """Return SLIP times the mean of J Mass^-1 J* over three directions, of each point, neutral, in world 0 [1/kg]."""
     one = scene.with_values(**{name: array[:1] for name, array in scene.values.items()})
-    inverse = np.linalg.pinv(_evaluated(one, mass_matrix, (scene.dof_count, scene.dof_count)))
+    inverse = np.linalg.pinv(evaluated(one, mass_matrix, (scene.dof_count, scene.dof_count)))
     frames = tuple((point.body, point.position) for point in scene.contact_points)
-    J = _evaluated(one, lambda trace: jacobian(trace, frames), (len(frames), 6, scene.dof_count))[:, :3]
+    J = evaluated(one, lambda trace: jacobian(trace, frames), (len(frames), 6, scene.dof_count))[:, :3]
     return (SLIP / 3.0 * np.einsum("pai,ij,paj->p", J, inverse, J)).tolist()
 
 
-def _evaluated(scene: Scene, trace: Callable, shape: tuple[int, ...]) -> np.ndarray:
+def evaluated(scene: Scene, trace: Callable, shape: tuple[int, ...]) -> np.ndarray:
     """Return the result of a trace in the neutral configuration."""
     stores, found = trace(Trace(Links(scene), "float64", ("q",))), np.zeros(shape)
     values = evaluate([item.value for item in stores], lambda array, index: scene.neutral_q[index[0]])

@@ -77,13 +77,14 @@ class ContactStep(Step):
         alpha: dict[int, tuple[Vector, Vector]] = {}
         moved = expand(trace, done, rates, (ZERO, ZERO), alpha=alpha)
         gains = {item.index[0]: self.h * item.value for item in moved if item.array == "out"}
+        gains = self.couple(done, gains, alpha)
         passed = [item for item in moved if item.array != "out"]
         passed += [Store(GAIN, (self._kept.get(dof, dof),), gain) for dof, gain in gains.items()]
         efforts = []
         for link in self.links:
             trace.label(link, "u")
             efforts += [law.finish(gains[dof]) for dof in link.dofs for law in self.secants[dof]]
-        cones, pulls, missed = [], [], []
+        cones, pulls, missed = self.coupled_excess()
         forces: dict[int, list[tuple[Point, Vector, Value]]] = {}  # by point
         for point, touch in zip(points, touches, strict=True):
             trace.graph.step = f"contact {point.number}|f"
@@ -104,6 +105,18 @@ class ContactStep(Step):
             return passed + kept.end + after
         trace.news = after
         return sent + passed + kept.end
+
+    # -- bodies that touch each other ------------------------------------------------------------------------------
+    def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, tuple[Vector, Vector]]) -> dict[int, Value]:
+        """Return qd' - qd by dof with the forces between bodies; ``alpha`` becomes that of the links."""
+        return gains
+
+    def coupled_excess(self) -> tuple[list[Value], list[Value], list[Value]]:
+        """Return by how much forces between bodies leave their cones, how much they pull, and pushes that are missing.
+
+        Those of points with the ground are added.
+        """
+        return [], [], []
 
     # -- hinges ----------------------------------------------------------------------------------------------------
     def _pieces(self, link: Link) -> list[Law]:
@@ -286,7 +299,9 @@ class ContactStep(Step):
 
     def _inputs(self) -> list[Value]:
         """Return all inputs, with those values of contacts and of the ground that are no constants."""
+        scene = self.trace.links.scene
         points = [number for number, _ in own_points(self.trace)]
+        points += range(len(scene.contact_points), scene.contact_count)
         names = ("contact_friction", "contact_stiffness", "contact_damping")
         values = [self.impedance.value(name, point) for name in names for point in points]
         place = ground_place(self.impedance)

@@ -1,0 +1,74 @@
+"""Scenes whose bodies touch each other."""
+
+import numpy as np
+from contact_cases import solid
+
+import warp_spo as spo
+
+STRAIGHT = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def cube(mass, half):
+    return spo.Body(mass, inertia=solid(mass, 2 * half, 2 * half, 2 * half))
+
+
+def box(body, half, **contact):
+    return spo.Contact(body, box=(half, half, half), **contact)
+
+
+def free(bodies, contacts, gravity=(0.0, 0.0, 0.0)):
+    """Bodies that fly freely."""
+    return spo.Scene(bodies, [spo.Hinge("free", -1, i) for i in range(len(bodies))], gravity=gravity, contacts=contacts)
+
+
+def stack(masses=(5.0,) * 5, half=0.1, ground=1e5, **contact):
+    """Cubes on each other and on the ground."""
+    contacts = [box(0, half, stiffness=ground, damping=1e3)]
+    contacts += [box(i, half, other=box(i - 1, half), **contact) for i in range(1, len(masses))]
+    return free([cube(mass, half) for mass in masses], contacts, (0.0, 0.0, -9.81))
+
+
+def stacked(count, half=0.1, offset=0.005, turn=0.05):
+    """Return q of a stack, each cube shifted and turned against the one below."""
+    place = [(offset * i, 0.6 * offset * i * (-1) ** i, half + 2 * half * i) for i in range(count)]
+    turns = [(0.0, 0.0, np.sin(0.5 * turn * i), np.cos(0.5 * turn * i)) for i in range(count)]
+    return np.concatenate([np.concatenate(both) for both in zip(place, turns, strict=True)])
+
+
+def mixed():
+    """A two-link arm with a pad and a capsule, and a cube, a ball and a stick around it: every kind of pair."""
+    bodies = [cube(2.0, 0.05), cube(1.0, 0.04), cube(1.5, 0.06), cube(0.5, 0.05), cube(0.4, 0.03), spo.Body(0.0)]
+    pose = lambda z: (0.0, 0.0, z, 0.0, 0.0, 0.0, 1.0)  # noqa: E731
+    drive = dict(armature=0.02, target_ke=30.0, target_kd=1.0, effort_limit=4.0)
+    hinges = [spo.Hinge("revolute", -1, 0, axis=(1, 0, 0), parent_pose=pose(0.6), **drive),
+              spo.Hinge("revolute", 0, 1, axis=(0, 1, 0), parent_pose=pose(-0.2), friction=0.1, **drive)]  # fmt: skip
+    hinges += [spo.Hinge("free", -1, i) for i in range(2, 5)]
+    hinges += [spo.Hinge("fixed", -1, 5)]
+    stick = dict(capsule=((0.0, 0.0, 0.0), (0.0, 0.0, -0.2), 0.03))
+    pad = dict(box=((0.04, 0.04, 0.02), (0.0, 0.0, -0.2, 0.1, 0.0, 0.0, 1.0) / np.sqrt(np.r_[[1.0] * 3, [1.01] * 4])))
+    half = dict(stiffness=1e4, damping=20.0)
+    contacts = [
+        box(2, 0.06, friction=0.4),
+        spo.Contact(1, **pad, other=2, **half),
+        spo.Contact(0, **stick, other=spo.Contact(4, capsule=((-0.1, 0, 0), (0.1, 0, 0), 0.02)), **half),
+        spo.Contact(3, sphere=0.05, other=spo.Contact(1, **pad), friction=0.3, **half),
+        spo.Contact(0, **stick, other=spo.Contact(3, sphere=0.05), **half),
+        spo.Contact(5, box=(0.3, 0.3, 0.05), other=spo.Contact(3, sphere=0.05), stiffness=2e4),
+        box(2, 0.06, other=spo.Contact(5, box=(0.3, 0.3, 0.05)), eps=2e-3),
+        spo.Contact(4, point=(0.1, 0.0, 0.0), other=box(2, 0.06), **half),
+    ]
+    return spo.Scene(bodies, hinges, contacts=contacts, ground=spo.Plane(height=-0.04))
+
+
+def mixed_states(seed, worlds):
+    """Return q, qd of ``mixed`` with several pairs in contact in each world."""
+    rng, scene = np.random.default_rng(seed), mixed()
+    q, qd = np.tile(scene.neutral_q, (worlds, 1)), 0.5 * rng.normal(size=(worlds, scene.dof_count))
+    q[:, :2] = 0.2 * rng.normal(size=(worlds, 2))
+    ball = np.resize([(0.075, 0.0, 0.2), (0.0, 0.07, 0.5), (0.2, 0.1, 0.09)], (worlds, 3))
+    stick = np.resize([(0.03, 0.05, 0.45), (0.03, 0.05, 0.45), (-0.09, 0.0, 0.16)], (worlds, 3))
+    for first, place in ((2, (0.0, 0.0, 0.11)), (9, ball), (16, stick)):
+        q[:, first : first + 3] = place + 0.01 * rng.normal(size=(worlds, 3))
+        turns = np.concatenate([0.05 * rng.normal(size=(worlds, 3)), np.ones((worlds, 1))], axis=1)
+        q[:, first + 3 : first + 7] = turns / np.linalg.norm(turns, axis=1)[:, None]
+    return np.float64(np.float32(q)), np.float64(np.float32(qd))

@@ -1,0 +1,178 @@
+"""The specification of contact between bodies: dense float64 NumPy for one world, deliberately simple.
+
+Two bodies share points, each with a normal n towards the first body and a depth. A point is a contact as one with the
+ground is, whose velocity is that of the first body at the point less that of the second: J = J_first - J_second. So a
+step solves the system of :mod:`.reference_contact` with more rows, exactly, and forces come in pairs.
+"""
+
+import numpy as np
+
+from .reference_contact import SLIP, ContactStep, Points
+from .reference_rotations import homogeneous
+
+LEAD = 0.05  # share of the smallest half size by which the second box must be farther away to give the common face
+
+
+class PairStep(ContactStep):
+    """One step of a scene in which bodies touch the ground and each other; arguments as those of ContactStep.
+
+    Attributes:
+        pair_of: by point after those with the ground, the number of its pair.
+    """
+
+    def _points(self):
+        dense, scene, rows, self.numbers, self.pair_of = self.dense, self.scene, [], [], []
+        ground = super()._points() if scene.contact_points else None
+        for number, pair in enumerate(scene.contact_pairs):
+            at = len(scene.contact_points) + number
+            k, d, mu = (dense.value(f"contact_{name}")[at] for name in ("stiffness", "damping", "friction"))
+            places = [dense.body_matrix[body] for body in (pair.body, pair.other)]
+            touched = touches(*(place(shape, body) for shape, body in zip(pair.shapes, places, strict=True)))
+            for point, normal, depth in touched:
+                J = dense._jacobian_at(pair.body, point)[:3] - dense._jacobian_at(pair.other, point)[:3]
+                share = len(touched)
+                rows.append((J, normal, depth, k / share, d / share, mu, pair.eps, pair_weight(self.neutral, pair)))
+                self.pair_of.append(number)
+        n = dense.dof_count
+        shapes = ((-1, 3, n), (-1, 3), *[(-1,)] * 6)
+        found = Points(
+            *(np.reshape([row[i] for row in rows], shape) for i, shape in enumerate(shapes)), np.zeros(len(rows))
+        )
+        return found if ground is None else Points(*(np.concatenate(both) for both in zip(ground, found, strict=True)))
+
+    def reports(self, found):
+        """Return the force on the first body of each pair [pair, 3], and gap and slip of its deepest point [pair]."""
+        count, first = len(self.scene.contact_pairs), len(self.numbers)
+        f, gap, slip = np.zeros((count, 3)), np.full(count, np.inf), np.zeros(count)
+        for i, number in enumerate(self.pair_of, start=first):
+            f[number] += found.f[i]
+            if -self.points.depth[i] < gap[number]:
+                v, n = self.points.J[i] @ found.v, self.points.n[i]
+                gap[number], slip[number] = -self.points.depth[i], np.linalg.norm(v - n * (n @ v))
+        return f, gap, slip
+
+
+def pair_weight(dense, pair):
+    """Return the inverse weight of a pair, the sum of its bodies', each the mean over its shape, times SLIP [1/kg]."""
+    inverse, total = np.linalg.pinv(dense.mass_matrix), 0.0
+    for body, shape in zip((pair.body, pair.other), pair.shapes, strict=True):
+        frames = [(body, (*point, 0, 0, 0, 1)) for point in shape.samples]
+        J = dense.jacobian(frames)[:, :3]
+        total += np.einsum("pai,ij,paj->", J, inverse, J) / (3.0 * len(frames))
+    return SLIP * total
+
+
+def place(shape, body):
+    """Return the kind of a shape, its 4 x 4 matrix in the inertial frame, its half sizes and its radius."""
+    return shape.kind, body @ homogeneous(shape.pose), shape.size, shape.radius
+
+
+def touches(first, second):
+    """Return the points that two placed shapes share: (point, normal towards the first, depth) each."""
+    if first[0] == second[0] == 0:
+        return [rounds(first, second)]
+    if first[0] == second[0] == 1:
+        return faces(first, second)
+    if first[0] == 0:
+        return [ball_in_box(first, second)]
+    point, normal, depth = ball_in_box(second, first)
+    return [(point, -normal, depth)]
+
+
+def rounds(first, second):
+    """Return the point of two segments with radii, in the middle between their surfaces."""
+    ends = [(place[:3, 3] - size[2] * place[:3, 2], place[:3, 3] + size[2] * place[:3, 2])
+            for _, place, size, _ in (first, second)]  # fmt: skip
+    x, y = nearest(*ends[0], *ends[1])
+    apart = x - y
+    distance = np.linalg.norm(apart)
+    normal = apart / distance if distance > 0.0 else np.array([0.0, 0.0, 1.0])
+    r, s = first[3], second[3]
+    return 0.5 * (x - r * normal + y + s * normal), normal, r + s - distance
+
+
+def nearest(a, b, c, d):
+    """Return the nearest points of two segments, from a to b and from c to d. Ericson 2005, section 5.1.9."""
+    u, v, w = b - a, d - c, a - c
+    uu, vv, uv, uw, vw = u @ u, v @ v, u @ v, u @ w, v @ w
+    clip = lambda x: min(max(x, 0.0), 1.0)  # noqa: E731
+    if uu == 0.0:
+        s, t = 0.0, clip(vw / vv) if vv > 0.0 else 0.0
+    elif vv == 0.0:
+        s, t = clip(-uw / uu), 0.0
+    else:
+        across = uu * vv - uv * uv
+        s = clip((uv * vw - uw * vv) / across) if across > 1e-6 * uu * vv else 0.5
+        t = (uv * s + vw) / vv
+        if not 0.0 <= t <= 1.0:
+            t = clip(t)
+            s = clip((uv * t - uw) / uu)
+    return a + s * u, c + t * v
+
+
+def ball_in_box(ball, box):
+    """Return the point of a sphere and a box; the normal leads out of the box."""
+    (_, at, _, radius), (_, place, half, _) = ball, box
+    local = place[:3, :3].T @ (at[:3, 3] - place[:3, 3])
+    inside = np.clip(local, -half, half)
+    apart = local - inside
+    distance = np.linalg.norm(apart)
+    if distance > 0.0:
+        normal = apart / distance
+    else:
+        axis = np.argmin(half - np.abs(local))
+        normal, distance = np.zeros(3), -(half - np.abs(local))[axis]
+        normal[axis] = 1.0 if local[axis] >= 0.0 else -1.0
+    depth = radius - distance
+    surface = local - distance * normal  # of the box
+    return place[:3, :3] @ (surface - 0.5 * depth * normal) + place[:3, 3], place[:3, :3] @ normal, depth
+
+
+def faces(first, second):
+    """Return the points of two boxes: a face of one, clipped by the sides of the nearest face of the other.
+
+    The face with the largest distance between the boxes along its normal is the common one, the first box's unless the
+    second one's is farther by LEAD of the smallest half size.
+    """
+    best = [farthest(first, second), farthest(second, first)]
+    lead = LEAD * min(first[2].min(), second[2].min())
+    swap = best[1][0] > best[0][0] + lead
+    (_, here, half, _), (_, there, other, _) = (second, first) if swap else (first, second)
+    _, axis, sign = best[1] if swap else best[0]
+    normal = sign * here[:3, axis]  # out of the box of the common face
+    toward = there[:3, :3].T @ normal
+    side = np.argmax(np.abs(toward))
+    facing = -np.sign(toward[side]) * there[:3, side]
+    u, v = there[:3, (side + 1) % 3] * other[(side + 1) % 3], there[:3, (side + 2) % 3] * other[(side + 2) % 3]
+    middle = there[:3, 3] + facing * other[side]
+    polygon = [middle + u + v, middle - u + v, middle - u - v, middle + u - v]
+    for step in (1, 2):
+        across, width = here[:3, (axis + step) % 3], half[(axis + step) % 3]
+        for way in (1.0, -1.0):
+            polygon = clipped(polygon, way * across, width + way * across @ here[:3, 3])
+    found = []
+    for corner in polygon:
+        depth = half[axis] - normal @ (corner - here[:3, 3])
+        found.append((corner + 0.5 * depth * normal, normal if swap else -normal, depth))
+    return found
+
+
+def farthest(one, other):
+    """Return distance, axis and sign of the face of a box from which another box is farthest."""
+    (_, here, half, _), (_, there, size, _) = one, other
+    offset = here[:3, :3].T @ (there[:3, 3] - here[:3, 3])
+    apart = np.abs(offset) - half - np.abs(here[:3, :3].T @ there[:3, :3]) @ size
+    axis = np.argmax(apart)
+    return apart[axis], axis, 1.0 if offset[axis] >= 0.0 else -1.0
+
+
+def clipped(polygon, across, limit):
+    """Return the part of a polygon with across . x <= limit."""
+    found = []
+    for a, b in zip(polygon, polygon[1:] + polygon[:1], strict=True):
+        x, y = across @ a - limit, across @ b - limit
+        if x <= 0.0:
+            found.append(a)
+        if (x < 0.0 < y) or (y < 0.0 < x):
+            found.append(a + (b - a) * (x / (x - y)))
+    return found

@@ -1,0 +1,149 @@
+"""Contacts between two bodies: their shapes, and the constants that a scene chooses where a user gives none."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..errors import UnsupportedError, as_integer
+from .checks import read_only
+from .storage import StoredPart
+
+SINK = 1e-4  # how far the lighter body sinks in [m] that rests on the other one, where the stiffness is chosen
+DAMPING = 2.0  # of sqrt(k m): critical, so that stacks come to rest
+FACE = 8  # corners at most of the common part of two rectangles
+EXACT = 8  # touching pairs of a world at most that are solved together
+ROUND, BOX = 0, 1
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Solid(StoredPart):
+    """A convex shape of a body.
+
+    Attributes:
+        kind: BOX, or ROUND: all points within ``radius`` of a segment, which is a point for spheres.
+        pose: of the box, or of the segment's middle with the segment along z, in the body [7].
+        size: half the sizes of the box [m]; (0, 0, half the length) of the segment.
+        radius: [m]; 0 of boxes and points.
+    """
+
+    kind: int
+    pose: np.ndarray
+    size: np.ndarray
+    radius: float
+
+    @property
+    def samples(self) -> np.ndarray:
+        """Points on the surface, or near it, in the body frame [point, 3] [m]."""
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        local = signs * (self.size + self.radius / np.sqrt(3.0))
+        return local @ _rotation(self.pose[3:]).T + self.pose[:3]
+
+
+class ContactPair(NamedTuple):
+    """Two bodies that may touch: after the points, a row of ``contact_f``, ``contact_gap`` and ``contact_slip``.
+
+    Attributes:
+        contact: index of its contact in ``Scene.contacts``. body, other: indices of the bodies; forces are on ``body``.
+        shapes: of the two. points: how many they share at most. eps: speed below which friction is a damper [m/s].
+    """
+
+    contact: int
+    body: int
+    other: int
+    shapes: tuple[Solid, Solid]
+    points: int
+    eps: float
+
+
+def contact_pairs(contacts: Sequence[Any], body_count: int) -> tuple[ContactPair, ...]:
+    """Return the pairs of bodies among the contacts of a scene; raise an error for those that no solver takes."""
+    found = []
+    for index, contact in enumerate(contacts):
+        if contact.other is None:
+            continue
+        call = f"Scene: contact {index} {contact.label!r}" if contact.label else f"Scene: contact {index}"
+        if contact.dissipation is not None:
+            raise UnsupportedError(call, "dissipation= of a contact between bodies", "give damping=")
+        partner = _partner(call, contact, contacts)
+        if not 0 <= partner.body < body_count:
+            raise ValueError(f"{call} is with body {partner.body}; expected one of {body_count} bodies, 0 and up")
+        if partner.body == contact.body:
+            raise ValueError(f"{call} is of body {contact.body} with itself; expected two bodies")
+        first, second = shape_of(call, contact), shape_of(call, partner)
+        kinds = {first.kind, second.kind}
+        if kinds == {ROUND, BOX} and max(shape.size[2] for shape in (first, second) if shape.kind == ROUND) > 0.0:
+            raise UnsupportedError(call, "a capsule with a box", "use spheres along the capsule, or a box in its place")
+        points = FACE if kinds == {BOX} else 1
+        found.append(ContactPair(index, contact.body, partner.body, (first, second), points, contact.eps))
+    return tuple(found)
+
+
+def _partner(call: str, contact: Any, contacts: Sequence[Any]) -> Any:
+    """Return the contact that has the shape of the other body."""
+    if type(contact.other) is type(contact):
+        if contact.other.other is not None:
+            raise ValueError(f"{call}: other has an other= itself; expected a Contact that gives a body and its shape")
+        return contact.other
+    body = as_integer(contact.other)
+    if body is None:
+        raise TypeError(f"{call}: other is {contact.other!r}; expected a Contact, or the index of a body")
+    own = [one for one in contacts if one.other is None and one.body == body]
+    if len(own) != 1:
+        raise ValueError(
+            f"{call}: other is body {body}, which has {len(own)} contacts with the ground; expected one, whose shape "
+            f"it takes; or pass other=spo.Contact({body}, box=...)"
+        )
+    return own[0]
+
+
+def shape_of(call: str, contact: Any) -> Solid:
+    """Return the shape of a contact."""
+    if contact.hull is not None:
+        raise UnsupportedError(call, "a hull in contact with a body", "use spheres, capsules, boxes, or single points")
+    places, radius = contact.positions, contact.radius
+    if contact.box is not None:
+        pose, size = contact.frame
+        return Solid(BOX, pose, size, 0.0)
+    half = (places[-1] - places[0]) / 2.0
+    length = float(np.linalg.norm(half))
+    turn = (0.0, 0.0, 0.0, 1.0) if length == 0.0 else _from_z(half / length)
+    pose = np.concatenate([(places[-1] + places[0]) / 2.0, turn])
+    return Solid(ROUND, read_only(pose), read_only(np.array([0.0, 0.0, length])), radius)
+
+
+def pair_values(pair: ContactPair, scene: Any, stand: Any) -> tuple[float, float, float]:
+    """Return friction, stiffness [N/m] and damping [N s/m] of a pair; what its contact leaves open is chosen."""
+    contact, parents, masses = scene.contacts[pair.contact], scene.tree.parent, []
+    together = stand.roots[pair.body] == stand.roots[pair.other]
+    for body in (pair.body, pair.other):
+        way = [body]
+        while parents[way[-1]] >= 0:
+            way.append(parents[way[-1]])
+        if any(scene.hinges[scene.hinge_of[one]].dof_count for one in way):
+            carried = [other for other in range(len(parents)) if not together or scene.tree.is_ancestor(body, other)]
+            carried += [body] if together else []
+            masses.append(sum(stand.masses[other] for other in set(carried) if stand.roots[other] == stand.roots[body]))
+    mass = float(min(masses, default=0.0)) or 1.0
+    k = mass * stand.gravity / SINK if contact.stiffness is None else contact.stiffness
+    d = DAMPING * np.sqrt(k * mass) if contact.damping is None else contact.damping
+    return contact.friction, float(k), float(d)
+
+
+def _from_z(axis: np.ndarray) -> tuple[float, ...]:
+    """Return the quaternion xyzw that turns z into a unit vector, or into the one against it."""
+    axis = axis if axis[2] > 0.0 else -axis
+    turn = np.array([-axis[1], axis[0], 0.0, 1.0 + axis[2]])
+    return tuple((turn / np.linalg.norm(turn)).tolist())
+
+
+def _rotation(turn: np.ndarray) -> np.ndarray:
+    x, y, z, w = turn
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
