@@ -2,8 +2,8 @@
 
 Sine and cosine reduce the angle by pi / 2 in three parts and evaluate a polynomial, with an error of about one unit in
 the last place while |x| is below ``reach``. On CUDA, the caller of ``sincos`` brings larger angles into this range with
-``reduced``, which subtracts full turns in float64; ``sincos_any`` does so itself. The reciprocal is the approximation
-of the hardware with one Newton step (two in float64).
+``reduced``, which subtracts full turns in float64; ``sincos_any`` does so itself. The reciprocal and the
+inverse root are approximations of the hardware with one Newton step (two in float64).
 """
 
 import warp as wp
@@ -77,6 +77,17 @@ struct on
         return fused(r, fused(-x, r, 1.0f), r);
 #else
         return 1.0f / x;
+#endif
+    }
+
+    static CUDA_CALLABLE inline float inverse_root(float x)
+    {
+#if defined(__CUDA_ARCH__)
+        float r;
+        asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
+        return fused(0.5f * r, fused(-x * r, r, 1.0f), r);
+#else
+        return 1.0f / sqrtf(x);
 #endif
     }
 
@@ -173,6 +184,18 @@ struct on
         return fused(r, fused(-x, r, 1.0), r);
 #else
         return 1.0 / x;
+#endif
+    }
+
+    static CUDA_CALLABLE inline double inverse_root(double x)
+    {
+#if defined(__CUDA_ARCH__)
+        double r;
+        asm("rsqrt.approx.ftz.f64 %0, %1;" : "=d"(r) : "d"(x));
+        r = fused(0.5 * r, fused(-x * r, r, 1.0), r);
+        return fused(0.5 * r, fused(-x * r, r, 1.0), r);
+#else
+        return 1.0 / ::sqrt(x);
 #endif
     }
 

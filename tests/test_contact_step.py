@@ -235,7 +235,7 @@ def test_a_ground_that_is_not_there_is_an_error(values, words):
 
 
 BUGS = {
-    "active set": (secants.Secant, "finish", "quotient(bound, share), 1.0", "0.0, 1.0"),
+    "active set": (secants.Secant, "finish", "bound * reciprocal(share), 1.0", "0.0, 1.0"),
     "candidates frozen": (step.ContactStep, "_finish", "select(touch.candidate, touch.candidate, reached)",
                           "touch.candidate"),
     "dampers above ground": (step.ContactStep, "_finish", "candidate * pushes", "pushes"),
@@ -244,7 +244,7 @@ BUGS = {
     "straight paths": (points, "place_points", "(0.5 * h) * faster", "0.0"),
     "damper of straight paths": (points, "place_points", "k * below - damping * faster", "k * below"),
     "damping that does not grow": (points, "place_points", "d * (k * select(less(0.0, depth), depth, 0.0))", "d"),
-    "tangent friction": (step.ContactStep, "_secant", "reciprocal(sqrt(w * w + point.eps * point.eps))",
+    "tangent friction": (step.ContactStep, "_secant", "inverse_root(w * w + point.eps * point.eps)",
                          "reciprocal(w * w + point.eps * point.eps) * point.eps"),
 }  # fmt: skip
 

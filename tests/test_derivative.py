@@ -116,6 +116,7 @@ RULES = {
     "select": lambda x, y: g.select(x, x * y, y) + g.select(x.graph.make("lost", x), x, y * y),
     "less": lambda x, y: g.less(x, y) + x * y,
     "floor": lambda x, y: g.floor(x) + x * y,
+    "inverse_root": lambda x, y: g.inverse_root(1.0 + x * x + y * y),
     "arctangent": lambda x, y: g.arctangent(x * x + 1.0, y),
     "exponential": lambda x, y: g.exponential(x * y),
     "logarithm": lambda x, y: g.logarithm(x * x + y * y),

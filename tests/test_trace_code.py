@@ -205,8 +205,10 @@ def test_reciprocal_and_root(dtype, device):
     rng = np.random.default_rng(7)
     rows = (10.0 ** rng.uniform(-30, 30, (20000, 1))).astype(dtype)
     rows = np.concatenate([rows, -rows])
-    got = compiled([g.reciprocal(x), g.sqrt(x * (1.0 / 3.0))], rows, dtype, device)
+    got = compiled([g.reciprocal(x), g.sqrt(x * (1.0 / 3.0)), g.inverse_root(x)], rows, dtype, device)
     assert last_places(got[:, 0], 1 / rows[:, 0].astype(np.longdouble), dtype).max() <= LAST_PLACES
     third = rows[:20000, 0] * np.dtype(dtype).type(1.0 / 3.0)
     assert last_places(got[:20000, 1], np.sqrt(third.astype(np.longdouble)), dtype).max() <= LAST_PLACES
-    assert np.isnan(got[20000:, 1]).all()
+    inverse = 1 / np.sqrt(rows[:20000, 0].astype(np.longdouble))
+    assert last_places(got[:20000, 2], inverse, dtype).max() <= LAST_PLACES
+    assert np.isnan(got[20000:, 1:]).all()

@@ -143,7 +143,7 @@ FUNCTIONS = {
     "absolute": np.abs, "reduced": lambda x: x, "within_reach": lambda x: x,
     "FUSED_float": lambda a, b, c: a * b + c, "FUSED_double": lambda a, b, c: a * b + c,
     "log": np.log, "sincos": _sincos, "sincos_any": _sincos, "mine": True, "again": False,
-    "arctangent": np.arctan2, "sin": np.sin, "cos": np.cos,
+    "arctangent": np.arctan2, "sin": np.sin, "cos": np.cos, "inverse_root": lambda x: 1.0 / np.sqrt(x),
 }  # fmt: skip
 
 

@@ -84,6 +84,8 @@ def partial(scalar: Scalar, at: int) -> Value:
         return -sin(args[0])
     if op == "sqrt":
         return 0.5 * reciprocal(scalar)
+    if op == "inverse_root":
+        return -0.5 * (scalar * (scalar * scalar))
     if op == "reciprocal":
         return -(scalar * scalar)
     if op == "quotient":

@@ -18,6 +18,7 @@ FUNCTIONS: dict[str, Callable] = {
     "sin": np.sin,
     "cos": np.cos,
     "sqrt": np.sqrt,
+    "inverse_root": lambda a: 1.0 / np.sqrt(a),
     "quotient": lambda a, b: a / b,
     "reciprocal": lambda a: 1.0 / a,
     "reduced": lambda a: a,

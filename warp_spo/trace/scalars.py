@@ -11,7 +11,13 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
-FUNCTIONS = {"sin": math.sin, "cos": math.cos, "sqrt": math.sqrt, "reciprocal": lambda x: 1.0 / x if x else math.nan}
+FUNCTIONS = {
+    "sin": math.sin,
+    "cos": math.cos,
+    "sqrt": math.sqrt,
+    "reciprocal": lambda x: 1.0 / x if x else math.nan,
+    "inverse_root": lambda x: 1.0 / math.sqrt(x) if x > 0.0 else math.nan,
+}
 
 Value = Any  # a Scalar, or a float, which is a constant
 
@@ -156,7 +162,7 @@ def multiply(x: Value, y: Value) -> Value:
 
 
 def apply_function(name: str, x: Value) -> Value:
-    """Return sin, cos, sqrt or reciprocal of ``x``; the sign of an argument moves outward."""
+    """Return a function of FUNCTIONS of ``x``; the sign of an argument moves outward."""
     if is_constant(x):
         return FUNCTIONS[name](x)
     if x.op == "neg" and name in ("sin", "cos", "reciprocal"):
@@ -180,6 +186,11 @@ def reduced(x: Value) -> Value:
 
 def sqrt(x: Value) -> Value:
     return apply_function("sqrt", x)
+
+
+def inverse_root(x: Value) -> Value:
+    """Return 1 / sqrt(x) for ``x`` above zero, without the branches of a root that is rounded once."""
+    return apply_function("inverse_root", x)
 
 
 def reciprocal(x: Value) -> Value:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...scene.contacts import HeightField, Plane
-from ...trace.scalars import Graph, Value, floor, less, lookup, reciprocal, select, sqrt
+from ...trace.scalars import Graph, Value, floor, inverse_root, less, lookup, select
 from ...trace.spatial import IDENTITY, Vector, dot
 
 STEEP = 1.0  # slope beyond which a cell is a wall and a floor
@@ -111,7 +111,7 @@ def _between(x: Value, most: float) -> Value:
 
 def _facing(slope_x: Value, slope_y: Value) -> Vector:
     """Return the upward unit normal of a surface with these slopes."""
-    size = reciprocal(sqrt(slope_x * slope_x + slope_y * slope_y + 1.0))
+    size = inverse_root(slope_x * slope_x + slope_y * slope_y + 1.0)
     return Vector((-(slope_x * size), -(slope_y * size), size))
 
 

@@ -8,7 +8,7 @@ in. A limit is closed or open; the first pass closes those that the step may rea
 from __future__ import annotations
 
 from ...trace.emission import Store
-from ...trace.scalars import Graph, Value, absolute, less, quotient, reciprocal, select, sqrt
+from ...trace.scalars import Graph, Value, absolute, inverse_root, less, reciprocal, select
 from ..impedance import CREEP, FRICTION, LIMIT, Law, is_number
 
 SECANT = "secant"
@@ -68,7 +68,7 @@ class Secant:
 
     @staticmethod
     def _damper(w: Value) -> Value:
-        return reciprocal(sqrt(w * w + CREEP * CREEP))
+        return inverse_root(w * w + CREEP * CREEP)
 
     def piece(self) -> Law:
         """Return the law of this pass, without bounds."""
@@ -120,7 +120,7 @@ class Secant:
         size, bound = absolute(line), _positive(self._bound(line))
         beyond = _positive(x * size - bound)
         share = size + law.scale * law.resistance * (self.step_weight * beyond)
-        kept.keep(x, select(less(bound, share), quotient(bound, share), 1.0))
+        kept.keep(x, select(less(bound, share), bound * reciprocal(share), 1.0))
         return law.scale * beyond
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ...status import Status
 from ...trace.emission import Store
-from ...trace.scalars import Value, is_constant, less, reciprocal, select, sqrt
+from ...trace.scalars import Value, inverse_root, is_constant, less, reciprocal, select, sqrt
 from ...trace.spatial import ZERO, Vector, dot, total
 from ..articulated_sweeps import expand, reduce
 from ..impedance import Law, add_laws
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 PASSES = 3  # what a step with contacts takes if the caller does not say
 TOLERANCE = 0.1  # share of the weight, or of an effort limit, by which the last pass may exceed its laws without a word
+TINY = 1e-24  # square of a slip [m^2/s^2] that is nothing; its derivative is still a number in float32
 REPORTS = ("contact_f", "contact_gap", "contact_slip", "contact_excess")
 
 
@@ -151,12 +152,13 @@ class ContactStep(Step):
     def _slip(point: Point, x: Vector, normal: Value) -> Value:
         """Return the size of a vector's part across the normal."""
         rest = x - point.normal * normal
-        return sqrt(dot(rest, rest))
+        square = dot(rest, rest)
+        return square * inverse_root(square + TINY)
 
     @staticmethod
     def _secant(point: Point, fn: Value, w: Value) -> Value:
         """Return the damper that gives friction's bound at the speed ``w``."""
-        return point.mu * fn * reciprocal(sqrt(w * w + point.eps * point.eps))
+        return point.mu * fn * inverse_root(w * w + point.eps * point.eps)
 
     def _push(self, point: Point, speed: Value) -> Value:
         """Return the normal force of a closed point that leaves the ground at ``speed`` after the step."""
@@ -203,16 +205,15 @@ class ContactStep(Step):
             )
         normal = dot(point.normal, v)
         force = self._force(point, touch, v) if point.link is not None else ZERO
-        pushed, across = dot(point.normal, force), 0.0
+        push = self._push(point, normal)
+        pushed = 0.0 if point.link is None else touch.closed * push
         slip = self._slip(point, v, normal)
-        across = touch.across * slip
         fn = select(less(0.0, pushed), pushed, 0.0)
-        cone = across - point.mu * fn
+        cone = touch.across * slip - point.mu * fn
         over = select(less(0.0, cone), cone, 0.0)
         kept.keep(touch.across, self._secant(point, fn, slip + (h * point.weight) * over))
         reached = less(0.0, point.depth - h * normal)
         candidate = select(touch.candidate, touch.candidate, reached)
-        push = self._push(point, normal)
         pushes = less(0.0, push)
         kept.keep(touch.candidate, candidate)
         stays = kept.closing * touch.closed
