@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from .. import launches
-from ..kernels import native, philox
+from ..kernels import native, philox, row_chunks
 from ..kernels.elementary import C_TYPE
 from ..kernels.elementary import NATIVE as ELEMENTARY
 from ..trace.emission import Emitter, RangeReduction, Store, render
@@ -16,6 +16,7 @@ from ..trace.scalars import Graph, Scalar, ordered
 ROW, COLUMN, INT, LONG, CHOSEN, SHARED = "row", "column", "int", "long", "chosen", "shared"
 DRAW = "draw"  # random numbers of the thread's own
 BLOCK = 64  # threads
+LONG = 8  # entries of a row that the threads of a warp write together
 
 
 class Buffer(NamedTuple):
@@ -103,6 +104,15 @@ class Stage:
         """Return the names of the tables that the stored values depend on."""
         return {scalar.args[0] for scalar in ordered(item.value for item in self.stores) if scalar.op == "lookup"}
 
+    def _whole_rows(self, buffers: dict[str, Buffer]) -> dict[str, int]:
+        """Return the sizes of the rows of which all entries are stored, by array."""
+        stored: dict[str, set[int]] = {}
+        for item in self.stores:
+            if buffers[item.array].way == ROW:
+                stored.setdefault(item.array, set()).add(item.index[0])
+        sizes = {name: buffers[name].tensor.shape[-1] for name in stored}
+        return {name: size for name, size in sizes.items() if len(stored[name]) == size}
+
     def build(self, buffers: dict[str, Buffer], device: wp.Device) -> Launch | None:
         """Return the launch of the kernel; None if it writes nothing.
 
@@ -113,21 +123,36 @@ class Stage:
         """
         if not self.stores:
             return None
+        read = self.read_arrays()
+        chunked = {
+            name: entries for name, entries in self._whole_rows(buffers).items() if name not in read and entries >= LONG
+        }
+
+        def store(array: str, entry: str, value: str) -> str:
+            if array in chunked:
+                return f"PUT({array}, {chunked[array]}, {entry}, {value})"
+            return f"{'if (mine) ' if chunked else ''}{buffers[array].store(array, entry, value)}"
+
         emitter = Emitter(
             "float32",
             lambda array, entry: f"draw[{entry}]" if array == DRAW else buffers[array].load(array, entry),
-            lambda array, entry, value: buffers[array].store(array, entry, value),
+            store,
             lambda array, index: index[0],
             RangeReduction.FIRST,
             fuses=True,
         )
-        changed = {item.array for item in self.stores if item.array in self.read_arrays()}
-        late = [item for item in self.stores if item.array in changed]  # after all reads of what they overwrite
-        listings = [
-            emitter.region([item for item in self.stores if item.array not in changed], [x.value for x in late]),
-            emitter.region(late),
-        ]
-        body = "\n".join(render(listing, "float32") for listing in listings)
+        late = [item for item in self.stores if item.array in read]  # after all reads of what they overwrite
+        early = [item for item in self.stores if item.array not in read and item.array not in chunked]
+        listings = [emitter.region(early, [item.value for item in late])]
+        parts = [render(listings[0], "float32")]
+        for name, entries in chunked.items():
+            for start in range(0, entries, row_chunks.CHUNK):
+                count = min(row_chunks.CHUNK, entries - start)
+                inside = [x for x in self.stores if x.array == name and start <= x.index[0] < start + count]
+                listings.append(emitter.region(inside))
+                parts += [render(listings[-1], "float32"), f"FLUSH({name}, {entries}, {start}, {count})"]
+        listings.append(emitter.region(late))
+        body = "\n".join([*parts, render(listings[-1], "float32")])
         touched = {array for listing in listings for array, _ in listing.indices if array != DRAW}
         touched |= self.read_tables()
         words = [f"((unsigned int*)key.data)[{i}]" for i in range(3)]
@@ -139,17 +164,14 @@ class Stage:
             f"((unsigned int*)tick.data)[world] += {'1u' if self.ticks is True else self.ticks};" if self.ticks else ""
         )
         names = sorted(touched)
-        text = "\n".join(
-            [
-                ELEMENTARY[C_TYPE[wp.float32]],
-                "if (thread >= worlds) return;",
-                "const long long world = thread;",
-                random,
-                body,
-                count,
-                "",
-            ]
-        )
+        if chunked:
+            head = [row_chunks.define(BLOCK), "const bool mine = thread < worlds;"]
+            head += ["const long long world = mine ? thread : worlds - 1;"]
+            tail = [f"if (mine) {{ {count} }}" if count else "", row_chunks.UNDEFINE]
+        else:
+            head = ["if (thread >= worlds) return;", "const long long world = thread;"]
+            tail = [count]
+        text = "\n".join([ELEMENTARY[C_TYPE[wp.float32]], *head, random, body, *tail, ""])
         kernel = native.kernel(f"env_{self.name}", text, [(name, 1) for name in names], wp.float32)
         frames = "frame_pose" in touched or "frame_velocity" in touched
         return Launch(kernel, [buffers[name].warp() for name in names], emitter.operations, device, frames)

@@ -1,0 +1,41 @@
+"""Long rows of results, one a world, which a warp writes side by side: 64 entries of 32 worlds at a time.
+
+A thread that writes its own row touches 32 bytes of memory for each 4. Here the threads of a warp leave their entries
+in shared memory, and then write each world's part of the row together.
+"""
+
+CHUNK = 64  # entries of a row
+PITCH = CHUNK + 1  # scalars between rows in shared memory, odd against bank conflicts
+WARP = 32
+
+
+def define(block: int) -> str:
+    """Return the definitions of PUT and FLUSH, for blocks of so many threads, of which each has one world.
+
+    ``PUT(name, entries, entry, value)`` sets an entry of the own row of the array ``name`` [world, entries].
+    ``FLUSH(name, entries, start, count)`` writes the entries from ``start`` on; all that were put since the last FLUSH
+    must be of these ``count``, at most 64, and ``start`` a multiple of 64.
+    """
+    return f"""
+#if defined(__CUDA_ARCH__)
+__shared__ float chunks[{block * PITCH}];
+float* own_chunk = chunks + threadIdx.x * {PITCH};
+const int lane = threadIdx.x & 31;
+const float* chunks_of_warp = own_chunk - lane * {PITCH};
+const long long first_world = (long long)thread - lane;
+const int worlds_of_warp = worlds - first_world < {WARP} ? (int)(worlds - first_world) : {WARP};
+#define PUT(name, entries, entry, value) own_chunk[(entry) % {CHUNK}] = (value);
+#define FLUSH(name, entries, start, count) \\
+    __syncwarp(); \\
+    for (int i = lane; i < worlds_of_warp * (count); i += {WARP}) \\
+        name.data[(first_world + i / (count)) * (entries) + (start) + i % (count)] = \\
+            chunks_of_warp[i / (count) * {PITCH} + i % (count)]; \\
+    __syncwarp();
+#else
+#define PUT(name, entries, entry, value) name.data[world * (entries) + (entry)] = (value);
+#define FLUSH(name, entries, start, count)
+#endif
+"""
+
+
+UNDEFINE = "#undef PUT\n#undef FLUSH"
