@@ -108,7 +108,7 @@ def make(name: str, worlds: int | None = None, device: Any = None, seed: int = 0
     """Return the environment of a task; nothing is downloaded.
 
     Args:
-        name: "cartpole", "ant", "panda-reach", "go2-flat" or "g1-flat".
+        name: "cartpole", "ant", "panda-reach", "go2-flat", "go2-rough" or "g1-flat".
         worlds: how many; None: as many as the task is trained with.
         device: Warp or torch device. seed: of all random numbers. options: further arguments of :class:`Env`.
 

@@ -84,6 +84,19 @@ def tracking(env: Env, policy: Policy, seconds: float = 20.0) -> dict[str, float
     }
 
 
+def climb(env: Env, policy: Policy, seconds: float = 15.0, way: float = 3.2) -> dict[str, float]:
+    """Return the share of worlds whose base comes ``way`` [m] away from its start, higher up, on its feet."""
+    start: list[torch.Tensor] = []
+
+    def place(env: Env) -> torch.Tensor:
+        start.append(env.q[:, :3].clone())
+        return (env.q[:, :3] - start[0])[:, :3]
+
+    found = roll(env, policy, round(seconds / env.step_dt), {"place": place})
+    far = (found["place"][..., :2].norm(dim=2) > way) & (found["place"][..., 2] > 0.2) & found["valid"]
+    return {"worlds": env.num_envs, "climbed": float(far.any(dim=0).float().mean())}
+
+
 def base_rates(env: Env) -> torch.Tensor:
     """Return the base's velocity forward and to the left [m/s], and its rate of turning [rad/s], its axes [world, 3].
 

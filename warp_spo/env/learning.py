@@ -10,6 +10,7 @@ import dataclasses
 import json
 import os
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -76,20 +77,29 @@ class Gaussian(GaussianDistribution):
 
 
 class CapturedPPO(PPO):
-    """rsl_rl's PPO, whose ``act`` is one CUDA graph after the first call; on a CPU it is PPO."""
+    """rsl_rl's PPO, whose ``act`` is one CUDA graph after the first call; on a CPU it is PPO.
+
+    Models that cannot be captured act without a graph, and a warning says so.
+    """
 
     graph: Any = None
+    captures = True
 
     def act(self, obs: Any) -> torch.Tensor:
         """Sample actions and keep what the storage needs, as PPO does."""
-        if not torch.device(self.device).type == "cuda" or self.actor.is_recurrent:
+        if torch.device(self.device).type != "cuda" or self.actor.is_recurrent or not self.captures:
             return super().act(obs)
         if self.graph is None:
             super().act(obs)  # warms up
-            self.seen = obs.clone()
-            self.graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self.graph):
-                super().act(self.seen)
+            self.seen, graph = obs.clone(), torch.cuda.CUDAGraph()
+            try:
+                with torch.cuda.graph(graph):
+                    super().act(self.seen)
+            except RuntimeError as error:
+                warnings.warn(f"train: the policy acts without a CUDA graph: {error}", stacklevel=2)
+                self.captures = False
+                return super().act(obs)
+            self.graph = graph
             self.acted = {name: getattr(self.transition, name) for name in KEPT}
         for name, value in self.seen.items():
             value.copy_(obs[name])
@@ -151,7 +161,6 @@ class Course:
         row: dict[str, float] = {
             "iteration": it,
             "seconds": time.time() - self.began,
-            "steps": (it + 1) * self.worlds * others["steps"] if "steps" in others else 0,
             "collecting": collect_time,
             "learning": learn_time,
             "deviation": float(others["action_std"].detach().mean()),

@@ -10,6 +10,7 @@ TASKS = {
     "ant": "ant",
     "panda-reach": "panda_reach",
     "go2-flat": "go2_flat",
+    "go2-rough": "go2_rough",
     "g1-flat": "g1_flat",
 }
 """Name of a task -> its file. A file has ``build(worlds, device, seed, ...) -> Env`` and ``LEARNER``."""

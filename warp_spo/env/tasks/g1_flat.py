@@ -13,7 +13,7 @@ from . import velocity
 
 ROBOT = "g1"
 CAMERA = Camera(distance=3.2)
-LEARNER = Learner(iterations=2000, worlds=4096, steps=24, entropy=8e-3)
+LEARNER = Learner(iterations=2000, worlds=4096, steps=24, entropy=5e-3, deviation=0.7)
 ACTOR = velocity.ACTOR
 FEET = ".*_ankle_roll_link"
 SCALE = 0.25  # of a joint's effort limit over its servo's stiffness is the share of an action of 1
@@ -51,7 +51,7 @@ def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env
             "alive": (0.5, rewards.alive),
             "bouncing": (-0.5, rewards.vertical_velocity),
             "tilting": (-0.05, rewards.tilting),
-            "action rate": (-0.05, rewards.action_rate),
+            "action rate": (-0.02, rewards.action_rate),
             "joint limits": (-1.0, rewards.joint_limits()),
             "one foot": (0.5, velocity.one_foot(FEET)),
             "foot clearance": (-1.0, rewards.foot_clearance(FEET, height=0.1)),

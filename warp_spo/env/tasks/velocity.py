@@ -36,8 +36,8 @@ def observed(feet: Any, *more: Any) -> dict[str, list]:
 
 
 def base_height(w: World) -> Any:
-    """Return the height of the base's origin [m]."""
-    return w.base_position[2]
+    """Return the height of the base's origin over the ground [m]."""
+    return w.base_height
 
 
 def feet_state(bodies: Any) -> Any:
