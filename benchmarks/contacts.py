@@ -1,9 +1,10 @@
-"""Steps of Go2 and G1 on a plane and on a height field: time of a step, and errors against float64.
+"""Steps of Go2, G1 and an ant on a plane and on a height field: time of a step, and errors against float64.
 
     python -m benchmarks.contacts [--device cuda:0] [--worlds 4096 65536] [--granularity tree segment]
                                   [--dtype float32 float64] [--ground plane field none] [--json FILE]
 
 Go2 has a sphere at each foot and the trunk's eight corners; G1 four points at each sole and ten points on its body.
+The ant is that of the tasks, with its capsules.
 Drives hold the joints with effort limits; worlds stand on the ground in different states, dt is 5 ms, three passes.
 """
 
@@ -20,6 +21,7 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
+from warp_spo.env import robots as env_robots
 from warp_spo.reference_contact import ContactStep
 
 from . import robots
@@ -33,7 +35,9 @@ SOLE = [(x, y, -0.03) for x in (-0.05, 0.12) for y in (-0.03, 0.03)]
 
 
 def scene(name: str) -> spo.Scene:
-    """Return a robot on the ground, with drives."""
+    """Return a robot on the ground, with drives; the ant has none."""
+    if name == "ant":
+        return env_robots.load(name).scene
     bare = robots.scene(name)
     labels = [label.split("/")[-1] for label in bare.body_labels]
     if name == "go2":
@@ -113,7 +117,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default=None)
     parser.add_argument("--worlds", type=int, nargs="+", default=[4096, 65536])
-    parser.add_argument("--robots", nargs="+", default=["go2", "g1"])
+    parser.add_argument("--robots", nargs="+", default=["go2", "g1"], help="go2, g1, ant")
     parser.add_argument("--granularity", nargs="+", default=["planned"], help="planned, tree, segment")
     parser.add_argument("--dtype", nargs="+", default=["float32"])
     parser.add_argument("--ground", nargs="+", choices=GROUNDS, default=["plane", "field"])

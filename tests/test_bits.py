@@ -6,6 +6,7 @@ and leave; where the compiler chose which products to fuse with sums, their bits
 
 import functools
 
+import contact_cases
 import laws
 import numpy as np
 import pytest
@@ -27,6 +28,8 @@ SCENES = {
     "tree": lambda: shapes.random_tree(12),
     "go2": lambda: robots.scene("go2"),
     "g1": lambda: robots.scene("g1"),
+    "quadruped on the ground": contact_cases.quadruped,
+    "box on the ground": contact_cases.box,
 }
 STEP = Operation(
     "step",
@@ -104,6 +107,13 @@ def holds(name, granularity, operation, device, dtype="float32"):
 @pytest.mark.parametrize("granularity", ["node", *GRANULARITIES])
 def test_bits_of_a_branched_tree(granularity, operation, device):
     holds("tree", granularity, operation, device)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("granularity", GRANULARITIES)
+@pytest.mark.parametrize("name", ["quadruped on the ground", "box on the ground"])
+def test_bits_of_steps_with_contacts(name, granularity, dtype, device):
+    holds(name, granularity, "step", device, dtype)
 
 
 @pytest.mark.slow

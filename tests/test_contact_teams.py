@@ -98,6 +98,18 @@ def test_neighbours_change_nothing(monkeypatch):
             np.testing.assert_allclose(array[0], wanted[name][w].ravel(), atol=1e-6)
 
 
+def test_rows_that_come_in_together_change_no_bit(monkeypatch):
+    """The plan takes another text for more worlds."""
+    found = []
+    for staged in (False, True):
+        text, a, _ = text_of(monkeypatch, "quadruped", staged)
+        found.append((warp_machine.run(text, a, further=(more := {})), more))
+    (first, more), (second, others) = found
+    np.testing.assert_array_equal(first, second)
+    for name in more:
+        np.testing.assert_array_equal(more[name], others[name])
+
+
 def test_legs_share_one_text_and_the_points_of_the_trunk(monkeypatch):
     text, _, _ = text_of(monkeypatch, "quadruped")
     assert 2 * len(text.cuda) < len(text.cpu)
