@@ -152,3 +152,14 @@ def test_gradients_that_do_not_exist_have_names(device):
         loss(dyn, tensors, contact_f=force, substeps=2)
     loss(dyn, tensors, contact_f=force)
     assert (force[:, 0, 2] > 0.0).any()
+
+
+@pytest.mark.slow
+def test_jumps_are_not_seen_and_dissipation_has_none():
+    """The picture of the documentation: without jumps the mean of the gradients is the slope."""
+    from benchmarks import contact_gradients as pictured
+
+    mean, slope = pictured.slopes(**pictured.DAMPERS["damping=70"])
+    assert abs(mean / slope - 0.69) <= 0.02
+    mean, slope = pictured.slopes(**pictured.DAMPERS["dissipation=0.2"])
+    assert abs(mean / slope - 1.0) <= 5e-3

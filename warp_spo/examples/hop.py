@@ -30,7 +30,7 @@ def scene():
         spo.Hinge("revolute", 0, 1, **motor),
         spo.Hinge("revolute", 1, 2, parent_pose=at(z=-LINK), **motor),
     ]
-    foot = spo.Contact(2, sphere=((0, 0, -LINK), FOOT), friction=0.8, stiffness=2e4)
+    foot = spo.Contact(2, sphere=((0, 0, -LINK), FOOT), stiffness=2e4, dissipation=0.5)
     legs = [bar(-LINK, 0.3, axis=2) for _ in range(2)]
     return spo.Scene([trunk, *legs], hinges, contacts=[foot], ground=spo.Plane())
 
