@@ -31,14 +31,20 @@ SCENES = {
     "quadruped on the ground": contact_cases.quadruped,
     "box on the ground": contact_cases.box,
 }
-STEP = Operation(
-    "step",
-    ("q", "qd", "tau"),
-    lambda scene: (scene.dof_count,),
-    lambda subject, q, qd, tau, out: subject.dyn.step(q, qd, tau, DT, out=(None, out)),
-    lambda *_: None,
-)
-EVERY = {**OPERATIONS, **APPLICATIONS, "step": STEP}
+
+
+def stepping(name, substeps):
+    """A step, of which the rates count."""
+    return Operation(
+        name,
+        ("q", "qd", "tau"),
+        lambda scene: (scene.dof_count,),
+        lambda subject, q, qd, tau, out: subject.dyn.step(q, qd, tau, DT, substeps=substeps, out=(None, out)),
+        lambda *_: None,
+    )
+
+
+EVERY = {**OPERATIONS, **APPLICATIONS, "step": stepping("step", 1), "substeps": stepping("substeps", 3)}
 ROWS = "FEW_WORLDS", "SHORT_ROWS", "LONG_ROWS"  # limits of the plan that decide how rows come in and leave
 
 

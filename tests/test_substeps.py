@@ -13,6 +13,8 @@ from step_scenes import states as step_states
 
 import warp_spo as spo
 from benchmarks.resources import record_launches
+from warp_spo.execution import plan
+from warp_spo.execution.device_facts import CPU, MEASURED
 
 H, COUNT = 2e-3, 3
 
@@ -88,6 +90,13 @@ def test_explain_says_how_many_launches():
     delayed = arm([spo.Actuator(0, delay=2)])
     assert line(delayed).startswith("a launch each: delays of actuators count substeps, where ctrl is given; otherwise")
     assert line(MECHANISMS["fourbar"](), loops="multipliers").startswith("a launch each: loops='multipliers'")
+
+
+@pytest.mark.parametrize(("dofs", "worlds", "fuses"), [(18, 1 << 16, True), (35, 4096, True), (35, 16384, False)])
+def test_long_code_takes_launches_where_blocks_share_a_multiprocessor(dofs, worlds, fuses):
+    scene = zoo.from_parents([-1, *[0] * 4, *range(1, dofs - 4)], ["revolute"] * dofs, 1)
+    assert plan.choose(scene, worlds, MEASURED, "float32", "segment").fuses_substeps("segment") == fuses
+    assert plan.choose(scene, worlds, CPU, "float32", "tree").fuses_substeps("tree")
 
 
 @pytest.mark.parametrize("loops", ["embed", "multipliers"])

@@ -116,6 +116,9 @@ def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool) -
     tendons = acts and any(len(actuator.hinges) > 1 for actuator in dyn.scene.actuators)
     if tendons and not dyn.scene.values["body_mass"].all() and not dyn.closed and dyn.plan.of(STEP) == "segment":
         return "limbs read each other's hinges last, for actuators of several hinges and links without mass"
+    routine = CONTACT_STEP if dyn.scene.contacts else EMBEDDED_STEP if dyn.closed else STEP
+    if not dyn.plan.fuses_substeps(dyn.plan.of(routine)):
+        return "of so many worlds and dofs, blocks drift apart and fetch their code twice"
     return ""
 
 

@@ -159,6 +159,15 @@ class Plan:
             return self.worlds > WARP_SIZE if self.dofs > LONG_ROWS else routine.collects
         return results > FEW_RESULTS or (not self.few and (self.varies or routine.short))
 
+    def fuses_substeps(self, granularity: str) -> bool:
+        """Whether one kernel takes all substeps faster than a launch each.
+
+        Blocks that run side by side on a multiprocessor drift apart in it. Where their code leaves the instruction
+        cache, or what they hold the registers, each then fetches it by itself.
+        """
+        most = SPILLS["float32"] if granularity == "segment" else HELD
+        return not self.device.cuda or self.dofs <= most or self.worlds <= WARP_SIZE * self.device.multiprocessors
+
     def column_chunk(self, columns: int, bytes_per_column: int) -> int:
         """Right-hand sides that go through a solve at once."""
         return max(1, min(columns, COLUMN_BYTES // max(1, bytes_per_column)))
