@@ -7,6 +7,7 @@ import warp_machine
 import zoo
 from contact_cases import everywhere, quadruped, touching
 from step_scenes import furnished, states
+from test_step_teams import driven
 
 import warp_spo as spo
 from warp_spo.dynamics.integrators import CONTACT_STEP
@@ -22,10 +23,15 @@ SIZES = {"contact_f": (3,), "contact_gap": (), "contact_slip": ()}
 
 
 def case(name):
-    """A scene and states. The quadruped's legs share the points of its trunk; the tree has points anywhere."""
+    """A scene and states. The quadruped's legs share the points of its trunk; others have points anywhere, and in the
+    last one tendons from limb to limb."""
     if name == "quadruped":
         scene = quadruped()
         return scene, dict(zip(("q", "qd", "tau"), touching(scene, 3, WORLDS), strict=True))
+    if name == "driven":
+        scene = everywhere(driven(), 0)
+        ctrl = np.random.default_rng(4).normal(size=(WORLDS, len(scene.actuators)))
+        return scene, states(scene, WORLDS) | {"ctrl": ctrl}
     scene = everywhere(furnished(zoo.random_tree(8, 1)), 1) if name == "tree" else everywhere(furnished(zoo.fork()), 0)
     return scene, states(scene, WORLDS)
 
@@ -56,7 +62,13 @@ def assert_alike(got, more, wanted):
 
 
 @pytest.mark.parametrize(
-    ("name", "staged"), [("quadruped", True), ("fork", False), pytest.param("tree", True, marks=pytest.mark.slow)]
+    ("name", "staged"),
+    [
+        ("quadruped", True),
+        ("fork", False),
+        pytest.param("tree", True, marks=pytest.mark.slow),
+        pytest.param("driven", True, marks=pytest.mark.slow),
+    ],
 )
 def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
     """Warp by warp in either order, written over the state."""

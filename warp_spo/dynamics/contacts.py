@@ -12,6 +12,7 @@ from ..kernels import combination
 from ..recursions.contact.pairs import default_passes
 from ..recursions.contact.step import REPORTS
 from ..scene.contacts import HeightField, contact_figures
+from . import integrators
 from .operation import Argument
 
 if TYPE_CHECKING:
@@ -70,4 +71,6 @@ def explain(dyn: Dynamics) -> str:
     figures = contact_figures(dyn.scene)
     if not dyn.scene.contacts:
         return figures
-    return f"{figures}; {default_passes(dyn.scene)} passes of a step unless passes= says otherwise"
+    routine = integrators.CONTACT_STEP if dyn._pairs is None else integrators.PAIRED_STEP
+    form = "a warp for each limb" if dyn.plan.of(routine) == "segment" else "a thread for each world"
+    return f"{figures}; {default_passes(dyn.scene)} passes of a step unless passes= says otherwise, {form}"
