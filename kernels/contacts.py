@@ -1,20 +1,24 @@
-"""Contacts that a solver leaves out: the status words of the worlds that have some."""
+"""Contacts of a Newton model: materials of its shapes, and status words of worlds with contacts that are left out."""
 
 import functools
 
 import warp as wp
 
 OK, UNSUPPORTED = wp.constant(0), wp.constant(10)  # as warp_spo.Status, which kernels cannot import; a test compares
+STILL, GROUND, TOUCHING, MOVING = range(4)
+"""Roles of shapes: stands still; is the ground; moves, and its contacts with the ground are computed; moves."""
 
 
 @functools.cache
 def mark_contacts(_=None) -> wp.Kernel:
-    """Set the word of every world that has a contact to UNSUPPORTED, unless it holds a more severe one.
+    """Set the word of every world that has a contact which is left out to UNSUPPORTED, but for a more severe one.
 
-    One thread for each slot of a list of contacts. ``count`` holds the number of contacts, which may exceed that of the
-    slots: then the worlds of some are unknown, and every world is marked. So it is for a contact of shapes outside of
-    all worlds, unless neither of them is on a body. Threads that write one word write the same one.
+    Left out are those of a shape that moves, but for TOUCHING with GROUND. One thread for each slot of a list of
+    contacts. ``count`` holds the number of contacts, which may exceed that of the slots: then the worlds of some are
+    unknown, and every world is marked. So it is for a contact of shapes outside of all worlds, one of which moves.
+    Threads that write one word write the same one.
     """
+    still, ground, touching, moving = (wp.constant(role) for role in (STILL, GROUND, TOUCHING, MOVING))
 
     @wp.func
     def mark(world: int, severity: wp.array[wp.int32], status: wp.array[wp.int32]):
@@ -27,19 +31,21 @@ def mark_contacts(_=None) -> wp.Kernel:
         shape0: wp.array[wp.int32],
         shape1: wp.array[wp.int32],
         shape_world: wp.array[wp.int32],
-        shape_body: wp.array[wp.int32],
+        shape_role: wp.array[wp.int32],
         severity: wp.array[wp.int32],
         status_out: wp.array[wp.int32],
     ):
         i = wp.tid()
         if i >= count[0]:
             return
-        world, moves = int(-1), bool(False)
+        world, most, least = int(-1), int(still), int(moving)
         for side in range(2):
-            shape = wp.where(side == 0, shape0[i], shape1[i])
+            shape, role = wp.where(side == 0, shape0[i], shape1[i]), int(still)
             if shape >= 0:
                 world = wp.max(world, shape_world[shape])
-                moves = moves or shape_body[shape] >= 0
+                role = shape_role[shape]
+            most, least = wp.max(most, role), wp.min(least, role)
+        moves = most >= touching and not (most == touching and least == ground)
         if count[0] > shape0.shape[0] or (moves and world < 0):
             for every in range(status_out.shape[0]):
                 mark(every, severity, status_out)
@@ -77,4 +83,21 @@ def clear(_=None) -> wp.Kernel:
     return kernel
 
 
-KERNELS = (mark_contacts, keep_most_severe, clear)
+@functools.cache
+def mean_materials(_=None) -> wp.Kernel:
+    """Write the mean of a material of each point's shape and of its world's ground, [world, point]."""
+
+    @wp.kernel(module="warp_spo_contacts", enable_backward=False)
+    def kernel(
+        rows: wp.array2d[wp.int32],
+        ground: wp.array[wp.int32],
+        material: wp.array[wp.float32],
+        mean_out: wp.array2d[wp.float32],
+    ):
+        world, point = wp.tid()
+        mean_out[world, point] = 0.5 * (material[rows[world, point]] + material[ground[world]])
+
+    return kernel
+
+
+KERNELS = (mark_contacts, keep_most_severe, clear, mean_materials)

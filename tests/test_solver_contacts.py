@@ -1,4 +1,4 @@
-"""Contacts in SolverSPO's steps: an error, or inside a graph capture a status word in the worlds that have some."""
+"""Contacts that SolverSPO's steps leave out: an error, or in a graph capture a status word in the worlds with some."""
 
 import newton
 import numpy as np
@@ -24,7 +24,7 @@ def made():
     all_worlds.replicate(builder, 3)
     all_worlds.add_ground_plane()
     model = all_worlds.finalize(device="cpu")
-    return model, SolverSPO(model)
+    return model, SolverSPO(model, contacts="none")
 
 
 def start(model, heights=HEIGHTS):

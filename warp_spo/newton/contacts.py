@@ -1,4 +1,4 @@
-"""Contacts in calls of SolverSPO, which computes none: an error, or inside a graph capture a status word a world."""
+"""Contacts in SolverSPO: which of a model's it computes, and status words of worlds with others."""
 
 from __future__ import annotations
 
@@ -11,7 +11,67 @@ import warp as wp
 from ..errors import UnsupportedError
 from ..kernels import contacts as kernels
 from ..kernels import declare
+from ..scene.scene import Scene
+from ..scene.shapes import Choice, moving_bodies
 from ..status import Status
+from .model_contacts import CONTACT_MATERIALS, ModelContacts, model_contacts
+from .worlds import Worlds, to_numpy
+
+MODES = ("auto", "ground", "none")
+VALUES = {f"shape_material_{material}": name for name, material in CONTACT_MATERIALS.items()}
+"""Values of a scene by the model's array that they come from."""
+
+
+def find_contacts(
+    model: newton.Model, worlds: Worlds, scene: Scene, mode: str, points: int, lacking: str
+) -> ModelContacts | None:
+    """Return the contacts of a model's shapes with its ground, None if the solver leaves contacts out.
+
+    Args:
+        mode: "none" leaves them out; "ground" computes them, or raises an error; "auto" computes them if that leaves no
+            shape out that stands still, and no kind of shape.
+        points: of a hull at most. lacking: why the solver's steps have no contacts, "" if they do.
+
+    Raises:
+        UnsupportedError: with "ground", the model has no ground, or shapes that no contact represents.
+    """
+    if mode == "none" or (mode == "auto" and lacking):
+        return None
+    if lacking:
+        raise UnsupportedError("SolverSPO", f"contacts='ground' with {lacking}", "leave out one of them")
+    try:
+        made = model_contacts(model, worlds, scene, Choice(True, None, points))
+    except UnsupportedError:
+        if mode == "ground":
+            raise
+        return None
+    problem = f"left out: {', '.join(made.found.left_out)}" if made.found.left_out else ""
+    if made.found.soil is None:
+        problem = "a model whose ground is no level plane and no height field"
+    if problem and mode == "ground":
+        raise UnsupportedError("SolverSPO", f"contacts='ground': {problem}", "remove them, or pass contacts='none'")
+    return None if problem or not made.scene.contacts else made
+
+
+class Materials:
+    """Materials of contact points: the means of those of their shapes and of the ground.
+
+    Args:
+        made: the contacts of the model. device: of the model.
+    """
+
+    def __init__(self, made: ModelContacts, device: wp.Device):
+        rows, soil = made.point_rows, made.soil_rows
+        assert soil is not None
+        self._rows: Any = wp.array(rows, dtype=wp.int32, device=device)
+        self._soil: Any = wp.array(soil, dtype=wp.int32, device=device)
+        self._mean: Any = wp.empty(rows.shape, dtype=wp.float32, device=device)
+
+    def mean(self, flat: wp.array) -> wp.array:
+        """Return the means of a material [world, point], in a buffer that the next call overwrites."""
+        inputs, device = [self._rows, self._soil, flat], self._mean.device
+        wp.launch(kernels.mean_materials(), self._rows.shape, inputs, [self._mean], device=device)
+        return self._mean
 
 
 class StatusWords:
@@ -19,25 +79,29 @@ class StatusWords:
 
     Args:
         model: The Newton model.
-        worlds: The number of worlds.
+        worlds: The rows of its worlds.
+        made: The contacts that the solver computes, None if it computes none.
 
     Attributes:
         kept: int32 [world].
     """
 
-    def __init__(self, model: newton.Model, worlds: int):
-        self._model, self._device = model, model.device
+    def __init__(self, model: newton.Model, worlds: Worlds, made: ModelContacts | None):
+        self._model, self._device, self._computes = model, model.device, made is not None
         severity = [Status(number).severity for number in range(len(Status))]
         self._severity: Any = wp.array(np.array(severity), dtype=wp.int32, device=self._device)
-        self.kept: Any = wp.zeros(worlds, dtype=wp.int32, device=self._device)
+        self._role: Any = wp.array(_roles(model, worlds, made), dtype=wp.int32, device=self._device)
+        self.kept: Any = wp.zeros(worlds.count, dtype=wp.int32, device=self._device)
         declare(kernels, None)
 
     def find(self, contacts: Any) -> newton.Contacts | None:
-        """Return contacts whose number only the device can know, because a graph capture cannot read it.
+        """Return contacts of which only the device can know how many there are, and whether the solver takes them.
+
+        A solver that computes none reads their number back, except in a graph capture.
 
         Raises:
             TypeError: They are no contacts.
-            UnsupportedError: There are some, outside of a capture.
+            UnsupportedError: There are some, outside of a capture, and the solver computes none.
         """
         if contacts is not None and not hasattr(contacts, "rigid_contact_max"):
             raise TypeError(
@@ -45,20 +109,22 @@ class StatusWords:
             )
         if contacts is None or not contacts.rigid_contact_max:
             return None  # soft contacts are those of particles, which the solver refuses
-        if self._device.is_capturing:
+        if self._device.is_capturing or self._computes:
             return contacts
         count = int(contacts.rigid_contact_count.numpy()[0])
         if count:
             raise UnsupportedError(
-                "SolverSPO.step", f"{count} contacts", "pass contacts=None; bodies then pass through each other"
+                "SolverSPO.step",
+                f"{count} contacts",
+                "pass contacts=None; bodies then pass through each other; SolverSPO(model, contacts='ground') says why "
+                "it computes none",
             )
         return None
 
     def mark(self, contacts: newton.Contacts, status: wp.array) -> None:
-        """Set the words of worlds with contacts to UNSUPPORTED, by launches alone."""
-        model = self._model
+        """Set the words of worlds with contacts that the solver leaves out to UNSUPPORTED, by launches alone."""
         inputs = [contacts.rigid_contact_count, contacts.rigid_contact_shape0, contacts.rigid_contact_shape1]
-        inputs += [model.shape_world, model.shape_body, self._severity]
+        inputs += [self._model.shape_world, self._role, self._severity]
         wp.launch(kernels.mark_contacts(), contacts.rigid_contact_max, inputs, [status], device=self._device)
 
     def keep(self, status: wp.array) -> None:
@@ -69,3 +135,15 @@ class StatusWords:
     def clear(self, mask: wp.array | None) -> None:
         """Forget the words of the worlds in ``mask``, or of all."""
         wp.launch(kernels.clear(), len(self.kept), [mask], [self.kept], device=self._device)
+
+
+def _roles(model: newton.Model, worlds: Worlds, made: ModelContacts | None) -> np.ndarray:
+    """Return what each shape is: STILL, GROUND, TOUCHING (its contacts with the ground are computed) or MOVING."""
+    bodies = to_numpy(model, "shape_body") if model.shape_count else np.zeros(0, dtype=int)
+    if made is None:
+        return np.where(bodies >= 0, kernels.MOVING, kernels.STILL)
+    moving = np.append(moving_bodies(made.scene), False)  # the last entry is the inertial frame's
+    roles = np.where(moving[np.where(bodies >= 0, worlds.body_slot[bodies], -1)], kernels.MOVING, kernels.STILL)
+    roles[made.point_rows.ravel()] = kernels.TOUCHING
+    roles[made.soil_rows] = kernels.GROUND
+    return roles

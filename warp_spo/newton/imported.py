@@ -10,8 +10,8 @@ import numpy as np
 
 from ..scene.scene import Scene
 from ..scene.shapes import NONE, Choice
-from .collision_shapes import ModelShapes
 from .model import from_newton
+from .model_contacts import ModelShapes
 from .repair import repair_bodies
 from .worlds import Worlds
 

@@ -18,7 +18,7 @@ from ..errors import DirectedLoopError, UnsupportedError
 from ..scene.parts import DOF_VALUES, UNLIMITED, Body, Coupling, Hinge, Loop, checked_inertia
 from ..scene.scene import Scene
 from ..scene.shapes import POINTS, Choice
-from .collision_shapes import with_model_contacts
+from .model_contacts import with_model_contacts
 from .worlds import KINDS, Worlds, flat_entries, quote_labels, to_numpy, unit_pose
 
 ASYMMETRY = 1e-6  # relative asymmetry of an inertia that counts as rounding: R I R^T in float32 leaves a few 1e-7

@@ -11,6 +11,7 @@ from newton import ModelFlags
 
 from ..dynamics.dynamics import Dynamics
 from ..scene.parts import DOF_VALUES
+from .contacts import VALUES, Materials
 from .layout import Layout
 
 FORCE_VALUES = tuple(name for name in DOF_VALUES if name != "joint_armature")
@@ -24,8 +25,11 @@ FLAGS = {
     ModelFlags.CONSTRAINT_PROPERTIES: ("joint_mimic_coeffs",),
     ModelFlags.MODEL_PROPERTIES: ("gravity",),
 }
-"""Arrays of the model that each flag names. A step depends on no array that another flag would name."""
+"""Arrays of the model that each flag names. A step depends on no array that another flag would name, but for shapes."""
 WATCHED = tuple(dict.fromkeys(name for names in FLAGS.values() for name in names))
+SHAPES = (*VALUES, *(f"shape_{name}" for name in ("transform", "scale", "margin", "flags", "collision_group")))
+"""Arrays of shapes, on which steps of a solver depend that computes contacts."""
+SHAPE_FLAGS = {ModelFlags.SHAPE_PROPERTIES: SHAPES}
 
 
 class ModelArrays:
@@ -35,15 +39,25 @@ class ModelArrays:
         model: The Newton model.
         layouts: How the model's array is laid out, for each name that Dynamics may have as a variable value.
         factors: 1 or 0 for each dof [dof], for the gains that count only in some modes of a drive.
+        materials: Of the contacts that the solver computes, None without.
 
     Attributes:
         used: The copies by name.
+        flags: The arrays of the model that each flag names, as far as a step depends on them.
         stamp: A number that changes when copies are renewed.
     """
 
-    def __init__(self, model: newton.Model, layouts: Mapping[str, Layout], factors: Mapping[str, wp.array]):
-        self.model, self._layouts, self._factors = model, layouts, factors
-        self.used = {name: wp.clone(getattr(model, name)) for name in WATCHED}
+    def __init__(
+        self,
+        model: newton.Model,
+        layouts: Mapping[str, Layout],
+        factors: Mapping[str, wp.array],
+        materials: Materials | None,
+    ):
+        self.model, self._layouts, self._factors, self._materials = model, layouts, factors, materials
+        self.flags: Mapping[ModelFlags, Sequence[str]] = FLAGS if materials is None else {**FLAGS, **SHAPE_FLAGS}
+        watched = WATCHED if materials is None else (*WATCHED, *SHAPES)
+        self.used = {name: wp.clone(getattr(model, name)) for name in watched}
         self.stamp = 0
 
     def copy(self, names: Iterable[str]) -> None:
@@ -53,8 +67,12 @@ class ModelArrays:
             wp.copy(self.used[name], getattr(self.model, name))
 
     def set(self, dynamics: Dynamics, names: Iterable[str]) -> None:
-        """Set the values of ``dynamics`` to the copies; launches only."""
+        """Set the values of ``dynamics`` to the copies of arrays of these names; launches only."""
         for name in names:
+            if name in VALUES:
+                assert self._materials is not None
+                dynamics.set(**{VALUES[name]: self._materials.mean(self.used[name])})
+                continue
             layout = self._layouts[name]
             value = layout.read(self.used[name], name)
             if name in self._factors:
@@ -88,22 +106,19 @@ class ModelArrays:
         at = tuple(places[0].tolist())
         return f"is {now[at]} at {list(at)} where the solver uses {used[at]}"
 
+    def names_of_flags(self, flags: int) -> list[str]:
+        """Return the names of the arrays that ``flags`` name."""
+        return list(dict.fromkeys(name for flag, names in self.flags.items() if flags & int(flag) for name in names))
 
-def names_of_flags(flags: int) -> list[str]:
-    """Return the names of the arrays that ``flags`` name."""
-    return list(dict.fromkeys(name for flag, names in FLAGS.items() if flags & int(flag) for name in names))
+    def flag_of_name(self, name: str) -> ModelFlags:
+        """Return the first flag that names an array."""
+        return next(flag for flag, names in self.flags.items() if name in names)
 
-
-def flag_of_name(name: str) -> ModelFlags:
-    """Return the first flag that names an array."""
-    return next(flag for flag, names in FLAGS.items() if name in names)
-
-
-def check_flags_in_capture(flags: int, variable: Sequence[str]) -> None:
-    """Raise ValueError if a flag names only arrays that are not variable: a graph capture cannot rebuild the solver."""
-    for flag, names in FLAGS.items():
-        if flags & int(flag) and not set(names) & set(variable):
-            raise ValueError(
-                f"SolverSPO.notify_model_changed: {flag.name} inside a graph capture; expected flags of "
-                f"variable arrays; build the solver with variable=({', '.join(map(repr, names))})"
-            )
+    def check_flags_in_capture(self, flags: int, variable: Sequence[str]) -> None:
+        """Raise ValueError if a flag names only arrays that are not variable: a capture cannot rebuild the solver."""
+        for flag, names in self.flags.items():
+            if flags & int(flag) and not set(names) & set(variable):
+                raise ValueError(
+                    f"SolverSPO.notify_model_changed: {flag.name} inside a graph capture; expected flags of "
+                    f"variable arrays; build the solver with variable=({', '.join(map(repr, names))})"
+                )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, NoReturn
 
 import newton
@@ -18,15 +18,18 @@ from ..dynamics.dynamics import Dynamics
 from ..dynamics.steps import INTEGRATORS
 from ..errors import UnsupportedError, as_names
 from ..kernels import declare, exchange
+from ..memory import view
 from ..scene.parts import DOF_VALUES
+from ..scene.scene import Scene
+from ..scene.shapes import POINTS
 from .checks import check_state, read_flags
-from .contacts import StatusWords
+from .contacts import MODES, VALUES, Materials, StatusWords, find_contacts
 from .drives import GAINS, Drives
 from .joint_forces import JointForces
 from .layout import Layout, Layouts
 from .loop_joints import check_loop_joints
 from .model import from_newton
-from .model_arrays import ModelArrays, check_flags_in_capture, flag_of_name, names_of_flags
+from .model_arrays import ModelArrays
 from .plugs import Plugs
 from .tape import StepGradients, paused_tape, refuse_tape
 from .worlds import Worlds, to_numpy
@@ -40,6 +43,7 @@ DEFAULT_VARIABLE = (
     "joint_target_ke",
     "joint_target_kd",
     "gravity",
+    "shape_material_mu",
 )
 CLOSING_STEPS = 8  # iterations of Newton's method that close the loops in a reset; each squares the error
 
@@ -56,6 +60,15 @@ class Observables(SolverBase.Observables):
         dtype=wp.int32, frequency=newton.Model.AttributeFrequency.WORLD
     )
     """A :class:`warp_spo.Status` for each world, 0 if the step can be trusted, shape (world_count,)."""
+    contact_f: Any = SolverBase.Observables.field(  # noqa: RUF009
+        dtype=wp.vec3, frequency=newton.Model.AttributeFrequency.WORLD
+    )
+    """Force of the ground on each contact point [N], world axes, shape (world_count, points), not Newton's by contact.
+    The points are ``solver.dynamics.scene.contact_points``."""
+    contact_slip: Any = SolverBase.Observables.field(  # noqa: RUF009
+        dtype=wp.float32, frequency=newton.Model.AttributeFrequency.WORLD
+    )
+    """Speed of each contact point along the ground after the step [m/s], shape (world_count, points)."""
 
 
 class SolverSPO(Plugs, SolverBase):
@@ -71,6 +84,13 @@ class SolverSPO(Plugs, SolverBase):
     allocates nothing, reads nothing back and is bitwise repeatable, and a CUDA graph may capture any number of steps. A
     NaN in one world stays in that world. Who reads no poses of bodies sets ``body_q`` and ``body_qd`` of the second
     state to None, which saves a launch; ``body_f = None`` of the first saves reading forces.
+
+    Shapes touch the ground by the solver's own contacts, see :class:`warp_spo.Contact` and ``contacts``: it needs no
+    collision pipeline, and ``contacts`` of :meth:`step` may be None. The ground is the model's level plane or height
+    field, which may differ between worlds. ``ke``, ``kd`` and ``mu`` of materials are stiffness, damping and friction
+    of each point, the mean of the shape's and the ground's; ``margin`` lies around shapes; ``gap``, ``kf``, ``ka``,
+    ``restitution`` and friction against spinning and rolling are not used. Contacts between bodies are left out: pass
+    ``contacts`` to :meth:`step`, and :attr:`status` names worlds with some. Steps with contacts have no gradients yet.
 
     Loop joints, which belong to no articulation, and mimics hold after every step to float32's rounding if ``loops`` is
     "embed" or "multipliers". A loop joint can only be a constraint. Its entries of joint_q and joint_qd keep their
@@ -96,6 +116,12 @@ class SolverSPO(Plugs, SolverBase):
             :meth:`warp_spo.Dynamics.step`. "cut" ignores them.
         integrator: As in :meth:`warp_spo.Dynamics.step`. "midpoint" and "rk4" have no observables.
         granularity: As in :class:`warp_spo.Dynamics`.
+        contacts: "auto": contacts of shapes with the ground, unless loops are closed, the integrator or the granularity
+            has none, the model has no level ground, or other shapes that stand still, or shapes that have no points;
+            contacts are then left out, and a step that is given some says so. "ground": an error instead that says why
+            there are none. "none": contacts are left out.
+        points: Points at most of a mesh, a cylinder, a cone or an ellipsoid, see :func:`warp_spo.load`.
+        passes: Of a step with contacts, see :meth:`warp_spo.Dynamics.step`.
         tune: Time the granularities at which the step can run, as :meth:`warp_spo.Dynamics.tune` does, and use the
             fastest. The choice is kept in a file, so that only the first solver of a model measures.
 
@@ -107,7 +133,14 @@ class SolverSPO(Plugs, SolverBase):
 
     Observables = Observables
     SUPPORTED_OBSERVABLES: ClassVar[frozenset[str]] = frozenset(
-        {"joint_qdd", "status", SolverBase.ObservableKind.BODY_QDD, SolverBase.ObservableKind.BODY_PARENT_F}
+        {
+            "joint_qdd",
+            "status",
+            "contact_f",
+            "contact_slip",
+            SolverBase.ObservableKind.BODY_QDD,
+            SolverBase.ObservableKind.BODY_PARENT_F,
+        }
     )
 
     def __init__(
@@ -118,6 +151,9 @@ class SolverSPO(Plugs, SolverBase):
         loops: str = "raise",
         integrator: str = "semi_implicit",
         granularity: str | None = None,
+        contacts: str = "auto",
+        points: int = POINTS,
+        passes: int | None = None,
         tune: bool = False,
     ):
         if not hasattr(model, "particle_count"):
@@ -132,7 +168,10 @@ class SolverSPO(Plugs, SolverBase):
                 f"{model.particle_count} particles",
                 "simulate them with another solver on a view of the model",
             )
+        if contacts not in MODES:
+            raise ValueError(f"SolverSPO: contacts is {contacts!r}; expected one of {', '.join(MODES)}")
         self.integrator, self._tunes = integrator, tune
+        self._contact_options, self._passes = (contacts, points), passes
         self._options: dict[str, Any] = {"loops": loops, "granularity": granularity}
         with paused_tape():
             self._build()
@@ -147,11 +186,13 @@ class SolverSPO(Plugs, SolverBase):
                 "SolverSPO", f"mimic joints: {names}", "loops='embed' closes them, loops='cut' leaves them open"
             )
         worlds = Worlds(model)
+        touching = find_contacts(model, worlds, scene, *self._contact_options, self._lacks_contacts(scene))
         self._drives = Drives(model, scene)
-        scene = self._drives.apply(scene)
-        variable = tuple(name for name in self._asked if name not in GAINS or self._drives.any)
+        scene = self._drives.apply(scene if touching is None else touching.scene)
+        variable = [name for name in self._asked if name not in GAINS or self._drives.any]
+        self._values = {name: VALUES.get(name, name) for name in variable if name not in VALUES or touching}
         W, device = scene.worlds, model.device
-        self.dynamics = Dynamics(scene, W, device, "float32", variable, **self._options)
+        self.dynamics = Dynamics(scene, W, device, "float32", tuple(self._values.values()), **self._options)
         if self._tunes:
             self.dynamics.tune("forward_dynamics" if self.integrator == "rk4" else "step")
         if self.dynamics.closed:
@@ -178,10 +219,15 @@ class SolverSPO(Plugs, SolverBase):
             "body_inertia": layout("body_inertia", bodies, 3, 3),
             "gravity": Layout(gravity[:, None], (3,), device, model.gravity),
         }
-        self._arrays = ModelArrays(model, layouts, self._drives.factors)
+        materials = None if touching is None else Materials(touching, device)
+        self._arrays = ModelArrays(model, layouts, self._drives.factors, materials)
         # Steps with observables write status here if the caller does not ask for it: one kernel serves both.
         self._status = wp.zeros(W, dtype=wp.int32, device=device)
-        self._words = StatusWords(model, W)
+        self._words = StatusWords(model, worlds, touching)
+        # One kernel serves all observables of contacts: those that nobody asks for are written here.
+        shape = W, len(scene.contact_points)
+        kinds: dict[str, Any] = {"contact_f": wp.vec3, "contact_slip": wp.float32} if scene.contacts else {}
+        self._unasked = {name: wp.zeros(shape, dtype=kind, device=device) for name, kind in kinds.items()}
         self._joint_forces = JointForces(self.dynamics, state)
         self._gradients = StepGradients(model, self.dynamics, state, self._joint_forces, self._drives, self._arrays)
         self._prepare()
@@ -195,7 +241,15 @@ class SolverSPO(Plugs, SolverBase):
                 self.step(state, state, control, None, 1e-3, observables=seen)
             self.step(state, state, control, None, 1e-3)
             self.reset(state)
-        self._arrays.set(self.dynamics, self.dynamics.variable)
+        self._arrays.set(self.dynamics, self._values)
+
+    def _lacks_contacts(self, scene: Scene) -> str:
+        """Return in words why steps have no contacts, "" if they may have some."""
+        if (scene.loops or scene.couplings) and self._options["loops"] != "cut":
+            return f"loops={self._options['loops']!r}"
+        if self.integrator != "semi_implicit":
+            return f"integrator={self.integrator!r}"
+        return "granularity='node'" if self._options["granularity"] == "node" else ""
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(
@@ -205,17 +259,30 @@ class SolverSPO(Plugs, SolverBase):
 
     @property
     def supported_observables(self) -> frozenset[str]:
-        """Names of the observables. BODY_PARENT_F is missing if loops are closed or the scene has no dof."""
-        unknown = self.dynamics.closed or not self.dynamics.scene.dof_count
-        return self.SUPPORTED_OBSERVABLES - ({SolverBase.ObservableKind.BODY_PARENT_F} if unknown else set())
+        """Names of the observables.
+
+        BODY_PARENT_F is missing if loops are closed, the scene has no dof, or steps have contacts; contact_f and
+        contact_slip are missing if they have none.
+        """
+        touches, found = bool(self._unasked), self.SUPPORTED_OBSERVABLES
+        if self.dynamics.closed or not self.dynamics.scene.dof_count or touches:
+            found = found - {SolverBase.ObservableKind.BODY_PARENT_F}
+        return found if touches else found - {"contact_f", "contact_slip"}
+
+    def observables(self, kinds: Iterable[str], **options: Any) -> Any:
+        """Return arrays for observables, see ``newton.solvers.SolverBase.observables``."""
+        found = super().observables(kinds, **options)
+        for name in self._unasked.keys() & found.kinds:
+            setattr(found, name, wp.zeros_like(self._unasked[name]))
+        return found
 
     @property
     def status(self) -> wp.array:
         """The most severe :class:`warp_spo.Status` of each world since its last :meth:`reset`, int32 [world].
 
-        Steps with observables contribute the word that they compute. A step inside a graph capture contributes
-        UNSUPPORTED in worlds that have contacts, which the step leaves out. Other steps contribute nothing: ask for the
-        observable ``status`` to know about them.
+        Steps with observables contribute the word that they compute. A step that is given contacts contributes
+        UNSUPPORTED in worlds that have some which it leaves out. Other steps contribute nothing: ask for the observable
+        ``status`` to know about them.
         """
         return self._words.kept
 
@@ -233,12 +300,14 @@ class SolverSPO(Plugs, SolverBase):
         """Advance ``state_in`` by ``dt`` [s] and write the result to ``state_out``, which may be the same state.
 
         ``control.joint_f`` of FREE and DISTANCE joints is a wrench in world axes at the child's CoM. The forces
-        ``state_in.body_f`` act on all bodies. ``contacts`` must be None or empty. Outside of a graph capture their
-        count is read back. In a capture the device looks at it at every replay: contacts are left out, and
-        :attr:`status` is ``Status.UNSUPPORTED`` in worlds that have some, as is the observable.
+        ``state_in.body_f`` act on all bodies. A solver with contacts finds them itself, whatever ``contacts`` is. The
+        device looks at ``contacts`` if they are given: :attr:`status` is ``Status.UNSUPPORTED`` in worlds that have
+        some which the step leaves out, as is the observable. A solver without contacts reads their count back, except
+        in a graph capture.
 
         Raises:
-            UnsupportedError: There are contacts; or wp.Tape records a step that has no gradient.
+            UnsupportedError: There are contacts, outside of a capture, and the solver computes none; or wp.Tape records
+                a step that has no gradient.
             ValueError: The observables belong to another solver, or the integrator has none; or wp.Tape records a step
                 that writes a state which the tape still needs.
         """
@@ -276,6 +345,8 @@ class SolverSPO(Plugs, SolverBase):
         body_f = None if state_in.body_f is None else self._wrenches.read(state_in.body_f, "body_f")
         tau = self._joint_forces.read(control.joint_f, q, self._arrays.used["joint_X_p"])
         given: dict[str, Any] = dict(tau=tau, body_f=body_f, **self._drives.targets(control, self._q, self._qd))
+        if self._unasked:
+            given["passes"] = self._passes
         if observables is None or not observables.kinds:
             q_out, qd_out = self._q.target(state_out.joint_q, "q_out"), self._qd.target(state_out.joint_qd, "qd_out")
             more: dict[str, Any] = (
@@ -288,6 +359,10 @@ class SolverSPO(Plugs, SolverBase):
             q_out, qd_out = self._q.buffer("q_out"), self._qd.buffer("qd_out")
             qdd = self._qd.buffer("qdd") if qdd is None else qdd
             status = self._status if observables.status is None else observables.status
+            for name, unasked in self._unasked.items():
+                array = unasked if getattr(observables, name) is None else getattr(observables, name)
+                shape = (*array.shape, 3) if name == "contact_f" else array.shape
+                given[name] = view(array.ptr, shape, wp.float32, self.device.alias)
             self.dynamics.step(q, qd, dt=dt, out=(q_out, qd_out), qdd=qdd, status=status, **given)
             if contacts is not None:
                 self._words.mark(contacts, status)
@@ -386,10 +461,10 @@ class SolverSPO(Plugs, SolverBase):
         Raises:
             ValueError: Inside a capture, a flag names no variable array.
         """
-        names = names_of_flags(read_flags("SolverSPO.notify_model_changed", ModelFlags, flags))
-        variable = [name for name in names if name in self.dynamics.variable]
+        names = self._arrays.names_of_flags(read_flags("SolverSPO.notify_model_changed", ModelFlags, flags))
+        variable = [name for name in names if name in self._values]
         if self.device.is_capturing:
-            check_flags_in_capture(int(flags), variable)
+            self._arrays.check_flags_in_capture(int(flags), variable)
         else:
             changed = self._arrays.differences(name for name in names if name not in variable)
             if changed:
@@ -422,5 +497,5 @@ class SolverSPO(Plugs, SolverBase):
         for name, difference in self._arrays.differences(self._arrays.used).items():
             raise ValueError(
                 f"SolverSPO.check_model: model.{name} {difference}; "
-                f"call notify_model_changed(ModelFlags.{flag_of_name(name).name})"
+                f"call notify_model_changed(ModelFlags.{self._arrays.flag_of_name(name).name})"
             )

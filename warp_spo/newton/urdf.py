@@ -19,9 +19,9 @@ from ..errors import UnsupportedError
 from ..scene.parts import UNLIMITED, Body, Coupling, Hinge
 from ..scene.scene import Scene
 from ..scene.shapes import NONE, Choice
-from .collision_shapes import urdf_shapes
 from .repair import repair_bodies
 from .shapes import mass_of_shapes
+from .urdf_shapes import urdf_shapes
 from .worlds import quote_labels
 from .xml_source import Element, read_xml
 

@@ -1,0 +1,182 @@
+"""Contacts that SolverSPO computes by itself: a model's shapes on its plane or height field."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from solver_models import H
+
+import warp_spo as spo
+from warp_spo import Status
+from warp_spo.errors import UnsupportedError
+from warp_spo.newton import SolverSPO
+
+SIDE, DENSITY = 0.2, 500.0
+WEIGHT = DENSITY * SIDE**3 * 9.81
+CFG = newton.ModelBuilder.ShapeConfig(ke=2e3, kd=40.0, mu=0.4, density=DENSITY)
+
+
+def plane(height=0.0, normal=(0.0, 0.0, 1.0)):
+    return lambda builder: builder.add_shape_plane((*normal, -height), width=0.0, length=0.0, cfg=CFG)
+
+
+def field(seed, at=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0, 1.0)):
+    heights = 0.05 * np.random.default_rng(seed).normal(size=(5, 9))
+    hills = newton.Heightfield(heights, 5, 9, hx=2.0, hy=1.0)
+    return lambda builder: builder.add_shape_heightfield(heightfield=hills, xform=wp.transform(at, turn), cfg=CFG)
+
+
+def boxes(*grounds, everywhere=None):
+    """A world with a cube for each ground, 5 mm above z = 0.1; and a ground outside of all worlds."""
+    builder = newton.ModelBuilder()
+    for ground in grounds:
+        one = newton.ModelBuilder()
+        cube = one.add_link(label="cube", xform=wp.transform((0.0, 0.0, SIDE / 2 + 0.105), wp.quat_identity()))
+        one.add_shape_box(cube, hx=SIDE / 2, hy=SIDE / 2, hz=SIDE / 2, cfg=CFG, label="side")
+        one.add_articulation([one.add_joint_free(cube)])
+        one.joint_q[:] = [0.0, 0.0, SIDE / 2 + 0.105, 0.0, 0.0, 0.0, 1.0]
+        if ground is not None:
+            ground(one)
+        builder.add_world(one)
+    if everywhere is not None:
+        everywhere(builder)
+    return builder.finalize(device="cpu")
+
+
+def run(solver, state, steps, contacts=None, dt=H, observables=None):
+    for _ in range(steps):
+        solver.step(state, state, None, contacts, dt, observables=observables)
+
+
+def test_cubes_rest_on_grounds_of_their_own():
+    """Planes at other heights, one plane for all: materials are means, forces carry the weight, height is exact."""
+    for model, heights in ((boxes(plane(0.1), plane(0.02)), [0.1, 0.02]),
+                           (boxes(None, None, everywhere=plane(0.05)), [0.05, 0.05])):  # fmt: skip
+        solver, state = SolverSPO(model), model.state()
+        seen = solver.observables({"contact_f", "contact_slip", "status"})
+        seen.contact_f.fill_(np.nan)
+        run(solver, state, 500, observables=seen)
+        np.testing.assert_allclose(seen.contact_f.numpy()[..., 2].sum(axis=1), WEIGHT, rtol=1e-4)
+        resting = np.array(heights) + SIDE / 2 - WEIGHT / (4 * CFG.ke)
+        np.testing.assert_allclose(state.joint_q.numpy().reshape(2, 7)[:, 2], resting, atol=2e-6)
+        assert seen.contact_slip.numpy().shape == (2, 8) and abs(seen.contact_slip.numpy()).max() < 1e-5
+        assert not seen.status.numpy().any() and not solver.status.numpy().any()
+
+
+def test_a_step_is_that_of_the_scene(device):
+    """Bit by bit; worlds on height fields of their own, of which one is moved."""
+    model = boxes(field(1), field(2, at=(0.3, 0.1, -0.02)), field(1))
+    solver, state = SolverSPO(model), model.state()
+    scene = spo.from_newton(model, contacts=True)
+    assert scene.ground.count == 2 and scene.values["ground_field"].ravel().tolist() == [0, 1, 0]
+    np.testing.assert_allclose(scene.values["ground_origin"], [[0, 0, 0], [0.3, 0.1, -0.02], [0, 0, 0]], atol=1e-7)
+    variable = tuple(solver.dynamics.variable)
+    dyn = spo.Dynamics(scene, 3, "cpu", "float32", variable)
+    q, qd = model.joint_q.numpy().reshape(3, 7), model.joint_qd.numpy().reshape(3, 6)
+    for _ in range(150):
+        q, qd = dyn.step(q, qd, None, H)
+    run(solver, state, 150)
+    np.testing.assert_array_equal(state.joint_q.numpy().reshape(3, 7), q)
+    assert not np.array_equal(q[0], q[1]) and np.array_equal(q[0], q[2])
+
+
+def test_friction_may_change_between_steps():
+    """shape_material_mu is variable and set by launches; ke is compiled in, and rebuilds with a warning."""
+    model = boxes(plane(0.1), plane(0.1))
+    solver, state = SolverSPO(model), model.state()
+    qd = model.joint_qd.numpy().reshape(2, 6)
+    qd[:, 0] = 2.5
+    state.joint_qd.assign(qd.ravel())
+    mu = model.shape_material_mu.numpy()
+    mu[2] = 0.0  # of the cube in world 1: the mean with the ground's 0.4 is 0.2
+    model.shape_material_mu.assign(mu)
+    solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
+    run(solver, state, 300)
+    before = state.joint_qd.numpy().reshape(2, 6)[:, 0].copy()
+    run(solver, state, 10)
+    lost = before - state.joint_qd.numpy().reshape(2, 6)[:, 0]
+    np.testing.assert_allclose(lost[1], 0.2 * 9.81 * 10 * H, rtol=1e-2)
+    with pytest.raises(ValueError, match=r"SHAPE_PROPERTIES|shape_material_ke is"):
+        ke = model.shape_material_ke.numpy() * 2
+        model.shape_material_ke.assign(ke)
+        solver.check_model()
+    with pytest.warns(UserWarning, match="shape_material_ke folded into the kernels"):
+        solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
+    assert solver.dynamics.scene.values["contact_stiffness"][0, 0] == 4e3
+
+
+def spheres():
+    """Two spheres beside each other in each of two worlds: shapes 0, 1 and 2, 3; a plane, 4."""
+    one = newton.ModelBuilder()
+    for x in (-0.3, 0.3):
+        ball = one.add_link()
+        one.add_shape_sphere(ball, radius=0.19, cfg=CFG)
+        one.add_articulation([one.add_joint_free(ball)])
+        one.joint_q[-7:] = [x, 0.0, 0.19, 0.0, 0.0, 0.0, 1.0]
+    builder = newton.ModelBuilder()
+    builder.replicate(one, 2)
+    builder.add_ground_plane(cfg=CFG)
+    return builder.finalize(device="cpu")
+
+
+def test_contacts_between_bodies_are_named_by_status():
+    """Contacts with the ground are the solver's own; a pair of bodies is not: UNSUPPORTED in that world."""
+    model = spheres()
+    solver, state, contacts = SolverSPO(model), model.state(), newton.Contacts(4, 0, device="cpu")
+    for pairs, words in (([(0, 4), (4, 2)], [0, 0]), ([(0, 4), (2, 3)], [0, 10]), ([(1, 0), (3, 4)], [10, 0])):
+        contacts.rigid_contact_shape0.assign(np.array([pair[0] for pair in (*pairs, (0, 1), (2, 3))], np.int32))
+        contacts.rigid_contact_shape1.assign(np.array([pair[1] for pair in (*pairs, (0, 1), (2, 3))], np.int32))
+        contacts.rigid_contact_count.assign(np.array([2], np.int32))
+        solver.step(state, state, None, contacts, H)
+        assert solver.status.numpy().tolist() == words
+        solver.reset(state, wp.array([False, True, False], dtype=wp.bool, device="cpu"))
+        assert solver.status.numpy().tolist() == [words[0], 0]
+        solver.reset(state)
+
+
+@pytest.mark.slow
+def test_contacts_that_newton_finds():
+    """Newton's pipeline finds contacts with the ground, which the solver takes itself, and one pair in world 1."""
+    model = spheres()
+    solver, state, pipeline = SolverSPO(model), model.state(), newton.CollisionPipeline(model)
+    contacts = pipeline.contacts()
+    q = model.joint_q.numpy().reshape(2, 2, 7).copy()
+    q[1, 0, 0] = -0.05
+    state.joint_q.assign(q.ravel())
+    newton.eval_fk(model, state.joint_q, state.joint_qd, state)
+    pipeline.collide(state, contacts)
+    assert contacts.rigid_contact_count.numpy()[0] >= 5
+    solver.step(state, state, None, contacts, H)
+    assert solver.status.numpy().tolist() == [Status.OK, Status.UNSUPPORTED]
+
+
+def block(builder):
+    builder.add_shape_box(-1, hx=1.0, hy=1.0, hz=1.0, label="block")
+
+
+@pytest.mark.parametrize("grounds, words", [
+    ([None], "contacts='ground': a model whose ground is no level plane and no height field"),
+    ([lambda b: (plane()(b), block(b))], "contacts='ground': left out: box 'block' of the world"),
+    ([lambda b: (plane()(b), plane(1.0)(b))], "several grounds: plane"),
+    ([plane(), plane(0.0, (0.0, 0.6, 0.8))], "world 1 has a plane with another normal"),
+    ([field(1), field(1, turn=(0.0, 0.0, 0.6, 0.8))], "world 1 has a height field whose axes are turned"),
+    ([plane(), field(1)], r"world 1 (has|differs)"),
+])  # fmt: skip
+def test_what_has_no_contacts_says_why(grounds, words):
+    """An error if contacts are asked for; "auto" leaves them out, and a step with contacts is an error, as before."""
+    model = boxes(*grounds)
+    with pytest.raises(UnsupportedError, match=words):
+        SolverSPO(model, contacts="ground")
+    solver = SolverSPO(model)
+    assert not solver.dynamics.scene.contacts and "contact_f" not in solver.supported_observables
+
+
+def test_options_that_have_no_contacts():
+    model = boxes(plane())
+    with pytest.raises(ValueError, match="SolverSPO: contacts is 'all'; expected one of auto, ground, none"):
+        SolverSPO(model, contacts="all")
+    with pytest.raises(UnsupportedError, match="contacts='ground' with integrator='rk4'"):
+        SolverSPO(model, contacts="ground", integrator="rk4")
+    with pytest.raises(UnsupportedError, match="contacts='ground' with granularity='node'"):
+        SolverSPO(model, contacts="ground", granularity="node")
+    assert not SolverSPO(model, integrator="midpoint").dynamics.scene.contacts
