@@ -186,6 +186,7 @@ def pseudo_inertias(mass, com, inertia):
     return np.linalg.eigvalsh(whole)[..., 0]
 
 
+@pytest.mark.slow
 def test_randomised_values_are_those_of_the_dynamics():
     changes = [
         events.randomise("contact_friction", (0.3, 1.2), "set", FEET, alike=True),
@@ -248,6 +249,7 @@ def bilinear(field, x, y):
     return np.array(found).reshape(x.shape)
 
 
+@pytest.mark.slow
 def test_terrain_levels_and_height_scan():
     tiles = spo.terrain.tiles(4, 3, (6.0, 6.0), 0.1, seed=2)
     scene = walker_scene()
@@ -285,6 +287,7 @@ def test_terrain_levels_and_height_scan():
     assert env.memory("terrain")[:, 0].equal(expected) and env.memory("terrain")[:, 1].equal(column)
 
 
+@pytest.mark.slow
 def test_commands_grow_with_a_reward():
     level = commands.Level("standing", share=0.5, first=0.2, step=0.1)
     env = walker_env(

@@ -146,6 +146,7 @@ class Env(VecEnv):
         self.actions = zeros(worlds, self.num_actions)
         self._memory = zeros(max(1, layout.memory_size), worlds)
         self._tick = zeros(worlds, dtype=torch.int32)
+        self._advance = torch.ones(1, device=self.device)
         self._key = zeros(3, dtype=torch.int32)
         self.set_seed(self.seed)
         self._episode_length = zeros(worlds, dtype=torch.int64)
@@ -157,6 +158,7 @@ class Env(VecEnv):
             "memory": Buffer(self._memory, COLUMN),
             "tick": Buffer(self._tick, INT),
             "key": Buffer(self._key, SHARED),
+            "advance": Buffer(self._advance, SHARED),
             "episode_length": Buffer(self._episode_length, LONG),
             "chosen": Buffer(self.chosen, CHOSEN),
         }
@@ -198,6 +200,10 @@ class Env(VecEnv):
             self._frame_velocity = zeros(worlds, len(layout.frames), 6)
             buffers["frame_pose"] = Buffer(self._frame_pose.view(worlds, -1))
             buffers["frame_velocity"] = Buffer(self._frame_velocity.view(worlds, -1))
+        if "frame_acceleration" in read:
+            self._step_arrays["qdd"] = zeros(worlds, scene.dof_count)
+            self._frame_acceleration = zeros(worlds, len(layout.frames), 6)
+            buffers["frame_acceleration"] = Buffer(self._frame_acceleration.view(worlds, -1))
         self._actuator_state = None
         delays = [int(each.delay) for each in scene.actuators]
         delays += [event.longest for event in tracing.events if isinstance(event, Delays)]
@@ -279,7 +285,9 @@ class Env(VecEnv):
         self._after_reset()
         for part in self._user_parts("observe"):
             part.run()
+        self._advance.fill_(0.0)
         self._launch("observe")
+        self._advance.fill_(1.0)
         return self.get_observations(), {}
 
     def step(self, actions: torch.Tensor) -> tuple[Any, torch.Tensor, torch.Tensor, dict]:
@@ -396,6 +404,9 @@ class Env(VecEnv):
         if kernel is not None and kernel.reads_frames:
             self.dyn.frame_poses(self.q, self._frames, out=self._frame_pose)
             self.dyn.frame_velocities(self.q, self.qd, self._frames, out=self._frame_velocity)
+        if kernel is not None and kernel.reads_accelerations:
+            qdd = self._step_arrays["qdd"]
+            self.dyn.frame_accelerations(self.q, self.qd, qdd, self._frames, out=self._frame_acceleration)
 
     def _user_parts(self, stage: str) -> list[Part]:
         """Return the parts that fill in the numbers of the user's terms in torch that a stage reads."""

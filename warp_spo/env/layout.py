@@ -17,6 +17,8 @@ class Layout:
         biased: hinges whose encoders have a bias.
         sensors: (size, value at a reset, function that keeps it) of memory that each step brings up to date, by name.
         users: (stage, start) of the numbers of each user's term in torch.
+        drawn: functions that return memory that is drawn once, by name. observations: a number for each of those that
+            remember something.
         tables: numbers that all worlds share, by name. weights: of rewards.
         values: names of the scene's values that differ between worlds.
     """
@@ -34,6 +36,8 @@ class Layout:
         self.memory: dict[str, tuple[int, int, float | None]] = {}
         self.memory_size = 0
         self.frames: list[Any] = []
+        self.drawn: dict[str, Any] = {}
+        self.observations: dict[Any, int] = {}
         self.tables: dict[str, np.ndarray] = {}
         self.weights: dict[str, float] = {}
         self.users: dict[Any, tuple[str, int]] = {}

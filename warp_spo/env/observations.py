@@ -9,34 +9,72 @@ from typing import Any
 import numpy as np
 
 from ..hinges.functions import clip, where
-from .world import Vector, World, rotate, vector
+from .world import Vector, World, rotate, rotate_back, vector
 
 Term = Callable[[World], Any]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Observation:
-    """A term with what is done to its numbers: noise is added, the sum is scaled, then clipped.
+    """A term with what is done to its numbers: bias and noise are added, the sum is scaled and clipped, then it waits.
 
     Args:
         term: function of a :class:`World` that returns a number or an array of numbers.
         scale: factor.
-        noise: largest size of a uniform random number.
+        noise: largest size of a uniform random number, new at each step.
         clip: (lowest, highest).
+        bias: largest size of a uniform random number that a world draws once and keeps.
+        delay: steps by which the numbers are late, or (fewest, most), of which a world draws one for good. In the first
+            steps of an episode they are those of its start.
+        history: how many steps are seen, the newest first.
     """
 
     term: Term
     scale: float = 1.0
     noise: float = 0.0
     clip: tuple[float, float] | None = None
+    bias: float = 0.0
+    delay: int | tuple[int, int] = 0
+    history: int = 1
 
     def trace(self, w: World) -> Vector:
         """Return the numbers."""
-        values = np.atleast_1d(np.asarray(self.term(w), dtype=object)).ravel()
+        values = vector(np.atleast_1d(np.asarray(self.term(w), dtype=object)).ravel())
+        if self.bias > 0.0:
+            values = values + w.drawn(
+                f"bias {w.number(self)}", len(values), lambda s: [s.uniform(-self.bias, self.bias) for _ in values]
+            )
         if self.noise > 0.0:
             values = vector(x + w.uniform(-self.noise, self.noise) for x in values)
         values = vector(self.scale * x for x in values)
-        return values if self.clip is None else vector(clip(x, *self.clip) for x in values)
+        if self.clip is not None:
+            values = vector(clip(x, *self.clip) for x in values)
+        least, most = self.delay if isinstance(self.delay, tuple) else (self.delay, self.delay)
+        if self.history + most == 1:
+            return values
+        seen = self._remember(w, values, self.history + most)
+        if most == 0:
+            return vector(x for row in seen for x in row)
+        late: Any = (
+            w.drawn(f"delay {w.number(self)}", 1, lambda s: [s.integer(least, most)])[0] if least < most else most
+        )
+        chosen = seen[least : least + self.history]
+        for delay in range(least + 1, most + 1):
+            later = seen[delay : delay + self.history]
+            chosen = [
+                vector(where(late > delay - 0.5, a, b) for a, b in zip(*rows, strict=True))
+                for rows in zip(later, chosen, strict=True)
+            ]
+        return vector(x for row in chosen for x in row)
+
+    def _remember(self, w: World, values: Vector, count: int) -> list[Vector]:
+        """Return the numbers of ``count`` steps, the newest first, and keep them."""
+        size, name = len(values), f"history {w.number(self)}"
+        old = w.memory(name, (count - 1) * size)
+        if w.fresh is not None:
+            old = vector(where(w.fresh, values[i % size], x) for i, x in enumerate(old))
+            w.keep(name, [*values, *old][: (count - 1) * size])
+        return [values, *(old[i : i + size] for i in range(0, len(old), size))]
 
 
 class TorchTerm:
@@ -139,3 +177,13 @@ def height_scan(size: tuple[float, float] = (1.6, 1.0), cell: float = 0.1, offse
         return vector(z - offset - w.ground_height(x + c * a - s * b, y + s * a + c * b) for a, b in grid)
 
     return term
+
+
+def accelerometer(frame: Any) -> Term:
+    """Return the term of the acceleration that a sensor in a frame feels, in its axes (3,) [m/s^2]; 9.81 up at rest."""
+    return lambda w: w.imu(frame).acceleration
+
+
+def gyro(frame: Any) -> Term:
+    """Return the term of a frame's angular velocity in its axes (3,) [rad/s]."""
+    return lambda w: rotate_back(w.frame(frame).quaternion, w.frame(frame).angular_velocity)

@@ -16,7 +16,7 @@ from ..trace.scalars import Graph, Scalar, ordered
 ROW, COLUMN, INT, LONG, CHOSEN, SHARED = "row", "column", "int", "long", "chosen", "shared"
 DRAW = "draw"  # random numbers of the thread's own
 BLOCK = 64  # threads
-LONG = 8  # entries of a row that the threads of a warp write together
+WIDE = 8  # entries of a row that the threads of a warp write together
 
 
 class Buffer(NamedTuple):
@@ -125,7 +125,7 @@ class Stage:
             return None
         read = self.read_arrays()
         chunked = {
-            name: entries for name, entries in self._whole_rows(buffers).items() if name not in read and entries >= LONG
+            name: entries for name, entries in self._whole_rows(buffers).items() if name not in read and entries >= WIDE
         }
 
         def store(array: str, entry: str, value: str) -> str:
@@ -147,10 +147,10 @@ class Stage:
         parts = [render(listings[0], "float32")]
         for name, entries in chunked.items():
             for start in range(0, entries, row_chunks.CHUNK):
-                count = min(row_chunks.CHUNK, entries - start)
-                inside = [x for x in self.stores if x.array == name and start <= x.index[0] < start + count]
+                part = min(row_chunks.CHUNK, entries - start)
+                inside = [x for x in self.stores if x.array == name and start <= x.index[0] < start + part]
                 listings.append(emitter.region(inside))
-                parts += [render(listings[-1], "float32"), f"FLUSH({name}, {entries}, {start}, {count})"]
+                parts += [render(listings[-1], "float32"), f"FLUSH({name}, {entries}, {start}, {part})"]
         listings.append(emitter.region(late))
         body = "\n".join([*parts, render(listings[-1], "float32")])
         touched = {array for listing in listings for array, _ in listing.indices if array != DRAW}
@@ -174,17 +174,25 @@ class Stage:
         text = "\n".join([ELEMENTARY[C_TYPE[wp.float32]], *head, random, body, *tail, ""])
         kernel = native.kernel(f"env_{self.name}", text, [(name, 1) for name in names], wp.float32)
         frames = "frame_pose" in touched or "frame_velocity" in touched
-        return Launch(kernel, [buffers[name].warp() for name in names], emitter.operations, device, frames)
+        return Launch(
+            kernel,
+            [buffers[name].warp() for name in names],
+            emitter.operations,
+            device,
+            frames,
+            "frame_acceleration" in touched,
+        )
 
 
 class Launch(NamedTuple):
-    """A kernel with its arguments; ``operations`` of one world; whether it reads frames."""
+    """A kernel with its arguments; ``operations`` of one world; whether it reads frames, and their accelerations."""
 
     kernel: wp.Kernel
     arrays: list[wp.array]
     operations: int
     device: wp.Device
     reads_frames: bool
+    reads_accelerations: bool
 
     def __call__(self, worlds: int) -> None:
         """Launch the kernel on Warp's current stream."""

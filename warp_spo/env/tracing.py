@@ -231,6 +231,8 @@ class Tracing:
                 event.change(w)
             if isinstance(event, Reset) and event.first is not None:
                 event.first(w)
+        for name, draw in self.layout.drawn.items():
+            w.keep(name, draw(w))
         for name, values in w.kept.items():
             self._keep(w, name, values)
 
@@ -257,9 +259,13 @@ class Tracing:
     # -- memory ----------------------------------------------------------------------------------------------------
     def _close(self) -> None:
         """Store what each stage keeps; what a reset clears is cleared by the stage that resets."""
-        for w in (self.act, self.observed):
-            for name, values in w.kept.items():
-                self._keep(w, name, values)
+        for name, values in self.act.kept.items():
+            self._keep(self.act, name, values)
+        if self.observed.kept:  # a look at worlds that go on, after a reset of others, is not a step of theirs
+            goes = (self.observed.read("advance", 1)[0] > 0.5) | self.observed.fresh
+            for name, values in self.observed.kept.items():
+                old = self.observed.remembered(name)
+                self._keep(self.observed, name, vector(where(goes, a, b) for a, b in zip(values, old, strict=True)))
         for name, (_, _, update) in self.layout.sensors.items():
             if name not in self.judge.kept:
                 update(self.judge)

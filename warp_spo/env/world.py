@@ -35,6 +35,17 @@ class Frame(NamedTuple):
     angular_velocity: Vector
 
 
+class Imu(NamedTuple):
+    """What an inertial measurement unit in a frame measures, in the frame's axes.
+
+    Attributes:
+        acceleration: of its origin less gravity (3,) [m/s^2]. rate: angular velocity (3,) [rad/s].
+    """
+
+    acceleration: Vector
+    rate: Vector
+
+
 def vector(values: Iterable[Any]) -> Vector:
     """Return an array of abstract scalars."""
     values = list(values)
@@ -99,11 +110,12 @@ class World:
         time: since the last reset [s].
         dt: of a step of the environment [s].
         values: in events that change values: arrays by name, of abstract scalars or numbers, whose entries they assign.
+        fresh: in observations: whether the world has just started anew; None elsewhere.
         before: in resets: the world at the end of the episode; None at the start and in resets on request.
     """
 
-    def __init__(self, layout: Layout, stage: Stage, fresh: Any = None, own_action: Any = None):
-        self._layout, self._stage, self._fresh, self._own_action = layout, stage, fresh, own_action
+    def __init__(self, layout: Layout, stage: Stage, fresh: Any = None):
+        self._layout, self._stage, self.fresh = layout, stage, fresh
         self.scene = layout.scene
         self.dt = layout.step_dt
         self.kept: dict[str, Vector] = {}
@@ -304,6 +316,17 @@ class World:
         assert at < count
         return Frame(pose[:3], pose[3:], rates[:3], rates[3:])
 
+    def imu(self, name: Any) -> Imu:
+        """Return what an inertial measurement unit at a frame measures; ``name`` as :meth:`frame`.
+
+        The acceleration is that of the last step of the dynamics. A world that has just started anew is at rest.
+        """
+        frame, at = self.frame(name), self._layout.frame(name)
+        acceleration = self._quiet(vector(self._scalar("frame_acceleration", 6 * at + i) for i in range(3)))
+        felt = acceleration - vector(as_scalar(x) for x in self.value("gravity"))
+        turned = (rotate_back(frame.quaternion, v) for v in (felt, frame.angular_velocity))
+        return Imu(*turned)
+
     def value(self, name: str) -> np.ndarray:
         """Return a value of the scene, such as "body_com" [body, 3]: of this world where it is randomised."""
         if name in self.values:
@@ -349,9 +372,12 @@ class World:
             size: how many.
             reset: their value at the start of an episode; None: a reset leaves them alone, and they start from zero.
         """
-        start = self._layout.remember(name, size, reset)
-        if name in self.kept:
-            return self.kept[name]
+        self._layout.remember(name, size, reset)
+        return self.kept[name] if name in self.kept else self.remembered(name)
+
+    def remembered(self, name: str) -> Vector:
+        """Return numbers of :meth:`memory` as they were before this stage."""
+        start, size, _ = self._layout.memory[name]
         return vector(self._scalar("memory", start + i) for i in range(size))
 
     def keep(self, name: str, values: Any) -> None:
@@ -373,6 +399,20 @@ class World:
             update(self)
         return self.memory(name, size, reset)
 
+    def number(self, observation: Any) -> int:
+        """Return the number of an observation that remembers something, the same in all stages."""
+        numbers = self._layout.observations
+        return numbers.setdefault(observation, len(numbers))
+
+    def drawn(self, name: str, size: int, draw: Callable[[World], Any]) -> Vector:
+        """Return numbers of :meth:`memory` that are drawn once, when the environment is made, and then stay.
+
+        Args:
+            name, size: as :meth:`memory`. draw: function of a :class:`World` that returns the numbers.
+        """
+        self._layout.drawn.setdefault(name, draw)
+        return self.memory(name, size, reset=None)
+
     # -- inside ----------------------------------------------------------------------------------------------------
     def read(self, array: str, size: int) -> Vector:
         """Return the entries of an array of the environment."""
@@ -383,15 +423,20 @@ class World:
 
     def _quiet(self, values: Vector) -> Vector:
         """Return values of the last step, zero in a world that was reset since."""
-        if self._fresh is None:
+        if self.fresh is None:
             return values
-        return vector(where(self._fresh, 0.0, value) for value in values)
+        return vector(where(self.fresh, 0.0, value) for value in values)
 
     def _point_count(self) -> int:
         count = len(self.scene.contact_points)
         if not count:
             raise ValueError("Env: a term reads contacts, and the scene has none; expected scene.with_contacts(...)")
         return count
+
+
+def as_scalar(x: Any) -> Any:
+    """Return an abstract scalar, or a number as a Python float."""
+    return x if isinstance(x, AbstractScalar) else float(x)
 
 
 def as_value(x: Any) -> Value:
