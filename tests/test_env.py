@@ -7,7 +7,7 @@ import warp as wp
 from env_scenes import FEET, cart_env, walker_env, walker_q, walker_scene
 
 import warp_spo as spo
-from warp_spo.env import TorchTerm, commands, events, observations, rewards
+from warp_spo.env import TorchTerm, actions, commands, events, observations, rewards
 from warp_spo.kernels import native, philox
 
 FLOAT32 = 2e-6  # a few roundings of numbers of size one
@@ -285,6 +285,33 @@ def test_terrain_levels_and_height_scan():
     assert done.all() and extras["time_outs"].all()
     expected = torch.where(far, row + 1, (row - 1).clamp(min=0))
     assert env.memory("terrain")[:, 0].equal(expected) and env.memory("terrain")[:, 1].equal(column)
+
+
+@pytest.mark.slow
+def test_forces_of_drives():
+    """Forces that terms see of drives and efforts: ke (target - q) - kd qd within the limit, and what actions say."""
+    scene = walker_scene().with_values(
+        joint_target_ke=np.r_[np.zeros(6), np.full(8, 30.0)],
+        joint_target_kd=np.r_[np.zeros(6), np.full(8, 1.0)],
+        joint_effort_limit=np.r_[np.full(6, 1e6), np.full(8, 4.0)],
+    )
+    both = [actions.Position(scale=0.3), actions.Effort("joint.*|.*", scale=2.0)]
+    env = walker_env(
+        3,
+        scene=scene,
+        actions=both,
+        events=[],
+        terminations={},
+        observations={"a": [lambda w: w.joint_force]},
+        rewards={},
+    )
+    given = torch.sin(torch.arange(48.0)).view(3, 16)
+    observed, _, _, _ = env.step(given)
+    stand = torch.as_tensor(walker_q()[7:], dtype=torch.float32)
+    drive = (30.0 * (stand + 0.3 * given[:, :8] - env.q[:, 7:]) - env.qd[:, 6:]).clamp(-4.0, 4.0)
+    assert (drive.abs() == 4.0).any() and (drive.abs() < 4.0).any()
+    assert torch.allclose(observed["a"][:, 6:], drive + 2.0 * given[:, 8:], atol=1e-4)
+    assert (observed["a"][:, :6] == 0).all()
 
 
 @pytest.mark.slow

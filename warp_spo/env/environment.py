@@ -117,6 +117,7 @@ class Env(VecEnv):
         parts = list(actions) if isinstance(actions, list | tuple) else [actions]
         self.action_labels = [label for part in parts for label in part.labels(scene)]
         self.num_actions = layout.action_count = len(self.action_labels)
+        layout.action_arrays = {part.array for part in parts}
         groups = {
             name: [term if isinstance(term, Observation) else Observation(term) for term in terms]
             for name, terms in observations.items()
@@ -179,10 +180,6 @@ class Env(VecEnv):
                 self._controls[part.array] = made
                 buffers[part.array] = Buffer(made)
         if "actuator_force" in read:
-            if "ctrl" not in self._controls:
-                raise ValueError(
-                    "Env: a term reads the actuators' forces, and no action sets ctrl; use actions.Control"
-                )
             self._actuator_force = zeros(worlds, scene.dof_count)
             buffers["actuator_force"] = Buffer(self._actuator_force)
         tables = dict(layout.tables)

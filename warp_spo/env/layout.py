@@ -14,7 +14,7 @@ class Layout:
 
     Attributes:
         memory: (start, size, value at a reset) of what worlds remember, by name. frames: that terms ask for.
-        biased: hinges whose encoders have a bias.
+        action_arrays: that actions set: "ctrl", "target_q", "tau". biased: hinges whose encoders have a bias.
         sensors: (size, value at a reset, function that keeps it) of memory that each step brings up to date, by name.
         users: (stage, start) of the numbers of each user's term in torch.
         drawn: functions that return memory that is drawn once, by name. observations: a number for each of those that
@@ -32,6 +32,7 @@ class Layout:
             values,
         )
         self.action_count = 0
+        self.action_arrays: set[str] = set()
         self.biased: list[int] = []
         self.memory: dict[str, tuple[int, int, float | None]] = {}
         self.memory_size = 0

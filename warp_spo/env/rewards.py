@@ -86,12 +86,12 @@ def joint_velocity(names: Any = None) -> Term:
 
 
 def torque(w: World) -> Any:
-    """Return the square of the actuators' forces on all dofs [N^2 m^2]."""
+    """Return the square of the forces that actions command, over all dofs [N^2 m^2]."""
     return square(w.joint_force)
 
 
 def power(w: World) -> Any:
-    """Return the sum of |force rate| of the actuators over all dofs [W]."""
+    """Return the sum of |force rate| of what actions command over all dofs [W]."""
     return sum(abs(f * rate) for f, rate in zip(w.joint_force, w.qd, strict=True))
 
 

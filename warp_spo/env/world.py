@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..hinges.functions import AbstractScalar, Condition, where
+from ..hinges.functions import AbstractScalar, Condition, clip, where
 from ..recursions.contact.ground import Place, height
 from ..trace import spatial
 from ..trace.scalars import Value, floor, is_constant, lookup
@@ -281,8 +281,22 @@ class World:
 
     @property
     def joint_force(self) -> Vector:
-        """Forces of the scene's actuators on each dof, in the state after the step [dof] [N m or N]."""
-        return self.read("actuator_force", self.scene.dof_count)
+        """Forces of what actions command, in the state after the step: actuators, drives, efforts [dof] [N m or N]."""
+        arrays, count = self._layout.action_arrays, self.scene.dof_count
+        total = vector(0.0 for _ in range(count))
+        if "ctrl" in arrays:
+            total = total + self.read("actuator_force", count)
+        if "tau" in arrays:
+            total = total + self.read("tau", count)
+        if "target_q" in arrays:
+            ke, kd, most = (self.value(f"joint_{name}") for name in ("target_ke", "target_kd", "effort_limit"))
+            target = self.read("target_q", self.scene.coord_count)
+            for hinge in self.joints():
+                i, j = int(self.scene.q_start[hinge]), int(self.scene.qd_start[hinge])
+                limit = as_scalar(most[j])
+                force = as_scalar(ke[j]) * (target[i] - self.q[i]) - as_scalar(kd[j]) * self.qd[j]
+                total[j] = total[j] + clip(force, -limit, limit)
+        return total
 
     # -- ground ----------------------------------------------------------------------------------------------------
     def ground_height(self, x: Any, y: Any) -> Any:
