@@ -56,6 +56,30 @@ def mark_contacts(_=None) -> wp.Kernel:
 
 
 @functools.cache
+def add_to_shapes(_=None) -> wp.Kernel:
+    """Add half the gradients by means of shape and ground to those of the shapes and of the grounds.
+
+    One thread for each shape, which reads the points that ``first`` and ``points`` list for it, in their order.
+    """
+
+    @wp.kernel(module="warp_spo_contacts", enable_backward=False)
+    def kernel(
+        shapes: wp.array[wp.int32],
+        first: wp.array[wp.int32],
+        points: wp.array[wp.int32],
+        gradient: wp.array[wp.float32],
+        gradient_out: wp.array[wp.float32],
+    ):
+        i = wp.tid()
+        found = gradient_out[shapes[i]]
+        for at in range(first[i], first[i + 1]):
+            found += 0.5 * gradient[points[at]]
+        gradient_out[shapes[i]] = found
+
+    return kernel
+
+
+@functools.cache
 def keep_most_severe(_=None) -> wp.Kernel:
     """Set ``kept[world]`` to ``status[world]`` where that is more severe."""
 

@@ -18,7 +18,7 @@ from warp_spo.trace.scalars import ordered
 
 VALUES = ("contact_friction", "contact_stiffness", "contact_damping", "joint_target_ke", "joint_target_kd",
           "ground_origin")  # fmt: skip
-STEP = {"q": 1e-6, "qd": 1e-6, "tau": 1e-3, "body_f": 1e-3, "target_q": 1e-4, "target_qd": 1e-4,
+STEP = {"q": 1e-6, "qd": 1e-6, "tau": 1e-3, "body_f": 1e-3, "target_q": 1e-4, "target_qd": 1e-4, "ctrl": 1e-4,
         "ground_origin": 1e-6}  # fmt: skip
 """Of the differences; values move by RELATIVE of themselves. Smaller ones drown in rounding errors."""
 RELATIVE = 3e-3

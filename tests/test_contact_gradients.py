@@ -1,16 +1,22 @@
 """Gradients of steps with contacts: every pass against differences away from switches, and through torch."""
 
+import itertools
+
 import contact_gradients
 import numpy as np
 import pytest
 import symbolic
+import warp as wp
 import zoo
 from contact_cases import EFFORT, box, everywhere, quadruped, touching
 from step_scenes import furnished, states
 from test_contact_step import FIELDS, above
+from test_solver_ground import SIDE, boxes, plane
 
 import warp_spo as spo
+from warp_spo.env import robots
 from warp_spo.examples import hop
+from warp_spo.newton import SolverSPO
 from warp_spo.recursions.contact import step
 from warp_spo.recursions.derivatives.contact import PassAdjoint
 
@@ -38,6 +44,27 @@ def cases():
     for name, field in FIELDS.items():
         scene = box(ground=field, friction=0.3)
         yield name, scene, above(scene, 1, 2 * WORLDS)
+
+
+def go2(ground):
+    """Go2 with its servos, standing in several ways, and ranges of control that some exceed."""
+    robot, rng = robots.load("go2", ground), np.random.default_rng(2)
+    q = np.tile(robot.q, (WORLDS, 1))
+    q[:, 7:] += 0.2 * rng.normal(size=(WORLDS, 12))
+    q[:, :3] += rng.normal(size=(WORLDS, 3)) * [0.2, 0.2, 0.02]
+    a = {"q": q, "qd": 0.5 * rng.normal(size=(WORLDS, 18)), "tau": rng.normal(size=(WORLDS, 18))}
+    return robot.scene, a | {"ctrl": robot.ctrl + 0.3 * rng.normal(size=(WORLDS, 12))}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ground", [None, FIELDS["rough"]], ids=["plane", "rough"])
+def test_gradients_of_go2_are_differences(ground):
+    scene, a = go2(ground)
+    names = ("q", "qd", "tau", "ctrl", "contact_friction", "contact_stiffness", "contact_damping", "ground_origin")
+    errors = contact_gradients.errors(scene, contact_gradients.furnish(scene, a), H, 3, names=names)
+    for argument, (error, crossed) in errors.items():
+        assert error <= LARGEST.get(argument, LARGEST_ELSE), (argument, errors)
+        assert crossed <= 0.05, (argument, errors)
 
 
 CASES = {name: (scene, contact_gradients.furnish(scene, a)) for name, scene, a in cases()}
@@ -152,6 +179,72 @@ def test_gradients_that_do_not_exist_have_names(device):
         loss(dyn, tensors, contact_f=force, substeps=2)
     loss(dyn, tensors, contact_f=force)
     assert (force[:, 0, 2] > 0.0).any()
+
+
+# -- through wp.Tape and JAX -------------------------------------------------------------------------------------------
+@pytest.mark.slow
+def test_a_tape_differentiates_the_solver():
+    """Cubes that slide: by the first state and by the friction of shapes, of which each point has a mean."""
+    model = boxes(plane(0.1), plane(0.105))
+    for name in ("joint_q", "joint_qd", "shape_material_mu"):
+        getattr(model, name).requires_grad = True
+    solver, steps = SolverSPO(model, passes=4), 3
+    first = model.state(requires_grad=True)
+    q, qd = first.joint_q.numpy().reshape(2, 7), np.tile([1.0, 0.3, 0.0, 0.0, 0.0, 0.5], (2, 1)).astype(np.float32)
+    q[:, 2] = [SIDE / 2 + 0.0995, SIDE / 2 + 0.1045]
+    first.joint_q.assign(q.ravel())
+    first.joint_qd.assign(qd.ravel())
+    states, tape = [first, *(model.state(requires_grad=True) for _ in range(steps))], wp.Tape()
+    with tape:
+        for before, after in itertools.pairwise(states):
+            solver.step(before, after, None, None, H)
+    seeds = np.random.default_rng(0).normal(size=(2, 6)).astype(np.float32)
+    tape.backward(grads={states[-1].joint_qd: wp.array(seeds.ravel(), device="cpu")})
+
+    scene = spo.from_newton(model, contacts=True)
+    dyn = spo.Dynamics(scene, 2, "cpu", "float64", variable=("contact_friction",))
+    mu = np.array(np.broadcast_to(scene.values["contact_friction"], (2, 8)), dtype=float)
+
+    def last(q, qd, mu):
+        dyn.set(contact_friction=mu)
+        for _ in range(steps):
+            q, qd = dyn.step(q, qd, None, H, passes=4)
+        return (qd * seeds).sum(axis=1)
+
+    nudge = 1e-6
+    by_mu = (last(q, qd, mu + nudge) - last(q, qd, mu - nudge)) / (2.0 * nudge)
+    cubes = [shape for shape, body in enumerate(model.shape_body.numpy()) if body >= 0]
+    found = model.shape_material_mu.grad.numpy()
+    np.testing.assert_allclose(found[cubes], 0.5 * by_mu, rtol=1e-3)
+    np.testing.assert_allclose(found.sum(), by_mu.sum(), rtol=1e-3)
+    for axis in range(6):
+        unit = nudge * np.eye(6)[axis]
+        wanted = (last(q, qd + unit, mu) - last(q, qd - unit, mu)) / (2.0 * nudge)
+        found = first.joint_qd.grad.numpy().reshape(2, 6)
+        np.testing.assert_allclose(found[:, axis], wanted, atol=2e-3 * np.abs(found).max())
+
+
+@pytest.mark.slow
+def test_jax_differentiates_the_step(device):
+    if not device.is_cpu:
+        pytest.skip("on the CPU; benchmarks/jax_check.py looks at a GPU")
+    jax = pytest.importorskip("jax")
+    spo_jax = pytest.importorskip("warp_spo.jax")
+    dyn, tensors = leg("float64", device)
+    q, qd, tau, targets = (tensors[name] for name in ("q", "qd", "tau", "target_q"))
+    wanted = torch.autograd.grad(loss(dyn, {n: t if n in ("q", "qd", "tau", "target_q") else t.detach()
+                                            for n, t in tensors.items()}, substeps=2).sum(), (q, qd, tau))  # fmt: skip
+    with jax.enable_x64(True):
+        step = spo_jax.function(dyn, "step", dt=H, substeps=2)
+
+        def number(q, qd, tau):
+            after, rate = step(q, qd, tau, target_q=targets.detach().numpy())
+            return (after * after).sum() + (rate * rate).sum()
+
+        arrays = [jax.numpy.asarray(x.detach().numpy()) for x in (q, qd, tau)]
+        found = jax.jit(jax.grad(number, argnums=(0, 1, 2)))(*arrays)
+    for mine, theirs in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(np.asarray(mine), theirs.numpy())
 
 
 @pytest.mark.slow

@@ -43,6 +43,7 @@ MOST_FUSED = 1 << 20  # substeps in one kernel, to which their number is a numbe
 SEVERITY = [Status(word).severity for word in range(len(Status))]
 
 if TYPE_CHECKING:
+    from ..recursions.links import Links
     from .dynamics import Dynamics
     from .gradients import Gradients
 
@@ -91,6 +92,12 @@ def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
     return ""
 
 
+def _lacking(links: Links) -> str:
+    """Return what of a scene has no gradient, and the way out; "" if nothing."""
+    pairs = getattr(links.scene, "contact_pairs", ())
+    return "contacts between bodies; leave out contacts with other=, or call inside torch.no_grad()" if pairs else ""
+
+
 def _take_substeps(call: str, arguments: dict[str, Any]) -> int:
     """Return the checked number of substeps, taken out of the arguments."""
     given = arguments.pop("substeps", 1)
@@ -135,6 +142,7 @@ STEP = Operation(
         launch=_launch_gradients,
         refuses=_without_gradient,
         repeats=_take_substeps,
+        lacking=_lacking,
     ),
 )
 

@@ -67,6 +67,25 @@ class Materials:
         self._soil: Any = wp.array(soil, dtype=wp.int32, device=device)
         self._mean: Any = wp.empty(rows.shape, dtype=wp.float32, device=device)
 
+        self._gradients: dict[str, wp.array] = {}
+        touched = np.concatenate([rows.ravel(), np.repeat(soil, rows.shape[1])])
+        point = np.tile(np.arange(rows.size), 2)[np.argsort(touched, kind="stable")]
+        shapes, counts = np.unique(touched, return_counts=True)
+        lists = (shapes, np.append(0, np.cumsum(counts)), point)
+        self._lists: list = [wp.array(x.astype(np.int32), dtype=wp.int32, device=device) for x in lists]
+
+    def gradient(self, name: str) -> wp.array:
+        """Return a buffer for the gradient by the means of a material [world, point], see :meth:`add`."""
+        if name not in self._gradients:
+            self._gradients[name] = wp.empty_like(self._mean)
+        return self._gradients[name]
+
+    def add(self, gradient: wp.array, flat: wp.array) -> None:
+        """Add a gradient by means to ``flat``, the gradient by the material of each shape."""
+        shapes, first, points = self._lists
+        inputs = [shapes, first, points, gradient.flatten()]
+        wp.launch(kernels.add_to_shapes(), len(shapes), inputs, [flat], device=flat.device)
+
     def mean(self, flat: wp.array) -> wp.array:
         """Return the means of a material [world, point], in a buffer that the next call overwrites."""
         inputs, device = [self._rows, self._soil, flat], self._mean.device

@@ -79,12 +79,23 @@ class ModelArrays:
                 value = layout.scale(value, self._factors[name], "driven")
             dynamics.set(**{name: value})
 
+    def source(self, name: str) -> str:
+        """Return the name of the model's array that a value of the scene comes from."""
+        return next((array for array, value in VALUES.items() if value == name), name)
+
     def gradient(self, name: str) -> wp.array:
         """Return an array [world, ...] for the gradient by a value, see :meth:`add`."""
+        if name in VALUES.values():
+            assert self._materials is not None
+            return self._materials.gradient(name)
         return self._layouts[name].buffer(f"{name} gradient")
 
     def add(self, name: str, gradient: wp.array, flat: wp.array) -> None:
         """Add a gradient by a value of the scene [world, ...] to ``flat``, the gradient by the model's array."""
+        if name in VALUES.values():
+            assert self._materials is not None
+            self._materials.add(gradient, flat)
+            return
         layout = self._layouts[name]
         if name in self._factors:
             gradient = layout.scale(gradient, self._factors[name], "driven gradient")

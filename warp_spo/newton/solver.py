@@ -90,7 +90,7 @@ class SolverSPO(Plugs, SolverBase):
     field, which may differ between worlds. ``ke``, ``kd`` and ``mu`` of materials are stiffness, damping and friction
     of each point, the mean of the shape's and the ground's; ``margin`` lies around shapes; ``gap``, ``kf``, ``ka``,
     ``restitution`` and friction against spinning and rolling are not used. Contacts between bodies are left out: pass
-    ``contacts`` to :meth:`step`, and :attr:`status` names worlds with some. Steps with contacts have no gradients yet.
+    ``contacts`` to :meth:`step`, and :attr:`status` names worlds with some.
 
     Loop joints, which belong to no articulation, and mimics hold after every step to float32's rounding if ``loops`` is
     "embed" or "multipliers". A loop joint can only be a constraint. Its entries of joint_q and joint_qd keep their
@@ -229,7 +229,9 @@ class SolverSPO(Plugs, SolverBase):
         kinds: dict[str, Any] = {"contact_f": wp.vec3, "contact_slip": wp.float32} if scene.contacts else {}
         self._unasked = {name: wp.zeros(shape, dtype=kind, device=device) for name, kind in kinds.items()}
         self._joint_forces = JointForces(self.dynamics, state)
-        self._gradients = StepGradients(model, self.dynamics, state, self._joint_forces, self._drives, self._arrays)
+        self._gradients = StepGradients(
+            model, self.dynamics, state, self._joint_forces, self._drives, self._arrays, passes=self._passes
+        )
         self._prepare()
 
     def _prepare(self) -> None:

@@ -66,6 +66,7 @@ class StepGradients:
         dynamics: Its dynamics.
         layouts: How Newton's arrays are laid out.
         forces, drives, arrays: What turns Newton's forces, targets and values into those of the dynamics.
+        passes: Of steps with contacts.
     """
 
     def __init__(
@@ -76,8 +77,9 @@ class StepGradients:
         forces: JointForces,
         drives: Drives,
         arrays: ModelArrays,
+        passes: int | None,
     ):
-        self.model, self.dynamics, self.layouts = model, dynamics, layouts
+        self.model, self.dynamics, self.layouts, self.passes = model, dynamics, layouts, passes
         self.forces, self.drives, self.arrays = forces, drives, arrays
 
     def record(
@@ -98,7 +100,7 @@ class StepGradients:
         """
         read = self._arrays_read(state_in, control)
         values = [name for name in self.dynamics.variable if name in DIFFERENTIABLE]
-        model = {name: getattr(self.model, name) for name in values}
+        model = {name: getattr(self.model, self.arrays.source(name)) for name in values}
         wanted = {name: array for name, array in {**read, **model}.items() if array.requires_grad}
         if not wanted:
             warnings.warn(
@@ -219,6 +221,8 @@ class StepRecord:
             outs = {ARGUMENTS[name]: self._buffer(name) for name in ARGUMENTS if name in names}
             values = {name: solver.arrays.gradient(name) for name in wanted if name in DIFFERENTIABLE}
             arrays = {**given, "dt": float(self._dt), "qdd": self.qdd, **cotangents}
+            if solver.dynamics.scene.contacts:
+                arrays["passes"] = solver.passes
             self._pull(STEP, {**outs, **values}, **arrays)
             if "tau" in outs:
                 poses = layouts.poses.buffer("poses gradient") if taus and "joint_q" in wanted else None
