@@ -13,7 +13,7 @@
     )
     observed, rewards, dones, extras = env.step(actions)                          # an rsl_rl VecEnv
 
-**A term is a function of one world**, :class:`World`, whose attributes are abstract scalars and NumPy arrays of them:
+**A term is a function of one world**, ``World``, whose attributes are abstract scalars and NumPy arrays of them:
 ``w.q``, ``w.joint_q("hip.*")``, ``w.base_velocity``, ``w.command``, ``w.contact_force``,
 ``w.feet("calf.*").air_time``, ``w.frame("hand").position``. It is traced once, when the environment is made, like the
 pose of a custom hinge: written with arithmetic, comparisons and NumPy's functions, with ``spo.where`` and ``spo.clip``
@@ -96,7 +96,7 @@ def skrl(env: Env, observations: str | None = None, states: str | None = None) -
 
 
 def __getattr__(name: str) -> Any:
-    """Return :class:`Env`, which imports torch; robots and terms alone do not."""
+    """Return ``Env``, which imports torch; robots and terms alone do not."""
     if name == "Env":
         from .environment import Env
 
@@ -110,7 +110,7 @@ def make(name: str, worlds: int | None = None, device: Any = None, seed: int = 0
     Args:
         name: "cartpole", "ant", "panda-reach", "go2-flat", "go2-rough" or "g1-flat".
         worlds: how many; None: as many as the task is trained with.
-        device: Warp or torch device. seed: of all random numbers. options: further arguments of :class:`Env`.
+        device: Warp or torch device. seed: of all random numbers. options: further arguments of ``Env``.
 
     Raises:
         ValueError: there is no task of this name.

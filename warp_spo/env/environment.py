@@ -1,4 +1,4 @@
-"""An environment of many worlds: :class:`Env`."""
+"""An environment of many worlds: ``Env``."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import warp as wp
 
 from ..arrays import parse_device
 from ..dynamics.dynamics import Dynamics
+from ..errors import as_integer
+from ..launches import compile_side_by_side
 from ..recursions.contact.ground import GROUND
 from ..scene.contacts import HeightField
 from ..scene.scene import Scene
@@ -20,7 +22,7 @@ from .events import Delays, Values
 from .graphs import Part, Replay
 from .layout import Layout
 from .observations import Observation, TorchTerm
-from .stage import CHOSEN, COLUMN, INT, LONG, ROW, SHARED, Buffer
+from .stage import CHOSEN, COLUMN, INT, LONG, ROW, SHARED, Buffer, output_name
 from .tracing import Tracing
 
 try:
@@ -47,7 +49,7 @@ class Env(VecEnv):
         dt: length of a step of the dynamics [s].
         decimation: steps of the dynamics in one step of the environment.
         actions: one of :mod:`warp_spo.env.actions`, or several; the policy's numbers are theirs, one after the other.
-        observations: for each group a list of terms, functions of a :class:`World` or :class:`Observation`.
+        observations: for each group a list of terms, functions of a ``World`` or ``Observation``.
         rewards: (weight, term) by name. The reward is the sum of weight times term times the length of the step.
         terminations: terms by name.
         commands: None, or one of :mod:`warp_spo.env.commands`.
@@ -104,7 +106,14 @@ class Env(VecEnv):
         self.scene, self.num_envs = scene, worlds
         self.warp_device = parse_device(str(device) if device is not None else None, "Env")
         self.device = torch.device(wp.device_to_torch(self.warp_device))
-        self.dt, self.decimation, self.step_dt = float(dt), int(decimation), float(dt) * int(decimation)
+        steps = as_integer(decimation)
+        if steps is None or steps < 1:
+            raise ValueError(f"Env: decimation is {decimation!r}; expected an integer, 1 or more")
+        if not (0.0 < dt < np.inf and 0.0 < episode_length_s < np.inf):
+            raise ValueError(
+                f"Env: dt is {dt!r} s and episode_length_s {episode_length_s!r} s; expected more than zero"
+            )
+        self.dt, self.decimation, self.step_dt = float(dt), steps, float(dt) * steps
         self.max_episode_length = max(1, round(episode_length_s / self.step_dt))
         self.seed, self.first_world, self.cfg = int(seed), int(first_world), {} if cfg is None else cfg
         self._passes, self.log_interval = passes, log_interval
@@ -118,6 +127,11 @@ class Env(VecEnv):
         self.action_labels = [label for part in parts for label in part.labels(scene)]
         self.num_actions = layout.action_count = len(self.action_labels)
         layout.action_arrays = {part.array for part in parts}
+        for name, reward in rewards.items():
+            if not isinstance(reward, tuple | list) or len(reward) != 2 or not callable(reward[1]):
+                raise TypeError(f"Env: rewards[{name!r}] is {reward!r}; expected (weight, term)")
+        if not observations or not all(observations.values()):
+            raise ValueError(f"Env: observations is {observations!r}; expected a list of terms for each group")
         groups = {
             name: [term if isinstance(term, Observation) else Observation(term) for term in terms]
             for name, terms in observations.items()
@@ -131,11 +145,13 @@ class Env(VecEnv):
         self._allocate(parts, tracing)
         stages = tracing.stages
         self._kernels = {name: stage.build(self._buffers, self.warp_device) for name, stage in stages.items()}
-        self._launch("start")
-        self._set_values()
         self._values_later = any(isinstance(event, Values) and event.when != "start" for event in events)
         wanted = self.warp_device.is_cuda if graph is None else bool(graph) and self.warp_device.is_cuda
         self.replay = Replay(self._parts(), wanted)
+        if self.warp_device.is_cuda:
+            self._compile()
+        self._launch("start")
+        self._set_values()
         self.reset()
 
     # -- arrays ----------------------------------------------------------------------------------------------------
@@ -221,7 +237,7 @@ class Env(VecEnv):
         for name, (start, size) in self._places.items():
             part = self._out[start : start + worlds * size]
             part = part.view(torch.int32) if name == "done" else part.view(worlds, size)
-            buffers[f"out_{name}".replace(" ", "_")] = Buffer(part, INT if name == "done" else ROW)
+            buffers[output_name(name)] = Buffer(part, INT if name == "done" else ROW)
         self._buffers = buffers
 
     def set_seed(self, seed: int) -> None:
@@ -350,6 +366,20 @@ class Env(VecEnv):
         if kernel is not None:
             with self._stream():
                 kernel(self.num_envs)
+
+    def _compile(self) -> None:
+        """Compile all kernels side by side, by a step in which nothing counts."""
+        torch.cuda.synchronize(self.device)
+        with compile_side_by_side():
+            for name in self._kernels:
+                self._after(name)
+                self._launch(name)
+            self._physics()
+            self._after_reset()
+        torch.cuda.synchronize(self.device)
+        self._memory.zero_()
+        self._episode_length.zero_()
+        self.set_seed(self.seed)
 
     def _parts(self) -> list[Part]:
         """Return the parts of a step."""

@@ -21,7 +21,7 @@ class Reset:
     """A function that changes ``w.q``, ``w.qd`` of a world whose episode starts; they are default_q and zero before.
 
     Args:
-        change: function of a :class:`World`, which assigns to entries of ``w.q`` and ``w.qd``. ``w.before`` is the
+        change: function of a ``World``, which assigns to entries of ``w.q`` and ``w.qd``. ``w.before`` is the
             world at the end of the episode. What it keeps with ``w.keep`` stays until the next reset.
         first: None, or a function that keeps what worlds remember for good, when the environment is made.
     """
@@ -35,7 +35,7 @@ class Interval:
     """A function that changes ``w.q``, ``w.qd`` of a world from time to time.
 
     Args:
-        change: function of a :class:`World`.
+        change: function of a ``World``.
         seconds: range of the time from one change to the next.
     """
 
@@ -49,7 +49,7 @@ class Values:
 
     Args:
         names: of the values that it changes, of those that ``Dynamics`` takes as ``variable``.
-        change: function of a :class:`World` that assigns to entries of ``w.values[name]``, which are the scene's own
+        change: function of a ``World`` that assigns to entries of ``w.values[name]``, which are the scene's own
             numbers before; arrays [...] in Newton's layout.
         when: "start": once, when the environment is made. "reset": at each start of an episode. Or the range of the
             time from one change to the next [s].
@@ -69,7 +69,7 @@ class Start:
     """A function that keeps what a world remembers for good, with ``w.keep``, when the environment is made.
 
     Args:
-        change: function of a :class:`World`.
+        change: function of a ``World``.
     """
 
     change: Callable[[World], None]

@@ -46,7 +46,7 @@ def most(values: list[Any]) -> Any:
 
 
 class FootTimes:
-    """The memory of :class:`Feet`: air, contact and last air time of each body, brought up to date once in a step."""
+    """The memory of ``Feet``: air, contact and last air time of each body, brought up to date once in a step."""
 
     def __init__(self, points: list[list[int]], threshold: float):
         self.points, self.threshold = points, threshold

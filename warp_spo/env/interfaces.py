@@ -32,7 +32,7 @@ def make_vector(env: Env, tensors: bool = False) -> Any:
     from gymnasium.vector.utils import batch_space
 
     class Worlds(VectorEnv):
-        """All worlds of an :class:`Env`; a world whose episode ends starts anew in the same step."""
+        """All worlds of an ``Env``; a world whose episode ends starts anew in the same step."""
 
         metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
 
@@ -123,7 +123,7 @@ def make_skrl(env: Env, observations: str | None = None, states: str | None = No
     box = _spaces(env)[1]
 
     class Worlds(Wrapper):
-        """All worlds of an :class:`Env`."""
+        """All worlds of an ``Env``."""
 
         def __init__(self) -> None:
             super().__init__(env)

@@ -19,7 +19,8 @@ class Layout:
         users: (stage, start) of the numbers of each user's term in torch.
         drawn: functions that return memory that is drawn once, by name. observations: a number for each of those that
             remember something.
-        tables: numbers that all worlds share, by name. weights: of rewards.
+        tables: numbers that all worlds share, by their names in kernels. table_names: names that terms give them.
+        weights: of rewards.
         values: names of the scene's values that differ between worlds.
     """
 
@@ -40,6 +41,7 @@ class Layout:
         self.drawn: dict[str, Any] = {}
         self.observations: dict[Any, int] = {}
         self.tables: dict[str, np.ndarray] = {}
+        self.table_names: list[str] = []
         self.weights: dict[str, float] = {}
         self.users: dict[Any, tuple[str, int]] = {}
         self.user_size = 0
@@ -60,7 +62,11 @@ class Layout:
 
     def table(self, name: str, numbers: np.ndarray) -> str:
         """Return the name under which kernels read a table."""
-        held = f"table_{name}"
+        numbers = np.asarray(numbers, dtype=np.float64)
+        held = next((f"table_{i}" for i, known in enumerate(self.table_names) if known == name), "")
+        if not held:
+            self.table_names.append(name)
+            held = f"table_{len(self.table_names) - 1}"
         if not np.array_equal(self.tables.setdefault(held, numbers), numbers):
             raise ValueError(
                 f"World.table: {name!r} is the name of two tables with different numbers; expected another"

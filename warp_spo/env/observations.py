@@ -1,4 +1,4 @@
-"""Observations: ready terms, each a function of a :class:`World` that returns numbers; :class:`Observation`."""
+"""Observations: ready terms, each a function of a ``World`` that returns numbers; ``Observation``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Observation:
     """A term with what is done to its numbers: bias and noise are added, the sum is scaled and clipped, then it waits.
 
     Args:
-        term: function of a :class:`World` that returns a number or an array of numbers.
+        term: function of a ``World`` that returns a number or an array of numbers.
         scale: factor.
         noise: largest size of a uniform random number, new at each step.
         clip: (lowest, highest).
@@ -85,7 +85,7 @@ class TorchTerm:
     it. In a graph, Python runs once: what the function does beside tensors is not repeated.
 
     Args:
-        function: of the :class:`Env`, which returns a tensor [world] or [world, size], of any dtype. It must not change
+        function: of the ``Env``, which returns a tensor [world] or [world, size], of any dtype. It must not change
             the environment.
         size: how many numbers it returns for each world.
         name: in errors and warnings; None: the function's.

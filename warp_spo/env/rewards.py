@@ -1,4 +1,4 @@
-"""Rewards: ready terms, each a function of a :class:`World` that returns one number."""
+"""Rewards: ready terms, each a function of a ``World`` that returns one number."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def alive(w: World) -> Any:
 
 
 def track_velocity(deviation: float = 0.5) -> Term:
-    """Return exp(-|error|^2 / deviation^2) of the base's horizontal velocity, in its axes, and the command."""
+    """Return exp(-error^2 / deviation^2) of the base's horizontal velocity, in its axes, and the command."""
     return lambda w: np.exp(square(w.command[:2] - w.base_velocity[:2]) * (-1.0 / deviation**2))
 
 
@@ -91,7 +91,7 @@ def torque(w: World) -> Any:
 
 
 def power(w: World) -> Any:
-    """Return the sum of |force rate| of what actions command over all dofs [W]."""
+    """Return the sum of abs(force rate) of what actions command over all dofs [W]."""
     return sum(abs(f * rate) for f, rate in zip(w.joint_force, w.qd, strict=True))
 
 
@@ -120,7 +120,7 @@ def foot_slip(bodies: Any, least_command: float | None = None) -> Term:
 
 
 def foot_clearance(bodies: Any, height: float = 0.08, least_command: float = 0.05) -> Term:
-    """Return the sum over feet of |gap - height| times the speed along the ground [m^2/s], as the command moves."""
+    """Return the sum over feet of abs(gap - height) times the speed along the ground [m^2/s], as the command moves."""
 
     def term(w: World) -> Any:
         feet = w.feet(bodies)

@@ -64,6 +64,13 @@ class Buffer(NamedTuple):
         return wp.from_torch(flat.view(torch.float32), dtype=wp.float32)
 
 
+def output_name(result: str) -> str:
+    """Return the name under which kernels write a result: "reward", a group of observations, and so on."""
+    return "out_" + "".join(
+        letter if letter.isalnum() and letter.isascii() else f"_{ord(letter)}_" for letter in result
+    )
+
+
 class Stage:
     """One kernel, a thread a world, made of the values that terms store.
 

@@ -1,4 +1,4 @@
-"""Terminations: ready terms, each a function of a :class:`World` that returns a comparison."""
+"""Terminations: ready terms, each a function of a ``World`` that returns a comparison."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from ..trace.scalars import Value, absolute, less
 from .events import EncoderBias, Interval, Reset, Start, Values
 from .layout import Layout
 from .observations import Observation
-from .stage import Stage
+from .stage import Stage, output_name
 from .world import Vector, World, as_condition, as_value, vector
 
 LARGEST = 1e30  # numbers beyond it count as not finite
@@ -123,9 +123,9 @@ class Tracing:
             terminated = terminated | ends[name]
         late = length >= float(steps)
         self.done = done = terminated | late
-        stage.store("out_reward", 0, as_value(where(bad, 0.0, total)))
-        stage.store("out_done", 0, as_value(where(done, 1.0, 0.0)))
-        stage.store("out_time_out", 0, as_value(where(late & ~terminated, 1.0, 0.0)))
+        stage.store(output_name("reward"), 0, as_value(where(bad, 0.0, total)))
+        stage.store(output_name("done"), 0, as_value(where(done, 1.0, 0.0)))
+        stage.store(output_name("time_out"), 0, as_value(where(late & ~terminated, 1.0, 0.0)))
         stage.store("chosen", 0, as_value(where(done, 1.0, 0.0)))
         stage.store("episode_length", 0, as_value(where(done, 0.0, length)))
         w.keep("episodes", w.memory("episodes", 1, reset=None) + where(done, 1.0, 0.0))
@@ -246,7 +246,7 @@ class Tracing:
             values = [x for term in terms for x in term.trace(w)]
             self.group_sizes[group] = values
             for i, value in enumerate(values):
-                stage.store(f"out_{group}", i, as_value(value))
+                stage.store(output_name(group), i, as_value(value))
 
     def _final(self) -> None:
         """Observe the state in which an episode ends, before worlds start anew."""
@@ -254,7 +254,7 @@ class Tracing:
         w.__dict__["time"] = (w.read("episode_length", 1)[0] + 1.0) * self.layout.step_dt
         for group, terms in self.groups.items():
             for i, value in enumerate(x for term in terms for x in term.trace(w)):
-                w._stage.store(f"out_final_{group}", i, as_value(value))
+                w._stage.store(output_name(f"final {group}"), i, as_value(value))
 
     # -- memory ----------------------------------------------------------------------------------------------------
     def _close(self) -> None:

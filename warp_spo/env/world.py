@@ -1,4 +1,4 @@
-"""The symbolic state of one world, which the terms of an environment are functions of: :class:`World`."""
+"""The symbolic state of one world, which the terms of an environment are functions of: ``World``."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def find(call: str, what: str, labels: Sequence[str], names: Any) -> list[int]:
 class World:
     """One world while a term is traced. Its attributes are abstract scalars, or NumPy arrays of them.
 
-    Terms are written with + - * / **, comparisons, NumPy's sin, cos, exp, log, sqrt, arctan2, abs and the like, and
+    Terms are written with ``+ - * / **``, comparisons, NumPy's sin, cos, exp, log, sqrt, arctan2, abs and the like, and
     :func:`warp_spo.where`, :func:`warp_spo.clip` in place of branches.
 
     Attributes:
@@ -281,7 +281,7 @@ class World:
 
     @property
     def joint_force(self) -> Vector:
-        """Forces of what actions command, in the state after the step: actuators, drives, efforts [dof] [N m or N]."""
+        """What actuators, drives and efforts do, as actions command, in the state after the step [dof] [N m or N]."""
         arrays, count = self._layout.action_arrays, self.scene.dof_count
         total = vector(0.0 for _ in range(count))
         if "ctrl" in arrays:
@@ -405,7 +405,7 @@ class World:
 
         Args:
             name, size, reset: as :meth:`memory`.
-            update: function of a :class:`World` that calls :meth:`keep` with this name.
+            update: function of a ``World`` that calls :meth:`keep` with this name.
         """
         self._layout.sensors[name] = size, reset, update
         self._layout.remember(name, size, reset)
@@ -422,7 +422,7 @@ class World:
         """Return numbers of :meth:`memory` that are drawn once, when the environment is made, and then stay.
 
         Args:
-            name, size: as :meth:`memory`. draw: function of a :class:`World` that returns the numbers.
+            name, size: as :meth:`memory`. draw: function of a ``World`` that returns the numbers.
         """
         self._layout.drawn.setdefault(name, draw)
         return self.memory(name, size, reset=None)
