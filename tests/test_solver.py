@@ -124,6 +124,29 @@ def test_in_place_is_the_same_and_nothing_is_allocated(turned):
         np.testing.assert_array_equal(getattr(state, name).numpy(), getattr(wanted, name).numpy())
 
 
+def test_substeps_of_a_step(turned):
+    """To the bit the last of as many steps, with the status of all and the bodies' states of the last."""
+    model, one = turned
+    solver = SolverSPO(model, substeps=3)
+    assert solver.supported_observables == {"status"} and "joint_qdd" in one.supported_observables
+    seen = solver.observables({"status"})
+    seen.status.fill_(-1)
+    wanted, found = advance(one, moving(model), 3, model.control(), h=H / 3.0), model.state()
+    for more in ({}, {"observables": seen}):
+        solver.step(moving(model), found, model.control(), None, H, **more)
+        for name in ("joint_q", "joint_qd", "body_q", "body_qd"):
+            np.testing.assert_array_equal(getattr(found, name).numpy(), getattr(wanted, name).numpy())
+    assert not seen.status.numpy().any()
+    with pytest.raises(ValueError, match="joint_qdd"):
+        solver.observables({"joint_qdd"})
+    state = moving(model)
+    state.joint_q.requires_grad = True
+    with wp.Tape(), pytest.raises(spo.UnsupportedError, match=r"substeps=3 on a wp.Tape.*substeps=1"):
+        solver.step(state, model.state(), model.control(), None, H)
+    with pytest.raises(ValueError, match="SolverSPO: substeps is 0; expected an integer, 1 or more"):
+        SolverSPO(model, substeps=0)
+
+
 def test_a_state_without_bodies(turned):
     """Steps leave out what nobody reads: bodies' poses, their velocities, or both, and forces on bodies."""
     model, solver = turned

@@ -16,7 +16,7 @@ from newton.solvers import SolverBase
 from .. import launches
 from ..dynamics.dynamics import Dynamics
 from ..dynamics.steps import INTEGRATORS
-from ..errors import UnsupportedError, as_names
+from ..errors import UnsupportedError, as_integer, as_names
 from ..kernels import declare, exchange
 from ..memory import view
 from ..scene.parts import DOF_VALUES
@@ -122,6 +122,9 @@ class SolverSPO(Plugs, SolverBase):
             there are none. "none": contacts are left out.
         points: Points at most of a mesh, a cylinder, a cone or an ellipsoid, see :func:`warp_spo.load`.
         passes: Of a step with contacts, see :meth:`warp_spo.Dynamics.step`.
+        substeps: A step takes so many of dt / substeps, see there, and writes the bodies' states once. Joint forces of
+            free joints on bodies keep the axes of the first. The observables are then status, contact_f (the mean) and
+            contact_slip (of the last), and a tape records no step.
         tune: Time the granularities at which the step can run, as :meth:`warp_spo.Dynamics.tune` does, and use the
             fastest. The choice is kept in a file, so that only the first solver of a model measures.
 
@@ -154,6 +157,7 @@ class SolverSPO(Plugs, SolverBase):
         contacts: str = "auto",
         points: int = POINTS,
         passes: int | None = None,
+        substeps: int = 1,
         tune: bool = False,
     ):
         if not hasattr(model, "particle_count"):
@@ -170,7 +174,10 @@ class SolverSPO(Plugs, SolverBase):
             )
         if contacts not in MODES:
             raise ValueError(f"SolverSPO: contacts is {contacts!r}; expected one of {', '.join(MODES)}")
-        self.integrator, self._tunes = integrator, tune
+        count = as_integer(substeps)
+        if count is None or count < 1:
+            raise ValueError(f"SolverSPO: substeps is {substeps!r}; expected an integer, 1 or more")
+        self.integrator, self._tunes, self._substeps = integrator, tune, count
         self._contact_options, self._passes = (contacts, points), passes
         self._options: dict[str, Any] = {"loops": loops, "granularity": granularity}
         with paused_tape():
@@ -264,11 +271,13 @@ class SolverSPO(Plugs, SolverBase):
         """Names of the observables.
 
         BODY_PARENT_F is missing if loops are closed, the scene has no dof, or steps have contacts; contact_f and
-        contact_slip are missing if they have none.
+        contact_slip are missing if they have none. Accelerations and BODY_PARENT_F are missing with substeps.
         """
         touches, found = bool(self._unasked), self.SUPPORTED_OBSERVABLES
         if self.dynamics.closed or not self.dynamics.scene.dof_count or touches:
             found = found - {SolverBase.ObservableKind.BODY_PARENT_F}
+        if self._substeps > 1:
+            found = found & {"status", "contact_f", "contact_slip"}
         return found if touches else found - {"contact_f", "contact_slip"}
 
     def observables(self, kinds: Iterable[str], **options: Any) -> Any:
@@ -328,6 +337,9 @@ class SolverSPO(Plugs, SolverBase):
         with paused_tape() as tape:
             given = state_in, state_out, control, dt, observables
             record = None if tape is None else self._gradients.record(tape, self.integrator, *given)
+            if record is not None and self._substeps > 1:
+                what, way = f"substeps={self._substeps} on a wp.Tape", "record the steps of a solver with substeps=1"
+                raise UnsupportedError("SolverSPO.step", what, way)
             self._step(*given, None if record is None else record.qdd, left_out)
             if record is not None:
                 record.append_to_tape()
@@ -349,6 +361,8 @@ class SolverSPO(Plugs, SolverBase):
         given: dict[str, Any] = dict(tau=tau, body_f=body_f, **self._drives.targets(control, self._q, self._qd))
         if self._unasked:
             given["passes"] = self._passes
+        if self._substeps > 1:
+            dt, given["substeps"] = dt / self._substeps, self._substeps
         if observables is None or not observables.kinds:
             q_out, qd_out = self._q.target(state_out.joint_q, "q_out"), self._qd.target(state_out.joint_qd, "qd_out")
             more: dict[str, Any] = (
