@@ -1,4 +1,4 @@
-"""Environments on several GPUs: env-steps/s at constant worlds a GPU, and whether a world's course depends on its place.
+"""Environments on several GPUs: env-steps/s at constant worlds a GPU, and whether a course depends on the place.
 
     python -m benchmarks.many_gpus [--task go2-flat] [--devices cuda:0 cuda:1] [--worlds 4096] [--json FILE]
 
