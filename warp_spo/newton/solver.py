@@ -396,9 +396,9 @@ class SolverSPO(Plugs, SolverBase):
         pairs = (self._poses, state.body_q, "body_q"), (self._wrenches, state.body_qd, "body_qd")
         if all(flat is None for _, flat, _ in pairs):
             return
-        out = tuple(at.buffer(name) if flat is None else at.target(flat, name) for at, flat, name in pairs)
-        self.dynamics.body_states(q, qd, out=out)
-        for (at, flat, _), array in zip(pairs, out, strict=True):
+        poses, rates = (at.buffer(name) if flat is None else at.target(flat, name) for at, flat, name in pairs)
+        self.dynamics.body_states(q, qd, out=(poses, rates))
+        for (at, flat, _), array in zip(pairs, (poses, rates), strict=True):
             if flat is not None:
                 at.write(array, flat)
 
