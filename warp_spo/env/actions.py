@@ -9,7 +9,8 @@ import numpy as np
 
 from ..hinges.functions import clip
 from ..scene.scene import Scene
-from .world import Vector, World, find
+from .vectors import Vector, find
+from .world import World
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from ..hinges.functions import Condition, clip, where
-from .world import Vector, World, vector
+from .vectors import Vector, vector
+from .world import World
 
 Range = tuple[float, float]
 

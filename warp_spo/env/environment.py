@@ -14,15 +14,13 @@ from ..arrays import parse_device
 from ..dynamics.dynamics import Dynamics
 from ..errors import as_integer
 from ..launches import compile_side_by_side
-from ..recursions.contact.ground import GROUND
-from ..scene.contacts import HeightField
 from ..scene.scene import Scene
 from ..torch import stream
 from .events import Delays, Values
 from .graphs import Part, Replay
 from .layout import Layout
 from .observations import Observation, TorchTerm
-from .stage import CHOSEN, COLUMN, INT, LONG, ROW, SHARED, Buffer, output_name
+from .storage import Storage
 from .tracing import Tracing
 
 try:
@@ -30,9 +28,6 @@ try:
     from tensordict import TensorDict
 except ImportError:  # optional packages
     VecEnv, TensorDict = object, None  # type: ignore[assignment,misc]
-
-CONTACT_ARRAYS = {"contact_f": 3, "contact_gap": 1, "contact_slip": 1}  # entries of each point
-ALIGNMENT = 4  # scalars
 
 
 class Env(VecEnv):
@@ -142,9 +137,19 @@ class Env(VecEnv):
         self.reward_names, self.termination_names = list(rewards), tracing.ends
         self.num_obs = {name: len(values) for name, values in tracing.group_sizes.items()}
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=layout.values, granularity=granularity)
-        self._allocate(parts, tracing)
-        stages = tracing.stages
-        self._kernels = {name: stage.build(self._buffers, self.warp_device) for name, stage in stages.items()}
+        finals = [(f"final {name}", size) for name, size in self.num_obs.items()] if self.final else []
+        results = [("reward", 1), ("done", 1), ("time_out", 1), *self.num_obs.items(), *finals]
+        store = self._store = Storage(layout, worlds, self.device, tracing.arrays, results)
+        self.q, self.qd, self.actions, self.chosen = (store.tensors[n] for n in ("q", "qd", "actions", "chosen"))
+        self._tensors, self._controls, self._step_arrays = store.tensors, store.controls, store.written
+        self.values = store.values
+        delays = [int(each.delay) for each in scene.actuators]
+        delays += [event.longest for event in events if isinstance(event, Delays)]
+        self._actuator_state: Any = None
+        if "ctrl" in store.controls and max(delays) > 0:
+            self._actuator_state = self.dyn.actuator_state(like=self.q, longest=max(delays))
+        self.set_seed(self.seed)
+        self._kernels = {name: stage.build(store.buffers, self.warp_device) for name, stage in tracing.stages.items()}
         self._values_later = any(isinstance(event, Values) and event.when != "start" for event in events)
         wanted = self.warp_device.is_cuda if graph is None else bool(graph) and self.warp_device.is_cuda
         self.replay = Replay(self._parts(), wanted)
@@ -154,107 +159,22 @@ class Env(VecEnv):
         self._set_values()
         self.reset()
 
-    # -- arrays ----------------------------------------------------------------------------------------------------
-    def _allocate(self, parts: list, tracing: Tracing) -> None:
-        scene, worlds, layout = self.scene, self.num_envs, self._layout
-        zeros = lambda *shape, dtype=torch.float32: torch.zeros(shape, dtype=dtype, device=self.device)  # noqa: E731
-        self.q = torch.tensor(layout.default_q, dtype=torch.float32, device=self.device).repeat(worlds, 1)
-        self.qd = zeros(worlds, scene.dof_count)
-        self.actions = zeros(worlds, self.num_actions)
-        self._memory = zeros(max(1, layout.memory_size), worlds)
-        self._tick = zeros(worlds, dtype=torch.int32)
-        self._advance = torch.ones(1, device=self.device)
-        self._key = zeros(3, dtype=torch.int32)
-        self.set_seed(self.seed)
-        self._episode_length = zeros(worlds, dtype=torch.int64)
-        self.chosen = zeros(worlds, dtype=torch.bool)
-        buffers = {
-            "q": Buffer(self.q),
-            "qd": Buffer(self.qd),
-            "actions": Buffer(self.actions),
-            "memory": Buffer(self._memory, COLUMN),
-            "tick": Buffer(self._tick, INT),
-            "key": Buffer(self._key, SHARED),
-            "advance": Buffer(self._advance, SHARED),
-            "episode_length": Buffer(self._episode_length, LONG),
-            "chosen": Buffer(self.chosen, CHOSEN),
-        }
-        read = tracing.arrays
-        self._step_arrays: dict[str, torch.Tensor] = {}
-        for name, each in CONTACT_ARRAYS.items():
-            if name in read:
-                count = len(scene.contact_points)
-                tensor = zeros(*((worlds, count, 3) if each == 3 else (worlds, count)))
-                self._step_arrays[name] = tensor
-                buffers[name] = Buffer(tensor.view(worlds, -1))
-        self._controls: dict[str, torch.Tensor] = {}
-        default = torch.tensor(layout.default_q, dtype=torch.float32, device=self.device)
-        for part in parts:
-            if part.array not in self._controls:
-                size = {"ctrl": len(scene.actuators), "tau": scene.dof_count, "target_q": scene.coord_count}[part.array]
-                made = zeros(worlds, size) if part.array != "target_q" else default.repeat(worlds, 1)
-                self._controls[part.array] = made
-                buffers[part.array] = Buffer(made)
-        if "actuator_force" in read:
-            self._actuator_force = zeros(worlds, scene.dof_count)
-            buffers["actuator_force"] = Buffer(self._actuator_force)
-        tables = dict(layout.tables)
-        if isinstance(scene.ground, HeightField):
-            tables[GROUND] = scene.ground.heights
-        for name, numbers in tables.items():
-            flat = torch.tensor(np.asarray(numbers), dtype=torch.float32, device=self.device).reshape(-1)
-            buffers[name] = Buffer(flat, SHARED)
-        if layout.users:
-            self._user = zeros(worlds, layout.user_size)
-            buffers["user"] = Buffer(self._user)
-        self._frames = layout.frames
-        if layout.frames:
-            self._frame_pose = zeros(worlds, len(layout.frames), 7)
-            self._frame_velocity = zeros(worlds, len(layout.frames), 6)
-            buffers["frame_pose"] = Buffer(self._frame_pose.view(worlds, -1))
-            buffers["frame_velocity"] = Buffer(self._frame_velocity.view(worlds, -1))
-        if "frame_acceleration" in read:
-            self._step_arrays["qdd"] = zeros(worlds, scene.dof_count)
-            self._frame_acceleration = zeros(worlds, len(layout.frames), 6)
-            buffers["frame_acceleration"] = Buffer(self._frame_acceleration.view(worlds, -1))
-        self._actuator_state = None
-        delays = [int(each.delay) for each in scene.actuators]
-        delays += [event.longest for event in tracing.events if isinstance(event, Delays)]
-        if "ctrl" in self._controls and max(delays) > 0:
-            self._actuator_state = self.dyn.actuator_state(like=self.q, longest=max(delays))
-        self.values: dict[str, torch.Tensor] = {}
-        for name in layout.values:
-            own = torch.tensor(scene.values[name][0], dtype=torch.float32, device=self.device)
-            self.values[name] = own.expand(worlds, *own.shape).contiguous()
-            buffers[f"value_{name}"] = Buffer(self.values[name].view(worlds, -1))
-        self._places: dict[str, tuple[int, int]] = {}
-        at = 0
-        finals = [(f"final {name}", size) for name, size in self.num_obs.items()] if self.final else []
-        for name, size in (("reward", 1), ("done", 1), ("time_out", 1), *self.num_obs.items(), *finals):
-            self._places[name] = at, size
-            at += -(-worlds * size // ALIGNMENT) * ALIGNMENT
-        self._out = zeros(at)
-        for name, (start, size) in self._places.items():
-            part = self._out[start : start + worlds * size]
-            part = part.view(torch.int32) if name == "done" else part.view(worlds, size)
-            buffers[output_name(name)] = Buffer(part, INT if name == "done" else ROW)
-        self._buffers = buffers
-
+    # -- numbers that may be written --------------------------------------------------------------------------------
     def set_seed(self, seed: int) -> None:
         """Set the seed of all later random numbers, 64 bits; the steps of the worlds count from zero again."""
         self.seed = int(seed)
         words = [self.seed & 0xFFFFFFFF, self.seed >> 32 & 0xFFFFFFFF, self.first_world]
-        self._key.copy_(torch.tensor(np.array(words, dtype=np.uint32).view(np.int32)))
-        self._tick.zero_()
+        self._tensors["key"].copy_(torch.tensor(np.array(words, dtype=np.uint32).view(np.int32)))
+        self._tensors["tick"].zero_()
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
         """Steps since the start of the episode, int64 [world]; it may be written."""
-        return self._episode_length
+        return self._tensors["episode_length"]
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
-        self._episode_length.copy_(value)
+        self._tensors["episode_length"].copy_(value)
 
     @property
     def default_q(self) -> np.ndarray:
@@ -271,7 +191,7 @@ class Env(VecEnv):
         if name not in self._layout.memory:
             raise ValueError(f"Env.memory: unknown name {name!r}; expected one of {', '.join(self._layout.memory)}")
         start, size, _ = self._layout.memory[name]
-        return self._memory[start : start + size].t()
+        return self._tensors["memory"][start : start + size].t()
 
     @property
     def command(self) -> torch.Tensor:
@@ -281,7 +201,7 @@ class Env(VecEnv):
     # -- stepping --------------------------------------------------------------------------------------------------
     def get_observations(self) -> Any:
         """Return the observations of the present state, a TensorDict of [world, number] by group."""
-        return self._observations(self._out.clone())
+        return self._observations(self._store.out.clone())
 
     def reset(self, mask: torch.Tensor | None = None) -> tuple[Any, dict]:
         """Start worlds anew: those where ``mask`` [world] is True, or all; return observations and an empty dict."""
@@ -298,9 +218,9 @@ class Env(VecEnv):
         self._after_reset()
         for part in self._user_parts("observe"):
             part.run()
-        self._advance.fill_(0.0)
+        self._tensors["advance"].fill_(0.0)
         self._launch("observe")
-        self._advance.fill_(1.0)
+        self._tensors["advance"].fill_(1.0)
         return self.get_observations(), {}
 
     def step(self, actions: torch.Tensor) -> tuple[Any, torch.Tensor, torch.Tensor, dict]:
@@ -321,14 +241,14 @@ class Env(VecEnv):
         self.actions.copy_(actions)
         self.replay()
         self._steps += 1
-        out = self._out.clone()
-        extras: dict[str, Any] = {"time_outs": self._part(out, "time_out").view(-1)}
+        out = self._store.out.clone()
+        extras: dict[str, Any] = {"time_outs": self._store.part(out, "time_out").view(-1)}
         if self._steps % self.log_interval == 0:
             extras["log"] = self.log()
         if self.final:
             extras["final_observations"] = self._observations(out, "final ")
-        done = self._part(out, "done").view(-1).view(torch.int32)
-        return self._observations(out), self._part(out, "reward").view(-1), done, extras
+        done = self._store.part(out, "done").view(-1).view(torch.int32)
+        return self._observations(out), self._store.part(out, "reward").view(-1), done, extras
 
     def log(self) -> dict[str, torch.Tensor]:
         """Return means over the worlds' last finished episodes by name, and counts of what was not finite."""
@@ -343,16 +263,35 @@ class Env(VecEnv):
             values[f"/not finite/{cause}"] = self.memory(f"bad {cause}")[:, 0].sum()
         return values
 
+    def explain(self) -> str:
+        """Return what a step consists of, and what it takes in memory."""
+        lines = [
+            f"{self.num_envs} worlds on {self.warp_device}, {self.decimation} steps of {self.dt:g} s a step, "
+            f"{self.max_episode_length} steps an episode",
+            f"actions      {self.num_actions}: {', '.join(self.action_labels)}",
+            f"observations {', '.join(f'{name} {size}' for name, size in self.num_obs.items())}",
+            f"rewards      {', '.join(self.reward_names)}",
+            f"ends         {', '.join(self.termination_names)}, after {self.max_episode_length} steps",
+            f"variable     {', '.join(self.values) or 'nothing'}",
+            f"memory       {self.bytes_per_world} bytes a world",
+        ]
+        kernels = {name: kernel for name, kernel in self._kernels.items() if kernel is not None}
+        lines += [f"{name:12} {kernel.operations} operations a world" for name, kernel in kernels.items()]
+        lines += [f"in torch     {term.name}, before {place}" for term, (place, _) in self._layout.users.items()]
+        return "\n".join(lines)
+
+    @property
+    def bytes_per_world(self) -> int:
+        """Bytes of device memory that a world takes, without the tables that all worlds share."""
+        delays = 0 if self._actuator_state is None else sum(part.nbytes for part in self._actuator_state)
+        return self._store.bytes_per_world + (delays + self.dyn.recursions.workspace_bytes) // self.num_envs
+
     def close(self) -> None:
         """Do nothing: memory is freed with the object."""
 
     # -- inside ----------------------------------------------------------------------------------------------------
-    def _part(self, out: torch.Tensor, name: str) -> torch.Tensor:
-        start, size = self._places[name]
-        return out[start : start + self.num_envs * size].view(self.num_envs, size)
-
     def _observations(self, out: torch.Tensor, kind: str = "") -> Any:
-        groups = {name: self._part(out, kind + name) for name in self.num_obs}
+        groups = {name: self._store.part(out, kind + name) for name in self.num_obs}
         return groups if TensorDict is None else TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def _stream(self) -> Any:
@@ -377,8 +316,8 @@ class Env(VecEnv):
             self._physics()
             self._after_reset()
         torch.cuda.synchronize(self.device)
-        self._memory.zero_()
-        self._episode_length.zero_()
+        self._tensors["memory"].zero_()
+        self._tensors["episode_length"].zero_()
         self.set_seed(self.seed)
 
     def _parts(self) -> list[Part]:
@@ -407,8 +346,8 @@ class Env(VecEnv):
             out=(self.q, self.qd),
             **options,
         )
-        if "actuator_force" in self._buffers:
-            self.dyn.actuator_force(self.q, self.qd, controls["ctrl"], out=self._actuator_force)
+        if "actuator_force" in self._tensors:
+            self.dyn.actuator_force(self.q, self.qd, controls["ctrl"], out=self._tensors["actuator_force"])
 
     def _observe_final(self) -> None:
         self._after("final")
@@ -427,13 +366,13 @@ class Env(VecEnv):
 
     def _after(self, stage: str) -> None:
         """Compute what a stage reads of the new state."""
-        kernel = self._kernels[stage]
+        kernel, frames = self._kernels[stage], self._layout.frames
         if kernel is not None and kernel.reads_frames:
-            self.dyn.frame_poses(self.q, self._frames, out=self._frame_pose)
-            self.dyn.frame_velocities(self.q, self.qd, self._frames, out=self._frame_velocity)
+            self.dyn.frame_poses(self.q, frames, out=self._tensors["frame_pose"])
+            self.dyn.frame_velocities(self.q, self.qd, frames, out=self._tensors["frame_velocity"])
         if kernel is not None and kernel.reads_accelerations:
-            qdd = self._step_arrays["qdd"]
-            self.dyn.frame_accelerations(self.q, self.qd, qdd, self._frames, out=self._frame_acceleration)
+            qdd, out = self._step_arrays["qdd"], self._tensors["frame_acceleration"]
+            self.dyn.frame_accelerations(self.q, self.qd, qdd, frames, out=out)
 
     def _user_parts(self, stage: str) -> list[Part]:
         """Return the parts that fill in the numbers of the user's terms in torch that a stage reads."""
@@ -449,7 +388,7 @@ class Env(VecEnv):
             came = tuple(found.shape) if isinstance(found, torch.Tensor) else type(found).__name__
             expected = (self.num_envs,) if term.size == 1 else (self.num_envs, term.size)
             raise ValueError(f"Env: the term {term.name} returned {came}; expected a tensor {expected}")
-        self._user[:, start : start + term.size].copy_(found.reshape(self.num_envs, term.size))
+        self._tensors["user"][:, start : start + term.size].copy_(found.reshape(self.num_envs, term.size))
 
 
 def _changed_values(scene: Scene, events: Sequence[Any]) -> tuple[str, ...]:

@@ -11,7 +11,8 @@ import numpy as np
 from ..hinges.functions import where
 from ..scene.terrain import Tiles
 from .actions import actuator_labels
-from .world import World, cross, find, vector
+from .vectors import cross, find, vector
+from .world import World
 
 Range = tuple[float, float]
 

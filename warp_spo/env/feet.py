@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ..hinges.functions import Condition, where
 
 if TYPE_CHECKING:
-    from .world import Vector, World
+    from .vectors import Vector
+    from .world import World
 
 
 class Feet(NamedTuple):

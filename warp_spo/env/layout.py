@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..scene.scene import Scene
+from .vectors import find
 
 
 class Layout:
@@ -87,8 +88,6 @@ class Layout:
     def frame(self, name: Any) -> int:
         """Return the number of a frame among those that terms ask for."""
         if isinstance(name, str) and name not in self.scene.sites:
-            from .world import find
-
             (name,) = find("Env", "site or body", self.scene.body_labels, name)[:1]
         if name not in self.frames:
             self.frames.append(name)

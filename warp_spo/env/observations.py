@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..hinges.functions import clip, where
-from .world import Vector, World, rotate, rotate_back, vector
+from .vectors import Vector, rotate, rotate_back, vector
+from .world import World
 
 Term = Callable[[World], Any]
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from ..hinges.functions import where
 from ..scene.contacts import HeightField, Plane
-from .world import Vector, World, rotate, rotate_back, vector
+from .vectors import Vector, rotate, rotate_back, vector
+from .world import World
 
 SMALLEST = 1e-9  # of a denominator
 Pose = tuple[float, float, float, float, float, float, float]

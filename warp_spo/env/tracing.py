@@ -17,7 +17,8 @@ from .events import EncoderBias, Interval, Reset, Start, Values
 from .layout import Layout
 from .observations import Observation
 from .stage import Stage, output_name
-from .world import Vector, World, as_condition, as_value, vector
+from .vectors import Vector, as_condition, as_value, vector
+from .world import World
 
 LARGEST = 1e30  # numbers beyond it count as not finite
 CAUSES = ("action", "state", "reward")

@@ -1,0 +1,129 @@
+"""The arrays of an environment, as torch tensors and as kernels see them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..recursions.contact.ground import GROUND
+from ..scene.contacts import HeightField
+from .layout import Layout
+from .stage import CHOSEN, COLUMN, INT, LONG, ROW, SHARED, Buffer, output_name
+
+CONTACT_ARRAYS = {"contact_f": 3, "contact_gap": 1, "contact_slip": 1}  # entries of each point
+ALIGNMENT = 4  # scalars
+
+
+class Storage:
+    """The arrays of an environment.
+
+    Args:
+        layout: what the stages agreed on. worlds: number of worlds. device: torch device.
+        read: names of the arrays that stages read. results: entries of each result, in order.
+
+    Attributes:
+        tensors: by name. buffers: the same memory as kernels see it.
+        controls: tensors that actions set, by name. written: tensors that a step of the dynamics writes besides the
+            state, by name. values: the scene's values that events change [world, ...], by name.
+        out: all results, one after the other. places: (start, entries) of each result in it.
+    """
+
+    def __init__(
+        self, layout: Layout, worlds: int, device: torch.device, read: set[str], results: list[tuple[str, int]]
+    ):
+        self.worlds, self.device = worlds, device
+        self.tensors: dict[str, torch.Tensor] = {}
+        self.buffers: dict[str, Buffer] = {}
+        self.controls: dict[str, torch.Tensor] = {}
+        self.written: dict[str, torch.Tensor] = {}
+        self.values: dict[str, torch.Tensor] = {}
+        self._add_state(layout)
+        self._add_controls(layout, read)
+        self._add_measured(layout, read)
+        self._add_numbers(layout)
+        self._add_results(results)
+
+    def part(self, out: torch.Tensor, name: str) -> torch.Tensor:
+        """Return a result in a copy of ``out`` [world, entries]."""
+        start, size = self.places[name]
+        return out[start : start + self.worlds * size].view(self.worlds, size)
+
+    @property
+    def bytes_per_world(self) -> int:
+        """Bytes that a world takes, without what all worlds share."""
+        own = (buffer.tensor.nbytes for buffer in self.buffers.values() if buffer.way != SHARED)
+        return sum(own) // self.worlds
+
+    # -- inside ----------------------------------------------------------------------------------------------------
+    def _zeros(self, *shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        return torch.zeros(shape, dtype=dtype, device=self.device)
+
+    def _add(self, name: str, tensor: torch.Tensor, way: str = ROW) -> torch.Tensor:
+        self.tensors[name] = tensor
+        self.buffers[name] = Buffer(tensor.view(self.worlds, -1) if way == ROW else tensor, way)
+        return tensor
+
+    def _add_state(self, layout: Layout) -> None:
+        worlds, scene = self.worlds, layout.scene
+        default = torch.tensor(layout.default_q, dtype=torch.float32, device=self.device)
+        self._add("q", default.repeat(worlds, 1))
+        self._add("qd", self._zeros(worlds, scene.dof_count))
+        self._add("actions", self._zeros(worlds, layout.action_count))
+        self._add("memory", self._zeros(max(1, layout.memory_size), worlds), COLUMN)
+        self._add("tick", self._zeros(worlds, dtype=torch.int32), INT)
+        self._add("key", self._zeros(3, dtype=torch.int32), SHARED)
+        self._add("advance", self._zeros(1) + 1.0, SHARED)
+        self._add("episode_length", self._zeros(worlds, dtype=torch.int64), LONG)
+        self._add("chosen", self._zeros(worlds, dtype=torch.bool), CHOSEN)
+
+    def _add_controls(self, layout: Layout, read: set[str]) -> None:
+        scene = layout.scene
+        sizes = {"ctrl": len(scene.actuators), "tau": scene.dof_count, "target_q": scene.coord_count}
+        for name in sorted(layout.action_arrays):
+            self.controls[name] = self._add(name, self._zeros(self.worlds, sizes[name]))
+        if "target_q" in self.controls:
+            self.controls["target_q"].copy_(self.tensors["q"])
+        if "actuator_force" in read:
+            self._add("actuator_force", self._zeros(self.worlds, scene.dof_count))
+
+    def _add_measured(self, layout: Layout, read: set[str]) -> None:
+        """Add what the dynamics write: contacts, frames."""
+        worlds, points, frames = self.worlds, len(layout.scene.contact_points), len(layout.frames)
+        for name, each in CONTACT_ARRAYS.items():
+            if name in read:
+                shape = (worlds, points, 3) if each == 3 else (worlds, points)
+                self.written[name] = self._add(name, self._zeros(*shape))
+        if frames:
+            self._add("frame_pose", self._zeros(worlds, frames, 7))
+            self._add("frame_velocity", self._zeros(worlds, frames, 6))
+        if "frame_acceleration" in read:
+            self.written["qdd"] = self._zeros(worlds, layout.scene.dof_count)
+            self._add("frame_acceleration", self._zeros(worlds, frames, 6))
+
+    def _add_numbers(self, layout: Layout) -> None:
+        """Add tables that all worlds share, values that events change, and what users compute in torch."""
+        tables: dict[str, Any] = dict(layout.tables)
+        if isinstance(layout.scene.ground, HeightField):
+            tables[GROUND] = layout.scene.ground.heights
+        for name, numbers in tables.items():
+            flat = torch.tensor(np.asarray(numbers), dtype=torch.float32, device=self.device).reshape(-1)
+            self._add(name, flat, SHARED)
+        for name in layout.values:
+            own = torch.tensor(layout.scene.values[name][0], dtype=torch.float32, device=self.device)
+            self.values[name] = self._add(f"value_{name}", own.expand(self.worlds, *own.shape).contiguous())
+        if layout.users:
+            self._add("user", self._zeros(self.worlds, layout.user_size))
+
+    def _add_results(self, results: list[tuple[str, int]]) -> None:
+        self.places: dict[str, tuple[int, int]] = {}
+        at = 0
+        for name, size in results:
+            self.places[name] = at, size
+            at += -(-self.worlds * size // ALIGNMENT) * ALIGNMENT
+        self.out = self._zeros(at)
+        for name in self.places:
+            part = self.part(self.out, name)
+            whole = name == "done"
+            self._add(output_name(name), part.view(-1).view(torch.int32) if whole else part, INT if whole else ROW)
