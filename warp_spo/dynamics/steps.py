@@ -39,7 +39,7 @@ from .operation import (
 )
 from .samples import rotations
 
-MOST_FUSED = 1 << 20  # substeps in one kernel, to which their number is a number of the scene's dtype
+MOST_FUSED = 1 << 10  # substeps in one kernel, so that it ends soon; drivers stop kernels that keep a display waiting
 SEVERITY = [Status(word).severity for word in range(len(Status))]
 
 if TYPE_CHECKING:
