@@ -252,9 +252,10 @@ def step(
             their controls; a scene without delays leaves them alone.
         substeps: how many steps of ``dt`` to take, with the same forces, targets and controls: to the bit what as many
             calls compute, each on the state that the one before returned. The time that passes is substeps dt. One
-            launch takes all, and holds the state meanwhile; its number is no constant of the kernel. Other integrators,
-            loops="multipliers" and delays of actuators take launches for each substep, see :meth:`explain`. Delays
-            count substeps. With a tensor that requires grad, every substep is recorded.
+            launch takes up to 1024 of them, and holds the state meanwhile; their number is no constant of the kernel.
+            Other integrators, loops="multipliers", pairs of bodies that touch and delays of actuators take launches for
+            each substep, see :meth:`explain`. Delays count substeps. With a tensor that requires grad, every substep is
+            recorded.
         passes: of a scene with contacts; None: 3. One is stable and coarse; more than three gain little, a shorter dt
             gains more.
         contact_f: written with the force of the ground on each contact point [world, contact, 3] [N], inertial axes,
