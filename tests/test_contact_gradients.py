@@ -3,6 +3,7 @@
 import itertools
 
 import contact_gradients
+import geared
 import numpy as np
 import pytest
 import symbolic
@@ -41,6 +42,8 @@ def cases():
     scene = without_friction(everywhere(furnished(zoo.random_tree(6, 1)), 1))
     a = states(scene, WORLDS)
     yield "tree", scene, a | {"qd": np.random.default_rng(0).normal(size=a["qd"].shape)}
+    scene = everywhere(geared.geared_tree("full"), 1)
+    yield "geared", scene, {name: states(scene, WORLDS)[name] for name in ("q", "qd", "tau")}
     for name, field in FIELDS.items():
         scene = box(ground=field, friction=0.3)
         yield name, scene, above(scene, 1, 2 * WORLDS)
@@ -70,7 +73,7 @@ def test_gradients_of_go2_are_differences(ground):
 CASES = {name: (scene, contact_gradients.furnish(scene, a)) for name, scene, a in cases()}
 
 
-SLOW = ("stick", "slide", "tree")
+SLOW = ("stick", "slide", "tree", "geared")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in CASES])
@@ -177,8 +180,23 @@ def test_gradients_that_do_not_exist_have_names(device):
     force = torch.zeros((WORLDS, 1, 3), dtype=torch.float64, device=tensors["q"].device)
     with pytest.raises(ValueError, match="contact_f is given with substeps and an input requires grad"):
         loss(dyn, tensors, contact_f=force, substeps=2)
+    with pytest.raises(ValueError, match="contact_f requires grad and an input requires grad"):
+        loss(dyn, tensors, contact_f=torch.zeros_like(force, requires_grad=True))
     loss(dyn, tensors, contact_f=force)
     assert (force[:, 0, 2] > 0.0).any()
+
+
+def test_values_without_entries_have_gradients_without_entries(device):
+    """Friction of contacts that a scene does not have comes first among the values, and the next one is right."""
+    kind = dict(dtype=torch.float64, device=str(device).replace("cuda:0", "cuda"))
+    hinge = spo.Hinge("revolute", -1, 0, axis=(1, 0, 0), damping=1.0)
+    scene = spo.Scene([spo.Body(1.0, inertia=np.eye(3))], [hinge])
+    dyn = spo.Dynamics(scene, 2, device, "float64", variable=("contact_friction", "joint_damping"))
+    friction, damping = torch.zeros((2, 0), **kind, requires_grad=True), torch.ones((2, 1), **kind, requires_grad=True)
+    dyn.set(contact_friction=friction, joint_damping=damping)
+    dyn.step(torch.zeros((2, 1), **kind), torch.ones((2, 1), **kind), None, 0.1)[1].sum().backward()
+    assert friction.grad.shape == (2, 0)
+    assert torch.allclose(damping.grad, torch.full((2, 1), -0.1 / 1.1**2, **kind))  # qd' = qd / (1 + h d / I)
 
 
 # -- through wp.Tape and JAX -------------------------------------------------------------------------------------------

@@ -229,11 +229,12 @@ class Gradients:
         self, derivative: Derivative, names: tuple[str, ...], outs: Sequence[wp.array], given: dict[str, Any]
     ) -> None:
         """Launch a derivative; gradients by values of the scene follow from those by the values of its links."""
-        dyn, results = self.dyn, dict(zip(names, outs, strict=True))
-        values = {name: results.pop(name) for name in names if name in LINK_VALUES}
+        dyn, results = self.dyn, {name: out for name, out in zip(names, outs, strict=True) if out.size}
+        values = {name: results.pop(name) for name in names if name in LINK_VALUES and name in results}
         if dyn.scene.dof_count == 0:
             for array in outs:
                 launches.fill(array, 0)
+        if dyn.scene.dof_count == 0 or not (results or values):
             return
         if values:
             dyn.programs.links.with_tables()  # fills the table

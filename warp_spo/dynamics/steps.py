@@ -89,6 +89,8 @@ def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
     for name in ("status", *contacts.REPORTS):
         if arguments.get(name) is not None and arguments.get("substeps", 1) != 1:
             return f"{name} is given with substeps; expected one of the two"
+        if getattr(arguments.get(name), "requires_grad", False):
+            return f"{name} requires grad; expected an array to write, which has no gradient"
     return ""
 
 
