@@ -43,7 +43,8 @@ def cases():
     a = states(scene, WORLDS)
     yield "tree", scene, a | {"qd": np.random.default_rng(0).normal(size=a["qd"].shape)}
     scene = everywhere(geared.geared_tree("full"), 1)
-    yield "geared", scene, {name: states(scene, WORLDS)[name] for name in ("q", "qd", "tau")}
+    a = states(scene, WORLDS)
+    yield "geared", scene, {"q": a["q"], "qd": np.random.default_rng(0).normal(size=a["qd"].shape), "tau": a["tau"]}
     for name, field in FIELDS.items():
         scene = box(ground=field, friction=0.3)
         yield name, scene, above(scene, 1, 2 * WORLDS)
