@@ -100,7 +100,7 @@ def inside(points):
 @pytest.mark.parametrize("field", [False, True])
 def test_rays(field):
     """Distances beside the first of many points along each ray that is inside of something."""
-    slopes = rays.ring(8) * [1.0, 1.0, 0.0] + [0.0, 0.0, -0.15]
+    slopes = rays.ring(8) * [1.0, 1.0, 0.0] + [0.0, 0.0, -0.5]
     directions = np.concatenate([rays.ring(12), slopes / np.linalg.norm(slopes, axis=1)[:, None], [[0, 0, -1.0]]])
     scene, obstacles = walker_scene(), OBSTACLES
     if field:
@@ -140,4 +140,4 @@ def test_rays(field):
             hits = inside(points)
         expected = np.where(hits.any(axis=1), t[hits.argmax(axis=1)], 3.0)
         assert np.allclose(observed["a"][world].numpy(), expected, atol=0.02 if field else 2e-3)
-        assert (expected < 3.0).sum() > (2 if field else 5)
+        assert (expected < 3.0).sum() > 5
