@@ -13,10 +13,12 @@ STILL, GROUND, TOUCHING, MOVING = range(4)
 def mark_contacts(_=None) -> wp.Kernel:
     """Set the word of every world that has a contact which is left out to UNSUPPORTED, but for a more severe one.
 
-    Left out are those of a shape that moves, but for TOUCHING with GROUND. One thread for each slot of a list of
+    Left out are those of a shape that moves, but for TOUCHING with GROUND, and but for those that are open at the poses
+    ``body_q``, if they are given: lists hold what may touch soon. So are those of surfaces that move by themselves, as
+    conveyors do. One thread for each slot of a list of
     contacts. ``count`` holds the number of contacts, which may exceed that of the slots: then the worlds of some are
-    unknown, and every world is marked. So it is for a contact of shapes outside of all worlds, one of which moves.
-    Threads that write one word write the same one.
+    unknown, and all are marked if ``beyond`` is 1. So it is for a contact of shapes outside of all worlds, one of which
+    moves. Threads that write one word write the same one.
     """
     still, ground, touching, moving = (wp.constant(role) for role in (STILL, GROUND, TOUCHING, MOVING))
 
@@ -32,6 +34,15 @@ def mark_contacts(_=None) -> wp.Kernel:
         shape1: wp.array[wp.int32],
         shape_world: wp.array[wp.int32],
         shape_role: wp.array[wp.int32],
+        shape_body: wp.array[wp.int32],
+        body_q: wp.array[wp.transform],
+        point0: wp.array[wp.vec3],
+        point1: wp.array[wp.vec3],
+        margin0: wp.array[wp.float32],
+        margin1: wp.array[wp.float32],
+        normal: wp.array[wp.vec3],
+        surface_velocity: wp.array[wp.vec3],
+        beyond: int,
         severity: wp.array[wp.int32],
         status_out: wp.array[wp.int32],
     ):
@@ -46,7 +57,17 @@ def mark_contacts(_=None) -> wp.Kernel:
                 role = shape_role[shape]
             most, least = wp.max(most, role), wp.min(least, role)
         moves = most >= touching and not (most == touching and least == ground)
-        if count[0] > shape0.shape[0] or (moves and world < 0):
+        if most >= touching and surface_velocity:
+            moves = moves or wp.length_sq(surface_velocity[i]) > 0.0
+        if moves and body_q:
+            a, b, n = shape0[i], shape1[i], normal[i]
+            at, there = wp.vec3(point0[i]), wp.vec3(point1[i])
+            if a >= 0 and shape_body[a] >= 0:
+                at = wp.transform_point(body_q[shape_body[a]], at)
+            if b >= 0 and shape_body[b] >= 0:
+                there = wp.transform_point(body_q[shape_body[b]], there)
+            moves = wp.dot(n, there - at) <= margin0[i] + margin1[i]
+        if beyond * count[0] > shape0.shape[0] or (moves and world < 0):
             for every in range(status_out.shape[0]):
                 mark(every, severity, status_out)
         elif moves:

@@ -163,17 +163,19 @@ def block(builder):
     ([plane(), field(1)], r"world 1 (has|differs)"),
 ])  # fmt: skip
 def test_what_has_no_contacts_says_why(grounds, words):
-    """An error if contacts are asked for; "auto" leaves them out, and a step with contacts is an error, as before."""
+    """An error if contacts with the ground are asked for; "auto" then leaves them out, or takes those of a pipeline."""
     model = boxes(*grounds)
     with pytest.raises(UnsupportedError, match=words):
         SolverSPO(model, contacts="ground")
-    solver = SolverSPO(model)
-    assert not solver.dynamics.scene.contacts and "contact_f" not in solver.supported_observables
+    if len(grounds) > 1 or grounds[0] is None:
+        solver = SolverSPO(model)
+        assert bool(solver.dynamics.scene.contacts) == ("another normal" in words or "turned" in words)
+        assert ("contact_f" in solver.supported_observables) == bool(solver.dynamics.scene.contacts)
 
 
 def test_options_that_have_no_contacts():
     model = boxes(plane())
-    with pytest.raises(ValueError, match="SolverSPO: contacts is 'all'; expected one of auto, ground, none"):
+    with pytest.raises(ValueError, match="SolverSPO: contacts is 'all'; expected one of auto, ground, pipeline, none"):
         SolverSPO(model, contacts="all")
     with pytest.raises(UnsupportedError, match="contacts='ground' with integrator='rk4'"):
         SolverSPO(model, contacts="ground", integrator="rk4")

@@ -15,30 +15,45 @@ from ..scene.scene import Scene
 from ..scene.shapes import Choice, moving_bodies
 from ..status import Status
 from .model_contacts import CONTACT_MATERIALS, ModelContacts, model_contacts
+from .slots import Slots
 from .worlds import Worlds, to_numpy
 
-MODES = ("auto", "ground", "none")
+MODES = ("auto", "ground", "pipeline", "none")
 VALUES = {f"shape_material_{material}": name for name, material in CONTACT_MATERIALS.items()}
 """Values of a scene by the model's array that they come from."""
 
 
 def find_contacts(
     model: newton.Model, worlds: Worlds, scene: Scene, mode: str, points: int, lacking: str
-) -> ModelContacts | None:
-    """Return the contacts of a model's shapes with its ground, None if the solver leaves contacts out.
+) -> ModelContacts | Slots | None:
+    """Return the contacts of a model's shapes with its ground, or slots for a list of contacts, None for neither.
 
     Args:
-        mode: "none" leaves them out; "ground" computes them, or raises an error; "auto" computes them if that leaves no
-            shape out that stands still, and no kind of shape.
-        points: of a hull at most. lacking: why the solver's steps have no contacts, "" if they do.
+        mode: "none" for neither; "ground" or "pipeline" for one of them, or an error; "auto" for the ground if that
+            leaves no shape out that stands still, and no kind of shape; else for slots, if a shape stands still.
+        points: of a hull at most, or slots of a shape. lacking: why the solver's steps have no contacts, "" if they do.
 
     Raises:
-        UnsupportedError: with "ground", the model has no ground, or shapes that no contact represents.
+        UnsupportedError: with "ground", the model has no ground, or shapes that no contact represents; with "ground" or
+            "pipeline", the worlds have different shapes, or steps have no contacts.
     """
     if mode == "none" or (mode == "auto" and lacking):
         return None
     if lacking:
-        raise UnsupportedError("SolverSPO", f"contacts='ground' with {lacking}", "leave out one of them")
+        raise UnsupportedError("SolverSPO", f"contacts={mode!r} with {lacking}", "leave out one of them")
+    if mode == "pipeline":
+        return Slots(model, worlds, scene, points)
+    found = _on_ground(model, worlds, scene, mode, points)
+    if found is not None or mode == "ground" or not model.shape_count:
+        return found
+    try:
+        return Slots(model, worlds, scene, points)
+    except UnsupportedError:
+        return None
+
+
+def _on_ground(model: newton.Model, worlds: Worlds, scene: Scene, mode: str, points: int) -> ModelContacts | None:
+    """Return the contacts of a model's shapes with its ground, None if it has none that fit."""
     try:
         made = model_contacts(model, worlds, scene, Choice(True, None, points))
     except UnsupportedError:
@@ -103,13 +118,14 @@ class StatusWords:
 
     Attributes:
         kept: int32 [world].
+        severity: of each status, int32. role: of each shape, int32, see :mod:`warp_spo.kernels.contacts`.
     """
 
-    def __init__(self, model: newton.Model, worlds: Worlds, made: ModelContacts | None):
-        self._model, self._device, self._computes = model, model.device, made is not None
+    def __init__(self, model: newton.Model, worlds: Worlds, made: ModelContacts | Slots | None):
+        self._model, self._device, self._made = model, model.device, made
         severity = [Status(number).severity for number in range(len(Status))]
-        self._severity: Any = wp.array(np.array(severity), dtype=wp.int32, device=self._device)
-        self._role: Any = wp.array(_roles(model, worlds, made), dtype=wp.int32, device=self._device)
+        self.severity: Any = wp.array(np.array(severity), dtype=wp.int32, device=self._device)
+        self.role: Any = wp.array(_roles(model, worlds, made), dtype=wp.int32, device=self._device)
         self.kept: Any = wp.zeros(worlds.count, dtype=wp.int32, device=self._device)
         declare(kernels, None)
 
@@ -128,7 +144,7 @@ class StatusWords:
             )
         if contacts is None or not contacts.rigid_contact_max:
             return None  # soft contacts are those of particles, which the solver refuses
-        if self._device.is_capturing or self._computes:
+        if self._device.is_capturing or self._made is not None:
             return contacts
         count = int(contacts.rigid_contact_count.numpy()[0])
         if count:
@@ -140,15 +156,25 @@ class StatusWords:
             )
         return None
 
-    def mark(self, contacts: newton.Contacts, status: wp.array) -> None:
-        """Set the words of worlds with contacts that the solver leaves out to UNSUPPORTED, by launches alone."""
+    def mark(self, contacts: newton.Contacts, status: wp.array, body_q: wp.array | None) -> None:
+        """Set the words of worlds with contacts that the solver leaves out, by launches alone.
+
+        They are UNSUPPORTED, and SLOTS where there are more of them than slots. If the solver computes contacts, those
+        that are open at the poses ``body_q`` do not count.
+        """
+        slots = self._made if isinstance(self._made, Slots) else None
         inputs = [contacts.rigid_contact_count, contacts.rigid_contact_shape0, contacts.rigid_contact_shape1]
-        inputs += [self._model.shape_world, self._role, self._severity]
+        inputs += [self._model.shape_world, self.role, self._model.shape_body, None if self._made is None else body_q]
+        names = ("point0", "point1", "margin0", "margin1", "normal", "surface_velocity")
+        inputs += [getattr(contacts, f"rigid_contact_{name}") for name in names]
+        inputs += [0 if slots else 1, self.severity]
         wp.launch(kernels.mark_contacts(), contacts.rigid_contact_max, inputs, [status], device=self._device)
+        if slots is not None:
+            slots.mark(self.severity, status)
 
     def keep(self, status: wp.array) -> None:
         """Keep the words of a step where they are more severe than those of steps before."""
-        inputs = [status, self._severity]
+        inputs = [status, self.severity]
         wp.launch(kernels.keep_most_severe(), len(self.kept), inputs, [self.kept], device=self._device)
 
     def clear(self, mask: wp.array | None) -> None:
@@ -156,13 +182,17 @@ class StatusWords:
         wp.launch(kernels.clear(), len(self.kept), [mask], [self.kept], device=self._device)
 
 
-def _roles(model: newton.Model, worlds: Worlds, made: ModelContacts | None) -> np.ndarray:
+def _roles(model: newton.Model, worlds: Worlds, made: ModelContacts | Slots | None) -> np.ndarray:
     """Return what each shape is: STILL, GROUND, TOUCHING (its contacts with the ground are computed) or MOVING."""
     bodies = to_numpy(model, "shape_body") if model.shape_count else np.zeros(0, dtype=int)
     if made is None:
         return np.where(bodies >= 0, kernels.MOVING, kernels.STILL)
     moving = np.append(moving_bodies(made.scene), False)  # the last entry is the inertial frame's
     roles = np.where(moving[np.where(bodies >= 0, worlds.body_slot[bodies], -1)], kernels.MOVING, kernels.STILL)
+    if isinstance(made, Slots):
+        roles[roles == kernels.STILL] = kernels.GROUND
+        roles[made.shape_rows.ravel()] = kernels.TOUCHING
+        return roles
     roles[made.point_rows.ravel()] = kernels.TOUCHING
     roles[made.soil_rows] = kernels.GROUND
     return roles

@@ -31,6 +31,8 @@ from .loop_joints import check_loop_joints
 from .model import from_newton
 from .model_arrays import ModelArrays
 from .plugs import Plugs
+from .slots import VARIABLE as SLOT_VALUES
+from .slots import Slots
 from .tape import StepGradients, paused_tape, refuse_tape
 from .worlds import Worlds, to_numpy
 
@@ -89,8 +91,12 @@ class SolverSPO(Plugs, SolverBase):
     collision pipeline, and ``contacts`` of :meth:`step` may be None. The ground is the model's level plane or height
     field, which may differ between worlds. ``ke``, ``kd`` and ``mu`` of materials are stiffness, damping and friction
     of each point, the mean of the shape's and the ground's; ``margin`` lies around shapes; ``gap``, ``kf``, ``ka``,
-    ``restitution`` and friction against spinning and rolling are not used. Contacts between bodies are left out: pass
-    ``contacts`` to :meth:`step`, and :attr:`status` names worlds with some.
+    ``restitution`` and friction against spinning and rolling are not used. In a model with other shapes that stand
+    still, steps take the ``contacts`` that they are given, those of ``newton.CollisionPipeline``, in a fixed number of
+    slots for each shape: its contacts in the order of the list, so that results are repeatable if the pipeline is
+    deterministic; :attr:`status` is SLOTS in worlds with more. Contacts between bodies are left out: pass ``contacts``
+    to :meth:`step`, and :attr:`status` is UNSUPPORTED in worlds with some. Steps that take
+    a list of contacts have no gradients.
 
     Loop joints, which belong to no articulation, and mimics hold after every step to float32's rounding if ``loops`` is
     "embed" or "multipliers". A loop joint can only be a constraint. Its entries of joint_q and joint_qd keep their
@@ -116,11 +122,13 @@ class SolverSPO(Plugs, SolverBase):
             :meth:`warp_spo.Dynamics.step`. "cut" ignores them.
         integrator: As in :meth:`warp_spo.Dynamics.step`. "midpoint" and "rk4" have no observables.
         granularity: As in :class:`warp_spo.Dynamics`.
-        contacts: "auto": contacts of shapes with the ground, unless loops are closed, the integrator or the granularity
-            has none, the model has no level ground, or other shapes that stand still, or shapes that have no points;
-            contacts are then left out, and a step that is given some says so. "ground": an error instead that says why
-            there are none. "none": contacts are left out.
-        points: Points at most of a mesh, a cylinder, a cone or an ellipsoid, see :func:`warp_spo.load`.
+        contacts: "ground": the solver's own contacts of shapes with the ground. "pipeline": those that :meth:`step` is
+            given. "none": contacts are left out, and a step that is given some says so. "auto": "ground" if the model
+            has a level ground, no other shape that stands still, and only shapes that have points; else "pipeline" if
+            a shape stands still, else "none". Where loops are closed, and with integrators and granularities that have
+            no contacts, "auto" is "none", and the others are an error.
+        points: With "ground", points at most of a mesh, a cylinder, a cone or an ellipsoid, see :func:`warp_spo.load`;
+            with "pipeline", slots of each shape, of spheres and capsules four at most.
         passes: Of a step with contacts, see :meth:`warp_spo.Dynamics.step`.
         substeps: A step takes so many of dt / substeps, see there, and writes the bodies' states once. Joint forces of
             free joints on bodies keep the axes of the first. The observables are then status, contact_f (the mean) and
@@ -194,12 +202,19 @@ class SolverSPO(Plugs, SolverBase):
             )
         worlds = Worlds(model)
         touching = find_contacts(model, worlds, scene, *self._contact_options, self._lacks_contacts(scene))
+        if isinstance(touching, Slots) and self._substeps > 1:
+            if self._contact_options[0] == "pipeline":
+                raise UnsupportedError("SolverSPO", "contacts='pipeline' with substeps", "call step for each substep")
+            touching = None
         self._drives = Drives(model, scene)
         scene = self._drives.apply(scene if touching is None else touching.scene)
         variable = [name for name in self._asked if name not in GAINS or self._drives.any]
-        self._values = {name: VALUES.get(name, name) for name in variable if name not in VALUES or touching}
+        self._slots: Slots | None = touching if isinstance(touching, Slots) else None
+        own = None if isinstance(touching, Slots) else touching
+        self._values = {name: VALUES.get(name, name) for name in variable if name not in VALUES or own}
+        changing = tuple(self._values.values()) + (SLOT_VALUES if self._slots else ())
         W, device = scene.worlds, model.device
-        self.dynamics = Dynamics(scene, W, device, "float32", tuple(self._values.values()), **self._options)
+        self.dynamics = Dynamics(scene, W, device, "float32", changing, **self._options)
         if self._tunes:
             self.dynamics.tune("forward_dynamics" if self.integrator == "rk4" else "step")
         if self.dynamics.closed:
@@ -226,7 +241,7 @@ class SolverSPO(Plugs, SolverBase):
             "body_inertia": layout("body_inertia", bodies, 3, 3),
             "gravity": Layout(gravity[:, None], (3,), device, model.gravity),
         }
-        materials = None if touching is None else Materials(touching, device)
+        materials = None if own is None else Materials(own, device)
         self._arrays = ModelArrays(model, layouts, self._drives.factors, materials)
         # Steps with observables write status here if the caller does not ask for it: one kernel serves both.
         self._status = wp.zeros(W, dtype=wp.int32, device=device)
@@ -311,7 +326,8 @@ class SolverSPO(Plugs, SolverBase):
         """Advance ``state_in`` by ``dt`` [s] and write the result to ``state_out``, which may be the same state.
 
         ``control.joint_f`` of FREE and DISTANCE joints is a wrench in world axes at the child's CoM. The forces
-        ``state_in.body_f`` act on all bodies. A solver with contacts finds them itself, whatever ``contacts`` is. The
+        ``state_in.body_f`` act on all bodies. With contacts="ground" the solver finds contacts itself, whatever
+        ``contacts`` is; with "pipeline" it takes ``contacts``, at the poses ``state_in.body_q``. The
         device looks at ``contacts`` if they are given: :attr:`status` is ``Status.UNSUPPORTED`` in worlds that have
         some which the step leaves out, as is the observable. A solver without contacts reads their count back, except
         in a graph capture.
@@ -340,6 +356,9 @@ class SolverSPO(Plugs, SolverBase):
             if record is not None and self._substeps > 1:
                 what, way = f"substeps={self._substeps} on a wp.Tape", "record the steps of a solver with substeps=1"
                 raise UnsupportedError("SolverSPO.step", what, way)
+            if record is not None and self._slots is not None:
+                what, way = "contacts of a pipeline on a wp.Tape", "record the steps of a solver with contacts='ground'"
+                raise UnsupportedError("SolverSPO.step", what, way)
             self._step(*given, None if record is None else record.qdd, left_out)
             if record is not None:
                 record.append_to_tape()
@@ -363,6 +382,12 @@ class SolverSPO(Plugs, SolverBase):
             given["passes"] = self._passes
         if self._substeps > 1:
             dt, given["substeps"] = dt / self._substeps, self._substeps
+        if self._slots is not None:
+            if state_in.body_q is None:
+                raise ValueError(
+                    "SolverSPO.step: state_in.body_q is None; expected poses, at which the contacts of a pipeline are"
+                )
+            self._slots.fill(contacts, state_in.body_q, self._words.role, self.dynamics)
         if observables is None or not observables.kinds:
             q_out, qd_out = self._q.target(state_out.joint_q, "q_out"), self._qd.target(state_out.joint_qd, "qd_out")
             more: dict[str, Any] = (
@@ -370,7 +395,7 @@ class SolverSPO(Plugs, SolverBase):
             )  # the kernel of steps with observables
             self.dynamics.step(q, qd, dt=dt, integrator=self.integrator, out=(q_out, qd_out), **more, **given)
             if contacts is not None:
-                self._words.mark(contacts, self._words.kept)
+                self._words.mark(contacts, self._words.kept, state_in.body_q)
         else:  # observables are computed from the state before the step, which state_out must not overwrite yet
             q_out, qd_out = self._q.buffer("q_out"), self._qd.buffer("qd_out")
             qdd = self._qd.buffer("qdd") if qdd is None else qdd
@@ -381,7 +406,7 @@ class SolverSPO(Plugs, SolverBase):
                 given[name] = view(array.ptr, shape, wp.float32, self.device.alias)
             self.dynamics.step(q, qd, dt=dt, out=(q_out, qd_out), qdd=qdd, status=status, **given)
             if contacts is not None:
-                self._words.mark(contacts, status)
+                self._words.mark(contacts, status, state_in.body_q)
             self._words.keep(status)
             self._observe(observables, q, qd, qdd, body_f)
         if state_out is not state_in and not self._q.plain:  # entries of loop joints keep their values

@@ -15,7 +15,7 @@ from .storage import Stored, StoredPart
 
 CONTACT_VALUES = ("contact_friction", "contact_stiffness", "contact_damping")
 """Names of a scene's values that come from its contacts, one entry a point."""
-GROUND_VALUES = ("ground_origin", "ground_field")
+GROUND_VALUES = ("ground_origin", "ground_field", "contact_place")
 """Names of a scene's values that come from its ground."""
 SINK = 1.7e-3  # how far a robot sinks in [m] that rests on its points, where the stiffness is chosen
 RESTS = 4  # points at most on which a robot rests
@@ -98,6 +98,20 @@ class HeightField(StoredPart):
     def cells(self) -> tuple[float, float]:
         """Distances between neighbours along x and along y [m]."""
         return self.cell if isinstance(self.cell, tuple) else (self.cell, self.cell)
+
+
+AWAY = -1e3  # depth of a surface that is not there [m]; no step reaches so far
+PLACE = 7  # numbers of a point in the value contact_place
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Listed(StoredPart):
+    """Ground that the value ``contact_place`` describes, by point: from outside, such as by a list of contacts.
+
+    Seven numbers a point: its place in the body frame (3) [m], the ground's normal there (3), inertial axes, and how
+    far the point is below it [m]. A depth far below zero is no contact. The positions of the scene's contacts only say
+    about where the points are.
+    """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -304,7 +318,7 @@ def contact_points(contacts: Sequence[Contact]) -> tuple[ContactPoint, ...]:
 
 def check_contacts(contacts: Sequence[Contact], ground: Any, bodies: Sequence[Any]) -> None:
     """Raise an error if a contact is on a body that is not there, or the ground is of an unknown kind."""
-    if ground is not None and not isinstance(ground, Plane | HeightField):
+    if ground is not None and not isinstance(ground, Plane | HeightField | Listed):
         raise TypeError(f"Scene: ground is of type {type(ground).__name__}; expected spo.Plane or spo.HeightField")
     for number, contact in enumerate(contacts):
         name = f"contact {number} {contact.label!r}" if contact.label else f"contact {number}"
@@ -362,6 +376,7 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
     values |= {
         "ground_origin": np.zeros((1, 3 if scene.contact_count else 0)),
         "ground_field": np.zeros((1, 1 if sets else 0)),
+        "contact_place": np.tile([0.0] * 5 + [1.0, AWAY], (1, len(points) if isinstance(scene.ground, Listed) else 0)),
     }
     if not scene.contact_count:
         return values

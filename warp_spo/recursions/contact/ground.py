@@ -11,12 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...scene.contacts import HeightField, Plane
+from ...scene.contacts import AWAY, HeightField, Listed, Plane
 from ...trace.scalars import Graph, Value, floor, inverse_root, less, lookup, select
 from ...trace.spatial import IDENTITY, Vector, dot
 
 STEEP = 1.0  # slope beyond which a cell is a wall and a floor
-AWAY = -1e3  # depth of a surface that is not there [m]; no step reaches so far
 GROUND = "ground"
 """Name of the table of heights, row after row."""
 
@@ -28,12 +27,12 @@ class Surface(NamedTuple):
     depth: Value
 
 
-def directions(ground: Plane | HeightField) -> list[Vector]:
+def directions(ground: Plane | HeightField | Listed) -> list[Vector]:
     """Return the directions, inertial axes, along which a point's place must be known."""
     return [Vector(ground.normal)] if isinstance(ground, Plane) else list(IDENTITY)
 
 
-def lowest(ground: Plane | HeightField) -> int:
+def lowest(ground: Plane | HeightField | Listed) -> int:
     """Return which of the directions leads from the lowest point of a sphere to its centre."""
     return 0 if isinstance(ground, Plane) else 2
 

@@ -19,12 +19,12 @@ numbers, and only the rest stays: they know that link's motion, and their messag
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...scene.contacts import ContactPoint
+from ...scene.contacts import PLACE, ContactPoint, Listed
 from ...scene.scene import Scene
 from ...trace.evaluation import evaluate
 from ...trace.scalars import Value, is_constant, less, select
@@ -36,7 +36,7 @@ from ..motion import Motion, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
 from ..remembered import remembered
 from ..tracing import Trace
-from .ground import Place, directions, lowest, surfaces
+from .ground import Place, Surface, directions, lowest, surfaces
 
 if TYPE_CHECKING:
     from ..impedance import Impedance
@@ -100,7 +100,7 @@ def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value],
     ground, weights = scene.ground, inverse_weights(scene)
     assert ground is not None
     place_of_ground = ground_place(impedance)
-    seats = {number: frame_on_link(trace, point.body, point.position) for number, point in own_points(trace)}
+    seats = {number: frame_on_link(trace, body, place) for number, body, place in _places(trace, impedance)}
     needed = with_ancestors([link for link, _ in seats.values()])
     asked = directions(ground)
     count = len(asked)
@@ -133,7 +133,8 @@ def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value],
         h, moving = impedance.h, motions[carrier]
         bend = bends[carrier][1] + cross(bends[carrier][0], centre)
         bend = bend if moving is None else bend + moving.whirl @ centre
-        for normal, depth in surfaces(trace.graph, ground, at, place_of_ground):
+        touched = [_listed(impedance, number)] if isinstance(ground, Listed) else None
+        for normal, depth in touched or surfaces(trace.graph, ground, at, place_of_ground):
             inward = Vector(total(n * axis[c] for n, axis in zip(normal, toward, strict=True)) for c in range(3))
             faster = h * dot(inward, bend)
             below = depth - (0.5 * h) * faster
@@ -163,6 +164,20 @@ def own_points(trace: Trace) -> list[tuple[int, ContactPoint]]:
         each, first = len(shared) // len(sharers), sharers.index(piece)
         found += shared[first * each : (first + 1) * each]
     return found
+
+
+def _places(trace: Trace, impedance: Impedance) -> Iterator[tuple[int, int, tuple]]:
+    """Yield number, body and place in the body frame of the contact points that a trace works on."""
+    listed = isinstance(trace.links.scene.ground, Listed)
+    for number, point in own_points(trace):
+        given = tuple(impedance.value("contact_place", PLACE * number + i) for i in range(3)) if listed else ()
+        yield number, point.body, given or point.position
+
+
+def _listed(impedance: Impedance, number: int) -> Surface:
+    """Return the surface near a point that the scene's values describe."""
+    *normal, depth = (impedance.value("contact_place", PLACE * number + i) for i in range(3, PLACE))
+    return Surface(Vector(normal), depth)
 
 
 def ground_place(impedance: Impedance) -> Place:
