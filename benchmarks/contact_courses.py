@@ -104,7 +104,8 @@ def stairs() -> Iterator[Row]:
         qd = np.array([[0.7, 0.05, -0.3, 0.0, 0.0, 0.0]] * len(q))
         found = thrown(field, q, qd, dt, 1.0)
         yield name, "feet swing in: rise [J]", dt, float(np.diff(found["energy"], axis=0).max()), 0.1
-        corners = free_body([spo.Contact(0, box=(0.1, 0.1, 0.1), friction=0.1)], field)
+        stiff = spo.Contact(0, box=(0.1, 0.1, 0.1), friction=0.1, stiffness=1e5)  # 1.5 sqrt(m / k) in a wall of 2 cm
+        corners = free_body([stiff], field)
         q = np.array(
             [
                 [-0.3, y, 0.0995, 0.0, 0.0, np.sin(0.5 * a), np.cos(0.5 * a)]

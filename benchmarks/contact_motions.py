@@ -200,7 +200,7 @@ def g1_worlds(scene: spo.Scene) -> tuple[spo.Dynamics, np.ndarray, np.ndarray, n
         q[at[name], 2] += 0.3
     dyn = spo.Dynamics(scene, worlds, dtype="float64", variable=names)
     dyn.set(**values)
-    settled = record(dyn, q, np.zeros((worlds, 35)), 5e-3, 8.0, lambda t: stand)["q"][-1]
+    settled = record(dyn, q, np.zeros((worlds, 35)), 5e-3, 30.0, lambda t: stand)["q"][-1]
     q[at["one leg"]] = settled[at["one leg"]]  # a sole tilts slowly until it carries the robot
     return dyn, q, stand, values["body_mass"].sum(axis=1)
 
@@ -250,7 +250,8 @@ def g1_lines(field: spo.HeightField | None = None) -> Iterator[Line]:
             for figure, value in steady.items():
                 asked = ASKED.get((figure, motion, dt), ASKED.get((figure, motion)))
                 asked = 1.0 if figure == "effort p95" else asked
-                asked = 2.0 if field is not None and figure == "position" else asked
+                if field is not None and figure in ("position", "creep"):
+                    asked = 2.0 if figure == "position" else None
                 yield Line(name, f"{figure} [{UNITS[figure]}]", dt, float(value), asked)
 
 

@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_spo import Dynamics
 from warp_spo import __main__ as job
-from warp_spo.trials import memory, report, trial
+from warp_spo.trials import film, memory, report, trial
 from warp_spo.trials.operations import OPERATIONS, TOLERANCE
 
 # Two bars on the ground whose tips are pinned together: a loop.
@@ -177,6 +177,7 @@ def test_a_bad_file_is_one_line_about_the_file(tmp_path, capfd, name):
         ([__file__], "ends in '.py'"),
         (["cartpole", "--worlds", "0"], "worlds is 0; expected 1 to 2147483647"),
         (["cartpole", "--worlds", "99999999999"], "worlds is 99999999999; expected 1 to 2147483647"),
+        (["panda", "--ground"], "--ground with 'panda'; expected one of ant, go2, g1"),
         (["cartpole", "--device", "abacus"], "--device is 'abacus'; expected one of this machine's devices: cpu"),
     ],
 )
@@ -184,6 +185,17 @@ def test_mistakes_are_one_line(arguments, expected, capsys):
     assert job.main(arguments) == 2
     out, err = capsys.readouterr()
     assert out == "" and err.count("\n") == 1 and expected in err
+
+
+def test_a_robot_falls_onto_the_ground(tmp_path, capsys, device):
+    """In the end four feet carry an ant; the strip has a picture for each row of the table."""
+    pytest.importorskip("mujoco")
+    assert job.main(["ant", "--ground", "--device", str(device), "--report", str(tmp_path)]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith(" ")]
+    times, heights, loads, points = (np.array([float(row[i]) for row in rows]) for i in range(4))
+    assert len(rows) == film.FRAMES and (np.diff(times) > 0.0).all() and heights[0] > heights[-1] + 0.25
+    assert loads[0] == 0.0 and abs(loads[-1] - 1.0) <= 0.02 and points[-1] == 4
+    assert (tmp_path / "ground.svg").read_text().startswith("<?xml")
 
 
 def test_a_mistaken_option_is_one_line(capsys):

@@ -4,6 +4,9 @@ ROBOT is a URDF, MJCF or USD file, or a robot that comes with Newton: humanoid (
 The results of some worlds are compared with the dense float64 reference. The exit code is 0 if every error is within
 its tolerance, 1 if an error is not, and 2 if the command line is wrong or the file cannot be read.
 
+With --ground, ROBOT is one of ant, go2 and g1: it falls onto the ground, and the command prints what happens and, with
+--report, draws a film strip; the comparison is left out.
+
 With --loops embed or multipliers, operations are compared that the dense reference of the open tree describes: with
 embed only body_poses, body_velocities, integrate and passive_force, because the closed mechanism has no dense reference
 here; with multipliers most of them. The output and the report name the others.
@@ -28,7 +31,7 @@ from .dynamics.dynamics import MOST_WORLDS, Dynamics
 from .dynamics.dynamics import OPERATIONS as DECLARED
 from .dynamics.operation import AS_WRITTEN
 from .scene.scene import Scene
-from .trials import drawing, report
+from .trials import drawing, film, report
 from .trials.memory import check_memory
 from .trials.operations import OPERATIONS, TOLERANCE, Inputs, Operation
 from .trials.trial import SAMPLE, Subject, Trial
@@ -36,7 +39,8 @@ from .trials.trial import SAMPLE, Subject, Trial
 WORLDS = {False: 1024, True: 4096}  # on a CPU, on a GPU
 WARM_UP, BUDGET = 0.05, 0.3  # [s] for each operation, so that all together take less than a minute
 SETS = {False: 1, True: 4}  # sets of inputs on a CPU, on a GPU; one graph evaluates them in turn
-REPORT = "report.html"
+REPORT, STRIP = "report.html", "ground.svg"
+FALLING = ("ant", "go2", "g1")  # robots of --ground
 CLOSED = ("forward_dynamics", "step")  # by either way they obey the loops, which the open tree does not
 
 
@@ -64,6 +68,13 @@ def parser() -> Parser:
         help="what to do with loop joints and couplings: refuse them, leave them open, close them by embedding or by "
         "multipliers; default: cut",
     )
+    p.add_argument(
+        "--ground",
+        nargs="?",
+        const="flat",
+        choices=film.GROUNDS,
+        help="let the robot fall onto flat ground, or rough ground or stairs, and print what happens",
+    )
     p.add_argument("--report", type=Path, metavar="DIR", help=f"folder for {REPORT}, with the table and a picture")
     return p
 
@@ -80,6 +91,8 @@ def main(argv: list[str] | None = None) -> int:
         pyplot: Any = drawing.load_pyplot() if options.report else None
         if options.report:
             _make_folder(options.report)
+        if options.ground:
+            return run_on_ground(options, pyplot)
         scene = load(options.robot)
         device = find_device(options.device)
         worlds = options.worlds if options.worlds is not None else WORLDS[device.is_cuda]
@@ -127,6 +140,32 @@ def main(argv: list[str] | None = None) -> int:
         expected = f"expected at most {TOLERANCE[row['dtype']]:.0e}"
         print(f"FAILED: {row['op']} in {row['dtype']} {what}; {expected}", file=sys.stderr)
     return 1 if failed else 0
+
+
+def run_on_ground(options: argparse.Namespace, pyplot: Any) -> int:
+    """Let a robot fall onto the ground, print a table, draw the film strip, and return the exit code.
+
+    Raises:
+        ValueError: The robot is not one that can stand; the message names those.
+    """
+    from .env import robots
+
+    if options.robot not in FALLING:
+        raise ValueError(f"--ground with {options.robot!r}; expected one of {', '.join(FALLING)}")
+    device = find_device(options.device)
+    robot = robots.load(options.robot, film.make_ground(options.ground))
+    title = f"{options.robot} falls {film.FALL} m onto {options.ground} ground, in steps of {1e3 * film.DT:g} ms"
+    frames = film.film(robot, device)
+    print(title, *film.table(frames), sep="\n")
+    if options.report:
+        figure, path = film.strip(pyplot, title, robot, frames), options.report / STRIP
+        path.write_text(drawing.svg(figure))
+        pyplot.close(figure)
+        print(f"wrote {path}")
+    lost = not all(np.isfinite(frame.poses).all() for frame in frames)
+    if lost:
+        print(f"FAILED: {options.robot} gives a state that is not finite", file=sys.stderr)
+    return int(lost)
 
 
 def refuse(message: str) -> int:
