@@ -176,6 +176,49 @@ def test_torch_differentiates_the_step(device):
         assert error <= 1e-3, (name, error)  # 1e-4 measured: a depth of 0.5 mm is rounded to 6e-5 of itself
 
 
+def test_worlds_are_apart(device):
+    """NaN stays in its world, and the other worlds' gradients have the bits that they have among other worlds."""
+    found = []
+    for order in ([0, 1, 2, 3], [3, 1, 0, 2]):
+        dyn, tensors = leg("float64", device)
+        mixed = {name: tensor.detach()[order].clone().requires_grad_() for name, tensor in tensors.items()}
+        with torch.no_grad():
+            mixed["q"][order.index(1), 1] = torch.nan
+        loss(dyn, mixed).sum().backward()
+        back = [order.index(world) for world in range(WORLDS)]
+        found.append({name: tensor.grad[back] for name, tensor in mixed.items()})
+    for name, first in found[0].items():
+        assert torch.isfinite(first[[0, 2, 3]]).all() and torch.equal(first[[0, 2, 3]], found[1][name][[0, 2, 3]]), name
+    assert torch.isnan(found[0]["q"][1]).any() and torch.isnan(found[0]["qd"][1]).any()
+
+
+@pytest.mark.slow
+def test_a_rollout_is_differentiated():
+    """Torques of the hopping leg, through 100 steps in which its foot lands and lifts off."""
+    dyn, rng = spo.Dynamics(hop.scene(), WORLDS, "cpu", "float64"), np.random.default_rng(0)
+    q0, qd0 = hop.start(dyn)
+    torques = torch.tensor(12.0 * rng.normal(size=(4, WORLDS, 2)), requires_grad=True)
+    force, touched = torch.zeros((WORLDS, 1, 3), dtype=torch.float64), []
+
+    def end(torques):
+        q, qd = q0, qd0
+        for at in range(hop.STEPS):
+            tau = torch.nn.functional.pad(torques[4 * at // hop.STEPS], (1, 0))
+            q, qd = dyn.step(q, qd, tau, hop.DT, target_q=q0, contact_f=force)
+            touched.append(force[:, 0, 2] > 0.0)
+        return (q * q).sum(1) + 0.1 * (qd * qd).sum(1)
+
+    end(torques).sum().backward()
+    closed = torch.stack(touched)
+    assert (closed[1:] != closed[:-1]).any(0).sum() >= 2
+    with torch.no_grad():
+        for knot, dof in np.ndindex(4, 2):
+            by = torch.zeros_like(torques)
+            by[knot, :, dof] = 1e-6
+            wanted, found = (end(torques + by) - end(torques - by)) / 2e-6, torques.grad[knot, :, dof]
+            assert (abs(found - wanted) <= 1e-5 * abs(torques.grad).amax((0, 2))).all()  # 1e-7 measured
+
+
 def test_gradients_that_do_not_exist_have_names(device):
     dyn, tensors = leg("float64", device)
     force = torch.zeros((WORLDS, 1, 3), dtype=torch.float64, device=tensors["q"].device)
@@ -185,6 +228,12 @@ def test_gradients_that_do_not_exist_have_names(device):
         loss(dyn, tensors, contact_f=torch.zeros_like(force, requires_grad=True))
     loss(dyn, tensors, contact_f=force)
     assert (force[:, 0, 2] > 0.0).any()
+    balls = [spo.Contact(body, sphere=((0, 0, 0), 0.1), other=other) for body, other in ((0, None), (1, 0))]
+    bodies = [spo.Body(1.0, inertia=0.01 * np.eye(3)) for _ in range(2)]
+    pair = spo.Scene(bodies, [spo.Hinge("free", -1, body) for body in range(2)], contacts=balls, ground=spo.Plane())
+    q = torch.tensor(pair.neutral_q[None], dtype=torch.float32, requires_grad=True)
+    with pytest.raises(spo.UnsupportedError, match="contacts between bodies"):
+        spo.Dynamics(pair, 1, "cpu").step(q, torch.zeros((1, 12)), None, H)
 
 
 def test_values_without_entries_have_gradients_without_entries(device):
