@@ -27,6 +27,7 @@ TERMS = {
     "landing force": rewards.landing_force(FEET),
     "touching": rewards.touching(FEET),
     "joint limits": rewards.joint_limits(0.5),
+    "last air time": lambda w: w.feet(FEET).last_air_time.sum(),
 }
 LOW, HIGH = -1.4, 1.0  # limits of all joints
 
@@ -95,6 +96,7 @@ def test_ready_rewards():
             "landing force": (lands * size).sum(1),
             "touching": touches.sum(1),
             "joint limits": np.maximum(abs(q[:, 7:] - 0.5 * (LOW + HIGH)) - 0.25 * (HIGH - LOW), 0.0).sum(1),
+            "last air time": last.sum(1),
         }
         for i, (name, values) in enumerate(expected.items()):
             found = observed["a"][:, i].double().numpy()
