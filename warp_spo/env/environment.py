@@ -227,12 +227,14 @@ class Env(VecEnv):
         """Take one step in all worlds.
 
         Args:
-            actions: float32 [world, action]. A world whose actions are not finite starts anew, and is counted.
+            actions: [world, action], a tensor or an array, on any device. A world whose actions are not finite starts
+                anew, and is counted.
 
         Returns:
             Observations by group; rewards [world]; whether the episode ended, int [world]; a dictionary with
             ``time_outs`` [world], 1 where it ended for its length alone, and now and then ``log``.
         """
+        actions = torch.as_tensor(actions)
         if tuple(actions.shape) != (self.num_envs, self.num_actions):
             raise ValueError(
                 f"Env.step: actions has shape {tuple(actions.shape)}; expected ({self.num_envs}, {self.num_actions}) "
