@@ -127,9 +127,10 @@ def test_what_is_not_finite_stays_in_its_world():
 
 
 def test_reset_of_chosen_worlds():
-    env = walker_env(4)
+    env, twin = walker_env(4), walker_env(4)
     for _ in range(3):
         env.step(torch.ones(4, 8))
+        twin.step(torch.ones(4, 8))
     before, mask = env.q.clone(), torch.tensor([True, False, True, False])
     env.reset(mask)
     assert env.q[~mask].equal(before[~mask]) and not (env.q[mask] == before[mask]).all()
@@ -138,6 +139,10 @@ def test_reset_of_chosen_worlds():
     again = env.q.clone()
     env.reset(mask)
     assert not (env.q[mask] == again[mask]).all()  # new random numbers
+    for _ in range(60):  # pushes and commands of the other worlds come as they would have come
+        env.step(torch.zeros(4, 8))
+        twin.step(torch.zeros(4, 8))
+    assert env.q[~mask].equal(twin.q[~mask]) and env.command[~mask].equal(twin.command[~mask])
 
 
 @pytest.mark.parametrize(

@@ -82,8 +82,8 @@ class Stage:
         graph: of the trace.
         stores: what the kernel writes, in order.
         draws: how many random numbers it uses.
-        ticks: it ends with another step counted, so that all later random numbers are new ones. In the stage that
-            resets on request the chosen worlds alone count one.
+        ticks: C++ of the condition under which it ends with another step counted, so that all later random numbers
+            are new ones; "" if it never does.
     """
 
     def __init__(self, name: str, stream: int):
@@ -92,7 +92,7 @@ class Stage:
         self.graph.step = name
         self.stores: list[Store] = []
         self.draws = 0
-        self.ticks: bool | str = False
+        self.ticks = ""
 
     def draw(self) -> Scalar:
         """Return a new random number, uniform in [0, 1)."""
@@ -167,9 +167,8 @@ class Stage:
         random = philox.draws(self.draws, (words[0], words[1]), self.stream, world, step, wp.float32)
         touched |= {"key"} if self.draws else set()
         touched |= {"tick"} if self.draws or self.ticks else set()
-        count = (
-            f"((unsigned int*)tick.data)[world] += {'1u' if self.ticks is True else self.ticks};" if self.ticks else ""
-        )
+        touched |= {name for name in ("advance", "chosen") if name in self.ticks}
+        count = f"((unsigned int*)tick.data)[world] += ({self.ticks}) ? 1u : 0u;" if self.ticks else ""
         names = sorted(touched)
         if chunked:
             head = [row_chunks.define(BLOCK), "const bool mine = thread < worlds;"]

@@ -23,6 +23,7 @@ from .world import World
 LARGEST = 1e30  # numbers beyond it count as not finite
 CAUSES = ("action", "state", "reward")
 NOT_FINITE = "not finite"
+CHOSEN_WORLD = "chosen.data[world]"  # C++: the world has just started anew
 
 
 def is_finite(values: Any) -> Condition:
@@ -223,7 +224,7 @@ class Tracing:
     def _first(self) -> None:
         """Draw what is drawn once: values of the scene, and memory."""
         stage = self.stages["start"]
-        stage.ticks = True
+        stage.ticks = "true"
         w = World(self.layout, stage)
         for event in self.events:
             if isinstance(event, Values):
@@ -240,7 +241,7 @@ class Tracing:
     # -- observe ---------------------------------------------------------------------------------------------------
     def _observe(self) -> None:
         stage = self.stages["observe"]
-        stage.ticks = True
+        stage.ticks = f"advance.data[0] > 0 || {CHOSEN_WORLD}"
         chosen = Condition(stage.graph.input("chosen", 0))
         w = self.observed = World(self.layout, stage, fresh=chosen)
         for group, terms in self.groups.items():
@@ -286,7 +287,7 @@ class Tracing:
     def _reset(self) -> None:
         stage = self.stages["reset"]
         chosen = Condition(stage.graph.input("chosen", 0))
-        stage.ticks = "(chosen.data[world] ? 1u : 0u)"
+        stage.ticks = CHOSEN_WORLD
         w = World(self.layout, stage)
         self._start(w, chosen, intervals=False)
         stage.store("episode_length", 0, as_value(where(chosen, 0.0, w.read("episode_length", 1)[0])))
