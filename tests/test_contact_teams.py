@@ -9,6 +9,7 @@ import warp_machine
 import zoo
 from contact_cases import everywhere, quadruped, touching
 from step_scenes import furnished, states
+from test_contact_step import steps
 from test_step_teams import driven
 
 import warp_spo as spo
@@ -27,8 +28,8 @@ SIZES = {"contact_f": (3,), "contact_gap": (), "contact_slip": ()}
 def case(name):
     """A scene and states. The quadruped's legs share the points of its trunk; others have points anywhere, and in the
     last one tendons from limb to limb."""
-    if name == "quadruped":
-        scene = quadruped()
+    if name in ("quadruped", "stairs"):
+        scene = quadruped(ground=steps() if name == "stairs" else None)
         return scene, dict(zip(("q", "qd", "tau"), touching(scene, 3, WORLDS), strict=True))
     if name == "driven":
         scene = everywhere(driven(), 0)
@@ -45,7 +46,7 @@ def known(name, staged=False):
         return text_of(patch, name, staged)
 
 
-def text_of(monkeypatch, name, staged=False, **numbers):
+def text_of(monkeypatch, name, staged=False, reports=REPORTS, status=True, **numbers):
     """The CUDA text of a step with all reports, a state, and what the step by a whole tree gives."""
     for limit in ("FEW_WORLDS", "LONG_ROWS") if staged else ():
         monkeypatch.setattr(plan, limit, 0)
@@ -56,9 +57,10 @@ def text_of(monkeypatch, name, staged=False, **numbers):
     dyn = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="segment")
     rate, count = (WORLDS, scene.dof_count), len(scene.contact_points)
     shapes = {key: array.shape for key, array in a.items()} | {"dt": (), "passes": (), **dict.fromkeys(numbers, ())}
-    more = {"q_out": (WORLDS, scene.coord_count), "qdd_out": rate, "status": (WORLDS,)}
-    more |= {key: (WORLDS, count, *size) for key, size in SIZES.items()} | {"contact_excess": (WORLDS, 3)}
-    options = dict(reports=REPORTS, qdd=True, status=True)
+    more = {"q_out": (WORLDS, scene.coord_count), "qdd_out": rate} | ({"status": (WORLDS,)} if status else {})
+    sizes = {key: (WORLDS, count, *size) for key, size in SIZES.items()} | {"contact_excess": (WORLDS, 3)}
+    more |= {key: sizes[key] for key in reports}
+    options = dict(reports=reports, qdd=True) | ({"status": True} if status else {})
     program = dyn.programs.find(CONTACT_STEP, shapes, rate, more, **options)
     assert program.warps > 1 and texts[-1].frame.staged == staged
     return texts[-1], a | {"dt": H, "passes": 3.0, **numbers}, symbolic.contact_step(scene, a, H)
@@ -77,6 +79,7 @@ def assert_alike(got, more, wanted):
         ("fork", False),
         pytest.param("tree", True, marks=pytest.mark.slow),
         pytest.param("driven", True, marks=pytest.mark.slow),
+        pytest.param("stairs", False, marks=pytest.mark.slow),
     ],
 )
 def test_warps_meet_at_barriers_alone(name, staged):
@@ -90,6 +93,13 @@ def assert_right(case):
     for backwards in (False, True):
         for over in (None, {"q_out": "q", "out": "qd"}):
             assert_alike(warp_machine.run(text, a, backwards, more := {}, over), more, wanted)
+
+
+@pytest.mark.parametrize(("reports", "status"), [((), True), (("contact_excess",), False), ((), False)])
+def test_what_is_not_asked_for(reports, status, monkeypatch):
+    text, a, wanted = text_of(monkeypatch, "quadruped", True, reports, status)
+    assert_alike(warp_machine.run(text, a, further=(more := {})), more, wanted)
+    assert set(more) == {"q_out", "qdd_out", *reports, *(["status"] if status else [])}
 
 
 def test_substeps_meet_at_barriers_alone(monkeypatch):
@@ -153,7 +163,10 @@ BUGS = {
 }
 
 
-@pytest.mark.parametrize("bug", BUGS)
+QUICK = ("a point that nobody takes", "what a message leaves out", "no barrier after the passes")
+
+
+@pytest.mark.parametrize("bug", [pytest.param(bug, marks=[pytest.mark.slow] * (bug not in QUICK)) for bug in BUGS])
 def test_a_planted_bug_is_seen(bug, monkeypatch):
     symbolic.plant(monkeypatch, *BUGS[bug])
     with pytest.raises(AssertionError):

@@ -96,7 +96,7 @@ def run(text, arrays, backwards=False, further=None, over=None):
     fields = {name: arrays[name] for name in frame.fields}
     space = FUNCTIONS | rows | fields | {"result_row": result, "sent": sent}
     space |= {f"{name}_row": [arrays[name]] for name in frame.numbers}
-    space |= {name: text.tables.get(name) for name in ("table", "shifts")} | {"worlds": np.arange(worlds)}
+    space |= {name: text.tables.get(name) for name in ("table", "shifts", "ground")} | {"worlds": np.arange(worlds)}
     exec(translated(text.cuda), space)
     stretch, going, ayes = 0, {warp: space["work"](warp) for warp in range(frame.warps)}, None
     while going:
@@ -144,6 +144,7 @@ FUNCTIONS = {
     "FUSED_float": lambda a, b, c: a * b + c, "FUSED_double": lambda a, b, c: a * b + c,
     "log": np.log, "sincos": _sincos, "sincos_any": _sincos, "mine": True, "again": False,
     "arctangent": np.arctan2, "sin": np.sin, "cos": np.cos, "inverse_root": lambda x: 1.0 / np.sqrt(x),
+    "floor": np.floor, "int64": np.int64,
 }  # fmt: skip
 
 
@@ -211,6 +212,7 @@ def _statement(line):
     line = re.sub(r"\bsubstep \? (.*) : 0\)", r"\1 if substep else 0)", line)
     line = re.sub(r"\((?:float|double)\)", "", line).replace("on::", "")
     line = re.sub(r"(?<![\w.])(\d+\.?\d*(?:e[-+]?\d+)?)f\b", r"\1", line)
+    line = re.sub(r"ground\.data\[\(int\)(\w+) \+ (\d+)\]", r"ground[int64(\1) + \2]", line).replace("::", "")
     line = re.sub(r"FIELD\((\w+), ([^()]*)\)", r"\1[\2]", line)
     line = re.sub(r"__ldg\(shifts\.data \+ (.*?)\)", r"int(shifts[\1])", line)
     line = re.sub(r"__ldg\((\w+ \+ \d+)\)", r"table[\1]", line)
