@@ -4,6 +4,8 @@ import numpy as np
 from contact_cases import solid
 
 import warp_spo as spo
+from warp_spo.reference_pairs import faces
+from warp_spo.reference_rotations import homogeneous
 
 STRAIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -72,3 +74,20 @@ def mixed_states(seed, worlds):
         turns = np.concatenate([0.05 * rng.normal(size=(worlds, 3)), np.ones((worlds, 1))], axis=1)
         q[:, first + 3 : first + 7] = turns / np.linalg.norm(turns, axis=1)[:, None]
     return np.float64(np.float32(q)), np.float64(np.float32(qd))
+
+
+def thrown(chosen):
+    """A cube that meets another one in the air: the scene, and ``chosen`` ones of 1500 random states."""
+    rng, worlds, half = np.random.default_rng(0), 1500, 0.1
+    law = dict(stiffness=1e6, damping=300.0, friction=0.3)
+    scene = free([cube(5.0, half), cube(3.0, half)], [box(1, half, other=box(0, half), **law)])
+    q, qd = np.zeros((worlds, 14)), np.zeros((worlds, 12))
+    turns = np.concatenate([0.1 * rng.normal(size=(worlds, 3)), np.ones((worlds, 1))], axis=1)
+    q[:, 6], q[:, 10:] = 1.0, turns / np.linalg.norm(turns, axis=1)[:, None]
+    q[:, 7:9], q[:, 9] = 0.03 * rng.normal(size=(worlds, 2)), 0.2
+    for row in q:
+        solids = [(1, homogeneous(row[7 * i : 7 * i + 7]), np.full(3, half), 0.0) for i in (1, 0)]
+        q_above = max((depth for _, _, depth in faces(*solids)), default=0.0)
+        row[9] += q_above - rng.uniform(-1e-3, 4e-3)
+    qd[:, 6:] = rng.normal(size=(worlds, 6)) * np.repeat([1.0, 6.0], 3)
+    return scene, q[chosen], qd[chosen]

@@ -16,6 +16,7 @@ from warp_spo.examples import (
     floating_arm,
     fourbar,
     geared_arm,
+    grasp,
     gripper,
     harmonic_drive,
     hop,
@@ -187,3 +188,11 @@ def test_the_list_names_every_example(capsys):
         path.stem for path in FOLDER.glob("[a-z]*.py") if path.stem not in ("parts", "options")
     }
     assert all(len(line.split()) > 3 for line in lines)
+
+
+@pytest.mark.slow
+def test_a_panda_lifts_a_cube(tmp_path, device, capsys):
+    grasp.main(device=str(device), picture=tmp_path / "grasp.svg")
+    said = capsys.readouterr().out
+    assert said.count("slips by") == 2 and said.count("stays on the ground") == 1
+    assert_is_whole((tmp_path / "grasp.svg").read_text())

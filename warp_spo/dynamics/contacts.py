@@ -9,8 +9,8 @@ import warp as wp
 from ..arrays import Call
 from ..errors import UnsupportedError, as_integer
 from ..kernels import combination
-from ..recursions.contact.pairs import default_passes
-from ..recursions.contact.step import REPORTS
+from ..recursions.contact import step as ground
+from ..recursions.contact.pairs import RESIDUAL, default_passes
 from ..scene.contacts import HeightField, contact_figures
 from . import integrators
 from .operation import Argument
@@ -18,12 +18,11 @@ from .operation import Argument
 if TYPE_CHECKING:
     from .dynamics import Dynamics
 
+REPORTS = (*ground.REPORTS, RESIDUAL)
+AXES = ("world, contact, 3", "world, contact", "world, contact", "world, 3", "world")
 ARGUMENTS = tuple(
-    Argument(name, axes, optional=True, asked=True, written=True)
-    for name, axes in zip(REPORTS, ("world, contact, 3", "world, contact", "world, contact", "world, 3"), strict=True)
+    Argument(name, axes, optional=True, asked=True, written=True) for name, axes in zip(REPORTS, AXES, strict=True)
 )
-
-
 MOST_HEIGHTS = {"float32": 2**24, "float64": 2**31}  # points of a field whose numbers the dtype tells apart
 
 
@@ -38,6 +37,10 @@ def check_step(dyn: Dynamics, call: Call, integrator: str, passes: Any, asked: d
             if value is not None:
                 raise ValueError(f"{call.name}: {name} is given, and the scene has no contacts; expected None")
         return None
+    if asked[RESIDUAL] is not None and not dyn.scene.contact_pairs:
+        raise ValueError(
+            f"{call.name}: {RESIDUAL} is given, and no bodies of the scene touch each other; expected None"
+        )
     count = default_passes(dyn.scene) if passes is None else as_integer(passes)
     if count is None or count < 1:
         raise ValueError(f"{call.name}: passes is {passes!r}; expected an integer, 1 or more")
@@ -54,6 +57,8 @@ def refuse(dyn: Dynamics, call: Call, integrator: str) -> None:
         raise UnsupportedError(call.name, "closing loops in a scene with contacts", "use loops='cut'")
     if forced == "node":
         raise UnsupportedError(call.name, f"granularity={forced!r} with contacts", "use another one, or leave it out")
+    if forced == "segment" and dyn.scene.contact_pairs:
+        raise UnsupportedError(call.name, "granularity='segment' with contacts between bodies", "leave it out")
     if isinstance(dyn.scene.ground, HeightField) and dyn.scene.ground.heights.size >= MOST_HEIGHTS[dyn.dtype.__name__]:
         way = "use dtype='float64', or a coarser field"
         raise UnsupportedError(call.name, f"a HeightField of {dyn.scene.ground.heights.size} points in float32", way)

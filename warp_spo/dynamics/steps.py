@@ -170,6 +170,7 @@ def step(
     contact_gap: AnyArray | None = None,
     contact_slip: AnyArray | None = None,
     contact_excess: AnyArray | None = None,
+    contact_residual: AnyArray | None = None,
     out: tuple[ArrayT | None, ArrayT | None] = (None, None),
 ) -> tuple[ArrayT, ArrayT]:
     """Compute the state after ``dt``: forward dynamics with the forces of all hinges, and q moved along the new qd.
@@ -205,8 +206,9 @@ def step(
     dry friction are then dampers that give their bound at the velocity of the pass before: a pass that ends outside of
     a bound does so by what ``contact_excess`` says, and gains no energy at a held pose. The normal force of a point
     is stiffness times depth plus damping times the speed inward, both after the step; there is no restitution. A point
-    that sticks creeps, by eps rho / sqrt(1 - rho^2) for the share rho of friction that is used. Contacts need
-    integrator="semi_implicit", no closed loops, and another granularity than "node".
+    that sticks creeps, by eps rho / sqrt(1 - rho^2) for the share rho of friction that is used. Pairs of bodies that
+    touch each other are solved together with all else, up to eight in a world, and in 16 rounds of one after the other
+    beyond. Contacts need integrator="semi_implicit", no closed loops, and another granularity than "node".
 
     Where Dynamics closes loops, accelerations obey the closures, with all of the above on every dof, those that a loop
     moves included. Two Newton steps then move q', and qd' there, onto the closures; they leave O((h rate)^6), 1e-10 at
@@ -258,16 +260,20 @@ def step(
             Other integrators, loops="multipliers", pairs of bodies that touch and delays of actuators take launches for
             each substep, see :meth:`explain`. Delays count substeps. With a tensor that requires grad, every substep is
             recorded.
-        passes: of a scene with contacts; None: 3. One is stable and coarse; more than three gain little, a shorter dt
-            gains more.
+        passes: of a scene with contacts; None: 3, or 4 where bodies touch each other. One is stable and coarse; more
+            gain little, a shorter dt gains more.
         contact_f: written with the force of the ground on each contact point [world, contact, 3] [N], inertial axes,
-            the mean over substeps. The points are ``scene.contact_points``.
+            the mean over substeps. The points are ``scene.contact_points``; after them, for each of
+            ``scene.contact_pairs``, comes the force of the other body on the first one.
         contact_gap: written with the distance of each point from the ground [world, contact] [m], negative inside, at
-            the q that the last substep starts from.
-        contact_slip: written with the speed of each point along the ground after the step [world, contact] [m/s].
+            the q that the last substep starts from; of a pair at its deepest point, infinite where no faces meet.
+        contact_slip: written with the speed of each point along the ground after the step [world, contact] [m/s]; of a
+            pair that of its deepest point along the other body.
         contact_excess: written with what the last pass of the last substep leaves [world, 3]: the largest friction
             force beyond its cone and the largest pull of a contact [N], and the largest force of a drive beyond its
             effort limit [N m or N].
+        contact_residual: of a scene with pairs of bodies, written with the largest change of a pair's force in the last
+            of 16 rounds, where more than eight pairs touch [world] [N]; zero where they are solved exactly.
         out: (q, qd) after the step, each an array or None. They may be the arrays of the state itself.
 
     Returns:
@@ -282,7 +288,8 @@ def step(
             if array is not None and integrator != "semi_implicit":
                 raise ValueError(f"{call.name}: {name} with integrator={integrator!r}; expected 'semi_implicit'")
         count = _take_substeps(call.name, {"substeps": substeps})
-        asked = dict(zip(contacts.REPORTS, (contact_f, contact_gap, contact_slip, contact_excess), strict=True))
+        reported = contact_f, contact_gap, contact_slip, contact_excess, contact_residual
+        asked = dict(zip(contacts.REPORTS, reported, strict=True))
         taken = contacts.check_step(self, call, integrator, passes, asked)
         actuators.check_state(self, call, ctrl, actuator_state)
         forces = {"tau": tau, "body_f": body_f, "target_q": target_q, "target_qd": target_qd, "ctrl": ctrl}

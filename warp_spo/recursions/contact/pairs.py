@@ -33,6 +33,8 @@ VALUE, START, TWIST, RESPONSE = "pair_value", "pair_start", "pair_twist", "pair_
 WRENCH, REPORT = "pair_wrench", "pair_report"
 """Arrays of a thread: stiffness, damping and friction of each pair, and then half of gravity h^2; twists before the
 step; those of x0, and then whether the next pass only closes; the response; what the coupling returns."""
+RESIDUAL = "contact_residual"
+"""Report [world]: by how much forces still change where more pairs touch than are solved together [N]."""
 READ = (TWIST, RESPONSE)  # what it reads in each pass
 
 
@@ -116,8 +118,8 @@ class PairedStep(ground.ContactStep):
     def coupled_excess(self) -> tuple[list[Value], list[Value], list[Value]]:
         """Return what the coupling says of this pass."""
         at = 5 * len(self.members.of_pairs)
-        cone, pull, missed = ([self.trace.graph.input(REPORT, at + i)] for i in range(3))
-        return cone, pull, missed
+        cone, pull, missed, left = (self.trace.graph.input(REPORT, at + i) for i in range(4))
+        return [cone], [pull], [missed, left]
 
     def _place(self, links: list[Link | None]) -> None:
         """Compute the axes of links and of those that carry them."""
@@ -175,6 +177,8 @@ class PairedStep(ground.ContactStep):
         """Return the stores of what the coupling found, after the rows of the points."""
         first, offset = len(self.trace.links.scene.contact_points), {"contact_gap": 3, "contact_slip": 4}
         stores, read = [], self.trace.graph.input
+        if name == RESIDUAL:
+            stores.append(Store(name, (), read(REPORT, 5 * len(self.members.of_pairs) + 3)))
         for pair in range(len(self.members.of_pairs)):
             if name == "contact_f":
                 stores += [Store(name, (first + pair, c), read(REPORT, 5 * pair + c)) for c in range(3)]
