@@ -4,6 +4,7 @@ import itertools
 
 import contact_gradients
 import geared
+import newton
 import numpy as np
 import pytest
 import symbolic
@@ -290,6 +291,36 @@ def test_a_tape_differentiates_the_solver():
         wanted = (last(q, qd + unit, mu) - last(q, qd - unit, mu)) / (2.0 * nudge)
         found = first.joint_qd.grad.numpy().reshape(2, 6)
         np.testing.assert_allclose(found[:, axis], wanted, atol=2e-3 * np.abs(found).max())
+
+
+@pytest.mark.slow
+def test_a_tape_of_a_solver_with_slots():
+    """Steps without a list of contacts are differentiated, whatever lists other steps get; with one they refuse."""
+    found = {}
+    for contacts in ("none", "pipeline"):
+        builder = newton.ModelBuilder()
+        pole = builder.add_link(mass=1.0, inertia=wp.mat33(np.eye(3)))
+        builder.add_shape_sphere(pole, radius=0.1)
+        builder.add_articulation([builder.add_joint_revolute(-1, pole, axis=(0, 1, 0))])
+        builder.add_shape_box(-1, xform=wp.transform((0.0, 0.0, -1.0), wp.quat_identity()), hx=0.2, hy=0.2, hz=0.2)
+        model = builder.finalize(device="cpu", requires_grad=True)
+        solver, first, last, tape = SolverSPO(model, contacts=contacts), model.state(), model.state(), wp.Tape()
+        first.joint_qd.fill_(0.5)
+        with tape:
+            solver.step(first, last, None, None, H)
+        if contacts == "pipeline":
+            listed = newton.Contacts(4, 0, device="cpu")
+            listed.rigid_contact_count.fill_(1)
+            listed.rigid_contact_shape0.fill_(0)
+            listed.rigid_contact_shape1.fill_(1)
+            listed.rigid_contact_normal.fill_(wp.vec3(0.0, 0.0, -1.0))
+            solver.step(model.state(), model.state(), None, listed, H)
+            with wp.Tape(), pytest.raises(spo.UnsupportedError, match="contacts of a pipeline"):
+                solver.step(first, model.state(), None, listed, H)
+        tape.backward(grads={last.joint_qd: wp.ones(1, dtype=float, device="cpu")})
+        found[contacts] = [first.joint_qd.grad.numpy(), model.body_mass.grad.numpy()]
+    for mine, wanted in zip(found["pipeline"], found["none"], strict=True):
+        np.testing.assert_allclose(mine, wanted, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.slow

@@ -79,6 +79,10 @@ class ModelArrays:
                 value = layout.scale(value, self._factors[name], "driven")
             dynamics.set(**{name: value})
 
+    def has_source(self, name: str) -> bool:
+        """Return whether a value of the scene comes from an array of the model."""
+        return self._materials is not None or name not in VALUES.values()
+
     def source(self, name: str) -> str:
         """Return the name of the model's array that a value of the scene comes from."""
         return next((array for array, value in VALUES.items() if value == name), name)

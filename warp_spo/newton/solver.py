@@ -252,7 +252,7 @@ class SolverSPO(Plugs, SolverBase):
         self._unasked = {name: wp.zeros(shape, dtype=kind, device=device) for name, kind in kinds.items()}
         self._joint_forces = JointForces(self.dynamics, state)
         self._gradients = StepGradients(
-            model, self.dynamics, state, self._joint_forces, self._drives, self._arrays, passes=self._passes
+            model, self.dynamics, state, self._joint_forces, self._drives, self._arrays, self._passes, self._empty_slots
         )
         self._prepare()
 
@@ -356,9 +356,9 @@ class SolverSPO(Plugs, SolverBase):
             if record is not None and self._substeps > 1:
                 what, way = f"substeps={self._substeps} on a wp.Tape", "record the steps of a solver with substeps=1"
                 raise UnsupportedError("SolverSPO.step", what, way)
-            if record is not None and self._slots is not None:
-                what, way = "contacts of a pipeline on a wp.Tape", "record the steps of a solver with contacts='ground'"
-                raise UnsupportedError("SolverSPO.step", what, way)
+            if record is not None and self._slots is not None and left_out is not None:
+                way = "pass contacts=None, or record the steps of a solver with contacts='ground'"
+                raise UnsupportedError("SolverSPO.step", "contacts of a pipeline on a wp.Tape", way)
             self._step(*given, None if record is None else record.qdd, left_out)
             if record is not None:
                 record.append_to_tape()
@@ -415,6 +415,11 @@ class SolverSPO(Plugs, SolverBase):
         self._q.write(q_out, state_out.joint_q)
         self._qd.write(qd_out, state_out.joint_qd)
         self._write_bodies(q_out, qd_out, state_out)
+
+    def _empty_slots(self) -> None:
+        """Take the contacts of a list, which the last step may have been given, out of the dynamics; launches only."""
+        if self._slots is not None:
+            self._slots.fill(None, self.model.body_q, self._words.role, self.dynamics)
 
     def _write_bodies(self, q: wp.array, qd: wp.array, state: newton.State) -> None:
         """Launch the bodies' poses and velocities, unless the state has none."""

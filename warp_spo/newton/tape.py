@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import newton
@@ -66,7 +66,7 @@ class StepGradients:
         dynamics: Its dynamics.
         layouts: How Newton's arrays are laid out.
         forces, drives, arrays: What turns Newton's forces, targets and values into those of the dynamics.
-        passes: Of steps with contacts.
+        passes: Of steps with contacts. prepare: Called before the backward pass of a step, by launches alone.
     """
 
     def __init__(
@@ -78,9 +78,10 @@ class StepGradients:
         drives: Drives,
         arrays: ModelArrays,
         passes: int | None,
+        prepare: Callable[[], None],
     ):
         self.model, self.dynamics, self.layouts, self.passes = model, dynamics, layouts, passes
-        self.forces, self.drives, self.arrays = forces, drives, arrays
+        self.forces, self.drives, self.arrays, self.prepare = forces, drives, arrays, prepare
 
     def record(
         self,
@@ -99,7 +100,7 @@ class StepGradients:
             ValueError: The step writes an array that it reads, or that an earlier step of the tape read or wrote.
         """
         read = self._arrays_read(state_in, control)
-        values = [name for name in self.dynamics.variable if name in DIFFERENTIABLE]
+        values = [name for name in self.dynamics.variable if name in DIFFERENTIABLE and self.arrays.has_source(name)]
         model = {name: getattr(self.model, self.arrays.source(name)) for name in values}
         wanted = {name: array for name, array in {**read, **model}.items() if array.requires_grad}
         if not wanted:
@@ -214,6 +215,7 @@ class StepRecord:
             )
         layouts, forces = solver.layouts, solver.forces
         with paused_tape():
+            solver.prepare()
             cotangents = self._cotangents()
             given = solver.given(read)
             taus = forces.turns_with_bodies and "joint_f" in read
