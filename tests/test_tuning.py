@@ -9,6 +9,7 @@ import warnings
 
 import contact_cases
 import numpy as np
+import pair_scenes
 import pytest
 import warp as wp
 import zoo
@@ -265,6 +266,9 @@ def test_only_what_the_plan_knows_is_a_candidate():
 def test_where_there_is_nothing_to_choose_nothing_is_measured(device, times, folder):
     choice = made(device, granularity="tree").tune(NAME)[NAME]
     assert choice.granularity == "tree" and not choice.us and str(choice) == "tree, the only one"
+    dyn = made(device, pair_scenes.mixed())  # a thread for each world solves for pairs of bodies, on a GPU, too
+    dyn.plan = plan.choose(dyn.scene, WORLDS, MEASURED, "float32")
+    assert dyn.tune("step")["step"].granularity == "tree"
     assert not times["measured"] and not folder.exists()
 
 

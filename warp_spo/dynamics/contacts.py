@@ -76,6 +76,6 @@ def explain(dyn: Dynamics) -> str:
     figures = contact_figures(dyn.scene)
     if not dyn.scene.contacts:
         return figures
-    routine = integrators.CONTACT_STEP if dyn._pairs is None else integrators.PAIRED_STEP
-    form = "a warp for each limb" if dyn.plan.of(routine) == "segment" else "a thread for each world"
+    limbs = dyn.plan.of(integrators.contact_routine(dyn)) == "segment"
+    form = "a warp for each limb" if limbs else "a thread for each world"
     return f"{figures}; {default_passes(dyn.scene)} passes of a step unless passes= says otherwise, {form}"

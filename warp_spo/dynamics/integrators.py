@@ -47,6 +47,11 @@ COORDINATE_RATES = Routine("coordinate_rates", coordinates.coordinate_rates)
 HINGE_FORCE = Routine("hinge_force", hinge_forces.hinge_force)
 
 
+def contact_routine(dyn: Dynamics) -> Routine:
+    """Return the kernel of a step of a scene with contacts."""
+    return CONTACT_STEP if dyn._pairs is None else PAIRED_STEP
+
+
 class Interval(NamedTuple):
     """The state before a step, arrays for the state after it, and its length [s]."""
 
@@ -86,11 +91,9 @@ def semi_implicit(
     if dyn.scene.contacts:
         count = float(pairs.default_passes(dyn.scene) if passes is None else passes)
         given |= {"passes": count, "reports": tuple(reports or ()), **option}
-        routine = CONTACT_STEP
         if dyn._pairs is not None:
             dyn._pairs.find(q)
-            routine = PAIRED_STEP
-        launch(routine, qd_out, more | (reports or {}), q=q, qd=qd, dt=dt, **given)
+        launch(contact_routine(dyn), qd_out, more | (reports or {}), q=q, qd=qd, dt=dt, **given)
     elif not dyn.closed:
         launch(STEP, qd_out, more, q=q, qd=qd, dt=dt, **given, **option)
     elif dyn.embedding is not None:

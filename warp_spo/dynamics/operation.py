@@ -265,7 +265,7 @@ class Operation:
         embed: form with ``loops="embed"``. multipliers: form with ``loops="multipliers"``. An operation that declares
             nothing is refused there.
         sharing: form of scenes whose links share dofs: of flexible bodies and rotors.
-        touching: kernel of scenes with contacts; None: contacts do not matter to it.
+        touching: ``touching(dyn)`` returns the kernel of a scene with contacts; None: contacts do not matter to it.
         derivative: its way back; None: torch gets no gradients.
         trial: how it is compared with the dense reference.
         product: it is itself a product with a Jacobian, of another operation.
@@ -278,7 +278,7 @@ class Operation:
     embed: Closed = Refused()
     multipliers: Closed = Refused()
     sharing: Closed = AS_WRITTEN
-    touching: Routine | None = None
+    touching: Callable[..., Routine] | None = None
     derivative: Derivative | None = None
     trial: Trial | None = None
     product: bool = False

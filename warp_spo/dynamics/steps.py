@@ -132,7 +132,7 @@ STEP = Operation(
     routine=integrators.STEP,
     embed=integrators.EMBEDDED_STEP,
     multipliers=AS_WRITTEN,
-    touching=integrators.CONTACT_STEP,
+    touching=integrators.contact_routine,
     derivative=Derivative(
         Routine("step_vjp", adjoints.step_vjp),
         by=("q", "qd", "tau", "body_f", "target_q", "target_qd", "ctrl"),

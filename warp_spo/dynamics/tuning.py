@@ -108,7 +108,7 @@ def _tune_one(dyn: Dynamics, operation: Operation) -> Tuned:
 def _routine(dyn: Dynamics, operation: Operation) -> Routine:
     """Return the kernel of an operation that this object launches."""
     if operation.touching is not None and dyn.scene.contacts:
-        return operation.touching
+        return operation.touching(dyn)
     embedded = dyn.embedding is not None and isinstance(operation.embed, Routine)
     routine = operation.embed if embedded else operation.routine
     assert isinstance(routine, Routine)
@@ -124,8 +124,9 @@ def use(dyn: Dynamics, name: str, choice: Tuned) -> None:
 def _switch(dyn: Dynamics, name: str, granularity: str | None) -> None:
     """Let the routine of this name run as if a granularity were asked for; None, or that of the rules: by the rules."""
     plan = dyn.plan
-    every = [routine for one in dyn._operations.values() for routine in (one.routine, one.touching)]
-    routines = [one for one in every if one is not None and one.name == name]
+    every = [one.routine for one in dyn._operations.values() if one.routine is not None]
+    every += [one.touching(dyn) for one in dyn._operations.values() if one.touching is not None]
+    routines = [one for one in every if one.name == name]
     names = {name, *(one.bias_first.name for one in routines if one.bias_first is not None)}
     for each in names:
         plan.instead.pop(each, None)
