@@ -126,6 +126,35 @@ def test_what_is_not_finite_stays_in_its_world():
     assert float(log["/termination/not finite"]) == 1  # of the worlds with a finished episode
 
 
+def test_a_reward_that_is_not_finite_is_counted_and_not_summed():
+    env = cart_env(4, rewards={"root": (1.0, lambda w: np.sqrt(0.4 - w.q[0]))}, terminations={})
+    env.q[2, 0] = 0.45
+    _, reward, done, _ = env.step(torch.zeros(4, 1))
+    log = env.log()
+    assert done.tolist() == [0, 0, 1, 0] and torch.isfinite(reward).all() and reward[2] == 0
+    assert float(log["/not finite/reward"]) == 1 and float(log["/not finite/state"]) == 0
+    assert all(torch.isfinite(value) for value in log.values())
+
+
+def test_events_may_remember():
+    """An event in between counts itself, in a memory that resets clear."""
+
+    def change(w):
+        w.keep("count", w.memory("count", 1) + 1.0)
+        w.qd[0] = w.qd[0] + 0.5
+
+    def start(w):
+        w.keep("starts", w.memory("starts", 1, reset=None) + 1.0)
+
+    env = cart_env(3, events=[events.Interval(change, (0.06, 0.06)), events.Reset(start)], terminations={})
+    counts = []
+    for _ in range(24):
+        env.step(torch.zeros(3, 1))
+        counts.append(env.memory("count")[0].item())
+    assert counts == [0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5, 5, 5, 6, 6, 0, 0, 0, 1, 1]
+    assert (env.memory("starts") == 2).all()
+
+
 def test_reset_of_chosen_worlds():
     env, twin = walker_env(4), walker_env(4)
     for _ in range(3):

@@ -21,7 +21,7 @@ from .graphs import Part, Replay
 from .layout import Layout
 from .observations import Observation, TorchTerm
 from .storage import Storage
-from .tracing import Tracing
+from .tracing import CAUSES, Tracing
 
 try:
     from rsl_rl.env import VecEnv
@@ -261,7 +261,7 @@ class Env(VecEnv):
         found |= {f"/termination/{name}": f"last end {name}" for name in self.termination_names}
         found["/episode/seconds"] = "last seconds"
         values = {key: (self.memory(name)[:, 0] * share).sum() for key, name in found.items()}
-        for cause in ("action", "state", "reward"):
+        for cause in CAUSES:
             values[f"/not finite/{cause}"] = self.memory(f"bad {cause}")[:, 0].sum()
         return values
 

@@ -21,7 +21,7 @@ from .vectors import Vector, as_condition, as_value, vector
 from .world import World
 
 LARGEST = 1e30  # numbers beyond it count as not finite
-CAUSES = ("action", "state", "reward")
+CAUSES = ("action", "state", "reward")  # of ends for numbers that are not finite, the first first
 NOT_FINITE = "not finite"
 CHOSEN_WORLD = "chosen.data[world]"  # C++: the world has just started anew
 
@@ -114,7 +114,8 @@ class Tracing:
         for name, (weight, term) in self.rewards.items():
             value = weight * self.layout.step_dt * scalar(f"reward {name!r}", term(w))
             total = total + value
-            w.keep(f"sum reward {name}", w.memory(f"sum reward {name}", 1) + where(sane, value, 0.0))
+            earned = where(is_finite([value]), value, 0.0)
+            w.keep(f"sum reward {name}", w.memory(f"sum reward {name}", 1) + earned)
         fine = is_finite([total])
         bad = ~sane | spoilt | ~fine
         self._count(w, "state", ~sane & ~spoilt)
@@ -164,6 +165,7 @@ class Tracing:
                 due = left <= 0.0
                 q = vector(where(due, a, b) for a, b in zip(changed.q, q, strict=True))
                 qd = vector(where(due, a, b) for a, b in zip(changed.qd, qd, strict=True))
+                self._merge(w, changed, due)
                 left = where(due | done, w.uniform(*event.seconds), left)
             else:
                 left = where(done, w.uniform(*event.seconds), left + self.layout.step_dt)
@@ -173,12 +175,16 @@ class Tracing:
         for name, values in (("q", q), ("qd", qd)):
             for i, value in enumerate(values):
                 stage.store(name, i, as_value(value))
-        for name, values in fresh.kept.items():
-            old = w.memory(name, len(values), reset=None)
-            w.keep(name, [where(done, a, b) for a, b in zip(values, old, strict=True)])
+        self._merge(w, fresh, done)
         self._draw_values(w, done, intervals)
         if self.commands is not None:
             self._command(w, done, q, qd, intervals)
+
+    def _merge(self, w: World, changed: World, due: Condition) -> None:
+        """Keep what an event kept in ``changed``, where ``due`` holds."""
+        for name, values in changed.kept.items():
+            old = w.kept.get(name, w.remembered(name))
+            w.keep(name, [where(due, a, b) for a, b in zip(values, old, strict=True)])
 
     def _command(self, w: World, done: Condition, q: Vector, qd: Vector, intervals: bool) -> None:
         left = w.memory("until command", 1, reset=None)[0]

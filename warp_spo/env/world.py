@@ -273,10 +273,8 @@ class World:
     def frame(self, name: Any) -> Frame:
         """Return a frame: the name of a site or of a body, a body, or (body, pose in the body)."""
         at = self._layout.frame(name)
-        count = len(self._layout.frames)  # grows while terms are traced; rows are sized at the end
         pose = vector(self._scalar("frame_pose", 7 * at + i) for i in range(7))
         rates = vector(self._scalar("frame_velocity", 6 * at + i) for i in range(6))
-        assert at < count
         return Frame(pose[:3], pose[3:], rates[:3], rates[3:])
 
     def imu(self, name: Any) -> Imu:
@@ -344,7 +342,10 @@ class World:
         return vector(self._scalar("memory", start + i) for i in range(size))
 
     def keep(self, name: str, values: Any) -> None:
-        """Set numbers of :meth:`memory`; a reset sets those without a :meth:`memory` call to zero."""
+        """Set numbers of :meth:`memory`; a reset sets those without a :meth:`memory` call to zero.
+
+        A term that is a reward and an observation, too, does so twice in a step; :meth:`sensor` does so once.
+        """
         self.kept[name] = vector(values)
         if name not in self._layout.memory:
             self._layout.remember(name, len(self.kept[name]), 0.0)
