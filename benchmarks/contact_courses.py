@@ -104,6 +104,9 @@ def stairs() -> Iterator[Row]:
         qd = np.array([[0.7, 0.05, -0.3, 0.0, 0.0, 0.0]] * len(q))
         found = thrown(field, q, qd, dt, 1.0)
         yield name, "feet swing in: rise [J]", dt, float(np.diff(found["energy"], axis=0).max()), 0.1
+        q = np.array([[-0.1 - cell - x, 0.3, 0.0295, *upright] for x in np.linspace(0.0, 7.5e-3, 10)])
+        found = thrown(field, q, np.array([[1.5, 0.0, 0.0, 0.0, 0.0, 0.0]] * len(q)), dt, 0.5)
+        yield name, "feet slide in: rise [J]", dt, float(np.diff(found["energy"], axis=0).max()), 0.1
         stiff = spo.Contact(0, box=(0.1, 0.1, 0.1), friction=0.1, stiffness=1e5)  # 1.5 sqrt(m / k) in a wall of 2 cm
         corners = free_body([stiff], field)
         q = np.array(

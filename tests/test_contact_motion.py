@@ -5,6 +5,7 @@ import pytest
 from contact_cases import STAND, ContactStep, quadruped
 
 import warp_spo as spo
+from benchmarks import contact_courses, contact_motions
 
 REPORTS = {"contact_f": (12, 3), "contact_gap": (12,), "contact_slip": (12,), "contact_excess": (3,)}
 RISE = 1e-5  # of the first state's energy, above which a step counts as one that gains
@@ -124,3 +125,19 @@ def test_tumbling_drops_gain_next_to_nothing(device, h, effort):
     qd = rng.normal(size=(worlds, 18)) * np.repeat([1.0, 3.0, 3.0], [3, 3, 12])
     found = rollout(scene, q, qd, h, 1.5, target, device)
     assert np.isfinite(found["qd"]).all() and rises(found).max() <= TUMBLING[h]
+
+
+SLIDES = {"feet slide in: rise [J]": 0.3, "box slides in: rise [J]": 5.0}
+"""Bounds of what the courses miss: a riser is not seen before a point is above its cell."""
+
+
+@pytest.mark.slow
+def test_inclines_and_stairs():
+    """Slide and creep on inclines; feet that swing into a riser, fly over its edge, stand across it."""
+    rows = [
+        contact_motions.Line(*row) for course in ("incline", "stairs") for row in contact_courses.courses()[course]()
+    ]
+    assert sum(row.asked is not None for row in rows) == 18
+    for row in rows:
+        bound = SLIDES.get(row.figure, row.asked) if row.motion.startswith("riser") else row.asked
+        assert bound is None or row.measured <= bound, str(row)
