@@ -148,6 +148,7 @@ class Env(VecEnv):
         self._actuator_state: Any = None
         if "ctrl" in store.controls and max(delays) > 0:
             self._actuator_state = self.dyn.actuator_state(like=self.q, longest=max(delays))
+        self._prepare_log()
         self.set_seed(self.seed)
         self._kernels = {name: stage.build(store.buffers, self.warp_device) for name, stage in tracing.stages.items()}
         self._values_later = any(isinstance(event, Values) and event.when != "start" for event in events)
@@ -254,16 +255,11 @@ class Env(VecEnv):
 
     def log(self) -> dict[str, torch.Tensor]:
         """Return means over the worlds' last finished episodes by name, and counts of what was not finite."""
-        episodes = self.memory("episodes")[:, 0]
-        finished = (episodes > 0).float()
-        share = finished / finished.sum().clamp(min=1.0)
-        found = {f"/reward/{name}": f"last reward {name}" for name in self.reward_names}
-        found |= {f"/termination/{name}": f"last end {name}" for name in self.termination_names}
-        found["/episode/seconds"] = "last seconds"
-        values = {key: (self.memory(name)[:, 0] * share).sum() for key, name in found.items()}
-        for cause in CAUSES:
-            values[f"/not finite/{cause}"] = self.memory(f"bad {cause}")[:, 0].sum()
-        return values
+        memory = self._tensors["memory"]
+        finished = (self.memory("episodes")[:, 0] > 0).float()
+        means = memory[self._logged] @ (finished / finished.sum().clamp(min=1.0))
+        counts = memory[self._counted].sum(dim=1)
+        return dict(zip(self._log_names, [*means.unbind(), *counts.unbind()], strict=True))
 
     def explain(self) -> str:
         """Return what a step consists of, and what it takes in memory."""
@@ -307,6 +303,18 @@ class Env(VecEnv):
         if kernel is not None:
             with self._stream():
                 kernel(self.num_envs)
+
+    def _prepare_log(self) -> None:
+        """Note which numbers of the memory :meth:`log` reads."""
+        means = {f"/reward/{name}": f"last reward {name}" for name in self.reward_names}
+        means |= {f"/termination/{name}": f"last end {name}" for name in self.termination_names}
+        means["/episode/seconds"] = "last seconds"
+        counts = {f"/not finite/{cause}": f"bad {cause}" for cause in CAUSES}
+        self._log_names = [*means, *counts]
+        self._logged, self._counted = (
+            torch.tensor([self._layout.memory[name][0] for name in names.values()], device=self.device)
+            for names in (means, counts)
+        )
 
     def _compile(self) -> None:
         """Compile all kernels side by side, by a step in which nothing counts."""
