@@ -9,7 +9,8 @@ and every other gradient is that of
 
 with lambda, qdd and the slopes held, plus that of s'. Forces f, laws l, S and what s' becomes are those of
 :class:`..contact.step.ContactStep` itself, so that a change of a law changes its gradient. No pass is left out: with
-the last one alone, the others frozen, gradients of sliding contacts are wrong by up to 29 %.
+the last one alone, the others frozen, gradients by tau of a quadruped on the ground are wrong by 7 to 34 % in the
+median.
 
 Where a comparison changes its answer the step has a kink, or a jump of s'; the gradient is that of the side on which
 the step is.
