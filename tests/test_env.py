@@ -230,7 +230,7 @@ def test_randomised_values_are_those_of_the_dynamics():
         events.randomise("contact_friction", (0.3, 1.2), "set", FEET, alike=True),
         events.pseudo_inertia("trunk", 0.2, 0.3, 0.1, 0.02),
         events.randomise("joint_armature", (0.5, 2.0)),
-        events.randomise("actuator_gain", (0.8, 1.2), when="reset"),
+        events.servo_gains((0.8, 1.2), (0.5, 2.0), when="reset"),
         events.delays((0, 3)),
         events.encoder_bias(0.02),
     ]
@@ -246,6 +246,8 @@ def test_randomised_values_are_those_of_the_dynamics():
     assert set(delay.unique().tolist()) <= {0.0, 1.0, 2.0, 3.0} and delay.unique().numel() > 1
     gains, bias = env.values["actuator_gain"].clone(), env.memory("encoder bias").clone()
     assert 0.01 < bias.abs().max() <= 0.02
+    kp, kv = -env.values["actuator_bias"][..., 1], -env.values["actuator_bias"][..., 2]
+    assert torch.allclose(kp, gains) and 10 < np.ptp(gains.numpy()) < 16 and 0.8 < np.ptp(kv.numpy()) < 1.5
     names = tuple(env.values)
     dyn = spo.Dynamics(env.scene, 6, "cpu", variable=names)
     dyn.set(**env.values)

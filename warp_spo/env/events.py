@@ -289,6 +289,26 @@ def pseudo_inertia(
     return Values(changed, change, when)
 
 
+def servo_gains(
+    stiffness: Range = (0.8, 1.2), damping: Range = (0.8, 1.2), names: Any = None, when: str | Range = "start"
+) -> Values:
+    """Return an event that scales the gains of position servos: kp, which is a gain and a bias, and kv.
+
+    Args:
+        stiffness: of the factor of kp. damping: of that of kv. names: regular expressions of actuators; None: all.
+        when: see :class:`Values`.
+    """
+
+    def change(w: World) -> None:
+        gain, bias = w.values["actuator_gain"], w.values["actuator_bias"]
+        for entry in entries_of(w.scene, "actuator_gain", names):
+            kp = w.uniform(*stiffness)
+            gain[entry], bias[entry, 1] = gain[entry] * kp, bias[entry, 1] * kp
+            bias[entry, 2] = bias[entry, 2] * w.uniform(*damping)
+
+    return Values(("actuator_gain", "actuator_bias"), change, when)
+
+
 def delays(steps: tuple[int, int], when: str | Range = "start", names: Any = None, alike: bool = True) -> Values:
     """Return an event that draws the delay of actuators anew, in steps of the dynamics, both ends included."""
 
