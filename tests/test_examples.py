@@ -22,6 +22,7 @@ from warp_spo.examples import (
     hop,
     identify,
     identify_boom,
+    newton_ground,
     options,
     parts,
     quasi_velocities,
@@ -36,7 +37,7 @@ FOLDER = Path(parts.__file__).parent
 
 
 SHORT = {
-    **dict.fromkeys((floating_arm, hop, identify, reach), 100),
+    **dict.fromkeys((floating_arm, hop, identify, newton_ground, reach), 100),
     **dict.fromkeys((crane, double_fourbar, harmonic_drive, identify_boom), 60),
     **dict.fromkeys((quasi_velocities, spinning_beam, star, tether), 60),
 }
@@ -196,3 +197,10 @@ def test_a_panda_lifts_a_cube(tmp_path, device, capsys):
     said = capsys.readouterr().out
     assert said.count("slips by") == 2 and said.count("stays on the ground") == 1
     assert_is_whole((tmp_path / "grasp.svg").read_text())
+
+
+@pytest.mark.slow
+def test_an_ant_comes_to_rest_on_newtons_plane():
+    shares, speed, heights, words = newton_ground.fall("ant", seconds=3.0)
+    np.testing.assert_allclose(shares, 1.0, atol=1e-3)
+    assert speed < 0.1 and heights.min() > 0.05 and not words.any()

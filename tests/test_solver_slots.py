@@ -135,6 +135,25 @@ def copy_list(source, target):
         wp.copy(getattr(target, f"rigid_contact_{name}"), getattr(source, f"rigid_contact_{name}"))
 
 
+def test_a_slider_does_not_turn():
+    """Places of points on it reach no result, and are read all the same: its weight rests on the listed contact."""
+    builder = newton.ModelBuilder()
+    slider = builder.add_link(mass=2.0)
+    builder.add_shape_sphere(slider, radius=RADIUS, cfg=newton.ModelBuilder.ShapeConfig(ke=2e3, kd=40.0, density=0.0))
+    turn = wp.transform((0.0, 0.0, 0.0), wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), 0.5))
+    upward = (0.0, np.sin(0.5), np.cos(0.5))  # in the turned anchors
+    joint = builder.add_joint_prismatic(-1, slider, axis=upward, parent_xform=turn, child_xform=turn)
+    builder.add_articulation([joint])
+    builder.joint_q[:] = [RADIUS - 0.005]
+    builder.add_ground_plane(cfg=CFG)
+    model = builder.finalize(device="cpu")
+    solver, state = SolverSPO(model, contacts="pipeline"), model.state()
+    newton.eval_fk(model, state.joint_q, state.joint_qd, state)
+    seen = solver.observables({"contact_f"})
+    run(solver, state, 300, listed([(0, 1, True, (0.0, 0.0, 0.0))]), observables=seen)
+    np.testing.assert_allclose(seen.contact_f.numpy()[0, :, 2], [2.0 * 9.81, 0, 0, 0], rtol=2e-3)
+
+
 def test_models_that_have_no_slots():
     assert float(contact_slots.AWAY) == scene_contacts.AWAY
     with pytest.raises(UnsupportedError, match="contacts of a model without shapes that stand still"):
