@@ -127,10 +127,6 @@ def test_tumbling_drops_gain_next_to_nothing(device, h, effort):
     assert np.isfinite(found["qd"]).all() and rises(found).max() <= TUMBLING[h]
 
 
-SLIDES = {"feet slide in: rise [J]": 0.3, "box slides in: rise [J]": 5.0}
-"""Bounds of what the courses miss: a riser is not seen before a point is above its cell."""
-
-
 @pytest.mark.slow
 def test_inclines_and_stairs():
     """Slide and creep on inclines; feet that swing into a riser, fly over its edge, stand across it."""
@@ -139,5 +135,4 @@ def test_inclines_and_stairs():
     ]
     assert sum(row.asked is not None for row in rows) == 18
     for row in rows:
-        bound = SLIDES.get(row.figure, row.asked) if row.motion.startswith("riser") else row.asked
-        assert bound is None or row.measured <= bound, str(row)
+        assert row.holds is not False, str(row)

@@ -13,7 +13,7 @@ from step_scenes import furnished, states
 
 import warp_spo as spo
 from warp_spo.dynamics import contacts
-from warp_spo.recursions.contact import dampers, points, secants, step
+from warp_spo.recursions.contact import dampers, ground, points, secants, step
 from warp_spo.reference_contact import ContactStep
 
 H, WORLDS = 5e-3, 4
@@ -137,6 +137,20 @@ def test_a_height_field(name):
     assert any(len(at.numbers) > 8 for at in touched) == (name == "stairs")  # walls
 
 
+def test_a_riser_is_seen_before_a_point_is_in_it():
+    """A cube whose front is 3 mm from a riser: it slides 7.5 mm towards it, away from it, past it, and not at all."""
+    scene = box(ground=FIELDS["stairs"])
+    q = np.tile([-0.603, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], (4, 1))
+    qd = np.zeros((4, 6))
+    qd[:, :2] = [[1.5, 0.2], [-1.5, 0.2], [0.0, 1.5], [0.0, 0.0]]
+    q[:, 2] += ContactStep(scene, q[0], qd[0], H).points.depth[:8].max()
+    assert_is_dense(scene, {"q": q, "qd": qd}, 3)
+    at = [ContactStep(scene, q[w], qd[w], H) for w in range(4)]
+    walls = [one.points.depth[one.points.n[:, 2] < 0.5] for one in at]
+    assert [len(depth) for depth in walls] == [2, 0, 0, 0] and walls[0].max() < 0.0
+    assert (at[0].run()[1].f[at[0].points.n[:, 2] < 0.5, 0] < -100.0).all()  # they push it back within the step
+
+
 def test_a_tilted_field_is_a_tilted_plane():
     slope = np.array([0.2, -0.1])
     x, y = np.arange(21) * 0.1 - 1.0, np.arange(31) * 0.1 - 1.5
@@ -241,6 +255,7 @@ BUGS = {
     "dampers above ground": (step.ContactStep, "_finish", "candidate * pushes", "pushes"),
     "last pass opens": (step.ContactStep, "_finish", "kept.closing * touch.closed", "0.0"),
     "wrong lever": (dampers, "_mass", "r * weight", "r * (2.0 * weight)"),
+    "riser unseen": (ground, "surfaces", "_cell((x + moves[0] - ground.origin[0]) * rate_x, rows)[0]", "i"),
     "straight paths": (points, "place_points", "(0.5 * h) * faster", "0.0"),
     "damper of straight paths": (points, "place_points", "k * below - damping * faster", "k * below"),
     "damping that does not grow": (points, "place_points", "d * (k * select(less(0.0, depth), depth, 0.0))", "d"),
@@ -257,6 +272,7 @@ def test_a_planted_bug_is_seen(monkeypatch, bug):
         test_a_cube_that_is_thrown()
         test_the_recursion_is_the_dense_step("fork", 4)
         test_damping_that_grows_with_depth()
+        test_a_riser_is_seen_before_a_point_is_in_it()
 
 
 @functools.cache

@@ -157,28 +157,38 @@ def _slip(n, x):
     return np.linalg.norm(x - _along(n, x)[:, None] * n, axis=1)
 
 
-def surfaces(field, at, number=0):
-    """Return normal and depth of the surfaces of a height field near a point: the field's own, or a floor and a wall.
+def surfaces(field, at, number=0, moves=(0.0, 0.0, 0.0)):
+    """Return normal and depth of the surfaces of a height field near a point that the step takes by ``moves``.
 
-    Of a set of fields it is that of this number.
-
-    The second one, a wall, is there where the middle slope of the cell exceeds 1, and ends at the highest corner.
+    They are the field's own, or a floor and a wall where the middle slope of the cell exceeds 1. The wall ends at the
+    highest corner. A cell without a wall is followed by the wall of the cell where the step takes the point, if that
+    rises along ``moves``. Of a set of fields it is that of this number.
     """
-    h, place = field.heights.reshape(-1, *field.heights.shape[-2:])[number], (at[:2] - field.origin[:2]) / field.cell
-    place = np.clip(place, 0.0, np.array(h.shape) - 1.0)
-    i, j = np.minimum(place.astype(int), np.array(h.shape) - 2)
-    s, t = place - (i, j)
-    corners, z = h[i : i + 2, j : j + 2], at[2] - field.origin[2]
+    h, place = field.heights.reshape(-1, *field.heights.shape[-2:])[number], at[:2] - field.origin[:2]
+    place, ahead = (np.clip(x / field.cell, 0.0, np.array(h.shape) - 1.0) for x in (place, place + moves[:2]))
+    z = at[2] - field.origin[2]
+    upward = lambda slope: np.array([*-slope, 1.0]) / np.sqrt(1.0 + slope @ slope)  # noqa: E731
+
+    def cell(inside):
+        """The corners of the cell, its slope in the middle, and where ``place`` is in it."""
+        first = np.minimum(inside.astype(int), np.array(h.shape) - 2)
+        corners = h[first[0] : first[0] + 2, first[1] : first[1] + 2]
+        middle = np.array([corners[1] - corners[0], corners[:, 1] - corners[:, 0]]).mean(axis=1) / field.cell
+        return corners, middle, place - first
+
+    def wall(corners, middle, inside):
+        plane = corners.mean() + field.cell * middle @ (inside - 0.5)
+        return [(upward(middle), (plane - z) * upward(middle)[2])] if z <= corners.max() else []
+
+    corners, middle, (s, t) = cell(place)
+    if np.linalg.norm(middle) > 1.0:
+        return [(np.array([0.0, 0.0, 1.0]), corners.min() - z), *wall(corners, middle, np.array([s, t]))]
     height = np.array([1.0 - s, s]) @ corners @ np.array([1.0 - t, t])
     slope = np.array([np.array([1.0 - t, t]) @ (corners[1] - corners[0]),
                       np.array([1.0 - s, s]) @ (corners[:, 1] - corners[:, 0])]) / field.cell  # fmt: skip
-    middle = np.array([corners[1] - corners[0], corners[:, 1] - corners[:, 0]]).mean(axis=1) / field.cell
-    upward = lambda slope: np.array([*-slope, 1.0]) / np.sqrt(1.0 + slope @ slope)  # noqa: E731
-    if np.linalg.norm(middle) <= 1.0:
-        return [(upward(slope), (height - z) * upward(slope)[2])]
-    floor = (np.array([0.0, 0.0, 1.0]), corners.min() - z)
-    plane = corners.mean() + field.cell * middle @ (np.array([s, t]) - 0.5)
-    return [floor, (upward(middle), (plane - z) * upward(middle)[2])] if z <= corners.max() else [floor]
+    after = cell(ahead)
+    rises = np.linalg.norm(after[1]) > 1.0 and after[1] @ moves[:2] > 0.0
+    return [(upward(slope), (height - z) * upward(slope)[2]), *(wall(*after) if rises else [])]
 
 
 class ContactStep:
@@ -215,6 +225,7 @@ class ContactStep:
         for number, point in enumerate(self.scene.contact_points):
             at = (dense.body_matrix[point.body] @ homogeneous([*point.position, 0, 0, 0, 1]))[:3, 3]
             turning = dense.jacobian_bias(self.qd, [(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
+            moves = self.h * dense.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3] @ self.qd
             at = at - point.radius * np.array(ground.normal if plane else (0.0, 0.0, 1.0))
             there = self.neutral.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
             weight = SLIP * np.trace(there @ inverse @ there.T) / 3.0
@@ -222,7 +233,7 @@ class ContactStep:
             if plane:
                 touched = [(np.array(ground.normal), ground.height - (at - moved) @ ground.normal)]
             else:
-                touched = surfaces(ground, at - moved, int(field[0]) if len(field) else 0)
+                touched = surfaces(ground, at - moved, int(field[0]) if len(field) else 0, moves)
             for normal, depth in touched:
                 J = dense._jacobian_at(point.body, at)[:3]
                 damping = d * k * max(depth, 0.0) if point.dissipates else d

@@ -3,6 +3,7 @@
 A plane has one normal. A height field is bilinear in each cell: the depth is (H - z) n_z with the normal n of the field
 under the point, held over the step. Where a cell is steeper than STEEP, the point has two surfaces instead: the wall,
 which is the cell's plane and ends at its highest corner, and the floor, which is flat at the height of its lowest one.
+A point that the step takes into such a cell has its wall already.
 """
 
 from __future__ import annotations
@@ -44,8 +45,14 @@ class Place(NamedTuple):
     field: Value
 
 
-def surfaces(graph: Graph, ground: Plane | HeightField, at: list[Value], place: Place) -> list[Surface]:
-    """Return the surfaces near a point, whose place along each direction is ``at``."""
+def surfaces(
+    graph: Graph, ground: Plane | HeightField, at: list[Value], place: Place, moves: list[Value]
+) -> list[Surface]:
+    """Return the surfaces near a point, whose place along each direction is ``at``; the step takes it by ``moves``.
+
+    The wall is that of the cell under the point. If that cell has none, it is the one of the cell where the step takes
+    the point, if it rises that way: a point must see a riser before it is in it, or the riser would throw it back.
+    """
     at = [a - dot(axis, place.origin) for a, axis in zip(at, directions(ground), strict=True)]
     if isinstance(ground, Plane):
         return [Surface(Vector((1.0,)), ground.height - at[0])]
@@ -54,28 +61,82 @@ def surfaces(graph: Graph, ground: Plane | HeightField, at: list[Value], place: 
     rate_x, rate_y = (1.0 / cell for cell in ground.cells)
     i, s = _cell((x - ground.origin[0]) * rate_x, rows)
     j, t = _cell((y - ground.origin[1]) * rate_y, columns)
-    first = i * float(columns) + j
-    if ground.count > 1:
-        field = floor(_between(place.field, ground.count - 1.0))
-        first = field * float(rows * columns) + first
-    h00, h01, h10, h11 = (lookup(graph, GROUND, first, step) for step in (0, 1, columns, columns + 1))
+    cell = _Corners.of(graph, ground, place, i, j)
     z = z - ground.origin[2]
-    base, run, rise, twist = h00, h10 - h00, h01 - h00, h00 - h10 - h01 + h11
-    height = base + run * s + rise * t + twist * (s * t)
-    smooth = _facing((run + twist * t) * rate_x, (rise + twist * s) * rate_y)
+    height = cell.base + cell.run * s + cell.rise * t + cell.twist * (s * t)
+    smooth = _facing((cell.run + cell.twist * t) * rate_x, (cell.rise + cell.twist * s) * rate_y)
     if not has_walls(ground):
         return [Surface(smooth, (height - z) * smooth[2])]
-    slope_x, slope_y = (run + 0.5 * twist) * rate_x, (rise + 0.5 * twist) * rate_y
-    steep = less(STEEP * STEEP, slope_x * slope_x + slope_y * slope_y)
-    low, high = h00, h00
-    for corner in (h01, h10, h11):
-        low, high = select(less(corner, low), corner, low), select(less(high, corner), corner, high)
+    steep = less(STEEP * STEEP, cell.steepness(rate_x, rate_y))
     flat = Vector(select(steep, a, b) for a, b in zip(IDENTITY[2], smooth, strict=True))
-    bottom = Surface(flat, (select(steep, low, height) - z) * flat[2])
-    wall = _facing(slope_x, slope_y)
-    middle = 0.25 * (h00 + h01 + h10 + h11) + (run + 0.5 * twist) * (s - 0.5) + (rise + 0.5 * twist) * (t - 0.5)
-    there = steep * (1.0 - less(high, z))
+    bottom = Surface(flat, (select(steep, cell.lowest, height) - z) * flat[2])
+    next_i = select(steep, i, _cell((x + moves[0] - ground.origin[0]) * rate_x, rows)[0])
+    next_j = select(steep, j, _cell((y + moves[1] - ground.origin[1]) * rate_y, columns)[0])
+    s, t = (i + s) - next_i, (j + t) - next_j
+    cell = _Corners.of(graph, ground, place, next_i, next_j)
+    run, rise = cell.run + 0.5 * cell.twist, cell.rise + 0.5 * cell.twist
+    wall = _facing(run * rate_x, rise * rate_y)
+    middle = cell.mean + run * (s - 0.5) + rise * (t - 0.5)
+    rises = select(steep, 1.0, less(0.0, run * rate_x * moves[0] + rise * rate_y * moves[1]))
+    there = rises * less(STEEP * STEEP, cell.steepness(rate_x, rate_y)) * (1.0 - less(cell.highest, z))
     return [bottom, Surface(wall, select(there, (middle - z) * wall[2], AWAY))]
+
+
+class _Corners(NamedTuple):
+    """The heights at the corners of a cell."""
+
+    h00: Value
+    h01: Value
+    h10: Value
+    h11: Value
+
+    @classmethod
+    def of(cls, graph: Graph, ground: HeightField, place: Place, i: Value, j: Value) -> _Corners:
+        """Return the corners of the cell (i, j) of a world's field."""
+        rows, columns = ground.heights.shape[-2:]
+        first = i * float(columns) + j
+        if ground.count > 1:
+            first = floor(_between(place.field, ground.count - 1.0)) * float(rows * columns) + first
+        return cls(*(lookup(graph, GROUND, first, step) for step in (0, 1, columns, columns + 1)))
+
+    @property
+    def base(self) -> Value:
+        return self.h00
+
+    @property
+    def run(self) -> Value:
+        return self.h10 - self.h00
+
+    @property
+    def rise(self) -> Value:
+        return self.h01 - self.h00
+
+    @property
+    def twist(self) -> Value:
+        return self.h00 - self.h10 - self.h01 + self.h11
+
+    @property
+    def mean(self) -> Value:
+        return 0.25 * (self.h00 + self.h01 + self.h10 + self.h11)
+
+    @property
+    def lowest(self) -> Value:
+        found = self.h00
+        for corner in (self.h01, self.h10, self.h11):
+            found = select(less(corner, found), corner, found)
+        return found
+
+    @property
+    def highest(self) -> Value:
+        found = self.h00
+        for corner in (self.h01, self.h10, self.h11):
+            found = select(less(found, corner), corner, found)
+        return found
+
+    def steepness(self, rate_x: float, rate_y: float) -> Value:
+        """Return the square of the slope in the middle."""
+        slope_x, slope_y = (self.run + 0.5 * self.twist) * rate_x, (self.rise + 0.5 * self.twist) * rate_y
+        return slope_x * slope_x + slope_y * slope_y
 
 
 def height(graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place: Place) -> Value:
@@ -87,11 +148,8 @@ def height(graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place:
     rows, columns = ground.heights.shape[-2:]
     i, s = _cell((x - ground.origin[0]) * (1.0 / ground.cells[0]), rows)
     j, t = _cell((y - ground.origin[1]) * (1.0 / ground.cells[1]), columns)
-    first = i * float(columns) + j
-    if ground.count > 1:
-        first = floor(_between(place.field, ground.count - 1.0)) * float(rows * columns) + first
-    h00, h01, h10, h11 = (lookup(graph, GROUND, first, step) for step in (0, 1, columns, columns + 1))
-    return h00 + (h10 - h00) * s + (h01 - h00 + (h00 - h10 - h01 + h11) * s) * t + (ground.origin[2] + place.origin[2])
+    cell = _Corners.of(graph, ground, place, i, j)
+    return cell.base + cell.run * s + (cell.rise + cell.twist * s) * t + (ground.origin[2] + place.origin[2])
 
 
 def _cell(x: Value, points: int) -> tuple[Value, Value]:

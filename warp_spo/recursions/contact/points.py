@@ -133,8 +133,10 @@ def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value],
         h, moving = impedance.h, motions[carrier]
         bend = bends[carrier][1] + cross(bends[carrier][0], centre)
         bend = bend if moving is None else bend + moving.whirl @ centre
+        w, v = twists[carrier]
+        moves = [h * dot(axis, v + cross(w, centre)) for axis in toward]
         touched = [_listed(impedance, number)] if isinstance(ground, Listed) else None
-        for normal, depth in touched or surfaces(trace.graph, ground, at, place_of_ground):
+        for normal, depth in touched or surfaces(trace.graph, ground, at, place_of_ground, moves):
             inward = Vector(total(n * axis[c] for n, axis in zip(normal, toward, strict=True)) for c in range(3))
             faster = h * dot(inward, bend)
             below = depth - (0.5 * h) * faster
