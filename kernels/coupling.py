@@ -78,7 +78,7 @@ def declare(couples: Couples, T: type) -> str:
     for word, pragma in (("UNROLL", "#pragma unroll"), ("EACH", each), ("LOOP", "#pragma unroll 1")):
         text = text.replace(f"{word}\n", f"{pragma}\n")
     constants = ", ".join(f"{name} = {value}" for name, value in sizes.items())
-    own = {"across": first[-1], "closed": first[-1], "candidate": first[-1], "force": 6 * pairs}
+    own = {"across": first[-1], "closed": first[-1], "candidate": first[-1], "force": 6 * pairs, "place": 7 * pairs}
     arrays = [f"{c} pair_{name}_row[{count}] = {{}};" for name, count in own.items()]
     return "\n".join([text.replace("CONSTANTS", constants), *arrays])
 
@@ -103,11 +103,11 @@ def _table(c: str, name: str, row: list[str], few: bool) -> str:
 
 BEGIN = """
 coupling::begin(pair_value_row, pair_start_row, touches.data + world, worlds, dt_row[0],
-    pair_across_row, pair_closed_row, pair_candidate_row);
+    pair_place_row, pair_across_row, pair_closed_row, pair_candidate_row);
 """
 PASS = """
 coupling::pass(pair_value_row, pair_twist_row, pair_response_row, touches.data + world, worlds, dt_row[0],
-    pair_twist_row[6 * BODIES] > 0, pair_across_row, pair_closed_row, pair_candidate_row,
+    pair_twist_row[6 * BODIES] > 0, pair_place_row, pair_across_row, pair_closed_row, pair_candidate_row,
     pair_force_row, pair_wrench_row, pair_report_row);
 """
 NATIVE = coupling_passes.NATIVE.replace("MATRICES", coupling_matrices.NATIVE.strip())

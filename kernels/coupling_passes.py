@@ -25,7 +25,7 @@ struct coupling
         return FUSED(a[0], b[0], FUSED(a[1], b[1], a[2] * b[2]));
     }
 
-    // A pair at its pose: where its reference point lies from the bodies' origins, and how many points it has.
+    // A pair at its pose: where its reference point lies from the bodies' origins, and how many points come first.
     struct Pair
     {
         REAL arm[2][3];
@@ -101,6 +101,23 @@ struct coupling
         return found;
     }
 
+    static CUDA_CALLABLE inline void keep(const Pair& pair, REAL* place)
+    {
+        UNROLL
+        for (int c = 0; c < 3; ++c) {
+            place[c] = pair.arm[0][c];
+            place[3 + c] = pair.arm[1][c];
+        }
+        place[6] = pair.count;
+    }
+
+    static CUDA_CALLABLE inline Pair recall(int pair, const REAL* place)
+    {
+        const Pair found = {{{place[0], place[1], place[2]}, {place[3], place[4], place[5]}},
+            {first_body_of(pair), second_body_of(pair)}, (int)place[6]};
+        return found;
+    }
+
     // Velocity of a point with a relative twist; returns its part along the normal, and the size of the rest.
     static CUDA_CALLABLE inline REAL rate(const REAL* twist, const Pair& pair, const Touch& touch, REAL* v, REAL& slip)
     {
@@ -125,19 +142,19 @@ struct coupling
     }
 
     static CUDA_CALLABLE inline void begin(const REAL* value, const REAL* start, const REAL* touches, long long worlds,
-        REAL h, REAL* across, REAL* closed, REAL* candidate)
+        REAL h, REAL* place, REAL* across, REAL* closed, REAL* candidate)
     {
         EACH
         for (int p = 0; p < PAIRS; ++p) {
             const Pair pair = find(p, touches, worlds);
+            keep(pair, place + 7 * p);
             if (!pair.count) continue;
             const REAL k = value[3 * p] / pair.count, kd = k * h + value[3 * p + 1] / pair.count;
             REAL twist[6], v[3], slip;
             pair.relative(start, twist);
             LOOP
-            for (int i = 0; i < points_of(p); ++i) {
+            for (int i = 0; i < pair.count; ++i) {
                 const Touch touch(touches, worlds, p, i);
-                if (touch.missing()) continue;
                 const REAL normal = rate(twist, pair, touch, v, slip);
                 const bool near = touch.depth + (normal < 0 ? -(h * normal) : 0) + value[3 * PAIRS] > 0;
                 const REAL push = k * touch.depth - kd * normal;
@@ -159,7 +176,7 @@ struct coupling
         for (int i = 0; i < 6; ++i) f0[i] = 0;
         const REAL k = value[3 * p] / pair.count, kd = k * h + value[3 * p + 1] / pair.count;
         LOOP
-        for (int i = 0; i < points_of(p); ++i) {
+        for (int i = 0; i < pair.count; ++i) {
             const int at = first_point_of(p) + i;
             const REAL a = across[at], shut = closed[at];
             if (!(a > 0 || shut > 0)) continue;
@@ -250,8 +267,8 @@ struct coupling
     }
 
     static CUDA_CALLABLE inline void pass(const REAL* value, const REAL* start, const REAL* response,
-        const REAL* touches, long long worlds, REAL h, bool closing, REAL* across, REAL* closed, REAL* candidate,
-        REAL* force, REAL* wrench, REAL* report)
+        const REAL* touches, long long worlds, REAL h, bool closing, const REAL* place, REAL* across, REAL* closed,
+        REAL* candidate, REAL* force, REAL* wrench, REAL* report)
     {
         Pair pairs[PAIRS];
         Triangle L[PAIRS];
@@ -264,7 +281,7 @@ struct coupling
         }
         EACH
         for (int p = 0; p < PAIRS; ++p) {
-            pairs[p] = find(p, touches, worlds);
+            pairs[p] = recall(p, place + 7 * p);
             const bool acts = gather(p, pairs[p], value, touches, worlds, h, across, closed, L[p], f0 + 6 * p);
             root(L[p]);
             if (acts) touching[count++] = p;
@@ -398,9 +415,8 @@ UNROLL
         const REAL k = value[3 * p] / pair.count, kd = k * h + value[3 * p + 1] / pair.count;
         pair.relative(twists, twist);
         LOOP
-        for (int i = 0; i < points_of(p); ++i) {
+        for (int i = 0; i < pair.count; ++i) {
             const Touch touch(touches, worlds, p, i);
-            if (touch.missing()) continue;
             const int at = first_point_of(p) + i;
             const REAL normal = rate(twist, pair, touch, v, slip);
             const REAL push = k * touch.depth - kd * normal, pushed = closed[at] > 0 ? push : 0;

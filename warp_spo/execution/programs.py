@@ -217,7 +217,10 @@ class Programs:
         regions += emitter.branches([coupled, looped] if coupled else [looped]) if looped else []
         *before, body = (render(each, self.run.dtype.__name__) for each in [*regions, emitter.region(placed)])
         if trace.begin:
-            entries = {GAIN: self.run.scene.dof_count, SECANT: sum(item.array == SECANT for item in trace.begin)}
+            entries = {
+                GAIN: self.run.scene.dof_count,
+                SECANT: max(1, sum(item.array == SECANT for item in trace.begin)),
+            }
             if coupled:
                 couples = self._couples(links)
                 entries |= coupling.shared_arrays(couples)
