@@ -33,6 +33,8 @@ from . import contacts, robots, runner, step_parts, substeps
 from .resources import record_launches, resources
 
 SOLVER_STEP = "SolverSPO.step"  # with drives and limits, of benchmarks.step_parts
+LEAN_STEP = "SolverSPO.step of joints alone"  # without the bodies' poses, and without forces on bodies
+STEPS = (SOLVER_STEP, LEAN_STEP)
 FEW, MANY, MOST = 4096, 65536, 1 << 20
 INERTIAS = ("body_mass", "body_com", "body_inertia")
 ON_PLANE, ON_FIELD = "contact_step", "contact_step on a height field"
@@ -86,8 +88,8 @@ def _over_float32(robot: str, operation: str, worlds: int, limit: float) -> Line
     return Line(call, "ratio", limit, dataclasses.replace(call, dtype="float32"))
 
 
-def _step_over_forward_dynamics(robot: str, worlds: int, limit: float) -> Line:
-    return Line(Call(robot, SOLVER_STEP, worlds), "ratio", limit, Call(robot, "forward_dynamics", worlds))
+def _step_over_forward_dynamics(robot: str, step: str, worlds: int, limit: float) -> Line:
+    return Line(Call(robot, step, worlds), "ratio", limit, Call(robot, "forward_dynamics", worlds))
 
 
 def _over_folded(robot: str, limit: float) -> Line:
@@ -96,7 +98,7 @@ def _over_folded(robot: str, limit: float) -> Line:
 
 
 LINES = (
-    *(_step_over_forward_dynamics(robot, FEW, 2.5) for robot in step_parts.NAMES),
+    *(_step_over_forward_dynamics(robot, step, FEW, 2.5) for step in STEPS for robot in step_parts.NAMES),
     *(_over_float32("centauro", "forward_dynamics", worlds, 3.0) for worlds in (FEW, MANY)),
     Line(Call("centauro", "forward_dynamics", MOST), "rate", 0.8),
     Line(Call("g1", "forward_dynamics", MOST), "rate", 1.6),
@@ -110,14 +112,14 @@ LINES = (
     *(Line(Call("go2", ON_PLANE, worlds), "us", limit) for worlds, limit in ((FEW, 25.0), (MANY, 150.0))),
     *(Line(Call("g1", ON_PLANE, worlds), "us", limit) for worlds, limit in ((FEW, 70.0), (MANY, 500.0))),
     Line(Call("go2", ON_FIELD, MANY), "ratio", 1.15, Call("go2", ON_PLANE, MANY)),
-    *(Line(Call(robot, name, FEW), "ratio", 0.8) for name in FUSED for robot in ("go2", "g1")),
+    *(Line(Call(robot, name, FEW), "ratio", limit) for name in FUSED for robot, limit in (("go2", 0.85), ("g1", 1.05))),
 )
 
 
 def trial_of(call: Call, device: wp.Device, sets: int = SETS) -> Trial | step_parts.SolverTrial:
     """Return the trial of a call, after its first evaluation."""
-    if call.operation == SOLVER_STEP:
-        return step_parts.SolverTrial(call.robot, call.worlds, device)
+    if call.operation in STEPS:
+        return step_parts.SolverTrial(call.robot, call.worlds, device, call.operation == LEAN_STEP)
     scene = robots.scene(call.robot)
     dyn = spo.Dynamics(scene, call.worlds, device, call.dtype, variable=call.variable)
     inputs = [Inputs(scene, call.worlds, seed) for seed in range(sets)]

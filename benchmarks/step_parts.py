@@ -64,10 +64,11 @@ class SolverTrial:
 
     Attributes:
         seconds: in which the solver was built.
+        lean: measured states have joints alone.
     """
 
-    def __init__(self, name: str, worlds: int, device: wp.Device):
-        self.name, self.worlds, self.device = name, worlds, device
+    def __init__(self, name: str, worlds: int, device: wp.Device, lean: bool = False):
+        self.name, self.worlds, self.device, self.lean = name, worlds, device, lean
         self.model = driven_model(name, worlds, device)
         begin = time.perf_counter()
         self.solver = SolverSPO(self.model)
@@ -105,11 +106,12 @@ class SolverTrial:
             wp.copy(found.joint_qd, qd.flatten())
         return found
 
-    def driven(self, lean: bool = False) -> Callable[[int], None]:
+    def driven(self, lean: bool | None = None) -> Callable[[int], None]:
         """Return steps of a simulation, which drives soon hold near their targets.
 
-        ``lean``: states have joints alone, no bodies and no forces on them.
+        ``lean``: states have joints alone, no bodies and no forces on them; None: as the trial has them.
         """
+        lean = self.lean if lean is None else lean
         states = [self.state(self.start), self.model.state()]
         for state in states if lean else ():
             state.body_q = state.body_qd = state.body_f = None
