@@ -44,7 +44,7 @@ def main(seconds=5.0, dt=5e-3, worlds=32, device=None, picture=None):
         q, qd = dyn.step(q, qd, None, dt, target_q=target)
         motion.append(100.0 * q[:, 4:6].sum(1))  # of the boom's tip, sideways [cm]: shapes are 1 there
     left = np.abs(motion)[ticks > 0.0].max(0)
-    print(f"After the turn the tip swings by {left[::2].max():.1f} cm, if shaped by {left[1::2].max(initial=0):.1f} cm.")
+    print(f"After the turn the tip swings by {left[::2].max():.1f} cm, shaped by {left[1::2].max(initial=0):.1f} cm.")
     if picture:
         with drawing(picture, "Slewing in 5 s, shaped in 8 s", "What is left") as (first, second):
             for k, color, name in ((0, OURS, "full acceleration, full braking"), (1, OURS_DARK, "shaped")):
