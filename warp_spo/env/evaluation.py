@@ -13,11 +13,12 @@ Policy = Callable[[Any], torch.Tensor]
 Read = Callable[[Env], torch.Tensor]
 
 
-def roll(env: Env, policy: Policy, steps: int, read: dict[str, Read]) -> dict[str, torch.Tensor]:
+def roll(env: Env, policy: Policy, steps: int, read: dict[str, Read], command: Any = None) -> dict[str, torch.Tensor]:
     """Start all worlds anew, and return what ``read`` returns after each step, [step, world, ...] by name.
 
     ``valid`` [step, world]: whether the world's first episode still goes on; ``ended`` [world]: whether it has ended by
     a termination, not by its length. What is read after the step that ends an episode belongs to the next one.
+    ``command``: held from the first step on; the observation before sees another one.
     """
     observed, _ = env.reset()
     env.episode_length_buf = torch.zeros_like(env.episode_length_buf)
@@ -25,6 +26,8 @@ def roll(env: Env, policy: Policy, steps: int, read: dict[str, Read]) -> dict[st
     ended = torch.zeros_like(alive)
     found: dict[str, list[torch.Tensor]] = {name: [] for name in ("valid", *read)}
     for _ in range(steps):
+        if command is not None:
+            env.command[:] = torch.tensor(command, dtype=torch.float32, device=env.device)
         observed, _, done, extras = env.step(policy(observed))
         over = done > 0
         ended |= alive & over & (extras["time_outs"] < 0.5)
@@ -68,11 +71,11 @@ def reach(env: Env, policy: Policy, frame: str, period: float) -> dict[str, floa
             "median error": float(last.median()), "95 % error": float(last.quantile(0.95))}  # fmt: skip
 
 
-def tracking(env: Env, policy: Policy, seconds: float = 20.0) -> dict[str, float]:
+def tracking(env: Env, policy: Policy, seconds: float = 20.0, command: Any = None) -> dict[str, float]:
     """Return the mean errors of a base that follows velocities [m/s, rad/s], and the share of worlds that fall."""
     wanted = lambda env: env.command.clone()  # noqa: E731
     read = {"is": base_rates, "wanted": wanted, "height": lambda env: env.q[:, 2]}
-    found = roll(env, policy, round(seconds / env.step_dt) - 1, read)
+    found = roll(env, policy, round(seconds / env.step_dt) - 1, read, command)
     error, valid = found["is"] - found["wanted"], found["valid"]
     return {
         "worlds": env.num_envs,

@@ -136,7 +136,6 @@ class Course:
         self.writer = self if folder is not None and writes else None
         self.rows: list[dict[str, float]] = []
         self.git_status_repos: list[str] = []
-        self.worlds = env.num_envs * int(os.getenv("WORLD_SIZE", "1"))
 
     def init_logging_writer(self) -> None:
         """Continue the rows of an earlier training in the same folder."""
@@ -193,6 +192,8 @@ def pick_device(asked: str | None) -> str:
     device = asked or (f"cuda:{local}" if torch.cuda.is_available() else "cpu")
     if device == "cpu":
         torch.set_num_threads(1)
+    else:
+        torch.cuda.set_device(device)
     return device
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -77,7 +78,11 @@ def _pictures(task: Any, recorded: Recording, rows: Any) -> list:
         ]
     shapes = [markers(task, recorded, row) for row in rows]
     follow = task.ROBOT not in ("cartpole", "panda")
-    return films.pictures(robot, recorded.q[rows], task.CAMERA, follow, shapes, texts)
+    camera = task.CAMERA
+    if follow:  # from the side of where the robot faces at first
+        _, _, z, w = recorded.q[rows[0], 3:7]
+        camera = dataclasses.replace(camera, azimuth=camera.azimuth + 2.0 * float(np.arctan2(z, w)))
+    return films.pictures(robot, recorded.q[rows], camera, follow, shapes, texts)
 
 
 def show(name: str, recorded: Recording, step: float) -> None:

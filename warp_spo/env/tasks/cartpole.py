@@ -13,7 +13,7 @@ from ..learning import Learner
 ROBOT = "cartpole"
 CAMERA = Camera(distance=5.0, elevation=0.15)
 LEARNER = Learner(
-    iterations=220, worlds=512, steps=24, hidden=(64, 64), rate=1e-3, epochs=5, batches=4, entropy=5e-3, target=0.015,
+    iterations=420, worlds=512, steps=24, hidden=(64, 64), rate=1e-3, epochs=5, batches=4, entropy=1e-2, target=0.015,
     deviation=1.0,
 )  # fmt: skip
 RAIL = 1.8  # half its length [m]
@@ -33,7 +33,7 @@ def upright(w: World) -> Any:
 
 def balance(w: World) -> Any:
     """Return 1 with the pole upright and at rest."""
-    error = (1.0 - np.cos(w.q[1])) / 0.02 + (w.qd[1] / 1.0) ** 2 + (w.qd[0] / 1.0) ** 2
+    error = (1.0 - np.cos(w.q[1])) / 0.05 + (w.qd[1] / 2.0) ** 2 + (w.qd[0] / 2.0) ** 2
     return np.exp(error * -0.5)
 
 

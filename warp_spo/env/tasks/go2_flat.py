@@ -13,7 +13,7 @@ from . import velocity
 
 ROBOT = "go2"
 CAMERA = Camera(distance=1.8)
-LEARNER = Learner(iterations=500, worlds=4096, steps=24, entropy=0.005, deviation=0.7)
+LEARNER = Learner(iterations=400, worlds=4096, steps=24, entropy=0.005, deviation=0.7)
 ACTOR = velocity.ACTOR
 FEET = ".*_calf"
 STANDING = {".*_(hip|thigh)_joint": 0.1, ".*_calf_joint": 0.2}  # deviations of joints from the default [rad]
@@ -29,6 +29,7 @@ def reward_terms(height: float) -> dict[str, tuple[float, Any]]:
         "pose": (1.0, velocity.pose(STANDING, WALKING)),
         "bouncing": (-1.0, rewards.vertical_velocity),
         "tilting": (-0.05, rewards.tilting),
+        "trot": (1.0, velocity.trot(FEET)),
         "action rate": (-0.03, rewards.action_rate),
         "joint limits": (-1.0, rewards.joint_limits()),
         "foot clearance": (-1.0, rewards.foot_clearance(FEET, height=height)),

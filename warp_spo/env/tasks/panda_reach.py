@@ -12,7 +12,7 @@ from ..learning import Learner
 
 ROBOT = "panda"
 CAMERA = Camera(distance=2.4, elevation=0.25, above=0.45)
-LEARNER = Learner(iterations=200, worlds=4096, steps=24, hidden=(128, 128), entropy=2e-3, discount=0.97)
+LEARNER = Learner(iterations=120, worlds=4096, steps=24, hidden=(128, 128), entropy=2e-3, discount=0.97)
 PLACES = ((0.35, 0.65), (-0.35, 0.35), (0.15, 0.65))  # ranges of x, y, z [m]
 PERIOD = 3.0  # time for each place [s]
 

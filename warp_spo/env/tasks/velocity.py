@@ -79,6 +79,21 @@ def swing_height(bodies: Any, height: float, least_command: float = 0.05) -> Any
     return term
 
 
+def trot(bodies: Any, least_command: float = 0.05) -> Any:
+    """Return, while the command moves, the share of a trot's four rules that hold.
+
+    Feet are front left, front right, hind left, hind right, in the order of the bodies. Those of a diagonal touch the
+    ground together or are both in the air; those side by side in front, and behind, are not alike.
+    """
+
+    def term(w: World) -> Any:
+        a, b, c, d = (where(touches, 1.0, 0.0) for touches in w.feet(bodies).touches)
+        rules = [1.0 - abs(a - d), 1.0 - abs(b - c), abs(a - b), abs(c - d)]
+        return where(rewards.moving(w, least_command), 0.25 * sum(rules), 0.0)
+
+    return term
+
+
 def one_foot(bodies: Any, most: float = 0.5, least_command: float = 0.05) -> Any:
     """Return the time of the present phase, up to ``most`` [s], while one foot alone touches the ground; 0 otherwise.
 
