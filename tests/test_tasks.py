@@ -41,7 +41,7 @@ def test_cartpole_steps():
     x, theta = q[-1][fine].T
     v, w = env.qd[fine].T
     up = 0.5 * (1 + theta.cos()) * (0.3 + 0.7 * (-((x / 0.8) ** 2)).exp())
-    still = (-0.5 * ((1 - theta.cos()) / 0.02 + w**2 + v**2)).exp()
+    still = (-0.5 * ((1 - theta.cos()) / 0.05 + w**2 / 4 + v**2 / 4)).exp()
     wanted = env.step_dt * (up + 2.0 * still - 0.02 * env.actions[fine, 0] ** 2)
     assert torch.allclose(reward[-1][fine], wanted, atol=1e-6)
     env.q[0, 0] = 1.9

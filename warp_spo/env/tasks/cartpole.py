@@ -13,7 +13,7 @@ from ..learning import Learner
 ROBOT = "cartpole"
 CAMERA = Camera(distance=5.0, elevation=0.15)
 LEARNER = Learner(
-    iterations=420, worlds=512, steps=24, hidden=(64, 64), rate=1e-3, epochs=5, batches=4, entropy=1e-2, target=0.015,
+    iterations=300, worlds=512, steps=24, hidden=(64, 64), rate=1e-3, epochs=5, batches=4, entropy=1e-2, target=0.015,
     deviation=1.0,
 )  # fmt: skip
 RAIL = 1.8  # half its length [m]

@@ -53,7 +53,7 @@ def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env
             "tilting": (-0.05, rewards.tilting),
             "action rate": (-0.01, rewards.action_rate),
             "joint limits": (-1.0, rewards.joint_limits()),
-            "one foot": (2.0, velocity.one_foot(FEET, most=0.4)),
+            "one foot": (1.5, velocity.one_foot(FEET)),
             "foot clearance": (-1.0, rewards.foot_clearance(FEET, height=0.1)),
             "swing height": (-0.25, velocity.swing_height(FEET, 0.1)),
             "foot slip": (-0.2, rewards.foot_slip(FEET)),

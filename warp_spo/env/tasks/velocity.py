@@ -94,22 +94,21 @@ def trot(bodies: Any, least_command: float = 0.05) -> Any:
     return term
 
 
-def one_foot(bodies: Any, most: float = 0.5, least_command: float = 0.05) -> Any:
-    """Return the time of the present phase, up to ``most`` [s], while one foot alone touches the ground; 0 otherwise.
+def one_foot(bodies: Any, longest: float = 0.5, least_command: float = 0.05) -> Any:
+    """Return 1, while the command moves, where one of two feet touches the ground, for not more than ``longest`` [s].
 
-    Steps of a walk earn it; standing and hopping do not.
+    Steps of a walk earn it; hops with both feet, standing, and standing on one leg do not.
     """
 
     def term(w: World) -> Any:
         feet = w.feet(bodies)
-        single = sum(where(touches, 1.0, 0.0) for touches in feet.touches)
-        phases = [where(t, c, a) for t, c, a in zip(feet.touches, feet.contact_time, feet.air_time, strict=True)]
-        shortest = phases[0]
+        left, right = feet.touches
+        alone = (left & ~right) | (right & ~left)
+        phases = [*feet.contact_time, *feet.air_time]
+        short = phases[0] < longest
         for phase in phases[1:]:
-            shortest = where(phase < shortest, phase, shortest)
-        shortest = where(shortest < most, shortest, most)
-        alone = (single > 0.5) & (single < 1.5) & rewards.moving(w, least_command)
-        return where(alone, shortest, 0.0)
+            short = short & (phase < longest)
+        return where(alone & short & rewards.moving(w, least_command), 1.0, 0.0)
 
     return term
 
