@@ -15,7 +15,6 @@ from .storage import StoredPart
 SINK = 1e-4  # how far the lighter body sinks in [m] that rests on the other one, where the stiffness is chosen
 DAMPING = 2.0  # of sqrt(k m): critical, so that stacks come to rest
 FACE = 8  # corners at most of the common part of two rectangles
-EXACT = 8  # touching pairs of a world at most that are solved together
 ROUND, BOX = 0, 1
 
 
