@@ -124,6 +124,7 @@ def test_in_place_is_the_same_and_nothing_is_allocated(turned):
         np.testing.assert_array_equal(getattr(state, name).numpy(), getattr(wanted, name).numpy())
 
 
+@pytest.mark.slow
 def test_substeps_of_a_step(turned):
     """To the bit the last of as many steps, with the status of all and the bodies' states of the last."""
     model, one = turned

@@ -217,7 +217,15 @@ def test_passes_share_what_does_not_change(monkeypatch):
     assert passes.max() > 1
 
 
-@pytest.mark.parametrize(("name", "staged"), [("hand", True), ("roots", False), ("still", False), ("driven", False)])
+@pytest.mark.parametrize(
+    ("name", "staged"),
+    [
+        ("hand", True),
+        ("driven", False),
+        pytest.param("roots", False, marks=pytest.mark.slow),
+        pytest.param("still", False, marks=pytest.mark.slow),
+    ],
+)
 def test_substeps_meet_at_barriers_alone(name, staged, monkeypatch):
     """The state stays where warps share it; the last of several substeps gives what as many runs give."""
     text, a, _ = texts_of(monkeypatch, name, staged, qdd=True, status=True, substeps=3)
