@@ -90,6 +90,15 @@ def test_units_are_converted(metre, kilogram, tmp_path):
         np.testing.assert_allclose(scene.values[name], value, rtol=4 * FLOAT32, atol=1e-9, err_msg=name)
 
 
+@pytest.mark.parametrize("metre", [1.0, 0.01])
+def test_contacts_are_in_metres(metre, tmp_path):
+    """The pole is a cube of 10 cm; the cart has no collision shape; the file has no material."""
+    (contact,) = load(mover(tmp_path, metre), contacts=True).contacts
+    np.testing.assert_allclose(np.abs(contact.positions), 0.05, rtol=FLOAT32)
+    assert contact.label.endswith("pole") and contact.body == 1
+    assert contact.friction == np.float32(spo.Contact.friction)
+
+
 def test_a_joint_outside_the_articulation_that_carries_a_body_is_refused(tmp_path):
     """Newton leaves the body out."""
     path = mover(tmp_path, more="uniform bool physics:excludeFromArticulation = 1")

@@ -200,8 +200,8 @@ class Programs:
         stores = [self._flattened(item, shapes) for item in routine.trace(trace, **options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         outs = [item for item in stores if item.array == "out"]
-        ahead = [Store("ahead", (), value) for value in trace.ahead]  # may read what no store needs
-        layout = self._layout(routine, outs, trace.begin + stores + ahead, shapes, more)
+        once_read = [Store("ahead", (), value) for value in trace.ahead]  # may read what no store needs
+        layout = self._layout(routine, outs, trace.begin + stores + once_read, shapes, more)
         once = routine.passes or any(item.array in LOOPED for item in stores)  # may write over what it reads
         layout = layout._replace(
             retries=not once and not layout.staged and layout.result.way in (DIRECT, TILED, RELAYED)

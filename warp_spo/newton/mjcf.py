@@ -146,7 +146,7 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool, choice: Choice = 
         raise unreadable(file, error) from error
     if gravity is not None:
         builder.gravity = gravity
-    lost = left_out(root)
+    lost = [what for what in left_out(root) if choice.contacts is None or "ground plane" not in what]
     if lost:
         warnings.warn(
             f"load: {str(file)!r}: {', '.join(lost)} left out; install the package mujoco, with which load reads "

@@ -9,6 +9,7 @@ import newton
 import numpy as np
 
 from ..errors import UnsupportedError
+from ..scene.contacts import Contact
 from ..scene.scene import Scene
 from ..scene.shapes import NONE, Choice
 from .imported import scene_of, unreadable
@@ -46,6 +47,7 @@ def read_usd(file: Path, floating: bool | None, repair: bool, choice: Choice = N
         stage.Reload()  # layers stay in memory as long as a stage has them
         metre, kilogram = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
         builder.default_shape_cfg.density *= metre**3 / kilogram  # the importer computes in the stage's units
+        builder.default_shape_cfg.mu = Contact.friction  # of shapes without a material
         found = builder.add_usd(str(file), floating=floating, load_visual_shapes=False, skip_mesh_approximation=True)
     except ImportError:
         raise
