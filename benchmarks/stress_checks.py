@@ -15,6 +15,7 @@ import warp_spo as spo
 
 from . import stress_scenes as scenes
 from . import stress_status
+from .stress_contact import check_falling_cubes
 from .stress_scenes import GRAVITY, NONE, Problem, Setting, draw, problem
 from .stress_status import run
 from .stress_steps import check_stiff_arm
@@ -186,6 +187,7 @@ LONG = {
     "S32.determinism_4096_worlds": (check_same_bits_of_4096_worlds, "S32"),
     "stiff_arm_million_steps": (check_million_steps, "unusual inputs"),
     "million_worlds": (check_million_worlds, "unusual inputs"),
+    "falling_cubes": (check_falling_cubes, "contact"),
 }
 """Checks that take minutes, as the slow cases do."""
 
