@@ -236,8 +236,8 @@ def permuted(scene, seed=0):
     values = {}
     for name, array in scene.values.items():
         by_dof = name not in ("gravity", "joint_X_p", "joint_X_c", "joint_rest_q") and name.startswith("joint")
-        if name.startswith(("actuator", "contact")):
-            continue  # in the order of the actuators and contacts, which stays
+        if name.startswith(("actuator", "contact", "ground")):
+            continue  # of actuators, contacts and the ground, whose order stays
         rows = {"gravity": slice(None), "joint_X_p": hinge, "joint_X_c": hinge, "joint_rest_q": q}
         values[name] = array[:, qd if by_dof else rows.get(name, body)]
     return Permuted(new.with_values(**values), body, hinge, q, qd)

@@ -200,18 +200,16 @@ class Programs:
         stores = [self._flattened(item, shapes) for item in routine.trace(trace, **options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         outs = [item for item in stores if item.array == "out"]
-        once_read = [Store("ahead", (), value) for value in trace.ahead]  # may read what no store needs
-        layout = self._layout(routine, outs, trace.begin + stores + once_read, shapes, more)
+        looped = [item for item in stores if item.array in PASSED]
+        kept = [Store("ahead", (), value) for value in trace.ahead] if looped else []  # may read what no store needs
+        layout = self._layout(routine, outs, trace.begin + stores + kept, shapes, more)
         once = routine.passes or any(item.array in LOOPED for item in stores)  # may write over what it reads
         layout = layout._replace(
             retries=not once and not layout.staged and layout.result.way in (DIRECT, TILED, RELAYED)
         )
         placed, table = staging.arrange_stores(outs, layout.result)
         placed += apart
-        emitter, looped = (
-            make_emitter(self.run.dtype.__name__, shapes, layout),
-            [item for item in stores if item.array in PASSED],
-        )
+        emitter = make_emitter(self.run.dtype.__name__, shapes, layout)
         coupled = [item for item in stores if item.array in pairs.READ]
         regions = [emitter.region(trace.begin, trace.ahead)] if looped else []
         regions += emitter.branches([coupled, looped] if coupled else [looped]) if looped else []
