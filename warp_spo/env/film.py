@@ -15,7 +15,7 @@ from .robots import Primitive, Robot
 
 SUN = np.array([0.35, -0.25, 0.9]) / np.linalg.norm([0.35, -0.25, 0.9])  # direction to the light
 SKY, GROUND, GROUND_DARK, SHADOW = (236, 240, 245), (214, 219, 224), (203, 209, 215), (160, 167, 175)
-CELL = 0.5  # edge of a square of the ground [m]
+CELL, FIELD_CELL = 0.5, 0.1  # edge of a square of flat ground, and of a height field [m]
 FINE = 2  # pictures are drawn so many times as large, then made smaller
 AROUND = 12  # corners of a circle
 
@@ -142,32 +142,34 @@ def draw(
 
 def _ground_faces(ground: Any, target: np.ndarray, camera: Camera) -> Any:
     """Yield (depth, places, colour) of the squares of the ground about the target."""
-    reach, cell = 2.5 * camera.distance, CELL
-    height = lambda x, y: np.zeros(np.broadcast(x, y).shape)  # noqa: E731
-    if isinstance(ground, HeightField):
-        reach, cell = 1.3 * camera.distance, float(ground.cell)
-        table, origin = np.asarray(ground.heights), np.asarray(ground.origin)
-
-        def height(x: Any, y: Any) -> Any:
-            i = np.clip(np.round((x - origin[0]) / cell).astype(int), 0, table.shape[0] - 1)
-            j = np.clip(np.round((y - origin[1]) / cell).astype(int), 0, table.shape[1] - 1)
-            return table[i, j] + origin[2]
-
+    uneven = isinstance(ground, HeightField)
+    reach, cell = (1.3 * camera.distance, FIELD_CELL) if uneven else (2.5 * camera.distance, CELL)
     first = np.floor((target[:2] - reach) / cell).astype(int)
     count = int(np.ceil(2 * reach / cell)) + 1
-    for i in range(first[0], first[0] + count):
-        for j in range(first[1], first[1] + count):
-            x, y = cell * np.array([i, i + 1, i + 1, i]), cell * np.array([j, j, j + 1, j + 1])
-            corners = np.stack([x, y, height(x, y)], axis=1)
-            places, depth = camera.project(corners, target)
-            if depth.min() < 0.1:
+    x, y = np.meshgrid(*(cell * (start + np.arange(count + 1)) for start in first), indexing="ij")
+    corners = np.stack([x, y, _heights(ground, x, y) if uneven else np.zeros_like(x)], axis=-1)
+    places, depth = camera.project(corners.reshape(-1, 3), target)
+    places, depth = places.reshape(*x.shape, 2), depth.reshape(x.shape)
+    for i in range(count):
+        for j in range(count):
+            at = ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1))
+            depths = [depth[k] for k in at]
+            if min(depths) < 0.1:
                 continue
-            color: tuple[int, ...] = GROUND if (i + j) % 2 else GROUND_DARK
-            if isinstance(ground, HeightField):
-                normal = np.cross(corners[2] - corners[0], corners[3] - corners[1])
-                light = 0.6 + 0.4 * max(0.0, float(normal @ SUN / np.linalg.norm(normal)))
+            color: tuple[int, ...] = GROUND if (first[0] + i + first[1] + j) % 2 else GROUND_DARK
+            if uneven:
+                normal = np.cross(corners[at[2]] - corners[at[0]], corners[at[3]] - corners[at[1]])
+                light = 0.45 + 0.55 * max(0.0, float(normal @ SUN / np.linalg.norm(normal)))
                 color = tuple(int(light * part) for part in GROUND)
-            yield depth.mean() + 0.05, [tuple(place) for place in places], color
+            yield sum(depths) / 4.0 + 0.05, [tuple(places[k]) for k in at], color
+
+
+def _heights(ground: HeightField, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the heights [m] of a field at points near its own."""
+    table, origin, cells = np.asarray(ground.heights), np.asarray(ground.origin), ground.cells
+    i = np.clip(np.round((x - origin[0]) / cells[0]).astype(int), 0, table.shape[0] - 1)
+    j = np.clip(np.round((y - origin[1]) / cells[1]).astype(int), 0, table.shape[1] - 1)
+    return table[i, j] + origin[2]
 
 
 def pictures(

@@ -21,13 +21,14 @@ class Recording(NamedTuple):
 
     Attributes:
         q: coordinates [step, coordinate]. qd: velocities [step, dof]. commands: [step, command], or None.
-        step: length of a step [s].
+        step: length of a step [s]. ground: of the scene.
     """
 
     q: np.ndarray
     qd: np.ndarray
     commands: np.ndarray | None
     step: float
+    ground: Any
 
 
 def record(env: Env, policy: Any, seconds: float, command: Any = None, world: int = 0) -> Recording:
@@ -43,7 +44,7 @@ def record(env: Env, policy: Any, seconds: float, command: Any = None, world: in
         for rows, values in zip(states, (env.q, env.qd, env.command if commanded else env.q), strict=True):
             rows.append(values[world].cpu().numpy().copy())
     q, qd, commands = (np.array(rows) for rows in states)
-    return Recording(q, qd, commands if commanded else None, env.step_dt)
+    return Recording(q, qd, commands if commanded else None, env.step_dt, env.scene.ground)
 
 
 def markers(task: Any, recorded: Recording, row: int) -> tuple:
@@ -68,7 +69,7 @@ def strip(task: Any, recorded: Recording, start: float = 0.5) -> list:
 
 
 def _pictures(task: Any, recorded: Recording, rows: Any) -> list:
-    robot = robots.load(task.ROBOT, getattr(task, "GROUND", None))
+    robot = robots.load(task.ROBOT, recorded.ground)
     rows = list(rows)
     texts = [f"{row * recorded.step:.2f} s" for row in rows]
     if recorded.commands is not None and not hasattr(task, "PLACES"):
