@@ -94,6 +94,17 @@ def test_more_contacts_than_slots_are_named_by_status(made):
     solver.reset(state)
 
 
+def test_slots_hold_the_first_contacts_of_their_shape(made):
+    """In the order of the list, whatever lies between them; an empty slot holds no number of a contact."""
+    model, solver, _ = made
+    owners = [3, 0, 2, 0, 3, 0, 0, 0]  # of each contact in the list
+    solver.step(start(model), model.state(), None, listed([(i, PLANE, i % 2 == 0, (0, 0, -1.0)) for i in owners]), H)
+    slots = solver._slots._slot.numpy().reshape(4, 4)
+    wanted = [[i for i, owner in enumerate(owners) if owner == shape][:4] for shape in range(4)]
+    assert [row[row != int(contact_slots.EMPTY)].tolist() for row in slots] == wanted
+    solver.reset(model.state())
+
+
 def test_what_slots_do_not_take_is_named_by_status(made):
     """Two bodies that touch, but not those apart; a belt that moves."""
     model, solver, _ = made
