@@ -37,7 +37,7 @@ def adapter(manager: Any, configuration: Any) -> tuple[type, type]:
     """
 
     class NewtonSPOManager(manager):
-        """Isaac Lab's manager with SolverSPO. It steps one state in place and computes no contacts."""
+        """Isaac Lab's manager with SolverSPO. It steps one state in place; contacts with the ground are its own."""
 
         @classmethod
         def _build_solver(cls, model: Any, solver_cfg: Any) -> None:

@@ -148,7 +148,7 @@ class Plugs(CouplingInterface):
             )
 
     def coupling_prepare_proxy_contacts(self, *_: Any, **__: Any) -> Any:
-        """Raise NotImplementedError, because SolverSPO computes no contacts."""
+        """Raise NotImplementedError, because SolverSPO takes no contacts of proxies."""
         raise NotImplementedError(
             "SolverSPO cannot be a proxy coupling destination, because it takes no contacts; make it the source"
         )
