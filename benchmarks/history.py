@@ -83,7 +83,8 @@ def harvest(folder: Path = FOLDER) -> list[Path]:
     for commit in commits.git("log", "--format=%H", "--", str(evidence.RESULTS)).split():
         names = commits.git("ls-tree", "--full-tree", "--name-only", "-r", commit, str(RESULTS_IN_GIT)).split("\n")
         for name in names:
-            if name.endswith(".json") and not name.startswith(str(RESULTS_IN_GIT / FOLDER.name)):
+            file = Path(name)
+            if file.suffix == ".json" and file.parent == RESULTS_IN_GIT:  # subfolders have results of other forms
                 data = json.loads(commits.git("show", f"{commit}:{name}"))
                 if isinstance(data, dict) and "rows" in data and "commit" in data:
                     runs.setdefault((data["commit"], data["machine"]["device"]), []).append(data)
