@@ -31,7 +31,8 @@ def run(name: str, line: str) -> str:
     command = [sys.executable, "-m", f"warp_spo.examples.{name}", "--picture", str(picture)]
     printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     return (
-        f"## {name}\n\n{line}\n\n    python -m warp_spo.examples.{name}\n\n"
+        f"## {name}\n\n{line}\n\n<!-- not run: benchmarks.gallery ran it -->\n"
+        f"```console\npython -m warp_spo.examples.{name}\n```\n\n"
         f"![what the example {name} draws](_static/gallery/{picture.name})\n\n```text\n{printed.strip()}\n```\n"
     )
 

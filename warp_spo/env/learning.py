@@ -235,8 +235,10 @@ def train(
         folder: is made; a training that resumes may continue in its own.
         iterations: in all, those before ``resume`` included; None: as the settings say.
         resume: checkpoint to continue from.
-        seed: of the learner's random numbers. save_interval: iterations from one checkpoint to the next. every:
-            iterations from one printed line to the next. began: time from which seconds count.
+        seed: of the learner's random numbers.
+        save_interval: iterations from one checkpoint to the next.
+        every: iterations from one printed line to the next.
+        began: time from which seconds count, as of ``time.time``.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
