@@ -7,7 +7,7 @@ which a difference across a switch is known and left out.
 import numpy as np
 
 from warp_spo.recursions.contact import step as contact
-from warp_spo.recursions.contact.ground import GROUND
+from warp_spo.recursions.contact.ground import CORNERS, GROUND, corner_steps, surface_count
 from warp_spo.recursions.contact.secants import SECANT
 from warp_spo.recursions.derivatives import contact as back
 from warp_spo.recursions.links import Links
@@ -16,12 +16,14 @@ from warp_spo.recursions.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
 from warp_spo.trace.scalars import ordered
 
+HEIGHTS = "ground_heights"
 VALUES = ("contact_friction", "contact_stiffness", "contact_damping", "joint_target_ke", "joint_target_kd",
-          "ground_origin")  # fmt: skip
+          "ground_origin", HEIGHTS)  # fmt: skip
 STEP = {"q": 1e-6, "qd": 1e-6, "tau": 1e-3, "body_f": 1e-3, "target_q": 1e-4, "target_qd": 1e-4, "ctrl": 1e-4,
-        "ground_origin": 1e-6}  # fmt: skip
+        "ground_origin": 1e-6, HEIGHTS: 1e-6}  # fmt: skip
 """Of the differences; values move by RELATIVE of themselves. Smaller ones drown in rounding errors."""
 RELATIVE = 3e-3
+OTHERS = 4  # heights of a field that no point stands on, whose differences are taken
 FOURTH = ((1.0, 8.0), (-1.0, -8.0), (2.0, -1.0), (-2.0, 1.0))
 """How far each copy moves, and its weight in twelve steps of the difference, which is of fourth order."""
 
@@ -29,7 +31,8 @@ FOURTH = ((1.0, 8.0), (-1.0, -8.0), (2.0, -1.0), (-2.0, 1.0))
 def furnish(scene, a):
     """The arguments and the values of a scene by name, [world, ...]."""
     worlds = len(a["q"])
-    return a | {name: np.tile(scene.values[name], (worlds, 1)) for name in VALUES}
+    values = {name: scene.values[name] for name in VALUES if scene.values[name].size}
+    return a | {name: np.tile(value, (worlds, *[1] * (value.ndim - 1))) for name, value in values.items()}
 
 
 def trace_of(scene, names):
@@ -54,7 +57,7 @@ def step(scene, a, h, passes):
     stores = contact.step(trace)
     known = a | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
     known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(trace.begin)))}
-    known[GROUND] = np.ravel(getattr(scene.ground, "heights", ()))
+    known[GROUND] = known.get(HEIGHTS, np.zeros((worlds, 0))).reshape(worlds, -1)  # each world has its own here
     answers = [store(trace.begin, known, known)]
     looped = [item for item in stores if item.array in (GAIN, SECANT)]
     for number in range(passes):
@@ -74,9 +77,11 @@ def gradient(scene, a, h, passes, cotangents, wrt):
     count = back.count_variables(trace_of(scene, names))
     forward = back.contact_pass(trace_of(scene, names))
     backward = back.contact_pass_vjp(trace_of(scene, (*names, "qdd", "q_cotangent", "qd_cotangent")), wrt)
-    blank = lambda size: np.full((worlds, size), np.nan)  # noqa: E731
+    blank = lambda *size: np.full((worlds, *size), np.nan)  # noqa: E731
     known = a | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
-    known[GROUND] = np.ravel(getattr(scene.ground, "heights", ()))
+    known[GROUND] = known.get(HEIGHTS, np.zeros((worlds, 0))).reshape(worlds, -1)
+    surfaces = len(scene.contact_points) * surface_count(scene.ground, varies=HEIGHTS in a)
+    shapes = {name: a[name].shape[1:] for name in wrt} | ({HEIGHTS: (surfaces, CORNERS)} if HEIGHTS in wrt else {})
     rates, rows = [blank(dofs)], [blank(count)]
     for number in range(passes):
         known |= {"number": np.full((worlds, 1), float(number)), "row": rows[-1], "qdd_before": rates[-1]}
@@ -85,27 +90,38 @@ def gradient(scene, a, h, passes, cotangents, wrt):
         rates.append(found["out"])
         rows.append(found["row_out"])
     known |= dict(zip(("q_cotangent", "qd_cotangent"), cotangents, strict=True), cotangent=blank(dofs + count))
-    known |= {f"{name}_later": np.full(a[name].shape, np.nan) for name in wrt}
+    known |= {f"{name}_later": blank(*shape) for name, shape in shapes.items()}
     for number in reversed(range(passes)):
         known |= {"number": np.full((worlds, 1), float(number)), "row": rows[number], "qdd_before": rates[number],
                   "qdd": rates[number + 1]}  # fmt: skip
-        found = {back.result_name(name, wrt): np.full(a[name].shape, np.nan) for name in wrt}
-        found["cotangent_out"] = blank(dofs + count)
+        found = {back.result_name(name, wrt): blank(*shape) for name, shape in shapes.items()}
+        found |= {"cotangent_out": blank(dofs + count), f"{back.HEIGHTS_AT}_bar": blank(surfaces)}
         store(backward, known, found)
         known["cotangent"] = found["cotangent_out"]
         known |= {f"{name}_later": found[back.result_name(name, wrt)] for name in wrt}
-    return {name: known[f"{name}_later"] for name in wrt}
+    gradients = {name: known[f"{name}_later"] for name in wrt}
+    if HEIGHTS in wrt:
+        by_height = np.zeros((worlds, scene.ground.heights.size))
+        cells = found[f"{back.HEIGHTS_AT}_bar"].astype(int)
+        for corner, distance in enumerate(corner_steps(scene.ground)):
+            np.add.at(by_height, (np.arange(worlds)[:, None], cells + distance), gradients[HEIGHTS][:, :, corner])
+        gradients[HEIGHTS] = by_height.reshape(a[HEIGHTS].shape)
+    return gradients
 
 
-def differences(scene, a, h, passes, cotangents, name, advance=step):
-    """Differences by the entries of an argument or value [world, entry], NaN where one crosses a switch."""
+def differences(scene, a, h, passes, cotangents, name, advance=step, chosen=None):
+    """Differences by the entries of an argument or value [world, entry], NaN where one crosses a switch.
+
+    ``chosen`` entries alone, if they are given.
+    """
     flat = a[name].reshape(len(a[name]), -1)
-    worlds, entries = flat.shape
+    chosen = np.arange(flat.shape[1]) if chosen is None else chosen
+    worlds, entries = len(flat), len(chosen)
     sizes = np.full(flat.shape, STEP[name]) if name in STEP else RELATIVE * np.maximum(abs(flat), 1e-2)
     moved = np.tile(flat, (entries * len(FOURTH), 1, 1))  # [entry and copy, world, entry]
     for at in range(entries):
         for copy, (share, _) in enumerate(FOURTH):
-            moved[at * len(FOURTH) + copy, :, at] += share * sizes[:, at]
+            moved[at * len(FOURTH) + copy, :, chosen[at]] += share * sizes[:, chosen[at]]
     many = {n: np.tile(x, (entries * len(FOURTH), *[1] * (x.ndim - 1))) for n, x in a.items()}
     many[name] = moved.reshape(-1, *a[name].shape[1:])
     q, qd, answers = advance(scene, many, h, passes)
@@ -115,7 +131,7 @@ def differences(scene, a, h, passes, cotangents, name, advance=step):
     crossed = (answers != answers[:, :1]).any(axis=(1, 3)).T
     for at in range(entries):
         weighted = sum(w * sums[at * len(FOURTH) + copy] for copy, (_, w) in enumerate(FOURTH))
-        found[:, at] = weighted / (12.0 * sizes[:, at])
+        found[:, at] = weighted / (12.0 * sizes[:, chosen[at]])
     return np.where(crossed, np.nan, found)
 
 
@@ -126,8 +142,12 @@ def errors(scene, a, h, passes, seed=0, names=None):
     wrt = tuple(names or a)
     found, errors = gradient(scene, a, h, passes, cotangents, wrt), {}
     for name in wrt:
-        wanted = differences(scene, a, h, passes, cotangents, name)
-        mine = found[name].reshape(wanted.shape)
+        mine, chosen = found[name].reshape(len(a[name]), -1), None
+        if name == HEIGHTS:  # those that points stand on, and a few others
+            touched = mine.any(axis=0)
+            chosen = np.append(np.flatnonzero(touched), np.flatnonzero(~touched)[:: len(touched) // OTHERS])
+            mine = mine[:, chosen]
+        wanted = differences(scene, a, h, passes, cotangents, name, chosen=chosen)
         assert np.isfinite(mine).all(), name
         scale = np.maximum(abs(mine).max(axis=1, keepdims=True), 1e-12)
         errors[name] = np.nanmax(abs(mine - wanted) / scale), np.isnan(wanted).mean()

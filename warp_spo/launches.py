@@ -1,8 +1,9 @@
-"""Launches kernels, copies and fills arrays; and records what a call does, so that a later call repeats it.
+"""Launches kernels, copies, fills and sorts arrays; and records what a call does, so that a later call repeats it.
 
-All device work between a public call and its result goes through :func:`launch`, :func:`copy` and :func:`fill`. While a
-:class:`Recording` is open in the thread, they also keep what they do. A repetition sets the addresses of the callers'
-arrays in the packed arguments of the kernels and packs nothing else, which takes a fraction of the time.
+All device work between a public call and its result goes through :func:`launch`, :func:`copy`, :func:`fill` and
+:func:`sort`. While a :class:`Recording` is open in the thread, they also keep what they do. A repetition sets the
+addresses of the callers' arrays in the packed arguments of the kernels and packs nothing else, which takes a fraction
+of the time.
 """
 
 from __future__ import annotations
@@ -63,9 +64,21 @@ def fill(array: wp.array, value: float) -> None:
         _thread.recording.keep(_Fill, array, value)
 
 
+def sort(keys: wp.array, values: wp.array, count: int) -> None:
+    """Sort the first ``count`` keys, 32-bit integers, and with them the values; equal keys keep their order.
+
+    Both arrays have room for twice as many entries.
+    """
+    if _thread.waiting is not None:
+        return _wait(functools.partial(sort, keys, values, count))
+    wp.utils.radix_sort_pairs(keys, values, count)
+    if _thread.recording is not None:
+        _thread.recording.keep(_Sort, keys, values, count)
+
+
 @contextlib.contextmanager
 def compile_side_by_side() -> Iterator[None]:
-    """Let the launches, copies and fills in the ``with`` block wait, and do them in order at its end.
+    """Let the launches, copies, fills and sorts in the ``with`` block wait, and do them in order at its end.
 
     On CUDA, the kernels of the launches are compiled before, on all cores of the host. Inside the block nothing is
     computed, so that results must not be read there, and arrays that callers pass must outlive it. No graph may be
@@ -137,6 +150,15 @@ class _Fill:
     def launch(self, stream: wp.Stream | None) -> None:
         with wp.ScopedStream(stream, sync_enter=False):
             _set_all(self._place.array(), self._value)
+
+
+class _Sort:
+    def __init__(self, keys: _Place, values: _Place, count: int):
+        self._keys, self._values, self._count = keys, values, count
+
+    def launch(self, stream: wp.Stream | None) -> None:
+        with wp.ScopedStream(stream, sync_enter=False):
+            wp.utils.radix_sort_pairs(self._keys.array(), self._values.array(), self._count)
 
 
 class _Launch:
@@ -222,7 +244,7 @@ class Recording:
         self.steps.append(_Launch(command))
 
     def keep(self, step: type, *arguments: Any) -> None:
-        """Keep a copy or fill that was done."""
+        """Keep a copy, a fill or a sort that was done."""
         places: list[Any] = []
         for argument in arguments:
             if not isinstance(argument, wp.array):

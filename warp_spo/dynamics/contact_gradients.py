@@ -10,10 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from ..execution.heights import HeightSums
 from ..execution.routine import Routine
+from ..recursions.contact.ground import CORNERS, corner_steps, surface_count
 from ..recursions.contact.step import PASSES
-from ..recursions.derivatives.contact import COTANGENT, contact_pass, contact_pass_vjp, count_variables
+from ..recursions.derivatives.adjoints import result_name
+from ..recursions.derivatives.contact import COTANGENT, HEIGHTS_AT, contact_pass, contact_pass_vjp, count_variables
 from ..recursions.tracing import Trace
+from ..scene.contacts import HEIGHTS, HeightField
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
@@ -53,15 +57,29 @@ def launch(
         engine.launch_routine(
             PASS, rates[number + 1], {"row_out": rows[number + 1]}, number=float(number), **before, **read
         )
+    results = dict(zip(wrt, (out, *more.values()), strict=True))
+    summed, ground = results.get(HEIGHTS), dyn.scene.ground
+    if summed is not None:
+        surfaces = len(dyn.scene.contact_points) * surface_count(ground, varies=True)
+        results[HEIGHTS] = dyn.recursions.array("heights by surface", dyn.worlds, surfaces, CORNERS)
+        results[HEIGHTS_AT] = dyn.recursions.array("cells by surface", dyn.worlds, surfaces)
     cotangents = [array(COTANGENT, number, dofs + variables) for number in range(2)]
-    later = {f"{name}_later": result for name, result in zip(wrt, (out, *more.values()), strict=True)}
+    later = {f"{name}_later": results[name] for name in wrt}
     read |= {name: given[name] for name in READ_AFTERWARDS[1:]} | later
     read.pop("tau", None)  # no gradient depends on it
     for number in reversed(range(count)):
         passed = {"row": rows[number], "qdd_before": rates[number], "qdd": rates[number + 1]}
         passed[COTANGENT] = cotangents[number % 2]
-        results = more | {f"{COTANGENT}_out": cotangents[1 - number % 2]}
-        engine.launch_routine(PASS_VJP, out, results, number=float(number), wrt=wrt, **passed, **read)
+        more = {result_name(name, wrt): array for name, array in results.items() if name != wrt[0]}
+        more[f"{COTANGENT}_out"] = cotangents[1 - number % 2]
+        engine.launch_routine(PASS_VJP, results[wrt[0]], more, number=float(number), wrt=wrt, **passed, **read)
+    if summed is not None:
+        assert isinstance(ground, HeightField)
+        contributions, cells = results[HEIGHTS], results[HEIGHTS_AT]
+        if dyn._gradients.height_sums is None:
+            dyn._gradients.height_sums = HeightSums(cells.size, summed.size, dyn.dtype, dyn.device)
+        flat = cells.flatten(), contributions.reshape((cells.size, CORNERS))
+        dyn._gradients.height_sums.add_up(*flat, corner_steps(ground), summed.flatten())
 
 
 def _variables(dyn: Dynamics, inputs: tuple[str, ...]) -> int:

@@ -18,6 +18,8 @@ from .. import launches
 from ..arrays import Call
 from ..errors import UnsupportedError, as_names
 from ..execution import link_values
+from ..execution.heights import HeightSums
+from ..execution.parameters import SHARED
 from ..execution.plan import MOST_DOFS
 from ..recursions.links import LINK_VALUES
 from .operation import DIFFERENTIABLE, Derivative, Operation, derivative_of
@@ -37,6 +39,7 @@ class Gradients:
         self.dyn = dyn
         self._checked: set[str] = set()  # names of operations that have gradients on this scene
         self.pass_variables: dict[tuple[str, ...], int] = {}  # of steps with contacts, by their arguments
+        self.height_sums: HeightSums | None = None
         self.latest: dict[str, Callable[[tuple, dict[str, Any]], Any]] = {}  # repeats a call that torch records
 
     # -- for torch -------------------------------------------------------------------------------------------------
@@ -221,7 +224,8 @@ class Gradients:
     def shape_of(self, operation: Operation, name: str) -> tuple[int, ...]:
         """Return the shape of the gradient by an argument, by a value of the scene, or along "tangent" coordinates."""
         if name in DIFFERENTIABLE:
-            return self.dyn.worlds, *self.dyn.scene.values[name].shape[1:]
+            shape = self.dyn.scene.values[name].shape[1:]
+            return shape if name in SHARED else (self.dyn.worlds, *shape)
         axes = {argument.name: argument.axes for argument in operation.arrays}
         return self.dyn._engine.shape(axes.get(name, "world, dof"))[0]
 

@@ -42,7 +42,7 @@ from ..dlpack import settle
 from ..execution.routine import Routine
 from ..gradients import call_in_graph, call_with_gradient, is_exported, is_traced, records_gradient
 from ..recursions.links import LINK_VALUES, MOTION_VALUES, Links
-from ..scene.contacts import CONTACT_VALUES
+from ..scene.contacts import CONTACT_VALUES, HEIGHTS
 from ..scene.frames import check_frames, origins
 from ..scene.scene import Scene
 from . import samples
@@ -190,7 +190,8 @@ GAINS = ("joint_damping", "joint_stiffness", "joint_friction", "joint_target_ke"
          "joint_velocity_limit")  # fmt: skip
 KINEMATIC = (*ANCHORS, "body_com")  # values that enter poses, velocities and Jacobians
 ACTUATION = ("actuator_gain", "actuator_bias", "actuator_gear", "actuator_strength")
-DIFFERENTIABLE = (*LINK_VALUES, *GAINS, *ACTUATION, *CONTACT_VALUES, "ground_origin")
+DIFFERENTIABLE = (*LINK_VALUES, *GAINS, *ACTUATION, *CONTACT_VALUES, "ground_origin",
+                  HEIGHTS)  # fmt: skip
 """All values of a scene by which some result can be differentiated."""
 
 

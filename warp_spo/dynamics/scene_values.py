@@ -10,7 +10,7 @@ import warp as wp
 
 from ..arrays import AnyArray, ArrayT, Call, shape_of
 from ..dlpack import settle
-from ..execution.parameters import VARIABLE
+from ..execution.parameters import SHARED, VARIABLE
 from ..execution.rows import as_rows, copy_rows
 from ..gradients import records_gradient
 from ..scene.actuators import check_actuator_value
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 def set_values(self: Dynamics, *, worlds: AnyArray | None = None, **values: Any) -> None:
     """Change values of the scene, in Newton's names and layouts, [world, ...] or [...] for all worlds.
+
+    All worlds share "ground_heights", which has no world axis.
 
     Names in ``variable`` are copied by launches, one for all names and one or two for what kernels derive from them,
     which a graph may capture; their numbers are not inspected, but for delays in NumPy arrays. Any other name rebuilds
@@ -53,11 +55,14 @@ def set_values(self: Dynamics, *, worlds: AnyArray | None = None, **values: Any)
                 except (TypeError, ValueError):
                     raise TypeError(f"Dynamics.set: {name} is {value!r}; expected an array of numbers") from None
             shape = self.scene.values[name].shape[1:]
-            if len(shape_of(value)) > len(shape):
+            if len(shape_of(value)) > len(shape) and name not in SHARED:
                 shape = (self.worlds, *shape)
             followed = name in self._gradients.values and records_gradient((value,))
             plain = value.detach() if followed else value
-            array = call.read(name, plain, shape, "[world, ...] or [...] as Newton has it")
+            meaning = (
+                "[...], because all worlds share it" if name in SHARED else "[world, ...] or [...] as Newton has it"
+            )
+            array = call.read(name, plain, shape, meaning)
             if name in self.variable:
                 if name == "actuator_delay" and isinstance(value, np.ndarray):
                     check_actuator_value("Dynamics.set", name, value)
@@ -154,6 +159,11 @@ def read_mask(call: Call, name: str, mask: Any, worlds: int) -> wp.array:
 
 def _refuse_with_mask(dyn: Dynamics, values: dict[str, Any], folded: dict[str, Any]) -> None:
     """Raise ValueError where values cannot change in some worlds alone."""
+    for name in values:
+        if name in SHARED:
+            raise ValueError(
+                f"Dynamics.set: worlds= with {name}, which all worlds share; expected no worlds=; set it for all worlds"
+            )
     if folded:
         raise ValueError(
             f"Dynamics.set: worlds= with {', '.join(folded)}, which is folded into the kernels; expected variable "

@@ -18,7 +18,7 @@ from ..kernels.spatial import POSE, RIGID
 from ..kernels.topology import Topology
 from ..memory import broadcast_worlds
 from ..scene.actuators import ACTUATOR_VALUES
-from ..scene.contacts import CONTACT_VALUES, GROUND_VALUES
+from ..scene.contacts import CONTACT_VALUES, GROUND_VALUES, HEIGHTS
 from ..scene.scene import Scene
 from .node_functions import node_functions
 from .rows import as_rows, copy_rows
@@ -48,6 +48,8 @@ VARIABLE = (
     *CONTACT_VALUES,
     *GROUND_VALUES,
 )
+SHARED = (HEIGHTS,)
+"""Values that all worlds share even where they are variable."""
 RIGID_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c")
 
 
@@ -89,7 +91,7 @@ class Parameters:
         self._values: dict[str, wp.array] = {}
         for name, value in scene.values.items():
             own: Any = wp.array(value, dtype=wp.float64, device=device)
-            if name in variable:
+            if name in variable and name not in SHARED:
                 shared, own = own, wp.empty((worlds, *value.shape[1:]), dtype=wp.float64, device=device)
                 launches.copy(own, broadcast_worlds(shared, 0, worlds))
             self._values[name] = own
@@ -173,6 +175,19 @@ class Parameters:
         return self.derived_arrays(name, build)[0]
 
     @property
+    def ground_heights(self) -> wp.array:
+        """Heights of the ground's height field, rounded, row after row, field after field [height]."""
+
+        def build() -> DerivedArrays:
+            value = self._values[HEIGHTS]
+            own: Any = wp.empty((value.size, 1), dtype=self.dtype, device=self.device)
+            inputs, kernel = [value.reshape((1, value.size))], kernels.transpose(node_functions(self.dtype))
+            fill = lambda: launches.launch(kernel, own.shape, inputs, [own], device=self.device)  # noqa: E731
+            return DerivedArrays([own.reshape(value.size)], (HEIGHTS,), fill)
+
+        return self.derived_arrays("heights of the ground", build)[0]
+
+    @property
     def gravity(self) -> wp.array | None:
         """Gravity [3, world], [m/s^2]; None where it is zero and not variable."""
         if "gravity" not in self.variable and not self.scene.values["gravity"].any():
@@ -186,14 +201,18 @@ class Parameters:
     def set(self, values: Mapping[str, wp.array], chosen: wp.array | None = None) -> None:
         """Set variable values from arrays [world, ...] or [...] in one launch, and what depends on them.
 
+        Values that all worlds share take a launch of their own.
+
         Args:
             values: by name, of the type of this object. chosen: the worlds whose values change [world]; None is all.
         """
         own = {name: self._values[name] for name, array in values.items() if array.size}
-        sources = [as_rows(values[name], array.shape[1:]) for name, array in own.items()]
-        targets = [as_rows(array, array.shape[1:]) for array in own.values()]
-        if sources:
-            copy_rows(sources, targets, self.worlds, chosen)
+        for worlds, names in ((self.worlds, own.keys() - set(SHARED)), (1, own.keys() & set(SHARED))):
+            sources = [as_rows(values[name], own[name].shape[1:]) for name in own if name in names]
+            targets = [as_rows(array, array.shape[1:]) for name, array in own.items() if name in names]
+            if sources:
+                copy_rows(sources, targets, worlds, chosen)
+        if own:
             self.refresh(values)
 
     def adopt_variable(self, other: Parameters) -> None:

@@ -241,7 +241,7 @@ class Programs:
     def _heights(self, reads: bool) -> dict[str, Any]:
         """Return the table of the ground's heights, if a program ``reads`` it."""
         ground = self.run.scene.ground
-        return {GROUND: ground.heights.ravel()} if reads and isinstance(ground, HeightField) else {}
+        return {GROUND: self.run.parameters.ground_heights} if reads and isinstance(ground, HeightField) else {}
 
     def _segment_program(
         self, routine: Routine, shapes: dict, pieces: Pieces, more: tuple, options: dict

@@ -15,7 +15,8 @@ from .storage import Stored, StoredPart
 
 CONTACT_VALUES = ("contact_friction", "contact_stiffness", "contact_damping")
 """Names of a scene's values that come from its contacts, one entry a point."""
-GROUND_VALUES = ("ground_origin", "ground_field", "contact_place")
+HEIGHTS = "ground_heights"
+GROUND_VALUES = ("ground_origin", "ground_field", "contact_place", HEIGHTS)
 """Names of a scene's values that come from its ground."""
 SINK = 1.7e-3  # how far a robot sinks in [m] that rests on its points, where the stiffness is chosen
 RESTS = 4  # points at most on which a robot rests
@@ -23,6 +24,7 @@ STANCE = 2  # bodies at most whose points, up to RESTS each, carry a robot
 MARGIN = 1.6  # of the moment that holds up one leg, over what tips it: 360 N m/rad of 226 for a humanoid of 33 kg
 DAMPING = 0.5  # of sqrt(k m), the share of mass over one point; standing is quiet from 0.1 to 2
 DIRECTIONS = 2048  # in which the extreme points of a hull are looked for
+STEEP = 1.0  # slope beyond which a cell of a height field is a wall and a floor
 STANDARD_GRAVITY = 9.81  # [m/s^2], in scenes without gravity
 
 
@@ -98,6 +100,15 @@ class HeightField(StoredPart):
     def cells(self) -> tuple[float, float]:
         """Distances between neighbours along x and along y [m]."""
         return self.cell if isinstance(self.cell, tuple) else (self.cell, self.cell)
+
+    @property
+    def has_walls(self) -> bool:
+        """Whether some cell is so steep that it has a wall."""
+        h, (cell_x, cell_y) = self.heights, self.cells
+        low, right, far, corner = h[..., :-1, :-1], h[..., 1:, :-1], h[..., :-1, 1:], h[..., 1:, 1:]
+        twist = low - right - far + corner
+        x, y = right - low + 0.5 * twist, far - low + 0.5 * twist
+        return bool((np.hypot(x, y * (cell_x / cell_y)) > STEEP * cell_x).any())
 
 
 AWAY = -1e3  # depth of a surface that is not there [m]; no step reaches so far
@@ -332,7 +343,12 @@ def check_contacts(contacts: Sequence[Contact], ground: Any, bodies: Sequence[An
 
 
 def check_field(call: str, name: str, array: np.ndarray, ground: Any) -> None:
-    """Raise ValueError unless ``ground_field`` holds numbers of fields."""
+    """Raise ValueError unless ``ground_field`` holds numbers of fields, and all worlds share ``ground_heights``."""
+    if name == HEIGHTS and len(array) > 1:
+        raise ValueError(
+            f"{call}: {name} has shape {array.shape}; expected {array.shape[1:]}, because all worlds share the heights;"
+            " make a HeightField of several fields, and say by ground_field which of them a world stands on"
+        )
     if name == "ground_field" and array.size and not np.isin(array, np.arange(ground.count)).all():
         raise ValueError(
             f"{call}: {name} holds {array.min():g} to {array.max():g}; expected integers below {ground.count}"
@@ -376,6 +392,7 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
     values |= {
         "ground_origin": np.zeros((1, 3 if scene.contact_count else 0)),
         "ground_field": np.zeros((1, 1 if sets else 0)),
+        HEIGHTS: scene.ground.heights[None] if isinstance(scene.ground, HeightField) else np.zeros((1, 0)),
         "contact_place": np.tile([0.0] * 5 + [1.0, AWAY], (1, len(points) if isinstance(scene.ground, Listed) else 0)),
     }
     if not scene.contact_count:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .contacts import HeightField
+from .contacts import HEIGHTS, HeightField
 from .scene import Scene
 
 HINGE = ("kind", "parent", "child", "axis", "linear", "angular", "pitch", "rotor", "flexible", "coordinates")
@@ -21,13 +21,13 @@ PLACES = (-0.7, -0.2, 0.1, 0.6)  # where a function of coordinates is sampled
 def fingerprint(scene: Scene, variable: Collection[str] = ()) -> str:
     """Return 64 hexadecimal digits of what decides the kernels of a scene: its structure and the values that fold.
 
-    Labels do not count, nor do heights of the ground, nor the numbers of values that are ``variable`` or differ between
-    worlds. A function of the user's counts by what it returns at a few points.
+    Labels do not count, nor do heights of the ground, but for whether some cell has a wall, nor the numbers of values
+    that are ``variable`` or differ between worlds. A function of the user's counts by what it returns at a few points.
     """
     digest = hashlib.sha256()
     ground: Any = scene.ground
     if isinstance(ground, HeightField):  # its heights are a table
-        ground = (ground.heights.shape, ground.cell, ground.origin)
+        ground = (ground.heights.shape, ground.cell, ground.origin, HEIGHTS not in variable and ground.has_walls)
     for hinge in scene.hinges:
         _feed(digest, [getattr(hinge, name) for name in HINGE])
         if hinge.pose is not None:
@@ -39,7 +39,7 @@ def fingerprint(scene: Scene, variable: Collection[str] = ()) -> str:
     for part in (scene.loops, scene.couplings, scene.actuators, scene.contacts, ground):
         _feed(digest, part)
     for name, values in sorted(scene.values.items()):
-        folds = name not in variable and values.shape[0] == 1
+        folds = name not in (*variable, HEIGHTS) and values.shape[0] == 1
         _feed(digest, (name, values if folds else values.shape[1:]))
     return digest.hexdigest()
 

@@ -6,6 +6,7 @@ frame is the child anchor of the hinge that carries the body, and the columns of
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -17,6 +18,7 @@ from .actuators import RANGES, Actuator, Keyframe, actuator_values, check_actuat
 from .checks import SYMMETRY
 from .contacts import (
     CONTACT_VALUES,
+    HEIGHTS,
     Contact,
     ContactPoint,
     HeightField,
@@ -111,7 +113,8 @@ class Scene(Stored):
             actuator_bias [actuator, 3], actuator_ctrl_range, actuator_force_range [actuator, 2], and actuator_gear, of
             the hinges of the first actuator, of the second, and so on. Of contacts: contact_friction,
             contact_stiffness [N/m], contact_damping [N s/m] [contact]; ground_origin [3], where the ground's own origin
-            is [m], zero at first; ground_field [1], which field of a set of height fields, the first at first.
+            is [m], zero at first; ground_field [1], which field of a set of height fields, the first at first;
+            ground_heights [m], the heights of a field, as they are there, shared by all worlds.
         contact_points: the points (``ContactPoint``) of all contacts with the ground, contact after contact.
         contact_pairs: the pairs of bodies (``ContactPair``) that touch each other. Where axes of arrays say "contact",
             there is an entry for each of the points and then one for each of the pairs.
@@ -398,6 +401,8 @@ class Scene(Stored):
         scene.__dict__.update(self.__dict__)
         checked = {name: self.check_value("Scene.with_values", name, value) for name, value in values.items()}
         scene.values = MappingProxyType({**self.values, **checked})
+        if HEIGHTS in checked and isinstance(self.ground, HeightField):
+            scene.ground = dataclasses.replace(self.ground, heights=checked[HEIGHTS][0])
         scene._refuse_crossed_limits("Scene.with_values", scene.values)
         if not checked.keys().isdisjoint(MASS_VALUES):
             check_modes(scene, "Scene.with_values")

@@ -41,7 +41,8 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
 
     Args:
         outputs: values of one graph.
-        load: ``load(array, index)`` returns an input, as a number or as an array over worlds.
+        load: ``load(array, index)`` returns an input, as a number or as an array over worlds; with the index () a table
+            [entry] or [world, entry].
         dtype: the precision.
     """
     outputs, values = list(outputs), {}
@@ -51,7 +52,8 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
         elif scalar.op == "lookup":
             table, place, step = scalar.args
             place = place if is_constant(place) else values[place.key]
-            values[scalar.key] = np.asarray(load(table, ()), dtype=dtype)[np.asarray(place, dtype=np.int64) + step]
+            numbers, entry = np.asarray(load(table, ()), dtype=dtype), np.asarray(place, dtype=np.int64) + step
+            values[scalar.key] = numbers[(..., entry) if numbers.ndim == 1 else (np.arange(len(numbers)), entry)]
         else:
             args = [np.asarray(a, dtype=dtype) if is_constant(a) else values[a.key] for a in scalar.args]
             values[scalar.key] = np.asarray(FUNCTIONS[scalar.op](*args), dtype=dtype)

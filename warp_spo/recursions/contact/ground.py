@@ -10,22 +10,26 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
-from ...scene.contacts import AWAY, HeightField, Listed, Plane
+from ...scene.contacts import AWAY, STEEP, HeightField, Listed, Plane
 from ...trace.scalars import Graph, Value, floor, inverse_root, less, lookup, select
 from ...trace.spatial import IDENTITY, Vector, dot
 
-STEEP = 1.0  # slope beyond which a cell is a wall and a floor
+CORNERS = 4  # of a cell
 GROUND = "ground"
 """Name of the table of heights, row after row."""
 
 
 class Surface(NamedTuple):
-    """A surface near a point: its normal in the axes that :func:`directions` names, and the point's depth below it."""
+    """A surface near a point.
+
+    Attributes:
+        normal: in the axes that :func:`directions` names. depth: of the point below the surface [m].
+        cell: whose heights the surface follows; None on a plane.
+    """
 
     normal: Vector
     depth: Value
+    cell: Corners | None = None
 
 
 def directions(ground: Plane | HeightField | Listed) -> list[Vector]:
@@ -39,10 +43,16 @@ def lowest(ground: Plane | HeightField | Listed) -> int:
 
 
 class Place(NamedTuple):
-    """Where a world's ground is: by how much it is moved, inertial axes [m], and which field of a set it is."""
+    """A world's ground among the values of the scene.
+
+    Attributes:
+        origin: by how much the ground is moved, inertial axes [m]. field: which field of a set it is.
+        varies: the heights are variable, so that any cell may become steep.
+    """
 
     origin: Vector
     field: Value
+    varies: bool = False
 
 
 def surfaces(
@@ -61,43 +71,49 @@ def surfaces(
     rate_x, rate_y = (1.0 / cell for cell in ground.cells)
     i, s = _cell((x - ground.origin[0]) * rate_x, rows)
     j, t = _cell((y - ground.origin[1]) * rate_y, columns)
-    cell = _Corners.of(graph, ground, place, i, j)
+    cell = Corners.of(graph, ground, place, i, j)
     z = z - ground.origin[2]
     height = cell.base + cell.run * s + cell.rise * t + cell.twist * (s * t)
     smooth = _facing((cell.run + cell.twist * t) * rate_x, (cell.rise + cell.twist * s) * rate_y)
-    if not has_walls(ground):
-        return [Surface(smooth, (height - z) * smooth[2])]
+    if not has_walls(ground, place.varies):
+        return [Surface(smooth, (height - z) * smooth[2], cell)]
     steep = less(STEEP * STEEP, cell.steepness(rate_x, rate_y))
     flat = Vector(select(steep, a, b) for a, b in zip(IDENTITY[2], smooth, strict=True))
-    bottom = Surface(flat, (select(steep, cell.lowest, height) - z) * flat[2])
+    bottom = Surface(flat, (select(steep, cell.lowest, height) - z) * flat[2], cell)
     next_i = select(steep, i, _cell((x + moves[0] - ground.origin[0]) * rate_x, rows)[0])
     next_j = select(steep, j, _cell((y + moves[1] - ground.origin[1]) * rate_y, columns)[0])
     s, t = (i + s) - next_i, (j + t) - next_j
-    cell = _Corners.of(graph, ground, place, next_i, next_j)
+    cell = Corners.of(graph, ground, place, next_i, next_j)
     run, rise = cell.run + 0.5 * cell.twist, cell.rise + 0.5 * cell.twist
     wall = _facing(run * rate_x, rise * rate_y)
     middle = cell.mean + run * (s - 0.5) + rise * (t - 0.5)
     rises = select(steep, 1.0, less(0.0, run * rate_x * moves[0] + rise * rate_y * moves[1]))
     there = rises * less(STEEP * STEEP, cell.steepness(rate_x, rate_y)) * (1.0 - less(cell.highest, z))
-    return [bottom, Surface(wall, select(there, (middle - z) * wall[2], AWAY))]
+    return [bottom, Surface(wall, select(there, (middle - z) * wall[2], AWAY), cell)]
 
 
-class _Corners(NamedTuple):
-    """The heights at the corners of a cell."""
+class Corners(NamedTuple):
+    """The heights at the corners of a cell, and the place of the first one in the table."""
 
     h00: Value
     h01: Value
     h10: Value
     h11: Value
+    first: Value
 
     @classmethod
-    def of(cls, graph: Graph, ground: HeightField, place: Place, i: Value, j: Value) -> _Corners:
+    def of(cls, graph: Graph, ground: HeightField, place: Place, i: Value, j: Value) -> Corners:
         """Return the corners of the cell (i, j) of a world's field."""
         rows, columns = ground.heights.shape[-2:]
         first = i * float(columns) + j
         if ground.count > 1:
             first = floor(_between(place.field, ground.count - 1.0)) * float(rows * columns) + first
-        return cls(*(lookup(graph, GROUND, first, step) for step in (0, 1, columns, columns + 1)))
+        h00, h01, h10, h11 = (lookup(graph, GROUND, first, step) for step in corner_steps(ground))
+        return cls(h00, h01, h10, h11, first)
+
+    @property
+    def heights(self) -> tuple[Value, Value, Value, Value]:
+        return self[:CORNERS]
 
     @property
     def base(self) -> Value:
@@ -139,6 +155,12 @@ class _Corners(NamedTuple):
         return slope_x * slope_x + slope_y * slope_y
 
 
+def corner_steps(ground: HeightField) -> tuple[int, ...]:
+    """Return how far the corners of a cell are from its first one in the table of heights."""
+    columns = ground.heights.shape[-1]
+    return 0, 1, columns, columns + 1
+
+
 def height(graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place: Place) -> Value:
     """Return the height of the ground at a point of the horizontal plane [m]; the plane must not be vertical."""
     x, y = x - place.origin[0], y - place.origin[1]
@@ -148,7 +170,7 @@ def height(graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place:
     rows, columns = ground.heights.shape[-2:]
     i, s = _cell((x - ground.origin[0]) * (1.0 / ground.cells[0]), rows)
     j, t = _cell((y - ground.origin[1]) * (1.0 / ground.cells[1]), columns)
-    cell = _Corners.of(graph, ground, place, i, j)
+    cell = Corners.of(graph, ground, place, i, j)
     return cell.base + cell.run * s + (cell.rise + cell.twist * s) * t + (ground.origin[2] + place.origin[2])
 
 
@@ -172,12 +194,11 @@ def _facing(slope_x: Value, slope_y: Value) -> Vector:
     return Vector((-(slope_x * size), -(slope_y * size), size))
 
 
-def has_walls(ground: Plane | HeightField) -> bool:
-    """Return whether some cell of a height field is so steep that it has a wall."""
-    if isinstance(ground, Plane):
-        return False
-    h, (cell_x, cell_y) = ground.heights, ground.cells
-    low, right, far, corner = h[..., :-1, :-1], h[..., 1:, :-1], h[..., :-1, 1:], h[..., 1:, 1:]
-    twist = low - right - far + corner
-    x, y = right - low + 0.5 * twist, far - low + 0.5 * twist
-    return bool((np.hypot(x, y * (cell_x / cell_y)) > STEEP * cell_x).any())
+def surface_count(ground: Plane | HeightField | Listed | None, varies: bool) -> int:
+    """Return how many surfaces a point may touch; ``varies``: the heights of a field are variable."""
+    return 2 if has_walls(ground, varies) else 1
+
+
+def has_walls(ground: Plane | HeightField | Listed | None, varies: bool) -> bool:
+    """Return whether some cell of a height field is so steep that it has a wall, or may become so steep."""
+    return isinstance(ground, HeightField) and (varies or ground.has_walls)

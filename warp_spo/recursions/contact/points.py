@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...scene.contacts import PLACE, ContactPoint, Listed
+from ...scene.contacts import HEIGHTS, PLACE, ContactPoint, Listed
 from ...scene.scene import Scene
 from ...trace.evaluation import evaluate
 from ...trace.scalars import Value, is_constant, less, select
@@ -36,7 +36,7 @@ from ..motion import Motion, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
 from ..remembered import remembered
 from ..tracing import Trace
-from .ground import Place, Surface, directions, lowest, surfaces
+from .ground import Corners, Place, Surface, directions, lowest, surfaces
 
 if TYPE_CHECKING:
     from ..impedance import Impedance
@@ -54,6 +54,7 @@ class Point:
         k, d, mu: stiffness, damping, friction. eps: speed below which friction is a damper.
         weight: inverse weight that predicts slip [1/kg]. axes: of the inertial frame, in the link, where asked.
         depth, push: how far below ground it would be after a step that ends with n* J v = 0, and its normal force then.
+        cell: of the height field, whose heights the ground has there; None on a plane.
     """
 
     number: int
@@ -70,6 +71,7 @@ class Point:
     axes: list[Vector]
     depth: Value
     push: Value
+    cell: Corners | None = None
 
     @property
     def state(self) -> list[Value]:
@@ -136,14 +138,14 @@ def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value],
         w, v = twists[carrier]
         moves = [h * dot(axis, v + cross(w, centre)) for axis in toward]
         touched = [_listed(impedance, number)] if isinstance(ground, Listed) else None
-        for normal, depth in touched or surfaces(trace.graph, ground, at, place_of_ground, moves):
+        for normal, depth, cell in touched or surfaces(trace.graph, ground, at, place_of_ground, moves):
             inward = Vector(total(n * axis[c] for n, axis in zip(normal, toward, strict=True)) for c in range(3))
             faster = h * dot(inward, bend)
             below = depth - (0.5 * h) * faster
             damping = d * (k * select(less(0.0, depth), depth, 0.0)) if point.dissipates else d
             material = k, damping, mu, point.eps, weights[number]
             push = k * below - damping * faster
-            found.append(Point(number, on, arm, inward, -depth, twists[carrier], *material, turned, below, push))
+            found.append(Point(number, on, arm, inward, -depth, twists[carrier], *material, turned, below, push, cell))
     return found
 
 
@@ -186,7 +188,7 @@ def ground_place(impedance: Impedance) -> Place:
     """Return where the ground is, from the scene's values."""
     sets = impedance.scene.values["ground_field"].size
     origin = Vector(impedance.value("ground_origin", i) for i in range(3))
-    return Place(origin, impedance.value("ground_field", 0) if sets else 0.0)
+    return Place(origin, impedance.value("ground_field", 0) if sets else 0.0, HEIGHTS in impedance.links.variable)
 
 
 def with_ancestors(links: list[Link | None]) -> set[int]:

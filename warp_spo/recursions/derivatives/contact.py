@@ -18,12 +18,16 @@ the step is.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from ...scene.contacts import HEIGHTS
 from ...trace.differentiation import reverse
 from ...trace.emission import Store
 from ...trace.scalars import Scalar, Value, cut, is_constant, less, ordered, reciprocal, select
 from ...trace.spatial import ZERO, Vector, dot, total
+from ..contact.ground import CORNERS
 from ..contact.points import place_points
 from ..contact.secants import Kept
 from ..contact.step import ContactStep
@@ -42,6 +46,8 @@ if TYPE_CHECKING:
 ROW, BEFORE, COTANGENT = "row", "qdd_before", "cotangent"
 """What the pass before left: variables [world, variable] and qdd [world, dof]; the gradient by what a pass leaves, qdd
 of each dof and then the variables."""
+HEIGHTS_AT = "heights_at"
+"""Where the heights lie in the table by which each surface has its gradient [world, surface]: those of a cell."""
 NUMBER = "number"
 """Input that counts the passes from zero; "passes" is how many there are."""
 
@@ -109,6 +115,7 @@ class PassAdjoint(OnePass):
     Attributes:
         last: 1 in the last pass, else 0. qdd: what the pass found by dof, cut from its history. gains: h qdd.
         points, touches: contact points and their variables. loads: forces on them, at the velocities that qdd gives.
+        corners: heights of the field that a point depends on, by key, each with its surface and corner.
     """
 
     def __init__(self, trace: Trace):
@@ -119,6 +126,10 @@ class PassAdjoint(OnePass):
             trace.place(link)
         self.points = place_points(trace, self.impedance, self.qd)
         self.touches = [self._begin(point) for point in self.points]
+        self.corners: dict[tuple, tuple[Value, int, int]] = {}
+        for at, point in enumerate(self.points):
+            for corner, height in enumerate(point.cell.heights if point.cell and point.link else ()):
+                self.corners.setdefault(height.key, (height, at, corner))
         self.qdd = {dof: cut(trace.vector("qdd")(dof)) for dof in self.before}
         self.gains = {dof: self.h * rate for dof, rate in self.qdd.items()}
         for link in self.links:
@@ -131,7 +142,7 @@ class PassAdjoint(OnePass):
 
     def backward(self, wrt: tuple[str, ...]) -> list[Store]:
         """Return the stores of the gradients by ``wrt``, those of later passes added, and by what came from before."""
-        trace, kept, qdd = self.trace, self.kept, list(self.qdd.values())
+        kept, qdd = self.kept, list(self.qdd.values())
         results, seeds = self._results()
         direct = dict(zip(self.qdd, reverse(results, qdd, seeds, True), strict=True))
         equations, solved = self._solve(lambda dof: direct[dof] + self._later(COTANGENT, dof))
@@ -144,17 +155,30 @@ class PassAdjoint(OnePass):
         results += [item.value for item in kept.begin]
         seeds += [select(kept.first, by_row[len(qdd) + item.index[0]], 0.0) for item in kept.begin]
         leaves = [x for x in ordered(results, stops) if x.op == "input"]
-        back = reverse(results, [*leaves, *stops], seeds, True)
+        heights = [x for x, *_ in self.corners.values()] if HEIGHTS in wrt else []
+        back = reverse(results, [*leaves, *heights, *stops], seeds, True)
         ways: Ways = dict(zip((x.args for x in leaves), back, strict=False))
+        for (_, *at), way in zip(self.corners.values(), back[len(leaves) :], strict=False):
+            ways[(HEIGHTS, *at)] = way
         for entry, way in equations.gradient(solved, self.qdd.__getitem__, self.qd, self.qd).items():
             ways[entry] = ways.get(entry, 0.0) + way
         for dof, value in solved.items():
             ways["tau", dof] = value
         stores = [Store(f"{COTANGENT}_out", (at,), value) for at, value in enumerate(by_row)]
         for name in wrt:
-            for index, value in entries(trace, name, ways):
+            if name == HEIGHTS:
+                cells = [point.cell for point in self.points if point.cell is not None]
+                stores += [Store(f"{HEIGHTS_AT}_bar", (at,), cell.first) for at, cell in enumerate(cells)]
+            for index, value in self._entries(name, ways):
                 stores.append(Store(result_name(name, wrt), index, self._later(f"{name}_later", *index) + value))
         return stores
+
+    def _entries(self, name: str, ways: Ways) -> Iterable[tuple[tuple[int, ...], Value]]:
+        """Return (index, gradient) of every entry of an argument or value; of heights, by surface and corner."""
+        if name != HEIGHTS:
+            return entries(self.trace, name, ways)
+        places = itertools.product(range(len(self.points)), range(CORNERS))
+        return [(place, ways.get((HEIGHTS, *place), 0.0)) for place in places]
 
     def _later(self, name: str, *index: int) -> Value:
         """Return an entry of what the passes after this one have found; zero in the last pass."""
