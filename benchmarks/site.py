@@ -70,9 +70,11 @@ def main() -> None:
     arguments = parser.parse_args()
     folder = arguments.folder.resolve()
     if not arguments.no_blocks:
-        subprocess.run([sys.executable, "-m", "benchmarks.blocks"], cwd=ROOT, check=True)
-    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "docs", str(folder)]
-    subprocess.run(command, cwd=ROOT, check=True)
+        if failed := subprocess.run([sys.executable, "-m", "benchmarks.blocks"], cwd=ROOT).returncode:
+            sys.exit(failed)
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "-E", "-b", "html", "docs", str(folder)]
+    if failed := subprocess.run(command, cwd=ROOT).returncode:
+        sys.exit(failed)
     broken, inside, outside = broken_links(folder)
     print(f"{inside} links within {folder}, {len(broken)} broken; {outside} to other hosts, not followed")
     sys.exit("\n".join(broken) if broken else 0)

@@ -10,36 +10,33 @@ import numpy as np
 import torch
 
 from .environment import Env
-from .tasks import task
+from .tasks import TASKS, task
 
 
 def describe(env: Env, name: str) -> dict[str, Any]:
     """Return what turns the network into a controller, as plain numbers and names.
 
-    A control is ``offset + scale action``, in the order ``actuators``; observations are the terms ``observations``
-    [name, size, scale], one after the other; ``None`` where the task does not list them. Joint positions are relative
+    Action k sets ``offset[k] + scale[k] action``, a control of the actuator or the target or force of the joint
+    ``actuators[k]``, whose gains are ``stiffness[k]`` and ``damping[k]``. Observations are the terms ``observations``
+    [name, size, scale], one after the other; ``None`` where no task lists them. Joint positions are relative
     to ``default_position``. ``delay_steps`` count steps of ``dt``; the policy runs every ``decimation`` of them.
     """
-    chosen, scene = task(name), env.scene
-    scale, offset = controls_of(env)
+    chosen, scene = task(name) if name in TASKS else None, env.scene
+    scale, offset, gains = controls_of(env)
     joints = [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == hinge.dof_count == 1]
     default = env._layout.default_q[[int(scene.q_start[i]) for i in joints]]
-    values = {key: scene.values[f"actuator_{key}"][0] for key in ("gain", "bias", "delay", "force_range")}
     count = len(joints)
     sizes = {"joint position": count, "joint velocity": count, "last action": env.num_actions}
     listed = getattr(chosen, "ACTOR", None)
     return {
         "task": name,
-        "robot": chosen.ROBOT,
+        "robot": getattr(chosen, "ROBOT", None),
         "joints": [scene.joint_labels[i] for i in joints],
         "actuators": list(env.action_labels),
         "default_position": default.tolist(),
         "action_offset": offset.tolist(),
         "action_scale": scale.tolist(),
-        "stiffness": (-values["bias"][:, 1]).tolist(),
-        "damping": (-values["bias"][:, 2]).tolist(),
-        "force_limit": values["force_range"][:, 1].tolist(),
-        "delay_steps": values["delay"].astype(int).tolist(),
+        **gains,
         "dt": env.dt,
         "decimation": env.decimation,
         "observation_size": env.num_obs["actor"],
@@ -47,30 +44,55 @@ def describe(env: Env, name: str) -> dict[str, Any]:
     }
 
 
-def controls_of(env: Env) -> tuple[np.ndarray, np.ndarray]:
-    """Return the scale and the offset of each control, as the environment's own stage computes them; worlds start anew.
+def controls_of(env: Env) -> tuple[np.ndarray, np.ndarray, dict[str, list]]:
+    """Return scale and offset of each action, as the environment's own stage computes them, and what it sets.
 
-    Raises:
-        ValueError: the actions do not set the scene's actuators one by one.
+    The last are lists by name, a number for each action; None where there is no limit. Worlds start anew.
     """
-    controls = env._controls.get("ctrl")
-    if controls is None or controls.shape[1] != env.num_actions:
-        raise ValueError("export: the actions do not set the scene's actuators one by one; expected actions.Control")
-    rows = []
-    for action in (0.0, 0.5):
-        env.actions.fill_(action)
+    scene, rows = env.scene, []
+    for action in (None, *range(env.num_actions)):
+        env.actions.zero_()
+        if action is not None:
+            env.actions[:, action] = 0.5
         env._launch("act")
-        rows.append(controls[0].double().cpu().numpy().copy())
+        rows.append({array: controls[0].double().cpu().numpy().copy() for array, controls in env._controls.items()})
     env.reset()
-    return 2.0 * (rows[1] - rows[0]), rows[0]
+    scale, offset = [], []
+    gains: dict[str, list] = {"stiffness": [], "damping": [], "force_limit": [], "delay_steps": []}
+    for label, row in zip(env.action_labels, rows[1:], strict=True):
+        moved = [(array, i) for array in row for i in np.flatnonzero(row[array] != rows[0][array])]
+        if len(moved) != 1:
+            raise ValueError(
+                f"export: action {label!r} sets {len(moved)} controls; expected one: a scale that is not 0"
+            )
+        ((array, i),) = moved
+        scale.append(2.0 * (row[array][i] - rows[0][array][i]))
+        offset.append(rows[0][array][i])
+        if array == "ctrl":
+            bias, delay = scene.values["actuator_bias"][0, i], scene.values["actuator_delay"][0, i]
+            stiffness, damping, limit = -bias[1], -bias[2], scene.values["actuator_force_range"][0, i, 1]
+        else:
+            dof = i if array == "tau" else int(scene.qd_start[list(scene.q_start).index(i)])
+            stiffness, damping = (scene.values[f"joint_target_{k}"][0, dof] for k in ("ke", "kd"))
+            limit, delay = scene.values["joint_effort_limit"][0, dof], 0
+        found = (float(stiffness), float(damping), float(limit) if np.isfinite(limit) else None, int(delay))
+        for key, value in zip(gains, found, strict=True):
+            gains[key].append(value)
+    return np.array(scale), np.array(offset), gains
 
 
 def save(runner: Any, env: Env, name: str, path: str | Path) -> list[Path]:
     """Write the actor of a runner as ``PATH.onnx`` and ``PATH.pt``, and return both files.
 
     Both take observations [batch, number], ``obs``, and return actions [batch, action], ``actions``; what normalises
-    observations is part of them. Metadata is :func:`describe`: in ONNX one text of JSON a key; in TorchScript the extra
-    file ``metadata.json``.
+    observations is part of them. Metadata holds joint order, default pose, scales of actions and observations, and
+    delays: in ONNX one text of JSON a key; in TorchScript the extra file ``metadata.json``.
+
+    Args:
+        runner: what :func:`warp_spo.env.learning.train` returned.
+        env: the environment that it was trained in.
+        name: of the task, or of an environment of your own, for the metadata.
+        path: of the files, without their endings.
     """
     import onnx
 
