@@ -6,7 +6,7 @@
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --export policy  # policy.onnx, policy.pt
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --mujoco         # 64 robots walk in MuJoCo
 
-Films are drawn without a display.
+Films are drawn without a display: by MuJoCo's renderer and EGL where both are at hand, else in NumPy.
 """
 
 from __future__ import annotations
@@ -34,7 +34,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=8.0, help="of the film")
     parser.add_argument("--command", type=float, nargs="+", help="held during the film; left out: drawn at random")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--trial", help="of go2-rough: on the ground of one of its trials")
     parser.add_argument("--out", type=Path, help="name of the film; left out: that of the checkpoint")
+    parser.add_argument("--film", choices=("gif", "webp", "mp4"), default="gif", help="mp4 needs imageio-ffmpeg")
+    parser.add_argument("--renderer", choices=("mujoco", "numpy"), help="left out: MuJoCo's where it works")
     parser.add_argument("--measure", action="store_true", help="print what the task asks for, over --worlds worlds")
     parser.add_argument("--worlds", type=int, default=256)
     parser.add_argument("--view", action="store_true", help="show Newton's viewer")
@@ -46,7 +49,8 @@ def main(arguments: list[str] | None = None) -> int:
 
     chosen = task(options.task)
     worlds = options.worlds if options.measure else 1
-    env = chosen.build(worlds, learning.pick_device(options.device), seed=options.seed)
+    given = {} if options.trial is None else {"trial": options.trial}
+    env = chosen.build(worlds, learning.pick_device(options.device), seed=options.seed, **given)
     runner = learning.make_runner(env, chosen.LEARNER)
     iteration = learning.load_checkpoint(runner, options.checkpoint, learns=False)
     policy = learning.policy_of(runner)
@@ -61,11 +65,11 @@ def main(arguments: list[str] | None = None) -> int:
     recorded = recording.record(env, policy, options.seconds, options.command)
     if options.view:
         recording.show(chosen.ROBOT, recorded, env.step_dt)
-    frames = recording.film(chosen, recorded, STEPS_A_PICTURE)
     name = options.out or options.checkpoint.with_suffix("")
-    film.save_gif(frames, name.with_suffix(".gif"), STEPS_A_PICTURE * env.step_dt)
-    film.save_strip(recording.strip(chosen, recorded), name.with_suffix(".png"))
-    print(name.with_suffix(".gif"), name.with_suffix(".png"))
+    frames = recording.film(chosen, recorded, STEPS_A_PICTURE, options.renderer)
+    print(film.save(frames, name.with_suffix(f".{options.film}"), STEPS_A_PICTURE * env.step_dt))
+    strip = recording.strip(chosen, recorded, renderer=options.renderer)
+    print(film.save_strip(strip, name.with_suffix(".png")))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Films of robots without a display: shaded primitives drawn in NumPy, as a GIF and as a strip of pictures."""
+"""Films and strips of pictures, without a display: shaded primitives, drawn by MuJoCo's renderer or in NumPy."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..reference_rotations import rotation
 from ..scene.contacts import HeightField
 from .robots import Primitive, Robot
 
@@ -74,19 +75,8 @@ def mesh(kind: str, size: tuple[float, ...]) -> tuple[np.ndarray, list[list[int]
     return corners, faces
 
 
-def rotation(quaternion: Any) -> np.ndarray:
-    """Return the matrix of a quaternion, xyzw."""
-    x, y, z, w = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(quaternion)
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
-
-
 def draw(
-    robot: Robot, poses: np.ndarray, camera: Camera, target: np.ndarray, markers: Sequence[Primitive] = (),
-    caption: str = "",
+    robot: Robot, poses: np.ndarray, camera: Camera, target: np.ndarray, markers: Sequence[Primitive] = ()
 ) -> Any:  # fmt: skip
     """Return a picture (PIL image) of a robot.
 
@@ -94,7 +84,7 @@ def draw(
         robot: what to draw, and its ground.
         poses: of its bodies [body, 7].
         camera: from where. target: point that it looks at (3,) [m].
-        markers: shapes to draw beside the robot's, such as a target. caption: text in the corner.
+        markers: shapes to draw beside the robot's, such as a target.
     """
     from PIL import Image, ImageDraw
 
@@ -134,10 +124,7 @@ def draw(
             faces.append((depth[side].mean(), [tuple(places[i]) for i in side], color))
     for _, places, color in sorted(faces, key=lambda face: -face[0]):
         pen.polygon(places, fill=color)
-    picture = picture.resize((camera.width // FINE, camera.height // FINE), Image.Resampling.LANCZOS)
-    if caption:
-        ImageDraw.Draw(picture).text((8, 6), caption, fill=(40, 44, 52))
-    return picture
+    return picture.resize((camera.width // FINE, camera.height // FINE), Image.Resampling.LANCZOS)
 
 
 def _ground_faces(ground: Any, target: np.ndarray, camera: Camera) -> Any:
@@ -174,7 +161,7 @@ def _heights(ground: HeightField, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def pictures(
     robot: Robot, q: np.ndarray, camera: Camera, follow: bool = True, markers: Sequence[Any] = (),
-    captions: Sequence[str] = (),
+    captions: Sequence[str] = (), renderer: str | None = None,
 ) -> list:  # fmt: skip
     """Return a picture of each state.
 
@@ -182,7 +169,10 @@ def pictures(
         q: coordinates [picture, coordinate].
         follow: whether the camera moves with the first body; otherwise it looks at the first body's first place.
         markers, captions: for each picture, or none.
+        renderer: "mujoco", "numpy", or None: MuJoCo's if it works here.
     """
+    from PIL import Image, ImageDraw
+
     from .. import Dynamics
 
     poses = Dynamics(robot.scene.with_contacts([]), len(q), "cpu", "float64").body_poses(np.asarray(q, np.float64))
@@ -191,21 +181,71 @@ def pictures(
         looked[:] = looked[0]
     elif not isinstance(robot.scene.ground, HeightField):
         looked[:, 2] = looked[:, 2].mean()
-    return [
-        draw(
-            robot, poses[i], camera, looked[i], markers[i] if len(markers) else (), captions[i] if len(captions) else ""
+    stage = _stage(robot.scene.ground, camera, renderer)
+    found = []
+    for i in range(len(q)):
+        beside = tuple(markers[i]) if len(markers) else ()
+        if stage is None:
+            picture = draw(robot, poses[i], camera, looked[i], beside)
+        else:
+            seen = (camera.distance, camera.azimuth, camera.elevation)
+            drawn = Image.fromarray(stage.draw((*robot.primitives, *beside), poses[i], looked[i], *seen))
+            picture = drawn.resize((camera.width, camera.height), Image.Resampling.LANCZOS)
+        if len(captions):
+            ImageDraw.Draw(picture).text((8, 6), captions[i], fill=(40, 44, 52))
+        found.append(picture)
+    if stage is not None:
+        stage.close()
+    return found
+
+
+def _stage(ground: Any, camera: Camera, renderer: str | None) -> Any:
+    """Return what draws with MuJoCo's renderer, or None: this file draws."""
+    if renderer not in (None, "mujoco", "numpy"):
+        raise ValueError(f"film: renderer {renderer!r}; expected 'mujoco', 'numpy' or None")
+    if renderer == "numpy":
+        return None
+    try:
+        from ..mujoco.rendering import Stage
+
+        return Stage(ground, FINE * camera.width, FINE * camera.height, camera.view)
+    except (ImportError, RuntimeError, AttributeError, OSError):
+        if renderer == "mujoco":
+            raise
+        return None
+
+
+def save(frames: Sequence[Any], path: str | Path, seconds: float) -> Path:
+    """Write pictures, ``seconds`` apart, as a film: ``.gif`` and ``.webp`` repeat for ever; ``.mp4`` is H.264.
+
+    Raises:
+        ImportError: a ``.mp4`` needs the package imageio-ffmpeg. ValueError: another suffix.
+    """
+    path = Path(path)
+    if path.suffix == ".gif":
+        reduced = [frame.quantize(64) for frame in frames]
+        reduced[0].save(path, save_all=True, append_images=reduced[1:], duration=round(1000 * seconds), loop=0)
+    elif path.suffix == ".webp":
+        frames[0].save(
+            path, save_all=True, append_images=frames[1:], duration=round(1000 * seconds), loop=0, quality=55, method=4
         )
-        for i in range(len(q))
-    ]
+    elif path.suffix == ".mp4":
+        import imageio_ffmpeg
+
+        writer = imageio_ffmpeg.write_frames(
+            str(path), frames[0].size, fps=1.0 / seconds, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=2,
+            quality=None, output_params=["-crf", "26", "-preset", "slow", "-movflags", "+faststart"],
+        )  # fmt: skip
+        writer.send(None)
+        for frame in frames:
+            writer.send(np.ascontiguousarray(frame.convert("RGB")).tobytes())
+        writer.close()
+    else:
+        raise ValueError(f"film.save: {path.name!r}; expected a name that ends in .gif, .webp or .mp4")
+    return path
 
 
-def save_gif(frames: Sequence[Any], path: str | Path, seconds: float) -> None:
-    """Write pictures, ``seconds`` apart, as an endless GIF."""
-    reduced = [frame.quantize(64) for frame in frames]
-    reduced[0].save(path, save_all=True, append_images=reduced[1:], duration=round(1000 * seconds), loop=0)
-
-
-def save_strip(frames: Sequence[Any], path: str | Path, columns: int = 5) -> None:
+def save_strip(frames: Sequence[Any], path: str | Path, columns: int = 5) -> Path:
     """Write pictures side by side, in rows, as one PNG."""
     from PIL import Image
 
@@ -215,3 +255,4 @@ def save_strip(frames: Sequence[Any], path: str | Path, columns: int = 5) -> Non
     for i, frame in enumerate(frames):
         sheet.paste(frame, (i % columns * width, i // columns * height))
     sheet.save(path)
+    return Path(path)

@@ -54,21 +54,21 @@ def markers(task: Any, recorded: Recording, row: int) -> tuple:
     return (robots.Primitive("sphere", -1, (0.025,), (*recorded.commands[row], 0, 0, 0, 1), (0.9, 0.25, 0.05)),)
 
 
-def film(task: Any, recorded: Recording, every: int = 2) -> list:
+def film(task: Any, recorded: Recording, every: int = 2, renderer: str | None = None) -> list:
     """Return pictures of a recording, one of ``every`` steps."""
-    return _pictures(task, recorded, range(0, len(recorded.q), every))
+    return _pictures(task, recorded, range(0, len(recorded.q), every), renderer)
 
 
-def strip(task: Any, recorded: Recording, start: float = 0.5) -> list:
+def strip(task: Any, recorded: Recording, start: float = 0.5, renderer: str | None = None) -> list:
     """Return the pictures of a film strip, from a share of the recording on; a stride if it walks."""
     if recorded.q.shape[1] == 2 or hasattr(task, "PLACES"):
         rows = np.linspace(0, len(recorded.q) - 1, STRIP).astype(int)
     else:
         rows = int(start * len(recorded.q)) + np.round(np.arange(STRIP) * STRIP_SECONDS / recorded.step).astype(int)
-    return _pictures(task, recorded, [int(row) for row in rows if row < len(recorded.q)])
+    return _pictures(task, recorded, [int(row) for row in rows if row < len(recorded.q)], renderer)
 
 
-def _pictures(task: Any, recorded: Recording, rows: Any) -> list:
+def _pictures(task: Any, recorded: Recording, rows: Any, renderer: str | None) -> list:
     robot = robots.load(task.ROBOT, recorded.ground)
     rows = list(rows)
     texts = [f"{row * recorded.step:.2f} s" for row in rows]
@@ -83,7 +83,7 @@ def _pictures(task: Any, recorded: Recording, rows: Any) -> list:
     if follow:  # from the side of where the robot faces at first
         _, _, z, w = recorded.q[rows[0], 3:7]
         camera = dataclasses.replace(camera, azimuth=camera.azimuth + 2.0 * float(np.arctan2(z, w)))
-    return films.pictures(robot, recorded.q[rows], camera, follow, shapes, texts)
+    return films.pictures(robot, recorded.q[rows], camera, follow, shapes, texts, renderer)
 
 
 def show(name: str, recorded: Recording, step: float) -> None:
