@@ -1,5 +1,6 @@
 """Tasks, their training, films and exports, at small sizes."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -9,7 +10,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("rsl_rl")
 
 from warp_spo import env as envs  # noqa: E402
-from warp_spo import play, train  # noqa: E402
+from warp_spo import play, terrain, train  # noqa: E402
 from warp_spo.env import evaluation, export, film, learning, recording, robots  # noqa: E402
 from warp_spo.env.tasks import TASKS, task  # noqa: E402
 
@@ -75,6 +76,8 @@ def test_a_training_resumes(trained, tmp_path):
     assert runner.current_learning_iteration == 3
     steps = {int(state["step"]) for state in runner.alg.optimizer.state_dict()["state"].values()}
     assert steps == {4 * learner.epochs * learner.batches}
+    runner = learning.train(env, learner, tmp_path, 9, resume=trained / "model_2.pt", seconds=0.0)
+    assert runner.current_learning_iteration == 3 and (tmp_path / "model_3.pt").exists()  # time is over after one
     with pytest.raises(ValueError, match="has 3 iterations; expected more"):
         learning.train(env, learner, tmp_path, 3, resume=trained / "model_2.pt")
 
@@ -105,7 +108,8 @@ def test_exports_act_as_the_policy(trained, tmp_path):
 def test_play_draws_a_film(trained, tmp_path):
     from PIL import Image
 
-    given = ["cartpole", str(trained / "model_2.pt"), "--seconds", "0.6", "--out", str(tmp_path / "film")]
+    given = ["cartpole", str(trained / "model_2.pt"), "--seconds", "0.6", "--renderer", "numpy"]
+    given += ["--out", str(tmp_path / "film")]
     assert play.main(given) == 0
     with Image.open(tmp_path / "film.gif") as film_, Image.open(tmp_path / "film.png") as strip:
         assert film_.n_frames > 3 and strip.size == (5 * 480, 2 * 300)
@@ -114,16 +118,59 @@ def test_play_draws_a_film(trained, tmp_path):
     assert 0.001 < orange < 0.1  # the pole
 
 
-def test_a_sphere_is_drawn_where_it_is():
+@pytest.mark.parametrize("renderer", ["numpy", pytest.param("mujoco", marks=pytest.mark.slow)])
+def test_a_sphere_is_drawn_where_it_is(renderer):
     """Its picture is a disc about the projected centre, of the radius that the opening angle gives."""
     camera = film.Camera(distance=4.0, width=200, height=200, view=0.5)
-    ball = robots.Primitive("sphere", -1, (0.3,), (0.0, 0.0, 1.0, 0, 0, 0, 1), (1.0, 0.0, 0.0))
+    ball = robots.Primitive("sphere", -1, (0.3,), (0.4, 0.1, 1.0, 0, 0, 0, 1), (1.0, 0.0, 0.0))
+    target = np.array([0.4, 0.1, 1.0])
     bare = robots.Robot("", robots.FILES, robots.load("cartpole").scene, np.zeros(2), np.zeros(1), ())
-    picture = np.asarray(film.draw(bare, np.zeros((2, 7)), camera, np.array([0.0, 0.0, 1.0]), [ball])).astype(int)
+    if renderer == "numpy":
+        picture = np.asarray(film.draw(bare, np.zeros((2, 7)), camera, target, [ball])).astype(int)
+    else:
+        stage = film._stage(None, camera, None)
+        if stage is None:
+            pytest.skip("MuJoCo's renderer has neither a display nor EGL here")
+        drawn = stage.draw([ball], np.zeros((0, 7)), target, camera.distance, camera.azimuth, camera.elevation)
+        stage.close()
+        picture = drawn[:: film.FINE, :: film.FINE].astype(int)
     red = np.argwhere(picture[..., 0] > picture[..., 1] + 60)
     radius = 100 * np.tan(np.arcsin(0.3 / 4.0)) / np.tan(0.25)
     assert np.allclose(red.mean(axis=0), 99.5, atol=2.0)
     assert len(red) == pytest.approx(np.pi * radius**2, rel=0.08)  # twelve corners: 0.95 of a disc
+
+
+@pytest.mark.slow
+def test_renderers_agree():
+    """A robot on stairs covers the same part of the picture, within 2 % of its pixels, whichever renderer draws."""
+    ground = terrain.stairs((4, 4), 0.1, 0.1)
+    robot, camera = robots.load("go2", ground), film.Camera(width=240, height=150)
+    q = robot.q + np.where(np.arange(len(robot.q)) == 2, 0.8, 0.0)  # in the air, so that no step hides a foot
+    if film._stage(ground, camera, None) is None:
+        pytest.skip("MuJoCo's renderer has neither a display nor EGL here")
+    shown = []
+    for renderer in ("mujoco", "numpy"):
+        bare, full = (
+            np.asarray(film.pictures(each, q[None], camera, renderer=renderer)[0]).astype(int)
+            for each in (dataclasses.replace(robot, primitives=()), robot)
+        )
+        shown.append(np.abs(bare - full).sum(axis=2) > 60)
+    above = np.arange(150)[:, None] < 80  # shadows lie lower
+    both = (shown[0] & shown[1] & above).sum()
+    assert both > 300 and both > 0.8 * ((shown[0] | shown[1]) & above).sum()
+
+
+def test_a_film_is_written_as_its_name_says(tmp_path):
+    from PIL import Image
+
+    frames = [Image.new("RGB", (32, 20), (80 * i, 0, 0)) for i in range(3)]
+    for suffix in ("gif", "webp"):
+        with Image.open(film.save(frames, tmp_path / f"film.{suffix}", 0.04)) as found:
+            assert found.n_frames == 3 and found.size == (32, 20)
+    with pytest.raises(ValueError, match=r"film.save: 'film.avi'; expected a name that ends in .gif, .webp or .mp4"):
+        film.save(frames, tmp_path / "film.avi", 0.04)
+    pytest.importorskip("imageio_ffmpeg")
+    assert b"ftyp" in film.save(frames, tmp_path / "film.mp4", 0.04).read_bytes()[:16]
 
 
 def test_measures_of_a_known_course():
@@ -146,6 +193,32 @@ def test_every_task_steps(name):
     observed, reward, _, _ = roll(env, 10)
     assert observed.isfinite().all() and reward.isfinite().all()
     assert (observed[-1].std(dim=0) > 0).float().mean() > 0.5  # worlds differ
+
+
+@pytest.mark.slow
+def test_g1_is_rewarded_for_steps_in_time():
+    """The clock's stance is 0.6 of a stride, half a stride apart, and both feet's while the command stands."""
+    from warp_spo.env.tasks import g1_flat
+
+    env = envs.make("g1-flat", 3, "cpu", seed=2)
+    env.reset()
+    env.episode_length_buf = torch.zeros_like(env.episode_length_buf)
+    sums, seen = [torch.zeros(3)], []
+    for step in range(1, 45):
+        env.command[:] = torch.tensor([[0.5, 0, 0], [0.0, 0, 0.3], [0, 0, 0]])
+        observed, _, done, _ = env.step(0.3 * torch.randn(3, env.num_actions))
+        assert not done.any()
+        turn = env.step_dt * step / g1_flat.STRIDE
+        wanted = [[np.sin(2 * np.pi * turn), np.cos(2 * np.pi * turn)]] * 2 + [[0.0, 0.0]]
+        assert np.allclose(observed["actor"][:, -2:], wanted, atol=1e-4)
+        touches = env.memory(f"feet {g1_flat.FEET} 1.0")[:, 2:4] > 0.0  # times of contact
+        stance = torch.tensor([abs((turn - foot / 2 + 0.5) % 1 - 0.5) < 0.3 for foot in (0, 1)])
+        right = torch.stack([touches[0] == stance, touches[1] == stance, touches[2]]).float().mean(dim=1)
+        sums.append(env.memory("sum reward in step")[:, 0].clone())
+        if step not in (8, 12, 28, 32):  # where a stance begins or ends, rounding decides
+            assert torch.allclose(sums[-1] - sums[-2], 2.0 * env.step_dt * right, atol=1e-5), (step, right)
+        seen.append(right)
+    assert len(torch.stack(seen).unique()) == 3  # none, one and both feet in step
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ python -m warp_spo.train go2-flat --gpus 4                # one process a GPU, e
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import subprocess
 import sys
@@ -29,6 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--device", help="such as cuda:0 or cpu; left out: cuda:0 if there is one")
     parser.add_argument("--gpus", type=int, default=1, help="processes, one a GPU (torchrun)")
     parser.add_argument("--iterations", type=int, help="in all; left out: as the task says")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="from the start, after which it stops; one GPU")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="folder; left out: runs/TASK")
     parser.add_argument("--resume", type=Path, help="checkpoint to continue from")
@@ -50,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"{options.task}: {worlds} worlds on {device}, {time.time() - BEGAN:.1f} s", flush=True)
     learning.train(
         env, chosen.LEARNER, folder, options.iterations, options.resume, options.seed + rank, options.save_interval,
-        began=BEGAN,
+        began=BEGAN, seconds=options.seconds,
     )  # fmt: skip
     if rank == 0:
         print(f"{folder}: checkpoints, progress.jsonl, {learning.draw_curve(folder, options.task).name}")

@@ -19,14 +19,16 @@ def describe(env: Env, name: str) -> dict[str, Any]:
     Action k sets ``offset[k] + scale[k] action``, a control of the actuator or the target or force of the joint
     ``actuators[k]``, whose gains are ``stiffness[k]`` and ``damping[k]``. Observations are the terms ``observations``
     [name, size, scale], one after the other; ``None`` where no task lists them. Joint positions are relative
-    to ``default_position``. ``delay_steps`` count steps of ``dt``; the policy runs every ``decimation`` of them.
+    to ``default_position``. ``stride`` is the period [s] of the observation "step phase", None without one: sine and
+    cosine of 2 pi time / stride, zeros while the command is zero. ``delay_steps`` count steps of ``dt``; the policy
+    runs every ``decimation`` of them.
     """
     chosen, scene = task(name) if name in TASKS else None, env.scene
     scale, offset, gains = controls_of(env)
     joints = [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == hinge.dof_count == 1]
     default = env._layout.default_q[[int(scene.q_start[i]) for i in joints]]
     count = len(joints)
-    sizes = {"joint position": count, "joint velocity": count, "last action": env.num_actions}
+    sizes = {"joint position": count, "joint velocity": count, "last action": env.num_actions, "step phase": 2}
     listed = getattr(chosen, "ACTOR", None)
     return {
         "task": name,
@@ -39,6 +41,7 @@ def describe(env: Env, name: str) -> dict[str, Any]:
         **gains,
         "dt": env.dt,
         "decimation": env.decimation,
+        "stride": getattr(chosen, "STRIDE", None),
         "observation_size": env.num_obs["actor"],
         "observations": listed and [[each[0], sizes.get(each[0], 3), each[2]] for each in listed],
     }

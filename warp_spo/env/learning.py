@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import time
 import warnings
@@ -121,6 +122,10 @@ class CapturedPPO(PPO):
         return losses
 
 
+class OutOfTime(Exception):
+    """The time that a training may take is over."""
+
+
 KEPT = ("actions", "values", "actions_log_prob", "distribution_params", "hidden_states")
 
 
@@ -131,8 +136,11 @@ class Course:
     reads them once.
     """
 
-    def __init__(self, env: Env, folder: Path | None, every: int, began: float, writes: bool):
+    def __init__(
+        self, env: Env, folder: Path | None, every: int, began: float, writes: bool, seconds: float = math.inf
+    ):  # fmt: skip
         self.env, self.log_dir, self.every, self.began = env, folder and str(folder), every, began
+        self.ends = began + seconds
         self.writer = self if folder is not None and writes else None
         self.rows: list[dict[str, float]] = []
         self.git_status_repos: list[str] = []
@@ -175,6 +183,8 @@ class Course:
             print(f"iteration {it:4d} of {total_it}  {row['seconds']:6.1f} s  reward {row['reward']:8.3f}  "
                   f"episode {row['/episode/seconds']:5.1f} s  collecting {1e3 * collect_time:4.0f} ms  "
                   f"learning {1e3 * learn_time:4.0f} ms", flush=True)  # fmt: skip
+        if time.time() > self.ends:
+            raise OutOfTime
 
     def save_model(self, *_: Any) -> None:
         """Do nothing: checkpoints stay in the folder."""
@@ -186,7 +196,8 @@ class Course:
 def pick_device(asked: str | None) -> str:
     """Return the device to learn on: what is asked for, or this process's GPU, or "cpu".
 
-    On a CPU torch takes one thread: networks are small, and several threads wait for each other.
+    On a CPU torch takes one thread: networks are small, and several threads wait for each other. On a GPU networks
+    multiply matrices in TF32; the dynamics do not.
     """
     local = os.environ.get("LOCAL_RANK", "0")
     device = asked or (f"cuda:{local}" if torch.cuda.is_available() else "cpu")
@@ -194,6 +205,7 @@ def pick_device(asked: str | None) -> str:
         torch.set_num_threads(1)
     else:
         torch.cuda.set_device(device)
+        torch.set_float32_matmul_precision("high")
     return device
 
 
@@ -204,12 +216,12 @@ def read_rows(file: Path) -> list[dict[str, float]]:
 
 def make_runner(
     env: Env, learner: Learner, folder: Path | None = None, save_interval: int = 100, every: int = 10,
-    began: float | None = None,
+    began: float | None = None, seconds: float = math.inf,
 ) -> OnPolicyRunner:  # fmt: skip
     """Return rsl_rl's runner on an environment, with the course of the training in ``folder``."""
     runner = OnPolicyRunner(env, learner.settings(env, save_interval), None, device=str(env.device))
     began = time.time() if began is None else began
-    runner.logger = Course(env, folder, every, began, runner.gpu_global_rank == 0)  # type: ignore[assignment]
+    runner.logger = Course(env, folder, every, began, runner.gpu_global_rank == 0, seconds)  # type: ignore[assignment]
     return runner
 
 
@@ -225,7 +237,7 @@ def load_checkpoint(runner: OnPolicyRunner, file: str | Path, learns: bool = Tru
 
 def train(
     env: Env, learner: Learner, folder: str | Path, iterations: int | None = None, resume: str | Path | None = None,
-    seed: int = 0, save_interval: int = 100, every: int = 10, began: float | None = None,
+    seed: int = 0, save_interval: int = 100, every: int = 10, began: float | None = None, seconds: float = math.inf,
 ) -> OnPolicyRunner:  # fmt: skip
     """Train, and leave checkpoints ``model_N.pt`` and ``progress.jsonl`` in a folder.
 
@@ -239,16 +251,24 @@ def train(
         save_interval: iterations from one checkpoint to the next.
         every: iterations from one printed line to the next.
         began: time from which seconds count, as of ``time.time``.
+        seconds: after which no iteration starts; for one process.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(seed)
-    runner = make_runner(env, learner, folder, save_interval, every, began)
+    runner = make_runner(env, learner, folder, save_interval, every, began, seconds)
     first = load_checkpoint(runner, resume) + 1 if resume is not None else 0
     total = learner.iterations if iterations is None else iterations
+    if runner.is_distributed and seconds < math.inf:
+        raise ValueError(
+            f"train: seconds {seconds} and several processes; expected iterations alone, for all to stop at"
+        )
     if first >= total:
         raise ValueError(f"train: {str(resume)!r} has {first} iterations; expected more than that to be asked for")
-    runner.learn(total - first, init_at_random_ep_len=True)
+    try:
+        runner.learn(total - first, init_at_random_ep_len=True)
+    except OutOfTime:
+        runner.save(str(folder / f"model_{runner.current_learning_iteration}.pt"))
     return runner
 
 

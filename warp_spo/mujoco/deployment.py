@@ -25,7 +25,7 @@ class Deployment:
 
     Attributes:
         data: MuJoCo's state of each robot. commands: forward, left [m/s], turn [rad/s], [world, 3].
-        fallen: robots whose trunk has leaned by more than 70 degrees since the start [world].
+        time: since the start [s]. fallen: robots whose trunk has leaned by more than 70 degrees since then [world].
     """
 
     def __init__(self, policy: str | Path, robot: str | Path, worlds: int, friction: float = 0.8, seed: int = 0):
@@ -55,7 +55,7 @@ class Deployment:
         }
         self.last = np.zeros((worlds, len(self.actuators)), np.float32)
         self.commands = np.zeros((worlds, 3))
-        self.fallen = np.zeros(worlds, bool)
+        self.fallen, self.time = np.zeros(worlds, bool), 0.0
         for data in self.data:
             self._start(data)
 
@@ -70,7 +70,7 @@ class Deployment:
 
     def observe(self) -> np.ndarray:
         """Return the policy's observations [world, number]."""
-        rows = []
+        rows, angle = [], 2.0 * np.pi * self.time / (self.metadata["stride"] or 1.0)
         for data, command, last in zip(self.data, self.commands, self.last, strict=True):
             base = data.xmat[1].reshape(3, 3)
             terms = {
@@ -81,6 +81,7 @@ class Deployment:
                 "joint velocity": data.qvel[self.joint_qd],
                 "last action": last,
                 "command": command,
+                "step phase": (np.abs(command).sum() > 0.0) * np.array([np.sin(angle), np.cos(angle)]),
             }
             rows.append(np.concatenate([scale * terms[name] for name, _, scale in self.metadata["observations"]]))
         return np.array(rows, np.float32)
@@ -90,6 +91,7 @@ class Deployment:
         before = self.last
         self.last = np.asarray(self.network(self.observe()))
         old, new = (self.numbers["action_offset"] + self.numbers["action_scale"] * x for x in (before, self.last))
+        self.time += self.metadata["dt"] * self.metadata["decimation"]
         for world, data in enumerate(self.data):
             for substep in range(self.metadata["decimation"]):
                 late = substep < self.numbers["delay_steps"]

@@ -10,8 +10,11 @@ from ... import where
 from .. import Env, Observation, World, actions, evaluation, events, observations, rewards, robots, terminations
 from ..film import Camera
 from ..learning import Learner
+from . import velocity
 
 ROBOT = "ant"
+FEET, DIAGONALS = ".*_foot", ((0, 2), (1, 3))
+TROT = 1.5  # weight; without it a leg drags, or stays in the air
 ENOUGH = 4.0  # speed that earns most [m/s]: its motors could throw it along at four times as much
 CAMERA = Camera(distance=3.5)
 LEARNER = Learner(iterations=250, worlds=4096, steps=24, hidden=(256, 128, 64), entropy=3e-3, deviation=0.7)
@@ -71,6 +74,7 @@ def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env
             "alive": (0.5, rewards.alive),
             "straight": (1.0, straight),
             "drift": (-0.2, drift),
+            "trot": (TROT, velocity.trot(FEET, DIAGONALS, least_command=None)),
             "effort": (-0.05, rewards.action_size),
             "action rate": (-0.05, rewards.action_rate),
             "tilting": (-0.05, rewards.tilting),

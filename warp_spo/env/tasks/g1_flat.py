@@ -14,7 +14,9 @@ from . import velocity
 ROBOT = "g1"
 CAMERA = Camera(distance=3.2)
 LEARNER = Learner(iterations=1000, worlds=8192, steps=24, entropy=3e-3, deviation=0.6)
-ACTOR = velocity.ACTOR
+STRIDE = 0.8  # time of two steps [s]
+PHASE = velocity.step_phase(STRIDE)
+ACTOR = (*velocity.ACTOR, ("step phase", PHASE, 1.0, 0.0))
 FEET = ".*_ankle_roll_link"
 SCALE = 0.25  # of a joint's effort limit over its servo's stiffness is the share of an action of 1
 STANDING = {".*": 0.1}  # deviations of joints from the default [rad]
@@ -42,7 +44,7 @@ def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env
         commands=commands.Velocity(
             forward=(-0.5, 1.0), left=(-0.4, 0.4), turn=(-0.6, 0.6), standing=0.1, seconds=(3.0, 8.0)
         ),
-        observations=velocity.observed(FEET),
+        observations=velocity.observed(FEET, PHASE),
         rewards={
             "velocity": (2.5, rewards.track_velocity(0.5)),
             "turning": (1.5, rewards.track_turning(0.5)),
@@ -53,7 +55,7 @@ def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env
             "tilting": (-0.05, rewards.tilting),
             "action rate": (-0.01, rewards.action_rate),
             "joint limits": (-1.0, rewards.joint_limits()),
-            "one foot": (1.5, velocity.one_foot(FEET)),
+            "in step": (2.0, velocity.in_step(FEET, STRIDE)),
             "foot clearance": (-1.0, rewards.foot_clearance(FEET, height=0.1)),
             "swing height": (-0.25, velocity.swing_height(FEET, 0.1)),
             "foot slip": (-0.2, rewards.foot_slip(FEET)),

@@ -79,36 +79,49 @@ def swing_height(bodies: Any, height: float, least_command: float = 0.05) -> Any
     return term
 
 
-def trot(bodies: Any, least_command: float = 0.05) -> Any:
-    """Return, while the command moves, the share of a trot's four rules that hold.
+def trot(bodies: Any, diagonals: Any = ((0, 3), (1, 2)), least_command: float | None = 0.05) -> Any:
+    """Return the share of a trot's four rules that hold, while the command moves if ``least_command`` is given.
 
-    Feet are front left, front right, hind left, hind right, in the order of the bodies. Those of a diagonal touch the
-    ground together or are both in the air; those side by side in front, and behind, are not alike.
+    Feet of a diagonal touch the ground together or are both in the air; the first feet of the two diagonals are not
+    alike, nor are the second. ``diagonals`` are numbers of feet, in the order of the bodies; as it is set, these are
+    front left, front right, hind left, hind right.
     """
 
     def term(w: World) -> Any:
-        a, b, c, d = (where(touches, 1.0, 0.0) for touches in w.feet(bodies).touches)
-        rules = [1.0 - abs(a - d), 1.0 - abs(b - c), abs(a - b), abs(c - d)]
-        return where(rewards.moving(w, least_command), 0.25 * sum(rules), 0.0)
+        contact = [where(touches, 1.0, 0.0) for touches in w.feet(bodies).touches]
+        (a, b), (c, d) = ([contact[foot] for foot in pair] for pair in diagonals)
+        share = 0.25 * sum([1.0 - abs(a - b), 1.0 - abs(c - d), abs(a - c), abs(b - d)])
+        return share if least_command is None else where(rewards.moving(w, least_command), share, 0.0)
 
     return term
 
 
-def one_foot(bodies: Any, longest: float = 0.5, least_command: float = 0.05) -> Any:
-    """Return 1, while the command moves, where one of two feet touches the ground, for not more than ``longest`` [s].
+def step_phase(stride: float, least_command: float = 0.05) -> Any:
+    """Return the term of sine and cosine of 2 pi time / ``stride`` [s], a clock of steps; zeros while it stands."""
 
-    Steps of a walk earn it; hops with both feet, standing, and standing on one leg do not.
+    def term(w: World) -> list:
+        angle = w.time * (2.0 * np.pi / stride)
+        moves = rewards.moving(w, least_command)
+        return [where(moves, np.sin(angle), 0.0), where(moves, np.cos(angle), 0.0)]
+
+    return term
+
+
+def in_step(bodies: Any, stride: float, stance: float = 0.6, least_command: float = 0.05) -> Any:
+    """Return the share of two feet, left and right, that do what a walk's clock says: touch the ground, or swing.
+
+    Each foot touches for ``stance`` of a stride [s], the right one half a stride after the left; the middle of the
+    left one's stance is where the cosine of :func:`step_phase` is 1. While the command stands, both touch.
     """
 
     def term(w: World) -> Any:
-        feet = w.feet(bodies)
-        left, right = feet.touches
-        alone = (left & ~right) | (right & ~left)
-        phases = [*feet.contact_time, *feet.air_time]
-        short = phases[0] < longest
-        for phase in phases[1:]:
-            short = short & (phase < longest)
-        return where(alone & short & rewards.moving(w, least_command), 1.0, 0.0)
+        middle = np.cos(w.time * (2.0 * np.pi / stride))
+        still = ~rewards.moving(w, least_command)
+        share: Any = 0.0
+        for touches, at in zip(w.feet(bodies).touches, (middle, -middle), strict=True):
+            wanted = (at > float(np.cos(np.pi * stance))) | still
+            share = share + where((touches & wanted) | ~(touches | wanted), 0.5, 0.0)
+        return share
 
     return term
 
