@@ -171,12 +171,12 @@ FORMS = [
 
 def translated(cuda):
     """``def work(warp)``: the statements for CUDA in Python."""
-    lines, depth = ["def work(warp):"], 1
+    lines, depth, mask = ["def work(warp):"], 1, ""  # of a branch of some worlds
     for line in map(str.strip, cuda.split("\n")):
         if not line or line.startswith(("//", "#")) or line == FENCE:
             continue
         if line == "}":
-            depth -= 1
+            depth, mask = depth - 1, ""
             continue
         if line in (BARRIER, SYNC):
             lines.append("    " * depth + "yield")
@@ -187,6 +187,14 @@ def translated(cuda):
             lines.append("    " * depth + f"for {loop[1]} in range({count}):")
             depth += 1
             continue
+        some = re.match(r"^if \((\w+) != 0\) \{$", line)
+        if some:
+            mask = some[1]
+            lines.append("    " * depth + "if True:")
+            depth += 1
+            continue
+        if mask:
+            line = re.sub(r"^(\w+) = (.*);$", rf"\1 = where({mask} != 0, \2, \1);", line)
         branch = re.match(r"^(else )?(?:if \((.*)\) )?\{$", line)
         if branch:
             condition = "False" if "reach" in (branch[2] or "") else (branch[2] or "").replace("||", "or")

@@ -92,7 +92,7 @@ def partial(scalar: Scalar, at: int) -> Value:
         return reciprocal(args[1]) if at == 0 else -(scalar * reciprocal(args[1]))
     if op == "absolute":
         return select(args[0] + scalar, 1.0, -1.0)  # the derivative at zero is 1
-    if op == "select":
+    if op in ("select", "branch"):
         return select(args[0], 1.0, 0.0) if at == 1 else select(args[0], 0.0, 1.0) if at == 2 else 0.0
     if op == "arctangent":
         y, x = args

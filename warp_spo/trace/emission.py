@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import enum
+import operator
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from .scalars import Scalar, Value, is_constant, ordered
 
 C_TYPE = {"float32": "float", "float64": "double"}
 LIBRARY = {"exponential": "exp", "logarithm": "log", "power": "pow", "floor": "floor"}  # functions of C, also on CUDA
+in_order = operator.attrgetter("number")  # sorts scalars as their graph grew
 BINARY = {"add": "+", "sub": "-", "mul": "*", "quotient": "/"}
 COST = {  # floating-point operations of a statement
     "add": 1,
@@ -24,6 +26,7 @@ COST = {  # floating-point operations of a statement
     "absolute": 0,
     "guarded": 1,
     "select": 1,
+    "branch": 1,
     "less": 1,
     "lost": 1,
     "input": 0,
@@ -167,13 +170,22 @@ class Emitter:
         fused: set[tuple] = set()  # products without a statement of their own
         if self._fuses:
             self._products, fused = choose_products(needed, {value.key for value in values})
-        for scalar in sorted(needed, key=lambda scalar: scalar.number):
+        blocks = find_blocks(needed, {value.key for value in values} | self._names.keys())
+        inside = {scalar.key for block in blocks.values() for scalar in block}
+        for scalar in sorted(needed, key=in_order):
+            if scalar.key in inside:
+                self.counts[scalar.op] += 1
+                continue
             where, _, step = scalar.step.rpartition("|")
             if where != self._place:
                 self._place = where
                 self._labels.append(where)
                 lines.append(f"// {LABEL}{len(self._labels) - 1}\x04")
-            if scalar.key not in self._names:
+            if scalar.op == "branch":
+                block = blocks.pop(branch_of(scalar), None)
+                if block is not None:
+                    self._emit_branch(scalar, needed, block, fused, due)
+            elif scalar.key not in self._names:
                 lines += self._statement(scalar, step) if scalar.key not in fused else []
                 self.counts[scalar.op] += 1
             for item in due.get(scalar.key, ()):
@@ -181,6 +193,36 @@ class Emitter:
         for item in known:
             self._emit_store(item)
         return Listing("\n".join(lines), self._constants, self._indices, self._labels)
+
+    def _emit_branch(
+        self, first: Scalar, needed: list[Scalar], block: list[Scalar], fused: set[tuple], due: dict[tuple, list[Store]]
+    ) -> None:
+        """Emit the statements ``block`` inside a branch, and all values of the branch of ``first``, its first value.
+
+        A value that replaces an entry, or leaves it, is stored inside the branch, and is no longer ``due``.
+        """
+        T, lines, mask = C_TYPE[self.dtype], self._lines, self._text(first.args[0])
+        results = [x for x in sorted(needed, key=in_order) if x.op == "branch" and branch_of(x) == branch_of(first)]
+        inside = {x.key: due.pop(x.key)[0] for x in results if [*map(replaces, due.get(x.key, ()))] == [True]}
+        taken = {value.key for x in needed for value in x.args if value.__class__ is Scalar}
+        for scalar in results:
+            self.counts["branch"] += 1
+            if scalar.key in taken or scalar.key not in inside:
+                otherwise = self._text(scalar.args[2])
+                lines.append(f"{T} {self._name(scalar, scalar.step.rpartition('|')[2])} = {otherwise};")
+        names = dict(self._names)
+        lines.append(f"if ({mask} != 0) {{")
+        for scalar in block:
+            if scalar.key not in fused and scalar.key not in self._names:  # a sine comes with its cosine
+                lines += self._statement(scalar, scalar.step.rpartition("|")[2])
+        for scalar in results:
+            value = self._text(scalar.args[1])
+            if scalar.key in names:
+                lines.append(f"{names[scalar.key]} = {value};")
+            if scalar.key in inside:
+                self._emit_store(inside[scalar.key]._replace(value=scalar.args[1]))
+        lines.append("}")
+        self._names = names
 
     def _find_needed(self, values: list[Scalar]) -> list[Scalar]:
         """Return the scalars without a name on which ``values`` depend, other than through scalars with a name."""
@@ -323,6 +365,47 @@ def choose_products(scalars: list[Scalar], stored: set[tuple]) -> tuple[dict[tup
             taken |= dict.fromkeys(takers, product)
             fused.add(product.key)
     return taken, fused
+
+
+def branch_of(scalar: Scalar) -> tuple:
+    """Return what tells the branch of a value from others: its mask and its name."""
+    mask, _, _, name = scalar.args
+    return mask.key, name
+
+
+def replaces(item: Store) -> bool:
+    """Return whether a store writes over an entry in a branch, and leaves it as it is otherwise."""
+    if is_constant(item.value) or item.value.op != "branch":
+        return False
+    old = item.value.args[2]
+    return old.__class__ is Scalar and old.op == "input" and old.args == (item.array, *item.index)
+
+
+def find_blocks(needed: list[Scalar], used: Container[tuple]) -> dict[tuple, list[Scalar]]:
+    """Return, by branch, the scalars that only the values of this branch need, in their order.
+
+    What a kernel reads stays outside, because statements before the branch may write over it.
+
+    Args:
+        needed: the scalars of a region. used: the keys of those that are stored, used later, or known.
+    """
+    blocks: dict[tuple, list[Scalar]] = {branch_of(x): [] for x in needed if x.op == "branch"}
+    if not blocks:
+        return blocks
+    owners: dict[tuple, set] = {}  # the branches in which each scalar is used; None: outside of all
+    for scalar in sorted(needed, key=in_order, reverse=True):
+        at = owners.get(scalar.key, {None})
+        own = next(iter(at)) if len(at) == 1 else None
+        turns = scalar.op in ("sin", "cos") and scalar.args[0].op == "input"  # angles that are reduced first
+        if scalar.key in used or turns or scalar.op in ("input", "branch"):
+            own = None
+        if own is not None:
+            blocks[own].append(scalar)
+        for place, value in enumerate(scalar.args):
+            if value.__class__ is Scalar:
+                takes = branch_of(scalar) if scalar.op == "branch" and place == 1 else own
+                owners.setdefault(value.key, set()).add(takes)
+    return {key: block[::-1] for key, block in blocks.items()}
 
 
 def fill_in(listing: Listing, constants: list[str], indices: list[str], labels: list[str], prefix: str = "") -> str:

@@ -32,6 +32,7 @@ FUNCTIONS: dict[str, Callable] = {
     "logarithm": np.log,
     "power": np.power,
     "select": lambda mask, a, b: np.where(mask != 0.0, a, b),
+    "branch": lambda mask, a, b: np.where(mask != 0.0, a, b),
     "sum_of_logarithms": lambda *terms: sum(np.log(term.astype(np.float64)) for term in terms),
 }
 
@@ -55,6 +56,7 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
             numbers, entry = np.asarray(load(table, ()), dtype=dtype), np.asarray(place, dtype=np.int64) + step
             values[scalar.key] = numbers[(..., entry) if numbers.ndim == 1 else (np.arange(len(numbers)), entry)]
         else:
-            args = [np.asarray(a, dtype=dtype) if is_constant(a) else values[a.key] for a in scalar.args]
+            given = (a for a in scalar.args if not isinstance(a, str))  # without the name of a branch
+            args = [np.asarray(a, dtype=dtype) if is_constant(a) else values[a.key] for a in given]
             values[scalar.key] = np.asarray(FUNCTIONS[scalar.op](*args), dtype=dtype)
     return [np.asarray(o, dtype=dtype) if is_constant(o) else values[o.key] for o in outputs]

@@ -222,6 +222,17 @@ def select(mask: Value, x: Value, y: Value) -> Value:
     return mask.graph.make("select", mask, x, y)
 
 
+def branch(mask: Value, x: Value, y: Value, name: str) -> Value:
+    """Return ``x`` where ``mask`` is not zero, else ``y``; where it is zero, code skips what only ``x`` needs.
+
+    For what is rarely needed: a warp takes the branch if one of its threads does. All values of one ``mask`` and
+    ``name`` share one branch; they must be made one after the other, when all that they choose from is there.
+    """
+    if is_constant(mask):
+        return x if mask else y
+    return x if select(mask, x, y) is x else mask.graph.make("branch", mask, x, y, name)
+
+
 def less(x: Value, y: Value) -> Value:
     """Return 1 where ``x`` is less than ``y``, else 0; 0 if one of them is NaN."""
     if is_constant(x) and is_constant(y):

@@ -25,11 +25,13 @@ class Surface(NamedTuple):
     Attributes:
         normal: in the axes that :func:`directions` names. depth: of the point below the surface [m].
         cell: whose heights the surface follows; None on a plane.
+        near: 1 where it is there at all, else 0, and then the depth is AWAY; None: it always is.
     """
 
     normal: Vector
     depth: Value
     cell: Corners | None = None
+    near: Value | None = None
 
 
 def directions(ground: Plane | HeightField | Listed) -> list[Vector]:
@@ -89,7 +91,7 @@ def surfaces(
     middle = cell.mean + run * (s - 0.5) + rise * (t - 0.5)
     rises = select(steep, 1.0, less(0.0, run * rate_x * moves[0] + rise * rate_y * moves[1]))
     there = rises * less(STEEP * STEEP, cell.steepness(rate_x, rate_y)) * (1.0 - less(cell.highest, z))
-    return [bottom, Surface(wall, select(there, (middle - z) * wall[2], AWAY), cell)]
+    return [bottom, Surface(wall, select(there, (middle - z) * wall[2], AWAY), cell, there)]
 
 
 class Corners(NamedTuple):

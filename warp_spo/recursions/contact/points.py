@@ -19,15 +19,15 @@ numbers, and only the rest stays: they know that link's motion, and their messag
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...scene.contacts import HEIGHTS, PLACE, ContactPoint, Listed
+from ...scene.contacts import AWAY, HEIGHTS, PLACE, ContactPoint, Listed
 from ...scene.scene import Scene
 from ...trace.evaluation import evaluate
-from ...trace.scalars import Value, is_constant, less, select
+from ...trace.scalars import Value, branch, is_constant, less, select
 from ...trace.spatial import IDENTITY, ZERO, Vector, cross, dot, total
 from ..composite import mass_matrix
 from ..kinematics import carried_velocity, frame_on_link, jacobian, zero
@@ -55,6 +55,7 @@ class Point:
         weight: inverse weight that predicts slip [1/kg]. axes: of the inertial frame, in the link, where asked.
         depth, push: how far below ground it would be after a step that ends with n* J v = 0, and its normal force then.
         cell: of the height field, whose heights the ground has there; None on a plane.
+        near: 1 where the surface is near, else 0; None: it always is, or code shall not branch.
     """
 
     number: int
@@ -72,12 +73,30 @@ class Point:
     depth: Value
     push: Value
     cell: Corners | None = None
+    near: Value | None = None
 
     @property
     def state(self) -> list[Value]:
         """The values that every pass reads: arm, normal, depth, push, damping, and the link's motion before it."""
         damping = [] if is_constant(self.d) or self.d.op == "input" else [self.d]
         return [*self.arm, *self.normal, self.depth, self.push, *damping, *self.twist[0], *self.twist[1]]
+
+    def settled(self, *more: Value) -> tuple[Point, list[Value]]:
+        """Return the point, and more values that are zero away from its surface; code computes both only near it."""
+        if self.near is None:
+            return self, list(more)
+        mask, name = self.near, f"surface of {self.number}"
+        only = lambda x, away=0.0: branch(mask, x, away, name)  # noqa: E731
+        values: dict[str, Any] = {} if is_constant(self.d) or self.d.op == "input" else {"d": only(self.d)}
+        values |= dict(normal=Vector(only(x) for x in self.normal), gap=only(self.gap, -AWAY), push=only(self.push))
+        depth, found = only(self.depth, AWAY), [only(x) for x in more]
+        return dataclasses.replace(self, **values, depth=depth, near=less(0.5 * AWAY, depth)), found
+
+    def only_near(self, values: Sequence[Value], name: str) -> list[Value]:
+        """Return values, zero away from the surface, where code does not compute them."""
+        if self.near is None:
+            return list(values)
+        return [branch(self.near, x, 0.0, f"{name} {self.number}") for x in values]
 
     @property
     def velocity(self) -> Vector:
@@ -93,10 +112,13 @@ class Point:
         return v + cross(w, self.arm)
 
 
-def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value], oriented: bool = False) -> list[Point]:
+def place_points(
+    trace: Trace, impedance: Impedance, qd: Callable[[int], Value], oriented: bool = False, branches: bool = False
+) -> list[Point]:
     """Return the contact points that a trace works on, one for each surface that a point may touch.
 
-    ``oriented``: with the inertial directions x, y, z in the axes of their links.
+    ``oriented``: with the inertial directions x, y, z in the axes of their links. ``branches``: code may leave out
+    points where their surface is not near.
     """
     scene = trace.links.scene
     ground, weights = scene.ground, inverse_weights(scene)
@@ -138,14 +160,15 @@ def place_points(trace: Trace, impedance: Impedance, qd: Callable[[int], Value],
         w, v = twists[carrier]
         moves = [h * dot(axis, v + cross(w, centre)) for axis in toward]
         touched = [_listed(impedance, number)] if isinstance(ground, Listed) else None
-        for normal, depth, cell in touched or surfaces(trace.graph, ground, at, place_of_ground, moves):
+        for normal, depth, cell, near in touched or surfaces(trace.graph, ground, at, place_of_ground, moves):
             inward = Vector(total(n * axis[c] for n, axis in zip(normal, toward, strict=True)) for c in range(3))
             faster = h * dot(inward, bend)
             below = depth - (0.5 * h) * faster
             damping = d * (k * select(less(0.0, depth), depth, 0.0)) if point.dissipates else d
             material = k, damping, mu, point.eps, weights[number]
             push = k * below - damping * faster
-            found.append(Point(number, on, arm, inward, -depth, twists[carrier], *material, turned, below, push, cell))
+            state = turned, below, push, cell, near if branches else None
+            found.append(Point(number, on, arm, inward, -depth, twists[carrier], *material, *state))
     return found
 
 

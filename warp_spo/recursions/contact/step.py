@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ...status import Status
 from ...trace.emission import Store
-from ...trace.scalars import Value, inverse_root, is_constant, less, reciprocal, select, sqrt
-from ...trace.spatial import ZERO, Vector, dot, total
+from ...trace.scalars import Value, branch, inverse_root, is_constant, less, reciprocal, select, sqrt
+from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from ..articulated_sweeps import expand, reduce
 from ..impedance import Law, add_laws
 from ..integration import integrate_link
@@ -68,9 +68,12 @@ class ContactStep(Step):
         trace, kept = self.trace, self.kept
         found = inverse_dynamics(trace, qdd=zero, letter="f")
         bias = {item.index[0]: item.value for item in found if item.array == "out"}
-        points = place_points(trace, self.impedance, self.qd, "contact_f" in self.reports)
+        points, touches = [], []
+        for raw in place_points(trace, self.impedance, self.qd, "contact_f" in self.reports, branches=True):
+            point, first = raw.settled(*self._first(raw))
+            points.append(point)
+            touches.append(self._touch(*first))
         trace.ahead = [*bias.values(), *(value for point in points for value in point.state)]
-        touches = [self._begin(point) for point in points]
         self._press(points, touches)
         trace.stiffened = self._stiffened
         tau = trace.vector("tau")
@@ -136,8 +139,17 @@ class ContactStep(Step):
 
     # -- contacts --------------------------------------------------------------------------------------------------
     def _begin(self, point: Point) -> Touch:
-        """Return the variables of a point, which begin as a candidate's if the step may reach the ground."""
-        kept, h = self.kept, self.h
+        """Return the variables of a point."""
+        return self._touch(*self._first(point))
+
+    def _touch(self, across: Value, candidate: Value) -> Touch:
+        """Return variables that begin with these values; a candidate begins closed."""
+        kept = self.kept
+        return Touch(kept.variable(across), kept.variable(candidate), kept.variable(candidate))
+
+    def _first(self, point: Point) -> tuple[Value, Value]:
+        """Return friction's damper before the first pass, and whether the step may reach the ground."""
+        h = self.h
         normal = dot(point.normal, point.velocity)
         squares = total(x * x for x in self.trace.links.gravity)
         reach = (0.5 * sqrt(squares)) * (h * h)
@@ -145,8 +157,7 @@ class ContactStep(Step):
         candidate = less(0.0, point.depth + falls + reach)
         push = self._push(point, normal)
         fn = candidate * select(less(0.0, push), push, 0.0)
-        across = self._secant(point, fn, self._slip(point, point.velocity, normal))
-        return Touch(kept.variable(across), kept.variable(candidate), kept.variable(candidate))
+        return self._secant(point, fn, self._slip(point, point.velocity, normal)), candidate
 
     @staticmethod
     def _slip(point: Point, x: Vector, normal: Value) -> Value:
@@ -166,23 +177,31 @@ class ContactStep(Step):
 
     def _press(self, points: list[Point], touches: list[Touch]) -> None:
         """Add dampers and loads of the points to their links."""
-        trace, h = self.trace, self.h
+        trace = self.trace
         on: dict[int, list[tuple[Point, Touch]]] = {}
         for point, touch in zip(points, touches, strict=True):
             if point.link is not None:
                 on.setdefault(id(point.link), []).append((point, touch))
         for key, pressed in on.items():
             trace.label(pressed[0][0].link, "c")  # type: ignore[arg-type]
-            mine = [point for point, _ in pressed]
-            along = [h * (touch.closed * (point.k * h + point.d)) for point, touch in pressed]
-            trace.dampers[key] = P = damper(mine, [h * touch.across for _, touch in pressed], along)
-            if len(pressed) < SEVERAL:
-                wrenches = [point.wrench(self._load(point, touch)) for point, touch in pressed]
-                trace.pushes[key] = Vector(total(wrench[i] for wrench in wrenches) for i in range(6))
-            else:
-                trace.pushes[key] = load(
-                    mine, [touch.closed * self._push(point, 0.0) for point, touch in pressed], P, h
-                )
+            P, push = self._sum([x for x in pressed if x[0].near is None])
+            rare = [x for x in pressed if x[0].near is not None]
+            if rare:
+                near, name = total(point.near for point, _ in rare), f"walls of {rare[0][0].number}"
+                more, pushed = self._sum(rare)
+                only = [branch(near, x, 0.0, name) for x in (*more.packed, *pushed)]
+                P, push = P + Articulated.unpacked(only[:-6]), push + Vector(only[-6:])
+            trace.dampers[key], trace.pushes[key] = P, push
+
+    def _sum(self, pressed: list[tuple[Point, Touch]]) -> tuple[Articulated, Vector]:
+        """Return the sums of dampers and loads of points of one link."""
+        h, mine = self.h, [point for point, _ in pressed]
+        along = [h * (touch.closed * (point.k * h + point.d)) for point, touch in pressed]
+        P = damper(mine, [h * touch.across for _, touch in pressed], along)
+        if len(pressed) < SEVERAL:
+            wrenches = [point.wrench(self._load(point, touch)) for point, touch in pressed]
+            return P, Vector(total(wrench[i] for wrench in wrenches) for i in range(6))
+        return P, load(mine, [touch.closed * self._push(point, 0.0) for point, touch in pressed], P, h)
 
     def _load(self, point: Point, touch: Touch) -> Vector:
         """Return f0 - G v before the step."""
@@ -211,15 +230,20 @@ class ContactStep(Step):
         fn = select(less(0.0, pushed), pushed, 0.0)
         cone = touch.across * slip - point.mu * fn
         over = select(less(0.0, cone), cone, 0.0)
-        kept.keep(touch.across, self._secant(point, fn, slip + (h * point.weight) * over))
+        across = self._secant(point, fn, slip + (h * point.weight) * over)
         reached = less(0.0, point.depth - h * normal)
         candidate = select(touch.candidate, touch.candidate, reached)
         pushes = less(0.0, push)
-        kept.keep(touch.candidate, candidate)
         stays = kept.closing * touch.closed
-        kept.keep(touch.closed, select(stays, 1.0, candidate * pushes))
+        closed = select(stays, 1.0, candidate * pushes)
         lacking = select(touch.closed, 0.0, candidate * select(pushes, push, 0.0))
-        return force, slip, over, select(less(pushed, 0.0), -pushed, 0.0), lacking
+        pulls = select(less(pushed, 0.0), -pushed, 0.0)
+        values = [*force, slip, over, pulls, lacking, across, candidate, closed]
+        values = point.only_near(values, "force at")
+        slip, over, pulls, lacking, across, candidate, closed = values[3:]
+        for variable, value in ((touch.across, across), (touch.candidate, candidate), (touch.closed, closed)):
+            kept.keep(variable, value)
+        return Vector(values[:3]), slip, over, pulls, lacking
 
     # -- results ---------------------------------------------------------------------------------------------------
     def _report(self, number: int, surfaces: list[tuple[Point, Vector, Value]]) -> None:
