@@ -12,9 +12,9 @@ WARP = 32
 def define(block: int) -> str:
     """Return the definitions of PUT and FLUSH, for blocks of so many threads, of which each has one world.
 
-    ``PUT(name, entries, entry, value)`` sets an entry of the own row of the array ``name`` [world, entries].
-    ``FLUSH(name, entries, start, count)`` writes the entries from ``start`` on; all that were put since the last FLUSH
-    must be of these ``count``, at most 64, and ``start`` a multiple of 64.
+    ``BEGIN(start)`` comes before the entries from ``start`` on. ``PUT(name, entries, entry, value)`` sets an entry of
+    the own row of the array ``name`` [world, entries]. ``FLUSH(name, entries, start, count)`` writes the entries from
+    ``start`` on; all that were put since BEGIN must be of these ``count``, at most 64.
     """
     return f"""
 #if defined(__CUDA_ARCH__)
@@ -24,7 +24,9 @@ const int lane = threadIdx.x & 31;
 const float* chunks_of_warp = own_chunk - lane * {PITCH};
 const long long first_world = (long long)thread - lane;
 const int worlds_of_warp = worlds - first_world < {WARP} ? (int)(worlds - first_world) : {WARP};
-#define PUT(name, entries, entry, value) own_chunk[(entry) % {CHUNK}] = (value);
+int first_entry = 0;
+#define BEGIN(start) first_entry = start;
+#define PUT(name, entries, entry, value) own_chunk[(entry) - first_entry] = (value);
 #define FLUSH(name, entries, start, count) \\
     __syncwarp(); \\
     for (int i = lane; i < worlds_of_warp * (count); i += {WARP}) \\
@@ -32,10 +34,11 @@ const int worlds_of_warp = worlds - first_world < {WARP} ? (int)(worlds - first_
             chunks_of_warp[i / (count) * {PITCH} + i % (count)]; \\
     __syncwarp();
 #else
+#define BEGIN(start)
 #define PUT(name, entries, entry, value) name.data[world * (entries) + (entry)] = (value);
 #define FLUSH(name, entries, start, count)
 #endif
 """
 
 
-UNDEFINE = "#undef PUT\n#undef FLUSH"
+UNDEFINE = "#undef BEGIN\n#undef PUT\n#undef FLUSH"

@@ -297,7 +297,7 @@ def test_terrain_levels_and_height_scan():
     env = walker_env(
         8,
         scene=scene,
-        observations={"a": [observations.height_scan((0.4, 0.2), 0.1, 0.5), lambda w: w.base_height]},
+        observations={"a": [observations.height_scan((0.5, 0.2), 0.1, 0.5), lambda w: w.base_height]},
         events=[events.terrain(tiles, rows=2), events.base(yaw=(-3.0, 3.0)), events.joints((-0.1, 0.1))],
         commands=commands.Velocity(forward=(1.0, 1.0), left=(0.0, 0.0)),
         terminations={},
@@ -313,11 +313,11 @@ def test_terrain_levels_and_height_scan():
     q = env.q.double().numpy()
     x, y, z, w = q[:, 3:7].T
     heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    grid = np.array([(a, b) for a in np.linspace(-0.2, 0.2, 5) for b in np.linspace(-0.1, 0.1, 3)]).T
+    grid = np.array([(a, b) for a in np.linspace(-0.25, 0.25, 6) for b in np.linspace(-0.1, 0.1, 3)]).T
     c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
     ground = bilinear(tiles.field, q[:, :1] + c * grid[0] - s * grid[1], q[:, 1:2] + s * grid[0] + c * grid[1])
-    assert np.allclose(observed["a"][:, :15].numpy(), q[:, 2:3] - 0.5 - ground, atol=1e-4)  # steep cells, float32
-    assert np.allclose(observed["a"][:, 15].numpy(), q[:, 2] - bilinear(tiles.field, q[:, 0], q[:, 1]), atol=1e-4)
+    assert np.allclose(observed["a"][:, :18].numpy(), q[:, 2:3] - 0.5 - ground, atol=1e-4)  # steep cells, float32
+    assert np.allclose(observed["a"][:, 18].numpy(), q[:, 2] - bilinear(tiles.field, q[:, 0], q[:, 1]), atol=1e-4)
     env.episode_length_buf = torch.full((8,), 99)
     far = torch.arange(8) % 2 == 0  # half of the worlds stand more than half a tile away, the others have gone nowhere
     env.q[:, :2] = torch.as_tensor(starts[:, :2], dtype=torch.float32) + 3.5 * far[:, None] * torch.tensor([[1.0, 0.0]])

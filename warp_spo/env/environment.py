@@ -20,6 +20,7 @@ from .events import Delays, Values
 from .graphs import Part, Replay
 from .layout import Layout
 from .observations import Observation, TorchTerm
+from .stage import Launch
 from .storage import Storage
 from .tracing import CAUSES, Tracing
 
@@ -135,7 +136,7 @@ class Env(VecEnv):
         tracing.run(self.max_episode_length, final_observations)
         self.final = final_observations
         self.reward_names, self.termination_names = list(rewards), tracing.ends
-        self.num_obs = {name: len(values) for name, values in tracing.group_sizes.items()}
+        self.num_obs = tracing.group_sizes
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=layout.values, granularity=granularity)
         finals = [(f"final {name}", size) for name, size in self.num_obs.items()] if self.final else []
         results = [("reward", 1), ("done", 1), ("time_out", 1), *self.num_obs.items(), *finals]
@@ -150,7 +151,7 @@ class Env(VecEnv):
             self._actuator_state = self.dyn.actuator_state(like=self.q, longest=max(delays))
         self._prepare_log()
         self.set_seed(self.seed)
-        self._kernels = {name: stage.build(store.buffers, self.warp_device) for name, stage in tracing.stages.items()}
+        self._kernels = self._build(tracing)
         self._values_later = any(isinstance(event, Values) and event.when != "start" for event in events)
         wanted = self.warp_device.is_cuda if graph is None else bool(graph) and self.warp_device.is_cuda
         self.replay = Replay(self._parts(), wanted)
@@ -273,8 +274,11 @@ class Env(VecEnv):
             f"variable     {', '.join(self.values) or 'nothing'}",
             f"memory       {self.bytes_per_world} bytes a world",
         ]
-        kernels = {name: kernel for name, kernel in self._kernels.items() if kernel is not None}
-        lines += [f"{name:12} {kernel.operations} operations a world" for name, kernel in kernels.items()]
+        kernels = [(name, kernel) for name, some in self._kernels.items() for kernel in some]
+        parts = [f"{kernel.rows} rows of a world, each" if kernel.rows else "a world," for _, kernel in kernels]
+        lines += [
+            f"{name:12} {part} {one.operations} operations" for (name, one), part in zip(kernels, parts, strict=True)
+        ]
         lines += [f"in torch     {term.name}, before {place}" for term, (place, _) in self._layout.users.items()]
         return "\n".join(lines)
 
@@ -298,10 +302,17 @@ class Env(VecEnv):
             return wp.ScopedDevice(self.warp_device)
         return wp.ScopedStream(stream(self.warp_device), sync_enter=False)
 
+    def _build(self, tracing: Tracing) -> dict[str, list[Launch]]:
+        """Return the kernels of each stage; the last one counts the step, after those that draw for rows."""
+        found: dict[str, list[Launch]] = {stage.name: [] for stage in tracing.stages.values()}
+        for stage in sorted(tracing.stages.values(), key=lambda stage: stage.rows == 0):
+            launch = stage.build(self._store.buffers, self.warp_device)
+            found[stage.name] += [] if launch is None else [launch]
+        return found
+
     def _launch(self, name: str) -> None:
-        kernel = self._kernels[name]
-        if kernel is not None:
-            with self._stream():
+        with self._stream():
+            for kernel in self._kernels[name]:
                 kernel(self.num_envs)
 
     def _prepare_log(self) -> None:
@@ -376,11 +387,11 @@ class Env(VecEnv):
 
     def _after(self, stage: str) -> None:
         """Compute what a stage reads of the new state."""
-        kernel, frames = self._kernels[stage], self._layout.frames
-        if kernel is not None and kernel.reads_frames:
+        kernels, frames = self._kernels[stage], self._layout.frames
+        if any(kernel.reads_frames for kernel in kernels):
             self.dyn.frame_poses(self.q, frames, out=self._tensors["frame_pose"])
             self.dyn.frame_velocities(self.q, self.qd, frames, out=self._tensors["frame_velocity"])
-        if kernel is not None and kernel.reads_accelerations:
+        if any(kernel.reads_accelerations for kernel in kernels):
             qdd, out = self._step_arrays["qdd"], self._tensors["frame_acceleration"]
             self.dyn.frame_accelerations(self.q, self.qd, qdd, frames, out=out)
 

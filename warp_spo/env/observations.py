@@ -13,6 +13,32 @@ from .vectors import Vector, rotate, rotate_back, vector
 from .world import World
 
 Term = Callable[[World], Any]
+MANY = 16  # rows from which a thread works on each
+
+
+class Each:
+    """A term of many numbers that are computed alike: a function of a world and of a row of numbers, for each row.
+
+    Equals ``lambda w: [function(w, row) for row in rows]``. With 16 rows or more, an observation of it that asks for
+    neither bias, delay nor history has a kernel of its own, in which a thread works on each row of each world.
+
+    Args:
+        function: of a ``World`` and a row (k,), which returns one number. It may not keep anything with ``w.keep``.
+        rows: numbers [row, k].
+    """
+
+    def __init__(self, function: Callable[[World, Any], Any], rows: Any):
+        self.function, self.rows = function, np.asarray(rows, dtype=np.float64)
+        if self.rows.ndim != 2:
+            raise ValueError(f"observations.Each: rows has shape {self.rows.shape}; expected [row, number]")
+
+    def __call__(self, w: World) -> Vector:
+        """Return the numbers of all rows."""
+        return vector(self.function(w, row) for row in self.rows)
+
+    def of_own_row(self, w: World) -> Any:
+        """Return the number of the thread's row, in a stage in which a world has a thread for each row."""
+        return self.function(w, w.table(f"rows {w.number(self)}", self.rows)(w.row))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -45,11 +71,7 @@ class Observation:
             values = values + w.drawn(
                 f"bias {w.number(self)}", len(values), lambda s: [s.uniform(-self.bias, self.bias) for _ in values]
             )
-        if self.noise > 0.0:
-            values = vector(x + w.uniform(-self.noise, self.noise) for x in values)
-        values = vector(self.scale * x for x in values)
-        if self.clip is not None:
-            values = vector(clip(x, *self.clip) for x in values)
+        values = vector(self._measured(w, x) for x in values)
         least, most = self.delay if isinstance(self.delay, tuple) else (self.delay, self.delay)
         if self.history + most == 1:
             return values
@@ -67,6 +89,25 @@ class Observation:
                 for rows in zip(later, chosen, strict=True)
             ]
         return vector(x for row in chosen for x in row)
+
+    @property
+    def rows(self) -> int:
+        """How many threads of a world work on the term, one for each row of :class:`Each`; 0: one does all terms."""
+        plain = self.bias == 0.0 and self.history == 1 and self.delay in (0, (0, 0))
+        return len(self.term.rows) if isinstance(self.term, Each) and plain and len(self.term.rows) >= MANY else 0
+
+    def trace_row(self, w: World) -> Any:
+        """Return the number of the thread's row."""
+        value = self._measured(w, self.term.of_own_row(w))  # type: ignore[attr-defined]
+        if w.kept:
+            raise ValueError(f"observations.Each: {self.term.function} keeps {', '.join(w.kept)}; expected nothing")  # type: ignore[attr-defined]
+        return value
+
+    def _measured(self, w: World, x: Any) -> Any:
+        """Return a number with noise, scaled and clipped."""
+        x = x + w.uniform(-self.noise, self.noise) if self.noise > 0.0 else x
+        x = self.scale * x
+        return x if self.clip is None else clip(x, *self.clip)
 
     def _remember(self, w: World, values: Vector, count: int) -> list[Vector]:
         """Return the numbers of ``count`` steps, the newest first, and keep them."""
@@ -169,15 +210,15 @@ def height_scan(size: tuple[float, float] = (1.6, 1.0), cell: float = 0.1, offse
     """
     along, across = (np.linspace(-0.5 * each, 0.5 * each, round(each / cell) + 1) for each in size)
 
-    def term(w: World) -> Vector:
+    def height(w: World, point: Any) -> Any:
         x, y, z = w.base_position
         forward = rotate(w.base_quaternion, np.array([1.0, 0.0, 0.0]))
         norm = 1.0 / np.sqrt(forward[0] ** 2 + forward[1] ** 2)
         c, s = forward[0] * norm, forward[1] * norm
-        grid = [(float(a), float(b)) for a in along for b in across]
-        return vector(z - offset - w.ground_height(x + c * a - s * b, y + s * a + c * b) for a, b in grid)
+        a, b = point
+        return z - offset - w.ground_height(x + c * a - s * b, y + s * a + c * b)
 
-    return term
+    return Each(height, [(a, b) for a in along for b in across])
 
 
 def accelerometer(frame: Any) -> Term:

@@ -10,7 +10,8 @@ import numpy as np
 
 from ..hinges.functions import where
 from ..scene.contacts import HeightField, Plane
-from .vectors import Vector, rotate, rotate_back, vector
+from .observations import Each
+from .vectors import rotate, rotate_back, vector
 from .world import World
 
 SMALLEST = 1e-9  # of a denominator
@@ -154,14 +155,11 @@ def lidar(
         most: [m]. position: where they start, in the base's axes [m]. obstacles, steps: as :func:`cast`.
     """
 
-    def term(w: World) -> Vector:
+    def distance(w: World, direction: Any) -> Any:
         origin = w.base_position + rotate(w.base_quaternion, position)
-        return vector(
-            cast(w, origin, rotate(w.base_quaternion, one), most, obstacles, steps)
-            for one in np.asarray(directions, dtype=float)
-        )
+        return cast(w, origin, rotate(w.base_quaternion, direction), most, obstacles, steps)
 
-    return term
+    return Each(distance, directions)
 
 
 def _to_sphere(to: Any, direction: Any, radius: float, most: float) -> Any:

@@ -1,4 +1,4 @@
-"""Stages: the work of an environment on one world as one traced kernel."""
+"""Stages: the work of an environment on one world as one traced kernel, or on each of many rows of numbers."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from .. import launches
 from ..kernels import native, philox, row_chunks
 from ..kernels.elementary import C_TYPE
 from ..kernels.elementary import NATIVE as ELEMENTARY
-from ..trace.emission import Emitter, RangeReduction, Store, render
+from ..trace.emission import Emitter, Listing, RangeReduction, Store, render, replaces
 from ..trace.scalars import Graph, Scalar, ordered
 
 ROW, COLUMN, INT, LONG, CHOSEN, SHARED = "row", "column", "int", "long", "chosen", "shared"
 DRAW = "draw"  # random numbers of the thread's own
-BLOCK = 64  # threads
+ROW_NUMBER = "row_number"  # of the thread, where a world has many
+BLOCK, BLOCK_OF_ROWS = 64, 128  # threads
 WIDE = 8  # entries of a row that the threads of a warp write together
 
 
@@ -72,11 +73,13 @@ def output_name(result: str) -> str:
 
 
 class Stage:
-    """One kernel, a thread a world, made of the values that terms store.
+    """One kernel, a thread a world or a row of a world, made of the values that terms store.
 
     Args:
         name: of the kernel.
         stream: number that tells this stage's random numbers from those of others.
+        rows: threads of a world; the input ROW_NUMBER is the thread's. A value that is stored to an entry is that of
+            row 0; those of the other rows lie behind it. 0: one thread a world.
 
     Attributes:
         graph: of the trace.
@@ -86,8 +89,8 @@ class Stage:
             are new ones; "" if it never does.
     """
 
-    def __init__(self, name: str, stream: int):
-        self.name, self.stream = name, stream
+    def __init__(self, name: str, stream: int, rows: int = 0):
+        self.name, self.stream, self.rows = name, stream, rows
         self.graph = Graph()
         self.graph.step = name
         self.stores: list[Store] = []
@@ -111,14 +114,21 @@ class Stage:
         """Return the names of the tables that the stored values depend on."""
         return {scalar.args[0] for scalar in ordered(item.value for item in self.stores) if scalar.op == "lookup"}
 
-    def _whole_rows(self, buffers: dict[str, Buffer]) -> dict[str, int]:
-        """Return the sizes of the rows of which all entries are stored, by array."""
+    def _wide(self, buffers: dict[str, Buffer]) -> dict[str, list[tuple[int, int]]]:
+        """Return the (first, count) of entries that a warp writes together, by array: stretches that nothing reads."""
+        read = self.read_arrays()
         stored: dict[str, set[int]] = {}
         for item in self.stores:
-            if buffers[item.array].way == ROW:
+            if buffers[item.array].way == ROW and item.array not in read and not self.rows:
                 stored.setdefault(item.array, set()).add(item.index[0])
-        sizes = {name: buffers[name].tensor.shape[-1] for name in stored}
-        return {name: size for name, size in sizes.items() if len(stored[name]) == size}
+        found = {}
+        for name, entries in stored.items():
+            firsts = sorted(entry for entry in entries if entry - 1 not in entries)
+            lasts = sorted(entry for entry in entries if entry + 1 not in entries)
+            whole = [(first, last + 1 - first) for first, last in zip(firsts, lasts, strict=True)]
+            if all(count >= WIDE for _, count in whole):
+                found[name] = whole
+        return found
 
     def build(self, buffers: dict[str, Buffer], device: wp.Device) -> Launch | None:
         """Return the launch of the kernel; None if it writes nothing.
@@ -130,77 +140,91 @@ class Stage:
         """
         if not self.stores:
             return None
-        read = self.read_arrays()
-        chunked = {
-            name: entries for name, entries in self._whole_rows(buffers).items() if name not in read and entries >= WIDE
-        }
+        wide, more = self._wide(buffers), " + row" if self.rows else ""
+
+        def load(array: str, entry: str) -> str:
+            own = {DRAW: f"DRAW({entry})", ROW_NUMBER: "(float)row"}
+            return own.get(array) or buffers[array].load(array, entry)
 
         def store(array: str, entry: str, value: str) -> str:
-            if array in chunked:
-                return f"PUT({array}, {chunked[array]}, {entry}, {value})"
-            return f"{'if (mine) ' if chunked else ''}{buffers[array].store(array, entry, value)}"
+            if array in wide:
+                return f"PUT({array}, {buffers[array].tensor.shape[-1]}, {entry}, {value})"
+            return f"{'if (mine) ' if wide else ''}{buffers[array].store(array, entry + more, value)}"
 
         emitter = Emitter(
-            "float32",
-            lambda array, entry: f"draw[{entry}]" if array == DRAW else buffers[array].load(array, entry),
-            store,
-            lambda array, index: index[0],
-            RangeReduction.FIRST,
-            fuses=True,
+            "float32", load, store, lambda array, index: index[0], RangeReduction.FIRST, late=(DRAW,), fuses=True
         )
-        late = [item for item in self.stores if item.array in read]  # after all reads of what they overwrite
-        early = [item for item in self.stores if item.array not in read and item.array not in chunked]
-        listings = [emitter.region(early, [item.value for item in late])]
-        parts = [render(listings[0], "float32")]
-        for name, entries in chunked.items():
-            for start in range(0, entries, row_chunks.CHUNK):
-                part = min(row_chunks.CHUNK, entries - start)
-                inside = [x for x in self.stores if x.array == name and start <= x.index[0] < start + part]
-                listings.append(emitter.region(inside))
-                parts += [render(listings[-1], "float32"), f"FLUSH({name}, {entries}, {start}, {part})"]
-        listings.append(emitter.region(late))
-        body = "\n".join([*parts, render(listings[-1], "float32")])
-        touched = {array for listing in listings for array, _ in listing.indices if array != DRAW}
+        listings, parts = self._emit(emitter, wide, buffers)
+        touched = {array for listing in listings for array, _ in listing.indices} - {DRAW, ROW_NUMBER}
         touched |= self.read_tables()
         words = [f"((unsigned int*)key.data)[{i}]" for i in range(3)]
         world, step = f"{words[2]} + (unsigned int)world", buffers["tick"].place("tick", "0")
-        random = philox.draws(self.draws, (words[0], words[1]), self.stream, world, step, wp.float32)
+        first = f"row * {-(-self.draws // 4)}" if self.rows else "0"
+        random = philox.draws(self.draws, (words[0], words[1]), self.stream, world, step, first)
         touched |= {"key"} if self.draws else set()
         touched |= {"tick"} if self.draws or self.ticks else set()
         touched |= {name for name in ("advance", "chosen") if name in self.ticks}
         count = f"((unsigned int*)tick.data)[world] += ({self.ticks}) ? 1u : 0u;" if self.ticks else ""
         names = sorted(touched)
-        if chunked:
+        if wide:
             head = [row_chunks.define(BLOCK), "const bool mine = thread < worlds;"]
             head += ["const long long world = mine ? thread : worlds - 1;"]
             tail = [f"if (mine) {{ {count} }}" if count else "", row_chunks.UNDEFINE]
+        elif self.rows:
+            head = [f"if (thread >= worlds * {self.rows}) return;", f"const int row = thread % {self.rows};"]
+            head += [f"const long long world = thread / {self.rows};"]
+            tail = []
         else:
             head = ["if (thread >= worlds) return;", "const long long world = thread;"]
             tail = [count]
-        text = "\n".join([ELEMENTARY[C_TYPE[wp.float32]], *head, random, body, *tail, ""])
+        tail += [philox.UNDEFINE] if self.draws else []
+        text = "\n".join([ELEMENTARY[C_TYPE[wp.float32]], *head, random, *parts, *tail, ""])
         kernel = native.kernel(f"env_{self.name}", text, [(name, 1) for name in names], wp.float32)
         frames = "frame_pose" in touched or "frame_velocity" in touched
-        return Launch(
-            kernel,
-            [buffers[name].warp() for name in names],
-            emitter.operations,
-            device,
-            frames,
-            "frame_acceleration" in touched,
-        )
+        arrays, accelerations = [buffers[name].warp() for name in names], "frame_acceleration" in touched
+        return Launch(kernel, arrays, emitter.operations, device, self.rows, frames, accelerations)
+
+    def _emit(
+        self, emitter: Emitter, wide: dict[str, list[tuple[int, int]]], buffers: dict[str, Buffer]
+    ) -> tuple[list[Listing], list[str]]:
+        """Return the listings of all statements, and their texts with what belongs between them."""
+        read = self.read_arrays()
+        at_once = lambda item: item.array not in read or (not wide and replaces(item))  # noqa: E731
+        late = [item for item in self.stores if not at_once(item)]  # after all reads of what they overwrite
+        early = [item for item in self.stores if at_once(item) and item.array not in wide]
+        listings = [emitter.region(early, [item.value for item in late])]
+        parts = [render(listings[0], "float32")]
+        for name, stretches in wide.items():
+            entries = buffers[name].tensor.shape[-1]
+            for first, count in stretches:
+                for start in range(first, first + count, row_chunks.CHUNK):
+                    part = min(row_chunks.CHUNK, first + count - start)
+                    inside = [x for x in self.stores if x.array == name and start <= x.index[0] < start + part]
+                    listings.append(emitter.region(inside))
+                    parts += [f"BEGIN({start})", render(listings[-1], "float32")]
+                    parts.append(f"FLUSH({name}, {entries}, {start}, {part})")
+        listings.append(emitter.region(late))
+        return listings, [*parts, render(listings[-1], "float32")]
 
 
 class Launch(NamedTuple):
-    """A kernel with its arguments; ``operations`` of one world; whether it reads frames, and their accelerations."""
+    """A kernel with its arguments.
+
+    Attributes:
+        operations: of one thread. rows: threads of a world; 0: one.
+        reads_frames, reads_accelerations: whether it reads frames, and their accelerations.
+    """
 
     kernel: wp.Kernel
     arrays: list[wp.array]
     operations: int
     device: wp.Device
+    rows: int
     reads_frames: bool
     reads_accelerations: bool
 
     def __call__(self, worlds: int) -> None:
         """Launch the kernel on Warp's current stream."""
-        threads = -(-worlds // BLOCK) * BLOCK if self.device.is_cuda else worlds
-        launches.launch(self.kernel, threads, [worlds, *self.arrays], [], device=self.device, block_dim=BLOCK)
+        block, threads = (BLOCK_OF_ROWS, worlds * self.rows) if self.rows else (BLOCK, worlds)
+        threads = -(-threads // block) * block if self.device.is_cuda else threads
+        launches.launch(self.kernel, threads, [worlds, *self.arrays], [], device=self.device, block_dim=block)

@@ -7,12 +7,13 @@ worlds alone. final: observations of the state after the step, before new starts
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from ..hinges.functions import AbstractScalar, Condition, where
-from ..trace.scalars import Value, absolute, less
+from ..trace.scalars import Value, absolute, branch, less
 from .events import EncoderBias, Interval, Reset, Start, Values
 from .layout import Layout
 from .observations import Observation
@@ -38,7 +39,8 @@ class Tracing:
     """The traced stages.
 
     Attributes:
-        stages: by name. group_sizes: the values of each group of observations. ends: names of terminations.
+        stages: by name; those of rows have the name of the one that they belong to. group_sizes: how many numbers each
+            group of observations has. ends: names of terminations.
     """
 
     def __init__(
@@ -62,7 +64,7 @@ class Tracing:
         self.ends = [*terminations, NOT_FINITE]
         names = ("act", "judge", "observe", "reset", "start", "final")
         self.stages = {name: Stage(name, stream) for stream, name in enumerate(names)}
-        self.group_sizes: dict[str, list] = {}
+        self.group_sizes: dict[str, int] = {}
 
     @property
     def arrays(self) -> set[str]:
@@ -131,19 +133,19 @@ class Tracing:
         stage.store(output_name("time_out"), 0, as_value(where(late & ~terminated, 1.0, 0.0)))
         stage.store("chosen", 0, as_value(where(done, 1.0, 0.0)))
         stage.store("episode_length", 0, as_value(where(done, 0.0, length)))
-        w.keep("episodes", w.memory("episodes", 1, reset=None) + where(done, 1.0, 0.0))
-        self._remember_last(w, done, "seconds", w.time)
-        for name in self.rewards:
-            self._remember_last(w, done, f"reward {name}", w.kept[f"sum reward {name}"][0])
-        for name in self.ends:
-            self._remember_last(w, done, f"end {name}", where(ends[name], 1.0, 0.0))
+        found = {"seconds": w.time, **{f"reward {name}": w.kept[f"sum reward {name}"][0] for name in self.rewards}}
+        found |= {f"end {name}": where(ends[name], 1.0, 0.0) for name in self.ends}
+        finished = [(f"last {name}", value) for name, value in found.items()]
+        finished.append(("episodes", w.memory("episodes", 1, reset=None)[0] + 1.0))
+        olds = [w.memory(name, 1, reset=None)[0] for name, _ in finished]
+        news = choose(done, [value for _, value in finished], olds, "end")
+        for (name, _), value in zip(finished, news, strict=True):
+            w.keep(name, [value])
         self._start(w, done, intervals=True)
 
     def _count(self, w: World, cause: str, holds: Condition) -> None:
-        w.keep(f"bad {cause}", w.memory(f"bad {cause}", 1, reset=None) + where(holds, 1.0, 0.0))
-
-    def _remember_last(self, w: World, done: Condition, name: str, value: Any) -> None:
-        w.keep(f"last {name}", [where(done, value, w.memory(f"last {name}", 1, reset=None)[0])])
+        old = w.memory(f"bad {cause}", 1, reset=None)
+        w.keep(f"bad {cause}", choose(holds, old + 1.0, old, f"bad {cause}"))
 
     def _start(self, w: World, done: Condition, intervals: bool) -> None:
         """Start worlds anew where ``done`` holds; let events happen and draw commands in the others."""
@@ -157,43 +159,48 @@ class Tracing:
                 event.change(fresh)
         q, qd = w.q.copy(), w.qd.copy()
         for number, event in enumerate(each for each in self.events if isinstance(each, Interval)):
-            left = w.memory(f"until event {number}", 1, reset=None)[0] - self.layout.step_dt
+            name, due = f"until event {number}", done
+            left = w.memory(name, 1, reset=None)[0]
             if intervals:
+                left = left - self.layout.step_dt
                 changed = World(self.layout, stage)
                 changed.__dict__.update(q=q.copy(), qd=qd.copy())
                 event.change(changed)
-                due = left <= 0.0
-                q = vector(where(due, a, b) for a, b in zip(changed.q, q, strict=True))
-                qd = vector(where(due, a, b) for a, b in zip(changed.qd, qd, strict=True))
-                self._merge(w, changed, due)
-                left = where(due | done, w.uniform(*event.seconds), left)
-            else:
-                left = where(done, w.uniform(*event.seconds), left + self.layout.step_dt)
-            w.keep(f"until event {number}", [left])
-        q = vector(where(done, a, b) for a, b in zip(fresh.q, q, strict=True))
-        qd = vector(where(done, a, b) for a, b in zip(fresh.qd, qd, strict=True))
+                q, qd = self._merge(w, q, qd, changed, left <= 0.0, f"event {number}")
+                due = done | (left <= 0.0)
+            w.keep(name, choose(due, [w.uniform(*event.seconds)], [left], name))
+        q, qd = self._merge(w, q, qd, fresh, done, "start")
         for name, values in (("q", q), ("qd", qd)):
             for i, value in enumerate(values):
                 stage.store(name, i, as_value(value))
-        self._merge(w, fresh, done)
         self._draw_values(w, done, intervals)
         if self.commands is not None:
             self._command(w, done, q, qd, intervals)
 
-    def _merge(self, w: World, changed: World, due: Condition) -> None:
-        """Keep what an event kept in ``changed``, where ``due`` holds."""
-        for name, values in changed.kept.items():
-            old = w.kept.get(name, w.remembered(name))
-            w.keep(name, [where(due, a, b) for a, b in zip(values, old, strict=True)])
+    def _merge(
+        self, w: World, q: Vector, qd: Vector, changed: World, due: Condition, name: str
+    ) -> tuple[Vector, Vector]:
+        """Return the state after an event, which is that of ``changed`` where ``due`` holds, and keep what it kept."""
+        olds = [w.kept.get(each, w.remembered(each)) for each in changed.kept]
+        news = np.concatenate([changed.q, changed.qd, *changed.kept.values()])
+        found = choose(due, news, np.concatenate([q, qd, *olds]), name)
+        sizes = [len(q), len(qd), *map(len, olds)]
+        q, qd, *kept = np.split(found, np.cumsum(sizes)[:-1])
+        for each, values in zip(changed.kept, kept, strict=True):
+            w.keep(each, values)
+        return q, qd
 
     def _command(self, w: World, done: Condition, q: Vector, qd: Vector, intervals: bool) -> None:
         left = w.memory("until command", 1, reset=None)[0]
         due = done | (left <= self.layout.step_dt) if intervals else done
         passed = self.layout.step_dt if intervals else 0.0
-        for name, values in self.commands.draw(w, done if intervals else None).items():
-            old = w.memory(name, len(values), reset=None)
-            w.keep(name, [where(due, a, b) for a, b in zip(values, old, strict=True)])
-        w.keep("until command", [where(due, w.uniform(*self.commands.seconds), left - passed)])
+        drawn = self.commands.draw(w, done if intervals else None)
+        olds = [w.memory(name, len(values), reset=None) for name, values in drawn.items()]
+        news = [*drawn.values(), [w.uniform(*self.commands.seconds)]]
+        found = choose(due, np.concatenate(news), np.concatenate([*olds, [left - passed]]), "command")
+        for name, values in zip(drawn, np.split(found, np.cumsum([*map(len, olds)])), strict=False):
+            w.keep(name, values)
+        w.keep("until command", found[-1:])
         later = World(self.layout, w._stage)
         later.__dict__.update(q=q, qd=qd)
         later.kept = w.kept
@@ -210,22 +217,28 @@ class Tracing:
                 left = w.memory(f"until values {number}", 1, reset=None)[0] - self.layout.step_dt
                 due = left <= 0.0
                 self._store_values(w, event, due)
-                w.keep(f"until values {number}", [where(due, w.uniform(*event.when), left)])
+                new = w.uniform(*event.when)
+                w.keep(f"until values {number}", choose(due, [new], [left], f"until values {number}"))
 
     def _store_values(self, w: World, event: Values, due: Condition | None) -> None:
         """Store what an event makes of values where ``due`` holds; None: everywhere."""
         drawn = World(self.layout, w._stage)
         drawn.values = {name: w.scene.values[name][0].astype(object) for name in event.names}
         event.change(drawn)
+        entries: list[tuple[str, int]] = []
+        news: Any = []
         for name in event.names:
             own = w.scene.values[name][0].ravel()
             for i, value in enumerate(drawn.values[name].ravel()):
                 if isinstance(value, AbstractScalar) or value != own[i]:
-                    array = f"value_{name}"
-                    if any(item.array == array and item.index == (i,) for item in w._stage.stores):
+                    if any(item.array == f"value_{name}" and item.index == (i,) for item in w._stage.stores):
                         raise ValueError(f"Env: two events change entry {i} of {name}; expected one")
-                    old = w._scalar(array, i) if due is not None else 0.0
-                    w._stage.store(array, i, as_value(value if due is None else where(due, value, old)))
+                    entries.append((f"value_{name}", i))
+                    news.append(value)
+        if due is not None:
+            news = choose(due, news, [w._scalar(*entry) for entry in entries], f"values {id(event)}")
+        for entry, value in zip(entries, news, strict=True):
+            w._stage.store(*entry, as_value(value))
 
     def _first(self) -> None:
         """Draw what is drawn once: values of the scene, and memory."""
@@ -248,21 +261,39 @@ class Tracing:
     def _observe(self) -> None:
         stage = self.stages["observe"]
         stage.ticks = f"advance.data[0] > 0 || {CHOSEN_WORLD}"
-        chosen = Condition(stage.graph.input("chosen", 0))
-        w = self.observed = World(self.layout, stage, fresh=chosen)
-        for group, terms in self.groups.items():
-            values = [x for term in terms for x in term.trace(w)]
-            self.group_sizes[group] = values
-            for i, value in enumerate(values):
-                stage.store(output_name(group), i, as_value(value))
+        begin = lambda one: World(self.layout, one, fresh=Condition(one.graph.input("chosen", 0)))  # noqa: E731
+        self.observed = begin(stage)
+        self._observe_groups(self.observed, begin, "")
 
     def _final(self) -> None:
         """Observe the state in which an episode ends, before worlds start anew."""
-        w = World(self.layout, self.stages["final"])
-        w.__dict__["time"] = (w.read("episode_length", 1)[0] + 1.0) * self.layout.step_dt
+
+        def begin(stage: Stage) -> World:
+            w = World(self.layout, stage)
+            w.__dict__["time"] = (w.read("episode_length", 1)[0] + 1.0) * self.layout.step_dt
+            return w
+
+        self._observe_groups(begin(self.stages["final"]), begin, "final ")
+
+    def _observe_groups(self, w: World, begin: Callable[[Stage], World], kind: str) -> None:
+        """Store the observations of all groups: of ``w``, or of the rows of a world that ``begin`` makes of a stage."""
+        of_rows: dict[int, World] = {}
         for group, terms in self.groups.items():
-            for i, value in enumerate(x for term in terms for x in term.trace(w)):
-                w._stage.store(output_name(f"final {group}"), i, as_value(value))
+            name, at = output_name(kind + group), 0
+            for term in terms:
+                rows = term.rows
+                if rows:
+                    if rows not in of_rows:
+                        stage = Stage(w._stage.name, len(self.stages), rows)
+                        self.stages[f"{w._stage.name}, {rows} rows"] = stage
+                        of_rows[rows] = begin(stage)
+                    of_rows[rows]._stage.store(name, at, as_value(term.trace_row(of_rows[rows])))
+                    at += rows
+                else:
+                    for value in term.trace(w):
+                        w._stage.store(name, at, as_value(value))
+                        at += 1
+            self.group_sizes[group] = at
 
     # -- memory ----------------------------------------------------------------------------------------------------
     def _close(self) -> None:
@@ -277,12 +308,19 @@ class Tracing:
         for name, (_, _, update) in self.layout.sensors.items():
             if name not in self.judge.kept:
                 update(self.judge)
-        for name, (_, size, reset) in list(self.layout.memory.items()):
-            values = self.judge.memory(name, size, reset)
-            if reset is not None:
-                values = vector(where(self.done, reset, x) for x in values)
-            if reset is not None or name in self.judge.kept:
-                self._keep(self.judge, name, values)
+        self._clear(self.judge, self.done)
+
+    def _clear(self, w: World, done: Condition) -> None:
+        """Store what a stage keeps; where ``done`` holds, the values at a reset of what has one."""
+        every = list(self.layout.memory.items())
+        names = [name for name, (_, _, reset) in every if reset is not None]
+        olds = [w.memory(name, size, reset) for name, (_, size, reset) in every if reset is not None]
+        resets = [reset for _, size, reset in self.layout.memory.values() if reset is not None for _ in range(size)]
+        found = choose(done, resets, [x for values in olds for x in values], "cleared")
+        kept = w.kept | dict(zip(names, np.split(found, np.cumsum([*map(len, olds)])), strict=False))
+        for name, _ in every:
+            if name in kept:
+                self._keep(w, name, kept[name])
 
     def _keep(self, w: World, name: str, values: Vector) -> None:
         start = self.layout.memory[name][0]
@@ -297,12 +335,16 @@ class Tracing:
         w = World(self.layout, stage)
         self._start(w, chosen, intervals=False)
         stage.store("episode_length", 0, as_value(where(chosen, 0.0, w.read("episode_length", 1)[0])))
-        for name, (_, size, reset) in self.layout.memory.items():
-            if name in w.kept or reset is not None:
-                values = w.memory(name, size, reset)
-                if reset is not None:
-                    values = vector(where(chosen, reset, x) for x in values)
-                self._keep(w, name, values)
+        self._clear(w, chosen)
+
+
+def choose(due: Condition, news: Any, olds: Any, name: str) -> Vector:
+    """Return new values where ``due`` holds, else old ones; what only new ones need is computed only there.
+
+    ``name`` tells the choices of one condition from each other.
+    """
+    pairs = [(as_value(a), as_value(b)) for a, b in zip(news, olds, strict=True)]
+    return vector(AbstractScalar(branch(due.value, a, b, name)) for a, b in pairs)
 
 
 def scalar(what: str, x: Any) -> Any:
