@@ -236,7 +236,7 @@ def test_go2_stands_in_mujoco(tmp_path):
     found = deployment.trial(robots_there, seconds=2.0, period=10.0)
     assert found["standing"] == 4
     for data in robots_there.data:
-        assert data.qpos[2] > 0.25 and np.abs(data.qpos[robots_there.joint_q] - env._layout.default_q[7:]).max() < 0.3
+        assert data.qpos[2] > 0.25 and np.abs(data.qpos[robots_there.joint_q] - env.default_q[7:]).max() < 0.3
     ours = recording.record(env, lambda observed: torch.zeros(2, 12), 2.0)
     assert np.allclose(ours.q[-1, 7:], robots_there.data[0].qpos[7:], atol=0.1)
 

@@ -16,13 +16,14 @@ from ..errors import as_integer
 from ..launches import compile_side_by_side
 from ..scene.scene import Scene
 from ..torch import stream
-from .events import Delays, Values
+from .events import Delays, Values, changed_values
 from .graphs import Part, Replay
 from .layout import Layout
+from .logs import Log, explain
 from .observations import Observation, TorchTerm
 from .stage import Launch
 from .storage import Storage
-from .tracing import CAUSES, Tracing
+from .tracing import Tracing
 
 try:
     from rsl_rl.env import VecEnv
@@ -68,6 +69,7 @@ class Env(VecEnv):
         replay: runs a step without its inputs and results; ``replay.captured`` says of how many graphs it is made.
         values: what events have made of the scene's values, torch tensors [world, ...] by name.
         dyn: the :class:`Dynamics`.
+        has_commands: whether it gives commands.
         num_envs, num_actions, num_obs, max_episode_length, episode_length_buf, device, cfg: as rsl_rl names them.
 
     Raises:
@@ -112,13 +114,13 @@ class Env(VecEnv):
         self.dt, self.decimation, self.step_dt = float(dt), steps, float(dt) * steps
         self.max_episode_length = max(1, round(episode_length_s / self.step_dt))
         self.seed, self.first_world, self.cfg = int(seed), int(first_world), {} if cfg is None else cfg
-        self._passes, self.log_interval = passes, log_interval
+        self._passes, self.log_interval, self.has_commands = passes, log_interval, commands is not None
         self._steps = 0
 
         default = np.asarray(scene.neutral_q if default_q is None else default_q, dtype=np.float64)
         if default.shape != (scene.coord_count,):
             raise ValueError(f"Env: default_q has shape {default.shape}; expected ({scene.coord_count},) [coordinate]")
-        layout = self._layout = Layout(scene, default, self.step_dt, commands, _changed_values(scene, events))
+        layout = self._layout = Layout(scene, default, self.step_dt, commands, changed_values(scene, events))
         parts = list(actions) if isinstance(actions, list | tuple) else [actions]
         self.action_labels = [label for part in parts for label in part.labels(scene)]
         self.num_actions = layout.action_count = len(self.action_labels)
@@ -149,7 +151,7 @@ class Env(VecEnv):
         self._actuator_state: Any = None
         if "ctrl" in store.controls and max(delays) > 0:
             self._actuator_state = self.dyn.actuator_state(like=self.q, longest=max(delays))
-        self._prepare_log()
+        self._log = Log(layout, self.reward_names, self.termination_names, self.device)
         self.set_seed(self.seed)
         self._kernels = self._build(tracing)
         self._values_later = any(isinstance(event, Values) and event.when != "start" for event in events)
@@ -254,33 +256,19 @@ class Env(VecEnv):
         done = self._store.part(out, "done").view(-1).view(torch.int32)
         return self._observations(out), self._store.part(out, "reward").view(-1), done, extras
 
+    def controls(self, actions: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return what actions set, "ctrl", "target_q" or "tau" [world, ...]; worlds remember them as their actions."""
+        self.actions.copy_(actions)
+        self._launch("act")
+        return {name: controls.clone() for name, controls in self._controls.items()}
+
     def log(self) -> dict[str, torch.Tensor]:
         """Return means over the worlds' last finished episodes by name, and counts of what was not finite."""
-        memory = self._tensors["memory"]
-        finished = (self.memory("episodes")[:, 0] > 0).float()
-        means = memory[self._logged] @ (finished / finished.sum().clamp(min=1.0))
-        counts = memory[self._counted].sum(dim=1)
-        return dict(zip(self._log_names, [*means.unbind(), *counts.unbind()], strict=True))
+        return self._log(self._tensors["memory"])
 
     def explain(self) -> str:
         """Return what a step consists of, and what it takes in memory."""
-        lines = [
-            f"{self.num_envs} worlds on {self.warp_device}, {self.decimation} steps of {self.dt:g} s a step, "
-            f"{self.max_episode_length} steps an episode",
-            f"actions      {self.num_actions}: {', '.join(self.action_labels)}",
-            f"observations {', '.join(f'{name} {size}' for name, size in self.num_obs.items())}",
-            f"rewards      {', '.join(self.reward_names)}",
-            f"ends         {', '.join(self.termination_names)}, after {self.max_episode_length} steps",
-            f"variable     {', '.join(self.values) or 'nothing'}",
-            f"memory       {self.bytes_per_world} bytes a world",
-        ]
-        kernels = [(name, kernel) for name, some in self._kernels.items() for kernel in some]
-        parts = [f"{kernel.rows} rows of a world, each" if kernel.rows else "a world," for _, kernel in kernels]
-        lines += [
-            f"{name:12} {part} {one.operations} operations" for (name, one), part in zip(kernels, parts, strict=True)
-        ]
-        lines += [f"in torch     {term.name}, before {place}" for term, (place, _) in self._layout.users.items()]
-        return "\n".join(lines)
+        return explain(self, self._kernels, self._layout.users)
 
     @property
     def bytes_per_world(self) -> int:
@@ -314,18 +302,6 @@ class Env(VecEnv):
         with self._stream():
             for kernel in self._kernels[name]:
                 kernel(self.num_envs)
-
-    def _prepare_log(self) -> None:
-        """Note which numbers of the memory :meth:`log` reads."""
-        means = {f"/reward/{name}": f"last reward {name}" for name in self.reward_names}
-        means |= {f"/termination/{name}": f"last end {name}" for name in self.termination_names}
-        means["/episode/seconds"] = "last seconds"
-        counts = {f"/not finite/{cause}": f"bad {cause}" for cause in CAUSES}
-        self._log_names = [*means, *counts]
-        self._logged, self._counted = (
-            torch.tensor([self._layout.memory[name][0] for name in names.values()], device=self.device)
-            for names in (means, counts)
-        )
 
     def _compile(self) -> None:
         """Compile all kernels side by side, by a step in which nothing counts."""
@@ -410,14 +386,3 @@ class Env(VecEnv):
             expected = (self.num_envs,) if term.size == 1 else (self.num_envs, term.size)
             raise ValueError(f"Env: the term {term.name} returned {came}; expected a tensor {expected}")
         self._tensors["user"][:, start : start + term.size].copy_(found.reshape(self.num_envs, term.size))
-
-
-def _changed_values(scene: Scene, events: Sequence[Any]) -> tuple[str, ...]:
-    """Return the names of the values that events change; ValueError if one is none of a scene's."""
-    names = dict.fromkeys(name for event in events if isinstance(event, Values) for name in event.names)
-    for name in names:
-        if name not in scene.values:
-            raise ValueError(f"Env: an event changes {name!r}; expected one of {', '.join(scene.values)}")
-        if scene.values[name].shape[0] > 1:
-            raise ValueError(f"Env: an event changes {name}, which differs between worlds of the scene already")
-    return tuple(names)

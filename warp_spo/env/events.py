@@ -364,3 +364,14 @@ def multiply(a: Any, b: Any) -> np.ndarray:
     """Return the product of two quaternions, xyzw: the rotation ``b``, then ``a``."""
     u = a[3] * vector(b[:3]) + b[3] * vector(a[:3]) + cross(a, b)
     return vector([*u, a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2]])
+
+
+def changed_values(scene: Any, events: Sequence[Any]) -> tuple[str, ...]:
+    """Return the names of the values that events change; ValueError if one is none of a scene's."""
+    names = dict.fromkeys(name for event in events if isinstance(event, Values) for name in event.names)
+    for name in names:
+        if name not in scene.values:
+            raise ValueError(f"Env: an event changes {name!r}; expected one of {', '.join(scene.values)}")
+        if scene.values[name].shape[0] > 1:
+            raise ValueError(f"Env: an event changes {name}, which differs between worlds of the scene already")
+    return tuple(names)

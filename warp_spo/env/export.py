@@ -26,7 +26,7 @@ def describe(env: Env, name: str) -> dict[str, Any]:
     chosen, scene = task(name) if name in TASKS else None, env.scene
     scale, offset, gains = controls_of(env)
     joints = [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == hinge.dof_count == 1]
-    default = env._layout.default_q[[int(scene.q_start[i]) for i in joints]]
+    default = env.default_q[[int(scene.q_start[i]) for i in joints]]
     count = len(joints)
     sizes = {"joint position": count, "joint velocity": count, "last action": env.num_actions, "step phase": 2}
     listed = getattr(chosen, "ACTOR", None)
@@ -53,12 +53,11 @@ def controls_of(env: Env) -> tuple[np.ndarray, np.ndarray, dict[str, list]]:
     The last are lists by name, a number for each action; None where there is no limit. Worlds start anew.
     """
     scene, rows = env.scene, []
-    for action in (None, *range(env.num_actions)):
-        env.actions.zero_()
-        if action is not None:
-            env.actions[:, action] = 0.5
-        env._launch("act")
-        rows.append({array: controls[0].double().cpu().numpy().copy() for array, controls in env._controls.items()})
+    given = torch.zeros(1 + env.num_actions, env.num_actions, device=env.device)
+    given[1:].fill_diagonal_(0.5)
+    for actions in given:
+        controls = env.controls(actions.expand(env.num_envs, -1))
+        rows.append({array: values[0].double().cpu().numpy() for array, values in controls.items()})
     env.reset()
     scale, offset = [], []
     gains: dict[str, list] = {"stiffness": [], "damping": [], "force_limit": [], "delay_steps": []}

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..hinges.functions import clip, where
+from .stage import ROW_NUMBER
 from .vectors import Vector, rotate, rotate_back, vector
 from .world import World
 
@@ -38,7 +39,7 @@ class Each:
 
     def of_own_row(self, w: World) -> Any:
         """Return the number of the thread's row, in a stage in which a world has a thread for each row."""
-        return self.function(w, w.table(f"rows {w.number(self)}", self.rows)(w.row))
+        return self.function(w, w.table(f"rows {w.number(self)}", self.rows)(w.read(ROW_NUMBER, 1)[0]))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

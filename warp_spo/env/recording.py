@@ -35,7 +35,7 @@ def record(env: Env, policy: Any, seconds: float, command: Any = None, world: in
     """Start all worlds anew and return the course of one of them; ``command`` is held if it is given."""
     observed, _ = env.reset()
     env.episode_length_buf = torch.zeros_like(env.episode_length_buf)
-    commanded = "command" in env._layout.memory
+    commanded = env.has_commands
     states: list[list[np.ndarray]] = [[], [], []]
     for _ in range(round(seconds / env.step_dt)):
         if command is not None:

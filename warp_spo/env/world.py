@@ -13,7 +13,7 @@ from ..recursions.contact.ground import Place, height
 from ..trace import spatial
 from ..trace.scalars import floor, lookup
 from .feet import Feet, feet
-from .stage import ROW_NUMBER, Stage
+from .stage import Stage
 from .vectors import Vector, as_scalar, as_value, cross, find, rotate, rotate_back, vector
 
 if TYPE_CHECKING:
@@ -84,11 +84,6 @@ class World:
     def default_q(self) -> np.ndarray:
         """The q that resets start from [coordinate], numbers."""
         return self._layout.default_q
-
-    @property
-    def row(self) -> Any:
-        """The number of the thread's row, where a world has a thread for each, see :class:`observations.Each`."""
-        return self._scalar(ROW_NUMBER, 0)
 
     @functools.cached_property
     def time(self) -> Any:

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import enum
-import operator
 import re
 from collections import Counter
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
 
+from .branches import branch_of, find_blocks, in_order
 from .scalars import Scalar, Value, is_constant, ordered
 
 C_TYPE = {"float32": "float", "float64": "double"}
 LIBRARY = {"exponential": "exp", "logarithm": "log", "power": "pow", "floor": "floor"}  # functions of C, also on CUDA
-in_order = operator.attrgetter("number")  # sorts scalars as their graph grew
 BINARY = {"add": "+", "sub": "-", "mul": "*", "quotient": "/"}
 COST = {  # floating-point operations of a statement
     "add": 1,
@@ -367,45 +366,12 @@ def choose_products(scalars: list[Scalar], stored: set[tuple]) -> tuple[dict[tup
     return taken, fused
 
 
-def branch_of(scalar: Scalar) -> tuple:
-    """Return what tells the branch of a value from others: its mask and its name."""
-    mask, _, _, name = scalar.args
-    return mask.key, name
-
-
 def replaces(item: Store) -> bool:
     """Return whether a store writes over an entry in a branch, and leaves it as it is otherwise."""
     if is_constant(item.value) or item.value.op != "branch":
         return False
     old = item.value.args[2]
     return old.__class__ is Scalar and old.op == "input" and old.args == (item.array, *item.index)
-
-
-def find_blocks(needed: list[Scalar], used: Container[tuple]) -> dict[tuple, list[Scalar]]:
-    """Return, by branch, the scalars that only the values of this branch need, in their order.
-
-    What a kernel reads stays outside, because statements before the branch may write over it.
-
-    Args:
-        needed: the scalars of a region. used: the keys of those that are stored, used later, or known.
-    """
-    blocks: dict[tuple, list[Scalar]] = {branch_of(x): [] for x in needed if x.op == "branch"}
-    if not blocks:
-        return blocks
-    owners: dict[tuple, set] = {}  # the branches in which each scalar is used; None: outside of all
-    for scalar in sorted(needed, key=in_order, reverse=True):
-        at = owners.get(scalar.key, {None})
-        own = next(iter(at)) if len(at) == 1 else None
-        turns = scalar.op in ("sin", "cos") and scalar.args[0].op == "input"  # angles that are reduced first
-        if scalar.key in used or turns or scalar.op in ("input", "branch"):
-            own = None
-        if own is not None:
-            blocks[own].append(scalar)
-        for place, value in enumerate(scalar.args):
-            if value.__class__ is Scalar:
-                takes = branch_of(scalar) if scalar.op == "branch" and place == 1 else own
-                owners.setdefault(value.key, set()).add(takes)
-    return {key: block[::-1] for key, block in blocks.items()}
 
 
 def fill_in(listing: Listing, constants: list[str], indices: list[str], labels: list[str], prefix: str = "") -> str:

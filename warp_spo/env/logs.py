@@ -1,0 +1,62 @@
+"""What an environment says of itself: means over finished episodes, counts of bad numbers, what a step consists of."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from .layout import Layout
+from .stage import Launch
+from .tracing import CAUSES
+
+if TYPE_CHECKING:
+    from .environment import Env
+
+
+class Log:
+    """Reads the worlds' memory, without waiting for the device.
+
+    Args:
+        layout: where the memory is. rewards, ends: names. device: of the memory.
+    """
+
+    def __init__(self, layout: Layout, rewards: list[str], ends: list[str], device: torch.device):
+        means = {f"/reward/{name}": f"last reward {name}" for name in rewards}
+        means |= {f"/termination/{name}": f"last end {name}" for name in ends}
+        means["/episode/seconds"] = "last seconds"
+        counts = {f"/not finite/{cause}": f"bad {cause}" for cause in CAUSES}
+        self._names = [*means, *counts]
+        self._means, self._counts, self._episodes = (
+            torch.tensor([layout.memory[name][0] for name in names], device=device)
+            for names in (means.values(), counts.values(), ["episodes"])
+        )
+
+    def __call__(self, memory: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return the report for the memory [number, world]."""
+        finished = (memory[self._episodes][0] > 0).float()
+        means = memory[self._means] @ (finished / finished.sum().clamp(min=1.0))
+        return dict(zip(self._names, [*means.unbind(), *memory[self._counts].sum(dim=1).unbind()], strict=True))
+
+
+def explain(env: Env, stages: dict[str, list[Launch]], users: dict[Any, tuple[str, int]]) -> str:
+    """Return what a step consists of, and what it takes in memory.
+
+    Args:
+        env: the environment. stages: its kernels, by stage. users: terms in torch, with the stage that reads them.
+    """
+    lines = [
+        f"{env.num_envs} worlds on {env.warp_device}, {env.decimation} steps of {env.dt:g} s a step, "
+        f"{env.max_episode_length} steps an episode",
+        f"actions      {env.num_actions}: {', '.join(env.action_labels)}",
+        f"observations {', '.join(f'{name} {size}' for name, size in env.num_obs.items())}",
+        f"rewards      {', '.join(env.reward_names)}",
+        f"ends         {', '.join(env.termination_names)}, after {env.max_episode_length} steps",
+        f"variable     {', '.join(env.values) or 'nothing'}",
+        f"memory       {env.bytes_per_world} bytes a world",
+    ]
+    kernels = [(name, kernel) for name, some in stages.items() for kernel in some]
+    parts = [f"{kernel.rows} rows of a world, each" if kernel.rows else "a world," for _, kernel in kernels]
+    lines += [f"{name:12} {part} {one.operations} operations" for (name, one), part in zip(kernels, parts, strict=True)]
+    lines += [f"in torch     {term.name}, before {place}" for term, (place, _) in users.items()]
+    return "\n".join(lines)

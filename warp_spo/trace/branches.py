@@ -1,0 +1,43 @@
+"""Branches of a trace: which statements only the values of one branch need, so that code may skip them."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Container
+
+from .scalars import Scalar
+
+in_order = operator.attrgetter("number")  # sorts scalars as their graph grew
+
+
+def branch_of(scalar: Scalar) -> tuple:
+    """Return what tells the branch of a value from others: its mask and its name."""
+    mask, _, _, name = scalar.args
+    return mask.key, name
+
+
+def find_blocks(needed: list[Scalar], used: Container[tuple]) -> dict[tuple, list[Scalar]]:
+    """Return, by branch, the scalars that only the values of this branch need, in their order.
+
+    What a kernel reads stays outside, because statements before the branch may write over it.
+
+    Args:
+        needed: the scalars of a region. used: the keys of those that are stored, used later, or known.
+    """
+    blocks: dict[tuple, list[Scalar]] = {branch_of(x): [] for x in needed if x.op == "branch"}
+    if not blocks:
+        return blocks
+    owners: dict[tuple, set] = {}  # the branches in which each scalar is used; None: outside of all
+    for scalar in sorted(needed, key=in_order, reverse=True):
+        at = owners.get(scalar.key, {None})
+        own = next(iter(at)) if len(at) == 1 else None
+        turns = scalar.op in ("sin", "cos") and scalar.args[0].op == "input"  # angles that are reduced first
+        if scalar.key in used or turns or scalar.op in ("input", "branch"):
+            own = None
+        if own is not None:
+            blocks[own].append(scalar)
+        for place, value in enumerate(scalar.args):
+            if value.__class__ is Scalar:
+                takes = branch_of(scalar) if scalar.op == "branch" and place == 1 else own
+                owners.setdefault(value.key, set()).add(takes)
+    return {key: block[::-1] for key, block in blocks.items()}
