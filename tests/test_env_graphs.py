@@ -20,7 +20,7 @@ class Device:
         monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", lambda mode: setattr(self, "mode", mode))
 
     @contextlib.contextmanager
-    def capture(self, graph):
+    def capture(self, graph, capture_error_mode):
         self.capturing = graph
         try:
             yield

@@ -3,6 +3,7 @@
 python -m warp_spo.train go2-flat                         # into runs/go2-flat
 python -m warp_spo.train go2-flat --resume runs/go2-flat/model_399.pt --iterations 800
 python -m warp_spo.train go2-flat --gpus 4                # one process a GPU, each with --worlds worlds
+python -m warp_spo.train cartpole --gpus 2 --device cpu   # two processes on the CPU
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("task", choices=sorted(TASKS))
     parser.add_argument("--worlds", type=int, help="of each GPU; left out: as the task says")
     parser.add_argument("--device", help="such as cuda:0 or cpu; left out: cuda:0 if there is one")
-    parser.add_argument("--gpus", type=int, default=1, help="processes, one a GPU (torchrun)")
+    parser.add_argument("--gpus", type=int, default=1, help="processes (torchrun), one a GPU, or with --device cpu")
     parser.add_argument("--iterations", type=int, help="in all; left out: as the task says")
     parser.add_argument("--seconds", type=float, default=math.inf, help="from the start, after which it stops; one GPU")
     parser.add_argument("--seed", type=int, default=0)
@@ -37,9 +38,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--save-interval", type=int, default=100, help="iterations between checkpoints")
     options = parser.parse_args(arguments)
     if options.gpus > 1 and "LOCAL_RANK" not in os.environ:
+        if options.device not in (None, "cpu"):
+            parser.error(f"--gpus {options.gpus} with --device {options.device}; expected no --device, or cpu")
         given = sys.argv[1:] if arguments is None else arguments
         run = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={options.gpus}"]
         return subprocess.call([*run, "-m", "warp_spo.train", *given])
+
+    import torch
 
     from .env import learning
 
@@ -56,6 +61,8 @@ def main(arguments: list[str] | None = None) -> int:
     )  # fmt: skip
     if rank == 0:
         print(f"{folder}: checkpoints, progress.jsonl, {learning.draw_curve(folder, options.task).name}")
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
     return 0
 
 

@@ -105,7 +105,7 @@ class Replay:
         """Return the graph of some parts, and the name of the user's term that cannot be in it."""
         graph, now = torch.cuda.CUDAGraph(), ""
         try:
-            with torch.cuda.graph(graph):
+            with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # other threads may do as they like
                 for part in parts:
                     now = part.term
                     part.run()

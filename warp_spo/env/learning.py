@@ -94,7 +94,7 @@ class CapturedPPO(PPO):
             super().act(obs)  # warms up
             self.seen, graph = obs.clone(), torch.cuda.CUDAGraph()
             try:
-                with torch.cuda.graph(graph):
+                with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # NCCL has threads of its own
                     super().act(self.seen)
             except RuntimeError as error:
                 warnings.warn(f"train: the policy acts without a CUDA graph: {error}", stacklevel=2)
@@ -127,6 +127,20 @@ class OutOfTime(Exception):
 
 
 KEPT = ("actions", "values", "actions_log_prob", "distribution_params", "hidden_states")
+
+
+class Runner(OnPolicyRunner):
+    """rsl_rl's runner; processes without GPUs average gradients through gloo, where rsl_rl knows NCCL alone."""
+
+    def _configure_multi_gpu(self) -> None:
+        size = int(os.environ.get("WORLD_SIZE", "1"))
+        if self.device != "cpu" or size == 1:
+            return super()._configure_multi_gpu()
+        self.gpu_world_size, self.is_distributed = size, True
+        self.gpu_global_rank, self.gpu_local_rank = (int(os.environ[name]) for name in ("RANK", "LOCAL_RANK"))
+        ranks = {"global_rank": self.gpu_global_rank, "local_rank": self.gpu_local_rank}
+        self.cfg["multi_gpu"] = ranks | {"world_size": size}
+        torch.distributed.init_process_group("gloo", rank=self.gpu_global_rank, world_size=size)
 
 
 class Course:
@@ -219,7 +233,7 @@ def make_runner(
     began: float | None = None, seconds: float = math.inf,
 ) -> OnPolicyRunner:  # fmt: skip
     """Return rsl_rl's runner on an environment, with the course of the training in ``folder``."""
-    runner = OnPolicyRunner(env, learner.settings(env, save_interval), None, device=str(env.device))
+    runner = Runner(env, learner.settings(env, save_interval), None, device=str(env.device))
     began = time.time() if began is None else began
     runner.logger = Course(env, folder, every, began, runner.gpu_global_rank == 0, seconds)  # type: ignore[assignment]
     return runner
@@ -240,6 +254,9 @@ def train(
     seed: int = 0, save_interval: int = 100, every: int = 10, began: float | None = None, seconds: float = math.inf,
 ) -> OnPolicyRunner:  # fmt: skip
     """Train, and leave checkpoints ``model_N.pt`` and ``progress.jsonl`` in a folder.
+
+    Under torchrun each process has its own worlds, gradients and normalisers are averaged over all, and the first
+    process writes; its log is of its own worlds.
 
     Args:
         env: the environment.
