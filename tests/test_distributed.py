@@ -43,7 +43,7 @@ def learn(rank, size, port, folder):
                       for name, value in getattr(runner.alg, part).state_dict().items()}  # fmt: skip
     found["rate"] = runner.alg.learning_rate
     torch.save(found, folder / f"found_{rank}.pt")
-    torch.distributed.destroy_process_group()
+    learning.leave()
 
 
 def test_two_processes_learn_one_policy(tmp_path):

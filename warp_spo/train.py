@@ -44,8 +44,6 @@ def main(arguments: list[str] | None = None) -> int:
         run = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={options.gpus}"]
         return subprocess.call([*run, "-m", "warp_spo.train", *given])
 
-    import torch
-
     from .env import learning
 
     rank = int(os.environ.get("RANK", 0))
@@ -61,8 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
     )  # fmt: skip
     if rank == 0:
         print(f"{folder}: checkpoints, progress.jsonl, {learning.draw_curve(folder, options.task).name}")
-    if torch.distributed.is_initialized():
-        torch.distributed.destroy_process_group()
+    learning.leave()
     return 0
 
 

@@ -289,6 +289,12 @@ def train(
     return runner
 
 
+def leave() -> None:
+    """End this process's part in a training of several."""
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
+
+
 def policy_of(runner: OnPolicyRunner) -> Any:
     """Return the function from observations (a TensorDict) to actions that the training has found."""
     model = runner.get_inference_policy(str(runner.device))
