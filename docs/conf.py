@@ -1,5 +1,6 @@
 """Sphinx configuration: ``python -m sphinx -W -b html docs docs/_build``, without network."""
 
+import sys
 from pathlib import Path
 
 import warp as wp
@@ -12,7 +13,8 @@ project = "warp_spo"
 author = "the warp_spo developers"
 release = warp_spo.__version__
 
-extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "myst_parser"]
+sys.path.insert(0, str(Path(__file__).parent))  # messages.py
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "myst_parser", "messages"]
 exclude_patterns = ["_build"]
 myst_heading_anchors = 3
 autosummary_generate = False  # tables alone; every call has its entry on the page below them
