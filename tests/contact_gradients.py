@@ -10,6 +10,7 @@ from warp_spo.recursions.contact import step as contact
 from warp_spo.recursions.contact.ground import CORNERS, GROUND, corner_steps, surface_count
 from warp_spo.recursions.contact.secants import SECANT
 from warp_spo.recursions.derivatives import contact as back
+from warp_spo.recursions.derivatives import contact_pass as one
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.step import GAIN
 from warp_spo.recursions.tracing import Trace
@@ -70,34 +71,54 @@ def step(scene, a, h, passes):
     return found["q_out"], found["out"], np.concatenate(answers, axis=1)
 
 
-def gradient(scene, a, h, passes, cotangents, wrt):
-    """The gradients of the sum of cotangents times results by name, from the kernels' traces."""
+def gradient(scene, a, h, passes, cotangents, wrt, ran=None):
+    """The gradients of the sum of cotangents times results by name, from the kernels' traces.
+
+    ``ran`` receives, for each launch, the kernel's name, what it reads and what it leaves.
+    """
     arguments, worlds, dofs = tuple(name for name in a if name not in VALUES), len(a["q"]), scene.dof_count
     names = (*arguments, "dt", "passes", "number")
-    count = back.count_variables(trace_of(scene, names))
-    forward = back.contact_pass(trace_of(scene, names))
-    backward = back.contact_pass_vjp(trace_of(scene, (*names, "qdd", "q_cotangent", "qd_cotangent")), wrt)
+    laws = one.count_laws(trace_of(scene, names))
+    count = one.count_variables(Links(scene, VALUES), laws)
+    back_names = (*names, "qdd", "solved", "q_cotangent", "qd_cotangent")
+    kernels = {
+        "contact_pass": one.contact_pass(trace_of(scene, names), laws),
+        "contact_solve": back.contact_solve(trace_of(scene, back_names), laws),
+        "contact_gradient": back.contact_gradient(trace_of(scene, back_names), laws, wrt, True),
+    }
     blank = lambda *size: np.full((worlds, *size), np.nan)  # noqa: E731
     known = a | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
+    known |= dict(zip(("q_cotangent", "qd_cotangent"), cotangents, strict=True))
     known[GROUND] = known.get(HEIGHTS, np.zeros((worlds, 0))).reshape(worlds, -1)
     surfaces = len(scene.contact_points) * surface_count(scene.ground, varies=HEIGHTS in a)
     shapes = {name: a[name].shape[1:] for name in wrt} | ({HEIGHTS: (surfaces, CORNERS)} if HEIGHTS in wrt else {})
+
+    def run(kernel, **found):
+        store(kernels[kernel], known, found)
+        if ran is not None:
+            ran.append((kernel, dict(known), found))
+        return found
+
     rates, rows = [blank(dofs)], [blank(count)]
+    left, solved = [None] * passes + [blank(dofs + count)], [None] * passes
     for number in range(passes):
         known |= {"number": np.full((worlds, 1), float(number)), "row": rows[-1], "qdd_before": rates[-1]}
-        found = {"out": blank(dofs), "row_out": blank(count)}
-        store(forward, known, found)
+        found = run("contact_pass", out=blank(dofs), row_out=blank(count))
         rates.append(found["out"])
         rows.append(found["row_out"])
-    known |= dict(zip(("q_cotangent", "qd_cotangent"), cotangents, strict=True), cotangent=blank(dofs + count))
+    for number in reversed(range(passes)):
+        known |= {"number": np.full((worlds, 1), float(number)), "row": rows[number], "qdd_before": rates[number],
+                  "qdd": rates[number + 1], "cotangent": left[number + 1]}  # fmt: skip
+        found = run("contact_solve", out=blank(dofs), cotangent_out=blank(dofs + count))
+        solved[number], left[number] = found["out"], found["cotangent_out"]
     known |= {f"{name}_later": blank(*shape) for name, shape in shapes.items()}
     for number in reversed(range(passes)):
         known |= {"number": np.full((worlds, 1), float(number)), "row": rows[number], "qdd_before": rates[number],
-                  "qdd": rates[number + 1]}  # fmt: skip
+                  "qdd": rates[number + 1], "cotangent": left[number + 1], "cotangent_came": left[number],
+                  "solved": solved[number]}  # fmt: skip
         found = {back.result_name(name, wrt): blank(*shape) for name, shape in shapes.items()}
-        found |= {"cotangent_out": blank(dofs + count), f"{back.HEIGHTS_AT}_bar": blank(surfaces)}
-        store(backward, known, found)
-        known["cotangent"] = found["cotangent_out"]
+        found |= {f"{back.HEIGHTS_AT}_bar": blank(surfaces)} if HEIGHTS in wrt else {}
+        run("contact_gradient", **found)
         known |= {f"{name}_later": found[back.result_name(name, wrt)] for name in wrt}
     gradients = {name: known[f"{name}_later"] for name in wrt}
     if HEIGHTS in wrt:

@@ -21,7 +21,7 @@ from warp_spo.examples import hop
 from warp_spo.execution.heights import HeightSums
 from warp_spo.newton import SolverSPO
 from warp_spo.recursions.contact import step
-from warp_spo.recursions.derivatives.contact import PassAdjoint
+from warp_spo.recursions.derivatives.contact import PassAdjoint, PassGradient, PassSolve
 
 torch = pytest.importorskip("torch")
 H, WORLDS = 5e-3, 4
@@ -101,15 +101,12 @@ def test_any_number_of_passes_is_differentiated(passes):
 
 
 BUGS = {
-    "earlier passes frozen": (PassAdjoint, "_results", "self._later(COTANGENT, len(self.qdd) + item.index[0])", "0.0"),
-    "what passes begin with": (
-        PassAdjoint,
-        "backward",
-        "select(kept.first, by_row[len(qdd) + item.index[0]], 0.0)",
-        "0.0",
-    ),
-    "a load held": (PassAdjoint, "backward", "[*seeds, 1.0]", "[*seeds, 0.0]"),
-    "dampers left out": (PassAdjoint, "_solve", "trace.pushes = {}", "trace.dampers = {}"),
+    "earlier passes frozen": (PassAdjoint, "_results", "self._later(COTANGENT, self._dofs + item.index[0])", "0.0"),
+    "what passes begin with": (PassGradient, "stores", "select(kept.first, way, 0.0)", "0.0"),
+    "a load held": (PassGradient, "stores", "seeds += [1.0,", "seeds += [0.0,"),
+    "a load held before": (PassSolve, "stores", "[*seeds, 1.0]", "[*seeds, 0.0]"),
+    "dampers left out": (PassSolve, "stores", "trace.stiffened = self._stiffened", "trace.dampers = {}"),
+    "points that do not press": (PassSolve, "stores", "Vector(wrenches[6 * at", "0.0 * Vector(wrenches[6 * at"),
 }
 
 

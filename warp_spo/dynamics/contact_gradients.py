@@ -1,6 +1,6 @@
 """Gradients of a step with contacts: its passes once more, of which all is kept, and then back through each of them.
 
-A pass is a launch of its own here, so that any number of them needs the same two kernels. What a pass leaves for the
+A pass is a launch of its own here, so that any number of them needs the same three kernels. What a pass leaves for the
 next one stays in the workspace, [world, dof] and [world, variable] of each pass; steps share it.
 """
 
@@ -14,17 +14,27 @@ from ..execution.heights import HeightSums
 from ..execution.routine import Routine
 from ..recursions.contact.ground import CORNERS, corner_steps, surface_count
 from ..recursions.contact.step import PASSES
+from ..recursions.derivatives import contact
 from ..recursions.derivatives.adjoints import result_name
-from ..recursions.derivatives.contact import COTANGENT, HEIGHTS_AT, contact_pass, contact_pass_vjp, count_variables
+from ..recursions.derivatives.contact import CAME, COTANGENT, HEIGHTS_AT, SOLVED
+from ..recursions.derivatives.contact_pass import BEFORE, NUMBER, ROW, contact_pass, count_laws, count_variables
 from ..recursions.tracing import Trace
 from ..scene.contacts import HEIGHTS, HeightField
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
 
-PASS = Routine("contact_pass", contact_pass, passes=True)
-PASS_VJP = Routine("contact_pass_vjp", contact_pass_vjp, passes=True)
-READ_AFTERWARDS = ("qdd", "q_cotangent", "qd_cotangent")  # of the arrays that are given, what the passes do not read
+
+def _divides(scene: Any, inputs: Any, apart: bool, **_: Any) -> bool:
+    return apart
+
+
+PASS = Routine("contact_pass", contact_pass, letters="Pzaf", crowded=True, wide=True)
+SOLVE = Routine("contact_solve", contact.contact_solve, letters="Pza", crowded=True, wide=True)
+GRADIENT = Routine(
+    "contact_gradient", contact.contact_gradient, letters="BG", divides=_divides, crowded=True, wide=True
+)
+NOT_READ = ("qdd", "q_cotangent", "qd_cotangent")  # of the arrays that are given, what the passes do not read
 
 
 def launch(
@@ -41,51 +51,53 @@ def launch(
         passes: as of the step. given: arrays and numbers by name: arguments of the step, "qdd" that it found, and the
             cotangents of its results.
     """
-    engine, count = dyn._engine, PASSES if passes is None else passes
+    launch, count = dyn._engine.launch_routine, PASSES if passes is None else passes
     given = {name: value for name, value in given.items() if value is not None}
-    read = {name: value for name, value in given.items() if name not in READ_AFTERWARDS}
+    read = {name: value for name, value in given.items() if name not in NOT_READ}
     read["passes"] = float(count)
-    variables, dofs = _variables(dyn, tuple(read)), dyn.scene.dof_count
+    laws, dofs = _laws(dyn, tuple(read)), dyn.scene.dof_count
+    variables = count_variables(dyn.programs.links, laws)
 
     def array(name: str, number: int, size: int) -> wp.array:
         return dyn.recursions.array((name, number, size), dyn.worlds, size)
 
     rates = [array("qdd of a pass", number, dofs) for number in range(count)] + [given["qdd"]]  # first: before the step
     rows = [array("variables of a pass", number, variables) for number in range(count)]
+    left = [array(COTANGENT, number, dofs + variables) for number in range(count + 1)]  # by what passes leave
+    solved = [array(SOLVED, number, dofs) for number in range(count)]
+    known = [{NUMBER: float(n), ROW: rows[n], BEFORE: rates[n], "laws": laws} for n in range(count)]
     for number in range(count - 1):
-        before = {"row": rows[number], "qdd_before": rates[number]}
-        engine.launch_routine(
-            PASS, rates[number + 1], {"row_out": rows[number + 1]}, number=float(number), **before, **read
-        )
-    results = dict(zip(wrt, (out, *more.values()), strict=True))
-    summed, ground = results.get(HEIGHTS), dyn.scene.ground
-    if summed is not None:
-        surfaces = len(dyn.scene.contact_points) * surface_count(ground, varies=True)
-        results[HEIGHTS] = dyn.recursions.array("heights by surface", dyn.worlds, surfaces, CORNERS)
-        results[HEIGHTS_AT] = dyn.recursions.array("cells by surface", dyn.worlds, surfaces)
-    cotangents = [array(COTANGENT, number, dofs + variables) for number in range(2)]
-    later = {f"{name}_later": results[name] for name in wrt}
-    read |= {name: given[name] for name in READ_AFTERWARDS[1:]} | later
+        launch(PASS, rates[number + 1], {f"{ROW}_out": rows[number + 1]}, **known[number], **read)
+    read |= {name: given[name] for name in NOT_READ[1:]}
     read.pop("tau", None)  # no gradient depends on it
     for number in reversed(range(count)):
-        passed = {"row": rows[number], "qdd_before": rates[number], "qdd": rates[number + 1]}
-        passed[COTANGENT] = cotangents[number % 2]
-        more = {result_name(name, wrt): array for name, array in results.items() if name != wrt[0]}
-        more[f"{COTANGENT}_out"] = cotangents[1 - number % 2]
-        engine.launch_routine(PASS_VJP, results[wrt[0]], more, number=float(number), wrt=wrt, **passed, **read)
-    if summed is not None:
+        known[number] |= {"qdd": rates[number + 1], COTANGENT: left[number + 1]}
+        launch(SOLVE, solved[number], {f"{COTANGENT}_out": left[number]}, **known[number], **read)
+    results = dict(zip(wrt, (out, *more.values()), strict=True))
+    ground, surfaces = dyn.scene.ground, len(dyn.scene.contact_points)
+    if HEIGHTS in results:
+        surfaces *= surface_count(ground, varies=True)
+        results[HEIGHTS] = dyn.recursions.array("heights by surface", dyn.worlds, surfaces, CORNERS)
+        results[HEIGHTS_AT] = dyn.recursions.array("cells by surface", dyn.worlds, surfaces)
+    bars = {result_name(name, wrt): array for name, array in results.items() if name != wrt[0]}
+    read |= {f"{name}_later": results[name] for name in wrt}
+    apart = contact.divides(dyn.scene, dyn.variable, read, wrt)
+    for number in reversed(range(count)):
+        known[number] |= {SOLVED: solved[number], CAME: left[number]}
+        launch(GRADIENT, results[wrt[0]], bars, wrt=wrt, apart=apart, **known[number], **read)
+    if HEIGHTS in wrt:
         assert isinstance(ground, HeightField)
-        contributions, cells = results[HEIGHTS], results[HEIGHTS_AT]
+        summed = (out, *more.values())[wrt.index(HEIGHTS)]
         if dyn._gradients.height_sums is None:
-            dyn._gradients.height_sums = HeightSums(cells.size, summed.size, dyn.dtype, dyn.device)
-        flat = cells.flatten(), contributions.reshape((cells.size, CORNERS))
-        dyn._gradients.height_sums.add_up(*flat, corner_steps(ground), summed.flatten())
+            dyn._gradients.height_sums = HeightSums(dyn.worlds * surfaces, summed.size, dyn.dtype, dyn.device)
+        contributions = results[HEIGHTS].reshape((dyn.worlds * surfaces, CORNERS))
+        sums = dyn._gradients.height_sums
+        sums.add_up(results[HEIGHTS_AT].flatten(), contributions, corner_steps(ground), summed.flatten())
 
 
-def _variables(dyn: Dynamics, inputs: tuple[str, ...]) -> int:
-    """Return how many variables the passes have, which depends on what is given besides the state."""
-    known = dyn._gradients.pass_variables
+def _laws(dyn: Dynamics, inputs: tuple[str, ...]) -> tuple[int, ...]:
+    """Return how many variables the laws of each link have, which depends on what is given besides the state."""
+    known = dyn._gradients.pass_laws
     if inputs not in known:
-        trace = Trace(dyn.programs.links.with_tables(), dyn.dtype.__name__, inputs)
-        known[inputs] = count_variables(trace)
+        known[inputs] = count_laws(Trace(dyn.programs.links.with_tables(), dyn.dtype.__name__, inputs))
     return known[inputs]

@@ -38,7 +38,7 @@ class Gradients:
     def __init__(self, dyn: Dynamics):
         self.dyn = dyn
         self._checked: set[str] = set()  # names of operations that have gradients on this scene
-        self.pass_variables: dict[tuple[str, ...], int] = {}  # of steps with contacts, by their arguments
+        self.pass_laws: dict[tuple[str, ...], tuple[int, ...]] = {}  # of steps with contacts, by their arguments
         self.height_sums: HeightSums | None = None
         self.latest: dict[str, Callable[[tuple, dict[str, Any]], Any]] = {}  # repeats a call that torch records
 
@@ -65,7 +65,7 @@ class Gradients:
     def forget(self) -> None:
         """Forget what was checked: values that kernels fold have changed."""
         self._checked.clear()
-        self.pass_variables.clear()
+        self.pass_laws.clear()
         self.latest.clear()
 
     def remember(self, record: Any, tensors: list, written: tuple, guards: Any, apply: Callable[..., Any]) -> None:

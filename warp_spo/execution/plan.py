@@ -117,7 +117,7 @@ class Plan:
     def _rule(self, routine: Routine) -> str:
         if self.granularity == "node" or self.limbs == 1 or self.limbs > MOST_WARPS:
             return self.granularity
-        if routine.long_result or routine.passes:  # in passes a thread holds too little even of a dozen dofs
+        if routine.long_result or routine.passes or routine.crowded:  # a thread holds too little even of a dozen dofs
             return "segment"
         if self.granularity == "segment" and not self.few:
             if routine.short or (not routine.velocities and self.dofs <= SOLVES[self.dtype]):

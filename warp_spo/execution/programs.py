@@ -278,7 +278,7 @@ class Programs:
             return None  # no room for the result in shared memory, which matters more
         if not layout.fits(self.run.dtype, self.room(routine.wide)):
             return None  # nor for what limbs tell each other
-        team = Team(pieces, dtype, passes)
+        team, looks_up = Team(pieces, dtype, passes), False
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
         placed, table = staging.arrange_stores(whole, layout.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
@@ -301,10 +301,10 @@ class Programs:
             ends = [item for item in news if item.array == "out"]
             news = [item for item in news if item.array != "out"] + by_slot(ends)
             branches = later.branch(news), [later.branch(by_slot(turn)) for turn in rounds]
-            team.add(
-                Work(piece, *regions, checking.region(checks), *branches, ahead),
-                sum(each.operations for each in {first, emitter, checking, later}),
-            )
+            work = Work(piece, *regions, checking.region(checks), *branches, ahead)
+            emitters = {first, emitter, checking, later}
+            team.add(work, sum(each.operations for each in emitters))
+            looks_up |= any(each.counts["lookup"] for each in emitters)
         cuda = team.cuda()  # fills the tables
         registers = self._registers(pieces.warps)
         if dtype == "float32" and not self.plan.few:
@@ -315,7 +315,7 @@ class Programs:
                     registers = fewer
                     break
         lists = {"place": table, "table": team.table, "shifts": team.shifts}
-        tables = {name: values for name, values in lists.items() if values} | self._heights(routine.counted)
+        tables = {name: values for name, values in lists.items() if values} | self._heights(looks_up)
         cap = registers if registers < MOST_REGISTERS else None
         return self._finished(routine, layout, cuda, team.cpu(), tables, team.operations, cap)
 

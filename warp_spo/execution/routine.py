@@ -37,6 +37,7 @@ class Routine:
         collects: by limbs, short rows of the result leave through shared memory.
         passes: the recursion is repeated until the laws of the joints hold, and its results may overwrite its inputs.
         counted: so often as the argument "passes" says.
+        crowded: a thread holds too little even of a dozen dofs, so that limbs share the work with many worlds, too.
         tiled: the result is left in tiles for the kernels of :mod:`warp_spo.kernels.tiles` to finish.
         bias_first: variant that computes velocity terms and loads first, for many worlds of shallow trees.
         occupancy: pairs (blocks, registers): by limbs in float32 with many worlds, a multiprocessor holds so many
@@ -62,6 +63,7 @@ class Routine:
     collects: bool = False
     passes: bool = False
     counted: bool = False
+    crowded: bool = False
     tiled: bool = False
     bias_first: Routine | None = None
     occupancy: tuple[tuple[int, int], ...] = ()

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -112,52 +112,70 @@ class Point:
         return v + cross(w, self.arm)
 
 
+class Carried(NamedTuple):
+    """What links that carry points know at qdd = 0, in their axes.
+
+    Attributes:
+        axes: the directions of the ground. origins: where the link's origin is along them. twist: (omega; v).
+        motion: velocity terms. bend: acceleration (omega'; v').
+    """
+
+    axes: list[Vector]
+    origins: list[Value]
+    twist: tuple[Vector, Vector]
+    motion: Motion | None
+    bend: tuple[Vector, Vector]
+
+
 def place_points(
-    trace: Trace, impedance: Impedance, qd: Callable[[int], Value], oriented: bool = False, branches: bool = False
+    trace: Trace,
+    impedance: Impedance,
+    qd: Callable[[int], Value],
+    oriented: bool = False,
+    branches: bool = False,
+    carry: Callable[[Link, Carried], Carried] | None = None,
 ) -> list[Point]:
     """Return the contact points that a trace works on, one for each surface that a point may touch.
 
     ``oriented``: with the inertial directions x, y, z in the axes of their links. ``branches``: code may leave out
-    points where their surface is not near.
+    points where their surface is not near. ``carry``: returns what points and further links read of a link, on the way
+    to any point of the scene; None: what was computed.
     """
     scene = trace.links.scene
     ground, weights = scene.ground, inverse_weights(scene)
     assert ground is not None
     place_of_ground = ground_place(impedance)
     seats = {number: frame_on_link(trace, body, place) for number, body, place in _places(trace, impedance)}
-    needed = with_ancestors([link for link, _ in seats.values()])
+    needed = with_ancestors([link for link, _ in seats.values()] if carry is None else point_links(trace.links))
     asked = directions(ground)
     count = len(asked)
     asked = [*asked, *IDENTITY] if oriented and count < len(IDENTITY) else asked
-    axes: dict[int | None, list[Vector]] = {None: asked}
-    origins: dict[int | None, list[Value]] = {None: [0.0] * count}  # along each direction of the ground
-    twists: dict[int | None, tuple[Vector, Vector]] = {None: (ZERO, ZERO)}
-    motions: dict[int | None, Motion | None] = {None: None}
-    bends: dict[int | None, tuple[Vector, Vector]] = {None: (ZERO, ZERO)}  # accelerations at qdd = 0
+    carried: dict[int | None, Carried] = {None: Carried(asked, [0.0] * count, (ZERO, ZERO), None, (ZERO, ZERO))}
     for link in trace.active_links:
         if id(link) not in needed:
             continue
         trace.label(link, "n")
-        key, over, place = id(link), None if link.parent is None else id(link.parent), trace.places[id(link)]
-        axes[key] = [place.pose.to_child(axis) for axis in axes[over]]
-        origins[key] = [at + dot(axis, place.pose.l) for at, axis in zip(origins[over], axes[over], strict=False)]
-        twists[key] = carried_velocity(place, twists[over], hinge_motion(link, place, qd))
-        motions[key] = move = link_motion(link, place, motions[over], qd)
-        bends[key] = link_acceleration(link, place, move, bends[over], zero)
+        over, place = carried[None if link.parent is None else id(link.parent)], trace.places[id(link)]
+        axes = [place.pose.to_child(axis) for axis in over.axes]
+        origins = [at + dot(axis, place.pose.l) for at, axis in zip(over.origins, over.axes, strict=False)]
+        twist = carried_velocity(place, over.twist, hinge_motion(link, place, qd))
+        move = link_motion(link, place, over.motion, qd)
+        own = Carried(axes, origins, twist, move, link_acceleration(link, place, move, over.bend, zero))
+        carried[id(link)] = own if carry is None else carry(link, own)
     found = []
     for number, (on, centre) in seats.items():
-        point, carrier = scene.contact_points[number], None if on is None else id(on)
+        point, mine = scene.contact_points[number], carried[None if on is None else id(on)]
         trace.graph.step = f"contact {number}|c"
-        toward = axes[carrier][:count]
+        toward = mine.axes[:count]
         arm = centre - toward[lowest(ground)] * point.radius if point.radius else centre
-        at = [origin + dot(axis, centre) for origin, axis in zip(origins[carrier], toward, strict=True)]
+        at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
         at[lowest(ground)] = at[lowest(ground)] - point.radius
         k, d, mu = (impedance.value(f"contact_{name}", number) for name in ("stiffness", "damping", "friction"))
-        turned = axes[carrier][-len(IDENTITY) :] if oriented else []
-        h, moving = impedance.h, motions[carrier]
-        bend = bends[carrier][1] + cross(bends[carrier][0], centre)
+        turned = mine.axes[-len(IDENTITY) :] if oriented else []
+        h, moving = impedance.h, mine.motion
+        bend = mine.bend[1] + cross(mine.bend[0], centre)
         bend = bend if moving is None else bend + moving.whirl @ centre
-        w, v = twists[carrier]
+        w, v = mine.twist
         moves = [h * dot(axis, v + cross(w, centre)) for axis in toward]
         touched = [_listed(impedance, number)] if isinstance(ground, Listed) else None
         for normal, depth, cell, near in touched or surfaces(trace.graph, ground, at, place_of_ground, moves):
@@ -168,8 +186,13 @@ def place_points(
             material = k, damping, mu, point.eps, weights[number]
             push = k * below - damping * faster
             state = turned, below, push, cell, near if branches else None
-            found.append(Point(number, on, arm, inward, -depth, twists[carrier], *material, *state))
+            found.append(Point(number, on, arm, inward, -depth, mine.twist, *material, *state))
     return found
+
+
+def point_links(links: Links) -> list[Link | None]:
+    """Return the links that carry the scene's contact points."""
+    return [links.seats[point.body].link for point in links.scene.contact_points]
 
 
 def own_points(trace: Trace) -> list[tuple[int, ContactPoint]]:

@@ -12,6 +12,9 @@ with lambda, qdd and the slopes held, plus that of s'. Forces f, laws l, S and w
 the last one alone, the others frozen, gradients by tau of a quadruped on the ground are wrong by 7 to 34 % in the
 median.
 
+A pass takes two traces, so that limbs share both. The first one solves: inward, outward, and the cotangents of what
+the pass before left, for which the first trace of that pass waits. The second one takes gradients inward.
+
 Where a comparison changes its answer the step has a kink, or a jump of s'; the gradient is that of the side on which
 the step is.
 """
@@ -19,166 +22,87 @@ the step is.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
 
-from ...scene.contacts import HEIGHTS
+from ...scene.contacts import CONTACT_VALUES, HEIGHTS
 from ...trace.differentiation import reverse
 from ...trace.emission import Store
-from ...trace.scalars import Scalar, Value, cut, is_constant, less, ordered, reciprocal, select
+from ...trace.scalars import Scalar, Value, cut, is_constant, less, ordered, select
 from ...trace.spatial import ZERO, Vector, dot, total
+from ..articulated_sweeps import expand, reduce
 from ..contact.ground import CORNERS
-from ..contact.points import place_points
-from ..contact.secants import Kept
-from ..contact.step import ContactStep
-from ..impedance import Law
+from ..contact.points import Carried, Point, own_points, place_points, point_links, with_ancestors
 from ..integration import integrate_link
 from ..kinematics import carried_velocity
 from ..links import Link
-from ..motion import hinge_motion
-from ..step import GAIN
-from .adjoints import TreeEquations, entries, result_name
-from .power import Entry, Ways
+from ..motion import hinge_motion, whirl
+from .adjoints import entries, result_name
+from .contact_pass import NUMBER, OnePass
+from .power import Entry, Power, Ways
 
 if TYPE_CHECKING:
+    from ...scene.scene import Scene
     from ..tracing import Trace
 
-ROW, BEFORE, COTANGENT = "row", "qdd_before", "cotangent"
-"""What the pass before left: variables [world, variable] and qdd [world, dof]; the gradient by what a pass leaves, qdd
-of each dof and then the variables."""
+COTANGENT, CAME, SOLVED = "cotangent", "cotangent_came", "solved"
+"""The gradient by what a pass leaves, qdd of each dof and then the variables; by what the pass before left, likewise;
+and lambda [world, dof]."""
 HEIGHTS_AT = "heights_at"
 """Where the heights lie in the table by which each surface has its gradient [world, surface]: those of a cell."""
-NUMBER = "number"
-"""Input that counts the passes from zero; "passes" is how many there are."""
-
-
-class RowKept(Kept):
-    """Variables of a pass that is a kernel by itself, in ROW.
-
-    Attributes:
-        variables: as the pass reads them, each cut from its history.
-    """
-
-    def __init__(self, trace: Trace):
-        super().__init__(trace.graph, NUMBER)
-        self.variables: list[Value] = []
-
-    def variable(self, first: Value) -> Value:
-        at = len(self.begin)
-        self.begin.append(Store(ROW, (at,), first))
-        self.variables.append(cut(select(self.first, first, self.graph.input(ROW, at))))
-        return self.variables[-1]
-
-    def keep(self, variable: Value, value: Value) -> None:
-        at = next(i for i, one in enumerate(self.variables) if one is variable)
-        self.end.append(Store(f"{ROW}_out", (at,), value))
-
-
-class OnePass(ContactStep):
-    """One pass of a step with contacts, which reads what the pass before left.
-
-    Attributes:
-        before: qdd of each dof in the pass before, zero before the first one. active: the laws of each dof, added up.
-    """
-
-    kept: RowKept
-
-    def __init__(self, trace: Trace):
-        super().__init__(trace, ())
-        dofs = sorted(dof for link in self.links for dof in link.dofs)
-        self.kept = RowKept(trace)
-        first, read = self.kept.first, trace.graph.input
-        self.active: dict[int, Law] = {}
-        self.before = {dof: cut(select(first, 0.0, read(BEFORE, dof))) for dof in dofs}
-        for link in self.links:
-            self._pieces(link)  # the laws of the hinges come first among the variables
-
-    def _kept_as(self, name: str, dof: int) -> Value:
-        return self.h * self.before[dof] if name == GAIN else super()._kept_as(name, dof)
-
-    def _pieces(self, link: Link) -> list[Law]:
-        found = super()._pieces(link)
-        self.active |= zip(link.dofs, found, strict=True)
-        return found
-
-    def forward(self) -> list[Store]:
-        """Return the stores of what the pass leaves."""
-        stores = self.stores(qdd=False, status=False)
-        self.trace.begin, self.trace.ahead = [], []  # there is no loop
-        gains = [Store("out", item.index, item.value * reciprocal(self.h)) for item in stores if item.array == GAIN]
-        return gains + self.kept.end
+BY_PIECES = ("q", "qd", "tau", "target_q", "target_qd", "ctrl", *CONTACT_VALUES, HEIGHTS)
+"""Arguments and values whose gradient a limb computes by itself, or by messages between limbs."""
+Twists = dict[int, tuple[Vector, Vector]]
 
 
 class PassAdjoint(OnePass):
-    """The way back through one pass, and through what follows the last one and precedes the first.
+    """What both traces of the way back through a pass know.
 
     Attributes:
         last: 1 in the last pass, else 0. qdd: what the pass found by dof, cut from its history. gains: h qdd.
-        points, touches: contact points and their variables. loads: forces on them, at the velocities that qdd gives.
-        corners: heights of the field that a point depends on, by key, each with its surface and corner.
+        points, touches: contact points and their variables. moving: (J qdd) of links by id.
+        loads: forces on the points, at the velocities that qdd gives.
     """
 
-    def __init__(self, trace: Trace):
-        super().__init__(trace)
-        read = trace.graph.input
-        self.last = less(read("passes", 0) - 1.5, read(NUMBER, 0))
-        for link in trace.links.links:
+    def __init__(self, trace: Trace, laws: tuple[int, ...]):
+        super().__init__(trace, laws)
+        self.last = less(trace.graph.input("passes", 0) - 1.5, trace.graph.input(NUMBER, 0))
+        for link in trace.active_links:
             trace.place(link)
-        self.points = place_points(trace, self.impedance, self.qd)
+        self.points = self._placed()
         self.touches = [self._begin(point) for point in self.points]
-        self.corners: dict[tuple, tuple[Value, int, int]] = {}
-        for at, point in enumerate(self.points):
-            for corner, height in enumerate(point.cell.heights if point.cell and point.link else ()):
-                self.corners.setdefault(height.key, (height, at, corner))
         self.qdd = {dof: cut(trace.vector("qdd")(dof)) for dof in self.before}
         self.gains = {dof: self.h * rate for dof, rate in self.qdd.items()}
         for link in self.links:
             for dof in link.dofs:
                 for law in self.secants[dof]:
                     law.finish(self.gains[dof])
-        moving = self._twists(self.qdd.__getitem__)
+        self.moving = self._twists(self._or_input(self.qdd, "qdd"))
         touching = zip(self.points, self.touches, strict=True)
-        self.loads = [self._finish(point, touch, moving)[0] for point, touch in touching]
+        self.loads = [self._finish(point, touch, self.moving)[0] for point, touch in touching]
 
-    def backward(self, wrt: tuple[str, ...]) -> list[Store]:
-        """Return the stores of the gradients by ``wrt``, those of later passes added, and by what came from before."""
-        kept, qdd = self.kept, list(self.qdd.values())
-        results, seeds = self._results()
-        direct = dict(zip(self.qdd, reverse(results, qdd, seeds, True), strict=True))
-        equations, solved = self._solve(lambda dof: direct[dof] + self._later(COTANGENT, dof))
-        results, seeds = [*results, self._power(solved)], [*seeds, 1.0]
+    def _placed(self) -> list[Point]:
+        """Return the contact points."""
+        return place_points(self.trace, self.impedance, self.qd)
 
-        came = [*self.before.values(), *kept.variables]
-        stops = _distinct([*qdd, *solved.values(), *came])
-        found = dict(zip((x.key for x in stops), reverse(results, stops, seeds, True), strict=True))
-        by_row = [0.0 if is_constant(x) else found[x.key] for x in came]
-        results += [item.value for item in kept.begin]
-        seeds += [select(kept.first, by_row[len(qdd) + item.index[0]], 0.0) for item in kept.begin]
-        leaves = [x for x in ordered(results, stops) if x.op == "input"]
-        heights = [x for x, *_ in self.corners.values()] if HEIGHTS in wrt else []
-        back = reverse(results, [*leaves, *heights, *stops], seeds, True)
-        ways: Ways = dict(zip((x.args for x in leaves), back, strict=False))
-        for (_, *at), way in zip(self.corners.values(), back[len(leaves) :], strict=False):
-            ways[(HEIGHTS, *at)] = way
-        for entry, way in equations.gradient(solved, self.qdd.__getitem__, self.qd, self.qd).items():
-            ways[entry] = ways.get(entry, 0.0) + way
-        for dof, value in solved.items():
-            ways["tau", dof] = value
-        stores = [Store(f"{COTANGENT}_out", (at,), value) for at, value in enumerate(by_row)]
-        for name in wrt:
-            if name == HEIGHTS:
-                cells = [point.cell for point in self.points if point.cell is not None]
-                stores += [Store(f"{HEIGHTS_AT}_bar", (at,), cell.first) for at, cell in enumerate(cells)]
-            for index, value in self._entries(name, ways):
-                stores.append(Store(result_name(name, wrt), index, self._later(f"{name}_later", *index) + value))
-        return stores
+    def _twists(self, rate: Entry) -> Twists:
+        """Return (omega; v) of the links by id for the rates of the dofs."""
+        found: Twists = {}
+        for link in self.trace.active_links:
+            self.trace.label(link, "t")
+            place = self.trace.places[id(link)]
+            over = (ZERO, ZERO) if link.parent is None else found[id(link.parent)]
+            found[id(link)] = self._known(link, carried_velocity(place, over, hinge_motion(link, place, rate)))
+        return found
 
-    def _entries(self, name: str, ways: Ways) -> Iterable[tuple[tuple[int, ...], Value]]:
-        """Return (index, gradient) of every entry of an argument or value; of heights, by surface and corner."""
-        if name != HEIGHTS:
-            return entries(self.trace, name, ways)
-        places = itertools.product(range(len(self.points)), range(CORNERS))
-        return [(place, ways.get((HEIGHTS, *place), 0.0)) for place in places]
+    def _known(self, link: Link, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+        """Return a twist of a link, as what follows from it reads it."""
+        return twist
+
+    def _or_input(self, known: dict[int, Value], name: str) -> Entry:
+        """Return entries by dof: those that are known, or of the dofs of other pieces the inputs."""
+        read = self.trace.vector(name)
+        return lambda dof: known[dof] if dof in known else read(dof)
 
     def _later(self, name: str, *index: int) -> Value:
         """Return an entry of what the passes after this one have found; zero in the last pass."""
@@ -196,57 +120,191 @@ class PassAdjoint(OnePass):
             seeds += [trace.vector("q_cotangent")(link.coordinate + c) for c in range(len(values))]
         seeds = [select(self.last, seed, 0.0) for seed in seeds]
         results += [item.value for item in self.kept.end]
-        return results, seeds + [self._later(COTANGENT, len(self.qdd) + item.index[0]) for item in self.kept.end]
+        return results, seeds + [self._later(COTANGENT, self._dofs + item.index[0]) for item in self.kept.end]
 
-    def _solve(self, right: Entry) -> tuple[TreeEquations, dict[int, Value]]:
-        """Return the equations of the pass, and their solution for ``right`` by dof, cut from its history."""
-        trace = self.trace
-        self._press(self.points, self.touches)
-        trace.pushes = {}  # the factor alone is needed
-        trace.stiffened = self._stiffened
-        equations = TreeEquations(trace)
-        return equations, {dof: cut(value) for dof, value in equations.solve(right).items()}
+    @property
+    def _dofs(self) -> int:
+        return self.trace.links.scene.dof_count
 
-    def _power(self, solved: dict[int, Value]) -> Value:
-        """Return lambda . (l - S qd') + (J lambda) . f for lambda = ``solved``."""
-        pushed = self._twists(solved.__getitem__)
+    def _power(self, solved: dict[int, Value], pushed: Twists) -> Value:
+        """Return lambda . (l - S qd') + (J lambda) . f for lambda = ``solved``, J lambda = ``pushed``."""
         power = [solved[dof] * (law.force - law.resistance * self.gains[dof]) for dof, law in self.active.items()]
         for point, force in zip(self.points, self.loads, strict=True):
             if point.link is not None:
                 power.append(dot(point.rate(*pushed[id(point.link)]), force))
         return total(power)
 
-    def _twists(self, rate: Entry) -> dict[int, tuple[Vector, Vector]]:
-        """Return (omega; v) of the links by id for the rates of the dofs."""
-        found: dict[int, tuple[Vector, Vector]] = {}
-        for link in self.trace.links.links:
-            self.trace.label(link, "t")
-            place = self.trace.places[id(link)]
-            over = (ZERO, ZERO) if link.parent is None else found[id(link.parent)]
-            found[id(link)] = carried_velocity(place, over, hinge_motion(link, place, rate))
-        return found
+
+class PassSolve(PassAdjoint):
+    """The solve of a pass, and the cotangents of what the pass before left."""
+
+    def _known(self, link: Link, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+        return _cut(twist[0]), _cut(twist[1])
+
+    def stores(self) -> list[Store]:  # type: ignore[override]
+        """Return the stores of lambda and of the cotangents, and messages to other pieces."""
+        trace = self.trace
+        on = list({id(point.link): None for point in self.points if point.link is not None})
+        results, seeds = self._results()
+        stops = [*self.qdd.values(), *(x for key in on for part in self.moving[key] for x in part)]
+        direct = _by_each(stops, reverse(results, _distinct(stops), seeds, True))
+        right = {dof: way + self._later(COTANGENT, dof) for dof, way in zip(self.qdd, direct, strict=False)}
+        self._press(self.points, self.touches)
+        wrenches = direct[len(self.qdd) :]
+        trace.pushes = {key: Vector(wrenches[6 * at : 6 * at + 6]) for at, key in enumerate(on)}
+        trace.stiffened = self._stiffened
+        done, rates, sent = reduce(trace, right.__getitem__, moves=False, loads=False)
+        pushed: Twists = {}
+        found = expand(trace, done, rates, (ZERO, ZERO), alpha=pushed)
+        solved = {item.index[0]: cut(item.value) for item in found if item.array == "out"}
+        sent += [item for item in found if item.array != "out"]
+        pushed = {key: (_cut(pushed[key][0]), _cut(pushed[key][1])) for key in on}
+        power = self._power(solved, pushed)
+        came = self.before | {self._dofs + at: value for at, value in self.kept.variables.items()}
+        held = [*stops, *solved.values(), *(x for twist in pushed.values() for part in twist for x in part)]
+        ends = reverse([*results, power], _distinct([*came.values(), *held]), [*seeds, 1.0], True)
+        by_came = zip(came, _by_each(list(came.values()), ends), strict=True)
+        return [
+            *sent,
+            *(Store("out", (dof,), value) for dof, value in solved.items()),
+            *(Store(f"{COTANGENT}_out", (at,), value) for at, value in by_came),
+        ]
 
 
-def contact_pass(trace: Trace) -> list[Store]:
-    """out = qdd of a pass, row_out = the variables that it leaves"""
-    return OnePass(trace).forward()
+class PassGradient(PassAdjoint):
+    """Gradients of a pass, and of what follows the last one and precedes the first.
+
+    A piece takes what its points know of the link that it moves on as given, and sends the gradient by that inward.
+
+    Attributes:
+        given: what the piece takes as given, each scalar cut from its history. passed_on: what its children take.
+    """
+
+    def __init__(self, trace: Trace, laws: tuple[int, ...]):
+        piece = trace.piece
+        self._under = None if piece is None or piece.parent is None else piece.parent.links[-1]
+        self._end = piece.links[-1] if piece is not None and piece.children else None
+        self._reached = with_ancestors(point_links(trace.links))
+        self.given: list[Value] = []
+        self.passed_on: list[Value] = []
+        super().__init__(trace, laws)
+        self.solved = {dof: cut(trace.vector(SOLVED)(dof)) for dof in self.before}
+        self.pushed = self._twists(self._or_input(self.solved, SOLVED))
+        self.corners: dict[tuple, tuple[Value, int, int]] = {}  # heights by key, with their surface and corner
+        for surface, point in zip(self.surfaces, self.points, strict=True):
+            for corner, height in enumerate(point.cell.heights if point.cell and point.link else ()):
+                self.corners.setdefault(height.key, (height, surface, corner))
+
+    def _placed(self) -> list[Point]:
+        return place_points(self.trace, self.impedance, self.qd, carry=self._carry)
+
+    def _carry(self, link: Link, own: Carried) -> Carried:
+        """Return what further links know of a link."""
+        known = [x for row in (*own.axes, own.origins, *own.twist, *own.bend) for x in row]
+        if link is self._end:
+            self.passed_on += known
+        if link is not self._under:
+            return own
+        self.given += (apart := [cut(x) for x in known])
+        take = iter(apart)
+        vector = lambda: Vector(itertools.islice(take, 3))  # noqa: E731
+        axes, origins = [vector() for _ in own.axes], [*itertools.islice(take, len(own.origins))]
+        twist, bend = (vector(), vector()), (vector(), vector())
+        move = own.motion
+        if move is not None:
+            assert list(move.spin) == list(own.twist[0])
+            move = move._replace(spin=twist[0], whirl=whirl(twist[0]))
+        return Carried(axes, origins, twist, move, bend)
+
+    def _known(self, link: Link, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+        if id(link) not in self._reached:
+            return twist
+        if link is self._end:
+            self.passed_on += [*twist[0], *twist[1]]
+        if link is not self._under:
+            return twist
+        apart = _cut(twist[0]), _cut(twist[1])
+        self.given += [*apart[0], *apart[1]]
+        return apart
+
+    def stores(self, wrt: tuple[str, ...]) -> list[Store]:  # type: ignore[override]
+        """Return the stores of the gradients by ``wrt``, those of later passes added, and messages to other pieces."""
+        trace, kept = self.trace, self.kept
+        results, seeds = self._results()
+        results += [self._power(self.solved, self.pushed), *(item.value for item in kept.begin)]
+        came = [trace.graph.input(CAME, self._dofs + item.index[0]) for item in kept.begin]
+        seeds += [1.0, *(select(kept.first, way, 0.0) for way in came)]
+        for piece in trace.piece.children if trace.piece is not None else ():
+            results += self.passed_on
+            seeds += trace.receive("G", piece)[: len(self.passed_on)]
+        held = [*self.qdd.values(), *self.solved.values(), *self.before.values(), *kept.variables.values()]
+        stops = _distinct([*self.given, *held])
+        leaves = [x for x in ordered(results, stops) if x.op == "input"]
+        heights = [x for x, *_ in self.corners.values()] if HEIGHTS in wrt else []
+        back = reverse(results, [*stops, *leaves, *heights], seeds, True)
+        sent = trace.send_to_parent("G", trace.own_links[0], _by_each(self.given, back))
+        rest = iter(back[len(stops) :])
+        ways: Ways = dict(zip((x.args for x in leaves), rest, strict=False))
+        for (_, *at), way in zip(self.corners.values(), rest, strict=False):
+            ways[(HEIGHTS, *at)] = way
+        multiplier, qdd = self._or_input(self.solved, SOLVED), self._or_input(self.qdd, "qdd")
+        power = Power(trace, lambda dof: -multiplier(dof), qdd)
+        for entry, way in power.ways.items():
+            ways[entry] = ways.get(entry, 0.0) + way
+        for dof, value in self.solved.items():
+            ways["tau", dof] = value
+        found: list[Store] = []
+        for name in wrt:
+            if name == HEIGHTS:
+                cells = zip(self.surfaces, (point.cell for point in self.points), strict=True)
+                found += [Store(f"{HEIGHTS_AT}_bar", (at,), cell.first) for at, cell in cells if cell is not None]
+            for index, value in self._entries(name, ways):
+                found.append(Store(result_name(name, wrt), index, self._later(f"{name}_later", *index) + value))
+        return [*sent, *power.stores, *found]
+
+    def _entries(self, name: str, ways: Ways) -> Iterable[tuple[tuple[int, ...], Value]]:
+        """Return (index, gradient) of every entry of an argument or value that this trace works on.
+
+        Of heights, the index is a surface and a corner.
+        """
+        if name == HEIGHTS:
+            places: Iterable[tuple[int, ...]] = itertools.product(self.surfaces, range(CORNERS))
+        elif self.trace.piece is not None and name in CONTACT_VALUES:
+            places = [(number,) for number, _ in own_points(self.trace)]
+        elif self.trace.piece is not None and name == "ctrl":
+            places = [(number,) for number in self._controls(list(self.before))]
+        else:
+            return entries(self.trace, name, ways)
+        return [(place, ways.get((name, *place), 0.0)) for place in places]
 
 
-def contact_pass_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
-    """Gradients by ``wrt`` through a pass and those after it, and by what the pass before left in "cotangent_out\""""
-    return PassAdjoint(trace).backward(wrt)
+def contact_solve(trace: Trace, laws: tuple[int, ...]) -> list[Store]:
+    """out = lambda of a pass, cotangent_out = gradients by what the pass before left"""
+    return PassSolve(trace, laws).stores()
 
 
-def count_variables(trace: Trace) -> int:
-    """Return the number of variables that a pass leaves."""
-    one = OnePass(trace)
-    for link in trace.links.links:
-        trace.place(link)
-    for point in place_points(trace, one.impedance, one.qd):
-        one._begin(point)
-    return len(one.kept.variables)
+def contact_gradient(trace: Trace, laws: tuple[int, ...], wrt: tuple[str, ...], apart: bool) -> list[Store]:
+    """Gradients by ``wrt`` through a pass and those after it"""
+    return PassGradient(trace, laws).stores(wrt)
 
 
-def _distinct(values: list[Value]) -> list[Scalar]:
+def divides(scene: Scene, variable: Collection[str], inputs: Collection[str], wrt: Collection[str]) -> bool:
+    """Return whether limbs can share the gradients of a pass."""
+    alone = all(len(actuator.hinges) == 1 for actuator in scene.actuators)
+    lifted = "body_gravcomp" in variable or bool(scene.values["body_gravcomp"].any())
+    return alone and not lifted and "body_f" not in inputs and set(wrt) <= set(BY_PIECES)
+
+
+def _distinct(values: Iterable[Value]) -> list[Scalar]:
     """Return the scalars among values, each once."""
     return [*{x.key: x for x in values if not is_constant(x)}.values()]
+
+
+def _by_each(values: list[Value], found: list[Value]) -> list[Value]:
+    """Return what was ``found`` by the distinct scalars, for each of the ``values``; of equal ones for the first."""
+    left = dict(zip((x.key for x in _distinct(values)), found, strict=False))
+    return [0.0 if is_constant(x) else left.pop(x.key, 0.0) for x in values]
+
+
+def _cut(vector: Vector) -> Vector:
+    return Vector(map(cut, vector))

@@ -1,0 +1,138 @@
+"""One pass of a step with contacts as a kernel of its own, which reads what the pass before left, and what it leaves.
+
+Gradients need that of every pass. The variables of a pass lie in a row [world, variable]: first those of the hinges'
+laws, link after link, then three for each surface that a point may touch. The order is the same for the whole tree and
+for its pieces.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from ...scene.contacts import HEIGHTS
+from ...trace.emission import Store
+from ...trace.scalars import Value, cut, reciprocal, select
+from ..contact.ground import surface_count
+from ..contact.points import own_points
+from ..contact.secants import Kept
+from ..contact.step import ContactStep, Touch
+from ..impedance import Law
+from ..links import Link, Links
+from ..step import GAIN
+
+if TYPE_CHECKING:
+    from ..tracing import Trace
+
+ROW, BEFORE = "row", "qdd_before"
+"""What the pass before left: variables [world, variable] and qdd [world, dof]."""
+NUMBER = "number"
+"""Input that counts the passes from zero; "passes" is how many there are."""
+OF_POINT = len(Touch._fields)  # variables of a surface
+
+
+class RowKept(Kept):
+    """Variables of a pass that is a kernel by itself, in ROW.
+
+    Attributes:
+        places: of the next variables in the row. variables: by place, as the pass reads them, each cut from its
+            history.
+    """
+
+    def __init__(self, trace: Trace):
+        super().__init__(trace.graph, NUMBER)
+        self.places: Iterator[int] = itertools.count()
+        self.variables: dict[int, Value] = {}
+
+    def variable(self, first: Value) -> Value:
+        at = next(self.places)
+        self.begin.append(Store(ROW, (at,), first))
+        self.variables[at] = cut(select(self.first, first, self.graph.input(ROW, at)))
+        return self.variables[at]
+
+    def keep(self, variable: Value, value: Value) -> None:
+        at = next(place for place, one in self.variables.items() if one is variable)
+        self.end.append(Store(f"{ROW}_out", (at,), value))
+
+
+class OnePass(ContactStep):
+    """One pass of a step with contacts, which reads what the pass before left.
+
+    Args:
+        laws: how many variables the laws of each link have, see :func:`count_laws`; None: they are counted.
+
+    Attributes:
+        before: qdd of each dof in the pass before, zero before the first one. active: the laws of each dof, added up.
+        counted: how many variables the laws of each link have. surfaces: numbers, in the whole scene, of the surfaces
+            that the trace's points may touch.
+    """
+
+    kept: RowKept
+
+    def __init__(self, trace: Trace, laws: tuple[int, ...] | None):
+        super().__init__(trace, ())
+        self.kept = RowKept(trace)
+        each = surface_count(trace.links.scene.ground, HEIGHTS in trace.links.variable)
+        numbers = (number for number, _ in own_points(trace))
+        self.surfaces = [number * each + i for number in numbers for i in range(each)]
+        self._next = iter(self.surfaces)
+        starts = itertools.accumulate(laws or (), initial=0)
+        self._starts = dict(zip(map(id, trace.links.leaders), starts, strict=False))
+        self._count = sum(laws or ())
+        self.active: dict[int, Law] = {}
+        dofs = sorted(dof for link in self.links for dof in link.dofs)
+        self.before = {dof: cut(select(self.kept.first, 0.0, trace.graph.input(BEFORE, dof))) for dof in dofs}
+        self.counted = tuple(self._count_laws(link) for link in self.links)
+
+    def _count_laws(self, link: Link) -> int:
+        """Make the variables of the laws of a link; return how many they are."""
+        known = len(self.kept.variables)
+        self.kept.places = itertools.count(self._starts.get(id(link), known))
+        self._pieces(link)
+        return len(self.kept.variables) - known
+
+    def _kept_as(self, name: str, dof: int) -> Value:
+        return self.h * self.before[dof] if name == GAIN else super()._kept_as(name, dof)
+
+    def _pieces(self, link: Link) -> list[Law]:
+        found = super()._pieces(link)
+        self.active |= zip(link.dofs, found, strict=True)
+        return found
+
+    def _touch(self, across: Value, candidate: Value) -> Touch:
+        self.kept.places = itertools.count(self._count + OF_POINT * next(self._next))
+        return super()._touch(across, candidate)
+
+    def forward(self) -> list[Store]:
+        """Return the stores of what the pass leaves, and messages to other pieces."""
+        trace = self.trace
+        dofs = {self._kept.get(dof, dof): dof for dof in self.before}
+        stores = self.stores(qdd=False, status=False)
+        sent = [item for item in trace.begin if item.array != ROW]
+        trace.begin, trace.ahead, trace.news, trace.rounds = [], [], [], []  # there is no loop
+        after = (GAIN, "out", "q_out", *(item.array for item in self.kept.end))
+        sent += [item for item in stores if item.array not in after]
+        gains = [
+            Store("out", (dofs[item.index[0]],), item.value * reciprocal(self.h))
+            for item in stores
+            if item.array == GAIN
+        ]
+        return sent + gains + self.kept.end
+
+
+def contact_pass(trace: Trace, laws: tuple[int, ...]) -> list[Store]:
+    """out = qdd of a pass, row_out = the variables that it leaves"""
+    return OnePass(trace, laws).forward()
+
+
+def count_laws(trace: Trace) -> tuple[int, ...]:
+    """Return how many variables the laws of each link have in a pass."""
+    return OnePass(trace, None).counted
+
+
+def count_variables(links: Links, laws: tuple[int, ...]) -> int:
+    """Return how many variables a pass leaves."""
+    scene = links.scene
+    surfaces = len(scene.contact_points) * surface_count(scene.ground, HEIGHTS in links.variable)
+    return sum(laws) + OF_POINT * surfaces
