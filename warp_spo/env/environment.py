@@ -291,7 +291,7 @@ class Env(VecEnv):
         return wp.ScopedStream(stream(self.warp_device), sync_enter=False)
 
     def _build(self, tracing: Tracing) -> dict[str, list[Launch]]:
-        """Return the kernels of each stage; the last one counts the step, after those that draw for rows."""
+        """Return the kernels of each stage; the last one, which counts the step, after those of rows."""
         found: dict[str, list[Launch]] = {stage.name: [] for stage in tracing.stages.values()}
         for stage in sorted(tracing.stages.values(), key=lambda stage: stage.rows == 0):
             launch = stage.build(self._store.buffers, self.warp_device)

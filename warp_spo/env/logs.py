@@ -56,7 +56,7 @@ def explain(env: Env, stages: dict[str, list[Launch]], users: dict[Any, tuple[st
         f"memory       {env.bytes_per_world} bytes a world",
     ]
     kernels = [(name, kernel) for name, some in stages.items() for kernel in some]
-    parts = [f"{kernel.rows} rows of a world, each" if kernel.rows else "a world," for _, kernel in kernels]
+    parts = [f"{each.threads} threads a world, each" if each.threads else "a world," for _, each in kernels]
     lines += [f"{name:12} {part} {one.operations} operations" for (name, one), part in zip(kernels, parts, strict=True)]
     lines += [f"in torch     {term.name}, before {place}" for term, (place, _) in users.items()]
     return "\n".join(lines)

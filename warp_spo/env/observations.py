@@ -14,14 +14,14 @@ from .vectors import Vector, rotate, rotate_back, vector
 from .world import World
 
 Term = Callable[[World], Any]
-MANY = 16  # rows from which a thread works on each
+MANY = 16  # rows from which they have threads of their own
 
 
 class Each:
     """A term of many numbers that are computed alike: a function of a world and of a row of numbers, for each row.
 
     Equals ``lambda w: [function(w, row) for row in rows]``. With 16 rows or more, an observation of it that asks for
-    neither bias, delay nor history has a kernel of its own, in which a thread works on each row of each world.
+    neither bias, delay nor history has a kernel of its own, in which a thread works on a few rows of a world.
 
     Args:
         function: of a ``World`` and a row (k,), which returns one number. It may not keep anything with ``w.keep``.
@@ -37,9 +37,9 @@ class Each:
         """Return the numbers of all rows."""
         return vector(self.function(w, row) for row in self.rows)
 
-    def of_own_row(self, w: World) -> Any:
-        """Return the number of the thread's row, in a stage in which a world has a thread for each row."""
-        return self.function(w, w.table(f"rows {w.number(self)}", self.rows)(w.read(ROW_NUMBER, 1)[0]))
+    def of_own_row(self, w: World, number: int) -> Any:
+        """Return the number of a row of the thread, in a stage in which a world has threads for its rows."""
+        return self.function(w, w.table(f"rows {w.number(self)}", self.rows)(w.read(ROW_NUMBER, number + 1)[number]))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -93,13 +93,13 @@ class Observation:
 
     @property
     def rows(self) -> int:
-        """How many threads of a world work on the term, one for each row of :class:`Each`; 0: one does all terms."""
+        """How many rows of :class:`Each` threads of their own work on; 0: the thread of all terms does."""
         plain = self.bias == 0.0 and self.history == 1 and self.delay in (0, (0, 0))
         return len(self.term.rows) if isinstance(self.term, Each) and plain and len(self.term.rows) >= MANY else 0
 
-    def trace_row(self, w: World) -> Any:
-        """Return the number of the thread's row."""
-        value = self._measured(w, self.term.of_own_row(w))  # type: ignore[attr-defined]
+    def trace_row(self, w: World, number: int) -> Any:
+        """Return the number of a row of the thread."""
+        value = self._measured(w, self.term.of_own_row(w, number))  # type: ignore[attr-defined]
         if w.kept:
             raise ValueError(f"observations.Each: {self.term.function} keeps {', '.join(w.kept)}; expected nothing")  # type: ignore[attr-defined]
         return value

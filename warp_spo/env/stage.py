@@ -16,6 +16,7 @@ from ..trace.scalars import Graph, Scalar, ordered
 ROW, COLUMN, INT, LONG, CHOSEN, SHARED = "row", "column", "int", "long", "chosen", "shared"
 DRAW = "draw"  # random numbers of the thread's own
 ROW_NUMBER = "row_number"  # of the thread, where a world has many
+ROWS_AT_ONCE = 4  # of a thread, which share what is the same for all
 BLOCK, BLOCK_OF_ROWS = 64, 128  # threads
 WIDE = 8  # entries of a row that the threads of a warp write together
 
@@ -78,12 +79,13 @@ class Stage:
     Args:
         name: of the kernel.
         stream: number that tells this stage's random numbers from those of others.
-        rows: threads of a world; the input ROW_NUMBER is the thread's. A value that is stored to an entry is that of
-            row 0; those of the other rows lie behind it. 0: one thread a world.
+        rows: of a world, of which a thread takes up to ROWS_AT_ONCE, ``threads`` apart; entry k of the input ROW_NUMBER
+            is the number of the thread's row k. 0: one thread does all of a world.
 
     Attributes:
         graph: of the trace.
-        stores: what the kernel writes, in order.
+        stores: what the kernel writes, in order; with rows, what a thread does for its first, for its second and so on.
+        at_once: rows of a thread. threads: of a world, where it has rows.
         draws: how many random numbers it uses.
         ticks: C++ of the condition under which it ends with another step counted, so that all later random numbers
             are new ones; "" if it never does.
@@ -91,9 +93,12 @@ class Stage:
 
     def __init__(self, name: str, stream: int, rows: int = 0):
         self.name, self.stream, self.rows = name, stream, rows
+        self.threads = -(-rows // ROWS_AT_ONCE)
+        self.at_once = -(-rows // self.threads) if rows else 0
         self.graph = Graph()
         self.graph.step = name
         self.stores: list[Store] = []
+        self.of_rows: list[list[Store]] = [[] for _ in range(self.at_once)]
         self.draws = 0
         self.ticks = ""
 
@@ -105,6 +110,11 @@ class Stage:
     def store(self, array: str, entry: int, value: Any) -> None:
         """Write a value to an entry of an array of the environment."""
         self.stores.append(Store(array, (entry,), value))
+
+    def store_row(self, array: str, first: int, number: int, value: Any) -> None:
+        """Write a value of the thread's row ``number`` to an array in which row 0 has the entry ``first``."""
+        self.store(array, first + number * self.threads, value)
+        self.of_rows[number].append(self.stores[-1])
 
     def read_arrays(self) -> set[str]:
         """Return the names of the arrays that the stored values depend on."""
@@ -143,7 +153,7 @@ class Stage:
         wide, more = self._wide(buffers), " + row" if self.rows else ""
 
         def load(array: str, entry: str) -> str:
-            own = {DRAW: f"DRAW({entry})", ROW_NUMBER: "(float)row"}
+            own = {DRAW: f"DRAW({entry})", ROW_NUMBER: f"(float)(row + ({entry}) * {self.threads})"}
             return own.get(array) or buffers[array].load(array, entry)
 
         def store(array: str, entry: str, value: str) -> str:
@@ -171,8 +181,8 @@ class Stage:
             head += ["const long long world = mine ? thread : worlds - 1;"]
             tail = [f"if (mine) {{ {count} }}" if count else "", row_chunks.UNDEFINE]
         elif self.rows:
-            head = [f"if (thread >= worlds * {self.rows}) return;", f"const int row = thread % {self.rows};"]
-            head += [f"const long long world = thread / {self.rows};"]
+            head = [f"if (thread >= worlds * {self.threads}) return;", f"const int row = thread % {self.threads};"]
+            head += [f"const long long world = thread / {self.threads};"]
             tail = []
         else:
             head = ["if (thread >= worlds) return;", "const long long world = thread;"]
@@ -182,7 +192,7 @@ class Stage:
         kernel = native.kernel(f"env_{self.name}", text, [(name, 1) for name in names], wp.float32)
         frames = "frame_pose" in touched or "frame_velocity" in touched
         arrays, accelerations = [buffers[name].warp() for name in names], "frame_acceleration" in touched
-        return Launch(kernel, arrays, emitter.operations, device, self.rows, frames, accelerations)
+        return Launch(kernel, arrays, emitter.operations, device, self.threads, frames, accelerations)
 
     def _emit(
         self, emitter: Emitter, wide: dict[str, list[tuple[int, int]]], buffers: dict[str, Buffer]
@@ -192,6 +202,11 @@ class Stage:
         at_once = lambda item: item.array not in read or (not wide and replaces(item))  # noqa: E731
         late = [item for item in self.stores if not at_once(item)]  # after all reads of what they overwrite
         early = [item for item in self.stores if at_once(item) and item.array not in wide]
+        if self.rows:
+            listings = [emitter.region(items) for items in self.of_rows]
+            *parts, last = (render(listing, "float32") for listing in listings)
+            over = f"if (row + {(self.at_once - 1) * self.threads} < {self.rows})"  # the last ones may be too many
+            return listings, [*parts, over + " {", last, "}"]
         listings = [emitter.region(early, [item.value for item in late])]
         parts = [render(listings[0], "float32")]
         for name, stretches in wide.items():
@@ -211,7 +226,7 @@ class Launch(NamedTuple):
     """A kernel with its arguments.
 
     Attributes:
-        operations: of one thread. rows: threads of a world; 0: one.
+        operations: of one thread. threads: of a world that has rows; 0: one.
         reads_frames, reads_accelerations: whether it reads frames, and their accelerations.
     """
 
@@ -219,12 +234,12 @@ class Launch(NamedTuple):
     arrays: list[wp.array]
     operations: int
     device: wp.Device
-    rows: int
+    threads: int
     reads_frames: bool
     reads_accelerations: bool
 
     def __call__(self, worlds: int) -> None:
         """Launch the kernel on Warp's current stream."""
-        block, threads = (BLOCK_OF_ROWS, worlds * self.rows) if self.rows else (BLOCK, worlds)
+        block, threads = (BLOCK_OF_ROWS, worlds * self.threads) if self.threads else (BLOCK, worlds)
         threads = -(-threads // block) * block if self.device.is_cuda else threads
         launches.launch(self.kernel, threads, [worlds, *self.arrays], [], device=self.device, block_dim=block)

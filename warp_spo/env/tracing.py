@@ -287,7 +287,9 @@ class Tracing:
                         stage = Stage(w._stage.name, len(self.stages), rows)
                         self.stages[f"{w._stage.name}, {rows} rows"] = stage
                         of_rows[rows] = begin(stage)
-                    of_rows[rows]._stage.store(name, at, as_value(term.trace_row(of_rows[rows])))
+                    one, stage = of_rows[rows], of_rows[rows]._stage
+                    for number in range(stage.at_once):
+                        stage.store_row(name, at, number, as_value(term.trace_row(one, number)))
                     at += rows
                 else:
                     for value in term.trace(w):
