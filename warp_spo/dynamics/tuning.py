@@ -1,4 +1,7 @@
-"""Plans by measurement: time the granularities at which an operation can run, and keep the best one."""
+"""Plans by measurement: time the granularities at which an operation can run, and keep the best one.
+
+Where launches for each level or scans serve all operations, forward dynamics says which of them is faster.
+"""
 
 from __future__ import annotations
 
@@ -26,6 +29,7 @@ if TYPE_CHECKING:
     from .dynamics import Dynamics
 
 USUAL = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "step")
+RECURSION = "recursion"  # name of the choice between sweeps and scans
 DIFFERENT = 1024  # worlds with inputs of their own; more repeat them
 REACH = 1.0  # largest coordinate of the inputs [rad, m]
 REPEATS = 9  # of which the median counts
@@ -43,6 +47,9 @@ def tune(self: Dynamics, operations: Sequence[str] | None = None) -> dict[str, T
     ``Dynamics(granularity=)``. Where the constants of the plan are within 3 % of the best, their choice stays.
 
     Where the choice is the plan's own, its kernels stay; others are those of an object with that ``granularity=``.
+
+    Where the plan is granularity "node", which larger scenes have, the choice is between sweeps, a launch for each
+    level, and scans; it holds for all operations, forward dynamics is timed, and its name is "recursion".
 
     Kernels of all candidates are compiled, which takes as long as that many calls of ``prepare``. Operations that share
     a kernel's recursion, as bias_force and inverse_dynamics do, share the choice. Graphs captured before keep their
@@ -65,7 +72,7 @@ def tune(self: Dynamics, operations: Sequence[str] | None = None) -> dict[str, T
         raise ValueError("Dynamics.tune: a graph capture is running; expected a call before the capture")
     if self.refine:
         raise UnsupportedError("Dynamics.tune", f"refine={self.refine}", "force one with granularity=")
-    found = {}
+    found = _tune_recursion(self)
     for name in names:
         operation = self._operations.get(name)
         if operation is None or operation.routine is None or operation.product:
@@ -88,20 +95,38 @@ def explain(dyn: Dynamics) -> list[str]:
 def _tune_one(dyn: Dynamics, operation: Operation) -> Tuned:
     dyn._engine.refuse(operation.name, operation)
     routine = _routine(dyn, operation)
-    if routine.name in dyn.plan.tuned:
-        return dyn.plan.tuned[routine.name]
     candidates = dyn.plan.candidates(routine)
     if len(candidates) == 1:
         return Tuned(candidates[0])
-    key = _key(dyn, routine)
+    return _choose(dyn, routine.name, candidates, lambda: _measure(dyn, operation, routine, candidates))
+
+
+def _tune_recursion(dyn: Dynamics) -> dict[str, Tuned]:
+    """Choose between sweeps and scans where both serve; return the choice by its name."""
+    stretches, operation = dyn.plan.stretches(dyn.scene), dyn._operations[USUAL[0]]
+    try:
+        dyn._engine.refuse(operation.name, operation)
+    except UnsupportedError:
+        return {}
+    if len(stretches) == 1:
+        return {}
+    with dyn.recursions.turn.lock:
+        return {RECURSION: _choose(dyn, RECURSION, tuple(stretches), lambda: _measure_recursion(dyn, operation))}
+
+
+def _choose(dyn: Dynamics, name: str, candidates: Sequence[str], measure: Callable[[], dict[str, float]]) -> Tuned:
+    """Use, and return, the choice of this name: the kept one, or what ``measure`` finds to be the fastest."""
+    if name in dyn.plan.tuned:
+        return dyn.plan.tuned[name]
+    key = _key(dyn, name)
     choice = files.read(key, candidates)
     if choice is None:
-        us = _measure(dyn, operation, routine, candidates)
+        us = measure()
         best = files.choice_of(us, candidates[0])
         now = Tuned(best, us, dyn.plan.device.name, f"{datetime.date.today()}", measured=True)
         choice = files.read(key, candidates, warn=False)  # another process may have been faster
         choice = files.write(key, now) if choice is None else choice
-    use(dyn, routine.name, choice)
+    use(dyn, name, choice)
     return choice
 
 
@@ -116,8 +141,11 @@ def _routine(dyn: Dynamics, operation: Operation) -> Routine:
 
 
 def use(dyn: Dynamics, name: str, choice: Tuned) -> None:
-    """Let the routine of this name run by a choice from now on."""
-    _switch(dyn, name, choice.granularity)
+    """Let the routine of this name, or the sweeps, run by a choice from now on."""
+    if name == RECURSION:
+        _switch_recursion(dyn, dyn.plan.stretches(dyn.scene)[choice.granularity])
+    else:
+        _switch(dyn, name, choice.granularity)
     dyn.plan.tuned[name] = choice
 
 
@@ -137,14 +165,21 @@ def _switch(dyn: Dynamics, name: str, granularity: str | None) -> None:
     dyn._gradients.forget()
 
 
-def _key(dyn: Dynamics, routine: Routine) -> dict[str, Any]:
+def _switch_recursion(dyn: Dynamics, stretch: int) -> None:
+    """Let sweeps run as if the plan had this stretch."""
+    dyn.recursions.use_stretch(stretch)
+    dyn._replays.forget()
+    dyn._gradients.forget()
+
+
+def _key(dyn: Dynamics, name: str) -> dict[str, Any]:
     """Return what a choice depends on, in words and numbers."""
     import warp_spo
 
     device, runtime = dyn.plan.device, cast(Any, wp._src.context.runtime)
     return {
         "scene": fingerprint(dyn.scene, dyn.variable),
-        "routine": routine.name,
+        "routine": name,
         "worlds": dyn.worlds,
         "dtype": dyn.dtype.__name__,
         "variable": sorted(dyn.variable),
@@ -167,6 +202,19 @@ def _measure(dyn: Dynamics, operation: Operation, routine: Routine, candidates: 
             us[granularity] = 1e6 * _seconds(functools.partial(operation.entry, dyn, **given, out=out), dyn.device)
     finally:
         _switch(dyn, routine.name, None)
+    return us
+
+
+def _measure_recursion(dyn: Dynamics, operation: Operation) -> dict[str, float]:
+    """Return the time of one call of an operation [us] by the names of stretches."""
+    given, us = _inputs(dyn, operation), {}
+    out = operation.entry(dyn, **given)
+    try:
+        for name, stretch in dyn.plan.stretches(dyn.scene).items():
+            _switch_recursion(dyn, stretch)
+            us[name] = 1e6 * _seconds(functools.partial(operation.entry, dyn, **given, out=out), dyn.device)
+    finally:
+        _switch_recursion(dyn, dyn.plan.stretch)
     return us
 
 

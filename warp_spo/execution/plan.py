@@ -14,7 +14,7 @@ from .routine import Routine
 from .stretches import cut, solid_nodes
 from .tuned import Tuned
 
-SHARED = "links share dofs"
+SHARED, ASKED = "links share dofs", "asked for"
 GRANULARITIES = ("node", "segment", "tree")
 RECURSIONS = ("sweep", "scan")
 DEFAULT: str | None = None  # granularity of who asks for none; None: chosen by the rules below
@@ -42,6 +42,7 @@ AT_ONCE = 65536  # worlds that a GPU runs at once, a thread each with up to 128 
 # scan 5 to 7 us, because a round of a scan is a product of two elements. A scan does three to five times the work of a
 # sweep, so it pays while threads wait; with more worlds a thread takes more nodes.
 STRETCH = 4  # nodes that a thread of a scan works through where few threads run; 8 are as fast, 2 and 16 slower
+STRETCHES = (4, 16, 64)  # that are timed where plans are measured
 SCAN_LAUNCH = 3  # launches of sweeps that take the time of one launch of a scan
 SWEEPS = 4  # of forward dynamics: motion outward, factors and forces inward, accelerations outward
 SCAN_THREADS = 32768  # stretches times worlds that keep a GPU busy; with more a scan only does more work
@@ -138,6 +139,23 @@ class Plan:
         found = ["tree", *["segment"] * divides, *["node"] * sweeps]
         return (first, *(name for name in found if name != first))
 
+    def stretches(self, scene: Scene) -> dict[str, int]:
+        """Return the stretches with which the sweeps of a scene may run here, by name, that of the rules first.
+
+        0, named "sweep", is without scans. Of lengths that cut the tree alike the first counts.
+        """
+        if self.forced or self.scan_reason == ASKED or self.granularity != "node" or not self.dofs:
+            return {name_stretch(self.stretch): self.stretch}
+        lengths = STRETCHES if self.device.cuda else (scene.body_count, *STRETCHES)
+        solid, cuts, found = solid_nodes(scene), [], [self.stretch, 0]
+        for length in dict.fromkeys((self.stretch, *lengths)):
+            pieces = cut(scene.tree, solid, length) if length else None
+            if pieces is None or pieces.nodes in cuts or (self.varies and any(x.longest > 1 for x in pieces.levels)):
+                continue
+            cuts.append(pieces.nodes)
+            found.append(length)
+        return {name_stretch(length): length for length in dict.fromkeys(found)}
+
     def stages(self, routine: Routine, warps: int) -> bool:
         """Whether rows come in through shared memory, for kernels in which ``warps`` share 32 worlds."""
         enough = self.worlds > self.device.scaled(FEW_WORLDS // 4)
@@ -207,7 +225,7 @@ def choose(
     pieces = Pieces(Links(scene)) if side_by_side else None
     limbs, alike = (pieces.warps, pieces.alike >= ALIKE[dtype]) if pieces else (1, True)
     rule = _chosen(scene.dof_count, limbs, alike, worlds, device, dtype, varies)
-    chosen, reason = (asked, "asked for") if asked else rule
+    chosen, reason = (asked, ASKED) if asked else rule
     if shared:
         reason = SHARED
     rows = SHORT_ROWS if chosen == "tree" else LONG_ROWS
@@ -221,7 +239,7 @@ def choose(
     apart = side_by_side and not varies and _takes_velocities_first(scene, "tree" if limbs == 1 else chosen, dtype)
     levels, dofs = tuple(outward), scene.dof_count
     if recursion is not None:
-        stretch = STRETCH if recursion == "scan" else 0, "asked for"
+        stretch = STRETCH if recursion == "scan" else 0, ASKED
     elif chosen != "node" or not dofs:
         stretch = 0, ""
     else:
@@ -248,6 +266,11 @@ def _stretch(scene: Scene, worlds: int, device: DeviceFacts, varies: bool) -> tu
     if worlds * threads > most:
         return 0, f"with {worlds} worlds the work takes longer than launches; scans would be {counts}"
     return length, f"{counts}, a thread takes up to {length} nodes"
+
+
+def name_stretch(length: int) -> str:
+    """Return the name of sweeps without scans, or of scans with so many nodes for a thread."""
+    return f"scan of {length}" if length else "sweep"
 
 
 def _takes_velocities_first(scene: Scene, granularity: str, dtype: str) -> bool:

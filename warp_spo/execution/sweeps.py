@@ -53,7 +53,12 @@ class Sweeps:
         self._workspace: dict[Hashable, wp.array] = {}
         self._frames: dict[tuple, tuple[wp.array, wp.array]] = {}
         self._hinge_kernels: dict[bool, wp.Kernel | None] = {}  # with velocities or not
-        self.scan = Scan(self, plan.stretch) if plan.stretch else None
+        self.scan: Scan | None = None
+        self.use_stretch(plan.stretch)
+
+    def use_stretch(self, length: int) -> None:
+        """Let scans with so many nodes for a thread do the work of sweeps from now on; 0: let sweeps do it."""
+        self.scan = Scan(self, length) if length else None
 
     def replace_values(self, scene: Scene) -> None:
         """Take the values of ``scene``, which has the same topology; variable values stay as they were set."""

@@ -107,7 +107,7 @@ def write(key: Mapping[str, Any], tuned: Tuned) -> Tuned:
             f"Dynamics.tune: the choice cannot be kept in {file} ({error}); it holds for this object, and the next "
             f"one measures anew; let the environment variable WARP_CACHE_PATH name a folder that can be written, or "
             f"pass granularity={tuned.granularity!r}",
-            stacklevel=4,
+            stacklevel=5,
         )
         return dataclasses.replace(tuned, file=None)
     return dataclasses.replace(tuned, file=file)
@@ -117,5 +117,5 @@ def _warn_damaged(file: Path, why: str) -> None:
     warnings.warn(
         f"Dynamics.tune: {file} cannot be used ({why}); the choice is measured anew and the file is replaced; delete "
         f"it if this warning comes again",
-        stacklevel=5,
+        stacklevel=6,
     )
