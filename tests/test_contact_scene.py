@@ -8,6 +8,8 @@ import zoo
 from contact_cases import box, quadruped
 
 import warp_spo as spo
+from warp_spo.dynamics.integrators import CONTACT_STEP
+from warp_spo.execution.programs import Programs
 from warp_spo.reference import Dense
 from warp_spo.scene.contacts import Stand
 
@@ -66,6 +68,23 @@ def test_contacts_are_told_kept_and_changed():
     assert scene.with_values(contact_friction=np.full(12, 0.3)).values["contact_friction"][0, 3] == 0.3
     with pytest.raises(ValueError, match=r"contact_stiffness holds -1.0; expected zero or more"):
         scene.with_values(contact_stiffness=np.full(12, -1.0))
+
+
+@pytest.mark.parametrize("room", [0, None])
+def test_explain_says_whether_limbs_have_room(room, monkeypatch):
+    """As the kernel says that was built: what limbs tell each other may not fit into shared memory."""
+    if room is not None:
+        monkeypatch.setattr(Programs, "room", lambda *_: room)
+    scene = quadruped()
+    dyn = spo.Dynamics(scene, 2, "cpu", granularity="segment")
+    assert dyn.explain().split("contacts  ")[1].split("\n")[0].endswith("a warp for each limb")
+    shapes = {"q": (2, 19), "qd": (2, 18), "dt": (), "passes": ()}
+    dyn.programs.find(CONTACT_STEP, shapes, (2, 18), {"q_out": (2, 19)}, reports=())
+    line = dyn.explain().split("contacts  ")[1].split("\n")[0]
+    if room is None:
+        assert line.endswith("a warp for each limb")
+    else:
+        assert line.endswith("a thread for each world: what limbs tell each other does not fit in shared memory")
 
 
 def test_a_scene_without_contacts_has_none():

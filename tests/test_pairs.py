@@ -407,5 +407,5 @@ def test_calls_without_a_kernel_have_names(device):
         alone.step(q, qd, None, H, contact_residual=np.zeros(1, np.float32))
     assert "1 pairs of bodies" in spo.Dynamics(scene, device=device).explain()
     torch = pytest.importorskip("torch")
-    with pytest.raises(ValueError, match="contacts between bodies"):
+    with pytest.raises(ValueError, match="contact between bodies"):
         spo.Dynamics(scene, device="cpu").step(torch.tensor(q, requires_grad=True), torch.tensor(qd), None, H)

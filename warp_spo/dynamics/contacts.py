@@ -76,6 +76,9 @@ def explain(dyn: Dynamics) -> str:
     figures = contact_figures(dyn.scene)
     if not dyn.scene.contacts:
         return figures
-    limbs = dyn.plan.of(integrators.contact_routine(dyn)) == "segment"
-    form = "a warp for each limb" if limbs else "a thread for each world"
+    routine = integrators.contact_routine(dyn)
+    form = "a thread for each world"
+    if dyn.plan.of(routine) == "segment":
+        held = dyn.programs.warps(routine) != 1  # 1: a kernel was built, and limbs found no room in it
+        form = "a warp for each limb" if held else f"{form}: what limbs tell each other does not fit in shared memory"
     return f"{figures}; {default_passes(dyn.scene)} passes of a step unless passes= says otherwise, {form}"

@@ -96,8 +96,8 @@ def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
 
 def _lacking(links: Links) -> str:
     """Return what of a scene has no gradient, and the way out; "" if nothing."""
-    way = "leave out contacts with other=, or call inside torch.no_grad()"
-    return f"contacts between bodies; {way}" if links.scene.contact_pairs else ""
+    way = "leave out contacts with other=, as those with the ground have gradients, or call inside torch.no_grad()"
+    return f"contact between bodies; {way}" if links.scene.contact_pairs else ""
 
 
 def _take_substeps(call: str, arguments: dict[str, Any]) -> int:

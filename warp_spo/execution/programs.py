@@ -152,6 +152,10 @@ class Programs:
         found = self._programs.items()
         return [(key, program) for key, program in found if program is not None and key[3] == self.plan.of(key[0])]
 
+    def warps(self, routine: Routine) -> int | None:
+        """Return how many warps share worlds in a routine's kernels; None before one is built."""
+        return max((program.warps for key, program in self._used if key[0] is routine), default=None)
+
     def described(self) -> list[str]:
         """A line for each kernel: its granularity, its operations in one world, and on CUDA what it takes."""
         lines = []
