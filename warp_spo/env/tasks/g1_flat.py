@@ -13,7 +13,7 @@ from . import velocity
 
 ROBOT = "g1"
 CAMERA = Camera(distance=3.2)
-LEARNER = Learner(iterations=1000, worlds=8192, steps=24, entropy=3e-3, deviation=0.6)
+LEARNER = Learner(iterations=1700, worlds=8192, steps=24, entropy=3e-3, deviation=0.6)
 STRIDE = 0.8  # time of two steps [s]
 PHASE = velocity.step_phase(STRIDE)
 ACTOR = (*velocity.ACTOR, ("step phase", PHASE, 1.0, 0.0))

@@ -14,7 +14,7 @@ from . import go2_flat, velocity
 from .go2_flat import FEET, ROBOT
 
 CAMERA = Camera(distance=2.6, elevation=0.35)
-LEARNER = Learner(iterations=800, worlds=4096, steps=24, entropy=5e-3, deviation=0.7)
+LEARNER = Learner(iterations=1300, worlds=4096, steps=24, entropy=5e-3, deviation=0.7)
 SIZE = (8.0, 8.0)  # of a tile [m]
 RISER, SLOPE = 0.12, np.radians(24.0)  # on the hardest tiles
 SCAN = Observation(observations.height_scan((1.2, 0.6), 0.1, offset=0.3), scale=2.0, noise=0.02)
