@@ -22,7 +22,18 @@ Every example runs as it stands, on a CPU in a minute at most, and draws its pic
 `python -m warp_spo.examples` lists them. This page was written by `python -m benchmarks.gallery`, with the sentences
 that each example printed.
 """
-ENTRY = re.compile(r"^## (\w+)\n.*?(?=^## |\Z)", re.MULTILINE | re.DOTALL)
+SHOWN = (
+    ("A Go2 falls and stands up", "ground.svg", "python -m warp_spo go2 --ground --report report"),
+    ("A trained Go2 trots at 0.8 m/s", "go2_trot.png", "python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt"),
+    ("A trained Go2 climbs stairs", "go2_stairs.png", "python -m warp_spo.play go2-rough runs/go2-rough/model_799.pt"),
+    ("One tile of each kind of terrain", "terrain.png", "python -m benchmarks.terrain terrain.png"),
+)
+"""Title, file in ``docs/_static`` and command of pictures that other commands draw."""
+OTHERS = """## Robots, policies, terrain
+
+Policies are trained by `python -m warp_spo.train TASK`: [training](training.md).
+"""
+ENTRY = re.compile(r"^## (\w+)\n.*?(?=^##? |\Z)", re.MULTILINE | re.DOTALL)
 
 
 def run(name: str, line: str) -> str:
@@ -48,7 +59,11 @@ def main(names: list[str]) -> None:
         if not names or name in names or name not in sections:
             print(name, flush=True)
             sections[name] = run(name, line)
-    PAGE.write_text(HEAD + "\n" + "\n".join(sections[name].strip() + "\n" for name in known))
+    parts = [HEAD, *(sections[name].strip() + "\n" for name in known), OTHERS]
+    for title, picture, command in SHOWN:
+        mark = "<!-- not run: the page that it belongs to says when it was -->"
+        parts.append(f"### {title}\n\n{mark}\n```console\n{command}\n```\n\n![{title}](_static/{picture})\n")
+    PAGE.write_text("\n".join(parts))
 
 
 if __name__ == "__main__":

@@ -9,8 +9,9 @@ import numpy as np
 import warp as wp
 
 from warp_spo import Status
-from warp_spo.examples.options import command
+from warp_spo.examples.options import band, command, drawing
 from warp_spo.newton import SolverSPO, shipped
+from warp_spo.trials.drawing import OURS
 
 DRIVES = {"quadruped": (2000.0, 20.0)}  # N m/rad, N m s/rad
 STAND = {"quadruped": [0.2, 0.4, -0.6, -0.2, -0.4, 0.6, -0.2, 0.4, -0.6, 0.2, -0.4, 0.6]}  # rad
@@ -35,18 +36,23 @@ def model(name, worlds, device=None):
     return every.finalize(device=device)
 
 
-def fall(name, seconds=3.0, dt=4e-3, worlds=4, device=None):
-    """Return the sum of contact forces over the weight [world], the largest speed of a body, and the worst status."""
+def fall(name, seconds=3.0, dt=4e-3, worlds=4, device=None, history=None):
+    """Return the sum of contact forces over the weight [world], the largest speed of a body, heights, status words.
+
+    ``history``, a list, receives the sums of each step.
+    """
     made = model(name, worlds, device)
     solver, state, control = SolverSPO(made, contacts="ground", points=4), made.state(), made.control()
     seen = solver.observables({"contact_f", "status"})
     speeds = made.joint_qd.numpy().reshape(worlds, -1).copy()
     speeds[:, :2] = np.random.default_rng(0).uniform(-0.5, 0.5, (worlds, 2))
     state.joint_qd.assign(speeds.ravel())
+    weight = made.body_mass.numpy().sum() / worlds * 9.81
     for _ in range(round(seconds / dt)):
         solver.step(state, state, control, None, dt, observables=seen)
+        if history is not None:
+            history.append(seen.contact_f.numpy()[..., 2].sum(axis=1) / weight)
     words = seen.status.numpy()
-    weight = made.body_mass.numpy().sum() / worlds * 9.81
     points = len(solver.dynamics.scene.contact_points)
     shares = seen.contact_f.numpy()[..., 2].sum(axis=1) / weight
     speed = float(np.abs(state.body_qd.numpy()).max())
@@ -57,8 +63,15 @@ def fall(name, seconds=3.0, dt=4e-3, worlds=4, device=None):
 
 
 def main(seconds=3.0, worlds=4, device=None, picture=None):
-    for name in ("quadruped", "ant", "humanoid"):
-        fall(name, seconds, worlds=worlds, device=device)
+    histories = {name: [] if picture else None for name in HEIGHT}
+    for name, history in histories.items():
+        fall(name, seconds, worlds=worlds, device=device, history=history)
+    if picture:
+        with drawing(picture, *histories) as axes:
+            for each, history in zip(axes, histories.values(), strict=True):
+                times = np.linspace(0.0, seconds, len(history))
+                band(each, times, np.array(history), OURS, "forces over weight")
+                each.set(xlabel="time [s]", ylabel="sum of contact forces / weight", ylim=(0.0, 4.0))
 
 
 if __name__ == "__main__":
