@@ -24,8 +24,26 @@ that each example printed.
 """
 SHOWN = (
     ("A Go2 falls and stands up", "ground.svg", "python -m warp_spo go2 --ground --report report"),
-    ("A trained Go2 trots at 0.8 m/s", "go2_trot.png", "python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt"),
-    ("A trained Go2 climbs stairs", "go2_stairs.png", "python -m warp_spo.play go2-rough runs/go2-rough/model_799.pt"),
+    (
+        "A trained G1 walks",
+        "films/g1_flat.webp",
+        "python -m warp_spo.play g1-flat runs/g1-flat/model_1699.pt --command 0.8 0 0 --film webp",
+    ),
+    (
+        "A trained Go2 follows commands",
+        "films/go2_flat.webp",
+        "python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --film webp",
+    ),
+    (
+        "A trained Go2 climbs stairs",
+        "films/go2_rough.webp",
+        'python -m warp_spo.play go2-rough runs/go2-rough/model_1299.pt --trial "stairs of 10 cm" --film webp',
+    ),
+    (
+        "A trained Panda reaches",
+        "films/panda_reach.webp",
+        "python -m warp_spo.play panda-reach runs/panda-reach/model_119.pt --film webp",
+    ),
     ("One tile of each kind of terrain", "terrain.png", "python -m benchmarks.terrain terrain.png"),
 )
 """Title, file in ``docs/_static`` and command of pictures that other commands draw."""
