@@ -1,7 +1,10 @@
 """Training in several processes: worlds are those of one process, gradients are means, and the policy is one."""
 
 import os
+import pathlib
 import socket
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -68,3 +71,17 @@ def test_a_device_for_each_process_is_refused(capsys):
     with pytest.raises(SystemExit):
         train.main(["cartpole", "--gpus", "2", "--device", "cuda:0"])
     assert "--gpus 2 with --device cuda:0; expected no --device, or cpu" in capsys.readouterr().err
+
+
+def test_two_processes_reach_the_return_of_one(tmp_path):
+    """The command with two processes, and with one and twice the worlds: 0.2 at first, about 25 in the end."""
+    folders, command = (tmp_path / "two", tmp_path / "one"), [sys.executable, "-m", "warp_spo.train", "cartpole"]
+    command += ["--device", "cpu", "--iterations", "100", "--seed", "1"]
+    own = {**os.environ, "PYTHONPATH": os.pathsep.join([str(pathlib.Path(__file__).parents[1]), *sys.path])}
+    for folder, more in zip(folders, (["--gpus", "2", "--worlds", "64"], ["--worlds", "128"]), strict=True):
+        subprocess.run([*command, *more, "--out", str(folder)], check=True, env=own, stdout=subprocess.DEVNULL)
+    two, one = (learning.read_rows(folder / "progress.jsonl") for folder in folders)
+    assert len(two) == len(one) == 100
+    assert max(two[0]["reward"], one[0]["reward"]) < 1.0
+    last = [sum(row["reward"] for row in rows[-10:]) / 10.0 for rows in (two, one)]
+    assert min(last) > 7.0 and max(last) < 2.0 * min(last)
