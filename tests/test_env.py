@@ -1,5 +1,7 @@
 """Environments against what they are made of: the dynamics, NumPy, and themselves with other worlds."""
 
+import gc
+
 import numpy as np
 import pytest
 import torch
@@ -287,6 +289,31 @@ def bilinear(field, x, y):
         s, t, h = np.clip(u - i, 0, 1), np.clip(v - j, 0, 1), field.heights[i : i + 2, j : j + 2]
         found.append(h[0, 0] * (1 - s) * (1 - t) + h[1, 0] * s * (1 - t) + h[0, 1] * (1 - s) * t + h[1, 1] * s * t)
     return np.array(found).reshape(x.shape)
+
+
+def allocated():
+    """Return the bytes of all arrays and tensors that own memory."""
+    gc.collect()
+    sizes = {}
+    for thing in gc.get_objects():
+        if type(thing) is wp.array and thing.deleter is not None:
+            sizes[thing.ptr] = thing.capacity
+        elif type(thing) is torch.Tensor:
+            sizes[thing.untyped_storage().data_ptr()] = thing.untyped_storage().nbytes()
+    return sum(size for place, size in sizes.items() if place)
+
+
+@pytest.mark.slow
+def test_bytes_of_a_world_are_those_of_all_arrays():
+    """More worlds take as much more memory; values that events change, and what is derived from them, included."""
+    found = []
+    for worlds in (1024, 2048):
+        env = walker_env(worlds, events=[events.randomise("body_mass", (0.8, 1.2)), events.push(0.5)])
+        env.step(torch.zeros(worlds, 8))
+        found.append(allocated())
+        expected = env.bytes_per_world
+        del env
+    assert (found[1] - found[0]) / 1024 == pytest.approx(expected, abs=8)
 
 
 @pytest.mark.slow

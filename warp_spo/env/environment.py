@@ -272,9 +272,11 @@ class Env(VecEnv):
 
     @property
     def bytes_per_world(self) -> int:
-        """Bytes of device memory that a world takes, without the tables that all worlds share."""
+        """Bytes of device memory that a world takes after a step, without what all worlds share."""
         delays = 0 if self._actuator_state is None else sum(part.nbytes for part in self._actuator_state)
-        return self._store.bytes_per_world + (delays + self.dyn.recursions.workspace_bytes) // self.num_envs
+        run = self.dyn.recursions
+        own = self._store.bytes_per_world + run.parameters.bytes_per_world
+        return own + (delays + run.workspace_bytes) // self.num_envs
 
     def close(self) -> None:
         """Do nothing: memory is freed with the object."""

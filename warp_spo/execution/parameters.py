@@ -16,7 +16,7 @@ from .. import launches
 from ..kernels import parameters as kernels
 from ..kernels.spatial import POSE, RIGID
 from ..kernels.topology import Topology
-from ..memory import broadcast_worlds
+from ..memory import broadcast_worlds, size_in_bytes
 from ..scene.actuators import ACTUATOR_VALUES
 from ..scene.contacts import CONTACT_VALUES, GROUND_VALUES, HEIGHTS
 from ..scene.scene import Scene
@@ -100,6 +100,14 @@ class Parameters:
     def version(self) -> int | None:
         """A number that is equal as long as no value has changed; None if a captured graph may change values."""
         return None if self._captured else self._version
+
+    @property
+    def bytes_per_world(self) -> int:
+        """Bytes of a world's own values, and of what has been derived from them."""
+        own = [self._values[name] for name in self.variable if name not in SHARED]
+        derived = (known.arrays for known in self._derived.values() if set(known.sources).isdisjoint(SHARED))
+        own += [array for arrays in derived for array in arrays if 0 not in array.strides]  # else worlds share it
+        return sum(map(size_in_bytes, own)) // self.worlds
 
     def derived_arrays(self, key: str, build: Callable[[], DerivedArrays]) -> list[wp.array]:
         """Return the derived arrays of this name; ``build()`` allocates them at the first request."""
