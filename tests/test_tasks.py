@@ -222,6 +222,26 @@ def test_g1_is_rewarded_for_steps_in_time():
 
 
 @pytest.mark.slow
+def test_ants_are_paid_for_a_trot():
+    """A quarter for each rule: legs of a diagonal alike, front left and right legs not, nor hind left and right."""
+    from warp_spo.env.tasks import ant
+
+    env = envs.make("ant", 32, "cpu", seed=4)
+    env.reset()
+    before, seen = torch.zeros(32), []
+    for _ in range(30):
+        _, _, done, _ = env.step(2.0 * torch.randn(32, 8))
+        going = done == 0
+        fl, hl, hr, fr = (env.memory(f"feet {ant.FEET} 1.0")[:, 4:8] > 0.0).T  # times of contact
+        right = (fl == hr).float() + (hl == fr).float() + (fl != fr).float() + (hl != hr).float()
+        now = env.memory("sum reward trot")[:, 0].clone()
+        assert torch.allclose((now - before)[going], (env.step_dt * ant.TROT * right / 4)[going], atol=1e-5)
+        before = now
+        seen.append(right[going])
+    assert set(torch.cat(seen).tolist()) >= {0.0, 2.0, 4.0}
+
+
+@pytest.mark.slow
 def test_go2_stands_in_mujoco(tmp_path):
     """A policy of zeros holds the default pose there: controls, joint order and metadata agree."""
     from warp_spo.mujoco import deployment

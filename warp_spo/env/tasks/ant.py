@@ -13,7 +13,7 @@ from ..learning import Learner
 from . import velocity
 
 ROBOT = "ant"
-FEET, DIAGONALS = ".*_foot", ((0, 2), (1, 3))
+FEET, DIAGONALS = ".*_foot", ((0, 2), (3, 1))
 TROT = 1.5  # weight; without it a leg drags, or stays in the air
 ENOUGH = 4.0  # speed that earns most [m/s]: its motors could throw it along at four times as much
 CAMERA = Camera(distance=3.5)
