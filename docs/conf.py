@@ -33,6 +33,7 @@ html_title = f"warp_spo {release}"
 html_theme_options = {
     "navbar_align": "left",
     "show_nav_level": 2,
+    "show_toc_level": 2,
     "show_prev_next": False,
     "footer_start": ["copyright"],
     "footer_end": [],
