@@ -32,7 +32,7 @@ def _divides(scene: Any, inputs: Any, apart: bool, **_: Any) -> bool:
 PASS = Routine("contact_pass", contact_pass, letters="Pzaf", crowded=True, wide=True)
 SOLVE = Routine("contact_solve", contact.contact_solve, letters="Pza", crowded=True, wide=True)
 GRADIENT = Routine(
-    "contact_gradient", contact.contact_gradient, letters="BG", divides=_divides, crowded=True, wide=True
+    "contact_gradient", contact.contact_gradient, letters="BGO", divides=_divides, crowded=True, wide=True
 )
 NOT_READ = ("qdd", "q_cotangent", "qd_cotangent")  # of the arrays that are given, what the passes do not read
 

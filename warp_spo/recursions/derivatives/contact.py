@@ -37,6 +37,7 @@ from ..integration import integrate_link
 from ..kinematics import carried_velocity
 from ..links import Link
 from ..motion import hinge_motion, whirl
+from ..pieces import Piece
 from .adjoints import entries, result_name
 from .contact_pass import NUMBER, OnePass
 from .power import Entry, Power, Ways
@@ -50,7 +51,8 @@ COTANGENT, CAME, SOLVED = "cotangent", "cotangent_came", "solved"
 and lambda [world, dof]."""
 HEIGHTS_AT = "heights_at"
 """Where the heights lie in the table by which each surface has its gradient [world, surface]: those of a cell."""
-BY_PIECES = ("q", "qd", "tau", "target_q", "target_qd", "ctrl", *CONTACT_VALUES, HEIGHTS)
+ORIGIN = "ground_origin"
+BY_PIECES = (ORIGIN, "q", "qd", "tau", "target_q", "target_qd", "ctrl", *CONTACT_VALUES, HEIGHTS)
 """Arguments and values whose gradient a limb computes by itself, or by messages between limbs."""
 Twists = dict[int, tuple[Vector, Vector]]
 
@@ -258,9 +260,21 @@ class PassGradient(PassAdjoint):
             if name == HEIGHTS:
                 cells = zip(self.surfaces, (point.cell for point in self.points), strict=True)
                 found += [Store(f"{HEIGHTS_AT}_bar", (at,), cell.first) for at, cell in cells if cell is not None]
+            if name == ORIGIN and trace.piece is not None:
+                sent += self._add_origins(trace.piece, ways)
+                if trace.piece.parent is not None:
+                    continue
             for index, value in self._entries(name, ways):
                 found.append(Store(result_name(name, wrt), index, self._later(f"{name}_later", *index) + value))
         return [*sent, *power.stores, *found]
+
+    def _add_origins(self, own: Piece, ways: Ways) -> list[Store]:
+        """Add to the gradient by the ground's origin those of the pieces further out; return what sends it inward."""
+        for piece in own.children:
+            for i, more in enumerate(self.trace.receive("O", piece)):
+                ways[ORIGIN, i] = ways.get((ORIGIN, i), 0.0) + more
+        sums = [ways.get((ORIGIN, i), 0.0) for i in range(3)]
+        return self.trace.send_to_parent("O", own.links[0], sums)
 
     def _entries(self, name: str, ways: Ways) -> Iterable[tuple[tuple[int, ...], Value]]:
         """Return (index, gradient) of every entry of an argument or value that this trace works on.
@@ -292,6 +306,7 @@ def divides(scene: Scene, variable: Collection[str], inputs: Collection[str], wr
     """Return whether limbs can share the gradients of a pass."""
     alone = all(len(actuator.hinges) == 1 for actuator in scene.actuators)
     lifted = "body_gravcomp" in variable or bool(scene.values["body_gravcomp"].any())
+    alone &= len(scene.tree.roots) == 1 or ORIGIN not in wrt  # its gradient is added up towards the root
     return alone and not lifted and "body_f" not in inputs and set(wrt) <= set(BY_PIECES)
 
 
