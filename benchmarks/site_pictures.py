@@ -1,13 +1,11 @@
-"""Draw the stress suite of committed results: the error of each family beside the error that its law expects.
+"""Draw committed results for the documentation's pages: the stress suite beside its laws, and what Python costs a call.
 
-python -m benchmarks.stress_picture [RESULTS.json]     # writes docs/_static/stress.svg; the newest of a GPU by itself
+python -m benchmarks.site_pictures       # writes stress.svg and host.svg to docs/_static, from the newest results
 """
 
 from __future__ import annotations
 
 import json
-import sys
-from pathlib import Path
 from typing import Any
 
 from warp_spo.trials import drawing
@@ -38,11 +36,20 @@ FAMILIES = {
     "S34.long_logdet": "log det of long chains",
 }
 """Case -> what it is, in the order of the picture."""
+CALLS = {
+    "torch: forward_dynamics, forward and backward": "forward_dynamics with gradient, torch",
+    "torch: an empty autograd.Function, forward and backward": "an empty autograd.Function with gradient",
+    "torch: add, forward and backward": "torch's add with gradient",
+    "torch: forward_dynamics": "forward_dynamics, torch",
+    "torch: forward_dynamics, out=": "forward_dynamics, torch, out=",
+    "torch: add, out=": "torch's add, out=",
+}
+"""Row of the results -> what the bar is called."""
 
 
-def picture(stress: list[dict]) -> Any:
+def draw_stress(stress: list[dict]) -> Any:
     """Return the figure: a row for each family, dots for the largest errors, bars for what the laws allow."""
-    pyplot = drawing.load_pyplot("stress_picture")
+    pyplot = drawing.load_pyplot("site_pictures")
     figure, axes = pyplot.subplots(1, 2, figsize=(11, 6), sharey=True, layout="constrained")
     for axis, precision in zip(axes, ("float32", "float64"), strict=True):
         for place, name in enumerate(FAMILIES):
@@ -70,13 +77,37 @@ def picture(stress: list[dict]) -> Any:
     return figure
 
 
+def draw_host(rows: list[dict], others: list[dict]) -> Any:
+    """Return the figure: a bar for each way to call forward dynamics of Go2 in 4,096 worlds, and for torch's add."""
+    pyplot = drawing.load_pyplot("site_pictures")
+    times = {row["name"]: row["us"] for row in rows}
+    (replayed,) = [
+        row["us"]
+        for row in others
+        if row["name"] == "go2.forward_dynamics"
+        and (row["worlds"], row["dtype"], row.get("peer")) == (4096, "float32", None)
+        and row.get("chosen")
+    ]
+    bars = {CALLS[name]: times[name] for name in CALLS} | {"forward_dynamics, replayed in a graph": replayed}
+    figure, axis = pyplot.subplots(figsize=(8, 3), layout="constrained")
+    colors = [drawing.OTHER if "add" in name or "empty" in name else drawing.color(None) for name in bars]
+    axis.barh(list(bars), list(bars.values()), color=colors)
+    axis.invert_yaxis()
+    axis.bar_label(axis.containers[0], [f" {value:.3g}" for value in bars.values()])
+    axis.set(xscale="log", xlim=(1.0, 500.0), xlabel="µs of the host for a call; replayed: of the GPU")
+    return figure
+
+
 def main() -> None:
-    """Write the picture."""
-    results = sorted((ROOT / "benchmarks" / "results").glob("*-h200.json"))
-    file = Path(sys.argv[1]) if len(sys.argv) > 1 else results[-1]
-    stress = json.loads(file.read_text())["stress"]
+    """Write the pictures."""
+    folder = ROOT / "benchmarks" / "results"
+    newest, host = ([*sorted(folder.glob(f"*-{name}.json"))][-1] for name in ("h200", "h200-host"))
+    everything = json.loads(newest.read_text())
     with drawing.style():
-        (STATIC / "stress.svg").write_text(drawing.svg(picture(stress)))
+        (STATIC / "stress.svg").write_text(drawing.svg(draw_stress(everything["stress"])))
+        (STATIC / "host.svg").write_text(
+            drawing.svg(draw_host(json.loads(host.read_text())["rows"], everything["rows"]))
+        )
 
 
 if __name__ == "__main__":
