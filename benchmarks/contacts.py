@@ -1,11 +1,11 @@
 """Steps of Go2, G1 and an ant on a plane and on a height field: time of a step, and errors against float64.
 
     python -m benchmarks.contacts [--device cuda:0] [--worlds 4096 65536] [--granularity tree segment]
-                                  [--dtype float32 float64] [--ground plane field none] [--json FILE]
+                                  [--dtype float32 float64] [--ground plane field none] [--passes 3 4] [--json FILE]
 
 Go2 has a sphere at each foot and the trunk's eight corners; G1 four points at each sole and ten points on its body.
 The ant is that of the tasks, with its capsules.
-Drives hold the joints with effort limits; worlds stand on the ground in different states, dt is 5 ms, three passes.
+Drives hold the joints with effort limits; worlds stand on the ground in different states, dt is 5 ms.
 """
 
 from __future__ import annotations
@@ -87,7 +87,13 @@ def subject(
 
 
 def measure(
-    robot: str, worlds: int, device: wp.Device, field: bool = False, contacts: bool = True, **options: Any
+    robot: str,
+    worlds: int,
+    device: wp.Device,
+    field: bool = False,
+    contacts: bool = True,
+    passes: int | None = None,
+    **options: Any,
 ) -> dict[str, Any]:
     """Return ``us`` of a step, and its errors against the dense step: of velocities, and of forces over the weight.
 
@@ -95,17 +101,17 @@ def measure(
     """
     dyn, sets = subject(robot, worlds, device, field, contacts, **options)
     out, (q, qd) = tuple(wp.empty_like(x) for x in sets[0]), sets[0]
-    found: dict[str, Any] = {"us": measure_time(lambda i: dyn.step(*sets[i], None, DT, out=out), device)}
+    found: dict[str, Any] = {"us": measure_time(lambda i: dyn.step(*sets[i], None, DT, passes=passes, out=out), device)}
     found["kernel"] = dyn.programs.described()[0]
     if not contacts:
         return found
     force = wp.empty((worlds, len(dyn.scene.contact_points), 3), dtype=q.dtype, device=device)
-    after = dyn.step(q, qd, None, DT, contact_f=force)[1].numpy()
+    after = dyn.step(q, qd, None, DT, passes=passes, contact_f=force)[1].numpy()
     weight, start = 9.81 * dyn.scene.values["body_mass"].sum(), [x.numpy().astype(np.float64) for x in (q, qd)]
     errors = []
     for w in range(0, worlds, max(1, worlds // SAMPLE)):
         at = ContactStep(dyn.scene, start[0][w], start[1][w], DT)
-        wanted, forces = at.run()[1], np.zeros(force.shape[1:])
+        wanted, forces = at.run(passes=passes or 3)[1], np.zeros(force.shape[1:])
         np.add.at(forces, at.numbers, wanted.f)
         errors.append((np.abs(after[w] - wanted.v).max() / np.abs(wanted.v).max(),
                        np.abs(force.numpy()[w] - forces).max() / weight))  # fmt: skip
@@ -121,14 +127,19 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--granularity", nargs="+", default=["planned"], help="planned, tree, segment")
     parser.add_argument("--dtype", nargs="+", default=["float32"])
     parser.add_argument("--ground", nargs="+", choices=GROUNDS, default=["plane", "field"])
+    parser.add_argument("--passes", type=int, nargs="+", default=[3])
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     device, results = wp.get_device(options.device), {}
-    for dtype, robot, worlds, form, ground in itertools.product(
-        options.dtype, options.robots, options.worlds, options.granularity, options.ground
+    for dtype, robot, worlds, form, ground, passes in itertools.product(
+        options.dtype, options.robots, options.worlds, options.granularity, options.ground, options.passes
     ):
+        if ground == "none" and passes != options.passes[0]:
+            continue  # passes are of steps with contacts
         name = f"{robot}, {worlds} worlds, ground: {ground}, {form}, {dtype}"
-        asked = dict(granularity=None if form == "planned" else form, dtype=dtype)
+        asked: dict[str, Any] = dict(granularity=None if form == "planned" else form, dtype=dtype)
+        if ground != "none":
+            name, asked["passes"] = f"{name}, {passes} passes", passes
         results[name] = found = measure(robot, worlds, device, **GROUNDS[ground], **asked)
         figures = (f"{key} {value if isinstance(value, str) else format(value, '.3g')}" for key, value in found.items())
         print(name, "  ".join(figures), flush=True)

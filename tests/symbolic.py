@@ -8,6 +8,7 @@ import textwrap
 import numpy as np
 
 import warp_spo
+from warp_spo.dynamics.rounds import EARLY
 from warp_spo.execution.routine import Routine
 from warp_spo.recursions import (
     composite,
@@ -28,6 +29,7 @@ from warp_spo.recursions import (
     regressor,
     step,
 )
+from warp_spo.recursions.contact import middle
 from warp_spo.recursions.contact import step as contact
 from warp_spo.recursions.contact.ground import GROUND
 from warp_spo.recursions.contact.secants import SECANT
@@ -135,6 +137,24 @@ def contact_step(scene, arrays, h, passes=3, dtype="float64"):
               "contact_gap": (points,), "contact_slip": (points,), "contact_excess": (3,)}  # fmt: skip
     last = [item for item in stores if item.array not in (GAIN, SECANT)]
     return stored(last, {name: np.full((worlds, *shape), np.nan) for name, shape in shapes.items()})
+
+
+def contact_step_in_rounds(scene, arrays, h, passes, dtype="float64"):
+    """The same for a step that begins with rounds, which see velocity terms in the middle of the step."""
+    loaded = {name: array for name, array in arrays.items() if name in ("q", "body_f")}
+    given = {name: array for name, array in arrays.items() if name != "body_f"}
+    before, found, worlds = arrays["qd"], {"out": arrays["qd"]}, len(arrays["q"])
+    for count in (*EARLY, passes):
+        known = loaded | {"qd": before, middle.FOUND: found["out"], "dt": np.full((worlds, 1), h)}
+        stores = middle.middle_bias(Trace(Links(scene), dtype, tuple(known)))
+        read = lambda name, at, known=known: known[name][(slice(None), *at)]  # noqa: E731
+        values = evaluate([item.value for item in stores], read, dtype)
+        result = {"out": np.zeros((worlds, scene.dof_count)), "mean_out": np.zeros((worlds, scene.dof_count))}
+        for item, value in zip(stores, values, strict=True):
+            result[item.array][(slice(None), *item.index)] = value
+        before = result["mean_out"]
+        found = contact_step(scene, given | {middle.MIDDLE: result["out"]}, h, count, dtype)
+    return found
 
 
 def plant(monkeypatch, owner, name, old, new):

@@ -12,7 +12,8 @@ RISE = 1e-5  # of the first state's energy, above which a step counts as one tha
 TUMBLING = {2e-3: 1e-4, 5e-3: 1e-3, 1e-2: 1e-2}
 """By dt: the largest rise of a tumbling drop over its energy; 5e-5, 9e-4, 3e-3 without drives, 6e-3 with weak ones."""
 LEFT_OPEN = {(10.0, 5e-3): (1, 0.15), (10.0, 1e-2): (6, 1e-4)}
-"""By mass of the trunk and dt: how many steps of landings gain energy, and the most; none elsewhere."""
+"""By mass of the trunk and dt: how many steps of landings gain energy in three passes, and the most; none elsewhere."""
+WITHOUT_DRIVES = 1e-4  # rise of a step of 10 ms in four passes where limbs whirl and land at once, as one of 5960 does
 
 
 def standing(scene, worlds):
@@ -91,7 +92,8 @@ def test_a_landing_does_not_depend_on_dt(device):
 @pytest.mark.slow
 @pytest.mark.parametrize("trunk", [1.0, 10.0, 100.0])
 @pytest.mark.parametrize("h", [2e-3, 5e-3, 1e-2])
-def test_66_landings_gain_nothing(device, h, trunk):
+@pytest.mark.parametrize("passes", [3, 4])
+def test_66_landings_gain_nothing(device, passes, h, trunk):
     """Stiffness from 1e4 to 1e7, friction from 0 to 1.5, in the worlds of one call; a trunk of many times its mass."""
     scene, worlds, heavier = quadruped(), 66, np.ones(13)
     heavier[0] = trunk
@@ -103,17 +105,18 @@ def test_66_landings_gain_nothing(device, h, trunk):
                   contact_damping=0.5 * np.sqrt(k * scene.values["body_mass"].sum() / 4.0))  # fmt: skip
     target, qd = standing(scene, worlds), np.zeros((worlds, 18))
     qd[:, 0], qd[:, 2] = 0.5, -1.5
-    found = rollout(scene, target, qd, h, 1.0, target, device, **values)
+    found = rollout(scene, target, qd, h, 1.0, target, device, passes, **values)
     gained = rises(found)[rises(found) > RISE]
-    many, most = LEFT_OPEN.get((trunk, h), (0, 0.0))
+    many, most = LEFT_OPEN.get((trunk, h), (0, 0.0)) if passes == 3 else (0, 0.0)
     assert np.isfinite(found["qd"]).all() and len(gained) <= many and gained.max(initial=0.0) <= most
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("effort", [33.0, 5.0, 0.0])
 @pytest.mark.parametrize("h", TUMBLING)
-def test_tumbling_drops_gain_next_to_nothing(device, h, effort):
-    """Any attitude and velocity, drives that saturate; what is left comes from the explicit velocity terms."""
+@pytest.mark.parametrize("passes", [3, 4])
+def test_tumbling_drops_gain_next_to_nothing(device, passes, h, effort):
+    """Any attitude and velocity, drives that saturate; three passes leave what comes from explicit velocity terms."""
     scene, worlds, rng = quadruped(effort or 33.0), 40, np.random.default_rng(0)
     if effort == 0.0:
         scene = scene.with_values(joint_target_ke=np.zeros(18), joint_target_kd=np.zeros(18))
@@ -123,8 +126,9 @@ def test_tumbling_drops_gain_next_to_nothing(device, h, effort):
     target = standing(scene, worlds)
     target[:, 7:] += rng.normal(size=(worlds, 12))
     qd = rng.normal(size=(worlds, 18)) * np.repeat([1.0, 3.0, 3.0], [3, 3, 12])
-    found = rollout(scene, q, qd, h, 1.5, target, device)
-    assert np.isfinite(found["qd"]).all() and rises(found).max() <= TUMBLING[h]
+    found = rollout(scene, q, qd, h, 1.5, target, device, passes)
+    most = TUMBLING[h] if passes == 3 else WITHOUT_DRIVES if effort == 0.0 and h == 1e-2 else RISE
+    assert np.isfinite(found["qd"]).all() and rises(found).max() <= most
 
 
 @pytest.mark.slow

@@ -9,6 +9,10 @@ along the normal n, both of which see the point's path bend as its links turn. A
 where S and l are resistances and loads of the hinges' laws. G, S and l depend on v; each pass takes them from the v of
 the pass before. Friction, effort limits and dry friction are secants: dampers that give the bound at the v before. The
 first pass closes all candidates, later passes open those that pull, the last of three or more only closes.
+
+A step of four passes or more begins with rounds. Each takes bias half way along v, at v itself, where v is qd at first
+and then the mean of v and of what the round before found: there velocity terms do the work by which the kinetic energy
+changes along the path. How much faster a dof gets that a saturated drive lets go follows from each pass's own sweep.
 """
 
 from typing import NamedTuple
@@ -21,6 +25,8 @@ from .reference_rotations import homogeneous
 CREEP = 1e-4  # rate below which dry friction is a damper [rad/s, m/s]
 UNBOUNDED, UNLIMITED = 1e6, 1e10  # effort and velocity limits, position limits, of this size and more are none
 HOLD = 300.0  # resistance of a velocity limit, in inertias over the step
+MANY = 4  # passes from which on a step begins with rounds
+EARLY = (3, 3)  # passes of each round
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
 
 
@@ -88,8 +94,11 @@ class Found(NamedTuple):
     on: np.ndarray
 
 
-def solve(M, laws, limits, points, v, load, h, passes=3, gravity=0.0):
-    """Return what the passes find for the velocity ``v`` before the step and the hinges' forces ``load`` [dof]."""
+def solve(M, laws, limits, points, v, load, h, passes=3, gravity=0.0, outward=None):
+    """Return what the passes find for the velocity ``v`` before the step and the hinges' forces ``load`` [dof].
+
+    ``outward`` by dof: the dofs that it carries, [dof] of bool; of these dofs weights come from each pass's sweep.
+    """
     start, kd = v, points.k * h + points.d
     at, still = points.J @ v, np.zeros_like(points.n)
     candidate = np.maximum(points.after(at, h), points.after(still, h)) + 0.5 * gravity * h * h > 0.0
@@ -129,11 +138,26 @@ def solve(M, laws, limits, points, v, load, h, passes=3, gravity=0.0):
         w = _slip(points.n, at) + h * points.weight * np.maximum(0.0, ft - points.mu * fn)
         force = drive_s * (laws.a - v)
         beyond = np.maximum(0.0, np.abs(force) - laws.effort)
-        drive_s = clamped(laws, v, force, h)
-        dry_w = np.abs(v) + h * laws.weight * np.maximum(0.0, dry_s * np.abs(v) - laws.dry)
+        felt = laws, laws
+        if outward is not None:
+            felt = tuple(laws._replace(weight=felt_weights(A, outward, h * s, laws.weight)) for s in (drive_s, dry_s))
+        drive_s = clamped(felt[0], v, force, h)
+        dry_w = np.abs(v) + h * felt[1].weight * np.maximum(0.0, dry_s * np.abs(v) - laws.dry)
     cone, adhesion = ft - points.mu * fn, -_along(points.n, f)
     excess = np.array([np.maximum(x, 0.0).max(initial=0.0) for x in (cone, adhesion, beyond)])
     return Found(v, f, excess, on)
+
+
+def felt_weights(A, outward, own, weight):
+    """Return ``weight`` [dof] with what some dofs feel if nothing further in moves and without their ``own`` damper.
+
+    1 over their pivots in A, eliminated from the outside in, less ``own``.
+    """
+    found = weight.copy()
+    for i, beyond in outward.items():
+        D = A[i, i] - A[i, beyond] @ np.linalg.solve(A[np.ix_(beyond, beyond)], A[beyond, i])
+        found[i] = 1.0 / max(D - own[i], 1e-12 * D)
+    return found
 
 
 def dampers(points, on, kd, fn, w):
@@ -210,11 +234,39 @@ class ContactStep:
 
     def run(self, tau=None, body_f=None, passes=3):
         """Return q' and what the passes find."""
-        dense = self.dense
-        load = (0.0 if tau is None else np.asarray(tau)) - dense.bias_force(self.qd, body_f)
-        gravity = np.linalg.norm(dense.value("gravity"))
-        found = solve(dense.mass_matrix, self.laws, self.limits, self.points, self.qd, load, self.h, passes, gravity)
+        dense, tau = self.dense, 0.0 if tau is None else np.asarray(tau)
+        system = dense.mass_matrix, self.laws, self.limits, self.points, self.qd
+        options = {"gravity": np.linalg.norm(dense.value("gravity"))}
+        if passes < MANY or self.scene.contact_pairs:
+            found = solve(*system, tau - dense.bias_force(self.qd, body_f), self.h, passes, **options)
+            return dense.integrate(found.v, self.h), found
+        v, found = self.qd, None
+        for count in (*EARLY, passes):
+            v = v if found is None else 0.5 * (v + found.v)
+            middle = Dense(self.scene, dense.integrate(v, 0.5 * self.h), v, self.world)
+            load = tau - middle.bias_force(v, body_f) + self._lift(middle) - self._lift(dense)
+            found = solve(*system, load, self.h, count, **options, outward=self._outward)
         return dense.integrate(found.v, self.h), found
+
+    @staticmethod
+    def _lift(dense):
+        """Return the part of passive_force that holds up bodies [dof]."""
+        scene = dense.scene.with_values(body_gravcomp=np.zeros(len(dense.scene.bodies)))
+        still = np.zeros(dense.dof_count)
+        return dense.passive_force(still) - Dense(scene, dense.q, world=dense.world).passive_force(still)
+
+    @property
+    def _outward(self):
+        """The dofs that a dof carries, of each hinge that has one dof; none where links share dofs."""
+        dense, tree, bodies = self.dense, self.scene.tree, range(len(self.scene.bodies))
+        dofs = [np.arange(dense.dof_count)[dense.dofs[i]] for i in bodies]
+        single = [] if self.scene.shares_dofs else [i for i in bodies if len(dofs[i]) == 1]
+        found = {}
+        for i in single:
+            beyond = np.zeros(dense.dof_count, dtype=bool)
+            beyond[[dof for j in bodies if j != i and tree.is_ancestor(i, j) for dof in dofs[j]]] = True
+            found[int(dofs[i][0])] = beyond
+        return found
 
     def _points(self):
         """Return the points; one that may touch a wall and a floor is two, and ``numbers`` says of which point."""

@@ -6,6 +6,7 @@ next one stays in the workspace, [world, dof] and [world, variable] of each pass
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -13,6 +14,7 @@ import warp as wp
 from ..execution.heights import HeightSums
 from ..execution.routine import Routine
 from ..recursions.contact.ground import CORNERS, corner_steps, surface_count
+from ..recursions.contact.middle import MIDDLE
 from ..recursions.contact.step import PASSES
 from ..recursions.derivatives import contact
 from ..recursions.derivatives.adjoints import result_name
@@ -20,6 +22,7 @@ from ..recursions.derivatives.contact import CAME, COTANGENT, HEIGHTS_AT, SOLVED
 from ..recursions.derivatives.contact_pass import BEFORE, NUMBER, ROW, contact_pass, count_laws, count_variables
 from ..recursions.tracing import Trace
 from ..scene.contacts import HEIGHTS, HeightField
+from . import rounds
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
@@ -29,8 +32,14 @@ def _divides(scene: Any, inputs: Any, apart: bool, **_: Any) -> bool:
     return apart
 
 
+def _reads_no_middle(scene: Any, inputs: Any, **_: Any) -> bool:
+    return MIDDLE not in inputs  # else the laws of a limb need the inertia of what it carries before its own sweep
+
+
 PASS = Routine("contact_pass", contact_pass, letters="Pzaf", crowded=True, wide=True)
-SOLVE = Routine("contact_solve", contact.contact_solve, letters="Pza", crowded=True, wide=True)
+SOLVE = Routine(
+    "contact_solve", contact.contact_solve, letters="Pza", divides=_reads_no_middle, crowded=True, wide=True
+)
 GRADIENT = Routine(
     "contact_gradient", contact.contact_gradient, letters="BGO", divides=_divides, crowded=True, wide=True
 )
@@ -51,8 +60,18 @@ def launch(
         passes: as of the step. given: arrays and numbers by name: arguments of the step, "qdd" that it found, and the
             cotangents of its results.
     """
-    launch, count = dyn._engine.launch_routine, PASSES if passes is None else passes
+    count = PASSES if passes is None else passes
     given = {name: value for name, value in given.items() if value is not None}
+    results = dict(zip(wrt, (out, *more.values()), strict=True))
+    if rounds.taken(dyn.scene, count):
+        rounds.pull_back(dyn, functools.partial(_launch, dyn), results, count, **given)
+    else:
+        _launch(dyn, results, count, **given)
+
+
+def _launch(dyn: Dynamics, asked: dict[str, wp.array], count: int, **given: Any) -> None:
+    """Launch the gradients of ``count`` passes into the arrays ``asked`` for by name."""
+    launch, wrt = dyn._engine.launch_routine, tuple(asked)
     read = {name: value for name, value in given.items() if name not in NOT_READ}
     read["passes"] = float(count)
     laws, dofs = _laws(dyn, tuple(read)), dyn.scene.dof_count
@@ -73,7 +92,7 @@ def launch(
     for number in reversed(range(count)):
         known[number] |= {"qdd": rates[number + 1], COTANGENT: left[number + 1]}
         launch(SOLVE, solved[number], {f"{COTANGENT}_out": left[number]}, **known[number], **read)
-    results = dict(zip(wrt, (out, *more.values()), strict=True))
+    results = dict(asked)
     ground, surfaces = dyn.scene.ground, len(dyn.scene.contact_points)
     if HEIGHTS in results:
         surfaces *= surface_count(ground, varies=True)
@@ -87,7 +106,7 @@ def launch(
         launch(GRADIENT, results[wrt[0]], bars, wrt=wrt, apart=apart, **known[number], **read)
     if HEIGHTS in wrt:
         assert isinstance(ground, HeightField)
-        summed = (out, *more.values())[wrt.index(HEIGHTS)]
+        summed = asked[HEIGHTS]
         if dyn._gradients.height_sums is None:
             dyn._gradients.height_sums = HeightSums(dyn.worlds * surfaces, summed.size, dyn.dtype, dyn.device)
         contributions = results[HEIGHTS].reshape((dyn.worlds * surfaces, CORNERS))

@@ -16,12 +16,13 @@ from ..kernels.substeps import SUBSTEPS
 from ..recursions import coordinates, hinge_forces
 from ..recursions import step as recursion
 from ..recursions.contact import pairs
-from ..recursions.contact import step as contact
 from ..recursions.impedance import DEFAULT_BOUND
 from ..recursions.loops import closed_step, multipliers
 from ..recursions.loops.closed_step import NEWTON_STEPS
 from ..scene.scene import Scene
+from . import rounds
 from .forward_dynamics import accelerations
+from .rounds import CONTACT_STEP
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
@@ -36,7 +37,6 @@ def _divides(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
 
 
 STEP = Routine("step", recursion.step, letters="PzaS", divides=_divides, passes=True, wide=True)
-CONTACT_STEP = Routine("contact_step", contact.step, letters="PzafSE", passes=True, counted=True, wide=True)
 PAIRED_STEP = Routine("paired_step", pairs.step, passes=True, counted=True)
 EMBEDDED_STEP = Routine("step", closed_step.step, passes=True)
 STEP_UNDER_MULTIPLIERS = Routine("step", closed_step.step_with_multipliers, passes=True)
@@ -90,6 +90,9 @@ def semi_implicit(
     given |= {SUBSTEPS: float(substeps)} if substeps > 1 else {}
     if dyn.scene.contacts:
         count = float(pairs.default_passes(dyn.scene) if passes is None else passes)
+        if rounds.taken(dyn.scene, count):
+            body_f = given.pop("body_f", None)
+            given[rounds.MIDDLE] = rounds.run(dyn, dt, q, qd, body_f, **given)[-1].bias
         given |= {"passes": count, "reports": tuple(reports or ()), **option}
         if dyn._pairs is not None:
             dyn._pairs.find(q)
@@ -102,11 +105,11 @@ def semi_implicit(
         _step_under_multipliers(dyn, q_out, qd_out, asked, option, q=q, qd=qd, dt=dt, **given)
 
 
-def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool) -> str:
+def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool, passes: int | None = None) -> str:
     """Return why substeps take a launch each; "" if one kernel takes all of them.
 
     Args:
-        acts: controls are given. delays: some are delayed.
+        acts: controls are given. delays: some are delayed. passes: of a step with contacts.
     """
     if integrator != "semi_implicit":
         return f"integrator={integrator!r} takes several"
@@ -114,6 +117,8 @@ def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool) -
         return "loops='multipliers' takes several"
     if dyn.scene.contact_pairs:
         return "the points that bodies share are found before each"
+    if passes is not None and rounds.taken(dyn.scene, passes):
+        return f"{passes} passes are preceded by rounds"
     if delays:
         return "delays of actuators count substeps"
     tendons = acts and any(len(actuator.hinges) > 1 for actuator in dyn.scene.actuators)

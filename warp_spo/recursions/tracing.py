@@ -43,6 +43,7 @@ class Trace:
         dampers, pushes: by id of the link: what contacts add to its articulated inertia, and to the forces on it; of a
             piece also for the link that it moves on.
         checks: stores that check a pass; they read their inputs anew, so that no register is kept for them.
+        instead: entries that take the place of those of an array, by its name.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class Trace:
         self.dampers: dict[int, Articulated] = {}
         self.pushes: dict[int, Vector] = {}
         self.checks: list[Store] = []
+        self.instead: dict[str, Callable[[int], Value]] = {}
         self._mail: dict[tuple[str, int], list[Value]] = {}  # messages between pieces of this trace
         self.own = set(map(id, links.links if piece is None else piece.links))
         self.active = set(self.own)
@@ -83,6 +85,8 @@ class Trace:
     # -- inputs ----------------------------------------------------------------------------------------------------
     def vector(self, name: str) -> Callable[[int], Value]:
         """Return ``entry(i)`` of an array; zero if the array is not among the inputs."""
+        if name in self.instead:
+            return self.instead[name]
         if name not in self.inputs:
             return lambda i: 0.0
         return lambda i: self.graph.input(name, i)

@@ -50,7 +50,8 @@ class Secant:
 
     Args:
         kept: variables of the passes. law: the law. qd, u: rate before the step; what the pass before added to it.
-        step_weight: h times the inverse inertia at the dof, which predicts how much faster a dof gets.
+        step_weight: h times the inverse inertia at the dof, which predicts how much faster a dof gets; a pass may know
+            a better one, see :meth:`finish`.
     """
 
     def __init__(self, kept: Kept, law: Law, qd: Value, u: Value, step_weight: Value):
@@ -102,16 +103,25 @@ class Secant:
         assert least is not None and most is not None
         return select(less(0.0, line), most, -least)
 
-    def finish(self, gain: Value) -> Value:
-        """Keep what the next pass reads, for u of this pass; return by how much the force exceeds its bound."""
+    @property
+    def resistance(self) -> Value:
+        """The resistance of the law's secant in this pass."""
+        return self.piece().resistance
+
+    def finish(self, gain: Value, step_weight: Value | None = None) -> Value:
+        """Keep what the next pass reads, for u of this pass; return by how much the force exceeds its bound.
+
+        ``step_weight``: that of this pass's own sweep; None: the one that the law was made with.
+        """
         law, x, kept = self.law, self.variable, self.kept
+        step_weight = self.step_weight if step_weight is None else step_weight
         if law.role == LIMIT:
             closed = less(0.0, self.inward * law.line(gain))
             kept.keep(x, select(closed, 1.0, select(kept.closing, select(x, HELD, 0.0), 0.0)))
             return 0.0
         if law.role == FRICTION:
             speed = absolute(self.qd + gain)
-            w = speed + self.step_weight * _positive(x * speed - law.scale)
+            w = speed + step_weight * _positive(x * speed - law.scale)
             kept.keep(x, law.scale * self._damper(w))
             return 0.0
         if x is None:
@@ -119,7 +129,7 @@ class Secant:
         line = law.line(gain)
         size, bound = absolute(line), _positive(self._bound(line))
         beyond = _positive(x * size - bound)
-        share = size + law.scale * law.resistance * (self.step_weight * beyond)
+        share = size + law.scale * law.resistance * (step_weight * beyond)
         kept.keep(x, select(less(bound, share), bound * reciprocal(share), 1.0))
         return law.scale * beyond
 

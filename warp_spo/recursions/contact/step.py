@@ -13,19 +13,22 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
+from ...scene.scene import Scene
 from ...status import Status
 from ...trace.emission import Store
 from ...trace.scalars import Value, branch, inverse_root, is_constant, less, reciprocal, select, sqrt
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
-from ..articulated_sweeps import expand, reduce
+from ..articulated_sweeps import Factors, expand, reduce
 from ..impedance import Law, add_laws
 from ..integration import integrate_link
 from ..kinematics import zero
 from ..links import Link
 from ..newton_euler import inverse_dynamics
 from ..pieces import Piece, Pieces
+from ..remembered import remembered
 from ..step import GAIN, Step
 from .dampers import SEVERAL, damper, load
+from .middle import MIDDLE
 from .points import Point, ground_place, own_points, place_points
 from .secants import Kept, Secant, largest
 
@@ -34,8 +37,17 @@ if TYPE_CHECKING:
 
 PASSES = 3  # what a step with contacts takes if the caller does not say
 TOLERANCE = 0.1  # share of the weight, or of an effort limit, by which the last pass may exceed its laws without a word
+FELT = 64.0  # roundings of a pivot; an inertia that is less of it may be rounding alone
 TINY = 1e-24  # square of a slip [m^2/s^2] that is nothing; its derivative is still a number in float32
 REPORTS = ("contact_f", "contact_gap", "contact_slip", "contact_excess")
+
+
+@remembered
+def single_dofs(scene: Scene) -> frozenset[int]:
+    """Return the dofs of the hinges that have one."""
+    return frozenset(
+        int(first) for hinge, first in zip(scene.hinges, scene.qd_start, strict=False) if hinge.dof_count == 1
+    )
 
 
 class Touch(NamedTuple):
@@ -66,8 +78,7 @@ class ContactStep(Step):
         For a piece, those after the last pass are the trace's ``news``.
         """
         trace, kept = self.trace, self.kept
-        found = inverse_dynamics(trace, qdd=zero, letter="f")
-        bias = {item.index[0]: item.value for item in found if item.array == "out"}
+        bias, sent_ahead = self._bias()
         points, touches = [], []
         for raw in place_points(trace, self.impedance, self.qd, "contact_f" in self.reports, branches=True):
             point, first = raw.settled(*self._first(raw))
@@ -87,7 +98,9 @@ class ContactStep(Step):
         efforts = []
         for link in self.links:
             trace.label(link, "u")
-            efforts += [law.finish(gains[dof]) for dof in link.dofs for law in self.secants[dof]]
+            efforts += [
+                law.finish(gains[dof], self._felt(law, link, done)) for dof in link.dofs for law in self.secants[dof]
+            ]
         cones, pulls, missed = self.coupled_excess()
         forces: dict[int, list[tuple[Point, Vector, Value]]] = {}  # by point
         for point, touch in zip(points, touches, strict=True):
@@ -103,12 +116,23 @@ class ContactStep(Step):
         if status or "contact_excess" in self.reports:
             trace.graph.step = "excess|e"
             self.excess = [self._last(largest(values)) for values in (cones, pulls, efforts, missed)]
-        trace.begin = [item for item in found if item.array != "out"] + kept.begin
+        trace.begin = sent_ahead + kept.begin
         after = self._after(qdd, status)
         if trace.piece is None:
             return passed + kept.end + after
         trace.news = after
         return sent + passed + kept.end
+
+    def _bias(self) -> tuple[dict[int, Value], list[Store]]:
+        """Return velocity terms, gravity and loads as forces of the dofs, and the stores that send for them."""
+        trace = self.trace
+        if MIDDLE in trace.inputs:
+            for link in trace.active_links:
+                trace.place(link)
+            return {dof: trace.vector(MIDDLE)(dof) for link in self.links for dof in link.dofs}, []
+        found = inverse_dynamics(trace, qdd=zero, letter="f")
+        bias = {item.index[0]: item.value for item in found if item.array == "out"}
+        return bias, [item for item in found if item.array != "out"]
 
     # -- bodies that touch each other ------------------------------------------------------------------------------
     def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, tuple[Vector, Vector]]) -> dict[int, Value]:
@@ -136,6 +160,18 @@ class ContactStep(Step):
             found.append(add_laws([law for law in laws if not law.bends] + pieces))
         self.forces |= {dof: piece.force for dof, piece in zip(link.dofs, found, strict=True)}
         return found
+
+    def _felt(self, law: Secant, link: Link, done: Factors) -> Value | None:
+        """Return h over the inertia that a law's dof feels in this pass without it; None: that of the neutral pose.
+
+        The sweep knows it of hinges with one dof, and it is asked for where velocity terms are given.
+        """
+        scene = self.trace.links.scene
+        if MIDDLE not in self.trace.inputs or scene.shares_dofs or link.dofs[0] not in single_dofs(scene):
+            return None
+        D = done[id(link)].pivots[0].D
+        felt, least = D - self.h * law.resistance, FELT * self.trace.epsilon * D
+        return self.h * reciprocal(select(less(least, felt), felt, least))
 
     # -- contacts --------------------------------------------------------------------------------------------------
     def _begin(self, point: Point) -> Touch:

@@ -23,22 +23,23 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ...scene.contacts import CONTACT_VALUES, HEIGHTS
 from ...trace.differentiation import reverse
 from ...trace.emission import Store
 from ...trace.scalars import Scalar, Value, cut, is_constant, less, ordered, select
 from ...trace.spatial import ZERO, Vector, dot, total
-from ..articulated_sweeps import expand, reduce
+from ..articulated_sweeps import Factors, expand, factor_tree, reduce
 from ..contact.ground import CORNERS
+from ..contact.middle import MEAN, MIDDLE, middle_bias
 from ..contact.points import Carried, Point, own_points, place_points, point_links, with_ancestors
 from ..integration import integrate_link
 from ..kinematics import carried_velocity
 from ..links import Link
 from ..motion import hinge_motion, whirl
 from ..pieces import Piece
-from .adjoints import entries, result_name
+from .adjoints import entries, gradient_stores, result_name
 from .contact_pass import NUMBER, OnePass
 from .power import Entry, Power, Ways
 
@@ -75,13 +76,20 @@ class PassAdjoint(OnePass):
         self.touches = [self._begin(point) for point in self.points]
         self.qdd = {dof: cut(trace.vector("qdd")(dof)) for dof in self.before}
         self.gains = {dof: self.h * rate for dof, rate in self.qdd.items()}
+        done = self._factors() if MIDDLE in trace.inputs else {}
         for link in self.links:
             for dof in link.dofs:
                 for law in self.secants[dof]:
-                    law.finish(self.gains[dof])
+                    law.finish(self.gains[dof], self._felt(law, link, done))
         self.moving = self._twists(self._or_input(self.qdd, "qdd"))
         touching = zip(self.points, self.touches, strict=True)
         self.loads = [self._finish(point, touch, self.moving)[0] for point, touch in touching]
+
+    def _factors(self) -> Factors:
+        """Return the factors of the pass, of a whole tree."""
+        self._press(self.points, self.touches)
+        self.trace.pushes, self.trace.stiffened = {}, self._stiffened
+        return factor_tree(self.trace)
 
     def _placed(self) -> list[Point]:
         """Return the contact points."""
@@ -250,11 +258,14 @@ class PassGradient(PassAdjoint):
         for (_, *at), way in zip(self.corners.values(), rest, strict=False):
             ways[(HEIGHTS, *at)] = way
         multiplier, qdd = self._or_input(self.solved, SOLVED), self._or_input(self.qdd, "qdd")
-        power = Power(trace, lambda dof: -multiplier(dof), qdd)
+        options: dict[str, Any] = {}
+        if MIDDLE in trace.inputs:  # velocity terms have a gradient of their own
+            trace.compensates, options = False, {"base": (ZERO, ZERO), "moves": False}
+        power = Power(trace, lambda dof: -multiplier(dof), qdd, **options)
         for entry, way in power.ways.items():
             ways[entry] = ways.get(entry, 0.0) + way
         for dof, value in self.solved.items():
-            ways["tau", dof] = value
+            ways["tau", dof], ways[MIDDLE, dof] = value, -value
         found: list[Store] = []
         for name in wrt:
             if name == HEIGHTS:
@@ -302,12 +313,24 @@ def contact_gradient(trace: Trace, laws: tuple[int, ...], wrt: tuple[str, ...], 
     return PassGradient(trace, laws).stores(wrt)
 
 
+def middle_bias_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
+    """J* (cotangent; mean_cotangent) of what a round leaves for the step, for the arguments ``wrt``"""
+    stores = middle_bias(trace)
+    names = {"out": "cotangent", f"{MEAN}_out": f"{MEAN}_cotangent"}
+    seeds = [trace.graph.input(names[item.array], *item.index) for item in stores]
+    results = [item.value for item in stores]
+    inputs = [x for x in ordered(results) if x.op == "input"]
+    found = dict(zip((x.args for x in inputs), reverse(results, inputs, seeds), strict=True))
+    return gradient_stores(trace, found, wrt, wrt)
+
+
 def divides(scene: Scene, variable: Collection[str], inputs: Collection[str], wrt: Collection[str]) -> bool:
     """Return whether limbs can share the gradients of a pass."""
     alone = all(len(actuator.hinges) == 1 for actuator in scene.actuators)
     lifted = "body_gravcomp" in variable or bool(scene.values["body_gravcomp"].any())
     alone &= len(scene.tree.roots) == 1 or ORIGIN not in wrt  # its gradient is added up towards the root
-    return alone and not lifted and "body_f" not in inputs and set(wrt) <= set(BY_PIECES)
+    alone &= not {"body_f", MIDDLE} & set(inputs)
+    return alone and not lifted and set(wrt) <= set(BY_PIECES)
 
 
 def _distinct(values: Iterable[Value]) -> list[Scalar]:

@@ -84,16 +84,24 @@ class Power:
 
     Args:
         multiplier, qdd: lambda and the accelerations, by dof: inputs, or what other recursions make.
-        base: acceleration of the inertial frame; gravity unless given.
+        base: acceleration of the inertial frame; gravity unless given. moves: links have velocities.
 
     Attributes:
         ways: gradient by entries of "q", "qd", "qdd", "body_f" and of the scene's values, by name and index.
         stores: messages to other pieces. forces: tau, by dof.
     """
 
-    def __init__(self, trace: Trace, multiplier: Entry, qdd: Entry, base: tuple[Vector, Vector] | None = None):
+    def __init__(
+        self,
+        trace: Trace,
+        multiplier: Entry,
+        qdd: Entry,
+        base: tuple[Vector, Vector] | None = None,
+        moves: bool = True,
+    ):
         self.trace, self.ways, self.stores = trace, Ways(), list[Store]()
         self.forces: dict[int, Value] = {}
+        self.rate: Entry = trace.vector("qd") if moves else lambda dof: 0.0
         self.multiplier, self.qdd = lambda dof: cut(multiplier(dof)), lambda dof: cut(qdd(dof))
         w, v = trace.base_acceleration if base is None else base
         inertial = Moving(ZERO, w, v, ZERO, ZERO)
@@ -119,7 +127,7 @@ class Power:
     def _moved(self, link: Link, carried: list[Vector]) -> Moving:
         """Return the motion of a link with its own rates added."""
         place, (spin, w, v, mu_w, mu_v, *_) = self.trace.places[id(link)], carried
-        rates = self.trace.vector("qd"), self.qdd, self.multiplier
+        rates = self.rate, self.qdd, self.multiplier
         (w_d, v_d), (w_dd, v_dd), (w_l, v_l) = (hinge_motion(link, place, rate) for rate in rates)
         moved = Moving(
             spin + w_d, w + cross(spin, w_d) + w_dd, v + 2.0 * cross(spin, v_d) + v_dd, mu_w + w_l, mu_v + v_l
