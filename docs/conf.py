@@ -1,5 +1,7 @@
 """Sphinx configuration: ``python -m sphinx -W -b html docs docs/_build``, without network."""
 
+import inspect
+import re
 import sys
 from pathlib import Path
 
@@ -60,6 +62,32 @@ def find_reference(app, env, node, content):
     return None
 
 
+def split_arguments(app, what, name, obj, options, lines):
+    """Give each argument a line of its own, where a docstring names several in one: ``rate: first. target: second.``"""
+    if "Args:" not in lines:
+        return
+    start = lines.index("Args:") + 1
+    stop = next((i for i in range(start, len(lines)) if not lines[i].startswith(" ")), len(lines))
+    taken = inspect.signature(obj).parameters if callable(obj) else {}
+    entries: list[str] = []
+    for line in lines[start:stop]:
+        if line.startswith("     ") and entries:
+            entries[-1] += " " + line.strip()
+        else:
+            entries.append(line)
+    apart = []
+    for entry in entries:
+        parts = re.split(r"(?<=[.;\])]) (?=\w+(?:, \w+)*: )", entry)
+        apart.append(parts[0])
+        for part in parts[1:]:
+            if re.split(r"[,:]", part)[0] in taken:
+                apart.append("    " + part)
+            else:
+                apart[-1] += " " + part
+    lines[start:stop] = apart
+
+
 def setup(app):
     """Add what this file does to Sphinx."""
     app.connect("missing-reference", find_reference)
+    app.connect("autodoc-process-docstring", split_arguments, priority=400)  # before napoleon, at 500
