@@ -12,11 +12,11 @@ Twists are (v; omega), wrenches (f; n), of the bodies' origins in inertial axes.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import warp as wp
 
-from . import coupling_matrices, coupling_passes
+from . import coupling_matrices, coupling_passes, coupling_points, touches
 from .elementary import C_TYPE
 from .touches import AWAY, HEADER, POINT
 
@@ -33,6 +33,7 @@ class Couples(NamedTuple):
         bodies: of each pair, numbers among those that move; -1 stands still. points: of each pair at most.
         eps, weight: of each pair: speed below which friction is a damper; inverse weight that predicts slip.
         blocks: first entry of each block of the bodies' response, by body and body not before it; -1 is zero.
+        solids: their shapes, with ``size``, ``lists`` and ``reals``.
     """
 
     bodies: tuple[tuple[int, int], ...]
@@ -40,6 +41,7 @@ class Couples(NamedTuple):
     eps: tuple[float, ...]
     weight: tuple[float, ...]
     blocks: tuple[tuple[int, ...], ...]
+    solids: Any
 
 
 def entries(points: Sequence[int]) -> tuple[int, ...]:
@@ -63,24 +65,30 @@ def declare(couples: Couples, T: type) -> str:
         "POINTS": couples.points, "FIRST_POINT": first[:-1], "ENTRY": entries(couples.points)[:-1],
         "BLOCK": [entry for row in couples.blocks for entry in row] or [-1],
     }  # fmt: skip
+    lists |= {name.upper(): row for name, row in couples.solids.lists.items()}
     reals = {"EPS": couples.eps, "WEIGHT": couples.weight}
-    tables = [_table("int", f"{name.lower()}_of", [str(x) for x in row], pairs <= FEW) for name, row in lists.items()]
+    reals |= {name.upper(): tuple(row) for name, row in couples.solids.reals.items()}
+    tables = [table("int", f"{name.lower()}_of", [str(x) for x in row], pairs <= FEW) for name, row in lists.items()]
     tables += [
-        _table(c, f"{name.lower()}_of", [f"{x!r}{number}" for x in row], pairs <= FEW) for name, row in reals.items()
+        table(c, f"{name.lower()}_of", [f"{x!r}{number}" for x in row], pairs <= FEW) for name, row in reals.items()
     ]
     sizes = {
         "PAIRS": pairs, "BODIES": bodies, "ROWS": 6 * together, "LARGEST": EXACT, "SWEEPS": SWEEPS,
         "HEADER": HEADER, "POINT": POINT, "ALONE": pairs if apart else 1, "FEW": int(pairs <= FEW),
     }  # fmt: skip
     text = NATIVE.replace("REAL", c).replace("FUSED", f"FUSED_{c}").replace("TABLES", "\n    ".join(tables))
-    text = text.replace("TINY", "1e-6f" if T is wp.float32 else "1e-13").replace("AWAY", f"{AWAY!r}{number}")
+    text = (
+        text.replace("NOTHING", f"1e-24{number}")
+        .replace("TINY", "1e-6f" if T is wp.float32 else "1e-13")
+        .replace("AWAY", f"{AWAY!r}{number}")
+    )
     each = "#pragma unroll" if pairs <= FEW else "#pragma unroll 1"
     for word, pragma in (("UNROLL", "#pragma unroll"), ("EACH", each), ("LOOP", "#pragma unroll 1")):
         text = text.replace(f"{word}\n", f"{pragma}\n")
     constants = ", ".join(f"{name} = {value}" for name, value in sizes.items())
-    own = {"across": first[-1], "closed": first[-1], "candidate": first[-1], "force": 6 * pairs, "place": 7 * pairs}
+    own = {"across": first[-1], "closed": first[-1], "candidate": first[-1], "force": 6 * pairs, "arm": 7 * pairs}
     arrays = [f"{c} pair_{name}_row[{count}] = {{}};" for name, count in own.items()]
-    return "\n".join([text.replace("CONSTANTS", constants), *arrays])
+    return "\n".join([touches.native(T), text.replace("CONSTANTS", constants), *arrays])
 
 
 def shared_arrays(couples: Couples) -> dict[str, int]:
@@ -88,11 +96,16 @@ def shared_arrays(couples: Couples) -> dict[str, int]:
     pairs, bodies = len(couples.bodies), len(couples.blocks)
     response = 1 + max((entry for row in couples.blocks for entry in row), default=0)
     sizes = {"value": VALUES * pairs + 1, "response": response + 35, "report": REPORTS * pairs + EXCESS}
-    sizes |= {"start": max(6 * bodies, 1), "twist": 6 * bodies + 1, "wrench": max(6 * bodies, 1)}
+    sizes |= {
+        "place": couples.solids.size,
+        "start": max(6 * bodies, 1),
+        "twist": 6 * bodies + 1,
+        "wrench": max(6 * bodies, 1),
+    }
     return {f"pair_{name}": size for name, size in sizes.items()}
 
 
-def _table(c: str, name: str, row: list[str], few: bool) -> str:
+def table(c: str, name: str, row: list[str], few: bool) -> str:
     """Return a function that gives an entry of a list; of a short list without memory, so that a compiler folds it."""
     if few:
         body = "".join(f"i == {i} ? {x} : " for i, x in enumerate(row[:-1])) + row[-1]
@@ -102,12 +115,14 @@ def _table(c: str, name: str, row: list[str], few: bool) -> str:
 
 
 BEGIN = """
-coupling::begin(pair_value_row, pair_start_row, touches.data + world, worlds, dt_row[0],
-    pair_place_row, pair_across_row, pair_closed_row, pair_candidate_row);
+coupling::begin(pair_value_row, pair_start_row, pair_place_row, touches.data + world, worlds, dt_row[0],
+    pair_arm_row, pair_across_row, pair_closed_row, pair_candidate_row);
 """
 PASS = """
 coupling::pass(pair_value_row, pair_twist_row, pair_response_row, touches.data + world, worlds, dt_row[0],
-    pair_twist_row[6 * BODIES] > 0, pair_place_row, pair_across_row, pair_closed_row, pair_candidate_row,
+    pair_twist_row[6 * BODIES] > 0, pair_arm_row, pair_across_row, pair_closed_row, pair_candidate_row,
     pair_force_row, pair_wrench_row, pair_report_row);
 """
-NATIVE = coupling_passes.NATIVE.replace("MATRICES", coupling_matrices.NATIVE.strip())
+NATIVE = coupling_passes.NATIVE.replace("POINTS", coupling_points.NATIVE + "\n").replace(
+    "MATRICES", coupling_matrices.NATIVE.strip()
+)

@@ -13,8 +13,8 @@ NATIVE = r"""// K = L L*; a column whose pivot is rounding alone is zero.
             EACH
             for (int k = 0; k < j; ++k) d = FUSED(-K[j * (j + 1) / 2 + k], K[j * (j + 1) / 2 + k], d);
             const bool counts = !(d <= least);
-            const REAL size = counts ? sqrt(d) : 0, inverse = counts ? 1 / size : 0;
-            K[j * (j + 1) / 2 + j] = size;
+            const REAL inverse = counts ? on::inverse_root(d) : 0;
+            K[j * (j + 1) / 2 + j] = d * inverse;
             UNROLL
             for (int i = j + 1; i < 6; ++i) {
                 REAL x = K[i * (i + 1) / 2 + j];
@@ -88,7 +88,7 @@ NATIVE = r"""// K = L L*; a column whose pivot is rounding alone is zero.
             REAL d = row[i];
             EACH
             for (int k = 0; k < i; ++k) d = FUSED(-row[k], row[k], d);
-            row[i] = 1 / sqrt(d);  // the diagonal holds inverses
+            row[i] = on::inverse_root(d);  // the diagonal holds inverses
         }
     }
 

@@ -10,77 +10,7 @@ struct coupling
 {
     TABLES
 
-    typedef REAL Triangle[21];  // the lower triangle of a matrix, row after row
-
-    // a += b x c
-    static CUDA_CALLABLE inline void add_cross(REAL* a, const REAL* b, const REAL* c)
-    {
-        a[0] = FUSED(b[1], c[2], FUSED(-b[2], c[1], a[0]));
-        a[1] = FUSED(b[2], c[0], FUSED(-b[0], c[2], a[1]));
-        a[2] = FUSED(b[0], c[1], FUSED(-b[1], c[0], a[2]));
-    }
-
-    static CUDA_CALLABLE inline REAL dot(const REAL* a, const REAL* b)
-    {
-        return FUSED(a[0], b[0], FUSED(a[1], b[1], a[2] * b[2]));
-    }
-
-    // A pair at its pose: where its reference point lies from the bodies' origins, and how many points come first.
-    struct Pair
-    {
-        REAL arm[2][3];
-        int body[2], count;
-
-        CUDA_CALLABLE inline void relative(const REAL* twist, REAL* t) const
-        {
-            UNROLL
-            for (int i = 0; i < 6; ++i) t[i] = 0;
-            UNROLL
-            for (int side = 0; side < 2; ++side) {
-                if (body[side] < 0) continue;
-                REAL v[6];
-                UNROLL
-                for (int i = 0; i < 6; ++i) v[i] = twist[6 * body[side] + i];
-                add_cross(v, v + 3, arm[side]);
-                UNROLL
-                for (int i = 0; i < 6; ++i) t[i] += side ? -v[i] : v[i];
-            }
-        }
-
-        CUDA_CALLABLE inline void push(const REAL* force, REAL* wrench) const
-        {
-            UNROLL
-            for (int side = 0; side < 2; ++side) {
-                if (body[side] < 0) continue;
-                REAL f[6];
-                UNROLL
-                for (int i = 0; i < 6; ++i) f[i] = side ? -force[i] : force[i];
-                add_cross(f + 3, arm[side], f);
-                UNROLL
-                for (int i = 0; i < 6; ++i) wrench[6 * body[side] + i] += f[i];
-            }
-        }
-    };
-
-    // A point of a pair.
-    struct Touch
-    {
-        REAL at[3], normal[3], depth;
-
-        CUDA_CALLABLE inline Touch(const REAL* touches, long long worlds, int pair, int point)
-        {
-            const REAL* from = touches + (entry_of(pair) + HEADER + POINT * point) * worlds;
-            UNROLL
-            for (int c = 0; c < 3; ++c) {
-                at[c] = from[c * worlds];
-                normal[c] = from[(3 + c) * worlds];
-            }
-            depth = from[6 * worlds];
-        }
-
-        CUDA_CALLABLE inline bool missing() const { return depth < (REAL)(0.5) * AWAY; }
-    };
-
+    POINTS
     static CUDA_CALLABLE inline Pair find(int pair, const REAL* touches, long long worlds)
     {
         Pair found = {{{0, 0, 0}, {0, 0, 0}}, {first_body_of(pair), second_body_of(pair)}, 0};
@@ -118,34 +48,12 @@ struct coupling
         return found;
     }
 
-    // Velocity of a point with a relative twist; returns its part along the normal, and the size of the rest.
-    static CUDA_CALLABLE inline REAL rate(const REAL* twist, const Pair& pair, const Touch& touch, REAL* v, REAL& slip)
-    {
-        REAL arm[3];
-        UNROLL
-        for (int c = 0; c < 3; ++c) {
-            arm[c] = touch.at[c] - pair.arm[0][c];
-            v[c] = twist[c];
-        }
-        add_cross(v, twist + 3, arm);
-        const REAL normal = dot(v, touch.normal);
-        REAL rest[3];
-        UNROLL
-        for (int c = 0; c < 3; ++c) rest[c] = v[c] - touch.normal[c] * normal;
-        slip = sqrt(dot(rest, rest));
-        return normal;
-    }
-
-    static CUDA_CALLABLE inline REAL damper(REAL friction, REAL fn, REAL w, int pair)
-    {
-        return friction * fn / sqrt(w * w + eps_of(pair) * eps_of(pair));
-    }
-
-    static CUDA_CALLABLE inline void begin(const REAL* value, const REAL* start, const REAL* touches, long long worlds,
-        REAL h, REAL* place, REAL* across, REAL* closed, REAL* candidate)
+    static CUDA_CALLABLE inline void begin(const REAL* value, const REAL* start, const REAL* places, REAL* touches,
+        long long worlds, REAL h, REAL* place, REAL* across, REAL* closed, REAL* candidate)
     {
         EACH
         for (int p = 0; p < PAIRS; ++p) {
+            find_points(p, places, 1, touches, worlds);
             const Pair pair = find(p, touches, worlds);
             keep(pair, place + 7 * p);
             if (!pair.count) continue;
@@ -156,11 +64,9 @@ struct coupling
             for (int i = 0; i < pair.count; ++i) {
                 const Touch touch(touches, worlds, p, i);
                 const REAL normal = rate(twist, pair, touch, v, slip);
-                const bool near = touch.depth + (normal < 0 ? -(h * normal) : 0) + value[3 * PAIRS] > 0;
-                const REAL push = k * touch.depth - kd * normal;
                 const int at = first_point_of(p) + i;
-                candidate[at] = closed[at] = near;
-                across[at] = near && push > 0 ? damper(value[3 * p + 2], push, slip, p) : 0;
+                candidate[at] = closed[at] =
+                    begin_point(touch, p, normal, slip, h, k, kd, value[3 * p + 2], value[3 * PAIRS], across[at]);
             }
         }
     }
@@ -181,36 +87,7 @@ struct coupling
             const REAL a = across[at], shut = closed[at];
             if (!(a > 0 || shut > 0)) continue;
             touching = true;
-            const Touch touch(touches, worlds, p, i);
-            REAL s[3], w[6];
-            UNROLL
-            for (int c = 0; c < 3; ++c) {
-                s[c] = touch.at[c] - pair.arm[0][c];
-                w[c] = touch.normal[c];
-                w[3 + c] = 0;
-            }
-            add_cross(w + 3, s, w);
-            const REAL along = shut * kd - a, push = shut * k * touch.depth, square = dot(s, s);
-            UNROLL
-            for (int r = 0, e = 0; r < 6; ++r) {
-                f0[r] = FUSED(push, w[r], f0[r]);
-                UNROLL
-                for (int c = 0; c <= r; ++c, ++e) K[e] = FUSED(along * w[r], w[c], K[e]);
-            }
-            UNROLL
-            for (int r = 0; r < 3; ++r) {
-                K[r * (r + 1) / 2 + r] += a;
-                UNROLL
-                for (int c = 0; c <= r; ++c)
-                    K[(r + 3) * (r + 4) / 2 + c + 3] += a * ((r == c ? square : 0) - s[r] * s[c]);
-            }
-            // [s]x, rows n, columns f
-            K[6 + 1] -= a * s[2];
-            K[6 + 2] += a * s[1];
-            K[10 + 0] += a * s[2];
-            K[10 + 2] -= a * s[0];
-            K[15 + 0] -= a * s[1];
-            K[15 + 1] += a * s[0];
+            add_point(pair, Touch(touches, worlds, p, i), a, shut, k, kd, K, f0);
         }
         return touching;
     }
@@ -419,20 +296,18 @@ UNROLL
             const Touch touch(touches, worlds, p, i);
             const int at = first_point_of(p) + i;
             const REAL normal = rate(twist, pair, touch, v, slip);
-            const REAL push = k * touch.depth - kd * normal, pushed = closed[at] > 0 ? push : 0;
-            const REAL fn = pushed > 0 ? pushed : 0, cone = across[at] * slip - friction * fn;
-            const REAL over = cone > 0 ? cone : 0, lacking = closed[at] > 0 || !(push > 0) ? 0 : push;
+            bool shut = closed[at] > 0, near = candidate[at] > 0;
+            const After after(touch, p, normal, slip, h, k, kd, friction, closing, across[at], shut, near);
             if (touch.depth > deepest) {
                 deepest = touch.depth;
                 report[5 * p + 3] = -deepest;
                 report[5 * p + 4] = slip;
             }
-            across[at] = damper(friction, fn, slip + h * weight_of(p) * over, p);
-            candidate[at] = candidate[at] > 0 || touch.depth - h * normal > 0;
-            closed[at] = (closing && closed[at] > 0) || (candidate[at] > 0 && push > 0);
-            excess[0] = over > excess[0] ? over : excess[0];
-            excess[1] = -pushed > excess[1] ? -pushed : excess[1];
-            excess[2] = candidate[at] * lacking > excess[2] ? candidate[at] * lacking : excess[2];
+            closed[at] = shut;
+            candidate[at] = near;
+            excess[0] = after.over > excess[0] ? after.over : excess[0];
+            excess[1] = after.pull > excess[1] ? after.pull : excess[1];
+            excess[2] = after.lacking > excess[2] ? after.lacking : excess[2];
         }
     }
 };

@@ -1,228 +1,352 @@
 """Points that two convex shapes share: segments with radii, spheres and boxes, boxes and boxes by clipped faces.
 
-A thread works on one pair in one world. The array of touches is [entry, world]. A pair has a header, the origin of the
+The array of touches is [entry, world]. A pair has a header, the origin of the
 second body from that of the first, and then POINT entries for each of its points: place from the first body's origin,
-normal towards the first body, depth; all in inertial axes. Points that are not there are AWAY deep.
+normal towards the first body, depth; all in inertial axes. Points that are not there are AWAY deep, and come last.
 """
-
-import functools
 
 import warp as wp
 
+from .elementary import C_TYPE
+
 HEADER, POINT, AWAY = 3, 7, -1e3
-ENTRIES = 11  # of a shape: its pose in the body, half its sizes, its radius
+MOST = 8  # points of two boxes
 LEAD = 0.05  # share of the smallest half size by which the second box must be farther away to give the common face
 
 
-@functools.cache
-def find_touches(T) -> wp.Kernel:
-    """Write the touches of all pairs.
-
-    Inputs are the poses of frames [world, frame, 7]; for each pair (frame, frame, kind, kind, first entry of its
-    touches), with 0 for shapes with a radius and 1 for boxes; and the shapes [2 pair, ENTRIES].
-    """
-    vec, quat, mat = wp.types.vector(3, T), wp.types.quaternion(T), wp.types.matrix((3, 3), T)
-    polygon = wp.types.matrix((8, 3), T)
-
-    @wp.struct
-    class Placed:
-        at: vec
-        turn: mat
-        size: vec
-        radius: T
-
-    @wp.struct
-    class Touch:
-        at: vec
-        normal: vec
-        depth: T
-
-    @wp.struct
-    class Face:
-        apart: T
-        axis: int
-        sign: T
-
-    @wp.func
-    def turn_of(x: T, y: T, z: T, w: T):
-        return wp.quat_to_matrix(wp.normalize(quat(x, y, z, w)))
-
-    @wp.func
-    def place(origin: vec, turn: mat, shapes: wp.array2d[T], row: int):
-        found = Placed()
-        local = vec(shapes[row, 0], shapes[row, 1], shapes[row, 2])
-        found.at = origin + turn * local
-        found.turn = turn * turn_of(shapes[row, 3], shapes[row, 4], shapes[row, 5], shapes[row, 6])
-        found.size = vec(shapes[row, 7], shapes[row, 8], shapes[row, 9])
-        found.radius = shapes[row, 10]
-        return found
-
-    @wp.func
-    def rounds(a: Placed, b: Placed):
-        """Ericson 2005, section 5.1.9."""
-        one, zero = T(1.0), T(0.0)
-        u = a.turn * vec(zero, zero, T(2.0) * a.size[2])
-        v = b.turn * vec(zero, zero, T(2.0) * b.size[2])
-        p, q = a.at - T(0.5) * u, b.at - T(0.5) * v
-        w = p - q
-        uu, vv, uv, uw, vw = wp.dot(u, u), wp.dot(v, v), wp.dot(u, v), wp.dot(u, w), wp.dot(v, w)
-        s = T(0.0)
-        t = T(0.0)
-        if uu == zero:
-            if vv > zero:
-                t = wp.clamp(vw / vv, zero, one)
-        elif vv == zero:
-            s = wp.clamp(-uw / uu, zero, one)
-        else:
-            across = uu * vv - uv * uv
-            s = T(0.5)
-            if across > T(1.0e-6) * uu * vv:
-                s = wp.clamp((uv * vw - uw * vv) / across, zero, one)
-            t = (uv * s + vw) / vv
-            if t < zero or t > one:
-                t = wp.clamp(t, zero, one)
-                s = wp.clamp((uv * t - uw) / uu, zero, one)
-        x, y = p + s * u, q + t * v
-        distance = wp.length(x - y)
-        found = Touch()
-        found.normal = vec(zero, zero, one)
-        if distance > zero:
-            found.normal = (x - y) / distance
-        found.at = T(0.5) * (x - a.radius * found.normal + y + b.radius * found.normal)
-        found.depth = a.radius + b.radius - distance
-        return found
-
-    @wp.func
-    def ball_in_box(ball: Placed, box: Placed):
-        """The normal leads out of the box."""
-        local = wp.transpose(box.turn) * (ball.at - box.at)
-        inside = vec(
-            wp.clamp(local[0], -box.size[0], box.size[0]),
-            wp.clamp(local[1], -box.size[1], box.size[1]),
-            wp.clamp(local[2], -box.size[2], box.size[2]),
-        )
-        distance = wp.length(local - inside)
-        normal = vec(T(0.0), T(0.0), T(0.0))
-        if distance > T(0.0):
-            normal = (local - inside) / distance
-        else:
-            axis = int(0)
-            for i in range(1, 3):
-                if box.size[i] - wp.abs(local[i]) < box.size[axis] - wp.abs(local[axis]):
-                    axis = i
-            distance = wp.abs(local[axis]) - box.size[axis]
-            normal[axis] = wp.where(local[axis] >= T(0.0), T(1.0), T(-1.0))
-        found = Touch()
-        found.depth = ball.radius - distance
-        found.normal = box.turn * normal
-        found.at = box.at + box.turn * (local - (distance + T(0.5) * found.depth) * normal)
-        return found
-
-    @wp.func
-    def farthest(one: Placed, other: Placed):
-        """The face of a box from which another box is farthest."""
-        offset = wp.transpose(one.turn) * (other.at - one.at)
-        across = wp.transpose(one.turn) * other.turn
-        found = Face()
-        found.axis = int(-1)
-        for i in range(3):
-            reach = T(0.0)
-            for j in range(3):
-                reach += wp.abs(across[i, j]) * other.size[j]
-            apart = wp.abs(offset[i]) - one.size[i] - reach
-            if found.axis < 0 or apart > found.apart:
-                found.apart = apart
-                found.axis = i
-                found.sign = wp.where(offset[i] >= T(0.0), T(1.0), T(-1.0))
-        return found
-
-    @wp.func
-    def axis_of(turn: mat, i: int):
-        return vec(turn[0, i], turn[1, i], turn[2, i])
-
-    @wp.func
-    def write(out: wp.array2d[T], entry: int, world: int, at: vec, normal: vec, depth: T):
-        for c in range(3):
-            out[entry + c, world] = at[c]
-            out[entry + 3 + c, world] = normal[c]
-        out[entry + 6, world] = depth
-
-    @wp.func
-    def faces(a: Placed, b: Placed, out: wp.array2d[T], entry: int, world: int):
-        """A face of one box, clipped by the sides of the nearest face of the other."""
-        first, second = farthest(a, b), farthest(b, a)
-        swap = second.apart > first.apart + T(LEAD) * wp.min(wp.min(a.size), wp.min(b.size))
-        here, there, face = a, b, first
-        if swap:
-            here = b
-            there = a
-            face = second
-        normal = face.sign * axis_of(here.turn, face.axis)
-        toward = wp.transpose(there.turn) * normal
-        side = int(0)
-        for i in range(1, 3):
-            if wp.abs(toward[i]) > wp.abs(toward[side]):
-                side = i
-        j, k = (side + 1) % 3, (side + 2) % 3
-        u, v = there.size[j] * axis_of(there.turn, j), there.size[k] * axis_of(there.turn, k)
-        middle = there.at - wp.sign(toward[side]) * there.size[side] * axis_of(there.turn, side)
-        corners = polygon()
-        corners[0] = middle + u + v
-        corners[1] = middle - u + v
-        corners[2] = middle - u - v
-        corners[3] = middle + u - v
-        count = int(4)
-        for cut in range(4):
-            i = (face.axis + 1 + cut / 2) % 3
-            across = wp.where(cut % 2 == 0, T(1.0), T(-1.0)) * axis_of(here.turn, i)
-            limit = here.size[i] + wp.dot(across, here.at)
-            kept = polygon()
-            number = int(0)
-            for at in range(count):
-                p, q = corners[at], corners[(at + 1) % count]
-                x, y = wp.dot(across, p) - limit, wp.dot(across, q) - limit
-                if x <= T(0.0) and number < 8:
-                    kept[number] = p
-                    number += 1
-                if ((x < T(0.0) and y > T(0.0)) or (y < T(0.0) and x > T(0.0))) and number < 8:
-                    kept[number] = p + (x / (x - y)) * (q - p)
-                    number += 1
-            corners = kept
-            count = number
-        for at in range(8):
-            depth = T(AWAY)
-            corner = vec(T(0.0), T(0.0), T(0.0))
-            if at < count:
-                corner = corners[at]
-                depth = here.size[face.axis] - wp.dot(normal, corner - here.at)
-                corner = corner + T(0.5) * depth * normal
-            write(out, entry + POINT * at, world, corner, wp.where(swap, normal, -normal), depth)
-
-    @wp.kernel(module=f"warp_spo_touches_{T.__name__}", enable_backward=False)
-    def kernel(poses: wp.array3d[T], pairs: wp.array2d[int], shapes: wp.array2d[T], touches_out: wp.array2d[T]):
-        pair, world = wp.tid()
-        i, j, header = pairs[pair, 0], pairs[pair, 1], pairs[pair, 4]
-        origin = vec(poses[world, i, 0], poses[world, i, 1], poses[world, i, 2])
-        between = vec(poses[world, j, 0], poses[world, j, 1], poses[world, j, 2]) - origin
-        turn = turn_of(poses[world, i, 3], poses[world, i, 4], poses[world, i, 5], poses[world, i, 6])
-        a = place(vec(T(0.0), T(0.0), T(0.0)), turn, shapes, 2 * pair)
-        turn = turn_of(poses[world, j, 3], poses[world, j, 4], poses[world, j, 5], poses[world, j, 6])
-        b = place(between, turn, shapes, 2 * pair + 1)
-        for c in range(3):
-            touches_out[header + c, world] = between[c]
-        entry = header + HEADER
-        if pairs[pair, 2] == 1 and pairs[pair, 3] == 1:
-            faces(a, b, touches_out, entry, world)
-        else:
-            touch = rounds(a, b)
-            if pairs[pair, 2] == 1:
-                touch = ball_in_box(b, a)
-                touch.normal = -touch.normal
-            elif pairs[pair, 3] == 1:
-                touch = ball_in_box(a, b)
-            write(touches_out, entry, world, touch.at, touch.normal, touch.depth)
-
-    return kernel
+def native(T: type) -> str:
+    """Return the definition of ``solids`` for scalars of type ``T``."""
+    number = "f" if T is wp.float32 else ""
+    text = NATIVE.replace("REAL", C_TYPE[T]).replace("UNROLL\n", "#pragma unroll\n")
+    for name, value in {"AWAY": AWAY, "LEAD": LEAD, "PARALLEL": 1e-6}.items():
+        text = text.replace(name, f"{value!r}{number}")
+    return text.replace("POINT", str(POINT)).replace("MOST", str(MOST))
 
 
-KERNELS = (find_touches,)
+NATIVE = r"""
+struct solids
+{
+    // A shape at its pose, a box if ``box``, else all points within ``radius`` of a segment along its z axis.
+    struct Solid
+    {
+        REAL at[3], turn[9], size[3], radius;
+        bool box;
+    };
+
+    static CUDA_CALLABLE inline REAL dot(const REAL* a, const REAL* b)
+    {
+        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    }
+
+    static CUDA_CALLABLE inline REAL size_of(REAL x) { return x < 0 ? -x : x; }
+
+    static CUDA_CALLABLE inline REAL within(REAL x, REAL low, REAL high) { return x < low ? low : x > high ? high : x; }
+
+    static CUDA_CALLABLE inline REAL pick(int i, REAL a, REAL b, REAL c) { return i == 0 ? a : i == 1 ? b : c; }
+
+    static CUDA_CALLABLE inline void axis_of(const Solid& solid, int i, REAL* axis)
+    {
+        UNROLL
+        for (int r = 0; r < 3; ++r)
+            axis[r] = pick(i, solid.turn[3 * r], solid.turn[3 * r + 1], solid.turn[3 * r + 2]);
+    }
+
+    // Where the points of a pair go, ``apart`` values from each other.
+    struct Out
+    {
+        REAL* to;
+        long long apart;
+        int count;
+
+        CUDA_CALLABLE inline void put(const REAL* at, const REAL* normal, REAL depth)
+        {
+            if (count >= MOST) return;
+            REAL* entry = to + POINT * count * apart;
+            UNROLL
+            for (int c = 0; c < 3; ++c) {
+                entry[c * apart] = at[c];
+                entry[(3 + c) * apart] = normal[c];
+            }
+            entry[6 * apart] = depth;
+            ++count;
+        }
+    };
+
+    // Ericson 2005, section 5.1.9.
+    static CUDA_CALLABLE inline void rounds(const Solid& a, const Solid& b, Out& out)
+    {
+        REAL u[3], v[3], w[3], x[3], y[3];
+        UNROLL
+        for (int r = 0; r < 3; ++r) {
+            u[r] = 2 * a.size[2] * a.turn[3 * r + 2];
+            v[r] = 2 * b.size[2] * b.turn[3 * r + 2];
+            x[r] = a.at[r] - a.size[2] * a.turn[3 * r + 2];
+            y[r] = b.at[r] - b.size[2] * b.turn[3 * r + 2];
+            w[r] = x[r] - y[r];
+        }
+        const REAL uu = dot(u, u), vv = dot(v, v), uv = dot(u, v), uw = dot(u, w), vw = dot(v, w);
+        REAL s = 0, t = 0;
+        if (uu == 0) {
+            if (vv > 0) t = within(vw / vv, 0, 1);
+        } else if (vv == 0) {
+            s = within(-uw / uu, 0, 1);
+        } else {
+            const REAL across = uu * vv - uv * uv;
+            s = across > PARALLEL * uu * vv ? within((uv * vw - uw * vv) / across, 0, 1) : (REAL)0.5;
+            t = (uv * s + vw) / vv;
+            if (t < 0 || t > 1) {
+                t = within(t, 0, 1);
+                s = within((uv * t - uw) / uu, 0, 1);
+            }
+        }
+        REAL normal[3];
+        UNROLL
+        for (int r = 0; r < 3; ++r) {
+            x[r] += s * u[r];
+            y[r] += t * v[r];
+            normal[r] = x[r] - y[r];
+        }
+        const REAL distance = sqrt(dot(normal, normal));
+        UNROLL
+        for (int r = 0; r < 3; ++r) {
+            normal[r] = distance > 0 ? normal[r] / distance : r == 2;
+            x[r] = (REAL)0.5 * (x[r] - a.radius * normal[r] + y[r] + b.radius * normal[r]);
+        }
+        out.put(x, normal, a.radius + b.radius - distance);
+    }
+
+    // The normal leads out of the box, or into it where ``inward``.
+    static CUDA_CALLABLE inline void ball_in_box(const Solid& ball, const Solid& box, bool inward, Out& out)
+    {
+        REAL offset[3], local[3], apart[3], normal[3], at[3], distance = 0;
+        UNROLL
+        for (int r = 0; r < 3; ++r) offset[r] = ball.at[r] - box.at[r];
+        UNROLL
+        for (int i = 0; i < 3; ++i) {
+            local[i] = box.turn[i] * offset[0] + box.turn[3 + i] * offset[1] + box.turn[6 + i] * offset[2];
+            apart[i] = local[i] - within(local[i], -box.size[i], box.size[i]);
+        }
+        distance = sqrt(dot(apart, apart));
+        if (distance > 0) {
+            UNROLL
+            for (int i = 0; i < 3; ++i) apart[i] /= distance;
+        } else {
+            int nearest = 0;
+            REAL least = box.size[0] - size_of(local[0]);
+            UNROLL
+            for (int i = 1; i < 3; ++i) {
+                const REAL left = box.size[i] - size_of(local[i]);
+                nearest = left < least ? i : nearest;
+                least = left < least ? left : least;
+            }
+            distance = -least;
+            UNROLL
+            for (int i = 0; i < 3; ++i) apart[i] = i != nearest ? 0 : local[i] >= 0 ? 1 : -1;
+        }
+        const REAL depth = ball.radius - distance;
+        UNROLL
+        for (int i = 0; i < 3; ++i) local[i] -= (distance + (REAL)0.5 * depth) * apart[i];
+        UNROLL
+        for (int r = 0; r < 3; ++r) {
+            normal[r] = dot(box.turn + 3 * r, apart);
+            at[r] = box.at[r] + dot(box.turn + 3 * r, local);
+            normal[r] = inward ? -normal[r] : normal[r];
+        }
+        out.put(at, normal, depth);
+    }
+
+    // A corner or a crossing of the polygon, in the common face: across it, and how deep.
+    struct Corner
+    {
+        REAL x, y, depth;
+
+        CUDA_CALLABLE inline Corner towards(const Corner& b, REAL share) const
+        {
+            return {x + share * (b.x - x), y + share * (b.y - y), depth + share * (b.depth - depth)};
+        }
+    };
+
+    // The face that both boxes share: where it is, and half its widths.
+    struct Face
+    {
+        REAL at[3], one[3], other[3], normal[3], outward[3], half, width, height;
+
+        CUDA_CALLABLE inline void put(const Corner& corner, Out& out) const
+        {
+            REAL place[3];
+            UNROLL
+            for (int r = 0; r < 3; ++r)
+                place[r] = at[r] + one[r] * corner.x + other[r] * corner.y
+                    + normal[r] * (half - (REAL)0.5 * corner.depth);
+            out.put(place, outward, corner.depth);
+        }
+
+        // Puts the first corner of an edge if it is not cut off, and where the edge crosses the sides along y.
+        CUDA_CALLABLE inline void put_edge(const Corner& a, const Corner& b, Out& out) const
+        {
+            bool inside = true;
+            UNROLL
+            for (int side = 1; side >= -1; side -= 2) {
+                const REAL from = side * a.y - height, to = side * b.y - height;
+                inside = inside && from <= 0;
+                if (from > 0 && to < 0) put(a.towards(b, from / (from - to)), out);
+            }
+            if (inside) put(a, out);
+            UNROLL
+            for (int side = 1; side >= -1; side -= 2) {
+                const REAL from = side * a.y - height, to = side * b.y - height;
+                if (from < 0 && to > 0) put(a.towards(b, from / (from - to)), out);
+            }
+        }
+    };
+
+    // Which face of a box another one is farthest from, for offset and axes of the other in the box's axes.
+    static CUDA_CALLABLE inline REAL farthest(const REAL* offset, const REAL* across, const REAL* size,
+        const REAL* other, int& axis, REAL& sign)
+    {
+        REAL most = 0;
+        UNROLL
+        for (int i = 0; i < 3; ++i) {
+            REAL reach = 0;
+            UNROLL
+            for (int j = 0; j < 3; ++j) reach += size_of(across[3 * i + j]) * other[j];
+            const REAL apart = size_of(offset[i]) - size[i] - reach;
+            const bool more = i == 0 || apart > most;
+            axis = more ? i : axis;
+            sign = !more ? sign : offset[i] >= 0 ? 1 : -1;
+            most = more ? apart : most;
+        }
+        return most;
+    }
+
+    // A face of one box, clipped by the sides of the nearest face of the other: first by those along x, where the cut
+    // closes the polygon with an edge of its own, and then each edge by those along y.
+    static CUDA_CALLABLE inline void faces(const Solid& a, const Solid& b, Out& out)
+    {
+        REAL across[9], back[9], offset[3], from_b[3], sign[2];
+        int axes[2];
+        UNROLL
+        for (int i = 0; i < 3; ++i) {
+            offset[i] = from_b[i] = 0;
+            UNROLL
+            for (int r = 0; r < 3; ++r) {
+                offset[i] += a.turn[3 * r + i] * (b.at[r] - a.at[r]);
+                from_b[i] += b.turn[3 * r + i] * (a.at[r] - b.at[r]);
+            }
+            UNROLL
+            for (int j = 0; j < 3; ++j) {
+                across[3 * i + j] = 0;
+                UNROLL
+                for (int r = 0; r < 3; ++r) across[3 * i + j] += a.turn[3 * r + i] * b.turn[3 * r + j];
+                back[3 * j + i] = across[3 * i + j];
+            }
+        }
+        const REAL first = farthest(offset, across, a.size, b.size, axes[0], sign[0]);
+        const REAL second = farthest(from_b, back, b.size, a.size, axes[1], sign[1]);
+        REAL least = a.size[0];
+        UNROLL
+        for (int i = 0; i < 3; ++i) {
+            least = a.size[i] < least ? a.size[i] : least;
+            least = b.size[i] < least ? b.size[i] : least;
+        }
+        const bool swap = second > first + LEAD * least;
+        Solid here, there;
+        UNROLL
+        for (int i = 0; i < 9; ++i) {
+            here.turn[i] = swap ? b.turn[i] : a.turn[i];
+            there.turn[i] = swap ? a.turn[i] : b.turn[i];
+        }
+        UNROLL
+        for (int i = 0; i < 3; ++i) {
+            here.at[i] = swap ? b.at[i] : a.at[i];
+            there.at[i] = swap ? a.at[i] : b.at[i];
+            here.size[i] = swap ? b.size[i] : a.size[i];
+            there.size[i] = swap ? a.size[i] : b.size[i];
+        }
+        const int axis = swap ? axes[1] : axes[0], i = axis == 2 ? 0 : axis + 1, j = axis == 0 ? 2 : axis - 1;
+        Face face;
+        face.half = pick(axis, here.size[0], here.size[1], here.size[2]);
+        face.width = pick(i, here.size[0], here.size[1], here.size[2]);
+        face.height = pick(j, here.size[0], here.size[1], here.size[2]);
+        axis_of(here, axis, face.normal);
+        axis_of(here, i, face.one);
+        axis_of(here, j, face.other);
+        UNROLL
+        for (int r = 0; r < 3; ++r) {
+            face.at[r] = here.at[r];
+            face.normal[r] *= swap ? sign[1] : sign[0];
+            face.outward[r] = swap ? face.normal[r] : -face.normal[r];
+        }
+        int side = 0;
+        REAL most = 0, toward = 0;
+        UNROLL
+        for (int k = 0; k < 3; ++k) {
+            const REAL x = there.turn[k] * face.normal[0] + there.turn[3 + k] * face.normal[1]
+                + there.turn[6 + k] * face.normal[2];
+            const bool more = k == 0 || size_of(x) > most;
+            side = more ? k : side;
+            toward = more ? x : toward;
+            most = more ? size_of(x) : most;
+        }
+        const int k = side == 2 ? 0 : side + 1, l = side == 0 ? 2 : side - 1;
+        REAL middle[3], u[3], v[3];
+        axis_of(there, side, middle);
+        axis_of(there, k, u);
+        axis_of(there, l, v);
+        const REAL deep = pick(side, there.size[0], there.size[1], there.size[2]);
+        UNROLL
+        for (int r = 0; r < 3; ++r) {
+            middle[r] = there.at[r] - here.at[r] - (toward > 0 ? deep : -deep) * middle[r];
+            u[r] *= pick(k, there.size[0], there.size[1], there.size[2]);
+            v[r] *= pick(l, there.size[0], there.size[1], there.size[2]);
+        }
+        const Corner m = {dot(face.one, middle), dot(face.other, middle), face.half - dot(face.normal, middle)};
+        const Corner p = {dot(face.one, u), dot(face.other, u), -dot(face.normal, u)};
+        const Corner q = {dot(face.one, v), dot(face.other, v), -dot(face.normal, v)};
+        Corner corners[4], out_of[2], into[2];
+        bool leaves[2] = {false, false}, enters[2] = {false, false};
+        UNROLL
+        for (int c = 0; c < 4; ++c) {
+            const REAL s = c == 0 || c == 3 ? 1 : -1, t = c < 2 ? 1 : -1;
+            corners[c] = {m.x + s * p.x + t * q.x, m.y + s * p.y + t * q.y, m.depth + s * p.depth + t * q.depth};
+        }
+        UNROLL
+        for (int c = 0; c < 4; ++c) {
+            const Corner from = corners[c], to = corners[(c + 1) % 4];
+            Corner begin = from, end = to;
+            bool stays = true;
+            UNROLL
+            for (int way = 0; way < 2; ++way) {
+                const REAL x = (way ? -from.x : from.x) - face.width, y = (way ? -to.x : to.x) - face.width;
+                const Corner crossing = from.towards(to, x / (x - y));
+                stays = stays && (x < 0 || y < 0 || (x == 0 && y == 0));
+                if (x < 0 && y > 0) end = crossing;
+                if (x > 0 && y < 0) begin = crossing;
+                if (x <= 0 && y > 0) {
+                    leaves[way] = true;
+                    out_of[way] = x < 0 ? crossing : from;
+                }
+                if (x > 0 && y <= 0) {
+                    enters[way] = true;
+                    into[way] = y < 0 ? crossing : to;
+                }
+            }
+            if (stays) face.put_edge(begin, end, out);
+        }
+        UNROLL
+        for (int way = 0; way < 2; ++way)
+            if (leaves[way] && enters[way]) face.put_edge(out_of[way], into[way], out);
+    }
+
+    // Puts the points of two shapes, and then those that are not there, up to ``most``.
+    static CUDA_CALLABLE inline void touch(const Solid& a, const Solid& b, REAL* to, long long apart, int most)
+    {
+        Out out = {to, apart, 0};
+        if (a.box && b.box) faces(a, b, out);
+        else if (a.box) ball_in_box(b, a, true, out);
+        else if (b.box) ball_in_box(a, b, false, out);
+        else rounds(a, b, out);
+        for (int i = out.count; i < most; ++i) to[(POINT * i + 6) * apart] = AWAY;
+    }
+};
+"""

@@ -76,6 +76,46 @@ def mixed_states(seed, worlds):
     return np.float64(np.float32(q)), np.float64(np.float32(qd))
 
 
+def hand():
+    """A palm on a short arm, three fingers with drives, and a cube and a ball between them: limbs on one base."""
+    bodies = [cube(2.0, 0.05), cube(1.0, 0.05)]
+    pose = lambda x, z: (x, 0.0, z, 0.0, 0.0, 0.0, 1.0)  # noqa: E731
+    drive = dict(armature=0.02, target_ke=30.0, target_kd=1.0, effort_limit=4.0)
+    hinges = [spo.Hinge("revolute", -1, 0, axis=(1, 0, 0), parent_pose=pose(0.0, 0.6), **drive),
+              spo.Hinge("revolute", 0, 1, axis=(0, 1, 0), parent_pose=pose(0.0, -0.1), **drive)]  # fmt: skip
+    for x in (-0.08, 0.08, 0.3):
+        hinges.append(spo.Hinge("revolute", 1, len(bodies), axis=(0, 1, 0), parent_pose=pose(x, -0.05), **drive))
+        bodies.append(spo.Body(0.2, (0, 0, -0.05), 4e-4 * np.eye(3)))
+    hinges += [spo.Hinge("free", -1, len(bodies) + i) for i in range(2)]
+    bodies += [cube(0.5, 0.05), cube(0.3, 0.03)]
+    law = dict(stiffness=1e4, damping=20.0)
+    pad = dict(box=((0.02, 0.03, 0.03), (0.0, 0.0, -0.1, 0.0, 0.0, 0.0, 1.0)))
+    contacts = [box(5, 0.05)]
+    contacts += [spo.Contact(finger, **pad, other=5, **law) for finger in (2, 3)]
+    contacts += [spo.Contact(2, sphere=((0.0, y, -0.1), 0.025), other=5, **law) for y in (-0.02, 0.02)]
+    contacts += [spo.Contact(4, sphere=((0.0, 0.0, -0.1), 0.02), other=spo.Contact(6, sphere=0.03), **law)]
+    contacts += [spo.Contact(4, sphere=((0.0, 0.0, -0.1), 0.02), other=spo.Contact(3, **pad), **law)]
+    return spo.Scene(bodies, hinges, contacts=contacts, ground=spo.Plane(height=0.28))
+
+
+def palm():
+    """The hand, whose palm touches the cube, too: limbs cannot share that."""
+    scene = hand()
+    touch = spo.Contact(1, sphere=((0.0, 0.0, -0.05), 0.06), other=5, stiffness=1e4, damping=20.0)
+    return scene.with_contacts([*scene.contacts, touch])
+
+
+def hand_states(seed, worlds):
+    """Return q, qd of ``hand`` with the cube between two fingers and the ball at the third; in the last world apart."""
+    rng, scene = np.random.default_rng(seed), hand()
+    q, qd = np.tile(scene.neutral_q, (worlds, 1)), 0.3 * rng.normal(size=(worlds, scene.dof_count))
+    q[:, :5] = 0.02 * rng.normal(size=(worlds, 5)) + [0.0, 0.0, -0.1, 0.1, 1.2]
+    q[:, 5:8], q[:, 12:15] = [0.0, 0.0, 0.34], [0.24, 0.0, 0.42]
+    q[:, 5:8] += 0.002 * rng.normal(size=(worlds, 3))
+    q[-1, 7], q[-1, 14] = 5.0, 6.0
+    return np.float64(np.float32(q)), np.float64(np.float32(qd))
+
+
 def thrown(chosen):
     """A cube that meets another one in the air: the scene, and ``chosen`` ones of 1500 random states."""
     rng, worlds, half = np.random.default_rng(0), 1500, 0.1

@@ -296,7 +296,7 @@ def test_sweeps_and_scans_are_a_choice_for_all_operations(device, monkeypatch):
 def test_where_there_is_nothing_to_choose_nothing_is_measured(device, times, folder):
     choice = made(device, granularity="tree").tune(NAME)[NAME]
     assert choice.granularity == "tree" and not choice.us and str(choice) == "tree, the only one"
-    dyn = made(device, pair_scenes.mixed())  # a thread for each world solves for pairs of bodies, on a GPU, too
+    dyn = made(device, pair_scenes.palm())  # a thread for each world solves for these pairs of bodies, on a GPU, too
     dyn.plan = plan.choose(dyn.scene, WORLDS, MEASURED, "float32")
     assert dyn.tune("step")["step"].granularity == "tree"
     assert not times["measured"] and not folder.exists()

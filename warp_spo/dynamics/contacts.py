@@ -10,6 +10,7 @@ from ..arrays import Call
 from ..errors import UnsupportedError, as_integer
 from ..kernels import combination
 from ..recursions.contact import step as ground
+from ..recursions.contact.pair_pieces import by_limbs
 from ..recursions.contact.pairs import RESIDUAL, default_passes
 from ..scene.contacts import HeightField, contact_figures
 from . import integrators
@@ -57,8 +58,9 @@ def refuse(dyn: Dynamics, call: Call, integrator: str) -> None:
         raise UnsupportedError(call.name, "closing loops in a scene with contacts", "use loops='cut'")
     if forced == "node":
         raise UnsupportedError(call.name, f"granularity={forced!r} with contacts", "use another one, or leave it out")
-    if forced == "segment" and dyn.scene.contact_pairs:
-        raise UnsupportedError(call.name, "granularity='segment' with contacts between bodies", "leave it out")
+    if forced == "segment" and dyn.scene.contact_pairs and not by_limbs(dyn.scene):
+        what = "granularity='segment' where pairs of bodies are not all on limbs of one link, or more than eight"
+        raise UnsupportedError(call.name, what, "leave it out")
     if isinstance(dyn.scene.ground, HeightField) and dyn.scene.ground.heights.size >= MOST_HEIGHTS[dyn.dtype.__name__]:
         way = "use dtype='float64', or a coarser field"
         raise UnsupportedError(call.name, f"a HeightField of {dyn.scene.ground.heights.size} points in float32", way)
@@ -78,7 +80,7 @@ def explain(dyn: Dynamics) -> str:
         return figures
     routine = integrators.contact_routine(dyn)
     form = "a thread for each world"
-    if dyn.plan.of(routine) == "segment":
+    if dyn.plan.of(routine) == "segment" and routine.divides(dyn.scene, ()):
         held = dyn.programs.warps(routine) != 1  # 1: a kernel was built, and limbs found no room in it
         form = "a warp for each limb" if held else f"{form}: what limbs tell each other does not fit in shared memory"
     return f"{figures}; {default_passes(dyn.scene)} passes of a step unless passes= says otherwise, {form}"

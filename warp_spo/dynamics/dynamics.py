@@ -38,7 +38,6 @@ from . import (
     kinematics,
     momentum,
     operational,
-    pairs,
     preparation,
     regressor,
     scene_values,
@@ -248,7 +247,6 @@ class Dynamics:
         self._replays = Replays(self.device, self.recursions.turn)
         self._engine, self._gradients = Engine(self), Gradients(self)
         self._closures = Closures(self, loops, independent)
-        self._pairs = pairs.PairPoints(self) if scene.contact_pairs else None
         self.closed, self.embedding = self._closures.closed, self._closures.embedding
         count = as_integer(refine)
         if count is None or count < 0:

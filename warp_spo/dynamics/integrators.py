@@ -15,7 +15,7 @@ from ..kernels import combination, loops
 from ..kernels.substeps import SUBSTEPS
 from ..recursions import coordinates, hinge_forces
 from ..recursions import step as recursion
-from ..recursions.contact import pairs
+from ..recursions.contact import pair_pieces, pairs
 from ..recursions.impedance import DEFAULT_BOUND
 from ..recursions.loops import closed_step, multipliers
 from ..recursions.loops.closed_step import NEWTON_STEPS
@@ -36,8 +36,15 @@ def _divides(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
     return recursion.by_pieces(scene)
 
 
+def _limbs_couple(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
+    return pair_pieces.by_limbs(scene)
+
+
 STEP = Routine("step", recursion.step, letters="PzaS", divides=_divides, passes=True, wide=True)
-PAIRED_STEP = Routine("paired_step", pairs.step, passes=True, counted=True)
+PAIRED_STEP = Routine(
+    "paired_step", pair_pieces.step, letters="PzafSE", divides=_limbs_couple, passes=True, counted=True, wide=True,
+    couples=True,
+)  # fmt: skip
 EMBEDDED_STEP = Routine("step", closed_step.step, passes=True)
 STEP_UNDER_MULTIPLIERS = Routine("step", closed_step.step_with_multipliers, passes=True)
 STEP_SYSTEM = Routine("step_system", closed_step.step_system)
@@ -49,7 +56,7 @@ HINGE_FORCE = Routine("hinge_force", hinge_forces.hinge_force)
 
 def contact_routine(dyn: Dynamics) -> Routine:
     """Return the kernel of a step of a scene with contacts."""
-    return CONTACT_STEP if dyn._pairs is None else PAIRED_STEP
+    return PAIRED_STEP if dyn.scene.contact_pairs else CONTACT_STEP
 
 
 class Interval(NamedTuple):
@@ -94,8 +101,6 @@ def semi_implicit(
             body_f = given.pop("body_f", None)
             given[rounds.MIDDLE] = rounds.run(dyn, dt, q, qd, body_f, **given)[-1].bias
         given |= {"passes": count, "reports": tuple(reports or ()), **option}
-        if dyn._pairs is not None:
-            dyn._pairs.find(q)
         launch(contact_routine(dyn), qd_out, more | (reports or {}), q=q, qd=qd, dt=dt, **given)
     elif not dyn.closed:
         launch(STEP, qd_out, more, q=q, qd=qd, dt=dt, **given, **option)
@@ -116,7 +121,7 @@ def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool, p
     if dyn.closed and dyn.embedding is None:
         return "loops='multipliers' takes several"
     if dyn.scene.contact_pairs:
-        return "the points that bodies share are found before each"
+        return "bodies that touch each other take one for each"
     if passes is not None and rounds.taken(dyn.scene, passes):
         return f"{passes} passes are preceded by rounds"
     if delays:

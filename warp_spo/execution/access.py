@@ -22,15 +22,17 @@ _IS_WORSE = (  # as kernels.combination.worst: a state that an earlier substep l
 )
 
 
-def make_emitter(dtype: str, shapes: dict, layout: KernelLayout) -> Emitter:
+def make_emitter(dtype: str, shapes: dict, layout: KernelLayout, pieces: bool = False) -> Emitter:
     """Return an emitter of statements for a kernel of this layout.
 
     Args:
         dtype: "float32" or "float64".
         shapes: of the arrays that the kernel reads and writes, [world, ...], by name.
         layout: how it reads and writes them.
+        pieces: the statements are those of a piece, whose names have a prefix.
     """
     result = layout.result
+    pieces = pieces or layout.warps > 1
     angles = RangeReduction.AGAIN if layout.retries else RangeReduction.FIRST
     angles = RangeReduction.IN_PLACE if layout.staged else angles
     guard = "if (mine) " if result.way == DIRECT else ""
@@ -38,7 +40,7 @@ def make_emitter(dtype: str, shapes: dict, layout: KernelLayout) -> Emitter:
     def load(array: str, entry: str) -> str:
         if array in (INWARD, OUTWARD):
             return f"SENT({entry})"
-        if array == HELD or (array in (*LOOPED, SECANT) and layout.warps > 1):
+        if array == HELD or (array in (*LOOPED, SECANT) and pieces):
             return f"{'' if array == MISSED else PREFIX}{array}_row[{entry}]"
         if array in FIELDS:
             return f"FIELD({array}, {entry})"
@@ -51,9 +53,9 @@ def make_emitter(dtype: str, shapes: dict, layout: KernelLayout) -> Emitter:
             return f"RELAY({entry}) = {value};"
         if array in (HELD, SECANT):
             return f"{load(array, entry)} = {value};"
-        if array == MISSED and layout.warps > 1:
+        if array == MISSED and pieces:
             return f"missed_row[0] += {value};"
-        if array in LOOPED and layout.warps > 1:
+        if array in LOOPED and pieces:
             return f"{'if (open) ' if array == GUESS else ''}{load(array, entry)} = {value};"
         if array == "out" and result.way == TILED:
             return f"if (mine) result_row[({entry}) * {straight.TILE}] = {value};"

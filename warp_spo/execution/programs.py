@@ -12,14 +12,16 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from .. import launches
-from ..kernels import coupling, native, straight
+from ..kernels import coupling, coupling_teams, native, straight
+from ..kernels.elementary import C_TYPE
 from ..kernels.fields import axes
 from ..kernels.native import INTEGERS
 from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout
 from ..kernels.substeps import SUBSTEPS
 from ..recursions import messages
-from ..recursions.contact import pairs
+from ..recursions.contact import pair_pieces, pairs
+from ..recursions.contact.couples import Team as Couplings
 from ..recursions.contact.ground import GROUND
 from ..recursions.contact.secants import SECANT
 from ..recursions.flexible import attach
@@ -29,7 +31,7 @@ from ..recursions.pieces import PARTS, Pieces
 from ..recursions.step import GAIN, GUESS, LOOPED, MISSED
 from ..recursions.tracing import Trace
 from ..scene.contacts import HeightField
-from ..trace.emission import Store, render
+from ..trace.emission import Store, render, under
 from ..trace.scalars import Scalar, is_constant
 from . import link_values, products, searches, staging
 from .access import make_emitter
@@ -77,6 +79,8 @@ class Programs:
     Attributes:
         relays: what is too long for shared memory waits in the rows of the result.
     """
+
+    LOCAL = False  # whether one thread keeps what couples of bodies share in its own memory, not in shared memory
 
     def __init__(self, run: Sweeps, plan: Plan):
         self.run, self.plan = run, plan
@@ -190,11 +194,12 @@ class Programs:
         shared = self.plan.of(routine) == "segment" and routine.divides(self.run.scene, shapes, **options)
         if routine.bias_first is not None and self.plan.at(routine).apart and "qd" in shapes:
             routine = routine.bias_first
-        if shared:
+        alone = not shared and routine.couples and routine.divides(self.run.scene, shapes, **options)
+        if shared or alone:
             pieces = Pieces(links)
-            several = 1 < pieces.warps <= MOST_WARPS
+            several = 1 < pieces.warps <= MOST_WARPS or alone
             both = {**shapes, **more}
-            program = self._segment_program(routine, both, pieces, tuple(more), options) if several else None
+            program = self._segment_program(routine, both, pieces, tuple(more), options, alone) if several else None
             if program is not None:
                 return program
         return self._tree_program(routine, links, {**shapes, **more}, tuple(more), options)
@@ -248,26 +253,35 @@ class Programs:
         return {GROUND: self.run.parameters.ground_heights} if reads and isinstance(ground, HeightField) else {}
 
     def _segment_program(
-        self, routine: Routine, shapes: dict, pieces: Pieces, more: tuple, options: dict
+        self, routine: Routine, shapes: dict, pieces: Pieces, more: tuple, options: dict, alone: bool = False
     ) -> Program | None:
+        """Return the program in which limbs share the work; ``alone``: one thread takes them all."""
         letters = messages.needed(routine.letters, shapes)
         dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(letters, pieces)
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
+        couples = self._team_of_pairs(slots, sent) if routine.couples else None
+        sent = couples.layout["end"] if couples is not None else sent
         everything: list[Store] = []
         traced: list[list[Store]] = []
         apart: list[tuple[list[Store], list[Store], list[list[Store]]]] = []
         begins: list[list[Store]] = []  # what each piece stores and sends before its passes
         held: list[list[Scalar]] = []  # what each piece computes once before its passes
+        responses: list[
+            tuple[list[tuple[int, list[Store]]], list[Any]]
+        ] = []  # what each piece leaves for pairs of bodies
         for index in range(len(pieces.pieces)):
             links = self._copied(options)  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
+            trace.team = couples
             traced.append([self._flattened(item, shapes) for item in routine.trace(trace, **options)])
             rounds = [[self._flattened(item, shapes) for item in turn] for turn in trace.rounds]
             news = [self._flattened(item, shapes) for item in trace.news]
             apart.append((trace.checks, news, rounds))
             begins.append(trace.begin)
+            responses.append((trace.couples, trace.carried))
             held.append(list({x.key: x for x in trace.ahead if not is_constant(x) and x.op != "input"}.values()))
             everything += trace.begin + traced[-1] + trace.checks + news + [item for turn in rounds for item in turn]
+            everything += [item for _, items in trace.couples for item in items]
         bends = any(item.array == MISSED for item in everything)
         held = held if bends or routine.counted else [[] for _ in held]
         sizes = {index: len(values) for index, values in enumerate(held)}
@@ -277,20 +291,24 @@ class Programs:
             passes = Passes((GAIN,), None, sizes, dict(enumerate(counts)))
         sent += 2 * pieces.warps if bends else 0
         whole = [item for item in everything if item.array == "out"]
-        layout = self._layout(routine, whole, everything, shapes, more, sent, pieces.warps)
+        local = alone and self.LOCAL
+        layout = self._layout(
+            routine, whole, everything, shapes, more, 0 if local else sent, 1 if alone else pieces.warps
+        )
         if layout.result.way == DIRECT and layout.result.array.entries > staging.LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
-        if not layout.fits(self.run.dtype, self.room(routine.wide)):
+        if not layout.fits(self.run.dtype, self.room(routine.wide, routine.couples)):
             return None  # nor for what limbs tell each other
-        team, looks_up = Team(pieces, dtype, passes), False
+        declared = "" if couples is None else coupling_teams.declare(couples, self.run.dtype, local)
+        team, looks_up = Team(pieces, dtype, passes, declared), False
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
         placed, table = staging.arrange_stores(whole, layout.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
         by_slot = lambda found: found if table is None else staging.stores_by_slot(found, table)  # noqa: E731
-        for piece, stores, items, (checks, news, rounds), begin, values in zip(
-            pieces.pieces, traced, outs, apart, begins, held, strict=True
+        for piece, stores, items, (checks, news, rounds), begin, values, (response, carried) in zip(
+            pieces.pieces, traced, outs, apart, begins, held, responses, strict=True
         ):
-            first, emitter, checking, later = (make_emitter(dtype, shapes, layout) for _ in range(4))
+            first, emitter, checking, later = (make_emitter(dtype, shapes, layout, True) for _ in range(4))
             ahead = first.region([*begin, *(Store(HELD, (at,), value) for at, value in enumerate(values))])
             later = later if passes else emitter
             emitter.keep(HELD, values)
@@ -301,16 +319,20 @@ class Programs:
             last = outward if set(letters) & set(messages.OUTWARD_LETTERS) else inward
             last += by_slot(items)
             last += [item for item in stores if item.array in (*more, GAIN, SECANT)]
-            regions = emitter.region(inward), emitter.region(outward)
+            sweep = emitter.region(inward, carried)
+            response = [under(emitter.branch(items), "SENT({}) > 0", INWARD, flag) for flag, items in response]
+            regions = sweep, emitter.region(outward)
             ends = [item for item in news if item.array == "out"]
             news = [item for item in news if item.array != "out"] + by_slot(ends)
             branches = later.branch(news), [later.branch(by_slot(turn)) for turn in rounds]
-            work = Work(piece, *regions, checking.region(checks), *branches, ahead)
+            work = Work(piece, *regions, checking.region(checks), *branches, ahead, response)
             emitters = {first, emitter, checking, later}
             team.add(work, sum(each.operations for each in emitters))
             looks_up |= any(each.counts["lookup"] for each in emitters)
-        cuda = team.cuda()  # fills the tables
-        registers = self._registers(pieces.warps)
+        cuda = team.cpu() if alone else team.cuda()  # fills the tables
+        if local:
+            cuda = f"{C_TYPE[self.run.dtype]} sent[{sent}];\n#undef SENT\n#define SENT(i) sent[i]\n{cuda}"
+        registers = self._registers(1 if alone else pieces.warps)
         if dtype == "float32" and not self.plan.few:
             for blocks, enough in routine.occupancy:
                 fewer = self._registers(blocks * pieces.warps)
@@ -320,15 +342,25 @@ class Programs:
                     break
         lists = {"place": table, "table": team.table, "shifts": team.shifts}
         tables = {name: values for name, values in lists.items() if values} | self._heights(looks_up)
+        if couples is not None:
+            tables["touches"] = self.run.array("touches", coupling.entries(couples.points)[-1], self.run.worlds)
         cap = registers if registers < MOST_REGISTERS else None
         return self._finished(routine, layout, cuda, team.cpu(), tables, team.operations, cap)
+
+    def _team_of_pairs(self, slots: dict[tuple[str, int], int], first: int) -> Couplings:
+        """Return the pairs of bodies as a team couples them, with values from ``first`` on among those of messages."""
+        seats = pair_pieces.seats_of(self.links, pieces := Pieces(self.links))
+        alpha = -1 if seats is None or seats.base is None else slots["a", seats.base.index]
+        return pair_pieces.team(self.links, pieces, alpha, first)
 
     @staticmethod
     def _couples(links: Links) -> coupling.Couples:
         """Return the pairs of bodies of a scene as their native code needs them."""
         scene, of_pairs = links.scene, pairs.members(links).of_pairs
         points, eps = zip(*((pair.points, pair.eps) for pair in scene.contact_pairs), strict=True)
-        return coupling.Couples(of_pairs, points, eps, tuple(pairs.inverse_weights(scene)), pairs.blocks(links))
+        return coupling.Couples(
+            of_pairs, points, eps, tuple(pairs.inverse_weights(scene)), pairs.blocks(links), pairs.solids_of(links)[0]
+        )
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
@@ -380,16 +412,13 @@ class Programs:
             entry,
         )
 
-    def room(self, wide: bool = False) -> int:
+    def room(self, wide: bool = False, couples: bool = False) -> int:
         """Bytes of shared memory that a block may have: for as many scalars in float64 as in float32 if the GPU can.
 
-        ``wide``: for long rows that all go through it.
+        ``wide``: for long rows that all go through it. ``couples``: for what limbs couple in it.
         """
-        wanted = (
-            max(straight.SHARED_BYTES, straight.WIDE_BYTES if wide else 0)
-            * wp.types.type_size_in_bytes(self.run.dtype)
-            // 4
-        )
+        more = straight.COUPLED_BYTES if couples else straight.WIDE_BYTES if wide else 0
+        wanted = max(straight.SHARED_BYTES, more) * wp.types.type_size_in_bytes(self.run.dtype) // 4
         allowed = self.plan.device.shared_bytes - 3 * RESERVED  # Warp takes a share, too
         return min(wanted, max(allowed, straight.SHARED_BYTES)) if self.plan.device.cuda else wanted
 

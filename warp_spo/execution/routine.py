@@ -38,6 +38,7 @@ class Routine:
         passes: the recursion is repeated until the laws of the joints hold, and its results may overwrite its inputs.
         counted: so often as the argument "passes" says.
         crowded: a thread holds too little even of a dozen dofs, so that limbs share the work with many worlds, too.
+        couples: by limbs, native code couples pairs of bodies between their sweeps.
         tiled: the result is left in tiles for the kernels of :mod:`warp_spo.kernels.tiles` to finish.
         bias_first: variant that computes velocity terms and loads first, for many worlds of shallow trees.
         occupancy: pairs (blocks, registers): by limbs in float32 with many worlds, a multiprocessor holds so many
@@ -64,6 +65,7 @@ class Routine:
     passes: bool = False
     counted: bool = False
     crowded: bool = False
+    couples: bool = False
     tiled: bool = False
     bias_first: Routine | None = None
     occupancy: tuple[tuple[int, int], ...] = ()

@@ -33,6 +33,7 @@ class Work(NamedTuple):
         rounds: what the piece computes, message by message, from the news of the other pieces.
         ahead: in work with passes, what the piece computes once before them and keeps. Where a fixed number of passes
             is counted, pieces send each other messages inward ahead, too.
+        couples: what the piece leaves for each couple of bodies that touches, after the inward sweep.
     """
 
     piece: Piece
@@ -42,11 +43,18 @@ class Work(NamedTuple):
     news: Listing
     rounds: list[Listing]
     ahead: Listing = Listing("", [], [], [])
+    couples: Sequence[Listing] = ()
 
     @property
     def text(self) -> tuple[str, ...]:
         """The statements without their numbers and entries; equal for pieces of equal structure."""
-        return self.ahead.text, self.inward.text, self.outward.text, self.check.text
+        return (
+            self.ahead.text,
+            self.inward.text,
+            self.outward.text,
+            self.check.text,
+            *(each.text for each in self.couples),
+        )
 
 
 class Passes(NamedTuple):
@@ -91,6 +99,7 @@ class Team:
         pieces: the pieces.
         dtype: the scalar type, "float32" or "float64".
         passes: the team repeats its work in passes; None if it does not.
+        pairs: the definition of ``team_coupling``, which couples pairs of bodies; "" if there are none.
 
     Attributes:
         table: the constants in which equal pieces differ, as the kernel's array holds them.
@@ -98,7 +107,8 @@ class Team:
         operations: the number of floating-point operations of one world.
     """
 
-    def __init__(self, pieces: Pieces, dtype: str, passes: Passes | None = None):
+    def __init__(self, pieces: Pieces, dtype: str, passes: Passes | None = None, pairs: str = ""):
+        self.pairs = pairs
         self.pieces, self.dtype, self.c, self.passes = pieces, dtype, C_TYPE[dtype], passes
         self.table: list[float] = []
         self.shifts: list[int] = []
@@ -109,6 +119,10 @@ class Team:
         """Add the work of a piece and its number of operations."""
         self._work[work.piece.index] = work
         self.operations += operations
+
+    @property
+    def _defined(self) -> list[str]:
+        return [self.pairs] if self.pairs else []
 
     @property
     def _last(self) -> int:
@@ -129,6 +143,10 @@ class Team:
             for piece in reversed(self.pieces.pieces):
                 if piece.inward == stage:
                     text.append(render(self._work[piece.index].inward, self.dtype, f"p{piece.index}_"))
+                    responses = [self._branch(piece, each) for each in self._work[piece.index].couples]
+                    text += ["if (coupled) {", *responses, "}"] if responses else []
+            text += [couple_pairs("0", 1)] if self.pairs and stage == 0 else []
+            text += [release_pairs("0", 1)] if self.pairs and stage == self._last else []
             for piece in self.pieces.pieces:
                 if piece.outward == stage:
                     text.append(render(self._work[piece.index].outward, self.dtype, f"p{piece.index}_"))
@@ -141,11 +159,14 @@ class Team:
             kept = {f"p{piece.index}_": [piece] for piece in self.pieces.pieces}
             order = reversed(self._work.values()) if self.passes.counted else self._work.values()  # children first
             ahead = [self._branch(work.piece, work.ahead) for work in order if work.ahead.text]
+            if self.pairs:
+                ahead += [begin_pairs("0", 1)]
+                text = [push_pairs("LOAD", "0", 1), *text, judge_pairs("0", 1)]
             one, counted = "\n".join(text), self.passes.counted
             loop = (
                 straight.count_team_passes(one, "", self.c) if counted else straight.repeat_thread_passes(one, self.c)
             )
-            text = [self.passes.declare(kept, self.c), *ahead, loop]
+            text = [*self._defined, self.passes.declare(kept, self.c), *ahead, loop]
         return "\n".join(text + later)
 
     def _branch(self, piece: Piece, listing: Listing) -> str:
@@ -162,7 +183,14 @@ class Team:
         for alike in kinds.values():
             text.append(f"{'else ' if text else ''}if ({_any_of([work.piece.warp for work in alike])}) {{")
             inward, outward = self._shared(alike)
-            text += [inward, self._inner([work.piece.warp for work in alike]), outward]
+            warps = [work.piece.warp for work in alike]
+            between = self._inner(warps)
+            if self.pairs:
+                inward = "\n".join([push_pairs("LOAD", "warp", self.pieces.warps), inward])
+                between = "\n".join([
+                    BARRIER, couple_pairs("warp", self.pieces.warps), between, release_pairs("warp", self.pieces.warps)
+                ])  # fmt: skip
+            text += [inward, between, outward]
             if not self.passes and any(work.rounds for works in kinds.values() for work in works):
                 text += [self._take_turns(alike, [[work.news] for work in alike], "n_"), BARRIER, self._rounds(alike)]
             text.append("}")
@@ -182,8 +210,11 @@ class Team:
             free[warp] = work
         names = ["", *(f"i{at}_" for at in range(len(ranks) - 1))]
         kept = {name: [work.piece for work in rank.values()] for name, rank in zip(names, ranks, strict=True)}
-        text = [self.passes.declare(kept, self.c)]
+        text = [*self._defined, self.passes.declare(kept, self.c)]
         text += self._ahead(leaves, dict(zip(names, ranks, strict=True)))
+        if self.pairs:
+            text += [BARRIER, begin_pairs("warp", self.pieces.warps)]
+            a_pass = "\n".join([a_pass, BARRIER, judge_pairs("warp", self.pieces.warps)])
         if self.passes.counted:
             text.append(straight.count_team_passes(a_pass, BARRIER, self.c))
         elif self.passes.flags is None:
@@ -292,8 +323,10 @@ class Team:
     def _shared(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str]:
         """Return one text for the inward and one for the outward sweeps of pieces of equal structure."""
         regions = [[work.inward for work in alike], [work.outward for work in alike], [work.check for work in alike]]
+        regions += [list(each) for each in zip(*(work.couples for work in alike), strict=True)]
         who = _choose([work.piece.warp for work in alike], range(len(alike)))
-        head, (inward, outward, check) = self._fill_in(regions, prefix, prefix, who)
+        head, (inward, outward, check, *couples) = self._fill_in(regions, prefix, prefix, who)
+        inward = "\n".join([inward, "if (coupled) {", *couples, "}"]) if any(couples) else inward
         outward = "\n".join([outward, "{", check, "}"]) if check else outward
         return f"{head}\n{inward}" if head else inward, outward
 
@@ -340,6 +373,44 @@ class Team:
             head += [f"{tables}shift[{k}] = {read.format(first + k, tables, count)};" for k in range(count)]
             self.shifts += [value for row in zip(*shifts.columns, strict=True) for value in row]
         return "\n".join(head), texts
+
+
+def begin_pairs(warp: str, warps: int) -> str:
+    """Return code that begins the pairs of bodies before the passes, for a warp of a team; ``coupled``: some touch."""
+    call = f"team_coupling::begin(sent, touches.data + world, worlds, dt_row[0], {warp}, {warps})"
+    return f"bool coupled = {_any_world(call, warps)};"
+
+
+def push_pairs(which: str, warp: str, warps: int) -> str:
+    """Return code that leaves wrenches on the bodies of a warp's limb, from the "LOAD" or the "CHANGE" of couples."""
+    return f"team_coupling::push(sent, AT_{which}, coupled, {warp}, {warps});"
+
+
+def couple_pairs(warp: str, warps: int) -> str:
+    """Return code that couples the pairs when all limbs have come in."""
+    build = f"team_coupling::build(sent, dt_row[0], {warp}, {warps})"
+    return f"if (coupled) {build};\nelse team_coupling::rest(sent, {warp});"
+
+
+def release_pairs(warp: str, warps: int) -> str:
+    """Return code that finds the forces of couples when the base has its acceleration, and leaves the wrenches."""
+    solve = "team_coupling::solve(sent, dt_row[0]);"
+    text = f"if ({warp} == 0) {solve}\n{BARRIER}" if warps > 1 else solve
+    return "\n".join([f"if (coupled) {{\n{text}\n}}", push_pairs("CHANGE", warp, warps)])
+
+
+def judge_pairs(warp: str, warps: int) -> str:
+    """Return code that takes the bodies' twists after a pass to the points of pairs, for the next one."""
+    call = "team_coupling::after(sent, touches.data + world, worlds, dt_row[0], closing, last, coupled, {}, {})"
+    return "\n".join([
+        "const bool last = turn + 1 == (int)passes_row[0];",
+        "const bool closing = turn > passes_row[0] - 2.5 && passes_row[0] > 2.5;",
+        f"coupled = {_any_world(call.format(warp, warps), warps)};",
+    ])  # fmt: skip
+
+
+def _any_world(call: str, warps: int) -> str:
+    return f"__syncthreads_or({call})" if warps > 1 else call
 
 
 class _Columns:

@@ -44,6 +44,8 @@ class Trace:
             piece also for the link that it moves on.
         checks: stores that check a pass; they read their inputs anew, so that no register is kept for them.
         instead: entries that take the place of those of an array, by its name.
+        team: of a piece, the pairs of bodies that native code couples between its sweeps. couples: what it stores for
+            each couple of bodies that touches, and the entry that says so; carried: values that both sweeps use.
     """
 
     def __init__(
@@ -64,6 +66,9 @@ class Trace:
         self.pushes: dict[int, Vector] = {}
         self.checks: list[Store] = []
         self.instead: dict[str, Callable[[int], Value]] = {}
+        self.team: Any = None
+        self.couples: list[tuple[int, list[Store]]] = []
+        self.carried: list[Value] = []
         self._mail: dict[tuple[str, int], list[Value]] = {}  # messages between pieces of this trace
         self.own = set(map(id, links.links if piece is None else piece.links))
         self.active = set(self.own)

@@ -7,14 +7,16 @@ sweep then adds A0^-1 J* times the wrenches to x0. :mod:`warp_spo.reference_pair
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ...scene.pairs import BOX
 from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Value, sqrt
-from ...trace.spatial import ZERO, Vector, cross, total
+from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, total
 from ..articulated_sweeps import NO_FORCE, pivots, propagate_inward, weighted_products
 from ..composite import mass_matrix
 from ..kinematics import carried_velocity, frame_on_link, jacobian, velocity
@@ -23,16 +25,17 @@ from ..motion import hinge_motion
 from ..operational import respond, unit_wrenches
 from ..remembered import remembered
 from . import step as ground
+from .couples import Solids
 from .points import SLIP, evaluated, with_ancestors
 
 if TYPE_CHECKING:
     from ..tracing import Trace
 
 PASSES = 4  # of a step with pairs; with three, random poses gained energy in 17 of 4500 cases, with four in 4
-VALUE, START, TWIST, RESPONSE = "pair_value", "pair_start", "pair_twist", "pair_response"
+PLACE, VALUE, START, TWIST, RESPONSE = "pair_place", "pair_value", "pair_start", "pair_twist", "pair_response"
 WRENCH, REPORT = "pair_wrench", "pair_report"
-"""Arrays of a thread: stiffness, damping and friction of each pair, and then half of gravity h^2; twists before the
-step; those of x0, and then whether the next pass only closes; the response; what the coupling returns."""
+"""Arrays of a thread: where shapes are; stiffness, damping and friction of each pair, and then half of gravity h^2;
+twists before the step; those of x0, and then whether the next pass only closes; the response; what it returns."""
 RESIDUAL = "contact_residual"
 """Report [world]: by how much forces still change where more pairs touch than are solved together [N]."""
 READ = (TWIST, RESPONSE)  # what it reads in each pass
@@ -73,6 +76,90 @@ def blocks(links: Links) -> tuple[tuple[int, ...], ...]:
     return tuple(map(tuple, found))
 
 
+def place_axes_of(trace: Trace, links: list[Link | None]) -> None:
+    """Compute the axes of links and of those that carry them."""
+    needed = with_ancestors(links)
+    for link in trace.active_links:
+        if id(link) in needed:
+            trace.label(link, "R")
+            turn = trace.places[id(link)].pose.rotation
+            trace.axes[id(link)] = turn if link.parent is None else trace.axes[id(link.parent)] @ turn
+
+
+def velocities_of(
+    trace: Trace, links: list[Link | None], qd: Callable[[int], Value]
+) -> dict[int | None, tuple[Vector, Vector]]:
+    """Return (omega; v) of links, and of those that carry them, in their axes by id."""
+    needed = with_ancestors(links)
+    found: dict[int | None, tuple[Vector, Vector]] = {None: (ZERO, ZERO)}
+    for link in trace.active_links:
+        if id(link) in needed:
+            trace.label(link, "v")
+            place, over = trace.places[id(link)], None if link.parent is None else id(link.parent)
+            found[id(link)] = carried_velocity(place, found[over], hinge_motion(link, place, qd))
+    return found
+
+
+def solids_of(links: Links) -> tuple[Solids, tuple[int, ...], tuple[tuple[int, tuple[float, ...]], ...]]:
+    """Return the shapes of pairs, their bodies, and body and pose in it of each shape."""
+    pairs = links.scene.contact_pairs
+    bodies = tuple(sorted({body for pair in pairs for body in (pair.body, pair.other)}))
+    number = {body: i for i, body in enumerate(bodies)}
+    shapes: dict[tuple[int, tuple[float, ...]], int] = {}
+    sides: list[tuple[int, ...]] = []
+    for pair in pairs:
+        row: list[int] = []
+        for body, shape in zip((pair.body, pair.other), pair.shapes, strict=True):
+            row += [number[body], shapes.setdefault((body, tuple(shape.pose.tolist())), len(shapes))]
+        sides.append(tuple(row))
+    kinds = [pair.shapes for pair in pairs]
+    solids = Solids(
+        len(bodies), len(shapes), tuple(sides), tuple((a.kind == BOX, b.kind == BOX) for a, b in kinds),
+        tuple((*a.size.tolist(), *b.size.tolist()) for a, b in kinds), tuple((a.radius, b.radius) for a, b in kinds),
+    )  # fmt: skip
+    return solids, bodies, tuple(shapes)
+
+
+def places_of(trace: Trace, own: Collection[int]) -> list[tuple[int, Value]]:
+    """Return where the ``own`` ones of the bodies with shapes are, and their shapes, by place among these values.
+
+    Origins are inertial, offsets of shapes from them, too; axes of shapes by rows.
+    """
+    links, identity = trace.links, np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    _, bodies, shapes = solids_of(links)
+    seats = {body: links.seat(body, identity) for body in bodies if body in own}
+    needed = with_ancestors([seat.link for seat in seats.values()])
+    place_axes_of(trace, [seat.link for seat in seats.values()])
+    origins: dict[int | None, Vector] = {None: ZERO}
+    axes: dict[int | None, Matrix] = {None: IDENTITY}
+    for link in trace.active_links:
+        if id(link) in needed:
+            over = None if link.parent is None else id(link.parent)
+            trace.label(link, "x")
+            origins[id(link)] = origins[over] + axes[over] @ trace.places[id(link)].pose.l
+            axes[id(link)] = trace.axes[id(link)]
+    found: list[tuple[int, Value]] = []
+    for number, body in enumerate(bodies):
+        if body in own:
+            key = None if seats[body].link is None else id(seats[body].link)
+            found += enumerate(origins[key] + axes[key] @ seats[body].offset, start=3 * number)
+    for number, (body, pose) in enumerate(shapes):
+        if body in own:
+            seat, key = links.seat(body, np.array(pose)), None if seats[body].link is None else id(seats[body].link)
+            offset, turn = axes[key] @ (seat.offset - seats[body].offset), axes[key] @ seat.matrix
+            found += enumerate([*offset, *(x for row in turn for x in row)], start=3 * len(bodies) + 12 * number)
+    return found
+
+
+def values_of(step: ground.ContactStep) -> list[Value]:
+    """Return stiffness, damping and friction of each pair, and then half of gravity h^2."""
+    trace, names = step.trace, ("stiffness", "damping", "friction")
+    first, count = len(trace.links.scene.contact_points), len(trace.links.scene.contact_pairs)
+    values = [step.impedance.value(f"contact_{name}", first + pair) for pair in range(count) for name in names]
+    squares = total(x * x for x in trace.links.gravity)
+    return [*values, (0.5 * sqrt(squares)) * (step.h * step.h)]
+
+
 class PairedStep(ground.ContactStep):
     """One time step with contacts of bodies with each other, too, as a trace; arguments as those of ContactStep.
 
@@ -94,8 +181,9 @@ class PairedStep(ground.ContactStep):
         trace, bodies = self.trace, self.members.bodies
         frames = tuple((body, (0.0, 0.0, 0.0)) for body in bodies)
         seats = [frame_on_link(trace, *frame) for frame in frames]
-        self._place([link for link, _ in seats])
-        before = self._velocities([link for link, _ in seats])
+        place_axes_of(trace, [link for link, _ in seats])
+        before = velocities_of(trace, [link for link, _ in seats], self.qd)
+        self.first += [Store(PLACE, (i,), value) for i, value in places_of(trace, range(len(trace.links.scene.bodies)))]
         self._begin_pairs(seats, before)
         forces = {id(link): NO_FORCE for link in trace.links.links}
         for number, (link, arm) in enumerate(seats):
@@ -121,35 +209,9 @@ class PairedStep(ground.ContactStep):
         cone, pull, missed, left = (self.trace.graph.input(REPORT, at + i) for i in range(4))
         return [cone], [pull], [missed, left]
 
-    def _place(self, links: list[Link | None]) -> None:
-        """Compute the axes of links and of those that carry them."""
-        needed = with_ancestors(links)
-        for link in self.trace.links.links:
-            if id(link) in needed:
-                self.trace.label(link, "R")
-                turn = self.trace.places[id(link)].pose.rotation
-                self.trace.axes[id(link)] = turn if link.parent is None else self.trace.axes[id(link.parent)] @ turn
-
-    def _velocities(self, links: list[Link | None]) -> dict[int | None, tuple[Vector, Vector]]:
-        """Return (omega; v) of links, and of those that carry them, before the step, in their axes by id."""
-        needed = with_ancestors(links)
-        found: dict[int | None, tuple[Vector, Vector]] = {None: (ZERO, ZERO)}
-        for link in self.trace.links.links:
-            if id(link) in needed:
-                self.trace.label(link, "v")
-                place, over = self.trace.places[id(link)], None if link.parent is None else id(link.parent)
-                found[id(link)] = carried_velocity(place, found[over], hinge_motion(link, place, self.qd))
-        return found
-
     def _begin_pairs(self, seats: list, before: dict) -> None:
         """Store what the coupling reads before the first pass."""
-        scene, points = self.trace.links.scene, len(self.trace.links.scene.contact_points)
-        names, count = ("stiffness", "damping", "friction"), len(scene.contact_pairs)
-        for pair in range(count):
-            values = [self.impedance.value(f"contact_{name}", points + pair) for name in names]
-            self.first += [Store(VALUE, (3 * pair + i,), value) for i, value in enumerate(values)]
-        squares = total(x * x for x in self.trace.links.gravity)
-        self.first.append(Store(VALUE, (3 * count,), (0.5 * sqrt(squares)) * (self.h * self.h)))
+        self.first += [Store(VALUE, (i,), value) for i, value in enumerate(values_of(self))]
         for number, (link, arm) in enumerate(seats):
             self.trace.label(link, f"T{number}_")
             (w, v), R = before[id(link)], self.trace.axes[id(link)]
@@ -198,8 +260,3 @@ def inverse_weights(scene: Scene) -> list[float]:
     J = evaluated(one, lambda trace: jacobian(trace, frames), (len(frames), 6, scene.dof_count))[:, :3]
     weights = SLIP / 3.0 * np.einsum("pai,ij,paj->p", J, inverse, J)
     return weights.reshape(len(scene.contact_pairs), 2, -1).mean(axis=2).sum(axis=1).tolist()
-
-
-def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> list[Store]:
-    """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world; and the ``reports``"""
-    return PairedStep(trace, reports).stores(qdd, status)

@@ -89,6 +89,7 @@ class ContactStep(Step):
         trace.stiffened = self._stiffened
         tau = trace.vector("tau")
         done, rates, sent = reduce(trace, lambda dof: tau(dof) + self.forces[dof] - bias[dof], moves=False, loads=False)
+        rates = self.close(done, rates)
         alpha: dict[int, tuple[Vector, Vector]] = {}
         moved = expand(trace, done, rates, (ZERO, ZERO), alpha=alpha)
         gains = {item.index[0]: self.h * item.value for item in moved if item.array == "out"}
@@ -135,6 +136,10 @@ class ContactStep(Step):
         return bias, [item for item in found if item.array != "out"]
 
     # -- bodies that touch each other ------------------------------------------------------------------------------
+    def close(self, done: dict, rates: dict) -> dict:
+        """Return the rates of a piece, by link, with what forces between its bodies and others add."""
+        return rates
+
     def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, tuple[Vector, Vector]]) -> dict[int, Value]:
         """Return qd' - qd by dof with the forces between bodies; ``alpha`` becomes that of the links."""
         return gains
@@ -145,6 +150,14 @@ class ContactStep(Step):
         Those of points with the ground are added.
         """
         return [], [], []
+
+    def last_excess(self) -> tuple[list[Value], ...]:
+        """Return the same of the last pass where no pass knows it: cones, pulls, efforts, missing pushes."""
+        return [], [], [], []
+
+    def reported(self) -> list[Store]:
+        """Return the stores of reports on bodies that touch each other that follow after all pieces are done."""
+        return []
 
     # -- hinges ----------------------------------------------------------------------------------------------------
     def _pieces(self, link: Link) -> list[Law]:
@@ -335,11 +348,13 @@ class ContactStep(Step):
             sent += trace.send("E", own, self.excess)
             if own.index == 0:
                 pieces = Pieces(trace.links).pieces
-                kinds = zip(*(trace.receive("E", piece) for piece in pieces), strict=True)
+                sent_by = zip(*(trace.receive("E", piece) for piece in pieces), strict=True)
+                kinds = ((*values, *more) for values, more in zip(sent_by, self.last_excess(), strict=True))
                 self.excess = [largest(list(values)) for values in kinds]
         sent += self._words(own, results) if status else []
-        if own.index == 0 and "contact_excess" in self.reports:
-            trace.rounds = [[*self._excess_stores(), *(item for turn in trace.rounds for item in turn)]]
+        first = [*self._excess_stores(), *self.reported()] if own.index == 0 else []
+        if first:
+            trace.rounds = [[*first, *(item for turn in trace.rounds for item in turn)]]
         return sent
 
     def _excess_stores(self) -> list[Store]:

@@ -1,0 +1,76 @@
+"""A kernel that finds the points of pairs of shapes alone, by the native code that steps run."""
+
+import functools
+
+import warp as wp
+
+from warp_spo.kernels import native, touches
+from warp_spo.kernels.elementary import C_TYPE
+
+ENTRIES = 11  # of a shape: its pose in the body, half its sizes, its radius
+
+FIND = r"""
+struct placing
+{
+    static CUDA_CALLABLE inline void matrix(const REAL* q, REAL* R)
+    {
+        const REAL s = 2 / (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+        const REAL x = q[0], y = q[1], z = q[2], w = q[3];
+        const REAL turn[9] = {1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w),
+            s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w),
+            s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)};
+        UNROLL
+        for (int i = 0; i < 9; ++i) R[i] = turn[i];
+    }
+
+    static CUDA_CALLABLE inline solids::Solid place(const REAL* origin, const REAL* body, const REAL* shape, bool box)
+    {
+        solids::Solid found;
+        REAL R[9], own[9];
+        matrix(body, R);
+        matrix(shape + 3, own);
+        UNROLL
+        for (int r = 0; r < 3; ++r) {
+            found.at[r] = origin[r] + solids::dot(R + 3 * r, shape);
+            found.size[r] = shape[7 + r];
+            UNROLL
+            for (int c = 0; c < 3; ++c)
+                found.turn[3 * r + c] = R[3 * r] * own[c] + R[3 * r + 1] * own[3 + c] + R[3 * r + 2] * own[6 + c];
+        }
+        found.radius = shape[10];
+        found.box = box;
+        return found;
+    }
+};
+const int* row = pairs.data + 5 * pair;
+const REAL* one = poses.data + ((long long)world * poses.shape[1] + row[0]) * 7;
+const REAL* two = poses.data + ((long long)world * poses.shape[1] + row[1]) * 7;
+const REAL* shape = shapes.data + 2 * ENTRIES * pair;
+const long long worlds = touches_out.shape[1];
+REAL *out = touches_out.data + row[4] * worlds + world, zero[3] = {0, 0, 0}, between[3];
+for (int c = 0; c < 3; ++c) out[c * worlds] = between[c] = two[c] - one[c];
+const solids::Solid a = placing::place(zero, one + 3, shape, row[2]);
+const solids::Solid b = placing::place(between, two + 3, shape + ENTRIES, row[3]);
+solids::touch(a, b, out + HEADER * worlds, worlds, row[2] && row[3] ? MOST : 1);
+"""
+
+
+@functools.cache
+def find_touches(T) -> wp.Kernel:
+    """Write the touches of all pairs.
+
+    Inputs are the poses of frames [world, frame, 7]; for each pair (frame, frame, kind, kind, first entry of its
+    touches), with 0 for shapes with a radius and 1 for boxes; and the shapes [2 pair, ENTRIES].
+    """
+    text = FIND.replace("REAL", C_TYPE[T]).replace("UNROLL\n", "#pragma unroll\n")
+    for name, value in {"ENTRIES": ENTRIES, "HEADER": touches.HEADER, "MOST": touches.MOST}.items():
+        text = text.replace(name, str(value))
+    arrays = {"poses": wp.array3d[T], "pairs": wp.array2d[int], "shapes": wp.array2d[T], "touches_out": wp.array2d[T]}
+    find = native.function("find_touch", touches.native(T) + text, {"pair": int, "world": int, **arrays})
+
+    @wp.kernel(module=f"warp_spo_touches_{T.__name__}", enable_backward=False)
+    def kernel(poses: wp.array3d[T], pairs: wp.array2d[int], shapes: wp.array2d[T], touches_out: wp.array2d[T]):
+        pair, world = wp.tid()
+        find(pair, world, poses, pairs, shapes, touches_out)
+
+    return kernel
