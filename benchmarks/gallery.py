@@ -7,6 +7,7 @@ With names, only these examples run; the page keeps what it says of the others.
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -58,7 +59,8 @@ def run(name: str, line: str) -> str:
     """Run an example; return its section of the page."""
     picture = PICTURES / f"{name}.svg"
     command = [sys.executable, "-m", f"warp_spo.examples.{name}", "--picture", str(picture)]
-    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    undated = {**os.environ, "SOURCE_DATE_EPOCH": "0"}  # equal pictures are equal files
+    printed = subprocess.run(command, capture_output=True, text=True, check=True, env=undated).stdout
     return (
         f"## {name}\n\n{line}\n\n<!-- not run: benchmarks.gallery ran it -->\n"
         f"```console\npython -m warp_spo.examples.{name}\n```\n\n"
@@ -77,11 +79,11 @@ def main(names: list[str]) -> None:
         if not names or name in names or name not in sections:
             print(name, flush=True)
             sections[name] = run(name, line)
-    parts = [HEAD, *(sections[name].strip() + "\n" for name in known), OTHERS]
+    parts = [HEAD, OTHERS]
     for title, picture, command in SHOWN:
         mark = "<!-- not run: the page that it belongs to says when it was -->"
         parts.append(f"### {title}\n\n{mark}\n```console\n{command}\n```\n\n![{title}](_static/{picture})\n")
-    PAGE.write_text("\n".join(parts))
+    PAGE.write_text("\n".join([*parts, *(sections[name].strip() + "\n" for name in known)]))
 
 
 if __name__ == "__main__":
