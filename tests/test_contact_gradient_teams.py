@@ -66,7 +66,9 @@ def test_limbs_share_gradients(monkeypatch):
 
 @pytest.mark.slow
 def test_limbs_share_gradients_on_stairs(monkeypatch):
-    assert_right(monkeypatch, steps(), (*WRT, "ground_heights", "contact_stiffness", "ground_origin"))
+    assert_right(
+        monkeypatch, steps(), (*WRT, "ground_heights", "contact_stiffness", "ground_origin", "joint_target_ke")
+    )
 
 
 BUGS = {

@@ -28,9 +28,6 @@ H, WORLDS = 5e-3, 4
 LARGEST = {"tau": 1e-6, "body_f": 1e-6}
 """Error of a gradient by forces over the largest entry; 1e-7 measured. By anything else:"""
 LARGEST_ELSE = 1e-4  # 2e-5 measured, of gains that hardly matter
-SWITCHES = {"stairs ground_heights": 0.2}
-"""Share of differences that cross a switch: the lowest corner of a cell of stairs is one of two. By anything else:"""
-SWITCHES_ELSE = 0.01
 
 
 def without_friction(scene):
@@ -51,7 +48,8 @@ def cases():
     a = states(scene, WORLDS)
     yield "geared", scene, {"q": a["q"], "qd": np.random.default_rng(0).normal(size=a["qd"].shape), "tau": a["tau"]}
     for name, field in FIELDS.items():
-        scene = box(ground=field, friction=0.3)
+        uneven = field.heights + 1e-3 * np.random.default_rng(0).normal(size=field.heights.shape)
+        scene = box(ground=spo.HeightField(uneven, field.cell, field.origin), friction=0.3)  # no two corners as low
         yield name, scene, above(scene, 1, 2 * WORLDS)
 
 
@@ -90,7 +88,7 @@ def test_gradients_are_differences(name):
     errors = contact_gradients.errors(scene, a, H, 3)
     for argument, (error, crossed) in errors.items():
         assert error <= LARGEST.get(argument, LARGEST_ELSE), (argument, errors)
-        assert crossed <= SWITCHES.get(f"{name} {argument}", SWITCHES_ELSE), (argument, errors)
+        assert crossed <= 0.01, (argument, errors)
 
 
 @pytest.mark.parametrize("passes", [1, 4])

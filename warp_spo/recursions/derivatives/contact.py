@@ -26,6 +26,7 @@ from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING, Any
 
 from ...scene.contacts import CONTACT_VALUES, HEIGHTS
+from ...scene.parts import DOF_VALUES
 from ...trace.differentiation import reverse
 from ...trace.emission import Store
 from ...trace.scalars import Scalar, Value, cut, is_constant, less, ordered, select
@@ -53,7 +54,8 @@ and lambda [world, dof]."""
 HEIGHTS_AT = "heights_at"
 """Where the heights lie in the table by which each surface has its gradient [world, surface]: those of a cell."""
 ORIGIN = "ground_origin"
-BY_PIECES = (ORIGIN, "q", "qd", "tau", "target_q", "target_qd", "ctrl", *CONTACT_VALUES, HEIGHTS)
+OF_DOFS = ("q", "qd", "tau", "target_q", "target_qd", "joint_rest_q", *DOF_VALUES)
+BY_PIECES = (*OF_DOFS, "ctrl", *CONTACT_VALUES, HEIGHTS, ORIGIN)
 """Arguments and values whose gradient a limb computes by itself, or by messages between limbs."""
 Twists = dict[int, tuple[Vector, Vector]]
 
