@@ -12,6 +12,7 @@ import warp as wp
 import warp_spo as spo
 from benchmarks import site
 from benchmarks.blocks import ROOT, agree, blocks, differences, pages, rewrite, run, unmarked
+from warp_spo.examples.__main__ import examples
 from warp_spo.execution import plan
 
 PAGES = {page.relative_to(ROOT).as_posix().removeprefix("docs/").replace("/", "."): page for page in pages()}
@@ -166,6 +167,16 @@ def test_every_public_name_has_its_entry_in_the_reference(learns):
     without = [name for name, found in objects if not inspect.getdoc(found)]
     assert not without, f"without a docstring: {', '.join(without)}"
     assert len(objects) > (100 if learns else 250)
+
+
+def test_the_gallery_shows_every_example_and_every_picture_is_shown():
+    text = {name: page.read_text() for name, page in PAGES.items()}
+    headings = set(re.findall(r"^## (\w+)$", text["gallery.md"], re.MULTILINE))
+    assert headings == set(examples())
+    folder = ROOT / "docs" / "_static"
+    shown = {path for page in text.values() for path in re.findall(r"_static/([\w./-]+)\)", page)}
+    kept = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.suffix not in ("", ".css")}
+    assert shown == kept
 
 
 def test_messages_on_the_page_of_questions_stand_in_the_code(monkeypatch):
