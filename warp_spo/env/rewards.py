@@ -108,6 +108,17 @@ def air_time(bodies: Any, target: float = 0.5, least_command: float = 0.1) -> Te
     return term
 
 
+def stepping(bodies: Any, longest: float = 0.4) -> Term:
+    """Return the share of feet that have landed or left the ground within the last ``longest`` seconds."""
+
+    def term(w: World) -> Any:
+        feet = w.feet(bodies)
+        phases = [air + contact for air, contact in zip(feet.air_time, feet.contact_time, strict=True)]
+        return sum(where(phase < longest, 1.0, 0.0) for phase in phases) * (1.0 / len(phases))
+
+    return term
+
+
 def foot_slip(bodies: Any, least_command: float | None = None) -> Term:
     """Return the sum over feet that touch of the square of their speed along the ground [m^2/s^2]."""
 

@@ -14,7 +14,7 @@ from . import velocity
 
 ROBOT = "ant"
 FEET, DIAGONALS = ".*_foot", ((0, 2), (3, 1))
-TROT = 1.5  # weight; without it a leg drags, or stays in the air
+TROT, STEPPING = 1.5, 3.0  # weights; without them a leg drags, or stays in the air
 ENOUGH = 4.0  # speed that earns most [m/s]: its motors could throw it along at four times as much
 CAMERA = Camera(distance=3.5)
 LEARNER = Learner(iterations=250, worlds=4096, steps=24, hidden=(256, 128, 64), entropy=3e-3, deviation=0.7)
@@ -75,6 +75,7 @@ def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env
             "straight": (1.0, straight),
             "drift": (-0.2, drift),
             "trot": (TROT, velocity.trot(FEET, DIAGONALS, least_command=None)),
+            "stepping": (STEPPING, rewards.stepping(FEET)),
             "effort": (-0.05, rewards.action_size),
             "action rate": (-0.05, rewards.action_rate),
             "tilting": (-0.05, rewards.tilting),
