@@ -7,10 +7,11 @@ import symbolic
 import warp_machine
 from contact_cases import quadruped, touching
 from test_contact_step import steps
+from test_step_teams import driven
 
 import warp_spo as spo
 from warp_spo.dynamics import contact_gradients as kernels
-from warp_spo.recursions.derivatives.contact import PassGradient, PassSolve
+from warp_spo.recursions.derivatives.contact import PassGradient, PassSolve, divides
 
 H, WORLDS, PASSES = 5e-3, 4, 2
 ROUTINES = {"contact_pass": kernels.PASS, "contact_solve": kernels.SOLVE, "contact_gradient": kernels.GRADIENT}
@@ -69,6 +70,15 @@ def test_limbs_share_gradients_on_stairs(monkeypatch):
     assert_right(
         monkeypatch, steps(), (*WRT, "ground_heights", "contact_stiffness", "ground_origin", "joint_target_ke")
     )
+
+
+def test_which_gradients_limbs_share():
+    scene = quadruped()
+    assert divides(scene, (), ("q", "dt"), ("q", "qd", "ctrl", "contact_friction", "ground_origin"))
+    assert not divides(scene, (), ("q", "body_f"), ("q",))
+    assert not divides(scene, (), ("q",), ("q", "value"))  # masses
+    assert not divides(scene, ("body_gravcomp",), ("q",), ("q",))
+    assert not divides(driven(), (), ("q", "ctrl"), ("q",))  # tendons from limb to limb
 
 
 BUGS = {
