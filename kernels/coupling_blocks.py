@@ -112,62 +112,67 @@ NATIVE = r"""static CUDA_CALLABLE inline void load_block(REAL* s, int from, int 
         }
     }
 
+    // S = C C*, and C^-1 times the right-hand sides, by columns of blocks; warps share rows and right-hand sides.
     static CUDA_CALLABLE inline void factor_all(REAL* s, int warp, int warps)
     {
         EACH
         for (int q = 0; q < COUPLES; ++q) {
             if (!(at(s, AT_ACTIVE + q) > 0)) continue;  // the same in all worlds of a team
             REAL C[21];
+            const int pivot = matrix_of(q * COUPLES + q);
             if (q % warps == warp) {
-                load_block(s, matrix_of(q * COUPLES + q), 21, C);
+                load_block(s, pivot, 21, C);
                 factor_block(C);
                 UNROLL
-                for (int i = 0; i < 21; ++i) at(s, matrix_of(q * COUPLES + q) + i) = C[i];
-                UNROLL
-                for (int j = 0; j < RIGHT; ++j) {
-                    REAL x[6];
-                    load_block(s, AT_RIGHT + 6 * (RIGHT * q + j), 6, x);
-                    forward(C, x);
-                    UNROLL
-                    for (int i = 0; i < 6; ++i) at(s, AT_RIGHT + 6 * (RIGHT * q + j) + i) = x[i];
-                }
+                for (int i = 0; i < 21; ++i) at(s, pivot + i) = C[i];
             }
             if (warps > 1) {
                 wait();
-                load_block(s, matrix_of(q * COUPLES + q), 21, C);
+                load_block(s, pivot, 21, C);
             }
             EACH
             for (int p = q + 1; p < COUPLES; ++p) {
                 const int block = matrix_of(p * COUPLES + q);
                 if (block < 0 || p % warps != warp || !(at(s, AT_ACTIVE + p) > 0)) continue;
-                REAL A[36];
-                load_block(s, block, 36, A);
+                LOOP
+                for (int i = 0; i < 6; ++i) {
+                    REAL x[6];
+                    load_block(s, block + 6 * i, 6, x);
+                    forward(C, x);
+                    UNROLL
+                    for (int k = 0; k < 6; ++k) at(s, block + 6 * i + k) = x[k];
+                }
+            }
+            LOOP
+            for (int j = warps - 1 - warp; j < RIGHT; j += warps) {
+                REAL x[6];
+                load_block(s, AT_RIGHT + 6 * (RIGHT * q + j), 6, x);
+                forward(C, x);
                 UNROLL
-                for (int i = 0; i < 6; ++i) forward(C, A + 6 * i);
-                UNROLL
-                for (int i = 0; i < 36; ++i) at(s, block + i) = A[i];
-                UNROLL
-                for (int j = 0; j < RIGHT; ++j) {
+                for (int i = 0; i < 6; ++i) at(s, AT_RIGHT + 6 * (RIGHT * q + j) + i) = x[i];
+            }
+            if (warps > 1) wait();
+            int turn = 0;
+            EACH
+            for (int p = q + 1; p < COUPLES; ++p) {
+                const int block = matrix_of(p * COUPLES + q);
+                if (block < 0 || !(at(s, AT_ACTIVE + p) > 0)) continue;
+                EACH
+                for (int r = q + 1; r <= p; ++r) {
+                    if (matrix_of(r * COUPLES + q) < 0 || !(at(s, AT_ACTIVE + r) > 0)) continue;
+                    if (turn++ % warps == warp) downdate(s, p, r, q);
+                }
+                LOOP
+                for (int j = warps - 1 - warp; j < RIGHT; j += warps) {
                     REAL b[6];
                     load_block(s, AT_RIGHT + 6 * (RIGHT * q + j), 6, b);
                     UNROLL
                     for (int i = 0; i < 6; ++i) {
                         REAL x = at(s, AT_RIGHT + 6 * (RIGHT * p + j) + i);
                         UNROLL
-                        for (int k = 0; k < 6; ++k) x = FUSED(-A[6 * i + k], b[k], x);
+                        for (int k = 0; k < 6; ++k) x = FUSED(-at(s, block + 6 * i + k), b[k], x);
                         at(s, AT_RIGHT + 6 * (RIGHT * p + j) + i) = x;
                     }
-                }
-            }
-            if (warps > 1) wait();
-            int turn = 0;
-            EACH
-            for (int p = q + 1; p < COUPLES; ++p) {
-                if (matrix_of(p * COUPLES + q) < 0 || !(at(s, AT_ACTIVE + p) > 0)) continue;
-                EACH
-                for (int r = q + 1; r <= p; ++r) {
-                    if (matrix_of(r * COUPLES + q) < 0 || !(at(s, AT_ACTIVE + r) > 0)) continue;
-                    if (turn++ % warps == warp) downdate(s, p, r, q);
                 }
             }
             if (warps > 1) wait();
@@ -185,8 +190,7 @@ NATIVE = r"""static CUDA_CALLABLE inline void load_block(REAL* s, int from, int 
             else if (at(s, AT_ACTIVE + q) > 0) block(s, p, q);
         }
         if (warps > 1) wait();
-        if (SPLIT && warps > 1) factor_all(s, warp, warps);
-        else if (warp == 0) factor_all(s, 0, 1);
+        factor_all(s, warp, warps);
         if (RIGHT == 1 || warp != 0) return;
         REAL inertia[21], force[6];
         UNROLL

@@ -111,7 +111,7 @@ struct team_coupling
         }
     };
 
-    // Places couples, begins their points, and gathers; returns whether one touches in a world of the warp.
+    // Places couples, begins their points, and adds them up; returns whether one touches in a world of the warp.
     static CUDA_CALLABLE APART bool begin(REAL* s, REAL* touches, long long worlds, REAL h, int warp, int warps)
     {
         bool touching = false;
@@ -143,7 +143,8 @@ struct team_coupling
                 at(s, AT_ARM + 6 * p + c) = place.arm[0][c];
                 at(s, AT_ARM + 6 * p + 3 + c) = place.arm[1][c];
             }
-            REAL twist[6], v[3], slip;
+            REAL twist[6], v[3], slip, deepest = AWAY, reach = 0;
+            Sum sum_of;
             relative(s, p, place, twist);
             LOOP
             for (int a = first_pair_of(p); a < first_pair_of(p + 1); ++a) {
@@ -154,59 +155,88 @@ struct team_coupling
                 LOOP
                 for (int i = 0; i < count; ++i) {
                     const Touch touch(touches, worlds, pair, i);
-                    const REAL normal = rate(twist, place, touch, v, slip), reach = at(s, AT_VALUE + 3 * PAIRS);
-                    REAL across;
+                    const REAL normal = rate(twist, place, touch, v, slip), falls = at(s, AT_VALUE + 3 * PAIRS);
+                    REAL across, arm[3];
                     const bool near =
-                        begin_point(touch, pair, normal, slip, h, law.k, law.kd, law.friction, reach, across);
+                        begin_point(touch, pair, normal, slip, h, law.k, law.kd, law.friction, falls, across);
                     at(s, across_of(pair, i)) = across;
                     flags.set(i, near, near);
+                    sum_of.add(place, touch, across, near, law);
+                    UNROLL
+                    for (int c = 0; c < 3; ++c) arm[c] = touch.at[c] - place.arm[0][c];
+                    const REAL away = sqrt(dot(arm, arm));
+                    deepest = touch.depth > deepest ? touch.depth : deepest;
+                    reach = away > reach ? away : reach;
                 }
                 flags.keep(s, pair);
+                sum_of.check(s, pair);
             }
-            touching = gather(s, p, place, touches, worlds, h) || touching;
+            at(s, AT_BOUND + 2 * p) = deepest;
+            at(s, AT_BOUND + 2 * p + 1) = reach;
+            touching = sum_of.leave(s, p) || touching;
         }
         return touching;
     }
 
-    // Leaves root and load of a couple; returns whether it touches in a world of the warp.
-    static CUDA_CALLABLE inline bool gather(REAL* s, int p, const Pair& place, const REAL* touches, long long worlds,
-        REAL h)
+    // Damper and load of a couple, added up over its points.
+    struct Sum
     {
-        REAL K[21], f0[6];
-        bool touching = false;
-        UNROLL
-        for (int i = 0; i < 21; ++i) K[i] = 0;
-        UNROLL
-        for (int i = 0; i < 6; ++i) f0[i] = 0;
-        LOOP
-        for (int a = first_pair_of(p); a < first_pair_of(p + 1); ++a) {
-            const int pair = pair_of(a), count = (int)at(s, AT_COUNT + pair);
-            const Law law(s, pair, h);
-            const int closed = Flags(s, pair).closed;
-            LOOP
-            for (int i = 0; i < count; ++i) {
-                const REAL across = at(s, across_of(pair, i)), shut = closed >> i & 1;
-                if (!(across > 0 || shut > 0)) continue;
-                touching = true;
-                add_point(place, Touch(touches, worlds, pair, i), across, shut, law.k, law.kd, K, f0);
-            }
+        REAL K[21], load[6];
+        bool touching;
+
+        CUDA_CALLABLE inline Sum() : touching(false)
+        {
+            UNROLL
+            for (int i = 0; i < 21; ++i) K[i] = 0;
+            UNROLL
+            for (int i = 0; i < 6; ++i) load[i] = 0;
+        }
+
+        CUDA_CALLABLE inline void add(const Pair& place, const Touch& touch, REAL across, bool closed, const Law& law)
+        {
+            if (!(across > 0 || closed)) return;
+            touching = true;
+            add_point(place, touch, across, closed, law.k, law.kd, K, load);
+        }
+
+        // NaN even where the pair does not touch.
+        CUDA_CALLABLE inline void check(REAL* s, int pair)
+        {
             UNROLL
             for (int i = 0; i < 3; ++i) {
                 const REAL value = at(s, AT_VALUE + 3 * pair + i);
-                if (value != value) touching = true;
-                f0[0] += value - value;  // NaN even where the pair does not touch
+                touching = touching || value != value;
+                load[0] += value - value;
             }
         }
-        const bool active = anywhere(touching);
-        at(s, AT_ACTIVE + p) = active;
-        if (active) root(K);
-        UNROLL
-        for (int i = 0; i < 6; ++i) at(s, AT_LOAD + 6 * p + i) = f0[i];
-        if (active) {
+
+        // Leaves the root; returns whether the couple touches in a world of the warp.
+        CUDA_CALLABLE inline bool leave(REAL* s, int p)
+        {
+            const bool active = anywhere(touching);
+            at(s, AT_ACTIVE + p) = active;
+            UNROLL
+            for (int i = 0; i < 6; ++i) at(s, AT_LOAD + 6 * p + i) = load[i];
+            if (!active) return false;
+            root(K);
             UNROLL
             for (int i = 0; i < 21; ++i) at(s, AT_ROOT + 21 * p + i) = K[i];
+            return true;
         }
-        return active;
+    };
+
+    // Whether a couple had no part in the pass before and is too far away for the velocity that it has now.
+    static CUDA_CALLABLE inline bool apart(REAL* s, int p, const REAL* twist, REAL h)
+    {
+        int near = at(s, AT_LOAD + 6 * p) != 0;
+        LOOP
+        for (int a = first_pair_of(p); a < first_pair_of(p + 1); ++a) {
+            const Flags flags(s, pair_of(a));
+            near |= flags.closed | flags.candidate;
+        }
+        const REAL depth = at(s, AT_BOUND + 2 * p), reach = at(s, AT_BOUND + 2 * p + 1);
+        const REAL speed = (REAL)1.001 * (sqrt(dot(twist, twist)) + sqrt(dot(twist + 3, twist + 3)) * reach);
+        return !near && depth + h * speed < 0;
     }
 
     // Wrenches on the bodies of a warp's limb, of every body where there is one warp, from forces of the couples.
@@ -247,6 +277,11 @@ struct team_coupling
             REAL twist[6], v[3], slip, most[3] = {0, 0, 0}, left[3];
             int all = 0;
             relative(s, p, place, twist);
+            if (!last && !anywhere(!apart(s, p, twist, h))) {
+                at(s, AT_ACTIVE + p) = 0;
+                continue;
+            }
+            Sum sum;
             UNROLL
             for (int c = 0; c < 3; ++c)
                 left[c] = at(s, AT_LOAD + 6 * p + c) + (coupled ? at(s, AT_CHANGE + 6 * p + c) : 0);
@@ -269,7 +304,10 @@ struct team_coupling
                         candidate);
                     at(s, across_of(pair, i)) = across;
                     flags.set(i, closed, candidate);
-                    if (!last) continue;
+                    if (!last) {
+                        sum.add(place, touch, across, closed, law);
+                        continue;
+                    }
                     if (touch.depth > deepest) {
                         deepest = touch.depth;
                         along = slip;
@@ -282,7 +320,10 @@ struct team_coupling
                         force[c] += touch.normal[c] * (now.push + before * normal) - before * v[c];
                 }
                 flags.keep(s, pair);
-                if (!last) continue;
+                if (!last) {
+                    sum.check(s, pair);
+                    continue;
+                }
                 at(s, AT_REPORT + 5 * pair + 3) = count ? -deepest : INFINITY;
                 at(s, AT_REPORT + 5 * pair + 4) = along;
                 UNROLL
@@ -292,7 +333,7 @@ struct team_coupling
                 }
             }
             if (!last) {
-                touching = gather(s, p, place, touches, worlds, h) || touching;
+                touching = sum.leave(s, p) || touching;
                 continue;
             }
             UNROLL

@@ -52,7 +52,7 @@ def declare(team: Any, T: type, local: bool = False) -> str:
     places = {f"AT_{name.upper()}": at for name, at in team.layout.items()}
     sizes = places | {
         "PAIRS": len(team.points), "COUPLES": couples, "BODIES": bodies, "ITEMS": len(items), "ALPHA": team.alpha,
-        "RIGHT": team.right, "SPLIT": int(not few), "BASE": BASE, "HEADER": HEADER, "POINT": POINT,
+        "RIGHT": team.right, "BASE": BASE, "HEADER": HEADER, "POINT": POINT,
     }  # fmt: skip
     text = coupling_shared.NATIVE.replace("MATRICES", coupling_matrices.NATIVE.strip())
     text = text.replace("BLOCKS", coupling_blocks.NATIVE).replace("SHAPES", coupling_points.NATIVE)

@@ -17,7 +17,11 @@ LEAD = 0.05  # share of the smallest half size by which the second box must be f
 def native(T: type) -> str:
     """Return the definition of ``solids`` for scalars of type ``T``."""
     number = "f" if T is wp.float32 else ""
-    text = NATIVE.replace("REAL", C_TYPE[T]).replace("UNROLL\n", "#pragma unroll\n")
+    text = (
+        NATIVE.replace("REAL", C_TYPE[T])
+        .replace("UNROLL\n", "#pragma unroll\n")
+        .replace("LOOP\n", "#pragma unroll 1\n")
+    )
     for name, value in {"AWAY": AWAY, "LEAD": LEAD, "PARALLEL": 1e-6}.items():
         text = text.replace(name, f"{value!r}{number}")
     return text.replace("POINT", str(POINT)).replace("MOST", str(MOST))
@@ -184,19 +188,20 @@ struct solids
         // Puts the first corner of an edge if it is not cut off, and where the edge crosses the sides along y.
         CUDA_CALLABLE inline void put_edge(const Corner& a, const Corner& b, Out& out) const
         {
-            bool inside = true;
+            bool inside = true, enters = false, leaves = false;
+            REAL start = 0, end = 0;
             UNROLL
             for (int side = 1; side >= -1; side -= 2) {
-                const REAL from = side * a.y - height, to = side * b.y - height;
+                const REAL from = side * a.y - height, to = side * b.y - height, share = from / (from - to);
                 inside = inside && from <= 0;
-                if (from > 0 && to < 0) put(a.towards(b, from / (from - to)), out);
+                enters = enters || (from > 0 && to < 0);
+                start = from > 0 && to < 0 ? share : start;
+                leaves = leaves || (from < 0 && to > 0);
+                end = from < 0 && to > 0 ? share : end;
             }
-            if (inside) put(a, out);
-            UNROLL
-            for (int side = 1; side >= -1; side -= 2) {
-                const REAL from = side * a.y - height, to = side * b.y - height;
-                if (from < 0 && to > 0) put(a.towards(b, from / (from - to)), out);
-            }
+            LOOP
+            for (int last = 0; last < 2; ++last)
+                if (last ? leaves : inside || enters) put(a.towards(b, last ? end : start), out);
         }
     };
 

@@ -92,7 +92,8 @@ class Team(NamedTuple):
         """Where each kind of values begins; "end" is the place after the last one."""
         pairs, couples, bodies = len(self.points), len(self.pairs), len(self.limbs)
         sizes = {
-            "value": VALUES * pairs + 2, "count": pairs, "across": sum(self.points), "flags": 2 * pairs,
+            "value": VALUES * pairs + 2, "bound": 2 * couples, "count": pairs,
+            "across": sum(self.points), "flags": 2 * pairs,
             "arm": 6 * couples, "active": couples, "load": 6 * couples, "change": 6 * couples, "root": 21 * couples,
             "right": 6 * self.right * couples, "matrix": sum(21 if p == q else 36 for p, q in self.blocks),
             "twist": 6 * bodies, "wrench": 6 * bodies, "base": BASE if self.alpha >= 0 else 0,
