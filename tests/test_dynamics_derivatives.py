@@ -361,3 +361,30 @@ def test_a_planted_bug_is_seen(bug, monkeypatch):
     got = inverse(scene, a)
     wanted = by_differences(scene, a, 0)
     assert max(laws.error(got[i, 0], wanted[i]) for i in range(2)) > 1e-3
+
+
+def test_a_repeated_or_captured_call_waits_for_its_second_stream(device):
+    """The inverse mass matrix is computed beside the rest, and the product needs it: no call reads an older one."""
+    scene, worlds = zoo.branched(0), 64
+    dyn = spo.Dynamics(scene, worlds, device)
+    states = [zoo.random_state(scene, worlds, seed) for seed in range(4)]
+    given = [[wp.array(x, dtype=dyn.dtype, device=device) for x in (s.q, s.qd, 3.0 * s.qd)] for s in states]
+    expected = [
+        [x.numpy() for x in spo.Dynamics(scene, worlds, device).forward_dynamics_derivatives(*g)] for g in given
+    ]
+    shape = worlds, scene.dof_count, scene.dof_count
+    out = tuple(wp.full(shape, np.nan, dtype=dyn.dtype, device=device) for _ in range(3))
+    for arrays, wanted in zip(given, expected, strict=True):  # the second call is recorded, the third repeats it
+        dyn.forward_dynamics_derivatives(*arrays, out=out)
+        assert all(np.array_equal(x.numpy(), y) for x, y in zip(out, wanted, strict=True))
+    if not device.is_cuda:
+        return
+    with wp.ScopedCapture(device) as capture:
+        for _ in range(3):
+            dyn.forward_dynamics_derivatives(*given[0], out=out)
+    for _ in range(3):
+        wp.copy(given[0][0], given[1][0])
+        wp.copy(given[0][1], given[1][1])
+        wp.copy(given[0][2], given[1][2])
+        wp.capture_launch(capture.graph)
+    assert all(np.array_equal(x.numpy(), y) for x, y in zip(out, expected[1], strict=True))

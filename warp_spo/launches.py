@@ -24,6 +24,7 @@ from .memory import size_in_bytes, view
 
 class _Thread(threading.local):
     recording: Recording | None = None
+    branch: Branch | None = None
     waiting: list[Callable[[], None]] | None = None
     kernels: set[tuple[wp.Kernel, str, int]] | None = None
 
@@ -74,6 +75,48 @@ def sort(keys: wp.array, values: wp.array, count: int) -> None:
     wp.utils.radix_sort_pairs(keys, values, count)
     if _thread.recording is not None:
         _thread.recording.keep(_Sort, keys, values, count)
+
+
+class Branch:
+    """A second stream of a device, for work of a call that runs beside the rest of it; on a CPU nothing.
+
+    A branch serves one call at a time, as the Dynamics does that has it.
+    """
+
+    def __init__(self, device: wp.Device):
+        self.device = device
+        if device.is_cuda:
+            self.stream, self._begin, self._end = wp.Stream(device), wp.Event(device), wp.Event(device)
+
+    @contextlib.contextmanager
+    def beside(self) -> Iterator[None]:
+        """Launch the work of the ``with`` block after all that came before, and beside what follows until the join."""
+        if not self.device.is_cuda or _thread.waiting is not None:
+            yield
+            return
+        self._order(self._fork)
+        _thread.branch = self
+        try:
+            with wp.ScopedStream(self.stream, sync_enter=False):
+                yield
+        finally:
+            _thread.branch = None
+
+    def join(self) -> None:
+        """Let what follows wait for the work of the branch."""
+        if self.device.is_cuda and _thread.waiting is None:
+            self._order(self._join)
+
+    def _order(self, order: Callable[[wp.Stream], None]) -> None:
+        order(self.device.stream)
+        if _thread.recording is not None:
+            _thread.recording.steps.append(_Order(order))
+
+    def _fork(self, main: wp.Stream) -> None:
+        self.stream.wait_event(main.record_event(self._begin))
+
+    def _join(self, main: wp.Stream) -> None:
+        main.wait_event(self.stream.record_event(self._end))
 
 
 @contextlib.contextmanager
@@ -183,6 +226,23 @@ class _Launch:
             )
 
 
+class _Order:
+    """Lets a branch wait for the stream of a call, or the stream for the branch."""
+
+    def __init__(self, order: Callable[[Any], None]):
+        self.launch = order
+
+
+class _OnBranch:
+    """A step on the stream of a branch, whatever the stream of the call."""
+
+    def __init__(self, step: Any, branch: Branch):
+        self._step, self._stream = step, branch.stream
+
+    def launch(self, stream: wp.Stream | None) -> None:
+        self._step.launch(self._stream)
+
+
 class Recording:
     """The device work of one call, done inside ``with Recording(arrays) as recording:``.
 
@@ -241,7 +301,7 @@ class Recording:
                 command.params_addr[at] = ctypes.c_void_p(ctypes.addressof(packed))
             self._follow(argument, packed)
         command.fwd_args = None  # would keep the caller's memory
-        self.steps.append(_Launch(command))
+        self._add(_Launch(command))
 
     def keep(self, step: type, *arguments: Any) -> None:
         """Keep a copy, a fill or a sort that was done."""
@@ -255,7 +315,10 @@ class Recording:
             if moves:
                 self.complete &= bool(argument.is_contiguous)
                 self._follow(argument, places[-1])
-        self.steps.append(step(*places))
+        self._add(step(*places))
+
+    def _add(self, step: Any) -> None:
+        self.steps.append(step if _thread.branch is None else _OnBranch(step, _thread.branch))
 
     def _find(self, array: wp.array) -> int | None:
         """Return the number of the caller's array in whose memory an array starts."""

@@ -7,6 +7,7 @@ about it, in the axes of the parent anchor.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -157,15 +158,21 @@ def forward_dynamics_derivatives(
         outs = engine.outs(call, FORWARD_DYNAMICS_DERIVATIVES, out)
         given = engine.read(call, FORWARD_DYNAMICS_DERIVATIVES, q=q, qd=qd, tau=tau, body_f=body_f)
         results = engine.write(call, FORWARD_DYNAMICS_DERIVATIVES, outs, given)
-        qdd = known_accelerations(self, None, **given)
         n, (by_q, by_qd, inverse) = self.scene.dof_count, results
         if self.embedding is not None:
+            qdd = known_accelerations(self, None, **given)
             _differentiate_by_rows(self, {**given, "qdd": qdd}, results)
         elif n:
+            assert MASS_MATRIX_INVERSE.routine is not None
+            beside = self.plan.runs_beside(MASS_MATRIX_INVERSE.routine)
+            with engine.branch.beside() if beside else contextlib.nullcontext():
+                engine.launch(MASS_MATRIX_INVERSE, inverse, q=given["q"])
+            qdd = known_accelerations(self, None, **given)
             given = {"q": given["q"], "qd": given["qd"], "qdd": qdd, "body_f": given["body_f"]}
             program, rates = _tiled(self, INVERSE_DYNAMICS_DERIVATIVES, (2, n, n), {"mass": False}, **given)
             assert program is not None and rates is not None
-            engine.launch(MASS_MATRIX_INVERSE, inverse, q=given["q"])
+            if beside:
+                engine.branch.join()
             self.programs.product(program, n).launch(inverse, rates, by_q, by_qd)
     return ForwardDynamicsDerivatives(*call.result)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,6 +28,11 @@ class Engine:
     def __init__(self, dyn: Dynamics):
         self._dyn = dyn
         self._shapes: dict[tuple[str, int, int], tuple[tuple[int, ...], str]] = {}
+
+    @functools.cached_property
+    def branch(self) -> launches.Branch:
+        """A second stream, for work of a call that runs beside the rest of it."""
+        return launches.Branch(self._dyn.device)
 
     # -- calls -----------------------------------------------------------------------------------------------------
     def run(self, operation: Operation, out: Any = None, entries: int = 0, **given: Any) -> Any:

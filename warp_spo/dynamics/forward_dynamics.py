@@ -73,7 +73,7 @@ FORWARD_DYNAMICS = Operation(
             nodes.forward_dynamics,
             letters="fPza",
             collects=True,
-            occupancy=((3, 168), (2, 128)),
+            occupancy=((4, 128), (3, 168), (2, 128)),
         ),
     ),
     embed=EMBEDDED_FORWARD_DYNAMICS,

@@ -186,6 +186,13 @@ class Plan:
         most = SPILLS["float32"] if granularity == "segment" else HELD
         return not self.device.cuda or self.dofs <= most or self.worlds <= WARP_SIZE * self.device.multiprocessors
 
+    def runs_beside(self, routine: Routine) -> bool:
+        """Whether a routine that others do not wait for runs on a second stream beside them.
+
+        Sweeps do not, because they share a workspace. With many worlds each kernel fills the GPU by itself.
+        """
+        return self.device.cuda and self.few and self.of(routine) != "node"
+
     def column_chunk(self, columns: int, bytes_per_column: int) -> int:
         """Right-hand sides that go through a solve at once."""
         return max(1, min(columns, COLUMN_BYTES // max(1, bytes_per_column)))
