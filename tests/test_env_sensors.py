@@ -49,24 +49,24 @@ def test_history_delay_and_bias():
 
 def test_a_term_of_rows_is_its_list():
     """A thread for each row of each world finds what the list of all rows is; noise differs by row, world and step."""
-    rows = np.random.default_rng(0).normal(size=(20, 2))
+    rows = np.random.default_rng(0).normal(size=(21, 2))
     each = observations.Each(lambda w, row: row[0] * w.q[1] + row[1], rows)
     noisy = Observation(each, scale=2.0, noise=0.1, clip=(-3.0, 3.0))
     terms = {"rows": [lambda w: w.q, each, noisy], "list": [lambda w: each(w)], "again": [noisy]}
     env, few = (cart_env(worlds, observations=terms, final_observations=True) for worlds in (8, 3))
-    assert env.num_obs == {"rows": 42, "list": 20, "again": 20}
+    assert env.num_obs == {"rows": 44, "list": 21, "again": 21}
     before = None
     for _ in range(25):  # with new starts
         observed, _, _, extras = env.step(torch.zeros(8, 1))
         fewer, _, _, _ = few.step(torch.zeros(3, 1))
         for seen in (observed, extras["final_observations"]):
-            plain, noise = seen["rows"][:, 2:22], seen["rows"][:, 22:] - 2.0 * seen["list"].clamp(-1.4, 1.4)
+            plain, noise = seen["rows"][:, 2:23], seen["rows"][:, 23:] - 2.0 * seen["list"].clamp(-1.4, 1.4)
             expected = seen["rows"][:, 1:2].double().numpy() * rows[:, 0] + rows[:, 1]
             assert np.allclose(plain.numpy(), expected, atol=FLOAT32) and torch.allclose(plain, seen["list"])
             inside = seen["list"].abs() < 1.4
             assert (noise[inside].abs() <= 0.2 + FLOAT32).all() and noise[inside].abs().max() > 0.15
             assert noise[inside].unique().numel() > 0.9 * inside.sum()
-            assert not seen["again"].equal(seen["rows"][:, 22:])
+            assert not seen["again"].equal(seen["rows"][:, 23:])
         assert all(fewer[name].equal(observed[name][:3]) for name in terms)
         assert before is None or not before.equal(noise)
         before = noise
