@@ -241,6 +241,11 @@ def less(x: Value, y: Value) -> Value:
     return graph.make("less", x, y)
 
 
+def lost(x: Value) -> Value:
+    """Return 0, or NaN where ``x`` is not finite."""
+    return x - x if is_constant(x) else x.graph.make("lost", x)
+
+
 def floor(x: Value) -> Value:
     """Return the largest whole number that is not above ``x``."""
     return math.floor(x) * 1.0 if is_constant(x) else x.graph.make("floor", x)

@@ -25,7 +25,7 @@ class Surface(NamedTuple):
     Attributes:
         normal: in the axes that :func:`directions` names. depth: of the point below the surface [m].
         cell: whose heights the surface follows; None on a plane.
-        near: 1 where it is there at all, else 0, and then the depth is AWAY; None: it always is.
+        near: 1 where it is there at all, else 0, and then the depth is AWAY; None: the ground has no walls.
     """
 
     normal: Vector
@@ -81,7 +81,7 @@ def surfaces(
         return [Surface(smooth, (height - z) * smooth[2], cell)]
     steep = less(STEEP * STEEP, cell.steepness(rate_x, rate_y))
     flat = Vector(select(steep, a, b) for a, b in zip(IDENTITY[2], smooth, strict=True))
-    bottom = Surface(flat, (select(steep, cell.lowest, height) - z) * flat[2], cell)
+    bottom = Surface(flat, (select(steep, cell.lowest, height) - z) * flat[2], cell, 1.0)
     next_i = select(steep, i, _cell((x + moves[0] - ground.origin[0]) * rate_x, rows)[0])
     next_j = select(steep, j, _cell((y + moves[1] - ground.origin[1]) * rate_y, columns)[0])
     s, t = (i + s) - next_i, (j + t) - next_j

@@ -19,7 +19,7 @@ numbers, and only the rest stays: they know that link's motion, and their messag
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -27,7 +27,7 @@ import numpy as np
 from ...scene.contacts import AWAY, HEIGHTS, PLACE, ContactPoint, Listed
 from ...scene.scene import Scene
 from ...trace.evaluation import evaluate
-from ...trace.scalars import Value, branch, is_constant, less, select
+from ...trace.scalars import Value, branch, is_constant, less, lost, select
 from ...trace.spatial import IDENTITY, ZERO, Vector, cross, dot, total
 from ..composite import mass_matrix
 from ..kinematics import carried_velocity, frame_on_link, jacobian, zero
@@ -55,7 +55,7 @@ class Point:
         weight: inverse weight that predicts slip [1/kg]. axes: of the inertial frame, in the link, where asked.
         depth, push: how far below ground it would be after a step that ends with n* J v = 0, and its normal force then.
         cell: of the height field, whose heights the ground has there; None on a plane.
-        near: 1 where the surface is near, else 0; None: it always is, or code shall not branch.
+        near: 1 where the surface is near, else 0; None: code shall not branch.
     """
 
     number: int
@@ -83,20 +83,18 @@ class Point:
 
     def settled(self, *more: Value) -> tuple[Point, list[Value]]:
         """Return the point, and more values that are zero away from its surface; code computes both only near it."""
-        if self.near is None:
+        if self.near is None or is_constant(self.near):
             return self, list(more)
         mask, name = self.near, f"surface of {self.number}"
         only = lambda x, away=0.0: branch(mask, x, away, name)  # noqa: E731
         values: dict[str, Any] = {} if is_constant(self.d) or self.d.op == "input" else {"d": only(self.d)}
         values |= dict(normal=Vector(only(x) for x in self.normal), gap=only(self.gap, -AWAY), push=only(self.push))
         depth, found = only(self.depth, AWAY), [only(x) for x in more]
-        return dataclasses.replace(self, **values, depth=depth, near=less(0.5 * AWAY, depth)), found
+        return dataclasses.replace(self, **values, depth=depth), found
 
-    def only_near(self, values: Sequence[Value], name: str) -> list[Value]:
-        """Return values, zero away from the surface, where code does not compute them."""
-        if self.near is None:
-            return list(values)
-        return [branch(self.near, x, 0.0, f"{name} {self.number}") for x in values]
+    def works(self, candidate: Value) -> Value:
+        """Return what is not zero where the point is a candidate, or its push is no number, which must be seen."""
+        return candidate + lost(self.push)
 
     @property
     def velocity(self) -> Vector:

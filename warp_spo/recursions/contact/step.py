@@ -39,6 +39,7 @@ PASSES = 3  # what a step with contacts takes if the caller does not say
 TOLERANCE = 0.1  # share of the weight, or of an effort limit, by which the last pass may exceed its laws without a word
 FELT = 64.0  # roundings of a pivot; an inertia that is less of it may be rounding alone
 TINY = 1e-24  # square of a slip [m^2/s^2] that is nothing; its derivative is still a number in float32
+NOTHING, NO_PUSH = Articulated.build(lambda i, j: 0.0), Vector([0.0] * 6)  # damper and load of no point
 REPORTS = ("contact_f", "contact_gap", "contact_slip", "contact_excess")
 
 
@@ -233,13 +234,19 @@ class ContactStep(Step):
                 on.setdefault(id(point.link), []).append((point, touch))
         for key, pressed in on.items():
             trace.label(pressed[0][0].link, "c")  # type: ignore[arg-type]
-            P, push = self._sum([x for x in pressed if x[0].near is None])
-            rare = [x for x in pressed if x[0].near is not None]
-            if rare:
-                near, name = total(point.near for point, _ in rare), f"walls of {rare[0][0].number}"
-                more, pushed = self._sum(rare)
-                only = [branch(near, x, 0.0, name) for x in (*more.packed, *pushed)]
-                P, push = P + Articulated.unpacked(only[:-6]), push + Vector(only[-6:])
+            floors = [x for x in pressed if x[0].near is None or is_constant(x[0].near)]
+            P, push = self._sum(floors)
+            if pressed[0][0].near is not None:  # the points of a ground with walls are rarely near it all at once
+                name, touched = (
+                    f"points of {pressed[0][0].number}",
+                    total(point.works(touch.candidate) for point, touch in floors),
+                )
+                P, push = _chosen(touched, (P, push), (NOTHING, NO_PUSH), name)
+            walls = [x for x in pressed if x[0].near is not None and not is_constant(x[0].near)]
+            if walls:
+                more, pushed = self._sum(walls)
+                touched = total(touch.candidate for _, touch in walls)
+                P, push = _chosen(touched, (P + more, push + pushed), (P, push), name)
             trace.dampers[key], trace.pushes[key] = P, push
 
     def _sum(self, pressed: list[tuple[Point, Touch]]) -> tuple[Articulated, Vector]:
@@ -287,12 +294,13 @@ class ContactStep(Step):
         closed = select(stays, 1.0, candidate * pushes)
         lacking = select(touch.closed, 0.0, candidate * select(pushes, push, 0.0))
         pulls = select(less(pushed, 0.0), -pushed, 0.0)
-        values = [*force, slip, over, pulls, lacking, across, candidate, closed]
-        values = point.only_near(values, "force at")
-        slip, over, pulls, lacking, across, candidate, closed = values[3:]
+        if point.near is not None:
+            values = (*force, over, pulls, lacking, across, closed)
+            found = [branch(point.works(candidate), x, 0.0, f"force at {point.number}") for x in values]
+            force, (over, pulls, lacking, across, closed) = Vector(found[:3]), found[3:]
         for variable, value in ((touch.across, across), (touch.candidate, candidate), (touch.closed, closed)):
             kept.keep(variable, value)
-        return Vector(values[:3]), slip, over, pulls, lacking
+        return force, slip, over, pulls, lacking
 
     # -- results ---------------------------------------------------------------------------------------------------
     def _report(self, number: int, surfaces: list[tuple[Point, Vector, Value]]) -> None:
@@ -383,6 +391,15 @@ class ContactStep(Step):
         place = ground_place(self.impedance)
         values += [*place.origin, place.field]
         return super()._inputs() + [value for value in values if not is_constant(value)]
+
+
+def _chosen(
+    mask: Value, new: tuple[Articulated, Vector], old: tuple[Articulated, Vector], name: str
+) -> tuple[Articulated, Vector]:
+    """Return damper and load ``new`` where ``mask`` is not zero, else ``old``, in a branch."""
+    pairs = zip((*new[0].packed, *new[1]), (*old[0].packed, *old[1]), strict=True)
+    found = [branch(mask, a, b, name) for a, b in pairs]
+    return Articulated.unpacked(found[:-6]), Vector(found[-6:])
 
 
 def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> list[Store]:
