@@ -237,16 +237,13 @@ class ContactStep(Step):
             floors = [x for x in pressed if x[0].near is None or is_constant(x[0].near)]
             P, push = self._sum(floors)
             if pressed[0][0].near is not None:  # the points of a ground with walls are rarely near it all at once
-                name, touched = (
-                    f"points of {pressed[0][0].number}",
-                    total(point.works(touch.candidate) for point, touch in floors),
-                )
-                P, push = _chosen(touched, (P, push), (NOTHING, NO_PUSH), name)
+                touched = total(point.works(touch.candidate) for point, touch in floors)
+                P, push = _chosen(touched, (P, push), (NOTHING, NO_PUSH), f"floors of {key}")
             walls = [x for x in pressed if x[0].near is not None and not is_constant(x[0].near)]
             if walls:
                 more, pushed = self._sum(walls)
                 touched = total(touch.candidate for _, touch in walls)
-                P, push = _chosen(touched, (P + more, push + pushed), (P, push), name)
+                P, push = _chosen(touched, (P + more, push + pushed), (P, push), f"walls of {key}")
             trace.dampers[key], trace.pushes[key] = P, push
 
     def _sum(self, pressed: list[tuple[Point, Touch]]) -> tuple[Articulated, Vector]:
