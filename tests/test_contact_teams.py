@@ -1,5 +1,6 @@
 """Steps with contacts by limbs side by side: the step by whole trees, races, and neighbours."""
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -7,9 +8,9 @@ import pytest
 import symbolic
 import warp_machine
 import zoo
-from contact_cases import everywhere, quadruped, touching
+from contact_cases import box, everywhere, quadruped, touching
 from step_scenes import furnished, states
-from test_contact_step import steps
+from test_contact_step import FIELDS, above, assert_is_dense, steps
 from test_step_teams import driven
 
 import warp_spo as spo
@@ -20,6 +21,7 @@ from warp_spo.kernels.substeps import repeat_on_cuda
 from warp_spo.recursions.contact import points, step
 from warp_spo.recursions.contact.step import REPORTS
 from warp_spo.recursions.tracing import Trace
+from warp_spo.reference_contact import ContactStep
 
 H, WORLDS = 5e-3, 4
 SIZES = {"contact_f": (3,), "contact_gap": (), "contact_slip": ()}
@@ -171,3 +173,14 @@ def test_a_planted_bug_is_seen(bug, monkeypatch):
     symbolic.plant(monkeypatch, *BUGS[bug])
     with pytest.raises(AssertionError):
         assert_right(text_of(monkeypatch, "quadruped", True))
+
+
+def test_points_that_see_no_walls():
+    """A box on stairs whose corners see slopes, with a sphere that sees walls."""
+    bare = box(ground=FIELDS["stairs"])
+    corners = dataclasses.replace(bare.contacts[0], walls=False)
+    scene = bare.with_contacts([corners, spo.Contact(0, sphere=0.25)], bare.ground)
+    a = above(bare, 1, 12)
+    assert_is_dense(scene, a, 3)
+    seen = [ContactStep(scene, a["q"][w], a["qd"][w], H).numbers for w in range(12)]
+    assert all(numbers[:8] == [*range(8)] for numbers in seen) and {len(numbers) for numbers in seen} == {9, 10}

@@ -181,12 +181,12 @@ def _slip(n, x):
     return np.linalg.norm(x - _along(n, x)[:, None] * n, axis=1)
 
 
-def surfaces(field, at, number=0, moves=(0.0, 0.0, 0.0)):
+def surfaces(field, at, number=0, moves=(0.0, 0.0, 0.0), walls=True):
     """Return normal and depth of the surfaces of a height field near a point that the step takes by ``moves``.
 
     They are the field's own, or a floor and a wall where the middle slope of the cell exceeds 1. The wall ends at the
     highest corner. A cell without a wall is followed by the wall of the cell where the step takes the point, if that
-    rises along ``moves``. Of a set of fields it is that of this number.
+    rises along ``moves``. Of a set of fields it is that of this number. Without ``walls`` they are the field's own.
     """
     h, place = field.heights.reshape(-1, *field.heights.shape[-2:])[number], at[:2] - field.origin[:2]
     place, ahead = (np.clip(x / field.cell, 0.0, np.array(h.shape) - 1.0) for x in (place, place + moves[:2]))
@@ -205,13 +205,13 @@ def surfaces(field, at, number=0, moves=(0.0, 0.0, 0.0)):
         return [(upward(middle), (plane - z) * upward(middle)[2])] if z <= corners.max() else []
 
     corners, middle, (s, t) = cell(place)
-    if np.linalg.norm(middle) > 1.0:
+    if walls and np.linalg.norm(middle) > 1.0:
         return [(np.array([0.0, 0.0, 1.0]), corners.min() - z), *wall(corners, middle, np.array([s, t]))]
     height = np.array([1.0 - s, s]) @ corners @ np.array([1.0 - t, t])
     slope = np.array([np.array([1.0 - t, t]) @ (corners[1] - corners[0]),
                       np.array([1.0 - s, s]) @ (corners[:, 1] - corners[:, 0])]) / field.cell  # fmt: skip
     after = cell(ahead)
-    rises = np.linalg.norm(after[1]) > 1.0 and after[1] @ moves[:2] > 0.0
+    rises = walls and np.linalg.norm(after[1]) > 1.0 and after[1] @ moves[:2] > 0.0
     return [(upward(slope), (height - z) * upward(slope)[2]), *(wall(*after) if rises else [])]
 
 
@@ -285,7 +285,7 @@ class ContactStep:
             if plane:
                 touched = [(np.array(ground.normal), ground.height - (at - moved) @ ground.normal)]
             else:
-                touched = surfaces(ground, at - moved, int(field[0]) if len(field) else 0, moves)
+                touched = surfaces(ground, at - moved, int(field[0]) if len(field) else 0, moves, point.walls)
             for normal, depth in touched:
                 J = dense._jacobian_at(point.body, at)[:3]
                 damping = d * k * max(depth, 0.0) if point.dissipates else d

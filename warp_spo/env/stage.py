@@ -170,7 +170,8 @@ class Stage:
         words = [f"((unsigned int*)key.data)[{i}]" for i in range(3)]
         world, step = f"{words[2]} + (unsigned int)world", buffers["tick"].place("tick", "0")
         first = f"row * {-(-self.draws // 4)}" if self.rows else "0"
-        random = philox.draws(self.draws, (words[0], words[1]), self.stream, world, step, first)
+        late = any(x.op == "branch" for x in ordered(item.value for item in self.stores))
+        random = philox.draws(self.draws, (words[0], words[1]), self.stream, world, step, first, late)
         touched |= {"key"} if self.draws else set()
         touched |= {"tick"} if self.draws or self.ticks else set()
         touched |= {name for name in ("advance", "chosen") if name in self.ticks}

@@ -78,4 +78,4 @@ def make_emitter(dtype: str, shapes: dict, layout: KernelLayout, pieces: bool = 
             return places[array][index[0]]
         return index[0] if len(index) == 1 else staging.flat_index(index, shapes[array][1:])
 
-    return Emitter(dtype, load, store, flat, angles, FIELDS, fuses=True)
+    return Emitter(dtype, load, store, flat, angles, FIELDS, fuses=True, branches=False)  # slower on an H200

@@ -160,6 +160,8 @@ class Contact(StoredPart):
             depth before the step, zero at the first touch. The scene's ``contact_damping`` of such points is c. Not
             with ``other``.
         eps: speed [m/s] below which friction is a damper. A point that sticks creeps by less than that.
+        walls: on a height field, cells steeper than 45 degrees are a wall and a floor for the points; False: the slopes
+            that they are, where a wall matters little, for half the time that such a point takes.
         label: name in tables and errors.
 
     Raises:
@@ -178,6 +180,7 @@ class Contact(StoredPart):
     damping: float | None = None
     dissipation: float | None = None
     eps: float = 1e-3
+    walls: bool = True
     label: str = ""
     positions: np.ndarray = dataclasses.field(init=False, repr=False)  # of the points, in the body frame [point, 3]
     radius: float = dataclasses.field(init=False, repr=False)  # of the sphere about each
@@ -211,7 +214,8 @@ class ContactPoint(NamedTuple):
     Attributes:
         contact: index of its contact in ``Scene.contacts``. body: index of its body.
         position: of the point, or of the centre of its sphere, in the body frame [m]. radius: of the sphere, or 0 [m].
-        eps: speed below which friction is a damper [m/s]. dissipates: its damping grows with the depth.
+        eps: speed below which friction is a damper [m/s]. dissipates: its damping grows with the depth. walls: it sees
+            walls of a height field.
     """
 
     contact: int
@@ -220,6 +224,7 @@ class ContactPoint(NamedTuple):
     radius: float
     eps: float
     dissipates: bool = False
+    walls: bool = True
 
 
 # -- shapes ------------------------------------------------------------------------------------------------------------
@@ -320,7 +325,9 @@ def spread_directions(count: int = DIRECTIONS) -> np.ndarray:
 def contact_points(contacts: Sequence[Contact]) -> tuple[ContactPoint, ...]:
     """Return the points of all contacts with the ground, contact after contact."""
     return tuple(
-        ContactPoint(index, contact.body, (x, y, z), contact.radius, contact.eps, contact.dissipation is not None)
+        ContactPoint(
+            index, contact.body, (x, y, z), contact.radius, contact.eps, contact.dissipation is not None, contact.walls
+        )
         for index, contact in enumerate(contacts)
         if contact.other is None
         for x, y, z in contact.positions.tolist()

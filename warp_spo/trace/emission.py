@@ -105,6 +105,8 @@ class Emitter:
         angles: when full turns are subtracted from large angles.
         late: the names of the arrays whose entries are loaded where they are first used, instead of where the trace
             first read them.
+        branches: whether CUDA branches, too. Otherwise it computes the values of a branch always, which must be the
+            same then.
         fuses: a product and the sum that takes it are one statement, FUSED_T(a, b, c) = a b + c, rounded once on CUDA.
             Otherwise the compiler decides, and may decide differently in another kernel with the same formulas.
     """
@@ -118,9 +120,11 @@ class Emitter:
         angles: RangeReduction = RangeReduction.FIRST,
         late: Iterable[str] = (),
         fuses: bool = False,
+        branches: bool = True,
     ):
         self.dtype, self._load, self._store, self._flat = dtype, load, store, flat
         self._angles, self._late, self._fuses = angles, tuple(late), fuses
+        self._branches = branches
         self._products: dict[tuple, Scalar] = {}
         self.counts: Counter = Counter()
         self._names: dict[tuple, str] = {}
@@ -210,7 +214,8 @@ class Emitter:
                 otherwise = self._text(scalar.args[2])
                 lines.append(f"{T} {self._name(scalar, scalar.step.rpartition('|')[2])} = {otherwise};")
         names = dict(self._names)
-        lines.append(f"if ({mask} != 0) {{")
+        condition = f"if ({mask} != 0) {{"
+        lines += [condition] if self._branches else ["#if defined(__CUDA_ARCH__)", "{", "#else", condition, "#endif"]
         for scalar in block:
             if scalar.key not in fused and scalar.key not in self._names:  # a sine comes with its cosine
                 lines += self._statement(scalar, scalar.step.rpartition("|")[2])

@@ -65,13 +65,16 @@ class Robot:
         return found
 
 
-def load(name: str, ground: Any = None, contacts: tuple[str, ...] | None = None) -> Robot:
+def load(
+    name: str, ground: Any = None, contacts: tuple[str, ...] | None = None, walls: tuple[str, ...] | None = None
+) -> Robot:
     """Return a robot by name, on the ground.
 
     Args:
         name: one of ``NAMES``.
         ground: spo.Plane or spo.HeightField; None: the plane z = 0.
         contacts: parts of the names of contacts to keep; None keeps all.
+        walls: parts of the names of contacts that see walls of a height field, see :class:`spo.Contact`; None: all.
 
     Raises:
         ValueError: the name is unknown.
@@ -89,6 +92,9 @@ def load(name: str, ground: Any = None, contacts: tuple[str, ...] | None = None)
     touch = [_contact(model, geom) for geom in range(model.ngeom) if model.geom_group[geom] == TOUCH]
     if contacts is not None:
         touch = [contact for contact in touch if any(part in contact.label for part in contacts)]
+    if walls is not None:
+        seen = {contact.label: any(part in contact.label for part in walls) for contact in touch}
+        touch = [dataclasses.replace(contact, walls=seen[contact.label]) for contact in touch]
     if touch:
         scene = scene.with_contacts(touch, Plane() if ground is None else ground)
     look = [_primitive(model, geom) for geom in range(model.ngeom) if model.geom_group[geom] == LOOK]

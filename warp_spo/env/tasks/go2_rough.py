@@ -36,7 +36,7 @@ def build(worlds: int, device: Any = None, seed: int = 0, trial: str | None = No
     """Return the environment; ``trial``: one of ``TRIALS``, straight on at 0.6 m/s; ``options`` go to :class:`Env`."""
     kinds, rows = (KINDS, 10) if trial is None else (TRIALS[trial], 1)
     tiles = terrain.tiles(rows, len(kinds) * (2 if trial is None else 1), SIZE, kinds=kinds, seed=1)
-    robot = robots.load(ROBOT, tiles.field, contacts=("foot", "trunk", "knee"))
+    robot = robots.load(ROBOT, tiles.field, contacts=("foot", "trunk", "knee"), walls=("foot",))
     wanted = commands.Velocity(
         forward=(-0.5, 1.0), left=(-0.4, 0.4), turn=(-1.0, 1.0), heading=(-np.pi, np.pi), standing=0.05,
         seconds=(5.0, 10.0),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ...trace.scalars import Value, is_constant, reciprocal
+from ...trace.scalars import Value, branch, is_constant, reciprocal
 from ...trace.spatial import Articulated, Matrix, Rigid, Vector, cross, dot, skew, total, upper
 from .points import Point
 
@@ -60,6 +60,15 @@ def load(points: Sequence[Point], pushes: Sequence[Value], P: Articulated, h: Va
         normal, moment = each[0][0].normal, _moment(each)
         n, f = n + cross(moment, normal), f + normal * total(push for _, push in each)
     return Vector((*n, *f))
+
+
+def chosen(
+    mask: Value, new: tuple[Articulated, Vector], old: tuple[Articulated, Vector], name: str
+) -> tuple[Articulated, Vector]:
+    """Return damper and load ``new`` where ``mask`` is not zero, else ``old``, in a branch."""
+    pairs = zip((*new[0].packed, *new[1]), (*old[0].packed, *old[1]), strict=True)
+    found = [branch(mask, a, b, name) for a, b in pairs]
+    return Articulated.unpacked(found[:-6]), Vector(found[-6:])
 
 
 def _by_normal(points: Sequence[Point], values: Sequence[Value]) -> list[list[tuple[Point, Value]]]:

@@ -58,12 +58,13 @@ class Place(NamedTuple):
 
 
 def surfaces(
-    graph: Graph, ground: Plane | HeightField, at: list[Value], place: Place, moves: list[Value]
+    graph: Graph, ground: Plane | HeightField, at: list[Value], place: Place, moves: list[Value], walls: bool = True
 ) -> list[Surface]:
     """Return the surfaces near a point, whose place along each direction is ``at``; the step takes it by ``moves``.
 
     The wall is that of the cell under the point. If that cell has none, it is the one of the cell where the step takes
     the point, if it rises that way: a point must see a riser before it is in it, or the riser would throw it back.
+    Without ``walls`` the surface is the field's own.
     """
     at = [a - dot(axis, place.origin) for a, axis in zip(at, directions(ground), strict=True)]
     if isinstance(ground, Plane):
@@ -77,8 +78,9 @@ def surfaces(
     z = z - ground.origin[2]
     height = cell.base + cell.run * s + cell.rise * t + cell.twist * (s * t)
     smooth = _facing((cell.run + cell.twist * t) * rate_x, (cell.rise + cell.twist * s) * rate_y)
-    if not has_walls(ground, place.varies):
-        return [Surface(smooth, (height - z) * smooth[2], cell)]
+    steep_somewhere = has_walls(ground, place.varies)
+    if not (walls and steep_somewhere):
+        return [Surface(smooth, (height - z) * smooth[2], cell, 1.0 if steep_somewhere else None)]
     steep = less(STEEP * STEEP, cell.steepness(rate_x, rate_y))
     flat = Vector(select(steep, a, b) for a, b in zip(IDENTITY[2], smooth, strict=True))
     bottom = Surface(flat, (select(steep, cell.lowest, height) - z) * flat[2], cell, 1.0)

@@ -176,7 +176,9 @@ def place_points(
         w, v = mine.twist
         moves = [h * dot(axis, v + cross(w, centre)) for axis in toward]
         touched = [_listed(impedance, number)] if isinstance(ground, Listed) else None
-        for normal, depth, cell, near in touched or surfaces(trace.graph, ground, at, place_of_ground, moves):
+        for normal, depth, cell, near in touched or surfaces(
+            trace.graph, ground, at, place_of_ground, moves, point.walls
+        ):
             inward = Vector(total(n * axis[c] for n, axis in zip(normal, toward, strict=True)) for c in range(3))
             faster = h * dot(inward, bend)
             below = depth - (0.5 * h) * faster

@@ -27,7 +27,7 @@ from ..newton_euler import inverse_dynamics
 from ..pieces import Piece, Pieces
 from ..remembered import remembered
 from ..step import GAIN, Step
-from .dampers import SEVERAL, damper, load
+from .dampers import SEVERAL, chosen, damper, load
 from .middle import MIDDLE
 from .points import Point, ground_place, own_points, place_points
 from .secants import Kept, Secant, largest
@@ -81,7 +81,8 @@ class ContactStep(Step):
         trace, kept = self.trace, self.kept
         bias, sent_ahead = self._bias()
         points, touches = [], []
-        for raw in place_points(trace, self.impedance, self.qd, "contact_f" in self.reports, branches=True):
+        alone = trace.piece is None  # limbs side by side are for GPUs, where branches cost more than they spare
+        for raw in place_points(trace, self.impedance, self.qd, "contact_f" in self.reports, branches=alone):
             point, first = raw.settled(*self._first(raw))
             points.append(point)
             touches.append(self._touch(*first))
@@ -238,12 +239,12 @@ class ContactStep(Step):
             P, push = self._sum(floors)
             if pressed[0][0].near is not None:  # the points of a ground with walls are rarely near it all at once
                 touched = total(point.works(touch.candidate) for point, touch in floors)
-                P, push = _chosen(touched, (P, push), (NOTHING, NO_PUSH), f"floors of {key}")
+                P, push = chosen(touched, (P, push), (NOTHING, NO_PUSH), f"floors of {key}")
             walls = [x for x in pressed if x[0].near is not None and not is_constant(x[0].near)]
             if walls:
                 more, pushed = self._sum(walls)
                 touched = total(touch.candidate for _, touch in walls)
-                P, push = _chosen(touched, (P + more, push + pushed), (P, push), f"walls of {key}")
+                P, push = chosen(touched, (P + more, push + pushed), (P, push), f"walls of {key}")
             trace.dampers[key], trace.pushes[key] = P, push
 
     def _sum(self, pressed: list[tuple[Point, Touch]]) -> tuple[Articulated, Vector]:
@@ -388,15 +389,6 @@ class ContactStep(Step):
         place = ground_place(self.impedance)
         values += [*place.origin, place.field]
         return super()._inputs() + [value for value in values if not is_constant(value)]
-
-
-def _chosen(
-    mask: Value, new: tuple[Articulated, Vector], old: tuple[Articulated, Vector], name: str
-) -> tuple[Articulated, Vector]:
-    """Return damper and load ``new`` where ``mask`` is not zero, else ``old``, in a branch."""
-    pairs = zip((*new[0].packed, *new[1]), (*old[0].packed, *old[1]), strict=True)
-    found = [branch(mask, a, b, name) for a, b in pairs]
-    return Articulated.unpacked(found[:-6]), Vector(found[-6:])
 
 
 def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> list[Store]:
