@@ -95,7 +95,8 @@ class SolverSPO(Plugs, SolverBase):
     still, steps take the ``contacts`` that they are given, those of ``newton.CollisionPipeline``, in a fixed number of
     slots for each shape: its contacts in the order of the list, so that results are repeatable if the pipeline is
     deterministic; :attr:`status` is SLOTS in worlds with more. Contacts between bodies are left out: pass ``contacts``
-    to :meth:`step`, and :attr:`status` is UNSUPPORTED in worlds with some. Steps that take
+    to :meth:`step`, and :attr:`status` is UNSUPPORTED in worlds with some; :class:`warp_spo.Dynamics` has them between
+    listed pairs, ``from_newton(model).with_contacts([spo.Contact(body, ..., other=...)])``. Steps that take
     a list of contacts have no gradients.
 
     Loop joints, which belong to no articulation, and mimics hold after every step to float32's rounding if ``loops`` is
