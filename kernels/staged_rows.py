@@ -14,6 +14,7 @@ FEW = 4  # turns of a loop that is hardly ever run, side by side; the compiler w
 DEFINE_ASYNC_COPY = """\
 #define ON_ITS_WAY(to, from) asm volatile("cp.async.ca.shared.global [%0], [%1], %2;" \
     :: "r"((unsigned)__cvta_generic_to_shared(to)), "l"(from), "n"(sizeof(*(to))) : "memory")"""
+COMMIT = 'asm volatile("cp.async.commit_group;" ::: "memory");'
 WAIT_FOR_COPIES = 'asm volatile("cp.async.wait_all;" ::: "memory");'
 
 
@@ -34,6 +35,7 @@ class Copy(NamedTuple):
         wide: entries in 16 bytes; 0 where single entries are copied.
         array: the name of the pointer into the caller's array.
         one: a statement for entry i. several: a statement for ``wide`` entries, from entry ``wide`` i on.
+        after: a statement that follows.
     """
 
     declared: str
@@ -42,6 +44,7 @@ class Copy(NamedTuple):
     array: str
     one: str
     several: str
+    after: str = ""
 
     def whole(self, team: int) -> str:
         """Return the loop of a team over the entries of 32 worlds, 16 bytes at a time where that can be."""
@@ -49,12 +52,16 @@ class Copy(NamedTuple):
         turns = -(-count // team)
         some = "" if turns * team == count else f"if (i < {count}) "
         return f"""    #pragma unroll
-    for (int k = 0; k < {turns}; ++k) {{ const int i = member + {team} * k; {some}{statement} }}"""
+    for (int k = 0; k < {turns}; ++k) {{ const int i = member + {team} * k; {some}{statement} }}{self._end}"""
 
     def part(self, team: int) -> str:
         """Return the loop of a team over the entries of the worlds that are present, one at a time."""
         loop = f"for (int i = member; i < present * {self.entries}; i += {team}) {{ {self.one} }}"
-        return f"    #pragma unroll {FEW}\n    {loop}"
+        return f"    #pragma unroll {FEW}\n    {loop}{self._end}"
+
+    @property
+    def _end(self) -> str:
+        return f"\n    {self.after}" if self.after else ""
 
 
 def pitch(entries: int) -> int:
@@ -67,17 +74,51 @@ def source(row: Row, c: str) -> tuple[str, str]:
     return ("unsigned char", f"(const unsigned char*){row.name}.data") if row.name in MASKS else (c, f"{row.name}.data")
 
 
-def copy_rows_in(rows: list[Row], offset: dict[str, int], c: str, team: int, direct: bool = False) -> str:
+def copy_rows_in(
+    rows: list[Row], offset: dict[str, int], c: str, team: int, direct: bool = False, late: bool = False
+) -> str:
     """Return code that copies the rows of arrays to shared memory, each from its scalar ``offset`` on.
 
     All arrays are read behind one test, because a thread that tests for each of them waits for each. Rows that do not
     pass through registers come first; with ``direct`` they are all that lie in shared memory as they do in the array.
+    With ``late`` nothing waits for these, see :func:`wait_where_used`.
     """
-    on_their_way = [row for row in rows if _is_asynchronous(row, direct)]
+    on_their_way = rows_on_their_way(rows, direct)
     copies = [_copy_in(row, offset[row.name], c, True) for row in on_their_way]
     copies += [_copy_in(row, offset[row.name], c, False) for row in rows if row not in on_their_way]
+    if late:
+        copies = [one._replace(after=COMMIT) if at < len(on_their_way) else one for at, one in enumerate(copies)]
+        return "\n".join([DEFINE_ASYNC_COPY, _run(copies, team), "#undef ON_ITS_WAY"])
     text = _run(copies, team)
     return "\n".join([DEFINE_ASYNC_COPY, text, WAIT_FOR_COPIES, "#undef ON_ITS_WAY"]) if on_their_way else text
+
+
+def rows_on_their_way(rows: list[Row], direct: bool) -> list[Row]:
+    """Return the rows that are copied without passing through registers."""
+    return [row for row in rows if _is_asynchronous(row, direct)]
+
+
+def wait_where_used(statements: str, rows: list[Row]) -> str:
+    """Return the statements of a warp with waits for ``rows``, copied in this order, each before its first use.
+
+    A wait is outside of braces, so that all threads of the warp come to it.
+    """
+    lines, depth, outside = statements.split("\n"), 0, []
+    for line in lines:
+        outside.append(depth == 0)
+        depth += line.count("{") - line.count("}")
+    waits: dict[int, int] = {}  # copies that may still be on their way, by the statement before which that is so
+    for at, row in enumerate(rows):
+        use = next((i for i, line in enumerate(lines) if f"{row.name}_row[" in line), 0)
+        while not outside[use]:
+            use -= 1
+        waits[use] = min(len(rows) - 1 - at, waits.get(use, len(rows)))
+    found = []
+    for i, line in enumerate(lines):
+        if i in waits:
+            found.append(f'asm volatile("cp.async.wait_group {waits[i]};" ::: "memory"); __syncwarp();')
+        found.append(line)
+    return "\n".join(found)
 
 
 def _is_asynchronous(row: Row, direct: bool) -> bool:

@@ -13,7 +13,17 @@ from .elementary import C_TYPE, NATIVE
 from .fields import copy_cached_fields, define_fields
 from .native import INTEGERS
 from .slots import RELAY_WORLDS, WARP_SIZE, SlotLayout
-from .staged_rows import DEFINE_ASYNC_COPY, WAIT_FOR_COPIES, Row, copy_rows_in, copy_rows_out, pitch, source
+from .staged_rows import (
+    DEFINE_ASYNC_COPY,
+    WAIT_FOR_COPIES,
+    Row,
+    copy_rows_in,
+    copy_rows_out,
+    pitch,
+    rows_on_their_way,
+    source,
+    wait_where_used,
+)
 from .substeps import STATE, hold_state, move_state, repeat_on_cuda, repeat_substeps, replace_state, write_state
 
 # shared memory that a block may declare: 48 KiB less the share that Warp uses; more is asked for at the launch
@@ -71,6 +81,7 @@ class KernelLayout(NamedTuple):
             that loads these entries from global memory does so long before their use, and runs out of registers.
         numbers: the names of the numbers that all worlds share, read as ``name_row[0]``.
         direct: short rows, too, are copied to shared memory without passing through registers.
+        late: the statements of a warp without a team wait for such rows where they first use them.
         repeats: the statements are those of a substep, see :mod:`.substeps`.
     """
 
@@ -87,6 +98,7 @@ class KernelLayout(NamedTuple):
     cached: tuple[tuple[int, ...], ...] = ()
     numbers: tuple[str, ...] = ()
     direct: bool = False
+    late: bool = False
     repeats: bool = False
 
     @property
@@ -183,8 +195,10 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
         lines.insert(next(i for i, line in enumerate(lines) if "FIELD(" in line), WAIT_FOR_COPIES)
         cuda = "\n".join(lines)
     if layout.staged or layout.shared_rows:
-        text += [copy_rows_in(layout.shared_rows, offset, c, team, layout.direct)] if layout.shared_rows else []
+        some = layout.shared_rows
+        text += [copy_rows_in(some, offset, c, team, layout.direct, layout.late)] if some else []
         text += [sync]
+        cuda = wait_where_used(cuda, rows_on_their_way(some, layout.direct)) if layout.late else cuda
     if layout.repeats:
         start, width = 0, 0
     elif result.way == IN_PLACE:

@@ -212,3 +212,17 @@ def test_reciprocal_and_root(dtype, device):
     inverse = 1 / np.sqrt(rows[:20000, 0].astype(np.longdouble))
     assert last_places(got[:20000, 2], inverse, dtype).max() <= LAST_PLACES
     assert np.isnan(got[20000:, 1:]).all()
+
+
+def test_a_warp_waits_for_a_row_where_it_first_uses_it():
+    rows = [staged_rows.Row(name, 2, 18) for name in ("q", "qd", "tau")]
+    statements = ["a = 1;", "b = q_row[3];", "if (b) {", "if (a) {", "b = tau_row[0] + qd_row[1];", "}", "}", "c = 2;"]
+    found = staged_rows.wait_where_used("\n".join(statements), rows).split("\n")
+    waits = {line: found[at + 1] for at, line in enumerate(found) if "wait_group" in line}
+    numbers = {re.search(r"wait_group (\d)", line)[1]: after for line, after in waits.items()}
+    assert numbers == {"2": "b = q_row[3];", "0": "if (b) {"}, "one wait for two rows, outside of the braces"
+    assert [line for line in found if "wait_group" not in line] == statements
+    assert all("__syncwarp();" in line for line in waits)
+    late = staged_rows.copy_rows_in(rows, {row.name: 0 for row in rows}, "float", 32, direct=True, late=True)
+    assert late.count(staged_rows.COMMIT) == 2 * len(rows) and staged_rows.WAIT_FOR_COPIES not in late
+    assert staged_rows.copy_rows_in(rows, {row.name: 0 for row in rows}, "float", 32, direct=True).count("wait") == 1

@@ -74,6 +74,7 @@ FORWARD_DYNAMICS = Operation(
             letters="fPza",
             collects=True,
             occupancy=((4, 128), (3, 168), (2, 128)),
+            waits_late=True,
         ),
     ),
     embed=EMBEDDED_FORWARD_DYNAMICS,

@@ -166,7 +166,8 @@ class Plan:
 
         They come sooner, but the compiler then takes more registers; that costs nothing where all worlds run at once.
         """
-        return routine.short and not self.varies and not self.few and self.worlds <= self.device.scaled(AT_ONCE)
+        suits = routine.short or routine.waits_late
+        return suits and not self.varies and not self.few and self.worlds <= self.device.scaled(AT_ONCE)
 
     def gathers(self, routine: Routine, warps: int, results: int) -> bool:
         """Whether short results leave through shared memory though rows do not come in through it.

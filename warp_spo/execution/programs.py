@@ -238,9 +238,10 @@ class Programs:
         elif looped:
             ahead, a_pass = before
             body = straight.repeat_passes(ahead, a_pass, body, LOOPED, self.run.scene.dof_count, self.run.dtype)
-        block = PAIR * WARP_SIZE if self.plan.few and not layout.shared_scalars else WARP_SIZE
-        direct = self.plan.copies_directly(routine)
-        layout = layout._replace(retries=layout.retries and "farthest" in body, block=block, direct=direct)
+        direct = layout.staged and self.plan.copies_directly(routine)
+        late = direct and routine.waits_late
+        block = PAIR * WARP_SIZE if late or (self.plan.few and not layout.shared_scalars) else WARP_SIZE
+        layout = layout._replace(retries=layout.retries and "farthest" in body, block=block, direct=direct, late=late)
         tables: dict[str, Any] = {} if table is None else {"place": table}
         tables |= self._heights(emitter.counts["lookup"] > 0)
         if coupled:

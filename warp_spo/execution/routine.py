@@ -43,6 +43,8 @@ class Routine:
         bias_first: variant that computes velocity terms and loads first, for many worlds of shallow trees.
         occupancy: pairs (blocks, registers): by limbs in float32 with many worlds, a multiprocessor holds so many
             blocks if a thread then still has so many registers; the first pair that applies.
+        waits_late: with a thread a world, where all worlds run at once, a block has two warps, and they wait for a row
+            where they first use it.
         variants: at most so many different options get a kernel of their own where sweeps serve the others.
         wide: its rows are long, so that a team asks for as much shared memory as they need.
         start: ``start(trace, **options)`` returns what a search starts from; None: the kernel is no search, see
@@ -69,6 +71,7 @@ class Routine:
     tiled: bool = False
     bias_first: Routine | None = None
     occupancy: tuple[tuple[int, int], ...] = ()
+    waits_late: bool = False
     variants: int = VARIANTS
     wide: bool = False
     start: Callable[..., list[Store]] | None = None
