@@ -30,7 +30,8 @@ from .substeps import STATE, hold_state, move_state, repeat_on_cuda, repeat_subs
 SHARED_BYTES = 46 * 1024
 COUPLED_BYTES = 220 * 1024  # of a block whose limbs couple pairs of bodies: all that a multiprocessor has
 WIDE_BYTES = 110 * 1024  # shared memory of a block with long rows, of which two fit into an H100's 228 KiB
-MOST_PASSES = 16  # limit for the passes of a loop; 13 was the largest count ever measured, see CONTRIBUTING
+MOST_PASSES = 32  # limit for the passes of a loop; 25 was the largest count ever measured, see docs/measured_facts.md
+PASS = "pass_row"  # counts the passes from zero
 IN_PLACE, STAGED, MAPPED, RELAYED, TILED, DIRECT = "in place", "staged", "mapped", "relayed", "tiled", "direct"
 BY_TABLE = (MAPPED, RELAYED)  # the ways in which a table says which value each entry of a row receives
 TILE = 8  # worlds in a tile of a TILED result
@@ -292,8 +293,13 @@ def repeat_passes(ahead: str, a_pass: str, last: str, names: tuple[str, str, str
     """
     c, missed = C_TYPE[T], names[-1]
     declared = [f"{c} {name}_row[{entries}] = {{}};" for name in names[:-1]] + [f"{c} {missed}_row[1] = {{}};"]
-    loop = f"for (int pass = 0; pass < {MOST_PASSES}; ++pass) {{\n{a_pass}\nif (!({missed}_row[0] > 0)) break;\n}}"
-    return "\n".join([ahead, *declared, loop, last])
+    body = f"{_numbered(a_pass, c)}\nif (!({missed}_row[0] > 0)) break;"
+    return "\n".join([ahead, *declared, f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{\n{body}\n}}", last])
+
+
+def _numbered(a_pass: str, c: str) -> str:
+    """Return code of a pass with its number, if it reads that."""
+    return f"const {c} {PASS}[1] = {{({c})turn}};\n{a_pass}" if PASS in a_pass else a_pass
 
 
 def repeat_counted_passes(parts: list[str], entries: dict[str, int], T: type) -> str:
@@ -322,7 +328,7 @@ def repeat_team_passes(a_pass: str, flags: int, warps: int, c: str) -> str:
             f"{c} missed_row[1] = {{}};",
             f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{",
             "missed_row[0] = 0;",
-            a_pass,
+            _numbered(a_pass, c),
             f"const int now = {flags} + (turn & 1) * {warps};",
             "SENT(now + warp) = missed_row[0];",
             "const int going = __syncthreads_or(missed_row[0] > 0);",
@@ -341,7 +347,7 @@ def count_team_passes(a_pass: str, barrier: str, c: str) -> str:
     another warp reads in a stage is written again in an earlier one.
     """
     loop = "for (int turn = 0; turn < (int)passes_row[0]; ++turn) {"
-    return "\n".join([loop, f"const {c} pass_row[1] = {{({c})turn}};", a_pass, "}", barrier])
+    return "\n".join([loop, f"const {c} {PASS}[1] = {{({c})turn}};", a_pass, "}", barrier])
 
 
 def run_one_pass(a_pass: str, barrier: str, c: str) -> str:
@@ -357,7 +363,7 @@ def repeat_thread_passes(a_pass: str, c: str) -> str:
             f"{c} missed_row[1] = {{}};",
             f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{",
             "missed_row[0] = 0;",
-            a_pass,
+            _numbered(a_pass, c),
             "if (!(missed_row[0] > 0)) break;",
             "}",
         ]

@@ -36,7 +36,7 @@ from warp_spo.recursions.contact.secants import SECANT
 from warp_spo.recursions.derivatives import adjoints, inverse_dynamics
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.loops import closed_step, embedded, embedded_adjoints, minimal, multipliers, projection
-from warp_spo.recursions.step import GAIN, LOOPED, MISSED
+from warp_spo.recursions.step import GAIN, LOOPED, MISSED, PASS
 from warp_spo.recursions.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
 from warp_spo.trace.scalars import ordered as ordered
@@ -77,7 +77,7 @@ def run(scene, operation, arrays, given, shapes, dtype="float64", **options):
     return results
 
 
-def advance(scene, arrays, h, dtype="float64", most=16, **options):
+def advance(scene, arrays, h, dtype="float64", most=32, **options):
     """One step: q', qd' [world, ...] and in how many passes each world's pieces held, ``most`` + 1 if they never did.
 
     Args:
@@ -103,7 +103,8 @@ def advance(scene, arrays, h, dtype="float64", most=16, **options):
         return found
 
     passes, looped = np.ones(worlds, dtype=int), [item for item in stores if item.array in LOOPED]
-    for _ in range(most if looped else 0):
+    for number in range(most if looped else 0):
+        known[PASS] = np.full((worlds, 1), float(number), dtype)
         known |= stored(looped)
         passes += known[MISSED][:, 0] > 0.0
         if not known[MISSED][:, 0].any():

@@ -199,7 +199,7 @@ def step(
     Effort and velocity limits of 1e6 and more, Newton's default, have no effect; nor do position limits of 1e10 and
     more. Laws that are zero or unbounded in the scene generate no code. The forces are implicit, which takes one
     addition to the mass matrix's diagonal: (Mass + dt R) qdd = tau - bias_force(q, qd) + F. Which parts of the
-    piecewise-linear laws hold is found in passes, in one launch, until no force changes (16 at most).
+    piecewise-linear laws hold is found in passes, in one launch, until no force changes (32 at most).
 
     A scene with ``contacts`` takes a fixed number of passes instead, each one sweep. The first closes all points that
     may touch, later ones open those that pull, and the last of three or more only closes. Friction, effort limits and

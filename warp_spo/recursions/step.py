@@ -17,7 +17,7 @@ from collections.abc import Callable
 from ..scene.scene import Scene
 from ..status import Status
 from ..trace.emission import Store
-from ..trace.scalars import Value, less, reciprocal, select
+from ..trace.scalars import Value, floor, less, reciprocal, select
 from ..trace.spatial import total
 from .actuation import hinge_laws
 from .articulated_sweeps import expand, reduce
@@ -28,10 +28,12 @@ from .links import Link
 from .pieces import Piece, Pieces
 from .tracing import Trace
 
-GUESS, GAIN, MISSED = "guess", "gain", "missed"
-"""Variables of the loop over passes, zero at first: guess of u, and u, by dof of a piece; number of wrong guesses."""
+GUESS, GAIN, MISSED, PASS = "guess", "gain", "missed", "pass"
+"""Variables of the loop over passes, zero at first: guess of u, and u, by dof of a piece; number of wrong guesses. And
+the number of the pass, from zero."""
 LOOPED = (GUESS, GAIN, MISSED)
 SHORT = 10  # dofs; up to so many, passes solve a system that is formed once
+PATIENCE, TURNS = 8, 3  # passes after which a dof changes its guess in every third one only, one dof after the other
 FAINT = 1e-12  # resistance of a massless dof without active law, as a share of the resistances of its laws
 
 
@@ -192,12 +194,22 @@ class Step:
                     after = gain
                     for law in laws:
                         after = select(law.skipped(guess, gain), law.middle, after)
-                    stores.append(Store(GUESS, (at,), after))
+                    stores.append(Store(GUESS, (at,), select(self._waits(at), guess, after)))
         stores += [Store(MISSED, (0,), total(missed))] if bends else []
         if self.trace.piece is None:
             return stores
         self.trace.checks = stores
         return found
+
+    def _waits(self, at: int) -> Value:
+        """Return non-zero in passes in which a dof, the ``at``-th of its piece, keeps its guess.
+
+        Guesses that all change at once may repeat for ever, in cycles of four or five passes. Where a third of the dofs
+        changes at a time, in turns, the cycles of all random states of G1 that were found ended.
+        """
+        number = self.trace.graph.input(PASS, 0) + float(at % TURNS)
+        turn = number - float(TURNS) * floor(number * (1.0 / TURNS) + 0.5 / TURNS)
+        return less(PATIENCE - 0.5, self.trace.graph.input(PASS, 0)) * less(0.5, turn)
 
     def _word(self, results: list[Value], looped: bool) -> Value:
         """Return the most severe status of the world."""
