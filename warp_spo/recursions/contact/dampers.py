@@ -17,9 +17,11 @@ SEVERAL = 3  # points of one normal from which sums take fewer operations
 
 def damper(points: Sequence[Point], across: Sequence[Value], along: Sequence[Value]) -> Articulated:
     """Return the sum of the dampers ``across`` I + (``along`` - ``across``) n n* at points of one link."""
-    found = None
-    for point, weight in zip(points, across, strict=True):
-        found = _mass(point.arm, weight) if found is None else found + _mass(point.arm, weight)
+    found, masses = None, {}
+    for point, weight in zip(points, across, strict=True):  # a wall's point is that of its floor
+        masses[id(point.arm)] = point.arm, weight + masses[id(point.arm)][1] if id(point.arm) in masses else weight
+    for arm, weight in masses.values():
+        found = _mass(arm, weight) if found is None else found + _mass(arm, weight)
     assert found is not None
     P = found.articulated
     for each in _by_normal(points, [b - a for a, b in zip(across, along, strict=True)]):

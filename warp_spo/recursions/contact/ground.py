@@ -84,10 +84,11 @@ def surfaces(
     steep = less(STEEP * STEEP, cell.steepness(rate_x, rate_y))
     flat = Vector(select(steep, a, b) for a, b in zip(IDENTITY[2], smooth, strict=True))
     bottom = Surface(flat, (select(steep, cell.lowest, height) - z) * flat[2], cell, 1.0)
-    next_i = select(steep, i, _cell((x + moves[0] - ground.origin[0]) * rate_x, rows)[0])
-    next_j = select(steep, j, _cell((y + moves[1] - ground.origin[1]) * rate_y, columns)[0])
-    s, t = (i + s) - next_i, (j + t) - next_j
-    cell = Corners.of(graph, ground, place, next_i, next_j)
+    next_i = _cell((x + moves[0] - ground.origin[0]) * rate_x, rows)[0]
+    next_j = _cell((y + moves[1] - ground.origin[1]) * rate_y, columns)[0]
+    ahead = Corners.of(graph, ground, place, next_i, next_j)  # read side by side with the cell under the point
+    cell = Corners(*(select(steep, a, b) for a, b in zip(cell, ahead, strict=True)))
+    s, t = (i + s) - select(steep, i, next_i), (j + t) - select(steep, j, next_j)
     run, rise = cell.run + 0.5 * cell.twist, cell.rise + 0.5 * cell.twist
     wall = _facing(run * rate_x, rise * rate_y)
     middle = cell.mean + run * (s - 0.5) + rise * (t - 0.5)

@@ -253,7 +253,11 @@ class ContactStep(Step):
         along = [h * (touch.closed * (point.k * h + point.d)) for point, touch in pressed]
         P = damper(mine, [h * touch.across for _, touch in pressed], along)
         if len(pressed) < SEVERAL:
-            wrenches = [point.wrench(self._load(point, touch)) for point, touch in pressed]
+            loads: dict[int, tuple[Point, Vector]] = {}  # by place, which a floor and its wall share
+            for point, touch in pressed:
+                first, load_there = loads.get(id(point.arm), (point, ZERO))
+                loads[id(point.arm)] = first, load_there + self._load(point, touch)
+            wrenches = [point.wrench(force) for point, force in loads.values()]
             return P, Vector(total(wrench[i] for wrench in wrenches) for i in range(6))
         return P, load(mine, [touch.closed * self._push(point, 0.0) for point, touch in pressed], P, h)
 
