@@ -17,7 +17,8 @@ SEVERAL = 3  # points of one normal from which sums take fewer operations
 
 def damper(points: Sequence[Point], across: Sequence[Value], along: Sequence[Value]) -> Articulated:
     """Return the sum of the dampers ``across`` I + (``along`` - ``across``) n n* at points of one link."""
-    found, masses = None, {}
+    found = None
+    masses: dict[int, tuple[Vector, Value]] = {}
     for point, weight in zip(points, across, strict=True):  # a wall's point is that of its floor
         masses[id(point.arm)] = point.arm, weight + masses[id(point.arm)][1] if id(point.arm) in masses else weight
     for arm, weight in masses.values():
