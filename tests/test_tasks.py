@@ -223,31 +223,31 @@ def test_g1_is_rewarded_for_steps_in_time():
 
 @pytest.mark.slow
 def test_ants_are_paid_for_a_trot_of_all_legs():
-    """A quarter for each rule of a trot, and for each foot that has landed or left the ground a short time ago."""
+    """A quarter for each rule of a trot, and for each foot that both touched and was lifted a short time ago."""
     from warp_spo.env.tasks import ant
 
     env = envs.make("ant", 32, "cpu", seed=4)
     env.reset()
     env.episode_length_buf = torch.zeros_like(env.episode_length_buf)
-    names = ("sum reward trot", "sum reward stepping")
-    before, since, touched, seen = torch.zeros(2, 32), torch.zeros(32, 4), torch.zeros(32, 4, dtype=bool), []
+    names, feet = ("sum reward trot", "sum reward stepping"), [f"foot_{i}" for i in (1, 2, 3, 4)]
+    before, times, seen = torch.zeros(2, 32), torch.zeros(32, 8), []
     for step in range(40):
         _, _, done, _ = env.step(2.0 * torch.randn(32, 8) * (torch.arange(32) % 2)[:, None])  # every other one stands
         going = done == 0
         touches = env.memory(f"feet {ant.FEET} 1.0")[:, 4:8] > 0.0  # times of contact
-        since = torch.where(touches == touched, since, torch.zeros(())) + 1.0
+        gap = env.dyn.frame_poses(env.q, feet)[:, :, 2] - 0.08
         fl, hl, hr, fr = touches.T
         rules = (fl == hr).float() + (hl == fr).float() + (fl != fr).float() + (hl != hr).float()
-        steps = (since * env.step_dt < 0.4).float().sum(dim=1)
-        if step > 0:  # nothing is known of what was before the start
-            now = torch.stack([env.memory(name)[:, 0].clone() for name in names])
-            wanted = 0.25 * env.step_dt * torch.stack([ant.TROT * rules, ant.STEPPING * steps])
-            edge = (since - 0.4 / env.step_dt).abs().min(dim=1).values < 0.5  # rounding decides
-            assert torch.allclose((now - before)[:, going & ~edge], wanted[:, going & ~edge], atol=1e-5), step
-            seen.append(torch.stack([rules, steps])[:, going])
-        before = torch.stack([env.memory(name)[:, 0].clone() for name in names])
-        touched, since = touches, torch.where(going[:, None], since, torch.zeros(()))
-        touched = touched & going[:, None]
+        since = env.memory(f"stepping {ant.FEET} 0.05").clone()
+        clear = torch.cat([torch.ones_like(touches), (gap - 0.05).abs() > 0.04], dim=1) & going[:, None]
+        wanted = torch.where(torch.cat([touches, gap > 0.05], dim=1), torch.zeros(()), times + env.step_dt)
+        assert torch.allclose(since[clear], wanted[clear], atol=1e-4), step
+        steps = ((since[:, :4] < 0.4) & (since[:, 4:] < 0.4)).float().sum(dim=1)
+        now = torch.stack([env.memory(name)[:, 0].clone() for name in names])
+        wanted = 0.25 * env.step_dt * torch.stack([ant.TROT * rules, ant.STEPPING * steps])
+        assert torch.allclose((now - before)[:, going], wanted[:, going], atol=1e-5), step
+        seen.append(torch.stack([rules, steps])[:, going])
+        before, times = now, since
     for row in torch.cat(seen, dim=1):
         assert set(row.tolist()) >= {0.0, 2.0, 4.0}
 

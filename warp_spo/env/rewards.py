@@ -108,13 +108,22 @@ def air_time(bodies: Any, target: float = 0.5, least_command: float = 0.1) -> Te
     return term
 
 
-def stepping(bodies: Any, longest: float = 0.4) -> Term:
-    """Return the share of feet that have landed or left the ground within the last ``longest`` seconds."""
+def stepping(bodies: Any, height: float = 0.05, longest: float = 0.4) -> Term:
+    """Return the share of feet that have touched the ground, and been ``height`` over it [m], a short time ago.
+
+    Short is less than ``longest`` [s]. Feet that drag, tap, or stay in the air earn nothing; at the start of an
+    episode all count.
+    """
 
     def term(w: World) -> Any:
         feet = w.feet(bodies)
-        phases = [air + contact for air, contact in zip(feet.air_time, feet.contact_time, strict=True)]
-        return sum(where(phase < longest, 1.0, 0.0) for phase in phases) * (1.0 / len(phases))
+        count, name = len(feet.gap), f"stepping {bodies} {height}"
+        before = w.memory(name, 2 * count)
+        down = [where(touches, 0.0, time + w.dt) for touches, time in zip(feet.touches, before[:count], strict=True)]
+        up = [where(gap > height, 0.0, time + w.dt) for gap, time in zip(feet.gap, before[count:], strict=True)]
+        w.keep(name, [*down, *up])
+        steps = [(low < longest) & (high < longest) for low, high in zip(down, up, strict=True)]
+        return sum(where(each, 1.0, 0.0) for each in steps) * (1.0 / count)
 
     return term
 

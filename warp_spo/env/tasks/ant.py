@@ -76,6 +76,7 @@ def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env
             "drift": (-0.2, drift),
             "trot": (TROT, velocity.trot(FEET, DIAGONALS, least_command=None)),
             "stepping": (STEPPING, rewards.stepping(FEET)),
+            "low": (-20.0, rewards.base_height(0.4)),
             "effort": (-0.05, rewards.action_size),
             "action rate": (-0.05, rewards.action_rate),
             "tilting": (-0.05, rewards.tilting),
