@@ -80,8 +80,6 @@ class Programs:
         relays: what is too long for shared memory waits in the rows of the result.
     """
 
-    LOCAL = False  # whether one thread keeps what couples of bodies share in its own memory, not in shared memory
-
     def __init__(self, run: Sweeps, plan: Plan):
         self.run, self.plan = run, plan
         self.relays = run.device.is_cuda
@@ -194,12 +192,16 @@ class Programs:
         shared = self.plan.of(routine) == "segment" and routine.divides(self.run.scene, shapes, **options)
         if routine.bias_first is not None and self.plan.at(routine).apart and "qd" in shapes:
             routine = routine.bias_first
-        alone = not shared and routine.couples and routine.divides(self.run.scene, shapes, **options)
-        if shared or alone:
-            pieces = Pieces(links)
+        attempts = [(False, False)] if shared else []
+        if routine.couples and routine.divides(self.run.scene, shapes, **options):
+            attempts += [(True, False), (True, True)]
+        pieces = Pieces(links) if attempts else None
+        for alone, local in attempts:
+            assert pieces is not None
             several = 1 < pieces.warps <= MOST_WARPS or alone
             both = {**shapes, **more}
-            program = self._segment_program(routine, both, pieces, tuple(more), options, alone) if several else None
+            form = (alone, local)
+            program = self._segment_program(routine, both, pieces, tuple(more), options, *form) if several else None
             if program is not None:
                 return program
         return self._tree_program(routine, links, {**shapes, **more}, tuple(more), options)
@@ -254,9 +256,12 @@ class Programs:
         return {GROUND: self.run.parameters.ground_heights} if reads and isinstance(ground, HeightField) else {}
 
     def _segment_program(
-        self, routine: Routine, shapes: dict, pieces: Pieces, more: tuple, options: dict, alone: bool = False
+        self, routine: Routine, shapes: dict, pieces: Pieces, more: tuple, options: dict, alone: bool, local: bool
     ) -> Program | None:
-        """Return the program in which limbs share the work; ``alone``: one thread takes them all."""
+        """Return the program in which limbs share the work, None if there is no room.
+
+        ``alone``: one thread takes them all. ``local``: it keeps what they tell each other in memory of its own.
+        """
         letters = messages.needed(routine.letters, shapes)
         dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(letters, pieces)
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
@@ -292,7 +297,6 @@ class Programs:
             passes = Passes((GAIN,), None, sizes, dict(enumerate(counts)))
         sent += 2 * pieces.warps if bends else 0
         whole = [item for item in everything if item.array == "out"]
-        local = alone and self.LOCAL
         layout = self._layout(
             routine, whole, everything, shapes, more, 0 if local else sent, 1 if alone else pieces.warps
         )
@@ -330,9 +334,10 @@ class Programs:
             emitters = {first, emitter, checking, later}
             team.add(work, sum(each.operations for each in emitters))
             looks_up |= any(each.counts["lookup"] for each in emitters)
-        cuda = team.cpu() if alone else team.cuda()  # fills the tables
+        cpu = team.cpu()
         if local:
-            cuda = f"{C_TYPE[self.run.dtype]} sent[{sent}];\n#undef SENT\n#define SENT(i) sent[i]\n{cuda}"
+            cpu = f"{C_TYPE[self.run.dtype]} sent[{sent}];\n#undef SENT\n#define SENT(i) sent[i]\n{cpu}"
+        cuda = cpu if alone else team.cuda()  # fills the tables
         registers = self._registers(1 if alone else pieces.warps)
         if dtype == "float32" and not self.plan.few:
             for blocks, enough in routine.occupancy:
@@ -346,7 +351,7 @@ class Programs:
         if couples is not None:
             tables["touches"] = self.run.array("touches", coupling.entries(couples.points)[-1], self.run.worlds)
         cap = registers if registers < MOST_REGISTERS else None
-        return self._finished(routine, layout, cuda, team.cpu(), tables, team.operations, cap)
+        return self._finished(routine, layout, cuda, cpu, tables, team.operations, cap)
 
     def _team_of_pairs(self, slots: dict[tuple[str, int], int], first: int) -> Couplings:
         """Return the pairs of bodies as a team couples them, with values from ``first`` on among those of messages."""
