@@ -35,7 +35,7 @@ from .resources import record_launches, resources
 SOLVER_STEP = "SolverSPO.step"  # with drives and limits, of benchmarks.step_parts
 LEAN_STEP = "SolverSPO.step of joints alone"  # without the bodies' poses, and without forces on bodies
 STEPS = (SOLVER_STEP, LEAN_STEP)
-FEW, MANY, MOST = 4096, 65536, 1 << 20
+FEW, SOME, MANY, MOST = 4096, 16384, 65536, 1 << 20
 INERTIAS = ("body_mass", "body_com", "body_inertia")
 ON_PLANE, ON_FIELD = "contact_step", "contact_step on a height field"
 SUBSTEPS = 4
@@ -99,6 +99,7 @@ def _over_folded(robot: str, limit: float) -> Line:
 
 LINES = (
     *(_step_over_forward_dynamics(robot, step, FEW, 2.5) for step in STEPS for robot in step_parts.NAMES),
+    *(_step_over_forward_dynamics(robot, SOLVER_STEP, SOME, 2.0) for robot in ("go2", "b1_z1", "centauro")),
     *(_over_float32("centauro", "forward_dynamics", worlds, 3.0) for worlds in (FEW, MANY)),
     Line(Call("centauro", "forward_dynamics", MOST), "rate", 0.8),
     Line(Call("g1", "forward_dynamics", MOST), "rate", 1.6),
