@@ -264,11 +264,11 @@ def step(
         substeps: how many steps of ``dt`` to take, with the same forces, targets and controls: to the bit what as many
             calls compute, each on the state that the one before returned. The time that passes is substeps dt. One
             launch takes up to 1024 of them, and holds the state meanwhile; their number is no constant of the kernel.
-            Other integrators, loops="multipliers", pairs of bodies that touch and delays of actuators take launches for
-            each substep, see :meth:`explain`. Delays count substeps. With a tensor that requires grad, every substep is
-            recorded.
+            Other integrators, loops="multipliers", pairs of bodies that touch, passes=4 and delays of actuators take
+            launches for each substep, see :meth:`explain`. Delays count substeps. With a tensor that requires grad,
+            every substep is recorded.
         passes: of a scene with contacts; None: 3, or 4 where bodies touch each other. One is stable and coarse. From 4
-            on, where no bodies touch each other, energy does not rise; that takes six times as long as three.
+            on, where no bodies touch each other, energy hardly ever rises; that takes six times as long as three.
         contact_f: written with the force of the ground on each contact point [world, contact, 3] [N], inertial axes,
             the mean over substeps. The points are ``scene.contact_points``; after them, for each of
             ``scene.contact_pairs``, comes the force of the other body on the first one.
