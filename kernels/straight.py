@@ -85,6 +85,7 @@ class KernelLayout(NamedTuple):
         direct: short rows, too, are copied to shared memory without passing through registers.
         late: the statements of a warp without a team wait for such rows where they first use them.
         repeats: the statements are those of a substep, see :mod:`.substeps`.
+        aside: the number of values that a thread sets aside in shared memory, as ``ASIDE(i)``.
     """
 
     rows: list[Row]
@@ -102,6 +103,7 @@ class KernelLayout(NamedTuple):
     direct: bool = False
     late: bool = False
     repeats: bool = False
+    aside: int = 0
 
     @property
     def state(self) -> list[Row]:
@@ -124,7 +126,7 @@ class KernelLayout(NamedTuple):
         rows = sum(pitch(row.entries) for row in self.shared_rows)
         rows += sum(pitch(row.entries) for row in self.staged_further if self.replaced(row) is None)
         rows += pitch(self.result.array.entries) if self.result.way == STAGED else 0
-        scalars = WARP_SIZE * (rows + self.messages + sum(map(len, self.cached)))
+        scalars = WARP_SIZE * (rows + self.messages + self.warps * self.aside + sum(map(len, self.cached)))
         if self.result.way == RELAYED:
             return max(scalars, self.result.slot_layout.scalars)
         return scalars + (self.result.slot_layout.scalars if self.result.way == MAPPED else 0)
@@ -228,6 +230,9 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
         text += [f"{c}* result_row = stage + {start} + lane * {width};"]
     if layout.messages:
         text += [f"{c}* sent = stage + {at} + lane;", "#define SENT(i) sent[(i) * 32]"]
+    if layout.aside:  # volatile, because a compiler would keep in a register what it stores
+        at += WARP_SIZE * layout.messages
+        text += [f"volatile {c}* aside = stage + {at} + member;", f"#define ASIDE(i) aside[(i) * {team}]"]
     if layout.retries:
         cuda = f"for (int again = 0;; ++again) {{\n{cuda}\nif (again || !(farthest > on::reach())) break;\n}}"
     if layout.repeats:
@@ -245,6 +250,7 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
     if result.way == RELAYED:
         text += [result.slot_layout.write_tiles("stage", team, sync, T)]
     text += ["#undef FIELD"] if layout.cached else []
+    text += ["#undef ASIDE"] if layout.aside else []
     text += ["#else", "const long long world = thread;", "const bool mine = true;"]
     text += [move_state(row, c) if row in layout.state else _own_row(row, c) for row in layout.rows]
     text += [_own_result(row, c) for row in layout.apart]

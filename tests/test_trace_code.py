@@ -14,6 +14,7 @@ import warp_spo as spo
 from warp_spo.kernels import native, staged_rows, straight
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.tracing import Trace
+from warp_spo.trace import fusion
 from warp_spo.trace import scalars as g
 from warp_spo.trace.emission import Emitter, Store, literal, render
 from warp_spo.trace.evaluation import evaluate
@@ -226,3 +227,32 @@ def test_a_warp_waits_for_a_row_where_it_first_uses_it():
     late = staged_rows.copy_rows_in(rows, {row.name: 0 for row in rows}, "float", 32, direct=True, late=True)
     assert late.count(staged_rows.COMMIT) == 2 * len(rows) and staged_rows.WAIT_FOR_COPIES not in late
     assert staged_rows.copy_rows_in(rows, {row.name: 0 for row in rows}, "float", 32, direct=True).count("wait") == 1
+
+
+def test_a_product_begins_with_the_other_summand_of_its_sum(device):
+    """x + (a b + c d) is two fused statements; sums that others use, that are stored or far away keep their own."""
+
+    def text(values):
+        emitter = Emitter("float32", lambda array, entry: f"{array}[{entry}]", lambda array, entry, value: f"{value};",
+                          lambda array, index: index[0], fuses=True)  # fmt: skip
+        return render(emitter.region([Store("out", (i,), value) for i, value in enumerate(values)]), "float32")
+
+    graph = g.Graph()
+    a, b, c, d, x, y = (graph.input("x", i) for i in range(6))
+    one = text([x + (a * b + c * d)])
+    assert one.count("FUSED") == 2 and " * " not in one and " + " not in one
+    three = text([x - (a * b - (y + c * d))])
+    assert three.count("FUSED") == 2 and " * " not in three
+    shared = a * b + c * d
+    assert text([x + shared, y * shared]).count(" * ") == 2, "both use the sum, which keeps its product"
+    assert text([x + shared, shared]).count(" * ") == 1, "it is a result itself"
+    far = a * b + c * d
+    others = [g.sin(x + float(at)) for at in range(fusion.NEAR)]
+    assert text([*others, others[-1] + far]).count(" * ") == 1
+    sums = [x + shared, x - (a * b - c * d), (a * b + c * d) - y, (x * y - a * b) - (c * d + a * x) + b,
+            ((a * b - c) + d * x) - (y - (a * x - b * y)), y - ((a + x * y) - (b - c * d)), shared]  # fmt: skip
+    rows = np.random.default_rng(4).uniform(-1.0, 1.0, (33, 6)).astype(np.float32).astype(np.float64)
+    wanted = np.array(evaluate(sums, lambda _, index: rows[:, index[0]])).T
+    for some in (slice(None), slice(0, 6), slice(1, 2), slice(3, 4), slice(4, 5), slice(5, 6)):
+        got = compiled(sums[some], rows, "float64", device, fuses=True)
+        np.testing.assert_allclose(got, wanted[:, some], rtol=0.0, atol=4e-15)

@@ -7,9 +7,9 @@ import dataclasses
 from ..errors import UnsupportedError
 from ..kernels.slots import WARP_SIZE
 from ..recursions.links import Links
-from ..recursions.pieces import Pieces
+from ..recursions.pieces import PARTS, Pieces
 from ..scene.scene import Scene
-from .device_facts import DeviceFacts
+from .device_facts import RESERVED, DeviceFacts
 from .routine import Routine
 from .stretches import cut, solid_nodes
 from .tuned import Tuned
@@ -37,6 +37,7 @@ NODE_WORLDS = 1024  # of a CPU, beyond which a launch for each level only takes 
 DEEPEST = 12  # dofs from a root to a leaf, a free hinge one, up to which velocity terms that come first are as accurate
 VELOCITIES_FIRST = {"tree": {"float32": HELD, "float64": HELD}, "segment": SPILLS}  # dofs beyond which they are faster
 AT_ONCE = 65536  # worlds that a GPU runs at once, a thread each with up to 128 registers
+PLACES = 28  # least number of places for values that are set aside; fewer do not save as many registers
 
 # Measured on an H200, 2026-11-22, see benchmarks/depth.py. In a graph, a launch of a sweep takes 3.4 us and one of a
 # scan 5 to 7 us, because a round of a scan is a product of two elements. A scan does three to five times the work of a
@@ -123,7 +124,7 @@ class Plan:
     def _rule(self, routine: Routine) -> str:
         if self.granularity == "node" or self.limbs == 1 or self.limbs > MOST_WARPS:
             return self.granularity
-        if routine.long_result or routine.passes or routine.crowded:  # a thread holds too little even of a dozen dofs
+        if routine.long_result or routine.passes:  # in passes a thread holds too little even of a dozen dofs
             return "segment"
         if self.granularity == "segment" and not self.few:
             if routine.short or (not routine.velocities and self.dofs <= SOLVES[self.dtype]):
@@ -182,6 +183,23 @@ class Plan:
         if warps > 1:
             return self.worlds > WARP_SIZE if self.dofs > LONG_ROWS else routine.collects
         return results > FEW_RESULTS or (not self.few and (self.varies or routine.short))
+
+    def places_aside(self, routine: Routine, shared_bytes: int, bytes_of: int, warps: int) -> int:
+        """Return how many values each thread of a team sets aside in shared memory, to need fewer registers; 0: none.
+
+        As many as leave room for all the blocks that ``routine.aside`` registers allow. Measured on an H200,
+        2026-11-23: G1 with variable inertias takes 841 us for 919 at 2^20 worlds. With folded ones, and with a thread a world, the
+        spills that they replace, or more registers, take less time.
+
+        Args:
+            shared_bytes: of the block without these values. bytes_of: of a value. warps: of the team.
+        """
+        if not routine.aside or not self.varies or self.few or bytes_of > 4 or self.dofs <= SPILLS["float32"]:
+            return 0
+        blocks = PARTS * (self.device.registers // PARTS // (WARP_SIZE * routine.aside)) // warps
+        room = self.device.shared_bytes // max(blocks, 1) - 3 * RESERVED - shared_bytes  # Warp takes a share, too
+        places = room // (WARP_SIZE * warps * bytes_of)
+        return places if places >= PLACES else 0
 
     def fuses_substeps(self, granularity: str) -> bool:
         """Whether one kernel takes all substeps faster than a launch each.

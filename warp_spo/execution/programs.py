@@ -33,6 +33,7 @@ from ..recursions.tracing import Trace
 from ..scene.contacts import HeightField
 from ..trace.emission import Store, render, under
 from ..trace.scalars import Scalar, is_constant
+from ..trace.set_aside import set_aside
 from . import link_values, products, searches, staging
 from .access import make_emitter
 from .device_facts import RESERVED
@@ -252,7 +253,7 @@ class Programs:
         tables: dict[str, Any] = {} if table is None else {"place": table}
         tables |= self._heights(emitter.counts["lookup"] > 0)
         if coupled:
-            tables["touches"] = self.run.array(*self._touches(couples.points))
+            tables["touches"] = self.run.array("touches", coupling.entries(couples.points)[-1], self.run.worlds)
         return self._finished(routine, layout, body, body, tables, emitter.operations)
 
     def _heights(self, reads: bool) -> dict[str, Any]:
@@ -375,17 +376,18 @@ class Programs:
                 if fewer >= enough and room:
                     registers = fewer
                     break
+        T = self.run.dtype
+        bytes_of = wp.types.type_size_in_bytes(T)
+        if places := self.plan.places_aside(routine, layout.shared_bytes(T), bytes_of, layout.warps):
+            layout, registers = layout._replace(aside=places), routine.aside
+            cuda = set_aside(cuda, C_TYPE[T], places)
         lists = {"place": table, "table": team.table, "shifts": team.shifts}
         lists |= {body_chains.NUMBERS: body_chains.chains(self.run.scene).numbers} if marches else {}
         tables = {name: values for name, values in lists.items() if values} | self._heights(looks_up)
         if couples is not None:
-            tables["touches"] = self.run.array(*self._touches(couples.points))
+            tables["touches"] = self.run.array("touches", coupling.entries(couples.points)[-1], self.run.worlds)
         cap = registers if registers < MOST_REGISTERS else None
         return self._finished(routine, layout, cuda, cpu, tables, team.operations, cap)
-
-    def _touches(self, points: tuple[int, ...]) -> tuple[str, int, int]:
-        """Return name and shape of the array of touches, for so many points of each pair."""
-        return "touches", coupling.entries(points)[-1], coupling.columns(self.run.worlds)
 
     def _team_of_pairs(self, slots: dict[tuple[str, int], int], first: int) -> Couplings:
         """Return the pairs of bodies as a team couples them, with values from ``first`` on among those of messages."""

@@ -45,6 +45,8 @@ class Routine:
             blocks if a thread then still has so many registers; the first pair that applies.
         waits_late: with a thread a world, where all worlds run at once, a block has two warps, and they wait for a row
             where they first use it.
+        aside: by limbs, with many worlds and variable inertias, registers of a thread that sets aside in shared memory
+            what nothing uses for long, see :mod:`..trace.set_aside`; 0: it sets nothing aside.
         variants: at most so many different options get a kernel of their own where sweeps serve the others.
         wide: its rows are long, so that a team asks for as much shared memory as they need.
         start: ``start(trace, **options)`` returns what a search starts from; None: the kernel is no search, see
@@ -72,6 +74,7 @@ class Routine:
     bias_first: Routine | None = None
     occupancy: tuple[tuple[int, int], ...] = ()
     waits_late: bool = False
+    aside: int = 0
     variants: int = VARIANTS
     wide: bool = False
     start: Callable[..., list[Store]] | None = None

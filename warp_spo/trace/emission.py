@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .branches import branch_of, find_blocks, in_order
+from .fusion import Chain, choose_chains, choose_products
 from .scalars import Scalar, Value, is_constant, ordered
 
 C_TYPE = {"float32": "float", "float64": "double"}
@@ -107,8 +108,9 @@ class Emitter:
             first read them.
         branches: whether CUDA branches, too. Otherwise it computes the values of a branch always, which must be the
             same then.
-        fuses: a product and the sum that takes it are one statement, FUSED_T(a, b, c) = a b + c, rounded once on CUDA.
-            Otherwise the compiler decides, and may decide differently in another kernel with the same formulas.
+        fuses: products and the sums that take them are one statement, FUSED_T(a, b, c) = a b + c, rounded once on CUDA;
+            :mod:`.fusion` chooses which. Otherwise the compiler decides, and may decide differently in another kernel
+            with the same formulas.
     """
 
     def __init__(
@@ -126,6 +128,7 @@ class Emitter:
         self._angles, self._late, self._fuses = angles, tuple(late), fuses
         self._branches = branches
         self._products: dict[tuple, Scalar] = {}
+        self._chains: dict[tuple, Chain] = {}
         self.counts: Counter = Counter()
         self._names: dict[tuple, str] = {}
         self._count = 0
@@ -172,7 +175,10 @@ class Emitter:
         needed = [scalar for scalar in needed if not self._is_late(scalar) or scalar.key in due]
         fused: set[tuple] = set()  # products without a statement of their own
         if self._fuses:
-            self._products, fused = choose_products(needed, {value.key for value in values})
+            stored = {value.key for value in values}
+            self._products, fused = choose_products(needed, stored)
+            self._chains, inner = choose_chains(needed, stored, self._products, fused)
+            fused |= inner
         blocks = find_blocks(needed, {value.key for value in values} | self._names.keys())
         inside = {scalar.key for block in blocks.values() for scalar in block}
         for scalar in sorted(needed, key=in_order):
@@ -306,6 +312,8 @@ class Emitter:
             sine, cosine = (self._name(scalar.graph.make(name, *args), name) for name in ("sin", "cos"))
             which = "sincos" if args[0].op == "input" else "sincos_any"  # coordinates are within reach already
             return [f"{T} {sine}, {cosine};", f"on::{which}({angle}, {sine}, {cosine});"]
+        if scalar.key in self._chains:
+            return self._chain_statement(scalar, self._chains[scalar.key], step)
         if scalar.key in self._products:
             return self._fused_statement(scalar, self._products[scalar.key], step)
         if op == "lookup":
@@ -343,32 +351,17 @@ class Emitter:
         T = C_TYPE[self.dtype]
         return [f"const {T} {self._name(scalar, step)} = FUSED_{T}({a}, {b}, {c});"]
 
-
-def choose_products(scalars: list[Scalar], stored: set[tuple]) -> tuple[dict[tuple, Scalar], set[tuple]]:
-    """Return the product that each sum or difference takes, by the key of the sum, and the keys of these products.
-
-    A product is taken where sums and differences alone use it, so that it needs no statement of its own. The choice
-    depends on the formulas only. Products with few uses come first, of equal ones the later.
-
-    Args:
-        scalars: the scalars of a region.
-        stored: the keys of those that are stored or used later.
-    """
-    uses: dict[tuple, list[Scalar]] = {}
-    for scalar in scalars:
-        for value in scalar.args:
-            if value.__class__ is Scalar:
-                uses.setdefault(value.key, []).append(scalar)
-    products = [scalar for scalar in scalars if scalar.op == "mul" and scalar.key not in stored]
-    taken: dict[tuple, Scalar] = {}
-    fused = {product.key for product in products if product.key not in uses}  # earlier regions have taken them
-    for product in sorted(products, key=lambda product: (len(uses.get(product.key, ())), -product.number)):
-        takers = {taker.key: taker for taker in uses.get(product.key, ())}
-        sums = len(takers) == len(uses.get(product.key, ())) and all(x.op in ("add", "sub") for x in takers.values())
-        if sums and not takers.keys() & taken.keys():
-            taken |= dict.fromkeys(takers, product)
-            fused.add(product.key)
-    return taken, fused
+    def _chain_statement(self, scalar: Scalar, chain: Chain, step: str) -> list[str]:
+        """Return the statement of a sum whose terms are added one by one."""
+        T = C_TYPE[self.dtype]
+        text = f"-({self._text(chain.first)})" if chain.sign < 0 else self._text(chain.first)
+        for sign, term in chain.terms:
+            if term.op == "mul" and term.key in chain.products:
+                a, b = (self._text(value) for value in term.args)
+                text = f"FUSED_{T}({f'-({a})' if sign < 0 else a}, {b}, {text})"
+            else:
+                text = f"({text} {'-' if sign < 0 else '+'} {self._text(term)})"
+        return [f"const {T} {self._name(scalar, step)} = {text};"]
 
 
 def replaces(item: Store) -> bool:
