@@ -32,6 +32,14 @@ SAMPLE = 64  # worlds of a run for the error
 STEPS = 20  # in a graph
 FILES = ("ant", "go2", "g1")
 MODELS = ("ant", "humanoid", "quadruped")
+OWN: dict[str, dict[str, Any]] = {
+    "SolverSPO": {},
+    "SolverSPO, tuned": dict(tune=True),
+    "SolverSPO, tuned, values folded": dict(tune=True, variable=()),
+    "SolverSPO, tuned, values folded, 4 points": dict(tune=True, variable=(), points=4),
+}
+"""Options of this library's solver; ``points`` are those of a cylinder at most, and count for the quadruped alone."""
+PEERS = ("SolverMuJoCo", "SolverSteel")
 
 
 class Stepper(NamedTuple):
@@ -125,7 +133,9 @@ def newton_model(name: str, worlds: int, device: wp.Device) -> Any:
         one.default_shape_cfg.ke, one.default_shape_cfg.gap = 1.0e4, 0.0
         options = dict(parse_sites=False) if name == "humanoid" else {}
         one.add_mjcf(newton.examples.get_asset(f"nv_{name}.xml"), ignore_names=["floor", "ground"],
-                     xform=wp.transform((0.0, 0.0, {"ant": 0.6, "humanoid": 1.35}[name])), **options)  # fmt: skip
+                     xform=wp.transform((0.0, 0.0, {"ant": -0.15, "humanoid": 1.35}[name])), **options)  # fmt: skip
+        low, high = (np.asarray(x[6:]) for x in (one.joint_limit_lower, one.joint_limit_upper))
+        one.joint_q[7:] = np.clip(one.joint_q[7:], low, high).tolist()  # zero is outside of the ankles' limits
     many = newton.ModelBuilder()
     many.default_shape_cfg = one.default_shape_cfg
     many.add_ground_plane()
@@ -153,7 +163,7 @@ def model_steps(solver: str) -> Callable[[str, int, float, wp.Device], Stepper]:
                     newton.CollisionPipeline(model),
                 )
             else:
-                taken = SolverSPO(model)
+                taken = SolverSPO(model, **OWN[solver])
             states, control = [model.state(), model.state()], model.control()
             contacts = pipeline.contacts() if pipeline else None
             qd = states[0].joint_qd.numpy().reshape(worlds, -1)
@@ -174,7 +184,10 @@ def model_steps(solver: str) -> Callable[[str, int, float, wp.Device], Stepper]:
                 option = taken.mjw_model.opt
                 found = taken.mjw_data.nacon.numpy()[0] / worlds
                 return f"iterations {option.iterations}, ls {option.ls_iterations}, {found:.1f} contacts a world"
-            return f"{contacts.rigid_contact_count.numpy()[0] / worlds:.1f} contacts a world" if contacts else ""
+            if contacts:
+                return f"{contacts.rigid_contact_count.numpy()[0] / worlds:.1f} contacts a world"
+            kernel = next((x for x in taken.dynamics.programs.described() if x.startswith("contact_step")), "")
+            return f"{len(taken.dynamics.scene.contact_points)} points, {kernel}"
 
         arrays = [x for x in (states[0].joint_q, states[0].joint_qd, states[0].body_q, states[0].body_qd)]
         return Stepper(step, lambda: states[0].joint_q.numpy().reshape(worlds, -1)[:, :3], arrays, said)
@@ -186,7 +199,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], dict[str, tuple[Callable[..., Stepper],
     "file": (FILES, {"warp_spo": (file_spo, 1), "mujoco_warp": (file_mujoco_warp, 1)}),
     "model": (
         MODELS,
-        {name: (model_steps(name), 2) for name in ("SolverSPO", "SolverMuJoCo", "SolverSteel")},
+        {name: (model_steps(name), 2) for name in (*OWN, *PEERS)},
     ),
 }
 """Robots, and the makers of steps with how many steps one call takes."""
@@ -252,6 +265,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--groups", nargs="+", choices=GROUPS, default=list(GROUPS))
     parser.add_argument("--robots", nargs="+", help="some of the robots")
     parser.add_argument("--solvers", nargs="+", help="some of the solvers")
+    parser.add_argument("--no-errors", action="store_true", help="times only")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     warnings.simplefilter("ignore")
@@ -264,7 +278,8 @@ def main(arguments: list[str] | None = None) -> int:
                     continue
                 row: dict[str, Any] = dict(group=group, robot=name, solver=solver)
                 try:
-                    row["error m"] = error(make, each, name, device)
+                    if not options.no_errors:
+                        row["error m"] = error(make, each, name, device)
                     for worlds in options.worlds:
                         found = measure(make, each, name, worlds, device)
                         row |= {f"us {worlds}": found["us"], "finite": found["finite"], "settings": found["said"]}

@@ -20,7 +20,7 @@ from . import coupling_matrices, coupling_passes, coupling_points, touches
 from .elementary import C_TYPE
 from .touches import AWAY, HEADER, POINT
 
-EXACT, SWEEPS, FEW = 8, 16, 2
+EXACT, SWEEPS, FEW, BLOCK = 8, 16, 2, 64
 VALUES, REPORTS, EXCESS = 3, 5, 4
 """Entries of a pair's values: stiffness, damping, friction; of its reports: force, gap, slip; and of a world's excess:
 beyond the friction cones, pull, lacking push, and the change of forces in the last of SWEEPS rounds."""
@@ -88,7 +88,7 @@ def declare(couples: Couples, T: type) -> str:
     constants = ", ".join(f"{name} = {value}" for name, value in sizes.items())
     own = {"across": first[-1], "closed": first[-1], "candidate": first[-1], "force": 6 * pairs, "arm": 7 * pairs}
     arrays = [f"{c} pair_{name}_row[{count}] = {{}};" for name, count in own.items()]
-    return "\n".join([touches.native(T), text.replace("CONSTANTS", constants), *arrays])
+    return "\n".join([COLUMN, touches.native(T), text.replace("CONSTANTS", constants), *arrays])
 
 
 def shared_arrays(couples: Couples) -> dict[str, int]:
@@ -114,12 +114,27 @@ def table(c: str, name: str, row: list[str], few: bool) -> str:
     return f"static CUDA_CALLABLE inline {c} {name}(int i) {{ static const {c} all[] = {{{listed}}}; return all[i]; }}"
 
 
+COLUMN = """
+#if defined(__CUDA_ARCH__)
+const long long column = start + lane;  // lanes without a world have columns of their own
+#else
+const long long column = world;
+#endif
+"""
+"""Native code that says which column of the array of touches is the thread's; there are :func:`columns`."""
+
+
+def columns(worlds: int) -> int:
+    """Return how many columns the array of touches has for so many worlds."""
+    return -(-worlds // BLOCK) * BLOCK
+
+
 BEGIN = """
-coupling::begin(pair_value_row, pair_start_row, pair_place_row, touches.data + world, worlds, dt_row[0],
+coupling::begin(pair_value_row, pair_start_row, pair_place_row, touches.data + column, touches.shape[1], dt_row[0],
     pair_arm_row, pair_across_row, pair_closed_row, pair_candidate_row);
 """
 PASS = """
-coupling::pass(pair_value_row, pair_twist_row, pair_response_row, touches.data + world, worlds, dt_row[0],
+coupling::pass(pair_value_row, pair_twist_row, pair_response_row, touches.data + column, touches.shape[1], dt_row[0],
     pair_twist_row[6 * BODIES] > 0, pair_arm_row, pair_across_row, pair_closed_row, pair_candidate_row,
     pair_force_row, pair_wrench_row, pair_report_row);
 """

@@ -18,7 +18,7 @@ from typing import Any
 import warp as wp
 
 from . import coupling_blocks, coupling_matrices, coupling_points, coupling_shared, touches
-from .coupling import FEW, entries, table
+from .coupling import COLUMN, FEW, entries, table
 from .elementary import C_TYPE
 from .touches import AWAY, HEADER, POINT
 
@@ -68,4 +68,4 @@ def declare(team: Any, T: type, local: bool = False) -> str:
     if local:
         text = text.replace("__noinline__", "inline").replace("STRIDE = 32", "STRIDE = 1")
     constants = ", ".join(f"{name} = {value}" for name, value in sizes.items())
-    return touches.native(T) + text.replace("CONSTANTS", constants)
+    return COLUMN + touches.native(T) + text.replace("CONSTANTS", constants)

@@ -253,7 +253,7 @@ class Programs:
         tables: dict[str, Any] = {} if table is None else {"place": table}
         tables |= self._heights(emitter.counts["lookup"] > 0)
         if coupled:
-            tables["touches"] = self.run.array("touches", coupling.entries(couples.points)[-1], self.run.worlds)
+            tables["touches"] = self.run.array(*self._touches(couples.points))
         return self._finished(routine, layout, body, body, tables, emitter.operations)
 
     def _heights(self, reads: bool) -> dict[str, Any]:
@@ -385,9 +385,13 @@ class Programs:
         lists |= {body_chains.NUMBERS: body_chains.chains(self.run.scene).numbers} if marches else {}
         tables = {name: values for name, values in lists.items() if values} | self._heights(looks_up)
         if couples is not None:
-            tables["touches"] = self.run.array("touches", coupling.entries(couples.points)[-1], self.run.worlds)
+            tables["touches"] = self.run.array(*self._touches(couples.points))
         cap = registers if registers < MOST_REGISTERS else None
         return self._finished(routine, layout, cuda, cpu, tables, team.operations, cap)
+
+    def _touches(self, points: tuple[int, ...]) -> tuple[str, int, int]:
+        """Return name and shape of the array of touches, for so many points of each pair."""
+        return "touches", coupling.entries(points)[-1], coupling.columns(self.run.worlds)
 
     def _team_of_pairs(self, slots: dict[tuple[str, int], int], first: int) -> Couplings:
         """Return the pairs of bodies as a team couples them, with values from ``first`` on among those of messages."""

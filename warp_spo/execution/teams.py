@@ -475,7 +475,7 @@ class Team:
 
 def begin_pairs(warp: str, warps: int) -> str:
     """Return code that begins the pairs of bodies before the passes, for a warp of a team; ``coupled``: some touch."""
-    call = f"team_coupling::begin(sent, touches.data + world, worlds, dt_row[0], {warp}, {warps})"
+    call = f"team_coupling::begin(sent, touches.data + column, touches.shape[1], dt_row[0], {warp}, {warps})"
     return f"bool coupled = {_any_world(call, warps)};"
 
 
@@ -499,7 +499,9 @@ def release_pairs(warp: str, warps: int) -> str:
 
 def judge_pairs(warp: str, warps: int) -> str:
     """Return code that takes the bodies' twists after a pass to the points of pairs, for the next one."""
-    call = "team_coupling::after(sent, touches.data + world, worlds, dt_row[0], closing, last, coupled, {}, {})"
+    call = (
+        "team_coupling::after(sent, touches.data + column, touches.shape[1], dt_row[0], closing, last, coupled, {}, {})"
+    )
     return "\n".join([
         "const bool last = turn + 1 == (int)passes_row[0];",
         "const bool closing = turn > passes_row[0] - 2.5 && passes_row[0] > 2.5;",

@@ -74,7 +74,7 @@ def load(
         name: one of ``NAMES``.
         ground: spo.Plane or spo.HeightField; None: the plane z = 0.
         contacts: parts of the names of contacts to keep; None keeps all.
-        walls: parts of the names of contacts that see walls of a height field, see :class:`spo.Contact`; None: all.
+        walls: parts of the names of contacts that see walls of a field, see :class:`warp_spo.Contact`; None: all.
 
     Raises:
         ValueError: the name is unknown.
