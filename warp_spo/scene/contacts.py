@@ -161,7 +161,7 @@ class Contact(StoredPart):
             with ``other``.
         eps: speed [m/s] below which friction is a damper. A point that sticks creeps by less than that.
         walls: on a height field, cells steeper than 45 degrees are a wall and a floor for the points; False: the slopes
-            that they are, where a wall matters little, for half the time that such a point takes.
+            that they are, where a wall matters little, for about half the operations of such a point.
         label: name in tables and errors.
 
     Raises:
