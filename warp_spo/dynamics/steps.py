@@ -268,7 +268,7 @@ def step(
             launches for each substep, see :meth:`explain`. Delays count substeps. With a tensor that requires grad,
             every substep is recorded.
         passes: of a scene with contacts; None: 3, or 4 where bodies touch each other. One is stable and coarse. From 4
-            on, where no bodies touch each other, energy hardly ever rises; that takes six times as long as three.
+            on, where no bodies touch each other, energy hardly ever rises; that is three times the work of three.
         contact_f: written with the force of the ground on each contact point [world, contact, 3] [N], inertial axes,
             the mean over substeps. The points are ``scene.contact_points``; after them, for each of
             ``scene.contact_pairs``, comes the force of the other body on the first one.
