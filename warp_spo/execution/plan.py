@@ -124,7 +124,7 @@ class Plan:
     def _rule(self, routine: Routine) -> str:
         if self.granularity == "node" or self.limbs == 1 or self.limbs > MOST_WARPS:
             return self.granularity
-        if routine.long_result or routine.passes:  # in passes a thread holds too little even of a dozen dofs
+        if routine.long_result or routine.passes or routine.crowded:  # a thread holds too little even of a dozen dofs
             return "segment"
         if self.granularity == "segment" and not self.few:
             if routine.short or (not routine.velocities and self.dofs <= SOLVES[self.dtype]):
@@ -188,8 +188,8 @@ class Plan:
         """Return how many values each thread of a team sets aside in shared memory, to need fewer registers; 0: none.
 
         As many as leave room for all the blocks that ``routine.aside`` registers allow. Measured on an H200,
-        2026-11-23: G1 with variable inertias takes 841 us for 919 at 2^20 worlds. With folded ones, and with a thread a
-        world, the spills that they replace, or more registers, take less time.
+        2026-11-23: G1 with variable inertias takes 841 us for 919 at 2^20 worlds. With folded ones, and with a thread
+        a world, the spills that they replace, or more registers, take less time.
 
         Args:
             shared_bytes: of the block without these values. bytes_of: of a value. warps: of the team.
