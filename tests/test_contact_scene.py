@@ -84,7 +84,7 @@ def test_explain_says_whether_limbs_have_room(room, monkeypatch):
     if room is None:
         assert line.endswith("a warp for each limb")
     else:
-        assert line.endswith("a thread for each world: what limbs tell each other does not fit in shared memory")
+        assert line.endswith("a thread computes a whole world: what limbs tell each other does not fit in shared memory")
 
 
 def test_a_scene_without_contacts_has_none():

@@ -134,7 +134,7 @@ def test_a_pair_of_the_base_itself(device):
     q, qd = hand_states(2, 4)
     dyn = spo.Dynamics(palm(), 4, device=device, dtype="float64")
     assert_is_dense(dyn, q, qd, least=8)
-    assert "a thread for each world" in dyn.explain()
+    assert "a thread computes a whole world" in dyn.explain()
 
 
 @pytest.mark.slow

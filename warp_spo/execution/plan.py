@@ -347,7 +347,7 @@ def describe(plan: Plan) -> str:
     others = ", ".join(name for name in GRANULARITIES if name != plan.granularity)
     limbs = plan.limbs if plan.granularity == "segment" else 1
     staged = plan.staged and (limbs == 1 or plan.worlds > plan.device.scaled(FEW_WORLDS // 4))
-    rows = "through shared memory" if staged else "each by its thread"
+    rows = "through shared memory" if staged else "by each thread for itself"
     first = "forward dynamics takes velocity terms first; " if plan.apart else ""
     force = "no other granularity serves them" if plan.reason == SHARED else f"granularity= can force {others}"
     return f"{plan.granularity}: {plan.reason}; rows are read {rows}; {first}{force}"
