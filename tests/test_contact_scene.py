@@ -74,7 +74,7 @@ def test_contacts_are_told_kept_and_changed():
 def test_explain_says_whether_limbs_have_room(room, monkeypatch):
     """As the kernel says that was built: what limbs tell each other may not fit into shared memory."""
     if room is not None:
-        monkeypatch.setattr(Programs, "room", lambda *_: room)
+        monkeypatch.setattr(Programs, "room", lambda *_, **__: room)
     scene = quadruped()
     dyn = spo.Dynamics(scene, 2, "cpu", granularity="segment")
     assert dyn.explain().split("contacts  ")[1].split("\n")[0].endswith("a warp for each limb")
@@ -84,7 +84,9 @@ def test_explain_says_whether_limbs_have_room(room, monkeypatch):
     if room is None:
         assert line.endswith("a warp for each limb")
     else:
-        assert line.endswith("a thread computes a whole world: what limbs tell each other does not fit in shared memory")
+        assert line.endswith(
+            "a thread computes a whole world: what limbs tell each other does not fit in shared memory"
+        )
 
 
 def test_a_scene_without_contacts_has_none():
