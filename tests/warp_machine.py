@@ -96,9 +96,7 @@ def run(text, arrays, backwards=False, further=None, over=None):
     fields = {name: arrays[name] for name in frame.fields}
     space = FUNCTIONS | rows | fields | {"result_row": result, "sent": sent}
     space |= {f"{name}_row": [arrays[name]] for name in frame.numbers}
-    space |= {name: text.tables.get(name) for name in ("table", "shifts", "ground", "chain")} | {
-        "worlds": np.arange(worlds)
-    }
+    space |= {name: text.tables.get(name) for name in ("table", "shifts", "ground")} | {"worlds": np.arange(worlds)}
     exec(translated(text.cuda), space)
     stretch, going, ayes = 0, {warp: space["work"](warp) for warp in range(frame.warps)}, None
     while going:
@@ -153,7 +151,7 @@ FUNCTIONS = {
 FORMS = [
     (r"^const int going = __syncthreads_or\((.*)\);$", r"going = yield bool((\1).any())"),
     (r"^(?:const )?bool (\w+) = true;$", r"\1 = worlds == worlds"),
-    (r"^if \(open\) (\w+_row\[.*\]) = (.*);$", r"\1 = where(open, \2, \1)"),
+    (r"^if \(open\) (\w+_row\[\d+\]) = (.*);$", r"\1 = where(open, \2, \1)"),
     (r"^if \(!going\) break;$", "if not going: break"),
     (r"^const int going = (.*);$", r"going = (\1).any()"),
     (r"^(?:const )?(?:float|double) (\w+)\[(\d+)\] = \{\};$", r"\1 = [0.0 * worlds] * \2"),
@@ -175,7 +173,7 @@ def translated(cuda):
     """``def work(warp)``: the statements for CUDA in Python."""
     lines, depth, mask = ["def work(warp):"], 1, ""  # of a branch of some worlds
     for line in map(str.strip, cuda.split("\n")):
-        if not line or line.startswith(("//", "#", 'asm("" :')) or line == FENCE:
+        if not line or line.startswith(("//", "#")) or line == FENCE:
             continue
         if line == "}":
             depth, mask = depth - 1, ""
@@ -212,7 +210,7 @@ def translated(cuda):
 def _statement(line):
     if "farthest" in line:
         return "pass"  # turns are not taken off here
-    who = re.match(r"^const int (\w*(?:who|first|base\d+)) = (.*);$", line)
+    who = re.match(r"^const int (\w*(?:who|first)) = (.*);$", line)
     if who:
         return f"{who[1]} = {_chosen(who[2])}"
     for form, python in FORMS:
@@ -223,7 +221,6 @@ def _statement(line):
     line = re.sub(r"\((?:float|double)\)", "", line).replace("on::", "")
     line = re.sub(r"(?<![\w.])(\d+\.?\d*(?:e[-+]?\d+)?)f\b", r"\1", line)
     line = re.sub(r"ground\.data\[\(int\)(\w+) \+ (\d+)\]", r"ground[int64(\1) + \2]", line).replace("::", "")
-    line = line.replace("chain.data[", "chain[")
     line = re.sub(r"FIELD\((\w+), ([^()]*)\)", r"\1[\2]", line)
     line = re.sub(r"__ldg\(shifts\.data \+ (.*?)\)", r"int(shifts[\1])", line)
     line = re.sub(r"__ldg\((\w+ \+ \d+)\)", r"table[\1]", line)
@@ -231,7 +228,7 @@ def _statement(line):
 
 
 def _chosen(number):
-    return re.sub(r"warp == (\d+) \? (-?\d+) : ", r"\2 if warp == \1 else ", number)
+    return re.sub(r"warp == (\d+) \? (\d+) : ", r"\2 if warp == \1 else ", number)
 
 
 def _sent(line):

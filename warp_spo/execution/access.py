@@ -5,7 +5,6 @@ from __future__ import annotations
 from ..kernels import straight
 from ..kernels.straight import DIRECT, RELAYED, TILED, KernelLayout
 from ..kernels.substeps import SUBSTEPS
-from ..recursions.body_chains import FRAME, NUMBERS
 from ..recursions.contact.secants import SECANT
 from ..recursions.messages import INWARD, OUTWARD
 from ..recursions.step import GUESS, LOOPED, MISSED
@@ -13,7 +12,7 @@ from ..status import Status
 from ..trace.emission import C_TYPE, PREFIX, Emitter, RangeReduction
 from . import staging
 from .staging import FIELDS
-from .teams import HELD, READY
+from .teams import HELD
 
 _SEVERITIES = hex(sum(word.severity << (4 * word) for word in Status)) + "ull"
 _SEVERITY = f"({_SEVERITIES} >> 4 * {{}} & 15)".format
@@ -41,9 +40,7 @@ def make_emitter(dtype: str, shapes: dict, layout: KernelLayout, pieces: bool = 
     def load(array: str, entry: str) -> str:
         if array in (INWARD, OUTWARD):
             return f"SENT({entry})"
-        if array == NUMBERS:
-            return f"{NUMBERS}.data[{entry}]"
-        if array in (HELD, READY, FRAME) or (array in (*LOOPED, SECANT) and pieces):
+        if array == HELD or (array in (*LOOPED, SECANT) and pieces):
             return f"{'' if array == MISSED else PREFIX}{array}_row[{entry}]"
         if array in FIELDS:
             return f"FIELD({array}, {entry})"
@@ -54,7 +51,7 @@ def make_emitter(dtype: str, shapes: dict, layout: KernelLayout, pieces: bool = 
             return f"SENT({entry}) = {value};"
         if array == "out" and result.way == RELAYED:
             return f"RELAY({entry}) = {value};"
-        if array in (HELD, READY, SECANT, FRAME):
+        if array in (HELD, SECANT):
             return f"{load(array, entry)} = {value};"
         if array == MISSED and pieces:
             return f"missed_row[0] += {value};"

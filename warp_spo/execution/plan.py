@@ -101,11 +101,6 @@ class Plan:
         return self.worlds <= self.device.scaled(FEW_WORLDS)
 
     @property
-    def apiece(self) -> bool:
-        """Whether a multiprocessor has no more than 32 worlds to work on."""
-        return not self.device.cuda or self.worlds <= WARP_SIZE * self.device.multiprocessors
-
-    @property
     def inward(self) -> tuple[tuple[int, int], ...]:
         """The levels from the deepest to the roots."""
         return self.outward[::-1]

@@ -19,7 +19,7 @@ from ..kernels.native import INTEGERS
 from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout
 from ..kernels.substeps import SUBSTEPS
-from ..recursions import body_chains, messages
+from ..recursions import messages
 from ..recursions.contact import pair_pieces, pairs
 from ..recursions.contact.couples import Team as Couplings
 from ..recursions.contact.ground import GROUND
@@ -40,12 +40,10 @@ from .device_facts import RESERVED
 from .plan import MOST_WARPS, Plan
 from .routine import Routine
 from .sweeps import Sweeps
-from .teams import HELD, READY, Passes, Team, Work
+from .teams import HELD, Passes, Team, Work
 
 PASSED = (*LOOPED, SECANT)  # variables of the loops over passes
 MOST_REGISTERS = 255  # of a thread
-INSIDE = True  # where worlds are few, a warp of its own works on the inner pieces while others work on limbs
-BODIES = "bodies"  # option of a step by limbs whose kernel writes the states of bodies, too
 PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
 
 
@@ -198,8 +196,7 @@ class Programs:
         attempts = [(False, False)] if shared else []
         if routine.couples and routine.divides(self.run.scene, shapes, **options):
             attempts += [(True, False), (True, True)]
-        inside = INSIDE and routine.passes and not routine.counted and self.plan.apiece
-        pieces = Pieces(links, inside) if attempts else None
+        pieces = Pieces(links) if attempts else None
         for alone, local in attempts:
             assert pieces is not None
             several = 1 < pieces.warps <= MOST_WARPS or alone
@@ -208,8 +205,6 @@ class Programs:
             program = self._segment_program(routine, both, pieces, tuple(more), options, *form) if several else None
             if program is not None:
                 return program
-        if options.get(BODIES):
-            return None
         return self._tree_program(routine, links, {**shapes, **more}, tuple(more), options)
 
     def _tree_program(self, routine: Routine, links: Links, shapes: dict, more: tuple, options: dict) -> Program:
@@ -268,21 +263,14 @@ class Programs:
 
         ``alone``: one thread takes them all. ``local``: it keeps what they tell each other in memory of its own.
         """
-        letters, marches = messages.needed(routine.letters, shapes), False
-        if options.get(BODIES):
-            marches = body_chains.suits(self.links)
-            letters = "".join(letter for letter in letters if letter not in ("X" if marches else "CF"))
-            of_chains = body_chains.turn_counts(self.run.scene) if marches else {}
-            for piece in pieces.pieces:
-                piece.turns = of_chains.get(piece.index, 0)
+        letters = messages.needed(routine.letters, shapes)
         dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(letters, pieces)
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         couples = self._team_of_pairs(slots, sent) if routine.couples else None
         sent = couples.layout["end"] if couples is not None else sent
         everything: list[Store] = []
         traced: list[list[Store]] = []
-        apart: list[tuple[list[list[Store]], list[Store], list[list[Store]]]] = []
-        marches_of: list[list[list[Store]]] = []
+        apart: list[tuple[list[Store], list[Store], list[list[Store]]]] = []
         begins: list[list[Store]] = []  # what each piece stores and sends before its passes
         held: list[list[Scalar]] = []  # what each piece computes once before its passes
         responses: list[
@@ -296,22 +284,18 @@ class Programs:
             rounds = [[self._flattened(item, shapes) for item in turn] for turn in trace.rounds]
             news = [self._flattened(item, shapes) for item in trace.news]
             apart.append((trace.checks, news, rounds))
-            marches_of.append([[self._flattened(item, shapes) for item in turn] for turn in trace.march])
             begins.append(trace.begin)
             responses.append((trace.couples, trace.carried))
             held.append(list({x.key: x for x in trace.ahead if not is_constant(x) and x.op != "input"}.values()))
-            everything += trace.begin + traced[-1] + news
-            everything += [item for turn in (*trace.checks, *rounds, *marches_of[-1]) for item in turn]
+            everything += trace.begin + traced[-1] + trace.checks + news + [item for turn in rounds for item in turn]
             everything += [item for _, items in trace.couples for item in items]
         bends = any(item.array == MISSED for item in everything)
-        inner = [piece.index for piece in pieces.pieces if piece.children]
         held = held if bends or routine.counted else [[] for _ in held]
         sizes = {index: len(values) for index, values in enumerate(held)}
-        ready = {index: len(news) for index, (_, news, _) in enumerate(apart) if pieces.inside and index in inner}
-        passes = Passes((GUESS, GAIN), sent if bends else None, sizes, ready) if routine.passes else None
+        passes = Passes((GUESS, GAIN), sent if bends else None, sizes) if routine.passes else None
         if routine.counted:
             counts = [sum(item.array == SECANT for item in begin) for begin in begins]
-            passes = Passes((GAIN,), None, sizes, {}, dict(enumerate(counts)))
+            passes = Passes((GAIN,), None, sizes, dict(enumerate(counts)))
         sent += 2 * pieces.warps if bends else 0
         whole = [item for item in everything if item.array == "out"]
         layout = self._layout(
@@ -319,19 +303,16 @@ class Programs:
         )
         if layout.result.way == DIRECT and layout.result.array.entries > staging.LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
-        room = self.room(routine.wide, routine.couples, BODIES in options)
-        if not layout.fits(self.run.dtype, room):
+        if not layout.fits(self.run.dtype, self.room(routine.wide, routine.couples)):
             return None  # nor for what limbs tell each other
-        if options.get(BODIES) and not layout.further_staged:
-            return None  # nor for the states of bodies, which another kernel then writes
         declared = "" if couples is None else coupling_teams.declare(couples, self.run.dtype, local)
         team, looks_up = Team(pieces, dtype, passes, declared), False
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
         placed, table = staging.arrange_stores(whole, layout.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
         by_slot = lambda found: found if table is None else staging.stores_by_slot(found, table)  # noqa: E731
-        for piece, stores, items, (checks, news, rounds), turns, begin, values, (response, carried) in zip(
-            pieces.pieces, traced, outs, apart, marches_of, begins, held, responses, strict=True
+        for piece, stores, items, (checks, news, rounds), begin, values, (response, carried) in zip(
+            pieces.pieces, traced, outs, apart, begins, held, responses, strict=True
         ):
             first, emitter, checking, later = (make_emitter(dtype, shapes, layout, True) for _ in range(4))
             ahead = first.region([*begin, *(Store(HELD, (at,), value) for at, value in enumerate(values))])
@@ -349,19 +330,9 @@ class Programs:
             regions = sweep, emitter.region(outward)
             ends = [item for item in news if item.array == "out"]
             news = [item for item in news if item.array != "out"] + by_slot(ends)
-            if piece.index in ready:  # limbs check their guesses meanwhile
-                found = [item for item in news if not is_constant(item.value)]
-                checks = [*checks, [Store(READY, (at,), item.value) for at, item in enumerate(found)]]
-                news = [item for item in news if is_constant(item.value)] + [
-                    item._replace(value=item.value.graph.input(READY, at))  # type: ignore[union-attr]
-                    for at, item in enumerate(found)
-                ]
             branches = later.branch(news), [later.branch(by_slot(turn)) for turn in rounds]
-            walkers = [make_emitter(dtype, shapes, layout, True) for _ in turns]
-            march = [walker.region(turn) for walker, turn in zip(walkers, turns, strict=True)]
-            checked = [checking.branch(check) for check in checks]
-            work = Work(piece, *regions, checked, *branches, ahead, response, march)
-            emitters = {first, emitter, checking, later, *walkers}
+            work = Work(piece, *regions, checking.region(checks), *branches, ahead, response)
+            emitters = {first, emitter, checking, later}
             team.add(work, sum(each.operations for each in emitters))
             looks_up |= any(each.counts["lookup"] for each in emitters)
         cpu = team.cpu()
@@ -382,7 +353,6 @@ class Programs:
             layout, registers = layout._replace(aside=places), routine.aside
             cuda = set_aside(cuda, C_TYPE[T], places)
         lists = {"place": table, "table": team.table, "shifts": team.shifts}
-        lists |= {body_chains.NUMBERS: body_chains.chains(self.run.scene).numbers} if marches else {}
         tables = {name: values for name, values in lists.items() if values} | self._heights(looks_up)
         if couples is not None:
             tables["touches"] = self.run.array(*self._touches(couples.points))
@@ -410,7 +380,7 @@ class Programs:
 
     @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
-        if item.array in (INWARD, OUTWARD, body_chains.FRAME, *PASSED, *pairs.READ):
+        if item.array in (INWARD, OUTWARD, *PASSED, *pairs.READ):
             return item
         return item._replace(index=(staging.flat_index(item.index, shapes[item.array][1:]),))
 
@@ -458,16 +428,14 @@ class Programs:
             entry,
         )
 
-    def room(self, wide: bool = False, couples: bool = False, whole: bool = False) -> int:
+    def room(self, wide: bool = False, couples: bool = False) -> int:
         """Bytes of shared memory that a block may have: for as many scalars in float64 as in float32 if the GPU can.
 
-        ``wide``: for long rows that all go through it. ``couples``: for what limbs couple in it. ``whole``: all that a
-        multiprocessor has.
+        ``wide``: for long rows that all go through it. ``couples``: for what limbs couple in it.
         """
         more = straight.COUPLED_BYTES if couples else straight.WIDE_BYTES if wide else 0
         wanted = max(straight.SHARED_BYTES, more) * wp.types.type_size_in_bytes(self.run.dtype) // 4
         allowed = self.plan.device.shared_bytes - 3 * RESERVED  # Warp takes a share, too
-        wanted = max(wanted, allowed) if whole else wanted
         return min(wanted, max(allowed, straight.SHARED_BYTES)) if self.plan.device.cuda else wanted
 
     def _registers(self, warps: int) -> int:
@@ -484,10 +452,9 @@ class Programs:
         sent: int = 0,
         warps: int = 1,
     ) -> KernelLayout:
-        gathers = "poses_out" in more or self.plan.gathers(routine, warps, 1 + len(more))
-        ways = self.plan.stages(routine, warps), gathers, routine.tiled
+        ways = self.plan.stages(routine, warps), self.plan.gathers(routine, warps, 1 + len(more)), routine.tiled
         wide = routine.wide and warps > 1
-        dtype, relays, room = self.run.dtype, self.relays, self.room(wide, whole="poses_out" in more)
+        dtype, relays, room = self.run.dtype, self.relays, self.room(wide)
         return staging.choose_layout(stores, everything, shapes, more, sent, warps, dtype, *ways, relays, room, wide)
 
 

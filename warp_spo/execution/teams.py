@@ -11,18 +11,13 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from ..kernels import straight
-from ..recursions.body_chains import FRAME
 from ..recursions.contact.secants import SECANT
-from ..recursions.messages import SIZES
 from ..recursions.pieces import Piece, Pieces
-from ..recursions.step import GAIN, GUESS
 from ..trace.emission import C_TYPE, Listing, fill_in, literal, render
 
-HELD, READY = "held", "ready"
-"""Names of the values that a piece computes once before its passes, and of those that it stores after the last one."""
+HELD = "held"
+"""Name of the values that a piece computes once before its passes."""
 BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
-KEEP = 'asm("" : "+r"({}));'  # keeps the compiler from computing a number anew wherever it is used
-LONG = 6000  # statements of a pass from which checks are loops
 CACHED = 8192  # largest number of operations of a world whose code fits into the instruction cache
 
 
@@ -33,29 +28,33 @@ class Work(NamedTuple):
         piece: the piece.
         inward: the inward sweep.
         outward: the outward sweep.
-        checks: whether the guesses of a pass were right, dof by dof.
+        check: the check whether the guesses of a pass were right.
         news: what the piece sends to the others after the outward sweep; in work with passes, after the last pass.
         rounds: what the piece computes, message by message, from the news of the other pieces.
         ahead: in work with passes, what the piece computes once before them and keeps. Where a fixed number of passes
             is counted, pieces send each other messages inward ahead, too.
         couples: what the piece leaves for each couple of bodies that touches, after the inward sweep.
-        march: what the piece computes after the rounds, in turns in a row; the variables of :mod:`.body_chains` stay.
     """
 
     piece: Piece
     inward: Listing
     outward: Listing
-    checks: Sequence[Listing]
+    check: Listing
     news: Listing
     rounds: list[Listing]
     ahead: Listing = Listing("", [], [], [])
     couples: Sequence[Listing] = ()
-    march: Sequence[Listing] = ()
 
     @property
     def text(self) -> tuple[str, ...]:
         """The statements without their numbers and entries; equal for pieces of equal structure."""
-        return self.ahead.text, self.inward.text, self.outward.text, *(each.text for each in self.couples)
+        return (
+            self.ahead.text,
+            self.inward.text,
+            self.outward.text,
+            self.check.text,
+            *(each.text for each in self.couples),
+        )
 
 
 class Passes(NamedTuple):
@@ -65,7 +64,6 @@ class Passes(NamedTuple):
         kept: the names of the values that a piece keeps from pass to pass, one for each of its dofs. They are arrays of
             the thread with constant indices, which the compiler keeps in registers.
         held: how many values each piece computes once before the passes, by its index; kept likewise.
-        ready: how many values each piece computes in every pass, by its index, to store them after the last one.
         flags: the place of the flags in the memory that the warps share; None if one pass suffices, because there is
             nothing to guess, or if passes are counted.
         variables: how many more values each piece keeps from pass to pass, by its index, if passes are counted: their
@@ -75,7 +73,6 @@ class Passes(NamedTuple):
     kept: tuple[str, ...]
     flags: int | None
     held: dict[int, int]
-    ready: dict[int, int]
     variables: dict[int, int] | None = None
 
     @property
@@ -90,8 +87,6 @@ class Passes(NamedTuple):
             dofs, held = max(piece.weight for piece in some), max(self.held.get(piece.index, 0) for piece in some)
             text += [f"{c} {prefix}{name}_row[{dofs}] = {{}};" for name in self.kept]
             text += [f"{c} {prefix}{HELD}_row[{held}] = {{}};"] if held else []
-            done = max(self.ready.get(piece.index, 0) for piece in some)
-            text += [f"{c} {prefix}{READY}_row[{done}] = {{}};"] if done else []
             more = max((self.variables or {}).get(piece.index, 0) for piece in some)
             text += [f"{c} {prefix}{SECANT}_row[{more}] = {{}};"] if more else []
         return "\n".join(text)
@@ -155,7 +150,8 @@ class Team:
             for piece in self.pieces.pieces:
                 if piece.outward == stage:
                     text.append(render(self._work[piece.index].outward, self.dtype, f"p{piece.index}_"))
-                    text += [self._branch(piece, check) for check in self._work[piece.index].checks]
+                    if self._work[piece.index].check.text:
+                        text.append(self._branch(piece, self._work[piece.index].check))
                     (later if self.passes else text).append(self._branch(piece, self._work[piece.index].news))
         for work in self._work.values():
             later += [self._branch(work.piece, listing) for listing in work.rounds]
@@ -171,10 +167,6 @@ class Team:
                 straight.count_team_passes(one, "", self.c) if counted else straight.repeat_thread_passes(one, self.c)
             )
             text = [*self._defined, self.passes.declare(kept, self.c), *ahead, loop]
-        for work in self._work.values():
-            if work.march:
-                later.append(f"{self.c} p{work.piece.index}_{FRAME}_row[{SIZES['F']}] = {{}};")
-                later += [self._branch(work.piece, listing) for listing in work.march]
         return "\n".join(text + later)
 
     def _branch(self, piece: Piece, listing: Listing) -> str:
@@ -202,45 +194,27 @@ class Team:
             if not self.passes and any(work.rounds for works in kinds.values() for work in works):
                 text += [self._take_turns(alike, [[work.news] for work in alike], "n_"), BARRIER, self._rounds(alike)]
             text.append("}")
-        for work in self._carriers[len(self._leaves) :]:
-            text += [f"else if (warp == {work.piece.warp}) {{", self._inner([work.piece.warp]), "}"]
         return self._in_passes("\n".join(text)) if self.passes else "\n".join(text)
-
-    @property
-    def _leaves(self) -> list[Work]:
-        """The work of the leaf pieces."""
-        return [work for work in self._work.values() if not work.piece.children]
-
-    @property
-    def _carriers(self) -> list[Work]:
-        """One piece of each warp: the leaf pieces, and one of a warp without a leaf piece."""
-        warps = {work.piece.warp for work in self._leaves}
-        rest = {work.piece.warp: work for work in self._work.values() if work.piece.warp not in warps}
-        return [*self._leaves, *rest.values()]
 
     def _in_passes(self, a_pass: str) -> str:
         """Return ``a_pass`` in a loop, then the news of every piece, then the rounds."""
         assert self.passes is not None
-        leaves, carriers = self._leaves, self._carriers
+        leaves = [work for work in self._work.values() if not work.piece.children]
         inner = [work for work in self._work.values() if work.piece.children]
         ranks: list[dict[int, Work]] = [{leaf.piece.warp: leaf for leaf in leaves}]  # by warp, one of its pieces each
         for work in inner:
             warp = work.piece.warp
-            free = next((rank for rank in ranks[1:] if warp not in rank), None)
+            free = next((rank for rank in ranks if warp not in rank), None)
             if free is None:
                 ranks.append(free := {})
             free[warp] = work
         names = ["", *(f"i{at}_" for at in range(len(ranks) - 1))]
         kept = {name: [work.piece for work in rank.values()] for name, rank in zip(names, ranks, strict=True)}
         text = [*self._defined, self.passes.declare(kept, self.c)]
-        text += self._ahead(carriers, dict(zip(names, ranks, strict=True)))
+        text += self._ahead(leaves, dict(zip(names, ranks, strict=True)))
         if self.pairs:
             text += [BARRIER, begin_pairs("warp", self.pieces.warps)]
             a_pass = "\n".join([a_pass, BARRIER, judge_pairs("warp", self.pieces.warps)])
-        for at, (name, rank) in enumerate(zip(names, ranks, strict=True)):
-            works = [rank.get(leaf.piece.warp) for leaf in carriers]
-            checks = [[] if work is None else [*work.checks] for work in works]
-            a_pass += "\n" + self._take_turns(carriers, checks, f"k{at}_", name, self._lines > LONG)
         if self.passes.counted:
             text.append(straight.count_team_passes(a_pass, BARRIER, self.c))
         elif self.passes.flags is None:
@@ -250,13 +224,12 @@ class Team:
         for last in (False, True):
             text_of_ranks = []
             for at, (name, rank) in enumerate(zip(names, ranks, strict=True)):
-                works = [rank.get(leaf.piece.warp) for leaf in carriers]
+                works = [rank.get(leaf.piece.warp) for leaf in leaves]
                 turns = [[] if work is None else work.rounds if last else [work.news] for work in works]
-                text_of_ranks.append(self._take_turns(carriers, turns, f"c{at}_", name))
-            march = self._march(carriers) if last else ""
-            if last and (march or any(text_of_ranks)):
+                text_of_ranks.append(self._take_turns(leaves, turns, f"c{at}_", name))
+            if last and any(text_of_ranks):
                 text.append(BARRIER)
-            text += [*text_of_ranks, march]
+            text += text_of_ranks
         return "\n".join(text)
 
     def _ahead(self, leaves: list[Work], ranks: dict[str, dict[int, Work]]) -> list[str]:
@@ -313,32 +286,20 @@ class Team:
         """Return the rounds of pieces of equal structure."""
         return self._take_turns(alike, [work.rounds for work in alike], f"{prefix}x_", prefix)
 
-    def _take_turns(
-        self,
-        alike: Sequence[Work],
-        turns: list[list[Listing]],
-        tables: str,
-        prefix: str = "",
-        loops: bool | None = None,
-    ) -> str:
-        """Return the statements that pieces of equal structure execute in turns; equal statements share one text.
-
-        ``loops``: turns are loops; None: see :attr:`_loops`.
-        """
-        loops = self._loops if loops is None else loops
+    def _take_turns(self, alike: Sequence[Work], turns: list[list[Listing]], tables: str, prefix: str = "") -> str:
+        """Return the statements that pieces of equal structure execute in turns; equal statements share one text."""
         kinds: dict[str, list[tuple[int, Listing]]] = {}
         for work, listings in zip(alike, turns, strict=True):
             for at, listing in enumerate(listings):
                 if listing.text:
-                    kept = [] if loops else [place for place in listing.indices if place[0] in (GUESS, GAIN)]
-                    kind = listing.text if loops else f"{at} {kept} {listing.text}"  # registers have constant places
+                    kind = listing.text if self._loops else f"{at} {listing.text}"
                     kinds.setdefault(kind, []).append((work.piece.warp, listing))
         text: list[str] = []
         for at, some in enumerate(kinds.values()):
             counts = Counter(warp for warp, _ in some)
             warps, name = list(counts), f"{tables}{at}_"
             several = max(counts.values()) > 1
-            who = f"{name}first + each" if several else _choose(warps, range(len(warps)))
+            who = f"{name}first + turn" if several else _choose(warps, range(len(warps)))
             head, (body,) = self._fill_in([[listing for _, listing in some]], prefix, name, who)
             condition = "" if len(warps) == len(alike) else f"if ({_any_of(warps)}) "
             inside = [head, body]
@@ -347,67 +308,12 @@ class Team:
                 inside = [
                     f"const int {name}first = {_choose(warps, starts)};",
                     "#pragma unroll 1",
-                    f"for (int each = 0; each < {_choose(warps, counts.values())}; ++each) {{",
+                    f"for (int turn = 0; turn < {_choose(warps, counts.values())}; ++turn) {{",
                     *inside,
                     "}",
                 ]
             text.append("\n".join([f"{condition}{{", *inside, "}"]))
         return "\n".join(text)
-
-    def _march(self, leaves: Sequence[Work]) -> str:
-        """Return a loop over the turns in which leaf pieces go along; all turns of one kind share one text."""
-        kinds: dict[tuple, list[tuple[int, int, Listing]]] = {}  # warp, turn and statements
-        for work in leaves:
-            for turn, listing in enumerate(work.march):
-                kinds.setdefault((listing.text, *listing.constants), []).append((work.piece.warp, turn, listing))
-        if not kinds:
-            return ""
-        warps, counts = [work.piece.warp for work in leaves], [len(work.march) for work in leaves]
-        starts = dict(zip(warps, itertools.accumulate(counts, initial=0), strict=False))
-        bases, shifts, branches = _Columns(), _Columns(), []
-
-        def entry(places: dict[tuple[int, int], int]) -> str:
-            """Return C++ for an entry, given it by warp and turn: in equal steps from turn to turn, or from a table."""
-            of_warps = [{turn: at for (one, turn), at in places.items() if one == warp} for warp in warps]
-            pairs = next((sorted(some.items())[:2] for some in of_warps if len(some) > 1), [(0, 0), (1, 0)])
-            step = (pairs[1][1] - pairs[0][1]) // (pairs[1][0] - pairs[0][0])
-            starts_of = [{at - step * turn for turn, at in some.items()} for some in of_warps]
-            if all(len(some) <= 1 for some in starts_of):
-                base = bases.of(tuple(next(iter(some), 0) for some in starts_of))
-                return f"march_base{base} + turn * {step}"
-            row = [0] * sum(counts)
-            for (warp, turn), at in places.items():
-                row[starts[warp] + turn] = at
-            return f"march_shift[{shifts.of(tuple(row))}]"
-
-        for kind, some in enumerate(kinds.values()):
-            listing = some[0][2]
-            entries = [
-                entry({(warp, turn): at for (warp, turn, _), (_, at) in zip(some, places, strict=True)})
-                for places in zip(*(x.indices for _, _, x in some), strict=True)
-            ]
-            numbers = [literal(x, self.dtype) for x in listing.constants]
-            mask = [sum(1 << turn for one, turn, _ in some if one == warp) for warp in warps]
-            word = "else if" if kind else "if"
-            inside = fill_in(listing, numbers, entries, listing.labels)
-            branches += [f"{word} (march_base{bases.of(tuple(mask))} >> turn & 1) {{", inside, "}"]
-        head = [f"const int march_first = {_choose(warps, starts.values())};"]
-        head += [f"const int march_base{at} = {_choose(warps, column)};" for at, column in enumerate(bases.columns)]
-        read = []
-        if shifts.columns:
-            place, width = f"{len(self.shifts)} + (march_first + turn) * {len(shifts.columns)}", len(shifts.columns)
-            read = [f"int march_shift[{width}];"]
-            read += [f"march_shift[{k}] = __ldg(shifts.data + {place} + {k});" for k in range(width)]
-            self.shifts += [value for row in zip(*shifts.columns, strict=True) for value in row]
-        loop = f"for (int turn = 0; turn < {_choose(warps, counts)}; ++turn) {{"
-        state = f"{self.c} {FRAME}_row[{SIZES['F']}] = {{}};"
-        return "\n".join(["{", *head, state, "#pragma unroll 1", loop, *read, *branches, "}", "}"])
-
-    @property
-    def _lines(self) -> int:
-        """The number of statements of a pass that a multiprocessor fetches."""
-        texts = {(*work.text, *(check.text for check in work.checks)) for work in self._work.values()}
-        return sum(text.count("\n") for work in texts for text in work)
 
     @property
     def _loops(self) -> bool:
@@ -416,11 +322,12 @@ class Team:
 
     def _shared(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str]:
         """Return one text for the inward and one for the outward sweeps of pieces of equal structure."""
-        regions = [[work.inward for work in alike], [work.outward for work in alike]]
+        regions = [[work.inward for work in alike], [work.outward for work in alike], [work.check for work in alike]]
         regions += [list(each) for each in zip(*(work.couples for work in alike), strict=True)]
         who = _choose([work.piece.warp for work in alike], range(len(alike)))
-        head, (inward, outward, *couples) = self._fill_in(regions, prefix, prefix, who)
+        head, (inward, outward, check, *couples) = self._fill_in(regions, prefix, prefix, who)
         inward = "\n".join([inward, "if (coupled) {", *couples, "}"]) if any(couples) else inward
+        outward = "\n".join([outward, "{", check, "}"]) if check else outward
         return f"{head}\n{inward}" if head else inward, outward
 
     def _fill_in(self, regions: list[list[Listing]], prefix: str, tables: str, who: str) -> tuple[str, list[str]]:
@@ -460,16 +367,11 @@ class Team:
             head.append(f"const {self.c}* {tables}numbers = table.data + {first} + {tables}who * {count};")
             self.table += [value for row in zip(*constants.columns, strict=True) for value in row]
         if shifts.columns:
-            uneven = _Columns()
-            head.append(f"int {tables}shift[{len(shifts.columns)}];")
-            for k, column in enumerate(shifts.columns):
-                if column == tuple(column[1] * place for place in range(len(column))):  # a table would be waited for
-                    head += [f"{tables}shift[{k}] = {tables}who * {column[1]};", KEEP.format(f"{tables}shift[{k}]")]
-                else:
-                    at = f"{len(self.shifts) + uneven.of(column)} + {tables}who * \x06"
-                    head.append(f"{tables}shift[{k}] = __ldg(shifts.data + {at});")
-            head = [line.replace("\x06", str(len(uneven.columns))) for line in head]
-            self.shifts += [value for row in zip(*uneven.columns, strict=True) for value in row]
+            first, count = len(self.shifts), len(shifts.columns)
+            head.append(f"int {tables}shift[{count}];")
+            read = "__ldg(shifts.data + {} + {}who * {})"
+            head += [f"{tables}shift[{k}] = {read.format(first + k, tables, count)};" for k in range(count)]
+            self.shifts += [value for row in zip(*shifts.columns, strict=True) for value in row]
         return "\n".join(head), texts
 
 

@@ -5,9 +5,7 @@ changes with the parent's motion, G = how another one changes with what contact 
 ground's origin, U = the flow and momentum of what a link carries, L = its load and pull; outward a and b = alpha, and
 for Mass^-1 N = the rates of all pivots further in for each unit force on the last link, D = the piece's own pivots, V =
 its columns of Y, Y = the part of them that lies further in. From all to the first piece, when all is done: S = a status
-word, E = by how much the last pass of a step with contacts exceeds its laws. From all to all then: X = the coordinates
-and the rates of a piece after a step, C = those of each turn of a limb's chain, F = the frame of a root; see
-:mod:`.body_chains`.
+word, E = by how much the last pass of a step with contacts exceeds its laws.
 """
 
 from __future__ import annotations
@@ -20,9 +18,9 @@ INWARD, OUTWARD = "sent", "returned"
 """The array that messages go through, by either name."""
 OUTWARD_LETTERS = "abNDVY"
 SIZES = {"P": 21, "z": 6, "f": 6, "y": 6, "R": 10, "B": 24, "G": 36, "O": 3, "U": 12, "L": 12, "a": 6, "b": 6, "S": 1,
-         "E": 4, "F": 13}  # fmt: skip
-NEEDS = {"U": "qd", "L": "body_f", "O": "ground_origin_later", "X": "poses_out", "C": "poses_out", "F": "poses_out"}
-"""The array without which a message is zero, or nobody reads it, and is not sent, by letter."""
+         "E": 4}  # fmt: skip
+NEEDS = {"U": "qd", "L": "body_f", "O": "ground_origin_later"}
+"""The array without which a message is zero and is not sent, by letter."""
 
 
 def way(letter: str) -> str:
@@ -33,8 +31,6 @@ def size(letter: str, piece: Piece) -> int:
     """Values of a message."""
     if letter in SIZES:
         return SIZES[letter]
-    if letter in "XC":
-        return piece.coordinates + piece.weight if letter == "X" else 2 * piece.turns
     further = sum(one.weight for one in piece.ancestors)
     whole = further + piece.weight
     return {"N": 6 * whole, "D": piece.weight, "V": whole * piece.weight, "Y": further * piece.weight}[letter]
@@ -48,14 +44,11 @@ def needed(letters: str, inputs: Collection[str]) -> str:
 def slots(letters: str, pieces: Pieces) -> tuple[dict[tuple[str, int], int], int]:
     """Return where each message begins, by letter and piece, and the values of all messages together.
 
-    Long messages outward take the place of what the same tree sent inward and has read by then. So does what chains
-    need after the last pass.
+    Long messages outward take the place of what the same tree sent inward and has read by then.
     """
     places: dict[tuple[str, int], int] = {}
     end = 0
     groups = ("P", letters[1:]) if "N" in letters else (letters,)
-    if "C" in letters:
-        groups = "".join(letter for letter in letters if letter not in "SCF"), "CF"
     for root in (piece for piece in pieces.pieces if piece.parent is None):
         tree = [piece for piece in pieces.pieces if root in (piece, *piece.ancestors)]
         start = end
@@ -67,18 +60,12 @@ def slots(letters: str, pieces: Pieces) -> tuple[dict[tuple[str, int], int], int
                         places[letter, piece.index] = at
                         at += size(letter, piece)
             end = max(end, at)
-    if "C" in letters and "S" in letters:  # a word is sent with what chains need
-        for piece in pieces.pieces:
-            places["S", piece.index] = end
-            end += SIZES["S"]
     return places, end
 
 
 def _sends(letter: str, piece: Piece, tree: list[Piece]) -> bool:
-    if letter in "SEX":
+    if letter in "SE":
         return True
-    if letter in "CF":
-        return not piece.children if letter == "C" else piece.parent is None
     if letter == "Y":
         return any(other.looks_at(piece) for other in tree)
     return bool(piece.children) if letter in OUTWARD_LETTERS else piece.parent is not None

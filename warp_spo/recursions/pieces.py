@@ -25,7 +25,6 @@ class Piece:
         links: from the innermost out.
         parent, children: the pieces that it moves on and that move on it.
         warp: index of the warp that works on it. inward, outward: stage of its inward and of its outward sweep.
-        turns: of a limb's chain of bodies, where it goes along one.
     """
 
     index: int
@@ -35,7 +34,6 @@ class Piece:
     warp: int = 0
     inward: int = 0
     outward: int = 0
-    turns: int = 0
 
     @property
     def dofs(self) -> list[int]:
@@ -45,11 +43,6 @@ class Piece:
     @property
     def weight(self) -> int:
         return len(self.dofs)
-
-    @property
-    def coordinates(self) -> int:
-        """How many entries of q its links have."""
-        return sum(link.hinge.coordinates for link in self.links)
 
     @property
     def ancestors(self) -> list[Piece]:
@@ -95,16 +88,11 @@ class Piece:
 class Pieces:
     """All pieces of a scene, parents first.
 
-    Args:
-        links: of the scene.
-        inside: a warp of their own works on the pieces that are no leaves, while others work on leaves.
-
     Attributes:
         warps: number of warps that work on a world. stages: number of stages, with a barrier between any two.
-        inside: a warp works on pieces that are no leaves alone.
     """
 
-    def __init__(self, links: Links, inside: bool = False):
+    def __init__(self, links: Links):
         self.pieces: list[Piece] = []
         self.of: dict[int, Piece] = {}  # by id of the link
         for link in links.links:
@@ -122,14 +110,9 @@ class Pieces:
         self.warps = len(leaves)
         for warp, piece in zip(_parted(leaves), leaves, strict=True):
             piece.warp = warp
-        inner = [piece for piece in reversed(self.pieces) if piece.children]
-        for piece in inner:
-            self._hand_over(piece)
-            if inside:
-                piece.warp = len(leaves)
-                piece.inward = max(child.inward + (child.warp != piece.warp) for child in piece.children)
-        self.inside = inside and bool(inner)
-        self.warps += self.inside
+        for piece in reversed(self.pieces):
+            if piece.children:
+                self._hand_over(piece)
         for piece in self.pieces:
             if piece.parent is not None:
                 piece.outward = piece.parent.outward + (piece.warp != piece.parent.warp)

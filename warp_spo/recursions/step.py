@@ -19,13 +19,11 @@ from ..status import Status
 from ..trace.emission import Store
 from ..trace.scalars import Value, floor, less, reciprocal, select
 from ..trace.spatial import total
-from . import body_chains
 from .actuation import hinge_laws
 from .articulated_sweeps import expand, reduce
 from .impedance import Law, add_laws, is_number
 from .integration import integrate_link
 from .joint_space import JointSpace
-from .kinematics import body_states
 from .links import Link
 from .pieces import Piece, Pieces
 from .tracing import Trace
@@ -178,7 +176,7 @@ class Step:
         bends = any(law.bends for laws in self.laws.values() for law in laws)
         if not bends and self.trace.piece is None:
             return []
-        stores, missed, found, checks = [], [], [], []
+        stores, missed, found = [], [], []
         for link in self.links:
             self.trace.label(link, "u")
             for dof in link.dofs:
@@ -191,20 +189,16 @@ class Step:
                 if not any(law.bends for law in laws):
                     continue
                 guess = self._guess(dof)
-                own = [law.missed(guess, gain, self.trace.epsilon) for law in laws]
-                missed += own
-                check = [Store(MISSED, (0,), total(own))]
+                missed += [law.missed(guess, gain, self.trace.epsilon) for law in laws]
                 if guess.args[0] == GUESS:
                     after = gain
                     for law in laws:
                         after = select(law.skipped(guess, gain), law.middle, after)
-                    check.append(Store(GUESS, (at,), select(self._waits(at), guess, after)))
-                    stores.append(check[-1])
-                checks.append(check)
+                    stores.append(Store(GUESS, (at,), select(self._waits(at), guess, after)))
         stores += [Store(MISSED, (0,), total(missed))] if bends else []
         if self.trace.piece is None:
             return stores
-        self.trace.checks = checks
+        self.trace.checks = stores
         return found
 
     def _waits(self, at: int) -> Value:
@@ -237,25 +231,6 @@ class Step:
             trace.rounds = [[Store("status", (), self._verdict(worst))]]
         return trace.send("S", own, [finite])
 
-    def add_bodies(self) -> None:
-        """Let a piece store poses_out, velocities_out = body_poses, body_velocities of its bodies after the step.
-
-        They are ``rounds`` of the trace, which read the state after the step of all pieces, or its ``march``.
-        """
-        trace, own = self.trace, self.trace.piece
-        assert own is not None, "by whole trees, another kernel computes the states of bodies"
-        after = {(item.array, item.index[0]): item.value for item in trace.news if item.array in ("q_out", "out")}
-        if body_chains.suits(trace.links):
-            body_chains.add_chains(trace, after)
-            return
-        trace.news = trace.news + trace.send("X", own, map(after.__getitem__, _entries(own)))
-        sent: dict[tuple[str, int], Value] = {}
-        for piece in Pieces(trace.links).pieces:
-            sent |= dict(zip(_entries(piece), trace.receive("X", piece), strict=True))
-        moved = trace.at({"q": lambda c: sent["q_out", c], "qd": lambda dof: sent["out", dof]})
-        found = [item._replace(array="poses_out") if item.array == "out" else item for item in body_states(moved)]
-        trace.rounds = [*trace.rounds, found]
-
     def _verdict(self, worst: Value) -> Value:
         """Return ``worst``, the most severe word of all pieces, or what the last pass adds where they are well."""
         settled = less(self.trace.graph.input(MISSED, 0), 0.5)
@@ -287,12 +262,6 @@ class Step:
         return [number for number, moved in enumerate(own) if moved.intersection(dofs)]
 
 
-def _entries(piece: Piece) -> list[tuple[str, int]]:
-    """Return the arrays and indices of the entries of a piece in the state after a step."""
-    coordinates = [link.coordinate + c for link in piece.links for c in range(link.hinge.coordinates)]
-    return [*(("q_out", c) for c in coordinates), *(("out", dof) for dof in piece.dofs)]
-
-
 def by_pieces(scene: Scene) -> bool:
     """Return whether pieces can share the work of a step: sweeps, not a matrix, serve its passes."""
     return scene.dof_count > SHORT
@@ -308,11 +277,6 @@ def all_finite(values: list[Value]) -> Value:
     return less(-1.0, total(v.graph.make("lost", v) for v in values if not isinstance(v, float)))
 
 
-def step(trace: Trace, qdd: bool = False, status: bool = False, bodies: bool = False) -> list[Store]:
-    """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world, with ``bodies`` poses_out
-    and velocities_out."""
-    one = Step(trace)
-    stores = one.stores(qdd, status)
-    if bodies:
-        one.add_bodies()
-    return stores
+def step(trace: Trace, qdd: bool = False, status: bool = False) -> list[Store]:
+    """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world."""
+    return Step(trace).stores(qdd, status)

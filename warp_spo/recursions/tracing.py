@@ -6,8 +6,7 @@ link and which letter of the paper a value belongs to.
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from ..trace.emission import Store
@@ -39,12 +38,11 @@ class Trace:
         stiffened: returns a link with what a time step adds to its armature.
         news: messages that a piece sends apart from the others, because pieces of equal structure do not all send them.
         rounds: what a piece stores after it has received all news, in turns of which many may be alike.
-        march: what a limb stores after that, turn by turn, each from what the turn before left in the limb's variables.
         ahead: values that the passes of a loop share, formed once before the loop.
         begin: stores before the passes of a loop, of the variables that they read.
         dampers, pushes: by id of the link: what contacts add to its articulated inertia, and to the forces on it; of a
             piece also for the link that it moves on.
-        checks: stores that check a pass, for each dof; they read their inputs anew, which keeps no register for them.
+        checks: stores that check a pass; they read their inputs anew, so that no register is kept for them.
         instead: entries that take the place of those of an array, by its name.
         team: of a piece, the pairs of bodies that native code couples between its sweeps. couples: what it stores for
             each couple of bodies that touches, and the entry that says so; carried: values that both sweeps use.
@@ -62,12 +60,11 @@ class Trace:
         self.piece, self.slot = piece, slot
         self.news: list[Store] = []
         self.rounds: list[list[Store]] = []
-        self.march: list[list[Store]] = []
         self.ahead: list[Value] = []
         self.begin: list[Store] = []
         self.dampers: dict[int, Articulated] = {}
         self.pushes: dict[int, Vector] = {}
-        self.checks: list[list[Store]] = []
+        self.checks: list[Store] = []
         self.instead: dict[str, Callable[[int], Value]] = {}
         self.team: Any = None
         self.couples: list[tuple[int, list[Store]]] = []
@@ -98,13 +95,6 @@ class Trace:
         if name not in self.inputs:
             return lambda i: 0.0
         return lambda i: self.graph.input(name, i)
-
-    def at(self, state: Mapping[str, Callable[[int], Value]]) -> Trace:
-        """Return a trace of the same links at another ``state``: functions of entries of "q" and "qd", no forces."""
-        other = copy.copy(self)
-        other.inputs, other.instead, other.compensates = tuple(state), dict(state), False
-        other.places, other.motions, other.axes = {}, {}, {}
-        return other
 
     def label(self, link: Link, letter: str) -> None:
         """Name the scalars that follow after a link and a letter."""
