@@ -121,7 +121,7 @@ def _gather_machine(runs: list[dict]) -> Evidence:
             if of_newest and key not in seen:
                 seen.add(key)
                 rows[kind].append(row)
-                used.setdefault(index, {})[row.get("peer") or kind] = None
+                used.setdefault(index, {})[row.get("peer") or row.get("group") or kind] = None
     machine = {key: value for data in runs[::-1] for key, value in data["machine"].items()}
     lines = [_source_line(data, list(used[index])) for index, data in enumerate(runs) if index in used]
     sources = list(dict.fromkeys(lines))

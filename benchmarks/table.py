@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -50,6 +51,7 @@ CLAIMS = (
         "forward dynamics of a G1 humanoid (35 degrees of freedom)",
         _dynamics("g1", "forward_dynamics", dtype="float32"),
         {
+            "torch by Cholesky": _dynamics("g1", "forward_dynamics", peer="torch", dtype="float32"),
             "GRiD": _dynamics("g1", "forward_dynamics", peer="GRiD"),
             "mujoco_warp": _dynamics("g1", "forward_dynamics", peer="mujoco_warp"),
             "Pinocchio in float64 on one CPU core": _dynamics(
@@ -63,6 +65,7 @@ CLAIMS = (
         {"mujoco_warp": dict(name="g1 mujoco_warp kinematics, com_pos, crb, factor_m, 2 jac, 12 solve_m")},
     ),
 )
+GROUPS = {"steps": "steps of a Panda"}  # what groups of rows are called, where their names say too little
 COST = _dynamics("go2", "forward_dynamics", dtype="float32")  # of one call, replayed
 CALLED = "torch: forward_dynamics, out="  # the same from Python, in rows of the host's time
 BESIDE = "torch: add, out="
@@ -157,8 +160,50 @@ def beyond(evidence: Evidence) -> str:
     text.append("|---|" + "---:|" * len(counts))
     for group, name in dict.fromkeys((row["group"], row["name"]) for row in rows):
         mine = {row["worlds"]: row for row in rows if (row["group"], row["name"]) == (group, name)}
-        text.append(f"| {group}: {name} | " + " | ".join(time(mine.get(worlds)) for worlds in counts) + " |")
+        text.append(
+            f"| {GROUPS.get(group, group)}: {name} | " + " | ".join(time(mine.get(worlds)) for worlds in counts) + " |"
+        )
     return "\n".join(text) + "\n"
+
+
+def others(evidence: Evidence, op: str = "forward_dynamics") -> str:
+    """Return a table of every other library's times of one operation of released robots, at the headline's worlds."""
+    rows = [row for row in evidence.peers if row["op"] == op and row["worlds"] == HEADLINE_WORLDS and "us" in row]
+    rows = [row for row in rows if row["scene"] in ROBOTS]
+    if not rows:
+        return ""
+    text = [f"`{op}` of every other library that was measured, {HEADLINE_WORLDS:,} worlds, µs:", ""]
+    text += ["| | | " + " | ".join(ROBOTS) + " |", "|---|---|" + "---:|" * len(ROBOTS)]
+    for key in sorted({(row["peer"], row.get("variant") or "", row["dtype"]) for row in rows}):
+        mine = {row["scene"]: row for row in rows if (row["peer"], row.get("variant") or "", row["dtype"]) == key}
+        name = ", ".join(filter(None, key[:2]))
+        text.append(f"| {name} | {key[2]} | " + " | ".join(time(mine.get(robot)) for robot in ROBOTS) + " |")
+    return "\n".join(text) + "\n\n"
+
+
+def later(run: dict, evidence: Evidence) -> str:
+    """Return a table of what a run of :mod:`.speed` measured after the rows of the tables, beside what these say.
+
+    Steps with contacts are left out; they have a page of their own.
+    """
+    rows: list[dict] = [*plain(evidence), *evidence.capabilities]
+    lines: list[str] = []
+    for row in run["rows"]:
+        robot, op, dtype = (row[key] for key in ("robot", "operation", "dtype"))
+        for old in rows:
+            same = (old.get("scene"), old.get("op"), old.get("dtype")) == (robot, op, dtype)
+            same |= old.get("name") == f"{robot} {op}" and dtype == "float32"
+            if same and old["worlds"] == row["worlds"] and not row["variable"]:
+                cells = [f"{robot}, `{op}`", dtype, f"{row['worlds']:,}", time(old), time(row), f"{row['error']:.1e}"]
+                lines.append("| " + " | ".join(cells) + " |")
+                break
+    if not lines:
+        return ""
+    head = (
+        f"Measured after these tables, at commit {run['commit'][:12]} on {run['date'][:10]}; these are the newer times:"
+    )
+    columns = ["| | | worlds | µs in the tables | µs later | its error |", "|---|---|---:|---:|---:|---:|"]
+    return "\n".join([head, "", *columns, *lines]) + "\n\n"
 
 
 def worst(errors: Sequence[float]) -> float:
@@ -218,8 +263,11 @@ def ratio(row: dict, ours: dict) -> str:
     return f"{float(f'{quotient:.2g}'):,.0f}"
 
 
-def page(everything: Sequence[Evidence]) -> str:
-    """Return what stands between the markers of the results' page: every machine's tables, and the pictures."""
+def page(everything: Sequence[Evidence], speed: dict | None = None) -> str:
+    """Return what stands between the markers of the results' page: every machine's tables, and the pictures.
+
+    ``speed``: a run of :mod:`.speed`, of which rows that are newer than the tables are shown beside them.
+    """
     text = []
     for evidence in everything:
         worlds = usual_worlds(plain(evidence))
@@ -228,7 +276,8 @@ def page(everything: Sequence[Evidence]) -> str:
         text += [f"## {evidence.machine['device']}", "", *evidence.sources, ""]
         text += [rates(evidence) + markdown(shown, operations)]
         if evidence is everything[0]:
-            text += [beyond(evidence)] if evidence.capabilities else []
+            text += [others(evidence) + (beyond(evidence) if evidence.capabilities else "")]
+            text += [later(speed, evidence)] if speed else []
             text += [line for name, what in PICTURES.items() for line in (f"![{what}]({name})", "")]
     return "\n".join(text).rstrip("\n") + "\n"
 
@@ -239,7 +288,9 @@ def filled(root: Path, results: Path, everything: Sequence[Evidence]) -> dict[Pa
     Raises:
         ValueError: a file is missing, or has not one of each of its markers, in order.
     """
-    texts = {results / "README.md": between(results / "README.md", "benchmarks", page(everything))}
+    runs = [json.loads(file.read_text()) for file in (results / "speed").glob("*.json")]
+    speed = max(runs, key=lambda run: run["date"], default=None)
+    texts = {results / "README.md": between(results / "README.md", "benchmarks", page(everything, speed))}
     if first := headline(everything[0]):
         texts[root / "README.md"] = between(root / "README.md", "headline", first)
     return texts
