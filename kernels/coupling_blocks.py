@@ -18,12 +18,11 @@ NATIVE = r"""static CUDA_CALLABLE inline void load_block(REAL* s, int from, int 
             for (int two = 0; two < 2; ++two) {
                 const int a = body_of(p, one), b = body_of(q, two);
                 if (a < 0 || b < 0 || limb_of(a) != limb_of(b)) continue;
-                const int skipped = seated_of(a) ? 42 : 6;
                 LOOP
                 for (int dof = 0; dof < dofs_of(a); ++dof) {
                     REAL y[6], z[6];
-                    load_block(s, side_of(2 * p + one) + skipped + 6 * dof, 6, y);
-                    load_block(s, side_of(2 * q + two) + skipped + 6 * dof, 6, z);
+                    load_block(s, side_of(2 * p + one) + skipped_of(2 * p + one) + 6 * dof, 6, y);
+                    load_block(s, side_of(2 * q + two) + skipped_of(2 * q + two) + 6 * dof, 6, z);
                     UNROLL
                     for (int i = 0; i < 6; ++i)
                         UNROLL
@@ -41,21 +40,18 @@ NATIVE = r"""static CUDA_CALLABLE inline void load_block(REAL* s, int from, int 
             }
     }
 
-    // L* u, and L* B where there is a base: both bodies' shares.
+    // Adds to L* u, and to L* B where there is a base, of the body that leads what the other one leaves.
     static CUDA_CALLABLE inline void sides(REAL* s, int p)
     {
+        const int lead = lead_of(p), first = body_of(p, lead), second = body_of(p, 1 - lead);
         LOOP
         for (int j = 0; j < RIGHT; ++j) {
-            REAL sum[6] = {0, 0, 0, 0, 0, 0};
+            const bool own = !j || seated_of(first), others = second >= 0 && (!j || seated_of(second));
             UNROLL
-            for (int side = 0; side < 2; ++side) {
-                const int body = body_of(p, side);
-                if (body < 0 || (j && !seated_of(body))) continue;
-                UNROLL
-                for (int i = 0; i < 6; ++i) sum[i] += at(s, side_of(2 * p + side) + 6 * j + i);
+            for (int i = 0; i < 6; ++i) {
+                const REAL mine = own ? at(s, right_of(p) + 6 * j + i) : 0;
+                at(s, right_of(p) + 6 * j + i) = mine + (others ? at(s, side_of(2 * p + 1 - lead) + 6 * j + i) : 0);
             }
-            UNROLL
-            for (int i = 0; i < 6; ++i) at(s, AT_RIGHT + 6 * (RIGHT * p + j) + i) = sum[i];
         }
     }
 
@@ -146,10 +142,10 @@ NATIVE = r"""static CUDA_CALLABLE inline void load_block(REAL* s, int from, int 
             LOOP
             for (int j = warps - 1 - warp; j < RIGHT; j += warps) {
                 REAL x[6];
-                load_block(s, AT_RIGHT + 6 * (RIGHT * q + j), 6, x);
+                load_block(s, right_of(q) + 6 * j, 6, x);
                 forward(C, x);
                 UNROLL
-                for (int i = 0; i < 6; ++i) at(s, AT_RIGHT + 6 * (RIGHT * q + j) + i) = x[i];
+                for (int i = 0; i < 6; ++i) at(s, right_of(q) + 6 * j + i) = x[i];
             }
             if (warps > 1) wait();
             int turn = 0;
@@ -165,13 +161,13 @@ NATIVE = r"""static CUDA_CALLABLE inline void load_block(REAL* s, int from, int 
                 LOOP
                 for (int j = warps - 1 - warp; j < RIGHT; j += warps) {
                     REAL b[6];
-                    load_block(s, AT_RIGHT + 6 * (RIGHT * q + j), 6, b);
+                    load_block(s, right_of(q) + 6 * j, 6, b);
                     UNROLL
                     for (int i = 0; i < 6; ++i) {
-                        REAL x = at(s, AT_RIGHT + 6 * (RIGHT * p + j) + i);
+                        REAL x = at(s, right_of(p) + 6 * j + i);
                         UNROLL
                         for (int k = 0; k < 6; ++k) x = FUSED(-at(s, block + 6 * i + k), b[k], x);
-                        at(s, AT_RIGHT + 6 * (RIGHT * p + j) + i) = x;
+                        at(s, right_of(p) + 6 * j + i) = x;
                     }
                 }
             }
@@ -183,11 +179,13 @@ NATIVE = r"""static CUDA_CALLABLE inline void load_block(REAL* s, int from, int 
     static CUDA_CALLABLE APART void build(REAL* s, REAL h, int warp, int warps)
     {
         LOOP
+        for (int p = warp; p < COUPLES; p += warps)
+            if (at(s, AT_ACTIVE + p) > 0) sides(s, p);
+        if (warps > 1) wait();  // blocks take the place of what was added
+        LOOP
         for (int item = warp; item < ITEMS; item += warps) {
             const int p = row_of(item), q = column_of(item);
-            if (!(at(s, AT_ACTIVE + p) > 0)) continue;
-            if (q < 0) sides(s, p);
-            else if (at(s, AT_ACTIVE + q) > 0) block(s, p, q);
+            if (at(s, AT_ACTIVE + p) > 0 && at(s, AT_ACTIVE + q) > 0) block(s, p, q);
         }
         if (warps > 1) wait();
         factor_all(s, warp, warps);
@@ -204,7 +202,7 @@ NATIVE = r"""static CUDA_CALLABLE inline void load_block(REAL* s, int from, int 
             for (int row = 0; row < 6; ++row) {
                 REAL e[RIGHT];
                 UNROLL
-                for (int j = 0; j < RIGHT; ++j) e[j] = at(s, AT_RIGHT + 6 * (RIGHT * p + j) + row);
+                for (int j = 0; j < RIGHT; ++j) e[j] = at(s, right_of(p) + 6 * j + row);
                 UNROLL
                 for (int i = 0, k = 0; i < RIGHT - 1; ++i) {
                     force[i] = FUSED(-e[1 + i], e[0], force[i]);
@@ -241,17 +239,17 @@ NATIVE = r"""static CUDA_CALLABLE inline void load_block(REAL* s, int from, int 
                 for (int i = 0; i < 6; ++i) at(s, AT_CHANGE + 6 * p + i) = 0;
                 continue;
             }
-            load_block(s, AT_RIGHT + 6 * RIGHT * p, 6, x);
+            load_block(s, right_of(p), 6, x);
             UNROLL
             for (int j = 1; j < RIGHT; ++j)
                 UNROLL
                 for (int i = 0; i < 6; ++i)
-                    x[i] = FUSED(at(s, AT_RIGHT + 6 * (RIGHT * p + j) + i), alpha[j - 1], x[i]);
+                    x[i] = FUSED(at(s, right_of(p) + 6 * j + i), alpha[j - 1], x[i]);
             EACH
             for (int q = p + 1; q < COUPLES; ++q) {
                 const int block = matrix_of(q * COUPLES + p);
                 if (block < 0 || !(at(s, AT_ACTIVE + q) > 0)) continue;
-                load_block(s, AT_RIGHT + 6 * RIGHT * q, 6, y);
+                load_block(s, right_of(q), 6, y);
                 UNROLL
                 for (int k = 0; k < 6; ++k)
                     UNROLL
@@ -265,7 +263,7 @@ NATIVE = r"""static CUDA_CALLABLE inline void load_block(REAL* s, int from, int 
                 x[i] *= C[i * (i + 1) / 2 + i];
             }
             UNROLL
-            for (int i = 0; i < 6; ++i) at(s, AT_RIGHT + 6 * RIGHT * p + i) = x[i];
+            for (int i = 0; i < 6; ++i) at(s, right_of(p) + i) = x[i];
             REAL zero[6] = {0, 0, 0, 0, 0, 0};
             load_block(s, AT_ROOT + 21 * p, 21, C);
             release(C, zero, x, y);

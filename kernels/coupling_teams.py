@@ -36,13 +36,14 @@ def declare(team: Any, T: type, local: bool = False) -> str:
         first_pair.append(first_pair[-1] + len(pairs))
     first_point = [sum(team.points[:pair]) for pair in range(len(team.points))]
     blocks = sorted(team.blocks)
-    items = [*blocks, *((couple, -1) for couple in range(couples))]
     lists: dict[str, Sequence[int]] = {
         "first_body": [bodies[0] for bodies, _ in team.pairs], "second_body": [bodies[1] for bodies, _ in team.pairs],
         "first_pair": first_pair, "pair": order, "points": team.points, "first_point": first_point,
-        "entry": entries(team.points)[:-1], "row": [row for row, _ in items], "column": [q for _, q in items],
+        "entry": entries(team.points)[:-1], "row": [row for row, _ in blocks], "column": [q for _, q in blocks],
         "matrix": [team.matrix(p, q) for p in range(couples) for q in range(couples)],
         "side": [team.side(p, side) for p in range(couples) for side in range(2)], "warp": team.warps or [0],
+        "right": [team.side(p, team.leads(p)) for p in range(couples)], "lead": [team.leads(p) for p in range(couples)],
+        "skipped": [team.skipped(p, side) for p in range(couples) for side in range(2)],
         "limb": team.limbs or [0], "dofs": team.dofs or [0], "seated": [int(x) for x in team.seated] or [0],
     }  # fmt: skip
     lists |= team.solids.lists
@@ -51,7 +52,7 @@ def declare(team: Any, T: type, local: bool = False) -> str:
     tables += [table(c, f"{name}_of", [f"{x!r}{number}" for x in row], few) for name, row in reals.items()]
     places = {f"AT_{name.upper()}": at for name, at in team.layout.items()}
     sizes = places | {
-        "PAIRS": len(team.points), "COUPLES": couples, "BODIES": bodies, "ITEMS": len(items), "ALPHA": team.alpha,
+        "PAIRS": len(team.points), "COUPLES": couples, "BODIES": bodies, "ITEMS": len(blocks), "ALPHA": team.alpha,
         "RIGHT": team.right, "BASE": BASE, "HEADER": HEADER, "POINT": POINT,
     }  # fmt: skip
     text = coupling_shared.NATIVE.replace("MATRICES", coupling_matrices.NATIVE.strip())

@@ -88,6 +88,11 @@ class Team(NamedTuple):
         return found
 
     @property
+    def _matrix_size(self) -> int:
+        others = sum(row != column for row, column in self.blocks)
+        return 21 * len(self.pairs) + 36 * (others - min(others, len(self.spare)))
+
+    @property
     def layout(self) -> dict[str, int]:
         """Where each kind of values begins; "end" is the place after the last one."""
         pairs, couples, bodies = len(self.points), len(self.pairs), len(self.limbs)
@@ -95,7 +100,7 @@ class Team(NamedTuple):
             "value": VALUES * pairs + 2, "bound": 2 * couples, "count": pairs,
             "across": sum(self.points), "flags": 2 * pairs,
             "arm": 6 * couples, "active": couples, "load": 6 * couples, "change": 6 * couples, "root": 21 * couples,
-            "right": 6 * self.right * couples, "matrix": sum(21 if p == q else 36 for p, q in self.blocks),
+            "matrix": self._matrix_size,
             "twist": 6 * bodies, "wrench": 6 * bodies, "base": BASE if self.alpha >= 0 else 0,
             "side": sum(self.sides),
         }  # fmt: skip
@@ -106,21 +111,44 @@ class Team(NamedTuple):
         found["excess"] = found["report"] + REPORTS * pairs
         return found | {"end": max(at, found["place"] + self.solids.size, found["excess"] + EXCESS * couples)}
 
+    def leads(self, couple: int) -> int:
+        """The side of a couple whose limb leaves L* u and L* B where the right-hand sides of the couple are."""
+        bodies = self.pairs[couple][0]
+        found = [side for side, body in enumerate(bodies) if body >= 0]
+        return next((side for side in found if self.seated[bodies[side]]), found[0])
+
+    def skipped(self, couple: int, side: int) -> int:
+        """How many values of a side come before z: L* u, and L* B where the limb has a base."""
+        if side == self.leads(couple):
+            return 6 * self.right
+        body = self.pairs[couple][0][side]
+        return RIGHT * 6 if body >= 0 and self.seated[body] else 6
+
     @property
     def sides(self) -> tuple[int, ...]:
         """How many values the limb of each couple's first and second body leaves: L* u, L* B and z."""
-        bodies = [body for pair, _ in self.pairs for body in pair]
-        return tuple(6 + 36 * self.seated[body] + 6 * self.dofs[body] if body >= 0 else 0 for body in bodies)
+        found = []
+        for couple, (bodies, _) in enumerate(self.pairs):
+            found += [self.skipped(couple, side) + 6 * self.dofs[body] if body >= 0 else 0
+                      for side, body in enumerate(bodies)]  # fmt: skip
+        return tuple(found)
 
     def side(self, couple: int, side: int) -> int:
         """Where the values of a couple's first or second body begin."""
         return self.layout["side"] + sum(self.sides[: 2 * couple + side])
 
+    @property
+    def spare(self) -> list[tuple[int, int]]:
+        """Couples and sides whose L* B is free for a block of S once it is added to that of the side that leads."""
+        others = [(couple, 1 - self.leads(couple)) for couple in range(len(self.pairs))]
+        return [(couple, side) for couple, side in others if self.skipped(couple, side) == 6 * RIGHT]
+
     def matrix(self, p: int, q: int) -> int:
         """Where a block of S begins; -1: it is zero."""
-        at = self.layout["matrix"]
+        spare, at = self.spare, self.layout["matrix"]
         for row, column in self.blocks:
+            used = spare.pop(0) if row != column and spare else None
             if (row, column) == (p, q):
-                return at
-            at += 21 if row == column else 36
+                return at if used is None else self.side(*used) + 6
+            at += 0 if used is not None else 21 if row == column else 36
         return -1

@@ -223,10 +223,9 @@ class PairedPiece(ContactStep):
             z = []
             for key, size in sizes.items():
                 z += [y * x for y, x in zip(found.get(key, [0.0] * len(size)), size, strict=True)]
-            at = first + 6
             if self.plan.seated[number]:
-                stores += [Store(INWARD, (at + 6 * i + column,), -x) for i, x in enumerate(force)]
-                at += 36
+                stores += [Store(INWARD, (first + 6 + 6 * i + column,), -x) for i, x in enumerate(force)]
+            at = first + self.plan.skipped(couple, side)
             stores += [Store(INWARD, (at + 6 * i + column,), x) for i, x in enumerate(z)]
         return stores
 
