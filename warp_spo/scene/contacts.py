@@ -149,10 +149,11 @@ class Contact(StoredPart):
         other: None: the ground. A Contact that gives another body and its shape, and nothing else counts of it. An
             index of a body: the shape of that body's one contact with the ground.
         friction: ratio of the largest friction force to the normal force.
-        stiffness: of each point [N/m]; None: so that a robot that stands on up to four points sinks by 1.7 mm, and that
-            the points of one body can hold it up alone, if they span a sole. See ``contact_points`` of :class:`Scene`.
-            With ``other``, of the pair; None: the lighter of the two, with all that is connected to it, sinks by 0.1 mm
-            where it rests on the other; of bodies connected to each other, with all that they carry.
+        stiffness: of each point [N/m]; None: so that a robot that stands on up to four points sinks by 1.7 mm, and so
+            that the points of one body, if they span a sole, carry the whole robot. See ``contact_points`` of
+            :class:`Scene`. With ``other``, of the pair; None: the lighter of the two, with all that is connected to
+            it, sinks by 0.1 mm where it rests on the other; of bodies connected to each other, with all that they
+            carry.
         damping: of each point [N s/m]; None: sqrt(stiffness mass) / 2, with the mass that rests on the point when the
             robot stands on two such bodies, or on four points. With ``other``, of the pair; None: critical for that
             mass.
