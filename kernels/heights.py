@@ -1,84 +1,149 @@
 """Sums over worlds and contact points of gradients by heights of a field, in a fixed order, without atomics.
 
 A contribution is the gradient by the four corners of one cell. Contributions are sorted by cell, stably, so that those
-of a cell are neighbours in the order of worlds and points. Several lanes add up a height: lane l of n takes the
-contributions l, l + n, ... to each of its four cells, and then the sums of the lanes are added in their order.
+of a cell are neighbours in the order of worlds and points; contributions of zeros come after all others, and are left
+there. A thread adds up RUN of them, whichever cells they belong to, so that all threads have the same work even where
+all worlds stand on one cell. What it has found when its cell goes on in the next thread's part is that cell's carry. A
+cell's sum is that of its carries, in order, and of its last part.
 """
 
 import functools
 
 import warp as wp
 
-LANES = 32  # of a height: threads that share the work where all worlds stand on one cell
+from .slots import WARP_SIZE
+
+RUN = 16  # contributions of a thread
+
+_SUM_OF_LANES = """
+#if defined(__CUDA_ARCH__)
+    for (int step = 16; step; step /= 2) x += __shfl_xor_sync(0xffffffffu, x, step);
+#endif
+    return x;
+"""
+
+
+@wp.func_native(_SUM_OF_LANES)
+def sum_of_lanes(x: wp.float32) -> wp.float32: ...
+
+
+@wp.func_native(_SUM_OF_LANES)
+def sum_of_lanes(x: wp.float64) -> wp.float64: ...  # noqa: F811 - Warp's way to overload
 
 
 @functools.cache
 def number_cells(T) -> wp.Kernel:
-    """Write the keys and the values to sort: the cell of each contribution, and its number."""
+    """Write the keys and the values to sort: each contribution's cell, ``none`` for one of zeros, and its number."""
 
     @wp.kernel(module=f"warp_spo_heights_{T.__name__}", enable_backward=False)
-    def kernel(cells: wp.array[T], keys_out: wp.array[wp.int32], order_out: wp.array[wp.int32]):
+    def kernel(
+        cells: wp.array[T],
+        contributions: wp.array2d[T],
+        none: int,
+        keys_out: wp.array[wp.int32],
+        order_out: wp.array[wp.int32],
+    ):
         at = wp.tid()
-        keys_out[at] = int(cells[at])
+        key = none
+        for corner in range(4):
+            if contributions[at, corner] != T(0.0):  # NaN, too
+                key = int(cells[at])
+        keys_out[at] = key
         order_out[at] = at
 
     return kernel
 
 
 @functools.cache
-def find_ranges(T) -> wp.Kernel:
-    """Write where the contributions to each cell begin and end among the sorted ``keys``."""
+def add_runs(T) -> wp.Kernel:
+    """Write carries and last parts, and where the contributions to each cell begin and end among the sorted ``keys``.
 
-    @wp.kernel(module=f"warp_spo_heights_{T.__name__}", enable_backward=False)
-    def kernel(keys: wp.array[wp.int32], count: int, begin_out: wp.array[wp.int32], end_out: wp.array[wp.int32]):
-        at = wp.tid()
-        cell = keys[at]
-        if at == 0 or keys[wp.max(at - 1, 0)] != cell:
-            begin_out[cell] = at
-        if at == count - 1 or keys[wp.min(at + 1, count - 1)] != cell:
-            end_out[cell] = at + 1
-
-    return kernel
-
-
-@functools.cache
-def add_lanes(T) -> wp.Kernel:
-    """Write the sum of each lane of each height; ``steps`` are the places of a cell's corners from its first one."""
+    A thread works on RUN places from a multiple of RUN on.
+    """
+    vec4 = wp.types.vector(4, T)
 
     @wp.kernel(module=f"warp_spo_heights_{T.__name__}", enable_backward=False)
     def kernel(
-        begin: wp.array[wp.int32],
-        end: wp.array[wp.int32],
+        keys: wp.array[wp.int32],
         order: wp.array[wp.int32],
-        steps: wp.vec4i,
         contributions: wp.array2d[T],
-        sums_out: wp.array2d[T],
+        count: int,
+        none: int,
+        range_out: wp.array2d[wp.int32],
+        carry_out: wp.array2d[T],
+        last_out: wp.array2d[T],
     ):
-        height, lane = wp.tid()
-        found, lanes = T(0.0), sums_out.shape[1]
+        part = wp.tid()
+        first = part * RUN
+        end = wp.min(first + RUN, count)
+        before = int(-1)
+        if first > 0:
+            before = keys[first - 1]
+        cell = keys[first]
+        found = vec4()
+        for at in range(first, end):
+            if cell != none:
+                if cell != before:
+                    range_out[0, cell] = at
+                    found = vec4()
+                one = order[at]
+                for corner in range(4):
+                    found[corner] += contributions[one, corner]
+                after = none
+                if at + 1 < count:
+                    after = keys[at + 1]
+                if after != cell:
+                    range_out[1, cell] = at + 1
+                    for corner in range(4):
+                        last_out[corner, cell] = found[corner]
+                before = cell
+                cell = after
         for corner in range(4):
-            cell = height - steps[corner]
-            if cell >= 0:
-                for at in range(begin[cell] + lane, end[cell], lanes):
-                    found += contributions[order[at], corner]
-        sums_out[height, lane] = found
+            carry_out[corner, part] = found[corner]
 
     return kernel
 
 
 @functools.cache
-def add_sums(T) -> wp.Kernel:
-    """Write the sum of all lanes of each height."""
+def add_carries(T) -> wp.Kernel:
+    """Write the sums of each cell by its corners; one lane, or the lanes of a warp, take turns at its carries."""
 
     @wp.kernel(module=f"warp_spo_heights_{T.__name__}", enable_backward=False)
-    def kernel(sums: wp.array2d[T], out: wp.array[T]):
+    def kernel(
+        range_of: wp.array2d[wp.int32], carry: wp.array2d[T], last: wp.array2d[T], lanes: int, sums_out: wp.array2d[T]
+    ):
+        cell, lane = wp.tid()
+        end = range_of[1, cell]
+        if end > 0:
+            first, behind = range_of[0, cell] // RUN, (end - 1) // RUN
+            for corner in range(4):
+                found = T(0.0)
+                for part in range(first + lane, behind, lanes):
+                    found += carry[corner, part]
+                found = sum_of_lanes(found)
+                if lane == 0:
+                    sums_out[corner, cell] = found + last[corner, cell]
+
+    return kernel
+
+
+@functools.cache
+def add_corners(T) -> wp.Kernel:
+    """Write the sum of each height over its four cells; ``steps`` are the places of a cell's corners from its first."""
+
+    @wp.kernel(module=f"warp_spo_heights_{T.__name__}", enable_backward=False)
+    def kernel(range_of: wp.array2d[wp.int32], sums: wp.array2d[T], steps: wp.vec4i, out: wp.array[T]):
         height = wp.tid()
         found = T(0.0)
-        for lane in range(sums.shape[1]):
-            found += sums[height, lane]
+        for corner in range(4):
+            cell = height - steps[corner]
+            if cell >= 0:
+                if range_of[1, cell] > 0:
+                    found += sums[corner, cell]
         out[height] = found
 
     return kernel
 
 
-KERNELS = (number_cells, find_ranges, add_lanes, add_sums)
+LANES = WARP_SIZE  # that share a cell on a GPU
+KERNELS = (number_cells, add_runs, add_carries, add_corners)

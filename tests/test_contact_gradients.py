@@ -255,20 +255,28 @@ def test_values_without_entries_have_gradients_without_entries(device):
 # -- heights of a field ------------------------------------------------------------------------------------------------
 def test_heights_add_up(device):
     """Contributions of many worlds to a few cells, against NumPy; twice the same bits."""
-    rng, worlds, rows, columns = np.random.default_rng(0), 300, 7, 5
-    cells = rng.integers(0, rows - 1, worlds) * columns + rng.integers(0, columns - 1, worlds)
-    cells[::2] = 8  # where most of them stand
-    parts, wanted, steps = rng.normal(size=(worlds, 4)), np.zeros(rows * columns), (0, 1, columns, columns + 1)
-    for corner, step_ in enumerate(steps):
-        np.add.at(wanted, cells + step_, parts[:, corner])
-    given = [wp.array(x, dtype=wp.float64, device=device) for x in (cells, parts)]
-    sums, found = HeightSums(worlds, rows * columns, wp.float64, wp.get_device(device)), []
-    for _ in range(2):
-        out = wp.full(rows * columns, np.nan, dtype=wp.float64, device=device)
-        sums.add_up(*given, steps, out)
-        found.append(out.numpy())
-    np.testing.assert_allclose(found[0], wanted, atol=1e-13)
-    assert (found[0] == found[1]).all() and (found[0] != 0.0).any()
+    rng, rows, columns = np.random.default_rng(0), 7, 5
+    steps = (0, 1, columns, columns + 1)
+    for worlds, standing in ((3000, 0.5), (300, 0.2), (1, 1.0), (40, 0.0)):  # some of them stand on the ground
+        cells = rng.integers(0, rows - 1, worlds) * columns + rng.integers(0, columns - 1, worlds)
+        cells[::2] = 8  # where most of them are
+        parts, wanted = rng.normal(size=(worlds, 4)), np.zeros(rows * columns)
+        parts[rng.random(worlds) >= standing] = 0.0
+        for corner, step_ in enumerate(steps):
+            np.add.at(wanted, cells + step_, parts[:, corner])
+        given = [wp.array(x, dtype=wp.float64, device=device) for x in (cells, parts)]
+        sums, found = HeightSums(worlds, rows * columns, wp.float64, wp.get_device(device)), []
+        for array in (sums.carries, sums.last, sums.sums):
+            array.fill_(np.nan)
+        for _ in range(2):
+            out = wp.full(rows * columns, np.nan, dtype=wp.float64, device=device)
+            sums.add_up(*given, steps, out)
+            found.append(out.numpy())
+        np.testing.assert_allclose(found[0], wanted, atol=1e-13 * worlds)
+        assert (found[0] == found[1]).all() and (found[0] != 0.0).any() == (standing > 0.0)
+    parts[3, 2] = np.nan
+    sums.add_up(given[0], wp.array(parts, dtype=wp.float64, device=device), steps, out)
+    assert np.flatnonzero(np.isnan(out.numpy())).tolist() == (cells[3] + np.array(steps))[2:3].tolist()
 
 
 @pytest.mark.slow

@@ -65,16 +65,16 @@ def fill(array: wp.array, value: float) -> None:
         _thread.recording.keep(_Fill, array, value)
 
 
-def sort(keys: wp.array, values: wp.array, count: int) -> None:
-    """Sort the first ``count`` keys, 32-bit integers, and with them the values; equal keys keep their order.
+def sort(keys: wp.array, values: wp.array, count: int, bits: int) -> None:
+    """Sort the first ``count`` keys, int32 from 0 to 2^bits - 1, and with them the values; equal keys keep their order.
 
     Both arrays have room for twice as many entries.
     """
     if _thread.waiting is not None:
-        return _wait(functools.partial(sort, keys, values, count))
-    wp.utils.radix_sort_pairs(keys, values, count)
+        return _wait(functools.partial(sort, keys, values, count, bits))
+    wp.utils.radix_sort_pairs(keys, values, count, 0, bits)
     if _thread.recording is not None:
-        _thread.recording.keep(_Sort, keys, values, count)
+        _thread.recording.keep(_Sort, keys, values, count, bits)
 
 
 class Branch:
@@ -196,12 +196,12 @@ class _Fill:
 
 
 class _Sort:
-    def __init__(self, keys: _Place, values: _Place, count: int):
-        self._keys, self._values, self._count = keys, values, count
+    def __init__(self, keys: _Place, values: _Place, count: int, bits: int):
+        self._keys, self._values, self._count, self._bits = keys, values, count, bits
 
     def launch(self, stream: wp.Stream | None) -> None:
         with wp.ScopedStream(stream, sync_enter=False):
-            wp.utils.radix_sort_pairs(self._keys.array(), self._values.array(), self._count)
+            wp.utils.radix_sort_pairs(self._keys.array(), self._values.array(), self._count, 0, self._bits)
 
 
 class _Launch:
