@@ -45,6 +45,18 @@ def test_limits_say_where_a_pose_is_looked_at():
         spo.Hinge.custom(-1, 0, coordinates=1, pose=pose)
 
 
+@pytest.mark.parametrize("more", [dict(velocity_limit=3.0), {}])
+def test_steps_that_weigh_hinges_at_zero_need_a_regular_pose_there(more):
+    """Contacts and velocity limits take scales from the mass matrix at the neutral q, which is infinite here."""
+    pose = lambda q: ((np.sqrt(q[0]), 0.0, 0.0), np.eye(3))  # noqa: E731
+    hinge = spo.Hinge.custom(-1, 0, coordinates=1, pose=pose, limit_lower=0.1, limit_upper=0.9, label="knee", **more)
+    contacts = [] if more else [spo.Contact(0, point=(0, 0, 0))]
+    dyn = spo.Dynamics(spo.Scene([spo.Body(1.0)], [hinge], contacts=contacts), worlds=1, dtype="float64", device="cpu")
+    text = r"mass matrix at the neutral q, .* is not finite at 'knee.*shift its coordinate"
+    with pytest.raises(ValueError, match=text):
+        dyn.step(np.full((1, 1), 0.5), np.zeros((1, 1)), None, 1e-3)
+
+
 def test_other_kinds_take_no_pose():
     with pytest.raises(ValueError, match="belong to a custom hinge"):
         spo.Hinge("revolute", -1, 0, axis=(0, 0, 1), pose=flat)

@@ -79,6 +79,11 @@ def test_limits_have_the_time_constant_of_solref():
     frequency = np.sqrt(values["joint_limit_ke"] / inertia)
     np.testing.assert_allclose(1.0 / (frequency * 0.05), 0.7)
     np.testing.assert_allclose(values["joint_limit_kd"] / (2.0 * inertia * frequency), 0.7)
+    early = spo.from_mujoco(compiled(text.format(joint.format('.05 .7" margin=".1')))).values
+    np.testing.assert_allclose(early["joint_limit_upper"], np.deg2rad(60) - 0.1)
+    np.testing.assert_allclose(early["joint_limit_lower"], np.deg2rad(-30) + 0.1)
+    with pytest.raises(spo.UnsupportedError, match="joint 'a', which has a margin of 1, more than half of its range"):
+        spo.from_mujoco(compiled(text.format(joint.format('.05 .7" margin="1'))))
     direct = spo.from_mujoco(compiled(text.format(joint.format("-300 -20")))).values
     np.testing.assert_allclose(
         [direct["joint_limit_ke"], direct["joint_limit_kd"]], [[[300 * inertia]], [[20 * inertia]]]

@@ -142,7 +142,10 @@ class Mechanism:
             if source.disabled(flag) or (name == "friction" and source.disabled("CONSTRAINT")):
                 values[name] = 0.0
         if m.jnt_limited[joint] and not (source.disabled("LIMIT") or source.disabled("CONSTRAINT")):
-            lower, upper = np.clip(m.jnt_range[joint], -UNLIMITED, UNLIMITED)
+            lower, upper = np.clip(m.jnt_range[joint], -UNLIMITED, UNLIMITED) + m.jnt_margin[joint] * np.array([1, -1])
+            if lower > upper:
+                margin = f"a margin of {m.jnt_margin[joint]:g}, more than half of its range"
+                source.refuse(f"{source.words('joint', joint)}, which has {margin},", "make the margin smaller")
             ke, kd = limit_gains(m.jnt_solref[joint], m.dof_invweight0[first])
             values |= {"limit_lower": lower, "limit_upper": upper, "limit_ke": ke, "limit_kd": kd}
         low, high = m.jnt_actfrcrange[joint]

@@ -39,8 +39,8 @@ def from_mujoco(model: Any, contacts: Any = None, ground: Any = None, points: in
 
     Args:
         model: a ``mujoco.MjModel``, of MuJoCo 3.11 or newer.
-        contacts, ground, points: which geoms touch which ground, as in :func:`load`. Friction is MuJoCo's of the geom
-            on the model's ground; ``solref`` and ``solimp`` are not read: stiffness and damping are chosen as
+        contacts, ground, points: which geoms touch which ground, as in :func:`load`. Friction and margin are those of
+            the geom on MuJoCo's ground; ``solref`` and ``solimp`` are not read: stiffness and damping are chosen as
             :class:`Contact` says.
 
     Raises:

@@ -15,6 +15,7 @@ from .source import Source
 GEOMS = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")): name.lower() for name in (
     "PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH", "SDF")}  # fmt: skip
 """MuJoCo's kinds by number."""
+Pairs = dict[frozenset[int], int]  # number of an explicit pair by its two geoms
 KINDS = {"mesh": "hull", "hfield": "height field"}
 
 
@@ -22,7 +23,8 @@ def collision_shapes(source: Source) -> list[Shape]:
     """Return the collision shapes of a model, those that explicit pairs name included.
 
     A shape that moves has the friction that it has on the model's ground, if there is one: by the rule of MuJoCo for
-    priorities, and zero where the contact has one dimension.
+    priorities, and zero where the contact has one dimension. Its rounding is the margin of the contact, the sum of both
+    geoms' or that of their pair, because MuJoCo pushes two surfaces apart until they are so far from each other.
     """
     m = source.model
     pairs = _pairs(source)
@@ -35,8 +37,12 @@ def collision_shapes(source: Source) -> list[Shape]:
         touched = [ground for ground in grounds if _touches(source, geom, ground, pairs)]
         if grounds and not still(geom) and not touched:
             continue  # it collides with other things than the ground
-        friction = None if still(geom) else _friction(source, geom, touched[0] if touched else None, pairs)
-        found.append(_shape(source, geom, friction))
+        if still(geom):
+            found.append(_shape(source, geom, None, 0.0))
+            continue
+        ground = touched[0] if touched else None
+        friction = _friction(source, geom, ground, pairs)
+        found.append(_shape(source, geom, friction, _margin(source, geom, ground, pairs)))
     return found
 
 
@@ -44,13 +50,13 @@ def _name(m: Any, geom: int) -> str:
     return GEOMS.get(int(m.geom_type[geom]), f"geom of type {int(m.geom_type[geom])}")
 
 
-def _pairs(source: Source) -> dict[frozenset[int], int]:
+def _pairs(source: Source) -> Pairs:
     """Return the explicit pairs of geoms: number of the pair by its geoms."""
     m = source.model
     return {frozenset((int(m.pair_geom1[i]), int(m.pair_geom2[i]))): i for i in range(m.npair)}
 
 
-def _touches(source: Source, geom: int, ground: int, pairs: dict[frozenset[int], int]) -> bool:
+def _touches(source: Source, geom: int, ground: int, pairs: Pairs) -> bool:
     """Whether MuJoCo makes contacts of a geom with a geom of the world: by masks or by a pair, unless excluded."""
     m = source.model
     if frozenset((geom, ground)) in pairs:
@@ -61,20 +67,34 @@ def _touches(source: Source, geom: int, ground: int, pairs: dict[frozenset[int],
     return bool(m.geom_contype[geom] & m.geom_conaffinity[ground] | m.geom_contype[ground] & m.geom_conaffinity[geom])
 
 
-def _friction(source: Source, geom: int, ground: int | None, pairs: dict[frozenset[int], int]) -> float:
+def _friction(source: Source, geom: int, ground: int | None, pairs: Pairs) -> float:
     """Return the sliding friction of a geom on a ground, its own without one."""
     m = source.model
-    if ground is None:
-        return float(m.geom_friction[geom, 0]) if m.geom_condim[geom] > 1 else 0.0
-    pair = pairs.get(frozenset((geom, ground)))
+    pair = None if ground is None else pairs.get(frozenset((geom, ground)))
     if pair is not None:
-        return float(m.pair_friction[pair, 0]) if m.pair_dim[pair] > 1 else 0.0
-    first, second = (m.geom_priority[g] for g in (geom, ground))
-    both = [geom, ground] if first == second else [geom if first > second else ground]
-    return float(max(m.geom_friction[g, 0] for g in both)) if max(m.geom_condim[g] for g in both) > 1 else 0.0
+        value, dimensions = m.pair_friction[pair, 0], m.pair_dim[pair]
+    else:
+        both = [geom] if ground is None else [geom, ground]
+        priority = max(m.geom_priority[g] for g in both)
+        both = [g for g in both if m.geom_priority[g] == priority]
+        value, dimensions = (max(values[g] for g in both) for values in (m.geom_friction[:, 0], m.geom_condim))
+    if source.enabled("OVERRIDE"):
+        value = m.opt.o_friction[0]
+    return float(value) if dimensions > 1 else 0.0
 
 
-def _shape(source: Source, geom: int, friction: float | None) -> Shape:
+def _margin(source: Source, geom: int, ground: int | None, pairs: Pairs) -> float:
+    """Return how far apart MuJoCo keeps the surfaces of a geom and a ground [m]; of the geom alone without one."""
+    m = source.model
+    if source.enabled("OVERRIDE"):
+        return float(m.opt.o_margin)
+    pair = None if ground is None else pairs.get(frozenset((geom, ground)))
+    if pair is not None:
+        return float(m.pair_margin[pair])
+    return float(sum(m.geom_margin[g] for g in (geom, ground) if g is not None))
+
+
+def _shape(source: Source, geom: int, friction: float | None, margin: float) -> Shape:
     m, kind = source.model, _name(source.model, geom)
     names: tuple[str, ...] = ()
     if kind in ("mesh", "hfield"):
@@ -85,6 +105,7 @@ def _shape(source: Source, geom: int, friction: float | None) -> Shape:
         KINDS.get(kind, kind),
         np.concatenate([m.geom_pos[geom], xyzw(m.geom_quat[geom])]),
         _sizes(m, geom, kind),
+        rounding=margin,
         friction=friction,
         names=names,
     )

@@ -63,3 +63,8 @@ class Source:
         """Whether the model's option flag of that name is off, such as "GRAVITY"."""
         bit: Any = getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")
         return bool(self.model.opt.disableflags & int(bit))
+
+    def enabled(self, name: str) -> bool:
+        """Whether the model's option flag of that name, which is off by default, is on, such as "OVERRIDE"."""
+        bit: Any = getattr(mujoco.mjtEnableBit, f"mjENBL_{name}")
+        return bool(self.model.opt.enableflags & int(bit))

@@ -20,13 +20,11 @@ import numpy as np
 from ..errors import UnsupportedError
 from ..scene.parts import UNLIMITED
 from ..scene.scene import Scene
-from ..trace.evaluation import evaluate
 from ..trace.scalars import Value, absolute, is_constant, less, reciprocal, select
 from ..trace.spatial import total
-from .composite import mass_matrix
 from .links import Link, Links
+from .neutral import masses
 from .remembered import remembered
-from .tracing import Trace
 
 CREEP = 1e-4  # rate [rad/s, m/s] below which dry friction is a damper; it saturates at this rate
 DEFAULT_BOUND = 1e6  # effort and velocity limits of this size and more are no limits; Newton's default
@@ -297,12 +295,7 @@ def is_number(x: Value, number: float) -> bool:
 @remembered
 def neutral_inertias(scene: Scene) -> np.ndarray:
     """Return 1 / diagonal of Mass^-1 at the neutral configuration of world 0 [dof]; of Mass where it is singular."""
-    one = scene.with_values(**{name: array[:1] for name, array in scene.values.items()})
-    entries = mass_matrix(Trace(Links(one), "float64", ("q",)))
-    mass = np.zeros((scene.dof_count, scene.dof_count))
-    values = evaluate([item.value for item in entries], lambda array, index: scene.neutral_q[index[0]])
-    for item, value in zip(entries, values, strict=True):
-        mass[item.index] = value
+    mass, inverse = masses(scene)
     with np.errstate(all="ignore"):
-        found = 1.0 / np.diagonal(np.linalg.pinv(mass))
+        found = 1.0 / np.diagonal(inverse)
     return np.where((found > 0.0) & (found <= np.diagonal(mass)), found, np.diagonal(mass))

@@ -17,16 +17,16 @@ from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Value, sqrt
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, total
+from .. import neutral
 from ..articulated_sweeps import NO_FORCE, pivots, propagate_inward, weighted_products
-from ..composite import mass_matrix
-from ..kinematics import carried_velocity, frame_on_link, jacobian, velocity
+from ..kinematics import carried_velocity, frame_on_link, velocity
 from ..links import Link, Links
 from ..motion import hinge_motion
 from ..operational import respond, unit_wrenches
 from ..remembered import remembered
 from . import step as ground
 from .couples import Solids
-from .points import SLIP, evaluated, with_ancestors
+from .points import SLIP, with_ancestors
 
 if TYPE_CHECKING:
     from ..tracing import Trace
@@ -252,11 +252,8 @@ class PairedStep(ground.ContactStep):
 @remembered
 def inverse_weights(scene: Scene) -> list[float]:
     """Return SLIP times the inverse weight of each pair [1/kg]: both bodies', means over their shapes, neutral."""
-    one = scene.with_values(**{name: array[:1] for name, array in scene.values.items()})
-    inverse = np.linalg.pinv(evaluated(one, mass_matrix, (scene.dof_count, scene.dof_count)))
     sides = [(body, shape) for p in scene.contact_pairs
              for body, shape in zip((p.body, p.other), p.shapes, strict=True)]  # fmt: skip
     frames = tuple((body, tuple(point)) for body, shape in sides for point in shape.samples.tolist())
-    J = evaluated(one, lambda trace: jacobian(trace, frames), (len(frames), 6, scene.dof_count))[:, :3]
-    weights = SLIP / 3.0 * np.einsum("pai,ij,paj->p", J, inverse, J)
+    weights = SLIP / 3.0 * neutral.inverse_weights(scene, frames)
     return weights.reshape(len(scene.contact_pairs), 2, -1).mean(axis=2).sum(axis=1).tolist()

@@ -22,15 +22,12 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
 from ...scene.contacts import AWAY, HEIGHTS, PLACE, ContactPoint, Listed
 from ...scene.scene import Scene
-from ...trace.evaluation import evaluate
 from ...trace.scalars import Value, branch, is_constant, less, lost, select
 from ...trace.spatial import IDENTITY, ZERO, Vector, cross, dot, total
-from ..composite import mass_matrix
-from ..kinematics import carried_velocity, frame_on_link, jacobian, zero
+from .. import neutral
+from ..kinematics import carried_velocity, frame_on_link, zero
 from ..links import Link, Links
 from ..motion import Motion, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
@@ -250,17 +247,5 @@ def with_ancestors(links: list[Link | None]) -> set[int]:
 @remembered
 def inverse_weights(scene: Scene) -> list[float]:
     """Return SLIP times the mean of J Mass^-1 J* over three directions, of each point, neutral, in world 0 [1/kg]."""
-    one = scene.with_values(**{name: array[:1] for name, array in scene.values.items()})
-    inverse = np.linalg.pinv(evaluated(one, mass_matrix, (scene.dof_count, scene.dof_count)))
     frames = tuple((point.body, point.position) for point in scene.contact_points)
-    J = evaluated(one, lambda trace: jacobian(trace, frames), (len(frames), 6, scene.dof_count))[:, :3]
-    return (SLIP / 3.0 * np.einsum("pai,ij,paj->p", J, inverse, J)).tolist()
-
-
-def evaluated(scene: Scene, trace: Callable, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the result of a trace in the neutral configuration."""
-    stores, found = trace(Trace(Links(scene), "float64", ("q",))), np.zeros(shape)
-    values = evaluate([item.value for item in stores], lambda array, index: scene.neutral_q[index[0]])
-    for item, value in zip(stores, values, strict=True):
-        found[item.index] = value
-    return found
+    return (SLIP / 3.0 * neutral.inverse_weights(scene, frames)).tolist()
