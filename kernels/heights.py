@@ -1,4 +1,4 @@
-"""Sums over worlds and contact points of gradients by heights of a field, in a fixed order, without atomics.
+"""Heights of a field: the table of its cells, and sums of gradients by them in a fixed order, without atomics.
 
 A contribution is the gradient by the four corners of one cell. Contributions are sorted by cell, stably, so that those
 of a cell are neighbours in the order of worlds and points; contributions of zeros come after all others, and are left
@@ -29,6 +29,28 @@ def sum_of_lanes(x: wp.float32) -> wp.float32: ...
 
 @wp.func_native(_SUM_OF_LANES)
 def sum_of_lanes(x: wp.float64) -> wp.float64: ...  # noqa: F811 - Warp's way to overload
+
+
+@functools.cache
+def list_corners(T) -> wp.Kernel:
+    """Write the four corners of the cell of each height, which is their first one [height, 4].
+
+    Heights are numbered field after field, [x, y] each with ``along_y`` the faster. At the ends of a field, where no
+    cell begins, the last height comes again.
+    """
+
+    @wp.kernel(module=f"warp_spo_heights_{T.__name__}", enable_backward=False)
+    def kernel(heights: wp.array[wp.float64], along_x: int, along_y: int, corners_out: wp.array2d[T]):
+        first = wp.tid()
+        y = first % along_y
+        beside = wp.where(y + 1 < along_y, 1, 0)
+        far = wp.where((first // along_y) % along_x + 1 < along_x, along_y, 0)
+        corners_out[first, 0] = T(heights[first])
+        corners_out[first, 1] = T(heights[first + beside])
+        corners_out[first, 2] = T(heights[first + far])
+        corners_out[first, 3] = T(heights[first + far + beside])
+
+    return kernel
 
 
 @functools.cache
@@ -146,4 +168,4 @@ def add_corners(T) -> wp.Kernel:
 
 
 LANES = WARP_SIZE  # that share a cell on a GPU
-KERNELS = (number_cells, add_runs, add_carries, add_corners)
+KERNELS = (list_corners, number_cells, add_runs, add_carries, add_corners)

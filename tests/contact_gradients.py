@@ -7,7 +7,7 @@ which a difference across a switch is known and left out.
 import numpy as np
 
 from warp_spo.recursions.contact import step as contact
-from warp_spo.recursions.contact.ground import CORNERS, GROUND, corner_steps, surface_count
+from warp_spo.recursions.contact.ground import CORNERS, GROUND, by_cell, corner_steps, surface_count
 from warp_spo.recursions.contact.secants import SECANT
 from warp_spo.recursions.derivatives import contact as back
 from warp_spo.recursions.derivatives import contact_pass as one
@@ -51,6 +51,11 @@ def store(stores, known, found):
     return np.array([np.broadcast_to(value, worlds) for value in values[len(outputs) :]]).T
 
 
+def cells_of(known):
+    """The table of cells [world, entry]: each world has its own here."""
+    return by_cell(known[HEIGHTS]).reshape(len(known["q"]), -1) if HEIGHTS in known else np.zeros((len(known["q"]), 0))
+
+
 def step(scene, a, h, passes):
     """q', qd' [world, ...] and the answers of all comparisons on the way [world, comparison]."""
     arguments = tuple(name for name in a if name not in VALUES)
@@ -58,7 +63,7 @@ def step(scene, a, h, passes):
     stores = contact.step(trace)
     known = a | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
     known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(trace.begin)))}
-    known[GROUND] = known.get(HEIGHTS, np.zeros((worlds, 0))).reshape(worlds, -1)  # each world has its own here
+    known[GROUND] = cells_of(known)
     answers = [store(trace.begin, known, known)]
     looped = [item for item in stores if item.array in (GAIN, SECANT)]
     for number in range(passes):
@@ -89,7 +94,7 @@ def gradient(scene, a, h, passes, cotangents, wrt, ran=None):
     blank = lambda *size: np.full((worlds, *size), np.nan)  # noqa: E731
     known = a | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
     known |= dict(zip(("q_cotangent", "qd_cotangent"), cotangents, strict=True))
-    known[GROUND] = known.get(HEIGHTS, np.zeros((worlds, 0))).reshape(worlds, -1)
+    known[GROUND] = cells_of(known)
     surfaces = len(scene.contact_points) * surface_count(scene.ground, varies=HEIGHTS in a)
     shapes = {name: a[name].shape[1:] for name in wrt} | ({HEIGHTS: (surfaces, CORNERS)} if HEIGHTS in wrt else {})
 

@@ -31,7 +31,7 @@ from warp_spo.recursions import (
 )
 from warp_spo.recursions.contact import middle
 from warp_spo.recursions.contact import step as contact
-from warp_spo.recursions.contact.ground import GROUND
+from warp_spo.recursions.contact.ground import GROUND, by_cell
 from warp_spo.recursions.contact.secants import SECANT
 from warp_spo.recursions.derivatives import adjoints, inverse_dynamics
 from warp_spo.recursions.links import Links
@@ -120,7 +120,7 @@ def contact_step(scene, arrays, h, passes=3, dtype="float64"):
     stores = contact.step(trace, True, True, contact.REPORTS)
     known = arrays | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
     known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(trace.begin)))}
-    known[GROUND] = np.ravel(getattr(scene.ground, "heights", ()))
+    known[GROUND] = by_cell(scene.ground.heights).ravel() if hasattr(scene.ground, "heights") else np.zeros(0)
 
     def stored(some, found):
         values = evaluate([item.value for item in some], lambda name, at: known[name][(slice(None), *at)], dtype)

@@ -330,7 +330,9 @@ def test_all_worlds_share_heights(device):
     with pytest.raises(ValueError, match="which all worlds share; expected no worlds="):
         dyn.set(ground_heights=higher, worlds=[True, False])
     dyn.set(ground_heights=higher)
-    assert np.array_equal(dyn.recursions.parameters.ground_heights.numpy(), np.float32(higher.ravel()))
+    cells = dyn.recursions.parameters.ground_cells.numpy().reshape(30, 20, 4)[:-1, :-1]
+    wanted = np.stack([higher[:-1, :-1], higher[:-1, 1:], higher[1:, :-1], higher[1:, 1:]], axis=-1)
+    assert np.array_equal(cells, np.float32(wanted))
 
 
 # -- through wp.Tape and JAX -------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import warp_spo as spo
+from warp_spo.recursions.contact.ground import by_cell
 from warp_spo.scene import terrain
 
 MAKERS = {
@@ -117,6 +118,26 @@ def test_worlds_start_on_tiles():
     for bad in (dict(worlds=0), dict(worlds=3, hardest=4), dict(worlds=3, hardest=-1)):
         with pytest.raises(ValueError, match=r"Tiles.starts: (worlds|hardest) is"):
             tiles.starts(**bad)
+
+
+def test_a_table_has_the_corners_of_each_cell_together(device):
+    """For a set of fields, which are not square; again after their heights have changed."""
+    rng = np.random.default_rng(0)
+    ball = spo.Body(1.0, inertia=np.eye(3))
+    ground = spo.HeightField(rng.normal(size=(3, 5, 4)), 0.1)
+    scene = spo.Scene(
+        [ball], [spo.Hinge("free", -1, 0)], contacts=[spo.Contact(0, sphere=((0, 0, 0), 0.1))], ground=ground
+    )
+    dyn = spo.Dynamics(scene, 2, device, "float64", variable=("ground_heights",))
+    heights, parameters = ground.heights, dyn.recursions.parameters
+    for _ in range(2):
+        table, known = parameters.ground_cells.numpy().reshape(3, 5, 4, 4), by_cell(heights)
+        for field, i, j in np.ndindex(3, 4, 3):
+            corners = [heights[field, i + di, j + dj] for di in (0, 1) for dj in (0, 1)]
+            assert table[field, i, j].tolist() == known[field, i, j].tolist() == corners
+        np.testing.assert_array_equal(table, known)
+        heights = rng.normal(size=heights.shape)
+        dyn.set(ground_heights=heights)
 
 
 def test_a_stack_holds_its_fields():

@@ -14,6 +14,8 @@ from ..arrays import parse_device
 from ..dynamics.dynamics import Dynamics
 from ..errors import as_integer
 from ..launches import compile_side_by_side
+from ..recursions.contact.ground import GROUND
+from ..scene.contacts import HeightField
 from ..scene.scene import Scene
 from ..torch import stream
 from .events import Delays, Values, changed_values
@@ -142,7 +144,10 @@ class Env(VecEnv):
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=layout.values, granularity=granularity)
         finals = [(f"final {name}", size) for name, size in self.num_obs.items()] if self.final else []
         results = [("reward", 1), ("done", 1), ("time_out", 1), *self.num_obs.items(), *finals]
-        store = self._store = Storage(layout, worlds, self.device, tracing.arrays, results)
+        tables = {}  # of the ground, the same memory that the dynamics read
+        if isinstance(scene.ground, HeightField):
+            tables[GROUND] = wp.to_torch(self.dyn.recursions.parameters.ground_cells)
+        store = self._store = Storage(layout, worlds, self.device, tracing.arrays, results, tables)
         self.q, self.qd, self.actions, self.chosen = (store.tensors[n] for n in ("q", "qd", "actions", "chosen"))
         self._tensors, self._controls, self._step_arrays = store.tensors, store.controls, store.written
         self.values = store.values

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 import torch
 
-from ..recursions.contact.ground import GROUND
-from ..scene.contacts import HeightField
 from .layout import Layout
 from .stage import CHOSEN, COLUMN, INT, LONG, ROW, SHARED, Buffer, output_name
 
@@ -22,6 +20,7 @@ class Storage:
     Args:
         layout: what the stages agreed on. worlds: number of worlds. device: torch device.
         read: names of the arrays that stages read. results: entries of each result, in order.
+        tables: which all worlds share, besides those of the layout, by name.
 
     Attributes:
         tensors: by name. buffers: the same memory as kernels see it.
@@ -31,7 +30,13 @@ class Storage:
     """
 
     def __init__(
-        self, layout: Layout, worlds: int, device: torch.device, read: set[str], results: list[tuple[str, int]]
+        self,
+        layout: Layout,
+        worlds: int,
+        device: torch.device,
+        read: set[str],
+        results: list[tuple[str, int]],
+        tables: Mapping[str, torch.Tensor],
     ):
         self.worlds, self.device = worlds, device
         self.tensors: dict[str, torch.Tensor] = {}
@@ -42,7 +47,7 @@ class Storage:
         self._add_state(layout)
         self._add_controls(layout, read)
         self._add_measured(layout, read)
-        self._add_numbers(layout)
+        self._add_numbers(layout, tables)
         self._add_results(results)
 
     def part(self, out: torch.Tensor, name: str) -> torch.Tensor:
@@ -102,12 +107,11 @@ class Storage:
             self.written["qdd"] = self._zeros(worlds, layout.scene.dof_count)
             self._add("frame_acceleration", self._zeros(worlds, frames, 6))
 
-    def _add_numbers(self, layout: Layout) -> None:
+    def _add_numbers(self, layout: Layout, tables: Mapping[str, torch.Tensor]) -> None:
         """Add tables that all worlds share, values that events change, and what users compute in torch."""
-        tables: dict[str, Any] = dict(layout.tables)
-        if isinstance(layout.scene.ground, HeightField):
-            tables[GROUND] = layout.scene.ground.heights
-        for name, numbers in tables.items():
+        for name, table in tables.items():
+            self._add(name, table.reshape(-1), SHARED)
+        for name, numbers in layout.tables.items():
             flat = torch.tensor(np.asarray(numbers), dtype=torch.float32, device=self.device).reshape(-1)
             self._add(name, flat, SHARED)
         for name in layout.values:

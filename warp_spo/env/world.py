@@ -265,9 +265,7 @@ class World:
         """
         held = self._layout.table(name, numbers)
         width, graph = numbers.shape[1], self._stage.graph
-        return lambda row: vector(
-            AbstractScalar(lookup(graph, held, as_value(row) * float(width), step)) for step in range(width)
-        )
+        return lambda row: vector(map(AbstractScalar, lookup(graph, held, as_value(row), width)))
 
     # -- frames, values --------------------------------------------------------------------------------------------
     def frame(self, name: Any) -> Frame:

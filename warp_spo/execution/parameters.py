@@ -14,9 +14,11 @@ import warp as wp
 
 from .. import launches
 from ..kernels import parameters as kernels
+from ..kernels.heights import list_corners
 from ..kernels.spatial import POSE, RIGID
 from ..kernels.topology import Topology
 from ..memory import broadcast_worlds, size_in_bytes
+from ..recursions.contact.ground import CORNERS
 from ..scene.actuators import ACTUATOR_VALUES
 from ..scene.contacts import CONTACT_VALUES, GROUND_VALUES, HEIGHTS
 from ..scene.scene import Scene
@@ -183,17 +185,18 @@ class Parameters:
         return self.derived_arrays(name, build)[0]
 
     @property
-    def ground_heights(self) -> wp.array:
-        """Heights of the ground's height field, rounded, row after row, field after field [height]."""
+    def ground_cells(self) -> wp.array:
+        """Table of the cells of a height field [height, 4], rounded, see :func:`recursions.contact.ground.by_cell`."""
 
         def build() -> DerivedArrays:
             value = self._values[HEIGHTS]
-            own: Any = wp.empty((value.size, 1), dtype=self.dtype, device=self.device)
-            inputs, kernel = [value.reshape((1, value.size))], kernels.transpose(node_functions(self.dtype))
-            fill = lambda: launches.launch(kernel, own.shape, inputs, [own], device=self.device)  # noqa: E731
-            return DerivedArrays([own.reshape(value.size)], (HEIGHTS,), fill)
+            own: Any = wp.empty((value.size, CORNERS), dtype=self.dtype, device=self.device)
+            inputs: Any = [value.flatten(), *value.shape[-2:]]
+            kernel = list_corners(self.dtype)
+            fill = lambda: launches.launch(kernel, value.size, inputs, [own], device=self.device)  # noqa: E731
+            return DerivedArrays([own], (HEIGHTS,), fill)
 
-        return self.derived_arrays("heights of the ground", build)[0]
+        return self.derived_arrays("cells of the ground", build)[0]
 
     @property
     def gravity(self) -> wp.array | None:

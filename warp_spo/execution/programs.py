@@ -252,9 +252,9 @@ class Programs:
         return self._finished(routine, layout, body, body, tables, emitter.operations)
 
     def _heights(self, reads: bool) -> dict[str, Any]:
-        """Return the table of the ground's heights, if a program ``reads`` it."""
+        """Return the table of the ground's cells, if a program ``reads`` it."""
         ground = self.run.scene.ground
-        return {GROUND: self.run.parameters.ground_heights} if reads and isinstance(ground, HeightField) else {}
+        return {GROUND: self.run.parameters.ground_cells} if reads and isinstance(ground, HeightField) else {}
 
     def _segment_program(
         self, routine: Routine, shapes: dict, pieces: Pieces, more: tuple, options: dict, alone: bool, local: bool

@@ -12,7 +12,7 @@ import numpy as np
 
 from .branches import branch_of, find_blocks, in_order
 from .fusion import Chain, choose_chains, choose_products
-from .scalars import Scalar, Value, is_constant, ordered
+from .scalars import Scalar, Value, is_constant, lookup, ordered
 
 C_TYPE = {"float32": "float", "float64": "double"}
 LIBRARY = {"exponential": "exp", "logarithm": "log", "power": "pow", "floor": "floor"}  # functions of C, also on CUDA
@@ -317,8 +317,7 @@ class Emitter:
         if scalar.key in self._products:
             return self._fused_statement(scalar, self._products[scalar.key], step)
         if op == "lookup":
-            place = self._text(args[1])
-            return [f"const {T} {self._name(scalar, step)} = {args[0]}.data[(int){place} + {args[2]}];"]
+            return self._lookup_statements(scalar, step)
         texts = [self._text(a) for a in args]
         name = self._name(scalar, step)
         if op in BINARY:
@@ -341,6 +340,16 @@ class Emitter:
             function = f"{LIBRARY[op]}f" if self.dtype == "float32" else f"::{LIBRARY[op]}"
             return [f"const {T} {name} = {function}({', '.join(texts)});"]
         return [f"const {T} {name} = on::{op}({', '.join(texts)});"]
+
+    def _lookup_statements(self, scalar: Scalar, step: str) -> list[str]:
+        """Return the statements of all entries of a table's row, which the compiler loads together if it may."""
+        (table, row, width, _), T = scalar.args, C_TYPE[self.dtype]
+        place, entries = f"{table}.data + {width}ll * (int){self._text(row)}", lookup(scalar.graph, table, row, width)
+        if width % 4 == 0:
+            place = f"(const {T}*)__builtin_assume_aligned({place}, 16)"
+        names = {i: self._name(entry, step) for i, entry in enumerate(entries) if entry.key not in self._names}
+        at = f"{self._names[scalar.key]}_row"
+        return [f"const {T}* {at} = {place};", *(f"const {T} {name} = {at}[{i}];" for i, name in names.items())]
 
     def _fused_statement(self, scalar: Scalar, product: Scalar, step: str) -> list[str]:
         """Return the statement of a sum or difference that takes ``product``."""

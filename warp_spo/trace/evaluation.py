@@ -51,9 +51,9 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
         if scalar.op == "input":
             values[scalar.key] = np.asarray(load(scalar.args[0], scalar.args[1:]), dtype=dtype)
         elif scalar.op == "lookup":
-            table, place, step = scalar.args
-            place = place if is_constant(place) else values[place.key]
-            numbers, entry = np.asarray(load(table, ()), dtype=dtype), np.asarray(place, dtype=np.int64) + step
+            table, row, width, column = scalar.args
+            row = np.asarray(row if is_constant(row) else values[row.key], dtype=np.int64)
+            numbers, entry = np.asarray(load(table, ()), dtype=dtype), width * row + column
             values[scalar.key] = numbers[(..., entry) if numbers.ndim == 1 else (np.arange(len(numbers)), entry)]
         else:
             given = (a for a in scalar.args if not isinstance(a, str))  # without the name of a branch

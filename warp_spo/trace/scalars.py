@@ -251,9 +251,9 @@ def floor(x: Value) -> Value:
     return math.floor(x) * 1.0 if is_constant(x) else x.graph.make("floor", x)
 
 
-def lookup(graph: Graph, table: str, place: Value, step: int) -> Value:
-    """Return entry ``place`` + ``step`` of a table of the kernel's own; ``place`` is a whole number at run time."""
-    return graph.make("lookup", table, place, step)
+def lookup(graph: Graph, table: str, row: Value, width: int) -> list[Scalar]:
+    """Return a row of a table of the kernel's own [row, width]; ``row`` is a whole number, known at run time."""
+    return [graph.make("lookup", table, row, width, column) for column in range(width)]
 
 
 def arctangent(y: Value, x: Value) -> Value:

@@ -10,13 +10,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from ...scene.contacts import AWAY, STEEP, HeightField, Listed, Plane
 from ...trace.scalars import Graph, Value, floor, inverse_root, less, lookup, select
 from ...trace.spatial import IDENTITY, Vector, dot
 
 CORNERS = 4  # of a cell
 GROUND = "ground"
-"""Name of the table of heights, row after row."""
+"""Name of the table of cells: the heights at the corners of each, see :func:`by_cell`."""
 
 
 class Surface(NamedTuple):
@@ -98,7 +100,7 @@ def surfaces(
 
 
 class Corners(NamedTuple):
-    """The heights at the corners of a cell, and the place of the first one in the table."""
+    """The heights at the corners of a cell, and the number of the first one, row after row, field after field."""
 
     h00: Value
     h01: Value
@@ -113,7 +115,7 @@ class Corners(NamedTuple):
         first = i * float(columns) + j
         if ground.count > 1:
             first = floor(_between(place.field, ground.count - 1.0)) * float(rows * columns) + first
-        h00, h01, h10, h11 = (lookup(graph, GROUND, first, step) for step in corner_steps(ground))
+        h00, h01, h10, h11 = lookup(graph, GROUND, first, CORNERS)
         return cls(h00, h01, h10, h11, first)
 
     @property
@@ -161,9 +163,20 @@ class Corners(NamedTuple):
 
 
 def corner_steps(ground: HeightField) -> tuple[int, ...]:
-    """Return how far the corners of a cell are from its first one in the table of heights."""
+    """Return how far the corners of a cell are from its first one, in numbers of heights."""
     columns = ground.heights.shape[-1]
     return 0, 1, columns, columns + 1
+
+
+def by_cell(heights: np.ndarray) -> np.ndarray:
+    """Return the table of cells of heights [..., x, y]: the corners of each in :class:`Corners`' order [..., x, y, 4].
+
+    What a point needs of a field lies together so. A cell has the number of its first corner; the numbers of the last
+    points along x and y are no cells, and nothing reads their rows.
+    """
+    far = np.concatenate([heights[..., 1:, :], heights[..., -1:, :]], axis=-2)
+    beside = [np.concatenate([each[..., 1:], each[..., -1:]], axis=-1) for each in (heights, far)]
+    return np.stack([heights, beside[0], far, beside[1]], axis=-1)
 
 
 def height(graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place: Place) -> Value:
