@@ -11,20 +11,23 @@ import warp as wp
 from ..errors import UnsupportedError
 from ..kernels import contacts as kernels
 from ..kernels import declare
+from ..scene.contacts import HEIGHTS
 from ..scene.scene import Scene
 from ..scene.shapes import Choice, moving_bodies
 from ..status import Status
+from .elevations import Elevations
 from .model_contacts import CONTACT_MATERIALS, ModelContacts, model_contacts
 from .slots import Slots
 from .worlds import Worlds, to_numpy
 
 MODES = ("auto", "ground", "pipeline", "none")
-VALUES = {f"shape_material_{material}": name for name, material in CONTACT_MATERIALS.items()}
+ELEVATIONS = "heightfield_elevations"
+VALUES = {f"shape_material_{material}": name for name, material in CONTACT_MATERIALS.items()} | {ELEVATIONS: HEIGHTS}
 """Values of a scene by the model's array that they come from."""
 
 
 def find_contacts(
-    model: newton.Model, worlds: Worlds, scene: Scene, mode: str, points: int, lacking: str
+    model: newton.Model, worlds: Worlds, scene: Scene, mode: str, points: int, lacking: str, apart: bool
 ) -> ModelContacts | Slots | None:
     """Return the contacts of a model's shapes with its ground, or slots for a list of contacts, None for neither.
 
@@ -32,6 +35,7 @@ def find_contacts(
         mode: "none" for neither; "ground" or "pipeline" for one of them, or an error; "auto" for the ground if that
             leaves no shape out that stands still, and no kind of shape; else for slots, if a shape stands still.
         points: of a hull at most, or slots of a shape. lacking: why the solver's steps have no contacts, "" if they do.
+        apart: each height field is one of its own, see :func:`.model_contacts.model_contacts`.
 
     Raises:
         UnsupportedError: with "ground", the model has no ground, or shapes that no contact represents; with "ground" or
@@ -43,7 +47,7 @@ def find_contacts(
         raise UnsupportedError("SolverSPO", f"contacts={mode!r} with {lacking}", "leave out one of them")
     if mode == "pipeline":
         return Slots(model, worlds, scene, points)
-    found = _on_ground(model, worlds, scene, mode, points)
+    found = _on_ground(model, worlds, scene, mode, points, apart)
     if found is not None or mode == "ground" or not model.shape_count:
         return found
     try:
@@ -52,10 +56,12 @@ def find_contacts(
         return None
 
 
-def _on_ground(model: newton.Model, worlds: Worlds, scene: Scene, mode: str, points: int) -> ModelContacts | None:
+def _on_ground(
+    model: newton.Model, worlds: Worlds, scene: Scene, mode: str, points: int, apart: bool
+) -> ModelContacts | None:
     """Return the contacts of a model's shapes with its ground, None if it has none that fit."""
     try:
-        made = model_contacts(model, worlds, scene, Choice(True, None, points))
+        made = model_contacts(model, worlds, scene, Choice(True, None, points), apart)
     except UnsupportedError:
         if mode == "ground":
             raise
@@ -101,11 +107,23 @@ class Materials:
         inputs = [shapes, first, points, gradient.flatten()]
         wp.launch(kernels.add_to_shapes(), len(shapes), inputs, [flat], device=flat.device)
 
-    def mean(self, flat: wp.array) -> wp.array:
+    def read(self, flat: wp.array) -> wp.array:
         """Return the means of a material [world, point], in a buffer that the next call overwrites."""
         inputs, device = [self._rows, self._soil, flat], self._mean.device
         wp.launch(kernels.mean_materials(), self._rows.shape, inputs, [self._mean], device=device)
         return self._mean
+
+
+def sources_of(model: newton.Model, made: ModelContacts | None, heights: bool) -> dict[str, Materials | Elevations]:
+    """Return what turns arrays of the model into values of contacts, by the names of VALUES; {} without contacts.
+
+    ``heights``: elevations, too, if a height field is the ground.
+    """
+    if made is None:
+        return {}
+    materials, rows = Materials(made, model.device), made.field_rows if heights else None
+    found: dict[str, Materials | Elevations] = dict.fromkeys((name for name in VALUES if name != ELEVATIONS), materials)
+    return found | ({} if rows is None else {ELEVATIONS: Elevations(model, rows, made.scene.values[HEIGHTS].shape[1:])})
 
 
 class StatusWords:

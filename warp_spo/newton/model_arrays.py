@@ -12,6 +12,7 @@ from newton import ModelFlags
 from ..dynamics.dynamics import Dynamics
 from ..scene.parts import DOF_VALUES
 from .contacts import VALUES, Materials
+from .elevations import Elevations
 from .layout import Layout
 
 FORCE_VALUES = tuple(name for name in DOF_VALUES if name != "joint_armature")
@@ -39,7 +40,8 @@ class ModelArrays:
         model: The Newton model.
         layouts: How the model's array is laid out, for each name that Dynamics may have as a variable value.
         factors: 1 or 0 for each dof [dof], for the gains that count only in some modes of a drive.
-        materials: Of the contacts that the solver computes, None without.
+        sources: What turns arrays of the model into values of the contacts that the solver computes, by name; {} if
+            it computes none.
 
     Attributes:
         used: The copies by name.
@@ -52,11 +54,11 @@ class ModelArrays:
         model: newton.Model,
         layouts: Mapping[str, Layout],
         factors: Mapping[str, wp.array],
-        materials: Materials | None,
+        sources: Mapping[str, Materials | Elevations],
     ):
-        self.model, self._layouts, self._factors, self._materials = model, layouts, factors, materials
-        self.flags: Mapping[ModelFlags, Sequence[str]] = FLAGS if materials is None else {**FLAGS, **SHAPE_FLAGS}
-        watched = WATCHED if materials is None else (*WATCHED, *SHAPES)
+        self.model, self._layouts, self._factors, self._sources = model, layouts, factors, sources
+        self.flags: Mapping[ModelFlags, Sequence[str]] = {**FLAGS, **SHAPE_FLAGS} if sources else FLAGS
+        watched = (*WATCHED, *SHAPES) if sources else WATCHED
         self.used = {name: wp.clone(getattr(model, name)) for name in watched}
         self.stamp = 0
 
@@ -70,8 +72,7 @@ class ModelArrays:
         """Set the values of ``dynamics`` to the copies of arrays of these names; launches only."""
         for name in names:
             if name in VALUES:
-                assert self._materials is not None
-                dynamics.set(**{VALUES[name]: self._materials.mean(self.used[name])})
+                dynamics.set(**{VALUES[name]: self._sources[name].read(self.used[name])})
                 continue
             layout = self._layouts[name]
             value = layout.read(self.used[name], name)
@@ -81,7 +82,7 @@ class ModelArrays:
 
     def has_source(self, name: str) -> bool:
         """Return whether a value of the scene comes from an array of the model."""
-        return self._materials is not None or name not in VALUES.values()
+        return name not in VALUES.values() or self.source(name) in self._sources
 
     def source(self, name: str) -> str:
         """Return the name of the model's array that a value of the scene comes from."""
@@ -90,15 +91,13 @@ class ModelArrays:
     def gradient(self, name: str) -> wp.array:
         """Return an array [world, ...] for the gradient by a value, see :meth:`add`."""
         if name in VALUES.values():
-            assert self._materials is not None
-            return self._materials.gradient(name)
+            return self._sources[self.source(name)].gradient(name)
         return self._layouts[name].buffer(f"{name} gradient")
 
     def add(self, name: str, gradient: wp.array, flat: wp.array) -> None:
         """Add a gradient by a value of the scene [world, ...] to ``flat``, the gradient by the model's array."""
         if name in VALUES.values():
-            assert self._materials is not None
-            self._materials.add(gradient, flat)
+            self._sources[self.source(name)].add(gradient, flat)
             return
         layout = self._layouts[name]
         if name in self._factors:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import warnings
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from ..errors import UnsupportedError
 from ..scene.contacts import HeightField, pose_matrix
 from ..scene.scene import Scene
 from ..scene.shapes import TURNED, Choice, Chosen, Shape
+from .elevations import Fields
 from .worlds import Worlds, to_numpy, unit_pose
 
 KINDS = {
@@ -106,13 +108,27 @@ class ModelShapes:
             body if body < 0 else int(self.worlds.body_slot[body]),
             "finite plane" if name == "plane" and scale[:2].any() else name,
             unit_pose(read["transform"][i].astype(np.float64)),
-            _model_sizes(model.shape_source[i], name, scale),
+            self._field(i, scale) if name == "height field" else _model_sizes(model.shape_source[i], name, scale),
             rounding=float(read["margin"][i]),
             friction=mu,
             stiffness=ke if self.materials else None,
             damping=kd if self.materials else None,
             index=i,
         )
+
+    @functools.cached_property
+    def _fields(self) -> Fields:
+        return Fields(self.model)
+
+    def _field(self, i: int, scale: np.ndarray) -> HeightField:
+        """Return the height field of a shape, with the elevations that the model has now."""
+        source: Any = self.model.shape_source[i]
+        data = self._fields.elevations(i).astype(np.float64)
+        rows, columns = data.shape
+        heights = source.min_z + data.T * (source.max_z - source.min_z)  # rows of Newton's data go along y
+        half_x, half_y = source.hx * scale[0], source.hy * scale[1]
+        cells = 2.0 * half_x / (columns - 1), 2.0 * half_y / (rows - 1)
+        return HeightField(heights * scale[2], cells, (-half_x, -half_y))
 
     def material(self, name: str, rows: Any) -> np.ndarray:
         """Return "mu", "ke" or "kd" of shapes, float64."""
@@ -123,11 +139,12 @@ class ModelShapes:
         column = np.flatnonzero(self.rows[0] == shape.index)
         return self.rows[:, column[0]] if len(column) else np.full(len(self.rows), shape.index)
 
-    def grounds(self, soil: Shape, ground: Any) -> tuple[Any, dict[str, np.ndarray]]:
+    def grounds(self, soil: Shape, ground: Any, apart: bool) -> tuple[Any, dict[str, np.ndarray]]:
         """Return the ground of all worlds, and where and which it is in each: ``ground_origin``, ``ground_field``.
 
         Args:
-            soil: the ground of world 0, as a shape. ground: as a plane or a height field.
+            soil: the ground of world 0, as a shape. ground: as a plane or a height field. apart: each shape is a field
+                of its own, though another one may have the same heights.
         """
         rows = self.rows_of(soil)
         if (rows == rows[0]).all():
@@ -145,14 +162,16 @@ class ModelShapes:
         if turned.any():
             self._refuse(int(np.argmax(turned)), "has a height field whose axes are turned")
         fields: list[HeightField] = []
-        numbers: dict[Any, int] = {}  # of a field, by its object and by its heights
-        for row in rows:
-            source = self.model.shape_source[row]
-            if id(source) not in numbers:
-                made = self._shape(int(row)).sizes
-                key = made.heights.shape, made.cell, made.origin, made.heights.tobytes()
-                numbers[id(source)] = numbers.setdefault(key, len(fields))
+        numbers: dict[Any, int] = {}  # of a field, by its source and by its heights, or by its shape
+        which = []
+        for row in map(int, rows):
+            source = row if apart else (id(self.model.shape_source[row]), self._fields.elevations(row).tobytes())
+            if source not in numbers:
+                made = self._shape(row).sizes
+                key = made.heights.shape, made.cell, made.origin, row if apart else made.heights.tobytes()
+                numbers[source] = numbers.setdefault(key, len(fields))
                 fields += [made] if numbers[key] == len(fields) else []
+            which.append(numbers[source])
         scales = self._read["scale"][rows]
         if (
             len({(field.heights.shape, field.cell, field.origin) for field in fields}) > 1
@@ -163,7 +182,6 @@ class ModelShapes:
         values = {"ground_origin": moved - moved[0]}
         if len(fields) > 1:
             ground = dataclasses.replace(ground, heights=np.stack([field.heights for field in fields]))
-            which = [numbers[id(self.model.shape_source[row])] for row in rows]
             values["ground_field"] = np.array(which, dtype=np.float64)[:, None]
         return ground, values
 
@@ -198,15 +216,26 @@ class ModelContacts(NamedTuple):
         """Index of the shape that is the ground [world]; None where the caller gives the ground."""
         return None if self.found.soil is None else self.shapes.rows_of(self.found.soil)
 
+    @property
+    def field_rows(self) -> np.ndarray | None:
+        """Index of the shape that is each height field [field], where fields are ``apart``; None: no shape is one."""
+        rows, soil = self.soil_rows, self.found.soil
+        return None if rows is None or soil is None or soil.kind != "height field" else np.array([*dict.fromkeys(rows)])
 
-def model_contacts(model: newton.Model, worlds: Worlds, scene: Scene, choice: Choice) -> ModelContacts:
-    """Return the scene with contacts of chosen shapes of a model; materials and grounds may differ between worlds."""
+
+def model_contacts(
+    model: newton.Model, worlds: Worlds, scene: Scene, choice: Choice, apart: bool = False
+) -> ModelContacts:
+    """Return the scene with contacts of chosen shapes of a model; materials and grounds may differ between worlds.
+
+    ``apart``: each height field is one of its own, though another one may have the same heights.
+    """
     shapes = ModelShapes(model, worlds)
     found = choice.resolve("from_newton", scene, shapes.first(), shapes.touches)
     ground: Any = found.ground
     values: dict[str, np.ndarray] = {}
     if found.soil is not None:
-        ground, values = shapes.grounds(found.soil, ground)
+        ground, values = shapes.grounds(found.soil, ground, apart)
     scene = scene.with_contacts([one for _, made in found.taken for one in made], ground)
     made = ModelContacts(scene, shapes, found)
     for name, key in CONTACT_MATERIALS.items():
@@ -231,11 +260,4 @@ def with_model_contacts(model: newton.Model, worlds: Worlds, scene: Scene, choic
 def _model_sizes(source: Any, kind: str, scale: np.ndarray) -> Any:
     if kind == "hull":
         return np.asarray(source.vertices, dtype=np.float64) * scale
-    if kind == "height field":
-        data = np.asarray(source.data, dtype=np.float64)
-        rows, columns = data.shape
-        heights = source.min_z + data.T * (source.max_z - source.min_z)  # rows of Newton's data go along y
-        half_x, half_y = source.hx * scale[0], source.hy * scale[1]
-        cells = 2.0 * half_x / (columns - 1), 2.0 * half_y / (rows - 1)
-        return HeightField(heights * scale[2], cells, (-half_x, -half_y))
     return scale[: SIZES.get(kind, 3)]

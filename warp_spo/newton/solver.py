@@ -23,7 +23,7 @@ from ..scene.parts import DOF_VALUES
 from ..scene.scene import Scene
 from ..scene.shapes import POINTS
 from .checks import check_state, read_flags
-from .contacts import MODES, VALUES, Materials, StatusWords, find_contacts
+from .contacts import ELEVATIONS, MODES, VALUES, StatusWords, find_contacts, sources_of
 from .drives import GAINS, Drives
 from .joint_forces import JointForces
 from .layout import Layout, Layouts
@@ -108,11 +108,13 @@ class SolverSPO(Plugs, SolverBase):
 
     Inside ``wp.Tape`` a step records its own backward pass: gradients by joint_q, joint_qd and body_f of the first
     state, by joint_f and the targets of the control, and by those arrays of the model that are ``variable`` and enter
-    the equations of motion (masses, centres of mass, inertias, armature, damping, stiffness, gains, gravity), from
-    gradients by joint_q, joint_qd, body_q and body_qd of the second state. Each step of a tape needs a state of its
-    own. Only arrays that require grad have gradients: ``builder.finalize(requires_grad=True)`` makes all arrays of the
-    model, its states and its controls such arrays, ``model.state(requires_grad=True)`` those of one state. A step whose
-    arrays need no gradient at all is not recorded, with a warning.
+    the equations of motion (masses, centres of mass, inertias, armature, damping, stiffness, gains, gravity, materials
+    of shapes, ``heightfield_elevations``), from gradients by joint_q, joint_qd, body_q and body_qd of the second state.
+    With ``heightfield_elevations`` among them each shape of a height field is one of its own. Each step of a tape needs
+    a state of its own. Only arrays that require grad have gradients: ``builder.finalize(requires_grad=True)`` makes all
+    arrays of the model, its states and its controls such arrays, but for elevations;
+    ``model.state(requires_grad=True)`` those of one state. A step whose arrays need no gradient at all is not recorded,
+    with a warning.
 
     Args:
         model: A finalized model whose worlds all have the same topology.
@@ -202,7 +204,9 @@ class SolverSPO(Plugs, SolverBase):
                 "SolverSPO", f"mimic joints: {names}", "loops='embed' closes them, loops='cut' leaves them open"
             )
         worlds = Worlds(model)
-        touching = find_contacts(model, worlds, scene, *self._contact_options, self._lacks_contacts(scene))
+        heights = ELEVATIONS in self._asked
+        options = (*self._contact_options, self._lacks_contacts(scene), heights)
+        touching = find_contacts(model, worlds, scene, *options)
         if isinstance(touching, Slots) and self._substeps > 1:
             if self._contact_options[0] == "pipeline":
                 raise UnsupportedError("SolverSPO", "contacts='pipeline' with substeps", "call step for each substep")
@@ -212,7 +216,11 @@ class SolverSPO(Plugs, SolverBase):
         variable = [name for name in self._asked if name not in GAINS or self._drives.any]
         self._slots: Slots | None = touching if isinstance(touching, Slots) else None
         own = None if isinstance(touching, Slots) else touching
-        self._values = {name: VALUES.get(name, name) for name in variable if name not in VALUES or own}
+        sources = sources_of(model, own, heights)
+        if heights and ELEVATIONS not in sources:
+            what = f"variable={ELEVATIONS!r} of a model whose ground is no height field that the solver computes"
+            raise UnsupportedError("SolverSPO", what, "leave it out, or see what contacts='ground' says")
+        self._values = {name: VALUES.get(name, name) for name in variable if name not in VALUES or name in sources}
         changing = tuple(self._values.values()) + (SLOT_VALUES if self._slots else ())
         W, device = scene.worlds, model.device
         self.dynamics = Dynamics(scene, W, device, "float32", changing, **self._options)
@@ -242,8 +250,7 @@ class SolverSPO(Plugs, SolverBase):
             "body_inertia": layout("body_inertia", bodies, 3, 3),
             "gravity": Layout(gravity[:, None], (3,), device, model.gravity),
         }
-        materials = None if own is None else Materials(own, device)
-        self._arrays = ModelArrays(model, layouts, self._drives.factors, materials)
+        self._arrays = ModelArrays(model, layouts, self._drives.factors, sources)
         # Steps with observables write status here if the caller does not ask for it: one kernel serves both.
         self._status = wp.zeros(W, dtype=wp.int32, device=device)
         self._words = StatusWords(model, worlds, touching)
