@@ -13,9 +13,9 @@ STILL, GROUND, TOUCHING, MOVING = range(4)
 def mark_contacts(_=None) -> wp.Kernel:
     """Set the word of every world that has a contact which is left out to UNSUPPORTED, but for a more severe one.
 
-    Left out are those of a shape that moves, but for TOUCHING with GROUND, and but for those that are open at the poses
-    ``body_q``, if they are given: lists hold what may touch soon. So are those of surfaces that move by themselves, as
-    conveyors do. One thread for each slot of a list of
+    Left out are those of a shape that moves, but for TOUCHING with GROUND, but for those with one of its ``partner``
+    [shape, n], and but for those that are open at the poses ``body_q``, if they are given: lists hold what may touch
+    soon. So are those of surfaces that move by themselves, as conveyors do. One thread for each slot of a list of
     contacts. ``count`` holds the number of contacts, which may exceed that of the slots: then the worlds of some are
     unknown, and all are marked if ``beyond`` is 1. So it is for a contact of shapes outside of all worlds, one of which
     moves. Threads that write one word write the same one.
@@ -35,6 +35,7 @@ def mark_contacts(_=None) -> wp.Kernel:
         shape_world: wp.array[wp.int32],
         shape_role: wp.array[wp.int32],
         shape_body: wp.array[wp.int32],
+        partner: wp.array2d[wp.int32],
         body_q: wp.array[wp.transform],
         point0: wp.array[wp.vec3],
         point1: wp.array[wp.vec3],
@@ -57,6 +58,9 @@ def mark_contacts(_=None) -> wp.Kernel:
                 role = shape_role[shape]
             most, least = wp.max(most, role), wp.min(least, role)
         moves = most >= touching and not (most == touching and least == ground)
+        if moves and partner and shape0[i] >= 0:
+            for k in range(partner.shape[1]):
+                moves = moves and partner[shape0[i], k] != shape1[i]
         if most >= touching and surface_velocity:
             moves = moves or wp.length_sq(surface_velocity[i]) > 0.0
         if moves and body_q:

@@ -90,5 +90,5 @@ _ADVICE = {
     Status.CONTACT: "Use a shorter dt or more passes, or lower the contact's stiffness.",
     Status.SLOTS: "Build the scene with more contact slots.",
     Status.UNSUPPORTED: "Take contacts of this kind out of the model, or give them shapes that the solver supports. "
-    "For contacts between bodies list pairs, spo.Contact(..., other=...), and step with Dynamics.",
+    "For contacts between bodies list pairs: SolverSPO(model, pairs=...), or spo.Contact(..., other=...) in a scene.",
 }

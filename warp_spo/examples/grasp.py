@@ -83,6 +83,34 @@ def path(dyn, seconds):
     return np.unique(rise), np.array(points), q
 
 
+def lifted(heights, points, time):
+    """Return targets of the arm's joints at a time [s]; heights and points as of :func:`path`."""
+    height = np.clip(time - 0.5, 0.0, 1.0)
+    return [np.interp(height, heights, points[:, joint]) for joint in range(7)]
+
+
+def row(dyn, q, force, time):
+    """Return the time, the cube's height, its place over the pads, and the force of the pads, each [world]."""
+    tip, held = dyn.frame_poses(q, [TIP, dyn.scene.body_count - 1])[:, :, 2].T
+    return time, held, held - tip, np.linalg.norm(force[:, -2:], axis=2).mean(axis=1)
+
+
+LIFTED = 1.6  # when the cube is up [s]
+
+
+def report(friction, rows):
+    """Print what the cubes did, a line a world; friction [world], rows as :func:`row` returns them.
+
+    Return times, heights over the ground, places in the hand, and which worlds are shown.
+    """
+    times, held, apart, pressed = (np.array(column) for column in zip(*rows, strict=True))
+    for world in some(len(friction)):
+        slip, up = np.ptp(apart[times > LIFTED, world]), held[-1, world] - CUBE
+        said = f"slips by {1e3 * slip:.2f} mm in {times[-1] - LIFTED:.1f} s" if up > 0.1 else "stays on the ground"
+        print(f"Friction {friction[world]:.2f}: each pad pushes with {pressed[-1, world]:.1f} N, and the cube {said}.")
+    return times, held - CUBE, apart, some(len(friction))
+
+
 def main(worlds=3, seconds=7.0, dt=5e-3, device=None, picture=None):
     dyn = spo.Dynamics(scene(), worlds, device, "float32", variable=("contact_friction",))
     friction = np.geomspace(0.8, 0.05, worlds) if worlds > 1 else np.array([0.8])
@@ -91,27 +119,19 @@ def main(worlds=3, seconds=7.0, dt=5e-3, device=None, picture=None):
     q, qd = q.astype(np.float32), np.zeros((worlds, dyn.scene.dof_count), np.float32)
     tau, force = np.zeros_like(qd), np.zeros((worlds, dyn.scene.contact_count, 3), np.float32)
     tau[:, 7:9] = -FORCE  # both fingers close
-    cube, target, rows = dyn.scene.body_count - 1, q.copy(), []
+    target, rows = q.copy(), []
     for step in range(round(seconds / dt)):
-        height = np.clip(step * dt - 0.5, 0.0, 1.0)
-        for joint in range(7):
-            target[:, joint] = np.interp(height, heights, points[:, joint])
+        target[:, :7] = lifted(heights, points, step * dt)
         q, qd = dyn.step(q, qd, tau, dt, target_q=target, contact_f=force)
-        tip, held = dyn.frame_poses(q, [TIP, cube])[:, :, 2].T
-        rows.append((step * dt, held, held - tip, np.linalg.norm(force[:, -2:], axis=2).mean(axis=1)))
-    times, held, apart, pressed = (np.array(column) for column in zip(*rows, strict=True))
-    lifted = times > 1.6
-    for world in some(worlds):
-        slip, up = np.ptp(apart[lifted, world]), held[-1, world] - CUBE
-        said = f"slips by {1e3 * slip:.2f} mm in {seconds - 1.6:.1f} s" if up > 0.1 else "stays on the ground"
-        print(f"Friction {friction[world]:.2f}: each pad pushes with {pressed[-1, world]:.1f} N, and the cube {said}.")
+        rows.append(row(dyn, q, force, step * dt))
+    times, heights, apart, shown = report(friction, rows)
     if picture:
         with drawing(picture, "The cube", "Its place in the hand") as (left, right):
-            for world in some(worlds):
-                color = (OURS, OURS_DARK, FAINT)[world % 3]
-                left.plot(times, 1e3 * (held[:, world] - CUBE), color=color, label=f"friction {friction[world]:.2f}")
-                if held[-1, world] > 0.1:
-                    right.plot(times[lifted], 1e3 * (apart[lifted, world] - apart[lifted, world][0]), color=color)
+            for world in shown:
+                color, late = (OURS, OURS_DARK, FAINT)[world % 3], times > LIFTED
+                left.plot(times, 1e3 * heights[:, world], color=color, label=f"friction {friction[world]:.2f}")
+                if heights[-1, world] > 0.1:
+                    right.plot(times[late], 1e3 * (apart[late, world] - apart[late, world][0]), color=color)
             left.set(xlabel="time [s]", ylabel="height [mm]")
             right.set(xlabel="time [s]", ylabel="slip [mm]")
 

@@ -17,6 +17,7 @@ from ..scene.shapes import Choice, moving_bodies
 from ..status import Status
 from .elevations import Elevations
 from .model_contacts import CONTACT_MATERIALS, ModelContacts, model_contacts
+from .pairs import ModelPairs
 from .slots import Slots
 from .worlds import Worlds, to_numpy
 
@@ -27,11 +28,19 @@ VALUES = {f"shape_material_{material}": name for name, material in CONTACT_MATER
 
 
 def find_contacts(
-    model: newton.Model, worlds: Worlds, scene: Scene, mode: str, points: int, lacking: str, apart: bool
+    model: newton.Model,
+    worlds: Worlds,
+    scene: Scene,
+    pairs: ModelPairs | None,
+    mode: str,
+    points: int,
+    lacking: str,
+    apart: bool,
 ) -> ModelContacts | Slots | None:
     """Return the contacts of a model's shapes with its ground, or slots for a list of contacts, None for neither.
 
     Args:
+        pairs: of bodies that touch each other, None without.
         mode: "none" for neither; "ground" or "pipeline" for one of them, or an error; "auto" for the ground if that
             leaves no shape out that stands still, and no kind of shape; else for slots, if a shape stands still.
         points: of a hull at most, or slots of a shape. lacking: why the solver's steps have no contacts, "" if they do.
@@ -46,14 +55,30 @@ def find_contacts(
     if lacking:
         raise UnsupportedError("SolverSPO", f"contacts={mode!r} with {lacking}", "leave out one of them")
     if mode == "pipeline":
-        return Slots(model, worlds, scene, points)
+        return Slots(model, worlds, scene, points, pairs)
     found = _on_ground(model, worlds, scene, mode, points, apart)
     if found is not None or mode == "ground" or not model.shape_count:
         return found
     try:
-        return Slots(model, worlds, scene, points)
+        return Slots(model, worlds, scene, points, pairs)
     except UnsupportedError:
         return None
+
+
+def find_pairs(model: newton.Model, worlds: Worlds, scene: Scene, asked: Any, lacking: str) -> ModelPairs | None:
+    """Return the pairs of a model's shapes that touch each other, None if none are asked for.
+
+    Args:
+        asked: "all", pairs of names, or None. lacking: why the solver's steps have no contacts, "" if they do.
+
+    Raises:
+        UnsupportedError: steps have no contacts; or as :class:`ModelPairs`.
+    """
+    if asked is None:
+        return None
+    if lacking:
+        raise UnsupportedError("SolverSPO", f"pairs={asked!r} with {lacking}", "leave out one of them")
+    return ModelPairs(model, worlds, scene, asked)
 
 
 def _on_ground(
@@ -75,20 +100,30 @@ def _on_ground(
 
 
 class Materials:
-    """Materials of contact points: the means of those of their shapes and of the ground.
+    """Materials of contacts: the means of those of their shapes and of the ground, or of both shapes of a pair.
 
     Args:
-        made: the contacts of the model. device: of the model.
+        made: the contacts of the model with its ground, None without. pairs: of bodies, None without.
+        worlds: how many. device: of the model.
     """
 
-    def __init__(self, made: ModelContacts, device: wp.Device):
+    _rows: Any = None
+
+    def __init__(self, made: ModelContacts | None, pairs: ModelPairs | None, worlds: int, device: wp.Device):
+        self._pairs = pairs
+        self._gradients: dict[str, wp.array] = {}
+        count = 0 if pairs is None else pairs.count
+        if made is not None:
+            self._read_points(made, device)
+            count += self._rows.shape[1]
+        self._mean: Any = wp.empty((worlds, count), dtype=wp.float32, device=device)
+
+    def _read_points(self, made: ModelContacts, device: wp.Device) -> None:
+        """Read the shapes of all points, and which points each shape has."""
         rows, soil = made.point_rows, made.soil_rows
         assert soil is not None
-        self._rows: Any = wp.array(rows, dtype=wp.int32, device=device)
+        self._rows = wp.array(rows, dtype=wp.int32, device=device)
         self._soil: Any = wp.array(soil, dtype=wp.int32, device=device)
-        self._mean: Any = wp.empty(rows.shape, dtype=wp.float32, device=device)
-
-        self._gradients: dict[str, wp.array] = {}
         touched = np.concatenate([rows.ravel(), np.repeat(soil, rows.shape[1])])
         point = np.tile(np.arange(rows.size), 2)[np.argsort(touched, kind="stable")]
         shapes, counts = np.unique(touched, return_counts=True)
@@ -96,7 +131,10 @@ class Materials:
         self._lists: list = [wp.array(x.astype(np.int32), dtype=wp.int32, device=device) for x in lists]
 
     def gradient(self, name: str) -> wp.array:
-        """Return a buffer for the gradient by the means of a material [world, point], see :meth:`add`."""
+        """Return a buffer for the gradient by the means of a material [world, point], see :meth:`add`.
+
+        Steps with pairs have no gradients.
+        """
         if name not in self._gradients:
             self._gradients[name] = wp.empty_like(self._mean)
         return self._gradients[name]
@@ -108,22 +146,30 @@ class Materials:
         wp.launch(kernels.add_to_shapes(), len(shapes), inputs, [flat], device=flat.device)
 
     def read(self, flat: wp.array) -> wp.array:
-        """Return the means of a material [world, point], in a buffer that the next call overwrites."""
-        inputs, device = [self._rows, self._soil, flat], self._mean.device
-        wp.launch(kernels.mean_materials(), self._rows.shape, inputs, [self._mean], device=device)
+        """Return the means of a material [world, contact], in a buffer that the next call overwrites."""
+        if self._rows is not None:
+            inputs, device = [self._rows, self._soil, flat], self._mean.device
+            wp.launch(kernels.mean_materials(), self._rows.shape, inputs, [self._mean], device=device)
+        if self._pairs is not None:
+            self._pairs.mean(flat, self._mean)
         return self._mean
 
 
-def sources_of(model: newton.Model, made: ModelContacts | None, heights: bool) -> dict[str, Materials | Elevations]:
+def sources_of(
+    model: newton.Model, worlds: Worlds, made: ModelContacts | Slots | None, pairs: ModelPairs | None, heights: bool
+) -> dict[str, Materials | Elevations]:
     """Return what turns arrays of the model into values of contacts, by the names of VALUES; {} without contacts.
 
-    ``heights``: elevations, too, if a height field is the ground.
+    Slots read materials themselves. ``heights``: elevations, too, if a height field is the ground.
     """
-    if made is None:
+    if isinstance(made, Slots) or (made is None and pairs is None):
         return {}
-    materials, rows = Materials(made, model.device), made.field_rows if heights else None
+    materials = Materials(made, pairs, worlds.count, model.device)
     found: dict[str, Materials | Elevations] = dict.fromkeys((name for name in VALUES if name != ELEVATIONS), materials)
-    return found | ({} if rows is None else {ELEVATIONS: Elevations(model, rows, made.scene.values[HEIGHTS].shape[1:])})
+    rows = made.field_rows if heights and made is not None else None
+    if made is None or rows is None:
+        return found
+    return found | {ELEVATIONS: Elevations(model, rows, made.scene.values[HEIGHTS].shape[1:])}
 
 
 class StatusWords:
@@ -132,15 +178,21 @@ class StatusWords:
     Args:
         model: The Newton model.
         worlds: The rows of its worlds.
-        made: The contacts that the solver computes, None if it computes none.
+        made: The contacts with the ground that the solver computes, None if it computes none.
+        pairs: Of bodies that touch each other, None without.
 
     Attributes:
         kept: int32 [world].
         severity: of each status, int32. role: of each shape, int32, see :mod:`warp_spo.kernels.contacts`.
     """
 
-    def __init__(self, model: newton.Model, worlds: Worlds, made: ModelContacts | Slots | None):
+    def __init__(
+        self, model: newton.Model, worlds: Worlds, made: ModelContacts | Slots | None, pairs: ModelPairs | None
+    ):
         self._model, self._device, self._made = model, model.device, made
+        partners = None if pairs is None else pairs.partners()
+        self._partner: Any = None if partners is None else wp.array(partners, dtype=wp.int32, device=self._device)
+        self._computes = made is not None or pairs is not None
         severity = [Status(number).severity for number in range(len(Status))]
         self.severity: Any = wp.array(np.array(severity), dtype=wp.int32, device=self._device)
         self.role: Any = wp.array(_roles(model, worlds, made), dtype=wp.int32, device=self._device)
@@ -162,7 +214,7 @@ class StatusWords:
             )
         if contacts is None or not contacts.rigid_contact_max:
             return None  # soft contacts are those of particles, which the solver refuses
-        if self._device.is_capturing or self._made is not None:
+        if self._device.is_capturing or self._computes:
             return contacts
         count = int(contacts.rigid_contact_count.numpy()[0])
         if count:
@@ -170,7 +222,7 @@ class StatusWords:
                 "SolverSPO.step",
                 f"{count} contacts",
                 "pass contacts=None; bodies then pass through each other; SolverSPO(model, contacts='ground') says why "
-                "it computes none",
+                "it computes none, and pairs= says which bodies touch each other",
             )
         return None
 
@@ -182,7 +234,8 @@ class StatusWords:
         """
         slots = self._made if isinstance(self._made, Slots) else None
         inputs = [contacts.rigid_contact_count, contacts.rigid_contact_shape0, contacts.rigid_contact_shape1]
-        inputs += [self._model.shape_world, self.role, self._model.shape_body, None if self._made is None else body_q]
+        inputs += [self._model.shape_world, self.role, self._model.shape_body, self._partner]
+        inputs.append(body_q if self._computes else None)
         names = ("point0", "point1", "margin0", "margin1", "normal", "surface_velocity")
         inputs += [getattr(contacts, f"rigid_contact_{name}") for name in names]
         inputs += [0 if slots else 1, self.severity]

@@ -17,6 +17,7 @@ from ..scene.scene import Scene
 from ..scene.shapes import moving_bodies
 from ..status import Status
 from .model_contacts import ModelShapes
+from .pairs import ModelPairs
 from .worlds import Worlds
 
 ROUND = {"sphere": 4, "capsule": 4}
@@ -32,6 +33,7 @@ class Slots:
         model, worlds: The Newton model and its rows.
         scene: Of the model, without contacts.
         points: Slots of a shape; spheres and capsules have four at most.
+        pairs: Of bodies that touch each other, whose materials come after those of slots; None without.
 
     Attributes:
         scene: With a contact for each slot.
@@ -41,8 +43,8 @@ class Slots:
         UnsupportedError: The worlds have different shapes, or no shape moves, or none stands still.
     """
 
-    def __init__(self, model: newton.Model, worlds: Worlds, scene: Scene, points: int):
-        self._model, self._device = model, model.device
+    def __init__(self, model: newton.Model, worlds: Worlds, scene: Scene, points: int, pairs: ModelPairs | None = None):
+        self._model, self._device, self._pairs = model, model.device, pairs
         shapes, moving = ModelShapes(model, worlds), moving_bodies(scene)
         contacts: list[Contact] = []
         columns: list[int] = []
@@ -71,7 +73,8 @@ class Slots:
         self._slot: Any = wp.zeros(size, dtype=wp.int32, device=device)
         self._excess: Any = wp.zeros(worlds.count, dtype=wp.int32, device=device)
         self._place: Any = wp.zeros((*size, PLACE), dtype=wp.float32, device=device)
-        self._materials: list[Any] = [wp.zeros(size, dtype=wp.float32, device=device) for _ in VARIABLE[1:]]
+        wide = size[0], size[1] + (0 if pairs is None else pairs.count)
+        self._materials: list[Any] = [wp.zeros(wide, dtype=wp.float32, device=device) for _ in VARIABLE[1:]]
         self._none = newton.Contacts(1, 0, device=device)
         declare(kernels, None)
 
@@ -98,6 +101,9 @@ class Slots:
         stiffness, damping, friction = self._materials
         results = [self._place, stiffness, damping, friction]
         wp.launch(kernels.place_points(), self._slot.shape, inputs, results, device=device)
+        if self._pairs is not None:
+            for name, material in zip(("ke", "kd", "mu"), self._materials, strict=True):
+                self._pairs.mean(getattr(model, f"shape_material_{name}"), material)
         place = self._place.reshape((len(self._slot), -1))
         dynamics.set(
             contact_place=place, contact_friction=friction, contact_stiffness=stiffness, contact_damping=damping

@@ -23,7 +23,7 @@ from ..scene.parts import DOF_VALUES
 from ..scene.scene import Scene
 from ..scene.shapes import POINTS
 from .checks import check_state, read_flags
-from .contacts import ELEVATIONS, MODES, VALUES, StatusWords, find_contacts, sources_of
+from .contacts import ELEVATIONS, MODES, VALUES, StatusWords, find_contacts, find_pairs, sources_of
 from .drives import GAINS, Drives
 from .joint_forces import JointForces
 from .layout import Layout, Layouts
@@ -47,6 +47,8 @@ DEFAULT_VARIABLE = (
     "gravity",
     "shape_material_mu",
 )
+REPORTS = frozenset({"contact_f", "contact_slip", "contact_residual"})
+"""Observables of contacts."""
 CLOSING_STEPS = 8  # iterations of Newton's method that close the loops in a reset; each squares the error
 
 
@@ -65,12 +67,19 @@ class Observables(SolverBase.Observables):
     contact_f: Any = SolverBase.Observables.field(  # noqa: RUF009
         dtype=wp.vec3, frequency=newton.Model.AttributeFrequency.WORLD
     )
-    """Force of the ground on each contact point [N], world axes, shape (world_count, points), not Newton's by contact.
-    The points are ``solver.dynamics.scene.contact_points``."""
+    """Force of the ground on each contact point [N], then of the second body of each pair on the first one, world axes,
+    shape (world_count, points + pairs), not Newton's by contact. They are ``solver.dynamics.scene.contact_points`` and
+    ``contact_pairs``."""
     contact_slip: Any = SolverBase.Observables.field(  # noqa: RUF009
         dtype=wp.float32, frequency=newton.Model.AttributeFrequency.WORLD
     )
-    """Speed of each contact point along the ground after the step [m/s], shape (world_count, points)."""
+    """Speed of each contact point along the ground, and of the bodies of each pair along each other, after the step
+    [m/s], shape (world_count, points + pairs)."""
+    contact_residual: Any = SolverBase.Observables.field(  # noqa: RUF009
+        dtype=wp.float32, frequency=newton.Model.AttributeFrequency.WORLD
+    )
+    """Largest change of a pair's force in the last round [N], where more than eight pairs touch and are solved in
+    rounds; else 0. Shape (world_count,)."""
 
 
 class SolverSPO(Plugs, SolverBase):
@@ -132,17 +141,24 @@ class SolverSPO(Plugs, SolverBase):
             no contacts, "auto" is "none", and the others are an error.
         points: With "ground", points at most of a mesh, a cylinder, a cone or an ellipsoid, see :func:`warp_spo.load`;
             with "pipeline", slots of each shape, of spheres and capsules four at most.
+        pairs: Shapes that touch each other: a list of pairs of two names, such as ``[("cube", "*finger*")]``, each a
+            pattern of the names of shapes or bodies, or the number of a shape in the first world. Two patterns stand
+            for every two shapes that they match and that the model lets collide; forces are those on the first.
+            "all": every two shapes of bodies that move which the model lets collide, 32 pairs at most, with a warning
+            of those that are no spheres, capsules or boxes, or are a capsule and a box. None: none.
         passes: Of a step with contacts, see :meth:`warp_spo.Dynamics.step`.
         substeps: A step takes so many of dt / substeps, see there, and writes the bodies' states once. Joint forces of
-            free joints on bodies keep the axes of the first. The observables are then status, contact_f (the mean) and
-            contact_slip (of the last), and a tape records no step.
+            free joints on bodies keep the axes of the first. The observables are then status, contact_f (the mean),
+            contact_slip and contact_residual (of the last), and a tape records no step.
         tune: Time the granularities at which the step can run, as :meth:`warp_spo.Dynamics.tune` does, and use the
             fastest. The choice is kept in a file, so that only the first solver of a model measures.
 
     Raises:
         UnsupportedError: :func:`warp_spo.from_newton` cannot represent the model; mimic joints with loops="raise"; a
-            loop joint with forces of its own; particles; position limits on BALL, FREE or DISTANCE joints.
-        ValueError: A name or option is unknown, or there are loop joints with loops="raise".
+            loop joint with forces of its own; particles; position limits on BALL, FREE or DISTANCE joints; pairs that
+            no contact represents, or more than 32 with pairs="all".
+        ValueError: A name or option is unknown, or there are loop joints with loops="raise", or ``pairs`` holds a name
+            of no shape, or two that may not touch.
     """
 
     Observables = Observables
@@ -152,6 +168,7 @@ class SolverSPO(Plugs, SolverBase):
             "status",
             "contact_f",
             "contact_slip",
+            "contact_residual",
             SolverBase.ObservableKind.BODY_QDD,
             SolverBase.ObservableKind.BODY_PARENT_F,
         }
@@ -167,6 +184,7 @@ class SolverSPO(Plugs, SolverBase):
         granularity: str | None = None,
         contacts: str = "auto",
         points: int = POINTS,
+        pairs: Any = None,
         passes: int | None = None,
         substeps: int = 1,
         tune: bool = False,
@@ -189,7 +207,7 @@ class SolverSPO(Plugs, SolverBase):
         if count is None or count < 1:
             raise ValueError(f"SolverSPO: substeps is {substeps!r}; expected an integer, 1 or more")
         self.integrator, self._tunes, self._substeps = integrator, tune, count
-        self._contact_options, self._passes = (contacts, points), passes
+        self._contact_options, self._pairs_asked, self._passes = (contacts, points), pairs, passes
         self._options: dict[str, Any] = {"loops": loops, "granularity": granularity}
         with paused_tape():
             self._build()
@@ -204,19 +222,19 @@ class SolverSPO(Plugs, SolverBase):
                 "SolverSPO", f"mimic joints: {names}", "loops='embed' closes them, loops='cut' leaves them open"
             )
         worlds = Worlds(model)
-        heights = ELEVATIONS in self._asked
-        options = (*self._contact_options, self._lacks_contacts(scene), heights)
-        touching = find_contacts(model, worlds, scene, *options)
+        heights, lacking = ELEVATIONS in self._asked, self._lacks_contacts(scene)
+        pairs = find_pairs(model, worlds, scene, self._pairs_asked, lacking)
+        touching = find_contacts(model, worlds, scene, pairs, *self._contact_options, lacking, heights)
         if isinstance(touching, Slots) and self._substeps > 1:
             if self._contact_options[0] == "pipeline":
                 raise UnsupportedError("SolverSPO", "contacts='pipeline' with substeps", "call step for each substep")
             touching = None
         self._drives = Drives(model, scene)
-        scene = self._drives.apply(scene if touching is None else touching.scene)
+        scene = scene if touching is None else touching.scene
+        scene = self._drives.apply(scene if pairs is None else pairs.added_to(scene))
         variable = [name for name in self._asked if name not in GAINS or self._drives.any]
         self._slots: Slots | None = touching if isinstance(touching, Slots) else None
-        own = None if isinstance(touching, Slots) else touching
-        sources = sources_of(model, own, heights)
+        sources = sources_of(model, worlds, touching, pairs, heights)
         if heights and ELEVATIONS not in sources:
             what = f"variable={ELEVATIONS!r} of a model whose ground is no height field that the solver computes"
             raise UnsupportedError("SolverSPO", what, "leave it out, or see what contacts='ground' says")
@@ -253,11 +271,13 @@ class SolverSPO(Plugs, SolverBase):
         self._arrays = ModelArrays(model, layouts, self._drives.factors, sources)
         # Steps with observables write status here if the caller does not ask for it: one kernel serves both.
         self._status = wp.zeros(W, dtype=wp.int32, device=device)
-        self._words = StatusWords(model, worlds, touching)
+        self._words = StatusWords(model, worlds, touching, pairs)
         # One kernel serves all observables of contacts: those that nobody asks for are written here.
-        shape = W, len(scene.contact_points)
-        kinds: dict[str, Any] = {"contact_f": wp.vec3, "contact_slip": wp.float32} if scene.contacts else {}
-        self._unasked = {name: wp.zeros(shape, dtype=kind, device=device) for name, kind in kinds.items()}
+        shape = W, scene.contact_count
+        kinds: dict[str, Any] = {"contact_f": (shape, wp.vec3), "contact_slip": (shape, wp.float32)}
+        kinds = kinds if scene.contacts else {}
+        kinds |= {} if pairs is None else {"contact_residual": ((W,), wp.float32)}
+        self._unasked = {name: wp.zeros(size, dtype=kind, device=device) for name, (size, kind) in kinds.items()}
         self._joint_forces = JointForces(self.dynamics, state)
         self._gradients = StepGradients(
             model, self.dynamics, state, self._joint_forces, self._drives, self._arrays, self._passes, self._empty_slots
@@ -294,14 +314,15 @@ class SolverSPO(Plugs, SolverBase):
         """Names of the observables.
 
         BODY_PARENT_F is missing if loops are closed, the scene has no dof, or steps have contacts; contact_f and
-        contact_slip are missing if they have none. Accelerations and BODY_PARENT_F are missing with substeps.
+        contact_slip are missing if they have none, contact_residual without pairs. Accelerations and BODY_PARENT_F are
+        missing with substeps.
         """
-        touches, found = bool(self._unasked), self.SUPPORTED_OBSERVABLES
+        touches, found = bool(self._unasked), self.SUPPORTED_OBSERVABLES - (REPORTS - self._unasked.keys())
         if self.dynamics.closed or not self.dynamics.scene.dof_count or touches:
             found = found - {SolverBase.ObservableKind.BODY_PARENT_F}
         if self._substeps > 1:
-            found = found & {"status", "contact_f", "contact_slip"}
-        return found if touches else found - {"contact_f", "contact_slip"}
+            found = found & {"status", *REPORTS}
+        return found
 
     def observables(self, kinds: Iterable[str], **options: Any) -> Any:
         """Return arrays for observables, see ``newton.solvers.SolverBase.observables``."""

@@ -1,0 +1,81 @@
+"""Contacts between bodies in SolverSPO: pairs of a model's collision shapes."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from ..kernels import contact_pairs as kernels
+from ..kernels import declare
+from ..scene.contacts import GROUND_VALUES
+from ..scene.scene import Scene
+from ..scene.shape_pairs import PairChoice
+from .model_contacts import CONTACT_MATERIALS, ModelShapes
+from .worlds import Worlds
+
+
+class ModelPairs:
+    """Pairs of a model's shapes that touch each other, in every world the same.
+
+    Args:
+        model, worlds: The Newton model and its rows.
+        scene: Of the model.
+        asked: As the argument ``pairs`` of SolverSPO.
+
+    Attributes:
+        rows: Indices of the first and of the second shape of each pair [2, world, pair].
+
+    Raises:
+        TypeError, ValueError, UnsupportedError: As :meth:`PairChoice.resolve`; or the worlds have different shapes.
+    """
+
+    def __init__(self, model: newton.Model, worlds: Worlds, scene: Scene, asked: Any):
+        self._shapes = ModelShapes(model, worlds)
+        shapes = self._shapes.first() if model.shape_count else []
+        numbers = {shape.index: shape for shape in shapes}
+        pairs, left_out = PairChoice("SolverSPO", scene, shapes, self._shapes.touches, numbers).resolve(asked)
+        if left_out:
+            more = f" and {len(left_out) - 4} more" if len(left_out) > 4 else ""
+            warnings.warn(
+                f"SolverSPO: pairs='all' leaves out {', '.join(left_out[:4])}{more}, which no contact represents",
+                UserWarning,
+                stacklevel=5,
+            )
+        self._contacts = [pair.contact() for pair in pairs]
+        self.rows = np.array([[self._shapes.rows_of(pair[side]) for pair in pairs] for side in range(2)])
+        self.rows = np.ascontiguousarray(self.rows.transpose(0, 2, 1))
+        self.count, device = len(pairs), model.device
+        self._sides: list[Any] = [wp.array(rows, dtype=wp.int32, device=device) for rows in self.rows]
+        declare(kernels, None)
+
+    def added_to(self, scene: Scene) -> Scene:
+        """Return a scene with the pairs after its own contacts; materials may differ between worlds."""
+        both = scene.with_contacts([*scene.contacts, *self._contacts], scene.ground)
+        values = {name: scene.values[name] for name in GROUND_VALUES if scene.contacts}
+        for name, key in CONTACT_MATERIALS.items():
+            own = self._shapes.material(key, self.rows).mean(axis=0)
+            given = scene.values[name] if scene.contacts else np.zeros((1, 0)), own
+            parts = [part[:1] if (part == part[:1]).all() else part for part in given]
+            worlds = max(map(len, parts))
+            values[name] = np.concatenate([np.broadcast_to(part, (worlds, part.shape[1])) for part in parts], axis=1)
+        return both.with_values(**values)
+
+    def mean(self, material: wp.array, out: Any) -> None:
+        """Write the means of a material by shape into the last columns of ``out`` [world, contact]; launches only."""
+        inputs = [*self._sides, material, out.shape[1] - self.count]
+        wp.launch(kernels.mean_pairs(), self._sides[0].shape, inputs, [out], device=out.device)
+
+    def partners(self) -> np.ndarray:
+        """Return for each shape of the model those that it is in a pair with [shape, n], filled up with -1."""
+        found: list[list[int]] = [[] for _ in range(self._shapes.model.shape_count)]
+        for one, other in self.rows.reshape(2, -1).T.tolist():
+            found[one].append(other)
+            found[other].append(one)
+        table = np.full((len(found), max(map(len, found))), -1, dtype=np.int32)
+        for row, partners in zip(table, found, strict=True):
+            row[: len(partners)] = partners
+        return table

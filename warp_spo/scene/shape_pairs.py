@@ -1,0 +1,182 @@
+"""Pairs of a source's collision shapes, and the contacts between two bodies that stand for them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from itertools import combinations, product
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ..errors import UnsupportedError, as_integer
+from .contacts import Contact, pose_matrix
+from .shapes import Shape, moving_bodies
+
+if TYPE_CHECKING:
+    from .scene import Scene
+
+ALL = "all"
+MOST = 32
+"""Pairs at most that "all" stands for. Eight that touch are solved exactly; nine boxes, 36 pairs, compile for 11 s."""
+KINDS = ("sphere", "capsule", "box")
+"""Kinds of shapes that pairs may have; a capsule with a box is none of them."""
+
+
+class ShapePair(NamedTuple):
+    """Two shapes of two bodies; reported forces are those on the first."""
+
+    first: Shape
+    second: Shape
+
+    @property
+    def fits(self) -> bool:
+        """Whether a contact can stand for the pair."""
+        kinds = {self.first.kind, self.second.kind}
+        return kinds <= set(KINDS) and kinds != {"capsule", "box"}
+
+    def contact(self) -> Contact:
+        """Return the contact that stands for the pair, with the means of the shapes' materials."""
+        a, b = self.first.on(self.second), self.second
+        material = {name: getattr(a, name) for name in ("stiffness", "damping")}
+        if a.friction is not None:
+            material["friction"] = a.friction
+        label = f"{a.label} with {b.label}" if a.label and b.label else ""
+        return Contact(a.body, **_solid(a), other=Contact(b.body, **_solid(b)), **material, label=label)
+
+    def words(self, bodies: Sequence[str]) -> str:
+        """Return the pair for a message."""
+        return " with ".join(shape.words(bodies) for shape in self)
+
+
+def _solid(shape: Shape) -> dict[str, Any]:
+    """Return a shape as arguments of a Contact; a margin makes a box larger on all sides."""
+    place = pose_matrix(shape.pose)
+    if shape.kind == "sphere":
+        return {"sphere": (place[:3, 3], shape.sizes[0] + shape.rounding)}
+    if shape.kind == "capsule":
+        radius, half = shape.sizes
+        ends = (place[:3, 3] + side * half * place[:3, 2] for side in (1.0, -1.0))
+        return {"capsule": (*ends, radius + shape.rounding)}
+    return {"box": (np.asarray(shape.sizes) + shape.rounding, shape.pose)}
+
+
+@dataclasses.dataclass(frozen=True)
+class PairChoice:
+    """Which shapes of a source touch each other.
+
+    Args:
+        call: for errors.
+        scene: of the source.
+        shapes: of the source, in the order of its numbers.
+        allowed: says whether the source lets two shapes collide.
+        numbers: the shape of each number that a user may give.
+    """
+
+    call: str
+    scene: Scene
+    shapes: Sequence[Shape]
+    allowed: Callable[[Shape, Shape], bool]
+    numbers: dict[int, Shape]
+
+    def resolve(self, asked: Any) -> tuple[list[ShapePair], list[str]]:
+        """Return the pairs that ``asked`` stands for, and in words those of "all" that no contact represents.
+
+        Args:
+            asked: "all", or pairs of two names each: a pattern of the names of shapes or bodies, or a shape's number.
+
+        Raises:
+            TypeError: ``asked`` is neither.
+            ValueError: A name or number is of no shape that moves, or two names stand for no pair that may touch.
+            UnsupportedError: No contact represents a listed pair, or "all" are too many.
+        """
+        moving = np.append(moving_bodies(self.scene), False)  # the last entry is the inertial frame's
+        solid = [shape for shape in self.shapes if moving[shape.body]]
+        if isinstance(asked, str) and asked == ALL:
+            return self._all(solid)
+        if isinstance(asked, str) or not isinstance(asked, Sequence) or not all(map(_is_pair, asked)):
+            raise TypeError(
+                f"{self.call}: pairs is {asked!r}; expected 'all', or a list of pairs of names of shapes or bodies, "
+                "such as [('cube', '*finger*')], or of numbers of shapes"
+            )
+        found: dict[frozenset[int], ShapePair] = {}
+        for names in asked:
+            for pair in self._listed(names, solid):
+                found.setdefault(frozenset(shape.index for shape in pair), pair)
+        return list(found.values()), []
+
+    def _all(self, solid: Sequence[Shape]) -> tuple[list[ShapePair], list[str]]:
+        """Return every pair that may touch, and in words those that no contact represents."""
+        pairs = [ShapePair(*pair) for pair in combinations(solid, 2) if self._may_touch(*pair)]
+        found = [pair for pair in pairs if pair.fits]
+        if not found:
+            left_out = f"; {pairs[0].words(self.scene.body_labels)} is none that it can take" if pairs else ""
+            raise ValueError(
+                f"{self.call}: pairs='all' finds no two shapes of bodies that move which may touch{left_out}; "
+                f"expected {', '.join(KINDS)}, and filters of the model that let them collide"
+            )
+        if len(found) > MOST:
+            raise UnsupportedError(
+                self.call,
+                f"pairs='all' of {len(found)} pairs of shapes, more than {MOST}",
+                "list those that matter, such as pairs=[('cube', '*finger*')], or filter others in the model",
+            )
+        return found, [pair.words(self.scene.body_labels) for pair in pairs if not pair.fits]
+
+    def _listed(self, names: Sequence[Any], solid: Sequence[Shape]) -> list[ShapePair]:
+        """Return the pairs that two names stand for."""
+        sides = [self._named(name, solid) for name in names]
+        both = [ShapePair(a, b) for a, b in product(*sides) if a.index != b.index]
+        pairs = [pair for pair in both if self._may_touch(*pair)]
+        bodies, what = self.scene.body_labels, f"pairs={tuple(names)!r}"
+        if not pairs:
+            why = "which the model's groups or filters keep apart, or which are fixed to each other"
+            which = f"{both[0].words(bodies)}, {why}" if both else "a shape with itself"
+            raise ValueError(f"{self.call}: {what} stands for {which}; expected shapes of two bodies that may touch")
+        for pair in pairs:
+            if not pair.fits:
+                raise UnsupportedError(
+                    self.call,
+                    f"{what}, which is {pair.words(bodies)}",
+                    "pairs are of spheres and capsules, of boxes, or of a sphere and a box: put such shapes in place "
+                    "of others, a row of spheres in place of a capsule that meets a box, or use another solver",
+                )
+        return pairs
+
+    def _named(self, name: Any, solid: Sequence[Shape]) -> list[Shape]:
+        """Return the shapes that move of a name or a number."""
+        number, bodies = as_integer(name), self.scene.body_labels
+        if number is not None:
+            found = [self.numbers[number]] if number in self.numbers else []
+            known = f"a number of a collision shape in the first world: {', '.join(map(str, self.numbers)) or 'none'}"
+        else:
+            found = [one for one in self.shapes if one.matches(name, "" if one.body < 0 else bodies[one.body])]
+            shown = dict.fromkeys(text for one in solid for text in (one.label, bodies[one.body]) if text)
+            known = f"a pattern of the names of shapes or bodies: {', '.join(map(repr, shown)) or 'none'}"
+        chosen = [one for one in found if any(one.index == other.index for other in solid)]
+        if found and not chosen:
+            raise UnsupportedError(
+                self.call,
+                f"pairs with {found[0].words(bodies)}, which stands still",
+                "leave it out of pairs: contacts='ground' and contacts='pipeline' are for shapes that stand still",
+            )
+        if not found:
+            raise ValueError(f"{self.call}: pairs holds {name!r}, which is no collision shape; expected {known}")
+        return chosen
+
+    def _may_touch(self, a: Shape, b: Shape) -> bool:
+        """Whether two shapes can move against each other, and the source lets them collide."""
+        return self._carrier(a.body) != self._carrier(b.body) and self.allowed(a, b)
+
+    def _carrier(self, body: int) -> int:
+        """Return the body nearest to the root to which a body is fixed."""
+        scene = self.scene
+        while scene.tree.parent[body] >= 0 and scene.hinges[scene.hinge_of[body]].dof_count == 0:
+            body = scene.tree.parent[body]
+        return body
+
+
+def _is_pair(names: Any) -> bool:
+    if isinstance(names, str) or not isinstance(names, Sequence) or len(names) != 2:
+        return False
+    return all(isinstance(name, str) or as_integer(name) is not None for name in names)
