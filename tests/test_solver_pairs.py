@@ -23,6 +23,12 @@ SLIP = 1e-3  # [m], of a held cube
 EQUAL = 1e-4  # of float32 steps of one scene from float32 and from float64 values, over the largest velocity
 
 
+@pytest.fixture(autouse=True)
+def on_the_device(device):
+    with wp.ScopedDevice(device):
+        yield
+
+
 def config(**values):
     found = WALL.copy()
     for name, value in values.items():
@@ -35,7 +41,7 @@ def many(one, worlds=2, ground=True):
     builder.replicate(one, worlds)
     if ground:
         builder.add_ground_plane(cfg=WALL)
-    return builder.finalize(device="cpu")
+    return builder.finalize()
 
 
 def free_cube(builder, label, at, half=SIDE, **cfg):
@@ -189,21 +195,21 @@ def test_a_step_is_that_of_a_scene_by_hand():
                 spo.Contact(0, **stick, other=spo.Contact(4, **ball), **law),
                 spo.Contact(4, **ball, other=spo.Contact(2, **pad), **law)]  # fmt: skip
     scene = spo.from_newton(model).with_contacts(contacts)
-    dyn = spo.Dynamics(scene, 2, "cpu", "float32", tuple(solver.dynamics.variable))
+    dyn = spo.Dynamics(scene, 2, dtype="float32", variable=tuple(solver.dynamics.variable))
     mu = [np.float32([0.5]) * (a + b) for a, b in np.float32([(0.8, 0.4), (0.2, 0.8), (0.1, 0.8), (0.8, 0.8)])]
     dyn.set(contact_friction=np.concatenate([mu[0], mu[1], mu[3], mu[3], mu[0], mu[2], mu[3], mu[3]]).reshape(2, 4))
     q, qd = state.joint_q.numpy().reshape(2, -1), state.joint_qd.numpy().reshape(2, -1)
-    seen, force = (
-        solver.observables({"contact_f", "contact_slip", "contact_residual", "status"}),
-        np.zeros((2, 4, 3), "f"),
-    )
-    for array in (seen.contact_f, seen.contact_slip, seen.contact_residual):
-        array.fill_(np.nan)
-    met = np.zeros(4, bool)
-    for _ in range(60):
-        q, qd = dyn.step(q, qd, None, H, contact_f=force)
+    reports = {"contact_f": (2, 4, 3), "contact_slip": (2, 4), "contact_residual": (2,), "qdd": qd.shape}
+    reports = {name: np.full(shape, np.nan, np.float32) for name, shape in reports.items()}
+    seen, force, status = solver.observables(solver.supported_observables), reports["contact_f"], np.ones(2, np.int32)
+    for name in ("contact_f", "contact_slip", "contact_residual"):
+        getattr(seen, name).fill_(np.nan)
+    state.body_f, met = None, np.zeros(4, bool)
+    for _ in range(60):  # with all that the solver asks for: one kernel, the same bits
+        q, qd = dyn.step(q, qd, np.zeros_like(qd), H, status=status, **reports)
         run(solver, state, 1, observables=seen)
-        np.testing.assert_array_equal(seen.contact_f.numpy(), force)
+        for name in ("contact_f", "contact_slip", "contact_residual"):
+            np.testing.assert_array_equal(getattr(seen, name).numpy(), reports[name])
         met |= force.any(axis=(0, 2))
     np.testing.assert_array_equal(state.joint_q.numpy().reshape(2, -1), q)
     assert met.sum() >= 3 and not solver.status.numpy().any() and not seen.contact_residual.numpy().any()
@@ -235,7 +241,7 @@ def test_impulses_are_equal_and_opposite(dtype):
         qd = state.joint_qd.numpy().reshape(2, 12)
     else:
         scene, force = dyn.scene, np.zeros((2, 1, 3))
-        dyn = spo.Dynamics(scene, 2, "cpu", "float64")
+        dyn = spo.Dynamics(scene, 2, dtype="float64")
         for _ in range(60):
             q, qd = dyn.step(q, qd, None, H, contact_f=force)
             met = max(met, np.abs(force).max())
@@ -281,7 +287,10 @@ def test_pairs_that_are_not_listed_are_a_status_word():
     q[1, 1:, 2] -= [1e-3, 3e-3]
     state.joint_q.assign(q.ravel())
     newton.eval_fk(model, state.joint_q, state.joint_qd, state)
-    with wp.ScopedCapture(device="cpu") as capture:
+    pipeline.collide(model.state(), contacts)  # loads what the graph needs
+    solver.step(model.state(), model.state(), None, contacts, H)
+    solver.reset(model.state())
+    with wp.ScopedCapture() as capture:
         pipeline.collide(state, contacts)
         solver.step(state, state, None, contacts, H)
     wp.capture_launch(capture.graph)
@@ -299,7 +308,7 @@ def test_friction_follows_the_model_by_a_launch():
     mu = model.shape_material_mu.numpy()
     mu[2:4] = 0.0
     model.shape_material_mu.assign(mu)
-    with wp.ScopedCapture(device="cpu") as capture:
+    with wp.ScopedCapture() as capture:
         solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
     wp.capture_launch(capture.graph)
     solver.check_model()
@@ -343,8 +352,8 @@ def own_scene():
 @pytest.mark.slow
 def test_a_step_of_the_gripper_is_that_of_the_librarys_own_scene():
     """From the moment in which the cube is held; the same forces, and both pads carry the cube's weight."""
-    model = newton_grasp.model(2, "cpu")
-    solver, dyn = SolverSPO(model, pairs=newton_grasp.PAIRS), spo.Dynamics(own_scene(), 2, "cpu", "float32")
+    model = newton_grasp.model(2)
+    solver, dyn = SolverSPO(model, pairs=newton_grasp.PAIRS), spo.Dynamics(own_scene(), 2, dtype="float32")
     assert len(solver.dynamics.scene.contact_points) == 24 and len(solver.dynamics.scene.contact_pairs) == 2
     _, _, q = grasp.path(dyn, 1.0)
     q[:, 7:9] = grasp.CUBE - 4e-4
@@ -371,7 +380,7 @@ def test_a_step_of_the_gripper_is_that_of_the_librarys_own_scene():
 @pytest.mark.slow
 def test_a_gripper_holds_a_cube(capsys, tmp_path):
     """0.5 kg with 40 N: it slips less than a millimetre in 5 s, and the pads carry its weight."""
-    rows, words = newton_grasp.main(worlds=2, device="cpu", picture=tmp_path / "cube.svg")
+    rows, words = newton_grasp.main(worlds=2, picture=tmp_path / "cube.svg")
     times, height, apart, _ = (np.array(column) for column in zip(*rows, strict=True))
     late = times > 2.0
     assert height[-1, 0] > 0.17 and np.ptp(apart[late, 0]) < SLIP  # 0.37 mm here
