@@ -48,6 +48,7 @@ ROOMS = (
     "newton",
     "trials",
     "env",
+    "commands",
     "train",
     "play",
     "examples",

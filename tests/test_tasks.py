@@ -78,8 +78,64 @@ def test_a_training_resumes(trained, tmp_path):
     assert steps == {4 * learner.epochs * learner.batches}
     runner = learning.train(env, learner, tmp_path, 9, resume=trained / "model_2.pt", seconds=0.0)
     assert runner.current_learning_iteration == 3 and (tmp_path / "model_3.pt").exists()  # time is over after one
-    with pytest.raises(ValueError, match="has 3 iterations; expected more"):
+    with pytest.raises(ValueError, match="has 3 iterations, and 3 are asked for in all; expected more"):
         learning.train(env, learner, tmp_path, 3, resume=trained / "model_2.pt")
+
+
+def test_a_resumed_training_drops_the_rows_after_its_checkpoint(trained, tmp_path):
+    """A course has each iteration once, and seconds that grow."""
+    env, learner = envs.make("cartpole", 16, "cpu"), task("cartpole").LEARNER
+    learning.train(env, learner, tmp_path, 3, seed=1)
+    (tmp_path / "model_1.pt").write_bytes((trained / "model_2.pt").read_bytes())
+    found = torch.load(tmp_path / "model_1.pt", weights_only=True) | {"iter": 1}
+    torch.save(found, tmp_path / "model_1.pt")
+    learning.train(env, learner, tmp_path, 5, resume=tmp_path / "model_1.pt")
+    rows = learning.read_rows(tmp_path / "progress.jsonl")
+    assert [row["iteration"] for row in rows] == [0, 1, 2, 3, 4]
+    assert (np.diff([row["seconds"] for row in rows]) > 0.0).all()
+    with pytest.raises(ValueError, match=r"holds a training; expected a new folder \(out\), or a checkpoint"):
+        learning.train(env, learner, tmp_path, 9)
+
+
+@pytest.mark.parametrize(
+    ("program", "given", "words"),
+    [
+        ("train", ["--worlds", "0"], "--worlds: '0' given; expected an integer, 1 or more"),
+        ("train", ["--iterations", "-2"], "--iterations: '-2' given"),
+        ("train", ["--save-interval", "0"], "--save-interval: '0' given"),
+        ("train", ["--seconds", "-1"], "expected seconds, more than zero"),
+        ("train", ["--device", "tpu"], "device is 'tpu'; expected one of this machine's devices"),
+        ("train", ["--resume", "nowhere.pt"], "No such file or directory: 'nowhere.pt'"),
+        ("train", ["--resume", "BAD"], "cannot be read"),
+        ("train", ["--resume", "OTHER"], "has no actor_state_dict, critic_state_dict, iter, optimizer_state_dict"),
+        ("train", ["--out", "TRAINED"], "holds a training"),
+        ("train", ["--resume", "GOOD", "--iterations", "2"], "has 3 iterations, and 2 are asked for in all"),
+        ("play", ["nowhere.pt"], "No such file or directory: 'nowhere.pt'"),
+        ("play", ["GOOD", "--seconds", "0"], "expected seconds, more than zero"),
+        ("play", ["GOOD", "--command", "1", "2"], "--command has 2 number(s); cartpole expects 0"),
+        ("play", ["GOOD", "--trial", "stairs"], "--trial is 'stairs'; expected one of those of cartpole: none"),
+        ("play", ["GOOD", "--mujoco"], "--mujoco with cartpole; expected a task that tracks velocities"),
+    ],
+)
+def test_what_a_command_line_asks_wrongly_is_one_line(program, given, words, trained, tmp_path, capsys):
+    places = {"BAD": tmp_path / "bad.pt", "OTHER": tmp_path / "other.pt", "TRAINED": trained}
+    places["GOOD"] = trained / "model_2.pt"
+    places["BAD"].write_text("hello")
+    torch.save({"weights": torch.zeros(3)}, places["OTHER"])
+    given = [str(places.get(text, text)) for text in given]
+    given += ["--worlds", "16"] if "--worlds" not in given else []
+    given += ["--out", str(tmp_path / "new" / "run")] if "--out" not in given else []
+    with pytest.raises(SystemExit) as stopped:
+        {"train": train, "play": play}[program].main(["cartpole", *given])
+    said = capsys.readouterr().err
+    assert stopped.value.code == 2 and words in said and said.count("\n") == 1
+
+
+def test_a_checkpoint_of_another_task_is_refused(trained):
+    env = envs.make("ant", 2, "cpu")
+    runner = learning.make_runner(env, task("ant").LEARNER)
+    with pytest.raises(ValueError, match=r"does not fit the task's networks .*expected one of the same task"):
+        learning.load_checkpoint(runner, trained / "model_2.pt")
 
 
 def test_exports_act_as_the_policy(trained, tmp_path):

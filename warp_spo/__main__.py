@@ -21,11 +21,12 @@ import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import warp as wp
 
+from .commands import Parser
 from .dynamics.closures import LOOPS
 from .dynamics.dynamics import MOST_WORLDS, Dynamics
 from .dynamics.dynamics import OPERATIONS as DECLARED
@@ -42,13 +43,6 @@ SETS = {False: 1, True: 4}  # sets of inputs on a CPU, on a GPU; one graph evalu
 REPORT, STRIP = "report.html", "ground.svg"
 FALLING = ("ant", "go2", "g1")  # robots of --ground
 CLOSED = ("forward_dynamics", "step")  # by either way they obey the loops, which the open tree does not
-
-
-class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}; see --help\n")
 
 
 def parser() -> Parser:

@@ -12,6 +12,7 @@ Films are drawn without a display: by MuJoCo's renderer and EGL where both are a
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import sys
 import tempfile
@@ -23,15 +24,17 @@ STEPS_A_PICTURE = 2
 
 def main(arguments: list[str] | None = None) -> int:
     """Play the checkpoint that the arguments name."""
+    from .commands import Parser, count, seconds
     from .env.tasks import TASKS, task
+    from .train import load_learning
 
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="python -m warp_spo.play", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("task", choices=sorted(TASKS))
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--seconds", type=float, default=8.0, help="of the film")
+    parser.add_argument("--seconds", type=seconds, default=8.0, help="of the film")
     parser.add_argument("--command", type=float, nargs="+", help="held during the film; left out: drawn at random")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--trial", help="of go2-rough: on the ground of one of its trials")
@@ -39,20 +42,28 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--film", choices=("gif", "webp", "mp4"), default="gif", help="mp4 needs imageio-ffmpeg")
     parser.add_argument("--renderer", choices=("mujoco", "numpy"), help="left out: MuJoCo's where it works")
     parser.add_argument("--measure", action="store_true", help="print what the task asks for, over --worlds worlds")
-    parser.add_argument("--worlds", type=int, default=256)
+    parser.add_argument("--worlds", type=count, default=256)
     parser.add_argument("--view", action="store_true", help="show Newton's viewer")
     parser.add_argument("--mujoco", action="store_true", help="let 64 robots walk in MuJoCo, on the CPU")
     parser.add_argument("--export", type=Path, help="write NAME.onnx and NAME.pt, TorchScript")
     options = parser.parse_args(arguments)
 
-    from .env import export, film, learning, recording
+    learning = load_learning(parser)
+    from .env import export, film, recording
 
     chosen = task(options.task)
     worlds = options.worlds if options.measure else 1
-    given = {} if options.trial is None else {"trial": options.trial}
-    env = chosen.build(worlds, learning.pick_device(options.device), seed=options.seed, **given)
-    runner = learning.make_runner(env, chosen.LEARNER)
-    iteration = learning.load_checkpoint(runner, options.checkpoint, learns=False)
+    name = options.out or options.checkpoint.with_suffix("")
+    try:
+        given = checked(options, chosen)
+        env = chosen.build(worlds, learning.pick_device(options.device), seed=options.seed, **given)
+        wanted = env.command.shape[1] if env.has_commands else 0
+        if options.command is not None and len(options.command) != wanted:
+            raise ValueError(f"--command has {len(options.command)} number(s); {options.task} expects {wanted}")
+        runner = learning.make_runner(env, chosen.LEARNER)
+        iteration = learning.load_checkpoint(runner, options.checkpoint, learns=False)
+    except (ValueError, OSError, ImportError) as error:
+        parser.error(str(error))
     policy = learning.policy_of(runner)
     print(f"{options.checkpoint}: {iteration} iterations")
     if options.measure:
@@ -65,12 +76,33 @@ def main(arguments: list[str] | None = None) -> int:
     recorded = recording.record(env, policy, options.seconds, options.command)
     if options.view:
         recording.show(chosen.ROBOT, recorded, env.step_dt)
-    name = options.out or options.checkpoint.with_suffix("")
     frames = recording.film(chosen, recorded, STEPS_A_PICTURE, options.renderer)
     print(film.save(frames, name.with_suffix(f".{options.film}"), STEPS_A_PICTURE * env.step_dt))
     strip = recording.strip(chosen, recorded, renderer=options.renderer)
     print(film.save_strip(strip, name.with_suffix(".png")))
     return 0
+
+
+def checked(options: argparse.Namespace, chosen: Any) -> dict[str, str]:
+    """Return the arguments of the task's environment, after a look at what is asked for; make the film's folder.
+
+    Raises:
+        ValueError: the task has no such trial, or no velocities to track in MuJoCo. ImportError: a package is missing.
+        OSError: the folder cannot be made.
+    """
+    trials = getattr(chosen, "TRIALS", {})
+    if options.trial is not None and options.trial not in trials:
+        known = ", ".join(map(repr, trials)) or "none"
+        raise ValueError(f"--trial is {options.trial!r}; expected one of those of {options.task}: {known}")
+    if options.mujoco and getattr(chosen, "ACTOR", [("",)])[0][0] != "base velocity":
+        raise ValueError(f"--mujoco with {options.task}; expected a task that tracks velocities, such as go2-flat")
+    for asked, module in (options.film == "mp4", "imageio_ffmpeg"), (options.view, "pyglet"):
+        if asked and importlib.util.find_spec(module) is None:
+            raise ImportError(f"{module} is missing; pip install {module.replace('_', '-')}")
+    for file in (options.out, options.export):
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+    return {} if options.trial is None else {"trial": options.trial}
 
 
 def walk_in_mujoco(runner: Any, env: Any, name: str, worlds: int = 64) -> dict[str, float]:

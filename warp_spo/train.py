@@ -15,27 +15,31 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 BEGAN = time.time()
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Train the task that the arguments name."""
+    from .commands import Parser, count, seconds
     from .env.tasks import TASKS, task
 
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="python -m warp_spo.train", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("task", choices=sorted(TASKS))
-    parser.add_argument("--worlds", type=int, help="of each GPU; left out: as the task says")
+    parser.add_argument("--worlds", type=count, help="of each GPU; left out: as the task says")
     parser.add_argument("--device", help="such as cuda:0 or cpu; left out: cuda:0 if there is one")
-    parser.add_argument("--gpus", type=int, default=1, help="processes (torchrun), one a GPU, or with --device cpu")
-    parser.add_argument("--iterations", type=int, help="in all; left out: as the task says")
-    parser.add_argument("--seconds", type=float, default=math.inf, help="from the start, after which it stops; one GPU")
+    parser.add_argument("--gpus", type=count, default=1, help="processes (torchrun), one a GPU, or with --device cpu")
+    parser.add_argument("--iterations", type=count, help="in all; left out: as the task says")
+    parser.add_argument(
+        "--seconds", type=seconds, default=math.inf, help="from the start, after which it stops; one GPU"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="folder; left out: runs/TASK")
     parser.add_argument("--resume", type=Path, help="checkpoint to continue from")
-    parser.add_argument("--save-interval", type=int, default=100, help="iterations between checkpoints")
+    parser.add_argument("--save-interval", type=count, default=100, help="iterations between checkpoints")
     options = parser.parse_args(arguments)
     if options.gpus > 1 and "LOCAL_RANK" not in os.environ:
         if options.device not in (None, "cpu"):
@@ -44,23 +48,36 @@ def main(arguments: list[str] | None = None) -> int:
         run = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={options.gpus}"]
         return subprocess.call([*run, "-m", "warp_spo.train", *given])
 
-    from .env import learning
-
+    learning = load_learning(parser)
     rank = int(os.environ.get("RANK", 0))
-    device = learning.pick_device(options.device)
     chosen = task(options.task)
     worlds = options.worlds or chosen.LEARNER.worlds
     folder = options.out or Path("runs") / options.task
-    env = chosen.build(worlds, device, seed=options.seed, first_world=rank * worlds)
-    print(f"{options.task}: {worlds} worlds on {device}, {time.time() - BEGAN:.1f} s", flush=True)
-    learning.train(
-        env, chosen.LEARNER, folder, options.iterations, options.resume, options.seed + rank, options.save_interval,
-        began=BEGAN, seconds=options.seconds,
-    )  # fmt: skip
+    try:
+        learning.check_folder(folder, options.resume)
+        device = learning.pick_device(options.device)
+        env = chosen.build(worlds, device, seed=options.seed, first_world=rank * worlds)
+        print(f"{options.task}: {worlds} worlds on {device}, {time.time() - BEGAN:.1f} s", flush=True)
+        runner, iterations = learning.prepare(
+            env, chosen.LEARNER, folder, options.iterations, options.resume, options.seed + rank,
+            options.save_interval, began=BEGAN, seconds=options.seconds,
+        )  # fmt: skip
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+    learning.run(runner, iterations)
     if rank == 0:
         print(f"{folder}: checkpoints, progress.jsonl, {learning.draw_curve(folder, options.task).name}")
     learning.leave()
     return 0
+
+
+def load_learning(parser: Any) -> Any:
+    """Return the module that trains; without rsl_rl the parser says what to install."""
+    try:
+        from .env import learning
+    except ImportError as error:
+        parser.error(f"{error}; install what learns: pip install -e '.[rl]'")
+    return learning
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import dataclasses
 import json
 import math
 import os
+import pickle
 import time
 import warnings
 from pathlib import Path
@@ -20,6 +21,7 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.runners import OnPolicyRunner
 
+from ..arrays import parse_device
 from .environment import Env
 
 
@@ -156,15 +158,17 @@ class Course:
         self.env, self.log_dir, self.every, self.began = env, folder and str(folder), every, began
         self.ends = began + seconds
         self.writer = self if folder is not None and writes else None
+        self.first = 0  # iteration
         self.rows: list[dict[str, float]] = []
         self.git_status_repos: list[str] = []
 
     def init_logging_writer(self) -> None:
-        """Continue the rows of an earlier training in the same folder."""
+        """Continue the rows of the training that is resumed, up to its checkpoint; its seconds count."""
         if self.writer is not None:
             self.file = Path(self.log_dir) / "progress.jsonl"  # type: ignore[arg-type]
             if self.file.exists():
-                self.rows = read_rows(self.file)
+                self.rows = [row for row in read_rows(self.file) if row["iteration"] < self.first]
+                self.file.write_text("".join(json.dumps(row) + "\n" for row in self.rows))
             if self.rows:
                 self.began -= self.rows[-1]["seconds"]
 
@@ -215,7 +219,7 @@ def pick_device(asked: str | None) -> str:
     """
     local = os.environ.get("LOCAL_RANK", "0")
     device = asked or (f"cuda:{local}" if torch.cuda.is_available() else "cpu")
-    if device == "cpu":
+    if not parse_device(device, "--device").is_cuda:
         torch.set_num_threads(1)
     else:
         torch.cuda.set_device(device)
@@ -240,13 +244,78 @@ def make_runner(
 
 
 def load_checkpoint(runner: OnPolicyRunner, file: str | Path, learns: bool = True) -> int:
-    """Load a checkpoint, tensors and numbers only, and return its iteration. ``learns``: the optimizer's state, too."""
-    found = torch.load(file, weights_only=True, map_location=runner.device)
+    """Load a checkpoint, tensors and numbers only, and return its iteration.
+
+    Args:
+        runner: what takes it. file: of a training of the same task. learns: whether it takes the optimizer's state.
+
+    Raises:
+        OSError: there is no such file. ValueError: it is no checkpoint, or that of networks with other sizes.
+    """
+    try:
+        found = torch.load(file, weights_only=True, map_location=runner.device)
+        missing = {"actor_state_dict", "critic_state_dict", "optimizer_state_dict", "iter"} - set(found)
+    except (pickle.UnpicklingError, EOFError, KeyError, RuntimeError, TypeError) as error:
+        raise ValueError(
+            f"checkpoint {str(file)!r}: cannot be read ({type(error).__name__}); expected a model_N.pt of a training"
+        ) from None
+    if missing:
+        raise ValueError(
+            f"checkpoint {str(file)!r}: has no {', '.join(sorted(missing))}; expected a model_N.pt of a training"
+        )
     parts = {"actor": True, "critic": True, "optimizer": learns, "iteration": True, "rnd": False}
-    runner.alg.load(found, parts, strict=True)
+    try:
+        runner.alg.load(found, parts, strict=True)
+    except RuntimeError as error:
+        first = next((line.strip() for line in str(error).splitlines()[1:]), str(error))
+        raise ValueError(
+            f"checkpoint {str(file)!r}: does not fit the task's networks ({first}); expected one of the same task"
+        ) from None
     if learns:
         runner.current_learning_iteration = found["iter"] + 1
     return int(found["iter"])
+
+
+def check_folder(folder: str | Path, resume: str | Path | None) -> None:
+    """Raise ValueError for a folder that holds another training, and OSError for a checkpoint that is not there."""
+    if resume is not None:
+        Path(resume).open("rb").close()
+    elif (Path(folder) / "progress.jsonl").exists():
+        raise ValueError(
+            f"train: {str(folder)!r} holds a training; expected a new folder (out), or a checkpoint to go on from "
+            "(resume); remove the folder if it is not needed"
+        )
+
+
+def prepare(
+    env: Env, learner: Learner, folder: str | Path, iterations: int | None = None, resume: str | Path | None = None,
+    seed: int = 0, save_interval: int = 100, every: int = 10, began: float | None = None, seconds: float = math.inf,
+) -> tuple[OnPolicyRunner, int]:  # fmt: skip
+    """Return a runner that is ready to train, and how many iterations are left; see :func:`train`."""
+    check_folder(folder, resume)
+    torch.manual_seed(seed)
+    folder = Path(folder)
+    runner = make_runner(env, learner, folder, save_interval, every, began, seconds)
+    first = load_checkpoint(runner, resume) + 1 if resume is not None else 0
+    runner.logger.first = first  # type: ignore[attr-defined]
+    total = learner.iterations if iterations is None else iterations
+    if runner.is_distributed and seconds < math.inf:
+        raise ValueError(
+            f"train: seconds {seconds} and several processes; expected iterations alone, for all to stop at"
+        )
+    if first >= total:
+        has = "no checkpoint" if resume is None else repr(str(resume))
+        raise ValueError(f"train: {has} has {first} iterations, and {total} are asked for in all; expected more")
+    folder.mkdir(parents=True, exist_ok=True)
+    return runner, total - first
+
+
+def run(runner: OnPolicyRunner, iterations: int) -> None:
+    """Train so many iterations, or until the time is over; then leave a checkpoint."""
+    try:
+        runner.learn(iterations, init_at_random_ep_len=True)
+    except OutOfTime:
+        runner.save(str(Path(runner.logger.log_dir) / f"model_{runner.current_learning_iteration}.pt"))
 
 
 def train(
@@ -261,7 +330,7 @@ def train(
     Args:
         env: the environment.
         learner: settings.
-        folder: is made; a training that resumes may continue in its own.
+        folder: is made; a training that resumes may continue in its own, whose rows after the checkpoint are dropped.
         iterations: in all, those before ``resume`` included; None: as the settings say.
         resume: checkpoint to continue from.
         seed: of the learner's random numbers.
@@ -269,23 +338,13 @@ def train(
         every: iterations from one printed line to the next.
         began: time from which seconds count, as of ``time.time``.
         seconds: after which no iteration starts; for one process.
+
+    Raises:
+        ValueError: the folder holds another training, the checkpoint is not of this task, or nothing is left to do.
+        OSError: there is no such checkpoint, or the folder cannot be made.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    torch.manual_seed(seed)
-    runner = make_runner(env, learner, folder, save_interval, every, began, seconds)
-    first = load_checkpoint(runner, resume) + 1 if resume is not None else 0
-    total = learner.iterations if iterations is None else iterations
-    if runner.is_distributed and seconds < math.inf:
-        raise ValueError(
-            f"train: seconds {seconds} and several processes; expected iterations alone, for all to stop at"
-        )
-    if first >= total:
-        raise ValueError(f"train: {str(resume)!r} has {first} iterations; expected more than that to be asked for")
-    try:
-        runner.learn(total - first, init_at_random_ep_len=True)
-    except OutOfTime:
-        runner.save(str(folder / f"model_{runner.current_learning_iteration}.pt"))
+    runner, left = prepare(env, learner, folder, iterations, resume, seed, save_interval, every, began, seconds)
+    run(runner, left)
     return runner
 
 
