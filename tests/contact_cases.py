@@ -125,7 +125,7 @@ def touching(scene, seed, worlds, h=5e-3):
     q = np.tile(scene.neutral_q, (worlds, 1))
     turns = np.concatenate([0.3 * rng.normal(size=(worlds, 3)), np.ones((worlds, 1))], axis=1)
     q[:, 3:7] = turns / np.linalg.norm(turns, axis=1)[:, None]
-    q[:, 7:] = (STAND + 0.4 * rng.normal(size=(worlds, 12))) if n > 6 else 0.0
+    q[:, 7:] = (STAND if n == 18 else 0.0) + 0.4 * rng.normal(size=(worlds, n - 6))
     for world in range(worlds):
         q[world, 2] += ContactStep(scene, q[world], np.zeros(n), h).points.depth.max() - rng.uniform(-2e-3, 8e-3)
     return tuple(np.float64(np.float32(x)) for x in (q, rng.normal(size=(worlds, n)), rng.normal(size=(worlds, n))))
@@ -140,3 +140,20 @@ def everywhere(scene, seed):
     contacts = [spo.Contact(int(rng.integers(scene.body_count)), **shape) for shape in shapes]
     normal = rng.normal(size=3)
     return scene.with_contacts(contacts, spo.Plane(0.1, normal / np.linalg.norm(normal)))
+
+
+def waisted(effort=2.0, ground=None):
+    """A trunk with a leg and a waist, which carries a head and an arm with two fingers; drives that saturate."""
+    parents = [-1, 0, 0, 2, 2, 4, 5, 5]  # trunk, leg, waist, head, arm, forearm, two fingers
+    rng, hinges = np.random.default_rng(7), [spo.Hinge("free", -1, 0)]
+    drive = dict(armature=0.01, target_ke=60.0, target_kd=2.0, effort_limit=effort, limit_ke=1e3, friction=0.2)
+    for body, parent in enumerate(parents[1:], 1):
+        at = (*(0.15 * rng.normal(size=3)), 0.0, 0.0, 0.0, 1.0)
+        axis, limits = rng.normal(size=3), dict(limit_lower=-1.0, limit_upper=1.0)
+        axis /= np.linalg.norm(axis)
+        hinges.append(spo.Hinge("revolute", parent, body, axis=axis, parent_pose=at, **limits, **drive))
+    bodies = [spo.Body(3.0 if body in (0, 2) else 0.5, 0.05 * rng.normal(size=3), solid(1.0, 0.2, 0.1, 0.1))
+              for body in range(len(parents))]  # fmt: skip
+    contacts = [spo.Contact(body, sphere=(0.1 * rng.normal(size=3), 0.05), friction=0.4) for body in range(1, 8)]
+    contacts += [spo.Contact(body, point=0.1 * rng.normal(size=3)) for body in (0, 0, 2, 2, 5, 5)]
+    return spo.Scene(bodies, hinges, contacts=contacts, ground=ground)

@@ -12,6 +12,7 @@ from warp_spo.recursions.contact.secants import SECANT
 from warp_spo.recursions.derivatives import contact as back
 from warp_spo.recursions.derivatives import contact_pass as one
 from warp_spo.recursions.links import Links
+from warp_spo.recursions.messages import SIZES
 from warp_spo.recursions.step import GAIN
 from warp_spo.recursions.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
@@ -85,6 +86,7 @@ def gradient(scene, a, h, passes, cotangents, wrt, ran=None):
     names = (*arguments, "dt", "passes", "number")
     laws = one.count_laws(trace_of(scene, names))
     count = one.count_variables(Links(scene, VALUES), laws)
+    weighed = SIZES["P"] * len(one.weighed_pieces(trace_of(scene, names)))
     back_names = (*names, "qdd", "solved", "q_cotangent", "qd_cotangent")
     kernels = {
         "contact_pass": one.contact_pass(trace_of(scene, names), laws),
@@ -105,7 +107,7 @@ def gradient(scene, a, h, passes, cotangents, wrt, ran=None):
         return found
 
     rates, rows = [blank(dofs)], [blank(count)]
-    left, solved = [None] * passes + [blank(dofs + count)], [None] * passes
+    left, solved, inertias = [None] * passes + [blank(dofs + count)], [None] * passes, [None] * passes
     for number in range(passes):
         known |= {"number": np.full((worlds, 1), float(number)), "row": rows[-1], "qdd_before": rates[-1]}
         found = run("contact_pass", out=blank(dofs), row_out=blank(count))
@@ -114,13 +116,15 @@ def gradient(scene, a, h, passes, cotangents, wrt, ran=None):
     for number in reversed(range(passes)):
         known |= {"number": np.full((worlds, 1), float(number)), "row": rows[number], "qdd_before": rates[number],
                   "qdd": rates[number + 1], "cotangent": left[number + 1]}  # fmt: skip
-        found = run("contact_solve", out=blank(dofs), cotangent_out=blank(dofs + count))
+        more = {f"{back.INERTIA}_out": blank(weighed)} if weighed else {}
+        found = run("contact_solve", out=blank(dofs), cotangent_out=blank(dofs + count), **more)
         solved[number], left[number] = found["out"], found["cotangent_out"]
+        inertias[number] = found.get(f"{back.INERTIA}_out")
     known |= {f"{name}_later": blank(*shape) for name, shape in shapes.items()}
     for number in reversed(range(passes)):
         known |= {"number": np.full((worlds, 1), float(number)), "row": rows[number], "qdd_before": rates[number],
                   "qdd": rates[number + 1], "cotangent": left[number + 1], "cotangent_came": left[number],
-                  "solved": solved[number]}  # fmt: skip
+                  "solved": solved[number], back.INERTIA: inertias[number]}  # fmt: skip
         found = {back.result_name(name, wrt): blank(*shape) for name, shape in shapes.items()}
         found |= {f"{back.HEIGHTS_AT}_bar": blank(surfaces)} if HEIGHTS in wrt else {}
         run("contact_gradient", **found)

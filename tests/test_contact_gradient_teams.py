@@ -1,17 +1,20 @@
 """Gradients of steps with contacts by limbs: every kernel against its trace of the whole tree, and races."""
 
+import contact_cases
 import contact_gradients
 import numpy as np
 import pytest
 import symbolic
 import warp_machine
-from contact_cases import quadruped, touching
+from contact_cases import quadruped, touching, waisted
 from test_contact_step import steps
 from test_step_teams import driven
 
 import warp_spo as spo
 from warp_spo.dynamics import contact_gradients as kernels
-from warp_spo.recursions.derivatives.contact import PassGradient, PassSolve, divides
+from warp_spo.recursions.contact.middle import MIDDLE
+from warp_spo.recursions.derivatives.contact import INERTIA, PassGradient, PassSolve, divides
+from warp_spo.recursions.derivatives.contact_pass import weighed_pieces
 
 H, WORLDS, PASSES = 5e-3, 4, 2
 ROUTINES = {"contact_pass": kernels.PASS, "contact_solve": kernels.SOLVE, "contact_gradient": kernels.GRADIENT}
@@ -19,36 +22,40 @@ OPTIONS = ("laws", "wrt", "apart")
 WRT = ("q", "qd", "tau", "contact_friction")
 
 
-def launches(ground, wrt):
-    """The scene, and for the last launch of each kernel its name, what it reads, and what the whole tree leaves."""
-    scene, ran = quadruped(ground=ground), []
+def launches(scene, wrt, middle):
+    """For the last launch of each kernel its name, what it reads, and what the whole tree leaves.
+
+    ``middle``: velocity terms are given, so that what joints feel depends on what they carry.
+    """
+    ran, rng = [], np.random.default_rng(0)
     a = dict(zip(("q", "qd", "tau"), touching(scene, 3, WORLDS), strict=True))
+    a |= {MIDDLE: 5.0 * rng.normal(size=a["qd"].shape)} if middle else {}
     a = contact_gradients.furnish(scene, a)
-    rng = np.random.default_rng(0)
     cotangents = [rng.normal(size=a[name].shape) for name in ("q", "qd")]
     contact_gradients.gradient(scene, a, H, PASSES, cotangents, wrt, ran)
-    return scene, {kernel: (known, found) for kernel, known, found in ran}
+    return {kernel: (known, found) for kernel, known, found in ran}
 
 
-def assert_right(monkeypatch, ground=None, wrt=WRT, only=tuple(ROUTINES)):
-    scene, ran = launches(ground, wrt)
+def assert_right(monkeypatch, scene, wrt=WRT, only=tuple(ROUTINES), middle=False):
+    ran = launches(scene, wrt, middle)
     texts = warp_machine.recorded(monkeypatch)
     dyn = spo.Dynamics(scene, WORLDS, "cpu", "float64", granularity="segment", variable=contact_gradients.VALUES)
-    arguments = ("q", "qd", "tau", "dt", "passes")
-    laws = kernels._laws(dyn, arguments)
+    terms = (MIDDLE,) if middle else ()
+    laws, weighed = kernels._laws(dyn, ("q", "qd", "tau", "dt", "passes", *terms))
     for kernel in only:
         known, wanted = ran[kernel]
-        read = ["q", "qd", "dt", "passes", "number", "row", "qdd_before"]
+        read = ["q", "qd", "dt", "passes", "number", "row", "qdd_before", *terms]
         read += ["tau"] if kernel == "contact_pass" else ["qdd", "q_cotangent", "qd_cotangent", "cotangent"]
         options = {"laws": laws}
         if kernel == "contact_gradient":
-            read += ["cotangent_came", "solved", *(f"{name}_later" for name in wrt)]
+            read += ["cotangent_came", "solved", *(f"{name}_later" for name in wrt), *[INERTIA] * bool(weighed)]
             options |= {"wrt": wrt, "apart": True}
         numbers = ("dt", "passes", "number")
         given = {name: float(known[name][0, 0]) if name in numbers else known[name] for name in read}
         shapes = {name: np.shape(array) for name, array in given.items()}
         more = {name: array.shape for name, array in wanted.items() if name != "out"}
-        program = dyn.programs.find(ROUTINES[kernel], shapes, wanted["out"].shape, more, **options)
+        routine = kernels.WEIGHED.get(ROUTINES[kernel], ROUTINES[kernel]) if weighed else ROUTINES[kernel]
+        program = dyn.programs.find(routine, shapes, wanted["out"].shape, more, **options)
         assert program.warps > 1
         fields = {name: known[name].reshape(WORLDS, -1).T for name in contact_gradients.VALUES if name in known}
         for backwards in (False, True):
@@ -62,13 +69,24 @@ def assert_right(monkeypatch, ground=None, wrt=WRT, only=tuple(ROUTINES)):
 
 @pytest.mark.slow
 def test_limbs_share_gradients(monkeypatch):
-    assert_right(monkeypatch)
+    assert_right(monkeypatch, quadruped())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", [quadruped(contact_cases.EFFORT), waisted()], ids=["quadruped", "waisted"])
+def test_limbs_share_gradients_of_given_velocity_terms(monkeypatch, scene):
+    """The waist and the arm of the second scene carry limbs, and feel their inertia."""
+    trace = contact_gradients.trace_of(scene, ("q", "qd", "tau", "dt", "passes", MIDDLE))
+    assert len(weighed_pieces(trace)) == (0 if scene.body_count == 13 else 2)
+    assert_right(monkeypatch, scene, (*WRT, MIDDLE, "joint_target_ke"), middle=True)
 
 
 @pytest.mark.slow
 def test_limbs_share_gradients_on_stairs(monkeypatch):
     assert_right(
-        monkeypatch, steps(), (*WRT, "ground_heights", "contact_stiffness", "ground_origin", "joint_target_ke")
+        monkeypatch,
+        quadruped(ground=steps()),
+        (*WRT, "ground_heights", "contact_stiffness", "ground_origin", "joint_target_ke"),
     )
 
 
@@ -89,6 +107,18 @@ BUGS = {
         "[0.0] * len(self.passed_on)",
     ),
     "what points on the trunk hand on": (PassGradient, "_carry", "if link is not self._under:", "if True:"),
+    "how inertias count": (
+        PassSolve,
+        "_tell",
+        'trace.send("Q", piece, ways)',
+        'trace.send("Q", piece, [0.0] * len(ways))',
+    ),
+    "how inertias count in memory": (
+        PassGradient,
+        "stores",
+        "[trace.graph.input(INERTIA, first + i) for i in range(len(packed))]",
+        "[0.0] * len(packed)",
+    ),
     "a push of a limb": (PassSolve, "stores", "Vector(wrenches[6 * at : 6 * at + 6])", "Vector([0.0] * 6)"),
 }
 
@@ -96,9 +126,11 @@ BUGS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("bug", BUGS)
 def test_a_planted_bug_is_seen(bug, monkeypatch):
-    only = "contact_solve" if bug == "a push of a limb" else "contact_gradient"
-    launches_of = launches(None, WRT)
+    only = "contact_solve" if bug in ("a push of a limb", "how inertias count") else "contact_gradient"
+    middle = "inertias" in bug
+    scene = waisted() if middle else quadruped()
+    launches_of = launches(scene, WRT, middle)
     monkeypatch.setitem(globals(), "launches", lambda *_: launches_of)
     symbolic.plant(monkeypatch, *BUGS[bug])
     with pytest.raises(AssertionError):
-        assert_right(monkeypatch, only=(only,))
+        assert_right(monkeypatch, scene, only=(only,), middle=middle)

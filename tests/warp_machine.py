@@ -126,6 +126,16 @@ def run(text, arrays, backwards=False, further=None, over=None):
     return whole.T
 
 
+class Looked:
+    """Entries of a table from a place of each world on."""
+
+    def __init__(self, table, first):
+        self.table, self.first = np.ravel(table), first
+
+    def __getitem__(self, i):
+        return self.table[self.first + i]
+
+
 def _sincos(x):
     return np.sin(x), np.cos(x)
 
@@ -144,7 +154,7 @@ FUNCTIONS = {
     "FUSED_float": lambda a, b, c: a * b + c, "FUSED_double": lambda a, b, c: a * b + c,
     "log": np.log, "sincos": _sincos, "sincos_any": _sincos, "mine": True, "again": False,
     "arctangent": np.arctan2, "sin": np.sin, "cos": np.cos, "inverse_root": lambda x: 1.0 / np.sqrt(x),
-    "floor": np.floor, "int64": np.int64,
+    "floor": np.floor, "int64": np.int64, "Looked": Looked,
 }  # fmt: skip
 
 
@@ -158,6 +168,10 @@ FORMS = [
     (r"^const (?:float|double) pass_row\[1\] = \{(.*)\};$", r"pass_row = [\1 + 0.0 * worlds]"),
     (r"^const int (now) = (.*);$", r"\1 = \2"),
     (r"^const \w+\* (\w+) = table\.data \+ (.*);$", r"\1 = \2"),
+    (
+        r"^const \w+\* (\w+) = \(const \w+\*\)__builtin_assume_aligned\((\w+)\.data \+ (\d+)ll \* \(int\)(\w+), 16\);$",
+        r"\1 = Looked(\2, \3 * int64(\4))",
+    ),
     (r"^int (\w+)\[\d+\];$", r"\1 = {}"),
     (r"^on::(sincos\w*)\((\w+), (\w+), (\w+)\);$", r"\3, \4 = \1(\2)"),
     (r"^if \(mine\) \{ const int word = (\w+); .* \}$", r"status_row[0] = worst(substep, status_row, \1)"),

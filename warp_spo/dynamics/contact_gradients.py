@@ -6,6 +6,7 @@ next one stays in the workspace, [world, dof] and [world, variable] of each pass
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +15,20 @@ import warp as wp
 from ..execution.heights import HeightSums
 from ..execution.routine import Routine
 from ..recursions.contact.ground import CORNERS, corner_steps, surface_count
-from ..recursions.contact.middle import MIDDLE
 from ..recursions.contact.step import PASSES
 from ..recursions.derivatives import contact
 from ..recursions.derivatives.adjoints import result_name
-from ..recursions.derivatives.contact import CAME, COTANGENT, HEIGHTS_AT, SOLVED
-from ..recursions.derivatives.contact_pass import BEFORE, NUMBER, ROW, contact_pass, count_laws, count_variables
+from ..recursions.derivatives.contact import CAME, COTANGENT, HEIGHTS_AT, INERTIA, SOLVED
+from ..recursions.derivatives.contact_pass import (
+    BEFORE,
+    NUMBER,
+    ROW,
+    contact_pass,
+    count_laws,
+    count_variables,
+    weighed_pieces,
+)
+from ..recursions.messages import SIZES
 from ..recursions.tracing import Trace
 from ..scene.contacts import HEIGHTS, HeightField
 from . import rounds
@@ -32,17 +41,13 @@ def _divides(scene: Any, inputs: Any, apart: bool, **_: Any) -> bool:
     return apart
 
 
-def _reads_no_middle(scene: Any, inputs: Any, **_: Any) -> bool:
-    return MIDDLE not in inputs  # else the laws of a limb need the inertia of what it carries before its own sweep
-
-
 PASS = Routine("contact_pass", contact_pass, letters="Pzaf", crowded=True, wide=True)
-SOLVE = Routine(
-    "contact_solve", contact.contact_solve, letters="Pza", divides=_reads_no_middle, crowded=True, wide=True
-)
+SOLVE = Routine("contact_solve", contact.contact_solve, letters="Pza", crowded=True, wide=True)
 GRADIENT = Routine(
     "contact_gradient", contact.contact_gradient, letters="BGO", divides=_divides, crowded=True, wide=True
 )
+WEIGHED = {SOLVE: dataclasses.replace(SOLVE, letters="PzaQ"), GRADIENT: dataclasses.replace(GRADIENT, letters="PBGO")}
+"""The same where limbs tell each other how inertias count that joints further in feel."""
 NOT_READ = ("qdd", "q_cotangent", "qd_cotangent")  # of the arrays that are given, what the passes do not read
 
 
@@ -74,7 +79,7 @@ def _launch(dyn: Dynamics, asked: dict[str, wp.array], count: int, **given: Any)
     launch, wrt = dyn._engine.launch_routine, tuple(asked)
     read = {name: value for name, value in given.items() if name not in NOT_READ}
     read["passes"] = float(count)
-    laws, dofs = _laws(dyn, tuple(read)), dyn.scene.dof_count
+    (laws, weighed), dofs = _laws(dyn, tuple(read)), dyn.scene.dof_count
     variables = count_variables(dyn.programs.links, laws)
 
     def array(name: str, number: int, size: int) -> wp.array:
@@ -84,6 +89,8 @@ def _launch(dyn: Dynamics, asked: dict[str, wp.array], count: int, **given: Any)
     rows = [array("variables of a pass", number, variables) for number in range(count)]
     left = [array(COTANGENT, number, dofs + variables) for number in range(count + 1)]  # by what passes leave
     solved = [array(SOLVED, number, dofs) for number in range(count)]
+    solve, gradient = (WEIGHED[one] if weighed else one for one in (SOLVE, GRADIENT))
+    inertias = [array(INERTIA, number, SIZES["P"] * len(weighed)) for number in range(count)] if weighed else []
     known = [{NUMBER: float(n), ROW: rows[n], BEFORE: rates[n], "laws": laws} for n in range(count)]
     for number in range(count - 1):
         launch(PASS, rates[number + 1], {f"{ROW}_out": rows[number + 1]}, **known[number], **read)
@@ -91,7 +98,8 @@ def _launch(dyn: Dynamics, asked: dict[str, wp.array], count: int, **given: Any)
     read.pop("tau", None)  # no gradient depends on it
     for number in reversed(range(count)):
         known[number] |= {"qdd": rates[number + 1], COTANGENT: left[number + 1]}
-        launch(SOLVE, solved[number], {f"{COTANGENT}_out": left[number]}, **known[number], **read)
+        more = {f"{COTANGENT}_out": left[number]} | ({f"{INERTIA}_out": inertias[number]} if weighed else {})
+        launch(solve, solved[number], more, **known[number], **read)
     results = dict(asked)
     ground, surfaces = dyn.scene.ground, len(dyn.scene.contact_points)
     if HEIGHTS in results:
@@ -102,8 +110,8 @@ def _launch(dyn: Dynamics, asked: dict[str, wp.array], count: int, **given: Any)
     read |= {f"{name}_later": results[name] for name in wrt}
     apart = contact.divides(dyn.scene, dyn.variable, read, wrt)
     for number in reversed(range(count)):
-        known[number] |= {SOLVED: solved[number], CAME: left[number]}
-        launch(GRADIENT, results[wrt[0]], bars, wrt=wrt, apart=apart, **known[number], **read)
+        known[number] |= {SOLVED: solved[number], CAME: left[number]} | ({INERTIA: inertias[number]} if weighed else {})
+        launch(gradient, results[wrt[0]], bars, wrt=wrt, apart=apart, **known[number], **read)
     if HEIGHTS in wrt:
         assert isinstance(ground, HeightField)
         summed = asked[HEIGHTS]
@@ -114,9 +122,13 @@ def _launch(dyn: Dynamics, asked: dict[str, wp.array], count: int, **given: Any)
         sums.add_up(results[HEIGHTS_AT].flatten(), contributions, corner_steps(ground), summed.flatten())
 
 
-def _laws(dyn: Dynamics, inputs: tuple[str, ...]) -> tuple[int, ...]:
-    """Return how many variables the laws of each link have, which depends on what is given besides the state."""
+def _laws(dyn: Dynamics, inputs: tuple[str, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return how many variables the laws of each link have, and which pieces carry what these laws feel.
+
+    Both depend on what is given besides the state.
+    """
     known = dyn._gradients.pass_laws
     if inputs not in known:
-        known[inputs] = count_laws(Trace(dyn.programs.links.with_tables(), dyn.dtype.__name__, inputs))
+        traces = (Trace(dyn.programs.links.with_tables(), dyn.dtype.__name__, inputs) for _ in range(2))
+        known[inputs] = count_laws(next(traces)), weighed_pieces(next(traces))
     return known[inputs]

@@ -38,7 +38,7 @@ class Gradients:
     def __init__(self, dyn: Dynamics):
         self.dyn = dyn
         self._checked: set[str] = set()  # names of operations that have gradients on this scene
-        self.pass_laws: dict[tuple[str, ...], tuple[int, ...]] = {}  # of steps with contacts, by their arguments
+        self.pass_laws: dict[tuple[str, ...], tuple[tuple[int, ...], tuple[int, ...]]] = {}  # of steps with contacts
         self.height_sums: HeightSums | None = None
         self.latest: dict[str, Callable[[tuple, dict[str, Any]], Any]] = {}  # repeats a call that torch records
 

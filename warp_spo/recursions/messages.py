@@ -2,10 +2,10 @@
 
 Letters: inward P = phi P+ phi*, z and y = phi z+ or a force, f = a force, R = the composite inertia, B = how a sum
 changes with the parent's motion, G = how another one changes with what contact points know of the parent, O = with the
-ground's origin, U = the flow and momentum of what a link carries, L = its load and pull; outward a and b = alpha, and
-for Mass^-1 N = the rates of all pivots further in for each unit force on the last link, D = the piece's own pivots, V =
-its columns of Y, Y = the part of them that lies further in. From all to the first piece, when all is done: S = a status
-word, E = by how much the last pass of a step with contacts exceeds its laws.
+ground's origin, U = the flow and momentum of what a link carries, L = its load and pull; outward a and b = alpha, Q =
+how a sum changes with P, and for Mass^-1 N = the rates of all pivots further in for each unit force on the last link,
+D = the piece's own pivots, V = its columns of Y, Y = the part of them that lies further in. From all to the first
+piece, when all is done: S = a status word, E = by how much the last pass of a step with contacts exceeds its laws.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from .pieces import Piece, Pieces
 
 INWARD, OUTWARD = "sent", "returned"
 """The array that messages go through, by either name."""
-OUTWARD_LETTERS = "abNDVY"
-SIZES = {"P": 21, "z": 6, "f": 6, "y": 6, "R": 10, "B": 24, "G": 36, "O": 3, "U": 12, "L": 12, "a": 6, "b": 6, "S": 1,
-         "E": 4}  # fmt: skip
+OUTWARD_LETTERS = "abQNDVY"
+SIZES = {"P": 21, "z": 6, "f": 6, "y": 6, "R": 10, "B": 24, "G": 36, "O": 3, "U": 12, "L": 12, "a": 6, "b": 6, "Q": 21,
+         "S": 1, "E": 4}  # fmt: skip
 NEEDS = {"U": "qd", "L": "body_f", "O": "ground_origin_later"}
 """The array without which a message is zero and is not sent, by letter."""
 

@@ -15,6 +15,10 @@ median.
 A pass takes two traces, so that limbs share both. The first one solves: inward, outward, and the cotangents of what
 the pass before left, for which the first trace of that pass waits. The second one takes gradients inward.
 
+Where velocity terms are given, s' depends on the inertia that joints feel in the pass, that is, on the articulated
+inertia of all that they carry. Limbs that a joint carries are told, outward in the first trace, how the sum changes
+with their articulated inertia; the second one, which needs it before its sweep, reads it from memory.
+
 Where a comparison changes its answer the step has a kink, or a jump of s'; the gradient is that of the side on which
 the step is.
 """
@@ -30,8 +34,8 @@ from ...scene.parts import DOF_VALUES
 from ...trace.differentiation import reverse
 from ...trace.emission import Store
 from ...trace.scalars import Scalar, Value, cut, is_constant, less, ordered, select
-from ...trace.spatial import ZERO, Vector, dot, total
-from ..articulated_sweeps import Factors, expand, factor_tree, reduce
+from ...trace.spatial import ZERO, Articulated, Vector, dot, total
+from ..articulated_sweeps import Factors, eliminate, expand, reduce
 from ..contact.ground import CORNERS
 from ..contact.middle import MEAN, MIDDLE, middle_bias
 from ..contact.points import Carried, Point, own_points, place_points, point_links, with_ancestors
@@ -39,7 +43,7 @@ from ..integration import integrate_link
 from ..kinematics import carried_velocity
 from ..links import Link
 from ..motion import hinge_motion, whirl
-from ..pieces import Piece
+from ..pieces import Piece, Pieces
 from .adjoints import entries, gradient_stores, result_name
 from .contact_pass import NUMBER, OnePass
 from .power import Entry, Power, Ways
@@ -51,11 +55,13 @@ if TYPE_CHECKING:
 COTANGENT, CAME, SOLVED = "cotangent", "cotangent_came", "solved"
 """The gradient by what a pass leaves, qdd of each dof and then the variables; by what the pass before left, likewise;
 and lambda [world, dof]."""
+INERTIA = "inertia_cotangent"
+"""The gradient by the packed articulated inertia that each piece of :attr:`.OnePass.weighed` carries [world, entry]."""
 HEIGHTS_AT = "heights_at"
 """Where the heights lie in the table by which each surface has its gradient [world, surface]: those of a cell."""
 ORIGIN = "ground_origin"
 OF_DOFS = ("q", "qd", "tau", "target_q", "target_qd", "joint_rest_q", *DOF_VALUES)
-BY_PIECES = (*OF_DOFS, "ctrl", *CONTACT_VALUES, HEIGHTS, ORIGIN)
+BY_PIECES = (*OF_DOFS, "ctrl", *CONTACT_VALUES, HEIGHTS, ORIGIN, MIDDLE)
 """Arguments and values whose gradient a limb computes by itself, or by messages between limbs."""
 Twists = dict[int, tuple[Vector, Vector]]
 
@@ -67,6 +73,7 @@ class PassAdjoint(OnePass):
         last: 1 in the last pass, else 0. qdd: what the pass found by dof, cut from its history. gains: h qdd.
         points, touches: contact points and their variables. moving: (J qdd) of links by id.
         loads: forces on the points, at the velocities that qdd gives.
+        inner: P+ of the trace's links, in their parents' frames, by id.
     """
 
     def __init__(self, trace: Trace, laws: tuple[int, ...]):
@@ -78,20 +85,45 @@ class PassAdjoint(OnePass):
         self.touches = [self._begin(point) for point in self.points]
         self.qdd = {dof: cut(trace.vector("qdd")(dof)) for dof in self.before}
         self.gains = {dof: self.h * rate for dof, rate in self.qdd.items()}
-        done = self._factors() if MIDDLE in trace.inputs else {}
+        self.inner: dict[int, Articulated] = {}
+        done = self._factors()
         for link in self.links:
             for dof in link.dofs:
                 for law in self.secants[dof]:
-                    law.finish(self.gains[dof], self._felt(law, link, done))
+                    law.finish(self.gains[dof], self._felt(law, link, done) if id(link) in done else None)
         self.moving = self._twists(self._or_input(self.qdd, "qdd"))
         touching = zip(self.points, self.touches, strict=True)
         self.loads = [self._finish(point, touch, self.moving)[0] for point, touch in touching]
 
     def _factors(self) -> Factors:
-        """Return the factors of the pass, of a whole tree."""
+        """Return the factors of the pass by link; {} where no law of these links or further in asks for them."""
+        trace, done = self.trace, Factors()
+        if not (self._carrier or any(map(self._weighs, self.links))):
+            return done
         self._press(self.points, self.touches)
-        self.trace.pushes, self.trace.stiffened = {}, self._stiffened
-        return factor_tree(self.trace)
+        trace.pushes, trace.stiffened = {}, self._stiffened
+        for link, outward in trace.traversal():
+            if outward:
+                trace.place(link)
+            else:
+                eliminate(trace, link, done, self.inner)
+        return done
+
+    @property
+    def _carrier(self) -> Piece | None:
+        """The piece that this one moves on, if that is one of those weighed."""
+        piece = self.trace.piece
+        above = None if piece is None else piece.parent
+        return above if above is not None and above.index in self.weighed else None
+
+    @property
+    def _packed(self) -> list[Value]:
+        """What the piece sends of its articulated inertia, with the dampers of its points on the link it moves on."""
+        piece = self.trace.piece
+        if self._carrier is None or piece is None:
+            return []
+        P, link = self.inner[id(piece.links[0])], piece.links[0]
+        return (P + self.trace.dampers[id(link.parent)] if id(link.parent) in self.trace.dampers else P).packed
 
     def _placed(self) -> list[Point]:
         """Return the contact points."""
@@ -171,6 +203,9 @@ class PassSolve(PassAdjoint):
         solved = {item.index[0]: cut(item.value) for item in found if item.array == "out"}
         sent += [item for item in found if item.array != "out"]
         pushed = {key: (_cut(pushed[key][0]), _cut(pushed[key][1])) for key in on}
+        if self._carrier is not None:
+            results, seeds = results + self._packed, seeds + trace.receive("Q", self._carrier)
+        sent += self._tell(results, seeds)
         power = self._power(solved, pushed)
         came = self.before | {self._dofs + at: value for at, value in self.kept.variables.items()}
         held = [*stops, *solved.values(), *(x for twist in pushed.values() for part in twist for x in part)]
@@ -181,6 +216,19 @@ class PassSolve(PassAdjoint):
             *(Store("out", (dof,), value) for dof, value in solved.items()),
             *(Store(f"{COTANGENT}_out", (at,), value) for at, value in by_came),
         ]
+
+    def _tell(self, results: list[Value], seeds: list[Value]) -> list[Store]:
+        """Return the stores of the gradient by what pieces carry, and those that tell it to the pieces carried."""
+        trace, found = self.trace, []
+        for at, index in enumerate(self.weighed):
+            piece = trace.piece or Pieces(trace.links).pieces[index]
+            if piece.index != index:
+                continue
+            carried = trace.from_children(piece.links[-1], "P", self.inner, Articulated.unpacked)[0].packed
+            ways = _by_each(carried, reverse(results, _distinct(carried), seeds, True))
+            found += [Store(f"{INERTIA}_out", (len(ways) * at + i,), way) for i, way in enumerate(ways)]
+            found += trace.send("Q", piece, ways)
+        return found
 
 
 class PassGradient(PassAdjoint):
@@ -246,6 +294,13 @@ class PassGradient(PassAdjoint):
         results += [self._power(self.solved, self.pushed), *(item.value for item in kept.begin)]
         came = [trace.graph.input(CAME, self._dofs + item.index[0]) for item in kept.begin]
         seeds += [1.0, *(select(kept.first, way, 0.0) for way in came)]
+        packed = self._packed
+        if self._carrier is not None:
+            first = len(packed) * self.weighed.index(self._carrier.index)
+            results, seeds = (
+                results + packed,
+                seeds + [trace.graph.input(INERTIA, first + i) for i in range(len(packed))],
+            )
         for piece in trace.piece.children if trace.piece is not None else ():
             results += self.passed_on
             seeds += trace.receive("G", piece)[: len(self.passed_on)]
@@ -255,6 +310,7 @@ class PassGradient(PassAdjoint):
         heights = [x for x, *_ in self.corners.values()] if HEIGHTS in wrt else []
         back = reverse(results, [*stops, *leaves, *heights], seeds, True)
         sent = trace.send_to_parent("G", trace.own_links[0], _by_each(self.given, back))
+        sent += trace.send_to_parent("P", trace.own_links[0], packed) if packed else []
         rest = iter(back[len(stops) :])
         ways: Ways = dict(zip((x.args for x in leaves), rest, strict=False))
         for (_, *at), way in zip(self.corners.values(), rest, strict=False):
@@ -331,7 +387,7 @@ def divides(scene: Scene, variable: Collection[str], inputs: Collection[str], wr
     alone = all(len(actuator.hinges) == 1 for actuator in scene.actuators)
     lifted = "body_gravcomp" in variable or bool(scene.values["body_gravcomp"].any())
     alone &= len(scene.tree.roots) == 1 or ORIGIN not in wrt  # its gradient is added up towards the root
-    alone &= not {"body_f", MIDDLE} & set(inputs)
+    alone &= "body_f" not in inputs
     return alone and not lifted and set(wrt) <= set(BY_PIECES)
 
 

@@ -7,6 +7,7 @@ for its pieces.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -15,11 +16,13 @@ from ...scene.contacts import HEIGHTS
 from ...trace.emission import Store
 from ...trace.scalars import Value, cut, reciprocal, select
 from ..contact.ground import surface_count
+from ..contact.middle import MIDDLE
 from ..contact.points import own_points
 from ..contact.secants import Kept
-from ..contact.step import ContactStep, Touch
-from ..impedance import Law
+from ..contact.step import ContactStep, Touch, single_dofs
+from ..impedance import LIMIT, Law
 from ..links import Link, Links
+from ..pieces import Pieces
 from ..step import GAIN
 
 if TYPE_CHECKING:
@@ -85,6 +88,23 @@ class OnePass(ContactStep):
         self.before = {dof: cut(select(self.kept.first, 0.0, trace.graph.input(BEFORE, dof))) for dof in dofs}
         self.counted = tuple(self._count_laws(link) for link in self.links)
 
+    @functools.cached_property
+    def weighed(self) -> tuple[int, ...]:
+        """Numbers of the pieces that carry others whose inertia counts in what laws leave for the next pass."""
+        if MIDDLE not in self.trace.inputs:
+            return ()
+        pieces = Pieces(self.trace.links).pieces
+        own = {piece.index for piece in pieces if any(self._weighs(link) for link in piece.links if link.leads)}
+        chains = {piece.index: {piece.index, *(further.index for further in piece.ancestors)} for piece in pieces}
+        return tuple(piece.index for piece in pieces if piece.children and own & chains[piece.index])
+
+    def _weighs(self, link: Link) -> bool:
+        """Whether what a law of the link leaves for the next pass depends on the inertia that its dof feels."""
+        scene = self.trace.links.scene
+        if MIDDLE not in self.trace.inputs or scene.shares_dofs or link.dofs[0] not in single_dofs(scene):
+            return False
+        return any(law.bends and law.role != LIMIT for laws in self.impedance.laws(link) for law in laws)
+
     def _count_laws(self, link: Link) -> int:
         """Make the variables of the laws of a link; return how many they are."""
         known = len(self.kept.variables)
@@ -129,6 +149,11 @@ def contact_pass(trace: Trace, laws: tuple[int, ...]) -> list[Store]:
 def count_laws(trace: Trace) -> tuple[int, ...]:
     """Return how many variables the laws of each link have in a pass."""
     return OnePass(trace, None).counted
+
+
+def weighed_pieces(trace: Trace) -> tuple[int, ...]:
+    """Return :attr:`OnePass.weighed`."""
+    return OnePass(trace, None).weighed
 
 
 def count_variables(links: Links, laws: tuple[int, ...]) -> int:
