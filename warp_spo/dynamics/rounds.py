@@ -16,7 +16,7 @@ from ..execution.routine import Routine
 from ..kernels import combination
 from ..recursions.contact import step as contact
 from ..recursions.contact.middle import FOUND, MEAN, MIDDLE, middle_bias
-from ..recursions.derivatives.contact import middle_bias_vjp
+from ..recursions.derivatives.middle import middle_bias_vjp
 from ..scene.scene import Scene
 
 if TYPE_CHECKING:

@@ -37,14 +37,14 @@ from ...trace.scalars import Scalar, Value, cut, is_constant, less, ordered, sel
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from ..articulated_sweeps import Factors, eliminate, expand, reduce
 from ..contact.ground import CORNERS
-from ..contact.middle import MEAN, MIDDLE, middle_bias
+from ..contact.middle import MIDDLE
 from ..contact.points import Carried, Point, own_points, place_points, point_links, with_ancestors
 from ..integration import integrate_link
 from ..kinematics import carried_velocity
 from ..links import Link
 from ..motion import hinge_motion, whirl
 from ..pieces import Piece, Pieces
-from .adjoints import entries, gradient_stores, result_name
+from .adjoints import entries, result_name
 from .contact_pass import NUMBER, OnePass
 from .power import Entry, Power, Ways
 
@@ -369,17 +369,6 @@ def contact_solve(trace: Trace, laws: tuple[int, ...]) -> list[Store]:
 def contact_gradient(trace: Trace, laws: tuple[int, ...], wrt: tuple[str, ...], apart: bool) -> list[Store]:
     """Gradients by ``wrt`` through a pass and those after it"""
     return PassGradient(trace, laws).stores(wrt)
-
-
-def middle_bias_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
-    """J* (cotangent; mean_cotangent) of what a round leaves for the step, for the arguments ``wrt``"""
-    stores = middle_bias(trace)
-    names = {"out": "cotangent", f"{MEAN}_out": f"{MEAN}_cotangent"}
-    seeds = [trace.graph.input(names[item.array], *item.index) for item in stores]
-    results = [item.value for item in stores]
-    inputs = [x for x in ordered(results) if x.op == "input"]
-    found = dict(zip((x.args for x in inputs), reverse(results, inputs, seeds), strict=True))
-    return gradient_stores(trace, found, wrt, wrt)
 
 
 def divides(scene: Scene, variable: Collection[str], inputs: Collection[str], wrt: Collection[str]) -> bool:
