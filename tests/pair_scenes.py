@@ -116,6 +116,27 @@ def hand_states(seed, worlds):
     return np.float64(np.float32(q)), np.float64(np.float32(qd))
 
 
+def shelf(body):
+    """Two cubes on each other and on a shelf that stands still: of the inertial frame, -1, or of a fixed body, 2."""
+    pose, law = (0.0, 0.1, 0.5, 0.0, np.sin(0.05), 0.0, np.cos(0.05)), dict(stiffness=1e4, damping=30.0)
+    bodies, hinges = [cube(1.0, 0.05), cube(2.0, 0.06)], [spo.Hinge("free", -1, i) for i in range(2)]
+    if body >= 0:
+        bodies, hinges = [*bodies, spo.Body(0.0)], [*hinges, spo.Hinge("fixed", -1, 2)]
+    board, knob = dict(box=((0.3, 0.2, 0.02), pose)), dict(sphere=((0.12, 0.1, 0.6), 0.07))
+    contacts = [box(0, 0.05), box(0, 0.05, other=spo.Contact(body, **board), **law), box(1, 0.06, other=0, **law),
+                box(1, 0.06, other=spo.Contact(body, **board)),
+                spo.Contact(0, sphere=0.06, other=spo.Contact(body, **knob), **law)]  # fmt: skip
+    return spo.Scene(bodies, hinges, contacts=contacts)
+
+
+def shelf_states(seed, worlds):
+    """Return q, qd of ``shelf`` with one cube on the shelf, at the knob, and the other one on it."""
+    rng = np.random.default_rng(seed)
+    q = np.tile([0.0, 0.1, 0.57, 0, 0, 0, 1, 0.02, 0.1, 0.676, 0, 0, 0, 1], (worlds, 1))
+    q[:, [0, 1, 2, 7, 8, 9]] += 0.003 * rng.normal(size=(worlds, 6))
+    return np.float64(np.float32(q)), np.float64(np.float32(0.3 * rng.normal(size=(worlds, 12))))
+
+
 def thrown(chosen):
     """A cube that meets another one in the air: the scene, and ``chosen`` ones of 1500 random states."""
     rng, worlds, half = np.random.default_rng(0), 1500, 0.1

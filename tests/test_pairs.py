@@ -5,7 +5,21 @@ import functools
 import numpy as np
 import pytest
 import warp as wp
-from pair_scenes import box, cube, free, hand, hand_states, mixed, mixed_states, palm, stack, stacked, thrown
+from pair_scenes import (
+    box,
+    cube,
+    free,
+    hand,
+    hand_states,
+    mixed,
+    mixed_states,
+    palm,
+    shelf,
+    shelf_states,
+    stack,
+    stacked,
+    thrown,
+)
 from pair_touches import find_touches
 
 import warp_spo as spo
@@ -126,6 +140,20 @@ def test_limbs_do_what_one_thread_does(device, name):
         for key in ("q", "qd", "contact_f"):
             np.testing.assert_array_equal(one[key][0], found[granularity][key][-1])
     np.testing.assert_allclose(found["segment"]["qd"], found["tree"]["qd"], atol=1e-11 * np.abs(qd).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("granularity", ["tree", "segment"])
+def test_shapes_that_stand_still(device, granularity):
+    """Of the inertial frame, as of a body that is fixed there."""
+    (q, qd), found = shelf_states(0, 5), {}
+    for body in (-1, 2):
+        dyn = spo.Dynamics(shelf(body), 5, device=device, dtype="float64", granularity=granularity)
+        found[body] = assert_is_dense(dyn, q, qd, least=5)
+    assert found[-1]["contact_f"][:, 8:].any(axis=(0, 2)).tolist() == [True, True, False, True]
+    for name in ("q", "qd", "contact_f", "contact_slip"):
+        np.testing.assert_allclose(found[-1][name], found[2][name], atol=1e-9)
+    np.testing.assert_array_equal(shelf(-1).values["contact_stiffness"], shelf(2).values["contact_stiffness"])
 
 
 @pytest.mark.slow

@@ -26,10 +26,11 @@ class PairStep(ContactStep):
         for number, pair in enumerate(scene.contact_pairs):
             at = len(scene.contact_points) + number
             k, d, mu = (dense.value(f"contact_{name}")[at] for name in ("stiffness", "damping", "friction"))
-            places = [dense.body_matrix[body] for body in (pair.body, pair.other)]
+            places = [dense.body_matrix[body] if body >= 0 else np.eye(4) for body in (pair.body, pair.other)]
             touched = touches(*(place(shape, body) for shape, body in zip(pair.shapes, places, strict=True)))
             for point, normal, depth in touched:
-                J = dense._jacobian_at(pair.body, point)[:3] - dense._jacobian_at(pair.other, point)[:3]
+                J = dense._jacobian_at(pair.body, point)[:3]
+                J = J - dense._jacobian_at(pair.other, point)[:3] if pair.other >= 0 else J
                 share = len(touched)
                 rows.append((J, normal, depth, k / share, d / share, mu, pair.eps, pair_weight(self.neutral, pair)))
                 self.pair_of.append(number)
@@ -56,6 +57,8 @@ def pair_weight(dense, pair):
     """Return the inverse weight of a pair, the sum of its bodies', each the mean over its shape, times SLIP [1/kg]."""
     inverse, total = np.linalg.pinv(dense.mass_matrix), 0.0
     for body, shape in zip((pair.body, pair.other), pair.shapes, strict=True):
+        if body < 0:
+            continue
         frames = [(body, (*point, 0, 0, 0, 1)) for point in shape.samples]
         J = dense.jacobian(frames)[:, :3]
         total += np.einsum("pai,ij,paj->", J, inverse, J) / (3.0 * len(frames))

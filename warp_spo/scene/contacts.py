@@ -146,8 +146,9 @@ class Contact(StoredPart):
         capsule: ((x, y, z) of one end of its axis, (x, y, z) of the other, radius) [m].
         box: half its sizes (x, y, z) [m], about the body frame's origin; or (half its sizes, its pose in the body).
         hull: points [n, 3], [m].
-        other: None: the ground. A Contact that gives another body and its shape, and nothing else counts of it. An
-            index of a body: the shape of that body's one contact with the ground.
+        other: None: the ground. A Contact that gives another body and its shape, and nothing else counts of it; its
+            body may be -1, a shape that stands in the inertial frame. An index of a body: the shape of that body's one
+            contact with the ground.
         friction: ratio of the largest friction force to the normal force.
         stiffness: of each point [N/m]; None: so that a robot that stands on up to four points sinks by 1.7 mm, and so
             that the points of one body, if they span a sole, carry the whole robot. See ``contact_points`` of

@@ -46,7 +46,8 @@ class ContactPair(NamedTuple):
     """Two bodies that may touch: after the points, a row of ``contact_f``, ``contact_gap`` and ``contact_slip``.
 
     Attributes:
-        contact: index of its contact in ``Scene.contacts``. body, other: indices of the bodies; forces are on ``body``.
+        contact: index of its contact in ``Scene.contacts``. body, other: indices of the bodies; forces are on ``body``,
+            and ``other`` is -1 where its shape stands in the inertial frame.
         shapes: of the two. points: how many they share at most. eps: speed below which friction is a damper [m/s].
     """
 
@@ -68,8 +69,11 @@ def contact_pairs(contacts: Sequence[Any], body_count: int) -> tuple[ContactPair
         if contact.dissipation is not None:
             raise UnsupportedError(call, "dissipation= of a contact between bodies", "give damping=")
         partner = _partner(call, contact, contacts)
-        if not 0 <= partner.body < body_count:
-            raise ValueError(f"{call} is with body {partner.body}; expected one of {body_count} bodies, 0 and up")
+        if not -1 <= partner.body < body_count:
+            raise ValueError(
+                f"{call} is with body {partner.body}; expected one of {body_count} bodies, 0 and up, "
+                "or -1, the inertial frame"
+            )
         if partner.body == contact.body:
             raise ValueError(f"{call} is of body {contact.body} with itself; expected two bodies")
         first, second = shape_of(call, contact), shape_of(call, partner)
@@ -117,8 +121,8 @@ def shape_of(call: str, contact: Any) -> Solid:
 def pair_values(pair: ContactPair, scene: Any, stand: Any) -> tuple[float, float, float]:
     """Return friction, stiffness [N/m] and damping [N s/m] of a pair; what its contact leaves open is chosen."""
     contact, parents, masses = scene.contacts[pair.contact], scene.tree.parent, []
-    together = stand.roots[pair.body] == stand.roots[pair.other]
-    for body in (pair.body, pair.other):
+    together = pair.other >= 0 and stand.roots[pair.body] == stand.roots[pair.other]
+    for body in (pair.body, pair.other) if pair.other >= 0 else (pair.body,):
         way = [body]
         while parents[way[-1]] >= 0:
             way.append(parents[way[-1]])

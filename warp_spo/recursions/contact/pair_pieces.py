@@ -134,7 +134,7 @@ class PairedPiece(ContactStep):
         on = [link for link, _ in self.seats.values()]
         place_axes_of(trace, on)
         self.before = velocities_of(trace, on, self.qd)
-        scenery = [body for body, seat in trace.links.seats.items() if seat.link is None]
+        scenery = [-1, *(body for body, seat in trace.links.seats.items() if seat.link is None)]
         still = scenery if trace.piece.index == 0 else []
         places = places_of(trace, {*self.own.values(), *still})
         self.first += [Store(INWARD, (self.at["place"] + i,), value) for i, value in places]

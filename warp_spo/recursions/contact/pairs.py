@@ -56,7 +56,8 @@ class Members(NamedTuple):
 def members(links: Links) -> Members:
     """Return the bodies of the pairs of a scene."""
     pairs = [(pair.body, pair.other) for pair in links.scene.contact_pairs]
-    bodies = sorted({body for pair in pairs for body in pair if links.seats[body].link is not None})
+    moving = {body for body, seat in links.seats.items() if seat.link is not None}
+    bodies = sorted({body for pair in pairs for body in pair} & moving)
     number = {body: i for i, body in enumerate(bodies)}
     return Members(tuple(bodies), tuple((number.get(i, -1), number.get(j, -1)) for i, j in pairs))
 
@@ -183,7 +184,9 @@ class PairedStep(ground.ContactStep):
         seats = [frame_on_link(trace, *frame) for frame in frames]
         place_axes_of(trace, [link for link, _ in seats])
         before = velocities_of(trace, [link for link, _ in seats], self.qd)
-        self.first += [Store(PLACE, (i,), value) for i, value in places_of(trace, range(len(trace.links.scene.bodies)))]
+        self.first += [
+            Store(PLACE, (i,), value) for i, value in places_of(trace, range(-1, len(trace.links.scene.bodies)))
+        ]
         self._begin_pairs(seats, before)
         forces = {id(link): NO_FORCE for link in trace.links.links}
         for number, (link, arm) in enumerate(seats):
@@ -254,6 +257,8 @@ def inverse_weights(scene: Scene) -> list[float]:
     """Return SLIP times the inverse weight of each pair [1/kg]: both bodies', means over their shapes, neutral."""
     sides = [(body, shape) for p in scene.contact_pairs
              for body, shape in zip((p.body, p.other), p.shapes, strict=True)]  # fmt: skip
-    frames = tuple((body, tuple(point)) for body, shape in sides for point in shape.samples.tolist())
-    weights = SLIP / 3.0 * neutral.inverse_weights(scene, frames)
+    points = [(body, tuple(point)) for body, shape in sides for point in shape.samples.tolist()]
+    weights, of_bodies = np.zeros(len(points)), [body >= 0 for body, _ in points]  # what stands still has none
+    frames = tuple(frame for frame in points if frame[0] >= 0)
+    weights[of_bodies] = SLIP / 3.0 * neutral.inverse_weights(scene, frames)
     return weights.reshape(len(scene.contact_pairs), 2, -1).mean(axis=2).sum(axis=1).tolist()
