@@ -101,7 +101,7 @@ MISTAKES = {
     "itself": ([("cube", "box of cube")], ValueError, "stands for a shape with itself"),
     "filtered": ([("upper", "lower")], ValueError, "groups or filters keep apart, or which are fixed"),
     "fixed": ([("elbow", "pad")], ValueError, "or which are fixed to each other"),
-    "still": ([("cube", "post")], UnsupportedError, "box 'post' of the world, which stands still"),
+    "still": ([("post", "post")], ValueError, "stands for a shape with itself"),
     "capsule": ([("stick", "cube")], UnsupportedError, "capsule 'stick' of body 'upper' with box 'box of cube'"),
     "cylinder": ([("tin", "cube")], UnsupportedError, "cylinder 'tin' of body 'tin' with box .*another solver"),
 }
@@ -271,6 +271,61 @@ def test_a_tower_stands(table):
     assert listed.rigid_contact_count.numpy()[0] > 12  # the bodies' contacts are in the list, and none is left out
     run(solver, state, 1, listed, seen)
     assert not solver.status.numpy().any()
+
+
+def with_table(post=False):
+    """A cube on a table over the ground, and one on the ground; and a post that nothing meets."""
+    builder = newton.ModelBuilder()
+    for _ in range(2):
+        one = newton.ModelBuilder()
+        free_cube(one, "cube", (0.0, 0.0, 0.6 + 0.1))
+        free_cube(one, "other", (2.0, 0.0, 0.1))
+        at = wp.transform(wp.vec3(0.0, 0.0, 0.55), wp.quat_identity())
+        one.add_shape_box(-1, xform=at, hx=0.5, hy=0.5, hz=0.05, cfg=config(mu=0.2), label="table")
+        if post:
+            one.add_shape_sphere(-1, xform=wp.transform(wp.vec3(4.0, 0.0, 0.0), wp.quat_identity()), radius=0.1,
+                                 cfg=WALL, label="post")  # fmt: skip
+        builder.add_world(one)
+    builder.add_ground_plane(cfg=WALL)
+    return builder.finalize()
+
+
+@pytest.mark.slow
+def test_a_cube_stands_on_a_table():
+    """A shape that stands still is in a pair, and the ground carries the other cube; friction is the mean."""
+    model = with_table()
+    solver, state, control = SolverSPO(model, pairs=[("table", "cube")]), model.state(), model.control()
+    (pair,) = solver.dynamics.scene.contact_pairs
+    assert (pair.body, pair.other) == (0, -1)
+    seen = solver.observables({"contact_f", "contact_slip", "status"})
+    run(solver, state, 200, observables=seen)
+    weight, force = WALL.density * (2 * SIDE) ** 3 * GRAVITY, seen.contact_f.numpy()[..., 2]
+    np.testing.assert_allclose(force[:, -1], weight, rtol=1e-4)
+    np.testing.assert_allclose(force[:, 8:16].sum(axis=1), weight, rtol=1e-4)
+    assert not force[:, :8].any() and not seen.status.numpy().any()
+    push = control.joint_f.numpy().reshape(2, 2, 6)
+    push[:, 0, 0] = [0.4 * weight, 0.6 * weight]  # friction is 0.5
+    control.joint_f.assign(push.ravel())
+    speeds = []
+    for _ in range(60):
+        solver.step(state, state, control, None, H)
+        speeds.append(state.joint_qd.numpy().reshape(2, 2, 6)[:, 0, 0].copy())
+    np.testing.assert_allclose((speeds[-1] - speeds[19]) / (40 * H), [0.0, 0.1 * GRAVITY], atol=5e-3)
+    assert speeds[-1][0] < 2e-3  # creeps by 1.3 mm/s: 0.8 of the friction is used
+    pipeline = newton.CollisionPipeline(model)
+    pipeline.collide(state, contacts := pipeline.contacts())
+    solver.step(state, state, control, contacts, H)
+    assert contacts.rigid_contact_count.numpy()[0] >= 16 and not solver.status.numpy().any()
+
+
+def test_pairs_name_all_that_stands_still_or_nothing():
+    model, pairs = with_table(post=True), [("table", "cube")]
+    with pytest.raises(UnsupportedError, match=r"beside shapes in no pair, such as sphere '.*post' of the world"):
+        SolverSPO(model, pairs=pairs)
+    with pytest.raises(UnsupportedError, match=r"contacts='ground': left out: sphere '.*post' of the world"):
+        SolverSPO(model, pairs=pairs, contacts="ground")
+    with pytest.raises(UnsupportedError, match=r"beside contacts='pipeline', such as box '.*table' of the world"):
+        SolverSPO(model, pairs=pairs, contacts="pipeline")
 
 
 @pytest.mark.slow

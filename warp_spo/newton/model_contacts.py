@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import warnings
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import newton
@@ -224,14 +225,22 @@ class ModelContacts(NamedTuple):
 
 
 def model_contacts(
-    model: newton.Model, worlds: Worlds, scene: Scene, choice: Choice, apart: bool = False
+    model: newton.Model,
+    worlds: Worlds,
+    scene: Scene,
+    choice: Choice,
+    apart: bool = False,
+    without: Collection[int] = (),
 ) -> ModelContacts:
     """Return the scene with contacts of chosen shapes of a model; materials and grounds may differ between worlds.
 
-    ``apart``: each height field is one of its own, though another one may have the same heights.
+    Args:
+        apart: each height field is one of its own, though another one may have the same heights.
+        without: indices of shapes that stand still and are not looked at.
     """
     shapes = ModelShapes(model, worlds)
-    found = choice.resolve("from_newton", scene, shapes.first(), shapes.touches)
+    seen = [shape for shape in shapes.first() if shape.index not in without]
+    found = choice.resolve("from_newton", scene, seen, shapes.touches)
     ground: Any = found.ground
     values: dict[str, np.ndarray] = {}
     if found.soil is not None:

@@ -28,6 +28,7 @@ class ModelPairs:
 
     Attributes:
         rows: Indices of the first and of the second shape of each pair [2, world, pair].
+        still: Those of shapes that stand still, of the first world or outside of all worlds.
 
     Raises:
         TypeError, ValueError, UnsupportedError: As :meth:`PairChoice.resolve`; or the worlds have different shapes.
@@ -37,7 +38,8 @@ class ModelPairs:
         self._shapes = ModelShapes(model, worlds)
         shapes = self._shapes.first() if model.shape_count else []
         numbers = {shape.index: shape for shape in shapes}
-        pairs, left_out = PairChoice("SolverSPO", scene, shapes, self._shapes.touches, numbers).resolve(asked)
+        choice = PairChoice("SolverSPO", scene, shapes, self._shapes.touches, numbers)
+        pairs, left_out = choice.resolve(asked)
         if left_out:
             more = f" and {len(left_out) - 4} more" if len(left_out) > 4 else ""
             warnings.warn(
@@ -45,6 +47,7 @@ class ModelPairs:
                 UserWarning,
                 stacklevel=5,
             )
+        self.still = frozenset(pair.second.index for pair in pairs if not choice.moves(pair.second))
         self._contacts = [pair.contact() for pair in pairs]
         self.rows = np.array([[self._shapes.rows_of(pair[side]) for pair in pairs] for side in range(2)])
         self.rows = np.ascontiguousarray(self.rows.transpose(0, 2, 1))

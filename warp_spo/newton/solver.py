@@ -143,7 +143,8 @@ class SolverSPO(Plugs, SolverBase):
             with "pipeline", slots of each shape, of spheres and capsules four at most.
         pairs: Shapes that touch each other: a list of pairs of two names, such as ``[("cube", "*finger*")]``, each a
             pattern of the names of shapes or bodies, or the number of a shape in the first world. Two patterns stand
-            for every two shapes that they match and that the model lets collide; forces are those on the first.
+            for every two shapes that they match and that the model lets collide; forces are those on the first. A
+            table or a wall may be the other one: pairs then name all shapes that stand still, but for the ground.
             "all": every two shapes of bodies that move which the model lets collide, 32 pairs at most, with a warning
             of those that are no spheres, capsules or boxes, or are a capsule and a box. None: none.
         passes: Of a step with contacts, see :meth:`warp_spo.Dynamics.step`.

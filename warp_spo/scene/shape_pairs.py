@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import UnsupportedError, as_integer
 from .contacts import Contact, pose_matrix
-from .shapes import Shape, moving_bodies
+from .shapes import Shape
 
 if TYPE_CHECKING:
     from .scene import Scene
@@ -24,7 +24,7 @@ KINDS = ("sphere", "capsule", "box")
 
 
 class ShapePair(NamedTuple):
-    """Two shapes of two bodies; reported forces are those on the first."""
+    """Two shapes of two bodies; reported forces are those on the first, which moves."""
 
     first: Shape
     second: Shape
@@ -79,6 +79,10 @@ class PairChoice:
     allowed: Callable[[Shape, Shape], bool]
     numbers: dict[int, Shape]
 
+    def moves(self, shape: Shape) -> bool:
+        """Whether a shape moves; that of a body that is fixed to the inertial frame does not."""
+        return self._carrier(shape.body) >= 0
+
     def resolve(self, asked: Any) -> tuple[list[ShapePair], list[str]]:
         """Return the pairs that ``asked`` stands for, and in words those of "all" that no contact represents.
 
@@ -87,13 +91,11 @@ class PairChoice:
 
         Raises:
             TypeError: ``asked`` is neither.
-            ValueError: A name or number is of no shape that moves, or two names stand for no pair that may touch.
+            ValueError: A name or number is of no shape, or two names stand for no pair that may touch.
             UnsupportedError: No contact represents a listed pair, or "all" are too many.
         """
-        moving = np.append(moving_bodies(self.scene), False)  # the last entry is the inertial frame's
-        solid = [shape for shape in self.shapes if moving[shape.body]]
         if isinstance(asked, str) and asked == ALL:
-            return self._all(solid)
+            return self._all([shape for shape in self.shapes if self.moves(shape)])
         if isinstance(asked, str) or not isinstance(asked, Sequence) or not all(map(_is_pair, asked)):
             raise TypeError(
                 f"{self.call}: pairs is {asked!r}; expected 'all', or a list of pairs of names of shapes or bodies, "
@@ -101,7 +103,7 @@ class PairChoice:
             )
         found: dict[frozenset[int], ShapePair] = {}
         for names in asked:
-            for pair in self._listed(names, solid):
+            for pair in self._listed(names):
                 found.setdefault(frozenset(shape.index for shape in pair), pair)
         return list(found.values()), []
 
@@ -123,10 +125,10 @@ class PairChoice:
             )
         return found, [pair.words(self.scene.body_labels) for pair in pairs if not pair.fits]
 
-    def _listed(self, names: Sequence[Any], solid: Sequence[Shape]) -> list[ShapePair]:
+    def _listed(self, names: Sequence[Any]) -> list[ShapePair]:
         """Return the pairs that two names stand for."""
-        sides = [self._named(name, solid) for name in names]
-        both = [ShapePair(a, b) for a, b in product(*sides) if a.index != b.index]
+        sides = [self._named(name) for name in names]
+        both = [ShapePair(a, b) if self.moves(a) else ShapePair(b, a) for a, b in product(*sides) if a.index != b.index]
         pairs = [pair for pair in both if self._may_touch(*pair)]
         bodies, what = self.scene.body_labels, f"pairs={tuple(names)!r}"
         if not pairs:
@@ -139,39 +141,34 @@ class PairChoice:
                     self.call,
                     f"{what}, which is {pair.words(bodies)}",
                     "pairs are of spheres and capsules, of boxes, or of a sphere and a box: put such shapes in place "
-                    "of others, a row of spheres in place of a capsule that meets a box, or use another solver",
+                    "of others, a row of spheres in place of a capsule that meets a box, or use another solver; "
+                    "contacts='ground' is for planes and height fields",
                 )
         return pairs
 
-    def _named(self, name: Any, solid: Sequence[Shape]) -> list[Shape]:
-        """Return the shapes that move of a name or a number."""
+    def _named(self, name: Any) -> list[Shape]:
+        """Return the shapes of a name or a number."""
         number, bodies = as_integer(name), self.scene.body_labels
         if number is not None:
             found = [self.numbers[number]] if number in self.numbers else []
             known = f"a number of a collision shape in the first world: {', '.join(map(str, self.numbers)) or 'none'}"
         else:
             found = [one for one in self.shapes if one.matches(name, "" if one.body < 0 else bodies[one.body])]
+            solid = [one for one in self.shapes if self.moves(one)]
             shown = dict.fromkeys(text for one in solid for text in (one.label, bodies[one.body]) if text)
             known = f"a pattern of the names of shapes or bodies: {', '.join(map(repr, shown)) or 'none'}"
-        chosen = [one for one in found if any(one.index == other.index for other in solid)]
-        if found and not chosen:
-            raise UnsupportedError(
-                self.call,
-                f"pairs with {found[0].words(bodies)}, which stands still",
-                "leave it out of pairs: contacts='ground' and contacts='pipeline' are for shapes that stand still",
-            )
         if not found:
             raise ValueError(f"{self.call}: pairs holds {name!r}, which is no collision shape; expected {known}")
-        return chosen
+        return found
 
     def _may_touch(self, a: Shape, b: Shape) -> bool:
         """Whether two shapes can move against each other, and the source lets them collide."""
         return self._carrier(a.body) != self._carrier(b.body) and self.allowed(a, b)
 
     def _carrier(self, body: int) -> int:
-        """Return the body nearest to the root to which a body is fixed."""
+        """Return the body nearest to the root to which a body is fixed; -1: it stands still."""
         scene = self.scene
-        while scene.tree.parent[body] >= 0 and scene.hinges[scene.hinge_of[body]].dof_count == 0:
+        while body >= 0 and scene.hinges[scene.hinge_of[body]].dof_count == 0:
             body = scene.tree.parent[body]
         return body
 
