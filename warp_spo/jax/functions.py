@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -12,14 +13,19 @@ import numpy as np
 import warp as wp
 
 from ..arrays import Call
+from ..dynamics.operation import Argument
+from ..errors import as_names
+from ..execution.parameters import SHARED
 from .programs import Program
 
 if TYPE_CHECKING:
     from ..dynamics.dynamics import Dynamics
-    from ..dynamics.operation import Argument, Operation
+    from ..dynamics.operation import Operation
 
 
-def function(dyn: Dynamics, operation: str, *, capture: bool = False, **options: Any) -> Function:
+def function(
+    dyn: Dynamics, operation: str, *, capture: bool = False, values: Sequence[str] = (), **options: Any
+) -> Function:
     """Return an operation of ``dyn`` as a function of JAX arrays, which ``jit``, ``grad`` and ``vmap`` transform.
 
     ::
@@ -38,7 +44,12 @@ def function(dyn: Dynamics, operation: str, *, capture: bool = False, **options:
     ``[world, ...]``, or ``[...]`` of one world where ``vmap`` makes the batch. A batch of several times as many rows as
     ``dyn`` has worlds is computed that many rows at a time. Kernels run on XLA's device and stream, at the values of
     the scene that ``dyn`` has then.
-    Gradients are those that torch gets, of first order; ``jvp`` and ``jacfwd`` are refused by JAX.
+    Gradients are those that torch gets, of first order; ``jvp`` and ``jacfwd`` are refused by JAX. Values of the scene
+    that ``values`` names are arguments, too, with gradients: each call computes with those that it is given, and leaves
+    those of ``dyn`` as they are::
+
+        step = warp_spo.jax.function(dyn, "step", dt=2e-3, values=("body_mass",))
+        jax.grad(lambda mass: step(q, qd, tau, body_mass=mass)[0][:, 2].sum())(mass)        # [world, body]
 
     Args:
         dyn: The Dynamics. It lives as long as the process, because XLA never forgets a function.
@@ -46,28 +57,38 @@ def function(dyn: Dynamics, operation: str, *, capture: bool = False, **options:
         capture: Let XLA capture the launches of the operation (not of its gradient) in its CUDA graphs, which saves the
             way through Python. After :meth:`Dynamics.set` of a value that is not ``variable``, such graphs are out of
             date.
+        values: Names of values of the scene among ``variable`` of ``dyn``, which the function takes by name:
+            ``[world, ...]``, or ``[...]`` of one world under ``vmap``; ``ground_heights`` as :meth:`Dynamics.set` takes
+            them, for all worlds. They cost four launches more in each direction.
         options: The operation's arguments that are not arrays, such as ``dt`` and ``frames``. With ``status=True``, for
             operations that take it, the status [world], int32, follows the results.
 
     Raises:
         TypeError: ``dyn`` is no Dynamics, or the options are not those of the operation.
-        ValueError: No such operation; or float64, while JAX's ``jax_enable_x64`` is off.
+        ValueError: No such operation; float64, while JAX's ``jax_enable_x64`` is off; a value that is not variable, or
+            values with ``capture``.
     """
     if not hasattr(dyn, "_operations"):
         raise TypeError(f"warp_spo.jax.function: dyn is of type {type(dyn).__name__}; expected a Dynamics")
     known = {name: one for name, one in dyn._operations.items() if one.results and not one.product}
     if not isinstance(operation, str) or operation not in known:
         raise ValueError(f"warp_spo.jax.function: operation is {operation!r}; expected one of {', '.join(known)}")
-    return Function(dyn, known[operation], options, capture)
+    names = as_names("warp_spo.jax.function", "values", values, ("gravity",))
+    return Function(dyn, known[operation], options, capture, names)
 
 
 class Function:
     """An operation that JAX traces; :func:`function` makes it."""
 
-    def __init__(self, dyn: Dynamics, operation: Operation, options: dict[str, Any], capture: bool):
+    def __init__(
+        self, dyn: Dynamics, operation: Operation, options: dict[str, Any], capture: bool, values: tuple[str, ...]
+    ):
         self.name = f"warp_spo.jax.function({operation.name!r})"
-        self.dyn, self.operation, self.options, self.capture = dyn, operation, dict(options), capture
+        self.dyn, self.operation, self.options = dyn, operation, dict(options)
+        self.capture, self.values = capture, values
+        self._check_values()
         self.arguments = {one.name: one for one in operation.arrays if not one.written}
+        self.arguments |= {name: Argument(name, "world, ...") for name in values}
         self._programs: dict[tuple, Program] = {}
         self.status = self._takes_status()
         self._check_options()
@@ -81,6 +102,7 @@ class Function:
         given = {name: self._as_array(name, array) for name, array in self._bind(arrays, more).items()}
         first = next(iter(given))
         alone = given[first].ndim == len(self._shape(self.arguments[first])) - 1
+        given = {name: array[None] if self._is_shared(name, alone) else array for name, array in given.items()}
         for name, array in given.items():
             self._check_shape(name, array, alone)
         if alone:
@@ -100,7 +122,8 @@ class Function:
         options = dict(self.options)
         derivative = self.operation.derivative
         times = 1 if derivative is None else derivative.repeats(self.name, options)
-        return (1, self) if times == 1 else (times, Function(self.dyn, self.operation, options, self.capture))
+        once = self if times == 1 else Function(self.dyn, self.operation, options, self.capture, self.values)
+        return times, once
 
     def _has_columns(self, name: str, array: Any) -> bool:
         """Whether an argument [row, ...] has an axis of right-hand sides."""
@@ -137,6 +160,30 @@ class Function:
             if one.read is not None and one.name in self.options:
                 one.read(self.dyn.scene, call, self.options[one.name])
 
+    def _check_values(self) -> None:
+        for name in self.values:
+            if name not in self.dyn.variable:
+                known = ", ".join(self.dyn.variable) or "none"
+                raise ValueError(
+                    f"{self.name}: values names {name!r}; expected values that are variable: {known}; build Dynamics "
+                    f"with variable=({name!r},)"
+                )
+        if self.values and self.capture:
+            raise ValueError(
+                f"{self.name}: values with capture=True; expected one of the two, because a call sets them"
+            )
+
+    def _is_shared(self, name: str, alone: bool) -> bool:
+        """Whether all worlds share an argument, which then has no world axis."""
+        if name not in self.values or name not in SHARED:
+            return False
+        if alone:
+            raise ValueError(
+                f"{self.name}: {name} is given with arrays of one world; expected arrays [world, ...], because all "
+                f"worlds share it"
+            )
+        return True
+
     def _check_precision(self) -> None:
         settings: Any = jax.config
         if self.dyn.dtype is wp.float64 and not settings.jax_enable_x64:
@@ -149,9 +196,9 @@ class Function:
     def _bind(self, arrays: tuple, more: dict[str, Any]) -> dict[str, Any]:
         """Return the arrays that were given by name."""
         named = (*zip(self.arguments, arrays, strict=False), *more.items())
-        needed = inspect.signature(self.operation.function).parameters
         found = {name: array for name, array in named if array is not None}
-        lacking = [n for n in self.arguments if needed[n].default is inspect.Parameter.empty and n not in dict(named)]
+        given = {name for name, array in named if array is not None or name not in self.values}
+        lacking = [name for name in self.arguments if self.is_needed(name) and name not in given]
         written = [
             name for name in ("out", *(one.name for one in self.operation.arrays if one.written)) if name in more
         ]
@@ -166,6 +213,11 @@ class Function:
                 f"{', '.join(self.arguments)}, each once at most{f'; {lacking[0]} is missing' if lacking else ''}"
             )
         return {name: found[name] for name in self.arguments if name in found}
+
+    def is_needed(self, name: str) -> bool:
+        """Whether each call takes an argument."""
+        parameters = inspect.signature(self.operation.function).parameters
+        return name in self.values or parameters[name].default is inspect.Parameter.empty
 
     def _as_array(self, name: str, array: Any) -> Any:
         """Return an argument as a JAX array; NumPy arrays are cast."""
@@ -182,7 +234,10 @@ class Function:
         return array
 
     def _shape(self, argument: Argument) -> tuple[int, ...]:
-        """Return the shape of an argument, [world, ...]."""
+        """Return the shape of an argument, [world, ...]; the axis of a value that all worlds share has one entry."""
+        if argument.name in self.values:
+            shape = self.dyn.scene.values[argument.name].shape[1:]
+            return (1 if argument.name in SHARED else self.dyn.worlds, *shape)
         return self.dyn._engine.shape(argument.axes, len(self.options.get("frames", ())))[0]
 
     def _check_shape(self, name: str, array: Any, alone: bool) -> None:

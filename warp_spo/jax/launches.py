@@ -28,7 +28,8 @@ def traceable(
     """Return ``run(inputs, outputs)``, which fills its outputs by launches, as a function of JAX arrays [row, ...].
 
     Rows are worlds, or several times as many: ``vmap`` puts its axis before the others, and Warp's arrays have all
-    leading axes in one. XLA never forgets a function, so that ``run`` lives as long as the process.
+    leading axes in one. A value that all worlds share has one row for as many rows of the others as there are worlds.
+    XLA never forgets a function, so that ``run`` lives as long as the process.
 
     Args:
         name: for errors of XLA.
@@ -50,9 +51,8 @@ def traceable(
     foreign = wp.jax_callable(call, num_outputs=len(outputs), graph_mode=mode, **options)
 
     def traced(*arrays: jax.Array) -> tuple[jax.Array, ...]:
-        rows = arrays[0].shape[0]
-        return tuple(
-            foreign(*arrays, output_dims={f"out_{i}": (rows, *one.shape[1:]) for i, one in enumerate(outputs)})
-        )
+        rows, worlds = arrays[0].shape[0], inputs[0].shape[0]
+        sizes = {f"out_{i}": (rows * one.shape[0] // worlds, *one.shape[1:]) for i, one in enumerate(outputs)}
+        return tuple(foreign(*arrays, output_dims=sizes))
 
     return jax.jit(traced)  # without it, every call would compile

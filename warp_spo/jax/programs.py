@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-import inspect
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from ..dynamics.operation import derivative_of
 from ..dynamics.preparation import stand_in
+from ..execution.parameters import SHARED
 from .launches import forms_of, traceable
 
 if TYPE_CHECKING:
@@ -37,8 +38,7 @@ class Program:
     def __init__(self, function: Function, columns: dict[str, int | None], alone: bool):
         self.function, self.dyn, self.operation = function, function.dyn, function.operation
         self.options, self.columns, self.alone = function.options, columns, alone
-        parameters = inspect.signature(self.operation.function).parameters
-        needed = (name for name in function.arguments if parameters[name].default is inspect.Parameter.empty)
+        needed = filter(function.is_needed, function.arguments)
         self._absent: dict[str, Any] = {name: None for name in needed if name not in columns}
         self._once: Program | None = None  # one of several repetitions
         self._status = ("status",) if function.status else ()
@@ -60,10 +60,26 @@ class Program:
     def _samples(self) -> dict[str, wp.array]:
         """Return arguments to compile with, [world, ...]."""
         arguments, frames = self.function.arguments, self.options.get("frames", ())
-        return {name: stand_in(self.dyn, arguments[name], frames, count) for name, count in self.columns.items()}
+        values, T = self.function.values, self.dyn.dtype
+        given = {name: count for name, count in self.columns.items() if name not in values}
+        found = {name: stand_in(self.dyn, arguments[name], frames, count) for name, count in given.items()}
+        own = {name: self.dyn.recursions.parameters.value(name).numpy() for name in values}
+        return found | {name: wp.array(own[name], dtype=T, device=self.dyn.device) for name in values}
 
     def _compute(self, given: dict[str, wp.array], **more: Any) -> Any:
-        return self.operation.entry(self.dyn, **self._absent, **given, **self.options, **more)
+        with self._at_values(given) as arrays:
+            return self.operation.entry(self.dyn, **self._absent, **arrays, **self.options, **more)
+
+    @contextlib.contextmanager
+    def _at_values(self, given: dict[str, wp.array]) -> Iterator[dict[str, wp.array]]:
+        """Return the arguments of the operation, and set the values of the scene among those given in the block."""
+        names = self.function.values
+        if not names:
+            yield given
+            return
+        values = {name: given[name][0] if name in SHARED else given[name] for name in names}
+        with self.dyn.recursions.turn.lock, self.dyn._gradients.at_values(values):
+            yield {name: array for name, array in given.items() if name not in names}
 
     def _written(self, names: tuple[str, ...]) -> dict[str, wp.array]:
         """Return arrays for arguments that the operation writes."""
@@ -84,7 +100,7 @@ class Program:
         given, results, written = self._computed(keep)
 
         def run(inputs: Arrays, outputs: Arrays) -> None:
-            for part in self._parts(outputs[0].shape[0]):
+            for part in self._parts(inputs[0].shape[0]):
                 found = [part(array) for array in outputs]
                 out = found[0] if self.count == 1 else tuple(found[: self.count])
                 more = dict(zip(written, found[self.count :], strict=True))
@@ -95,14 +111,17 @@ class Program:
         return self._first_order(traceable(name, run, read, forms, self.function.capture))
 
     def _parts(self, rows: int) -> Iterator[Callable[[wp.array], wp.array]]:
-        """Return functions that take as many rows of an array as there are worlds, part after part."""
+        """Return functions that take as many rows of an array as there are worlds, part after part.
+
+        Of a value that all worlds share they take one.
+        """
         self.function.check_rows(rows, self.alone)
         worlds = self.dyn.worlds
         if rows == worlds:
             yield lambda array: array
             return
-        for first in range(0, rows, worlds):
-            yield functools.partial(_rows, first, first + worlds)
+        for number in range(rows // worlds):
+            yield functools.partial(_part, number, rows // worlds)
 
     def _as_results(self, found: Arrays) -> Any:
         """Return arrays as the operation returns them: one array, a tuple, or a named tuple; with status, a tuple."""
@@ -161,7 +180,8 @@ class Program:
                 f"{self.function.name}, backwards: {refused}; if no gradient should pass, put jax.lax.stop_gradient "
                 f"around the result"
             )
-        by = derivative_of(self.operation).by
+        derivative = derivative_of(self.operation)
+        by = *derivative.by, *(name for name in self.function.values if name in derivative.values)
         lacking = [name for name in wanted if name not in by]
         if lacking:
             raise ValueError(
@@ -211,11 +231,12 @@ class Program:
             computed, cotangents = list(arrays[sizes[0] : sum(sizes)]), arrays[sum(sizes) :]
             del computed[self.count : self.count + len(self._status)]
             gradients = self.dyn._gradients
-            found = gradients.pull_back(self.operation, known, self.options, computed, cotangents, wanted)
-            return [found[name] for name in wanted]
+            with self._at_values(known) as mine:
+                found = gradients.pull_back(self.operation, mine, self.options, computed, cotangents, wanted)
+            return [found[name].reshape((1, *found[name].shape)) if name in SHARED else found[name] for name in wanted]
 
         def run(inputs: Arrays, outputs: Arrays) -> None:
-            for part in self._parts(outputs[0].shape[0]):
+            for part in self._parts(inputs[0].shape[0]):
                 for out, found in zip(outputs, pull(tuple(map(part, inputs))), strict=True):
                     wp.copy(part(out), found)
 
@@ -224,6 +245,7 @@ class Program:
         return self._first_order(traceable(name, run, forms_of(read), forms_of(pull(read)), False))
 
 
-def _rows(first: int, end: int, array: wp.array) -> wp.array:
-    """Return rows of an array, which share its memory."""
-    return array[first:end]
+def _part(number: int, count: int, array: wp.array) -> wp.array:
+    """Return one of ``count`` parts of the rows of an array, which shares its memory."""
+    rows = array.shape[0] // count
+    return array[number * rows : (number + 1) * rows]
