@@ -5,6 +5,7 @@ import contact_gradients
 import numpy as np
 import pytest
 import symbolic
+import warp as wp
 import warp_machine
 from contact_cases import quadruped, touching, waisted
 from test_contact_step import steps
@@ -12,6 +13,8 @@ from test_step_teams import driven
 
 import warp_spo as spo
 from warp_spo.dynamics import contact_gradients as kernels
+from warp_spo.dynamics.operation import derivative_of
+from warp_spo.dynamics.steps import STEP
 from warp_spo.recursions.contact.middle import MIDDLE
 from warp_spo.recursions.derivatives.contact import INERTIA, PassGradient, PassSolve, divides
 from warp_spo.recursions.derivatives.contact_pass import weighed_pieces
@@ -88,6 +91,29 @@ def test_limbs_share_gradients_on_stairs(monkeypatch):
         quadruped(ground=steps()),
         (*WRT, "ground_heights", "contact_stiffness", "ground_origin", "joint_target_ke"),
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("passes", [3, 4])
+def test_limbs_of_a_gpu_and_a_thread_of_a_cpu_agree(passes, device):
+    if device.is_cpu:
+        pytest.skip("limbs have GPU threads of their own")
+    scene, worlds, found = waisted(), 64, []
+    a = dict(zip(("q", "qd", "tau"), touching(scene, 3, worlds), strict=True)) | {"dt": H, "passes": passes}
+    rng = np.random.default_rng(0)
+    a |= {f"{name}_cotangent": rng.normal(size=a[name].shape) for name in ("q", "qd")}
+    for on, count in (("cpu", worlds), (device, worlds), (device, 33)):
+        dyn = spo.Dynamics(scene, count, on, "float64", variable=("contact_friction",))
+        given = {n: wp.array(x[:count], dtype=wp.float64, device=on) if np.ndim(x) else x for n, x in a.items()}
+        given["qdd"] = wp.zeros_like(given["qd"])
+        dyn.step(given["q"], given["qd"], given["tau"], H, qdd=given["qdd"], passes=passes)
+        outs = [wp.full(dyn._gradients.shape_of(STEP, n), np.nan, dtype=wp.float64, device=on) for n in WRT]
+        dyn._gradients.launch(derivative_of(STEP), WRT, outs, given)
+        found.append([out.numpy() for out in outs])
+    assert dyn.programs.warps(kernels.WEIGHED[kernels.GRADIENT] if passes == 4 else kernels.GRADIENT) > 1
+    for name, wanted, mine, few in zip(WRT, *found, strict=True):
+        np.testing.assert_allclose(mine, wanted, atol=1e-11 * abs(wanted).max(), err_msg=name)
+        assert (few == mine[:33]).all(), name
 
 
 def test_which_gradients_limbs_share():

@@ -314,7 +314,7 @@ def test_torch_differentiates_heights(count, device):
         nudge = torch.zeros_like(given)
         nudge[at] = 1e-7
         wanted = (end(given.detach() + nudge) - end(given.detach() - nudge)) / 2e-7
-        assert abs(mine[at] - wanted) <= 1e-5 * abs(mine).max()  # 1e-8 measured
+        assert abs(mine[at] - wanted) <= 1e-6 * abs(mine).max()  # 1e-8 measured
 
 
 def test_all_worlds_share_heights(device):
