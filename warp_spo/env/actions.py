@@ -9,6 +9,7 @@ import numpy as np
 
 from ..hinges.functions import clip
 from ..scene.scene import Scene
+from .checks import check_optional_span
 from .vectors import Vector, find
 from .world import World
 
@@ -30,6 +31,9 @@ class Control:
     offset: Any = 0.0
     clip: tuple[float, float] | None = None
     array = "ctrl"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "clip", check_optional_span(f"actions.{type(self).__name__}", "clip", self.clip))
 
     def labels(self, scene: Scene) -> list[str]:
         """Return the names of the actions."""
@@ -83,6 +87,9 @@ class Position:
     offset: Any = "default"
     clip: tuple[float, float] | None = None
     array = "target_q"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "clip", check_optional_span(f"actions.{type(self).__name__}", "clip", self.clip))
 
     def hinges(self, scene: Scene) -> list[int]:
         """Return the hinge of each action."""
@@ -140,10 +147,15 @@ def spread(call: str, name: str, value: Any, labels: list[str]) -> np.ndarray:
         if np.isnan(out).any():
             left = [label for label, number in zip(labels, out, strict=True) if np.isnan(number)]
             raise ValueError(f"actions.{call}: {name} has no number for {', '.join(left)}; add an expression for them")
-        return out
-    out = np.asarray(value, dtype=np.float64)
+    else:
+        try:
+            out = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(f"actions.{call}: {name} is {value!r}; expected one number or {len(labels)}") from None
     if out.shape not in ((), (len(labels),)):
         raise ValueError(f"actions.{call}: {name} has shape {out.shape}; expected one number or {len(labels)}")
+    if not np.isfinite(out).all():
+        raise ValueError(f"actions.{call}: {name} is {value!r}; expected finite numbers")
     return np.broadcast_to(out, (len(labels),))
 
 

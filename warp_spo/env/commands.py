@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from ..hinges.functions import Condition, clip, where
+from .checks import Range, check_interval, check_number, check_optional_span, check_span
 from .vectors import Vector, vector
 from .world import World
-
-Range = tuple[float, float]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -27,6 +26,10 @@ class Level:
     share: float = 0.8
     first: float = 0.3
     step: float = 0.05
+
+    def __post_init__(self) -> None:
+        for name in ("share", "first", "step"):
+            check_number("commands.Level", name, getattr(self, name), 0.0)
 
     def update(self, w: World, done: Condition | None) -> Any:
         """Return the level, after an episode if ``done``."""
@@ -71,6 +74,15 @@ class Velocity:
     seconds: Range = (10.0, 10.0)
     level: Level | None = None
 
+    def __post_init__(self) -> None:
+        call = "commands.Velocity"
+        for name in ("forward", "left", "turn"):
+            check_span(call, name, getattr(self, name))
+        check_optional_span(call, "heading", self.heading)
+        for name in ("gain", "standing", "still"):
+            check_number(call, name, getattr(self, name), 0.0)
+        check_interval(call, self.seconds)
+
     @property
     def size(self) -> int:
         """How many numbers a command has."""
@@ -114,6 +126,11 @@ class Uniform:
 
     ranges: tuple[Range, ...]
     seconds: Range = (4.0, 4.0)
+
+    def __post_init__(self) -> None:
+        for i, each in enumerate(self.ranges):
+            check_span("commands.Uniform", f"ranges[{i}]", each)
+        check_interval("commands.Uniform", self.seconds)
 
     @property
     def size(self) -> int:

@@ -12,12 +12,12 @@ import warp as wp
 
 from ..arrays import parse_device
 from ..dynamics.dynamics import Dynamics
-from ..errors import as_integer
 from ..launches import compile_side_by_side
 from ..recursions.contact.ground import GROUND
 from ..scene.contacts import HeightField
 from ..scene.scene import Scene
 from ..torch import stream
+from .checks import check_function, check_mapping, check_number, check_whole
 from .events import Delays, Values, changed_values
 from .graphs import Part, Replay
 from .layout import Layout
@@ -25,7 +25,7 @@ from .logs import Log, explain
 from .observations import Observation, TorchTerm
 from .stage import Launch
 from .storage import Storage
-from .tracing import Tracing
+from .tracing import NOT_FINITE, Tracing
 
 try:
     from rsl_rl.env import VecEnv
@@ -103,47 +103,45 @@ class Env(VecEnv):
         final_observations: bool = False,
         cfg: Any = None,
     ):
+        if not isinstance(scene, Scene):
+            raise TypeError(f"Env: scene is {type(scene).__name__}; expected spo.Scene")
         self.scene, self.num_envs = scene, worlds
         self.warp_device = parse_device(str(device) if device is not None else None, "Env")
         self.device = torch.device(wp.device_to_torch(self.warp_device))
-        steps = as_integer(decimation)
-        if steps is None or steps < 1:
-            raise ValueError(f"Env: decimation is {decimation!r}; expected an integer, 1 or more")
-        if not (0.0 < dt < np.inf and 0.0 < episode_length_s < np.inf):
-            raise ValueError(
-                f"Env: dt is {dt!r} s and episode_length_s {episode_length_s!r} s; expected more than zero"
-            )
+        steps = check_whole("Env", "decimation", decimation, 1)
+        for name, value in (("dt", dt), ("episode_length_s", episode_length_s)):
+            if check_number("Env", name, value) <= 0.0:
+                raise ValueError(f"Env: {name} is {value!r} s; expected more than zero")
         self.dt, self.decimation, self.step_dt = float(dt), steps, float(dt) * steps
         self.max_episode_length = max(1, round(episode_length_s / self.step_dt))
-        self.seed, self.first_world, self.cfg = int(seed), int(first_world), {} if cfg is None else cfg
-        self._passes, self.log_interval, self.has_commands = passes, log_interval, commands is not None
+        self.first_world = check_whole("Env", "first_world", first_world, 0, 2**32 - 1)
+        self.seed, self.cfg = check_whole("Env", "seed", seed, 0, 2**64 - 1), {} if cfg is None else cfg
+        self._passes, self.has_commands = passes, commands is not None
+        self.log_interval = check_whole("Env", "log_interval", log_interval, 1)
         self._steps = 0
 
         default = np.asarray(scene.neutral_q if default_q is None else default_q, dtype=np.float64)
         if default.shape != (scene.coord_count,):
             raise ValueError(f"Env: default_q has shape {default.shape}; expected ({scene.coord_count},) [coordinate]")
+        if not np.isfinite(default).all():
+            raise ValueError(f"Env: default_q is {default.tolist()}; expected finite numbers")
+        groups, rewards, terminations = _checked_terms(observations, rewards, terminations or {}, events)
         layout = self._layout = Layout(scene, default, self.step_dt, commands, changed_values(scene, events))
         parts = list(actions) if isinstance(actions, list | tuple) else [actions]
+        for part in parts:
+            if not hasattr(part, "labels"):
+                raise TypeError(f"Env: actions holds {part!r}; expected those of warp_spo.env.actions")
         self.action_labels = [label for part in parts for label in part.labels(scene)]
         self.num_actions = layout.action_count = len(self.action_labels)
         layout.action_arrays = {part.array for part in parts}
-        for name, reward in rewards.items():
-            if not isinstance(reward, tuple | list) or len(reward) != 2 or not callable(reward[1]):
-                raise TypeError(f"Env: rewards[{name!r}] is {reward!r}; expected (weight, term)")
-        if not observations or not all(observations.values()):
-            raise ValueError(f"Env: observations is {observations!r}; expected a list of terms for each group")
-        groups = {
-            name: [term if isinstance(term, Observation) else Observation(term) for term in terms]
-            for name, terms in observations.items()
-        }
-        tracing = Tracing(layout, parts, groups, dict(rewards), dict(terminations or {}), commands, list(events))
+        tracing = Tracing(layout, parts, groups, rewards, terminations, commands, list(events))
         tracing.run(self.max_episode_length, final_observations)
         self.final = final_observations
         self.reward_names, self.termination_names = list(rewards), tracing.ends
         self.num_obs = tracing.group_sizes
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=layout.values, granularity=granularity)
         finals = [(f"final {name}", size) for name, size in self.num_obs.items()] if self.final else []
-        results = [("reward", 1), ("done", 1), ("time_out", 1), *self.num_obs.items(), *finals]
+        results = [*((name, 1) for name in RESULTS), *self.num_obs.items(), *finals]
         tables = {}  # of the ground, the same memory that the dynamics read
         if isinstance(scene.ground, HeightField):
             tables[GROUND] = wp.to_torch(self.dyn.recursions.parameters.ground_cells)
@@ -171,7 +169,7 @@ class Env(VecEnv):
     # -- numbers that may be written --------------------------------------------------------------------------------
     def set_seed(self, seed: int) -> None:
         """Set the seed of all later random numbers, 64 bits; the steps of the worlds count from zero again."""
-        self.seed = int(seed)
+        self.seed = check_whole("Env.set_seed", "seed", seed, 0, 2**64 - 1)
         words = [self.seed & 0xFFFFFFFF, self.seed >> 32 & 0xFFFFFFFF, self.first_world]
         self._tensors["key"].copy_(torch.tensor(np.array(words, dtype=np.uint32).view(np.int32)))
         self._tensors["tick"].zero_()
@@ -183,6 +181,11 @@ class Env(VecEnv):
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
+        value = torch.as_tensor(value)
+        if value.shape not in ((), (self.num_envs,)):
+            raise ValueError(
+                f"Env.episode_length_buf: got shape {tuple(value.shape)}; expected ({self.num_envs},) [world]"
+            )
         self._tensors["episode_length"].copy_(value)
 
     @property
@@ -223,6 +226,7 @@ class Env(VecEnv):
                     f"Env.reset: mask is {mask.dtype} {tuple(mask.shape)}; expected bool ({self.num_envs},) [world]"
                 )
             self.chosen.copy_(mask)
+        before = self._store.out.clone()
         self._launch("reset")
         self._after_reset()
         for part in self._user_parts("observe"):
@@ -230,6 +234,10 @@ class Env(VecEnv):
         self._tensors["advance"].fill_(0.0)
         self._launch("observe")
         self._tensors["advance"].fill_(1.0)
+        if mask is not None:
+            for name in self.num_obs:  # others have seen nothing new
+                new, old = (self._store.part(out, name) for out in (self._store.out, before))
+                new.copy_(torch.where(mask[:, None], new, old))
         return self.get_observations(), {}
 
     def step(self, actions: torch.Tensor) -> tuple[Any, torch.Tensor, torch.Tensor, dict]:
@@ -243,13 +251,7 @@ class Env(VecEnv):
             Observations by group; rewards [world]; whether the episode ended, int [world]; a dictionary with
             ``time_outs`` [world], 1 where it ended for its length alone, and now and then ``log``.
         """
-        actions = torch.as_tensor(actions)
-        if tuple(actions.shape) != (self.num_envs, self.num_actions):
-            raise ValueError(
-                f"Env.step: actions has shape {tuple(actions.shape)}; expected ({self.num_envs}, {self.num_actions}) "
-                f"[world, action]: {', '.join(self.action_labels)}"
-            )
-        self.actions.copy_(actions)
+        self._read_actions("Env.step", actions)
         self.replay()
         self._steps += 1
         out = self._store.out.clone()
@@ -263,7 +265,7 @@ class Env(VecEnv):
 
     def controls(self, actions: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return what actions set, "ctrl", "target_q" or "tau" [world, ...]; worlds remember them as their actions."""
-        self.actions.copy_(actions)
+        self._read_actions("Env.controls", actions)
         self._launch("act")
         return {name: controls.clone() for name, controls in self._controls.items()}
 
@@ -287,6 +289,19 @@ class Env(VecEnv):
         """Do nothing: memory is freed with the object."""
 
     # -- inside ----------------------------------------------------------------------------------------------------
+    def _read_actions(self, call: str, actions: Any) -> None:
+        try:
+            given = torch.as_tensor(actions)
+        except (TypeError, ValueError, RuntimeError):
+            raise TypeError(f"{call}: actions is {type(actions).__name__}; expected a tensor or an array") from None
+        if tuple(given.shape) != (self.num_envs, self.num_actions) or given.is_complex():
+            kind = "complex numbers of " if given.is_complex() else ""
+            raise ValueError(
+                f"{call}: actions has {kind}shape {tuple(given.shape)}; expected ({self.num_envs}, {self.num_actions}) "
+                f"[world, action]: {', '.join(self.action_labels)}"
+            )
+        self.actions.copy_(given)
+
     def _observations(self, out: torch.Tensor, kind: str = "") -> Any:
         groups = {name: self._store.part(out, kind + name) for name in self.num_obs}
         return groups if TensorDict is None else TensorDict(groups, batch_size=[self.num_envs], device=self.device)
@@ -388,8 +403,41 @@ class Env(VecEnv):
 
     def _fill_in(self, term: TorchTerm, start: int) -> None:
         found = term.function(self)
-        if not isinstance(found, torch.Tensor) or found.numel() != self.num_envs * term.size:
+        expected = (self.num_envs,) if term.size == 1 else (self.num_envs, term.size)
+        if not isinstance(found, torch.Tensor) or tuple(found.shape) not in (expected, (self.num_envs, term.size)):
             came = tuple(found.shape) if isinstance(found, torch.Tensor) else type(found).__name__
-            expected = (self.num_envs,) if term.size == 1 else (self.num_envs, term.size)
             raise ValueError(f"Env: the term {term.name} returned {came}; expected a tensor {expected}")
         self._tensors["user"][:, start : start + term.size].copy_(found.reshape(self.num_envs, term.size))
+
+
+RESULTS = ("reward", "done", "time_out")
+
+
+def _checked_terms(
+    observations: Any, rewards: Any, terminations: Any, events: Any
+) -> tuple[dict[str, list[Observation]], dict[str, tuple[float, Any]], dict[str, Any]]:
+    """Return observations, rewards and terminations by name; ValueError and TypeError as :class:`Env` says."""
+    groups = check_mapping("Env", "observations", observations, "lists of terms")
+    if not groups:
+        raise ValueError("Env: observations is {}; expected a list of terms for each group")
+    for name, terms in groups.items():
+        if not isinstance(terms, list | tuple) or not terms:
+            raise TypeError(f"Env: observations[{name!r}] is {terms!r}; expected a list of terms for each group")
+        if name in RESULTS or name.startswith("final "):
+            raise ValueError(
+                f"Env: observations has a group {name!r}, which names another result; expected another name"
+            )
+        groups[name] = [term if isinstance(term, Observation) else Observation(term) for term in terms]
+    rewards = check_mapping("Env", "rewards", rewards, "pairs (weight, term)")
+    for name, reward in rewards.items():
+        if not isinstance(reward, tuple | list) or len(reward) != 2 or not callable(reward[1]):
+            raise TypeError(f"Env: rewards[{name!r}] is {reward!r}; expected (weight, term)")
+        check_number("Env", f"the weight of rewards[{name!r}]", reward[0])
+    terminations = check_mapping("Env", "terminations", terminations, "terms")
+    for name, term in terminations.items():
+        check_function("Env", f"terminations[{name!r}]", term)
+        if name == NOT_FINITE:
+            raise ValueError(f"Env: terminations has {name!r}, which every environment has; expected another name")
+    if not isinstance(events, list | tuple):
+        raise TypeError(f"Env: events is {events!r}; expected a list of those of warp_spo.env.events")
+    return groups, rewards, terminations

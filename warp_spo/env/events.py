@@ -11,10 +11,9 @@ import numpy as np
 from ..hinges.functions import where
 from ..scene.terrain import Tiles
 from .actions import actuator_labels
+from .checks import Range, check_interval, check_number, check_span, check_steps
 from .vectors import cross, find, vector
 from .world import World
-
-Range = tuple[float, float]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -43,6 +42,9 @@ class Interval:
     change: Callable[[World], None]
     seconds: Range = (1.0, 3.0)
 
+    def __post_init__(self) -> None:
+        check_interval("events.Interval", self.seconds)
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Values:
@@ -63,6 +65,8 @@ class Values:
     def __post_init__(self) -> None:
         if isinstance(self.when, str) and self.when not in ("start", "reset"):
             raise ValueError(f"events.Values: when is {self.when!r}; expected 'start', 'reset' or a range of seconds")
+        if not isinstance(self.when, str):
+            check_interval("events.Values: when", self.when)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -89,6 +93,8 @@ def joints(position: Range = (0.0, 0.0), velocity: Range = (0.0, 0.0), names: An
     Args:
         position: [rad or m]. velocity: [rad/s or m/s]. names: regular expressions of joints; None: all.
     """
+    position = check_span("events.joints", "position", position)
+    velocity = check_span("events.joints", "velocity", velocity)
 
     def change(w: World) -> None:
         for hinge in w.joints(names):
@@ -116,24 +122,28 @@ def base(
         x, y, z: [m], inertial axes. yaw, roll, pitch: [rad]. velocity: of each axis [m/s]. angular_velocity: of each
             axis [rad/s].
     """
+    for name, each in (("x", x), ("y", y), ("z", z), ("yaw", yaw), ("roll", roll), ("pitch", pitch)):
+        check_span("events.base", name, each)
+    check_span("events.base", "velocity", velocity)
+    check_span("events.base", "angular_velocity", angular_velocity)
 
     def change(w: World) -> None:
         start, rate = int(w.scene.q_start[w.base]), int(w.scene.qd_start[w.base])
-        for i, span in enumerate((x, y, z)):
-            if span != (0.0, 0.0):
-                w.q[start + i] += w.uniform(*span)
+        for i, places in enumerate((x, y, z)):
+            if tuple(places) != (0.0, 0.0):
+                w.q[start + i] += w.uniform(*places)
         quaternion = w.q[start + 3 : start + 7]
-        for axis, span in ((0, roll), (1, pitch), (2, yaw)):
-            if span != (0.0, 0.0):
-                half = 0.5 * w.uniform(*span)
+        for axis, angles in ((0, roll), (1, pitch), (2, yaw)):
+            if tuple(angles) != (0.0, 0.0):
+                half = 0.5 * w.uniform(*angles)
                 turn = [0.0, 0.0, 0.0, np.cos(half)]
                 turn[axis] = np.sin(half)
                 quaternion = multiply(turn, quaternion)
         w.q[start + 3 : start + 7] = quaternion
-        for first, span in ((rate, velocity), (rate + 3, angular_velocity)):
-            if span != (0.0, 0.0):
+        for first, rates in ((rate, velocity), (rate + 3, angular_velocity)):
+            if tuple(rates) != (0.0, 0.0):
                 for i in range(3):
-                    w.qd[first + i] += w.uniform(*span)
+                    w.qd[first + i] += w.uniform(*rates)
 
     return Reset(change)
 
@@ -191,6 +201,8 @@ def push(
         velocity: largest change along x and along y [m/s]. vertical: along z [m/s]. angular_velocity: about each axis
             [rad/s]. seconds: range of the time between pushes.
     """
+    for name, most in (("velocity", velocity), ("vertical", vertical), ("angular_velocity", angular_velocity)):
+        check_number("events.push", name, most, 0.0)
 
     def change(w: World) -> None:
         rate = int(w.scene.qd_start[w.base])
@@ -224,6 +236,10 @@ def randomise(
     if how not in ("scale", "add", "set"):
         raise ValueError(f"events.randomise: how is {how!r}; expected 'scale', 'add' or 'set'")
     spans: list[Any] = list(span) if np.ndim(span) == 2 else [span]
+    for each in spans:
+        check_span("events.randomise", f"span of {name}", each)
+    if not isinstance(alike, bool):
+        raise ValueError(f"events.randomise: alike is {alike!r}; expected True or False")
     combine = {"scale": lambda x, d: x * d, "add": lambda x, d: x + d, "set": lambda x, d: d}[how]
 
     def change(w: World) -> None:
@@ -262,6 +278,8 @@ def pseudo_inertia(
         size: largest a. stretch: largest d. shear: largest entry of s. shift: largest entry of t [m].
         when: see :class:`Values`.
     """
+    for name, most in (("size", size), ("stretch", stretch), ("shear", shear), ("shift", shift)):
+        check_number("events.pseudo_inertia", name, most, 0.0)
     changed = ("body_mass", "body_com", "body_inertia")
 
     def change(w: World) -> None:
@@ -298,6 +316,8 @@ def servo_gains(
         stiffness: of the factor of kp. damping: of that of kv. names: regular expressions of actuators; None: all.
         when: see :class:`Values`.
     """
+    for name, factors in (("stiffness", stiffness), ("damping", damping)):
+        check_span("events.servo_gains", name, factors)
 
     def change(w: World) -> None:
         gain, bias = w.values["actuator_gain"], w.values["actuator_bias"]
@@ -311,6 +331,7 @@ def servo_gains(
 
 def delays(steps: tuple[int, int], when: str | Range = "start", names: Any = None, alike: bool = True) -> Values:
     """Return an event that draws the delay of actuators anew, in steps of the dynamics, both ends included."""
+    check_steps("events.delays", "steps", steps)
 
     def change(w: World) -> None:
         for i, entry in enumerate(entries_of(w.scene, "actuator_delay", names)):
@@ -330,6 +351,7 @@ class Delays(Values):
 
 def encoder_bias(size: float = 0.015, names: Any = None) -> EncoderBias:
     """Return an event that draws once what joints' encoders read beyond the truth, up to ``size`` [rad or m]."""
+    check_number("events.encoder_bias", "size", size, 0.0)
 
     def change(w: World) -> None:
         w.keep("encoder bias", [w.uniform(-size, size) for _ in w.joints(names)])
@@ -372,6 +394,8 @@ def changed_values(scene: Any, events: Sequence[Any]) -> tuple[str, ...]:
     for name in names:
         if name not in scene.values:
             raise ValueError(f"Env: an event changes {name!r}; expected one of {', '.join(scene.values)}")
+        if not scene.values[name][0].size:
+            raise ValueError(f"Env: an event changes {name}, of which the scene has none; leave the event out")
         if scene.values[name].shape[0] > 1:
             raise ValueError(f"Env: an event changes {name}, which differs between worlds of the scene already")
     return tuple(names)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..hinges.functions import clip, where
+from .checks import check_function, check_number, check_optional_span, check_steps, check_whole
 from .stage import ROW_NUMBER
 from .vectors import Vector, rotate, rotate_back, vector
 from .world import World
@@ -65,6 +66,16 @@ class Observation:
     delay: int | tuple[int, int] = 0
     history: int = 1
 
+    def __post_init__(self) -> None:
+        call = "Observation"
+        check_function(call, "term", self.term)
+        check_number(call, "scale", self.scale)
+        for name in ("noise", "bias"):
+            check_number(call, name, getattr(self, name), 0.0)
+        check_optional_span(call, "clip", self.clip)
+        check_steps(call, "delay", self.delay)
+        check_whole(call, "history", self.history, 1)
+
     def trace(self, w: World) -> Vector:
         """Return the numbers."""
         values = vector(np.atleast_1d(np.asarray(self.term(w), dtype=object)).ravel())
@@ -73,7 +84,7 @@ class Observation:
                 f"bias {w.number(self)}", len(values), lambda s: [s.uniform(-self.bias, self.bias) for _ in values]
             )
         values = vector(self._measured(w, x) for x in values)
-        least, most = self.delay if isinstance(self.delay, tuple) else (self.delay, self.delay)
+        least, most = check_steps("Observation", "delay", self.delay)
         if self.history + most == 1:
             return values
         seen = self._remember(w, values, self.history + most)
@@ -94,7 +105,7 @@ class Observation:
     @property
     def rows(self) -> int:
         """How many rows of :class:`Each` threads of their own work on; 0: the thread of all terms does."""
-        plain = self.bias == 0.0 and self.history == 1 and self.delay in (0, (0, 0))
+        plain = self.bias == 0.0 and self.history == 1 and check_steps("Observation", "delay", self.delay) == (0, 0)
         return len(self.term.rows) if isinstance(self.term, Each) and plain and len(self.term.rows) >= MANY else 0
 
     def trace_row(self, w: World, number: int) -> Any:
@@ -111,13 +122,19 @@ class Observation:
         return x if self.clip is None else clip(x, *self.clip)
 
     def _remember(self, w: World, values: Vector, count: int) -> list[Vector]:
-        """Return the numbers of ``count`` steps, the newest first, and keep them."""
+        """Return the numbers of ``count`` steps, the newest first, and keep them.
+
+        An observation that stands in several groups is measured once in a step.
+        """
         size, name = len(values), f"history {w.number(self)}"
+        if name in w.measured:
+            return w.measured[name]
         old = w.memory(name, (count - 1) * size)
         if w.fresh is not None:
             old = vector(where(w.fresh, values[i % size], x) for i, x in enumerate(old))
             w.keep(name, [*values, *old][: (count - 1) * size])
-        return [values, *(old[i : i + size] for i in range(0, len(old), size))]
+        w.measured[name] = [values, *(old[i : i + size] for i in range(0, len(old), size))]
+        return w.measured[name]
 
 
 class TorchTerm:
@@ -135,7 +152,8 @@ class TorchTerm:
     """
 
     def __init__(self, function: Callable[[Any], Any], size: int = 1, name: str | None = None):
-        self.function, self.size = function, size
+        self.function = check_function("TorchTerm", "function", function)
+        self.size = check_whole("TorchTerm", "size", size, 1)
         self.name = name or getattr(function, "__name__", type(function).__name__)
 
     def __call__(self, w: World) -> Any:

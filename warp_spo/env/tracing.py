@@ -60,6 +60,10 @@ class Tracing:
             if not isinstance(event, Reset | Interval | Values | Start):
                 raise TypeError(f"Env: events holds {event!r}; expected those of warp_spo.env.events")
             if isinstance(event, EncoderBias):
+                if layout.biased:
+                    raise ValueError(
+                        "Env: events has two encoder_bias; expected one, whose names= are several expressions"
+                    )
                 layout.biased = World(layout, Stage("none", 0)).joints(event.names)
         self.ends = [*terminations, NOT_FINITE]
         names = ("act", "judge", "observe", "reset", "start", "final")
@@ -101,6 +105,8 @@ class Tracing:
         for part in self.actions:
             size = len(part.labels(w.scene))
             for entry, value in part.trace(w, action[at : at + size]):
+                if any(item.array == part.array and item.index == (entry,) for item in stage.stores):
+                    raise ValueError(f"Env: two actions set entry {entry} of {part.array}; expected one")
                 stage.store(part.array, entry, as_value(value))
             at += size
 

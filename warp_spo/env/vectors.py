@@ -46,19 +46,22 @@ def find(call: str, what: str, labels: Sequence[str], names: Any) -> list[int]:
     An expression matches the whole label, or all of it that follows the last "/".
 
     Raises:
-        ValueError: an expression matches nothing.
+        ValueError: an expression is none, or it matches nothing.
     """
-    patterns = [names] if isinstance(names, str) else list(names)
+    try:
+        patterns = [re.compile(name) for name in ([names] if isinstance(names, str) else names)]
+    except (TypeError, re.error) as error:
+        raise ValueError(f"{call}: {names!r} is no regular expression ({error}); expected one, or several") from None
     found: set[int] = set()
     for pattern in patterns:
         ends = [label.rsplit("/", 1)[-1] for label in labels]
         hits = {
             i
             for i, (label, end) in enumerate(zip(labels, ends, strict=True))
-            if re.fullmatch(pattern, label) or re.fullmatch(pattern, end)
+            if pattern.fullmatch(label) or pattern.fullmatch(end)
         }
         if not hits:
-            raise ValueError(f"{call}: {pattern!r} matches no {what}; expected one of {', '.join(labels)}")
+            raise ValueError(f"{call}: {pattern.pattern!r} matches no {what}; expected one of {', '.join(labels)}")
         found |= hits
     return sorted(found)
 
@@ -78,7 +81,8 @@ def as_condition(x: Any) -> Condition:
     if isinstance(x, Condition):
         return x
     if isinstance(x, AbstractScalar) and not is_constant(x.value) and x.value.op == "input":
-        return abs(x) > 0.0  # of a term in torch
+        if x.value.args[0] == "user":  # of a term in torch
+            return abs(x) > 0.0
     if isinstance(x, bool | np.bool_):
         return Condition(1.0 if x else 0.0)
     raise TypeError(f"Env: a termination returned {type(x).__name__}; expected a comparison, such as w.q[1] > 0.3")

@@ -68,6 +68,7 @@ class World:
         self.scene = layout.scene
         self.dt = layout.step_dt
         self.kept: dict[str, Vector] = {}
+        self.measured: dict[str, list[Vector]] = {}  # what observations with a history see, the newest first
         self.values: dict[str, np.ndarray] = {}
         self.before: World | None = None
 

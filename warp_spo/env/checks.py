@@ -1,0 +1,86 @@
+"""Checks of what users give to actions, commands, events and observations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..errors import as_integer
+
+Range = tuple[float, float]
+
+
+def check_number(call: str, name: str, value: Any, least: float = -math.inf) -> float:
+    """Return a finite number; ValueError for anything else, or one below ``least``."""
+    found = _number(value)
+    if found is None or found < least:
+        more = "" if least == -math.inf else f", {least:g} or more"
+        raise ValueError(f"{call}: {name} is {value!r}; expected a finite number{more}")
+    return found
+
+
+def check_whole(call: str, name: str, value: Any, least: int, most: float = math.inf) -> int:
+    """Return an integer within bounds; ValueError for anything else."""
+    found = as_integer(value)
+    if found is None or not least <= found <= most:
+        to = f"{least} or more" if most == math.inf else f"{least} to {most}"
+        raise ValueError(f"{call}: {name} is {value!r}; expected an integer, {to}")
+    return found
+
+
+def check_span(call: str, name: str, value: Any, least: float = -math.inf) -> Range:
+    """Return a range (lowest, highest) of finite numbers; ValueError for anything else, or one below ``least``."""
+    try:
+        low, high = (_number(end) for end in value)
+    except (TypeError, ValueError):
+        low = high = None
+    if low is None or high is None or not least <= low <= high:
+        more = "" if least == -math.inf else f", {least:g} or more"
+        raise ValueError(f"{call}: {name} is {value!r}; expected a range (lowest, highest) of finite numbers{more}")
+    return low, high
+
+
+def check_steps(call: str, name: str, value: Any) -> tuple[int, int]:
+    """Return (fewest, most) of a number of steps or of a pair of them; ValueError for anything else."""
+    found = [as_integer(end) for end in value] if isinstance(value, tuple | list) else [as_integer(value)] * 2
+    if len(found) != 2 or None in found or not 0 <= found[0] <= found[1]:  # type: ignore[operator]
+        raise ValueError(f"{call}: {name} is {value!r}; expected steps, 0 or more, or a pair (fewest, most) of them")
+    return found[0], found[1]  # type: ignore[return-value]
+
+
+def check_optional_span(call: str, name: str, value: Any) -> Range | None:
+    """Return None, or a range as :func:`check_span`."""
+    return None if value is None else check_span(call, name, value)
+
+
+def check_interval(call: str, value: Any) -> Range:
+    """Return a range of seconds above zero, as :func:`check_span`."""
+    low, high = check_span(call, "the range of seconds", value, 0.0)
+    if not high > 0.0:
+        raise ValueError(f"{call}: the range of seconds is {value!r}; expected a highest above zero")
+    return low, high
+
+
+def check_function(call: str, name: str, value: Any) -> Any:
+    """Return a function; TypeError for anything else."""
+    if not callable(value):
+        raise TypeError(f"{call}: {name} is {value!r}; expected a function")
+    return value
+
+
+def check_mapping(call: str, name: str, value: Any, expected: str) -> dict[str, Any]:
+    """Return a dictionary by name; TypeError for anything else."""
+    if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
+        raise TypeError(f"{call}: {name} is {value!r}; expected {expected} by name")
+    return dict(value)
+
+
+def _number(value: Any) -> float | None:
+    try:
+        found = float(value)
+    except (TypeError, ValueError):
+        return None
+    return found if np.isfinite(found) and not isinstance(value, str) else None
