@@ -77,6 +77,24 @@ def test_a_term_of_rows_is_its_list():
         observations.Each(lambda w, row: row, [1, 2, 3])
 
 
+def test_rows_read_what_was_remembered():
+    """A row is computed before other observations of the step keep something."""
+    rows = np.linspace(0.5, 1.5, 21)[:, None]
+
+    def count(w):
+        w.keep("count", w.memory("count", 1, reset=None) + 1.0)
+        return w.kept["count"]
+
+    each = observations.Each(lambda w, row: row[0] * w.memory("count", 1, reset=None)[0], rows)
+    env = cart_env(3, observations={"a": [count, each]})
+    plain = cart_env(3, observations={"a": [lambda w: w.q, each]})
+    assert env._in_turn == {"observe"} and not plain._in_turn  # only then kernels may run at the same time
+    for _ in range(4):
+        seen = env.step(torch.zeros(3, 1))[0]["a"]
+        assert torch.allclose(seen[:, 1:], torch.tensor(rows.T, dtype=seen.dtype) * (seen[:, :1] - 1.0), atol=FLOAT32)
+    assert seen[0, 0] == 5.0  # one look at the start
+
+
 @pytest.mark.slow
 def test_accelerometer_and_gyro():
     """At rest a sensor feels gravity upward; in flight nothing; else the change of its velocity."""

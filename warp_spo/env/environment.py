@@ -19,7 +19,7 @@ from ..scene.scene import Scene
 from ..torch import stream
 from .checks import check_function, check_mapping, check_number, check_whole
 from .events import Delays, Values, changed_values
-from .graphs import Part, Replay
+from .graphs import Part, Replay, run_all
 from .layout import Layout
 from .logs import Log, explain
 from .observations import Observation, TorchTerm
@@ -313,17 +313,21 @@ class Env(VecEnv):
         return wp.ScopedStream(stream(self.warp_device), sync_enter=False)
 
     def _build(self, tracing: Tracing) -> dict[str, list[Launch]]:
-        """Return the kernels of each stage; the last one, which counts the step, after those of rows."""
+        """Return the kernels of each stage: that of a thread a world first, unless it overwrites what others read."""
         found: dict[str, list[Launch]] = {stage.name: [] for stage in tracing.stages.values()}
-        for stage in sorted(tracing.stages.values(), key=lambda stage: stage.rows == 0):
+        in_turn = self._in_turn = tracing.in_turn
+        for stage in sorted(tracing.stages.values(), key=lambda each: (each.rows == 0) == (each.name in in_turn)):
             launch = stage.build(self._store.buffers, self.warp_device)
             found[stage.name] += [] if launch is None else [launch]
         return found
 
     def _launch(self, name: str) -> None:
-        with self._stream():
-            for kernel in self._kernels[name]:
+        def run(kernel: Launch) -> None:
+            with self._stream():
                 kernel(self.num_envs)
+
+        works = [functools.partial(run, kernel) for kernel in self._kernels[name]]
+        run_all(works, None if name in self._in_turn else self.device)
 
     def _compile(self) -> None:
         """Compile all kernels side by side, by a step in which nothing counts."""

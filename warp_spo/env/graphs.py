@@ -3,10 +3,26 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
+
+
+def run_all(works: Sequence[Callable[[], None]], device: torch.device | None = None) -> None:
+    """Do works; a graph of a ``device`` that is being captured holds them side by side, for None in turn."""
+    if len(works) > 1 and device and device.type == "cuda" and torch.cuda.is_current_stream_capturing():
+        main, sides = torch.cuda.current_stream(device), [torch.cuda.Stream(device) for _ in works[1:]]
+        for side in sides:
+            side.wait_stream(main)
+        works[0]()
+        for work, side in zip(works[1:], sides, strict=True):
+            with torch.cuda.stream(side):
+                work()
+            main.wait_stream(side)
+    else:
+        for work in works:
+            work()
 
 
 class Part(NamedTuple):

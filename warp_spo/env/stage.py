@@ -87,8 +87,8 @@ class Stage:
         stores: what the kernel writes, in order; with rows, what a thread does for its first, for its second and so on.
         at_once: rows of a thread. threads: of a world, where it has rows.
         draws: how many random numbers it uses.
-        ticks: C++ of the condition under which it ends with another step counted, so that all later random numbers
-            are new ones; "" if it never does.
+        ticks: C++ of how many steps it counts when it ends, after which all random numbers are new ones; "" for none.
+        late: C++ of how many of these steps its own random numbers do not know of, because others counted them early.
     """
 
     def __init__(self, name: str, stream: int, rows: int = 0):
@@ -100,7 +100,7 @@ class Stage:
         self.stores: list[Store] = []
         self.of_rows: list[list[Store]] = [[] for _ in range(self.at_once)]
         self.draws = 0
-        self.ticks = ""
+        self.ticks, self.late = "", ""
 
     def draw(self) -> Scalar:
         """Return a new random number, uniform in [0, 1)."""
@@ -119,6 +119,11 @@ class Stage:
     def read_arrays(self) -> set[str]:
         """Return the names of the arrays that the stored values depend on."""
         return {scalar.args[0] for scalar in ordered(item.value for item in self.stores) if scalar.op == "input"}
+
+    def overwrites(self, other: Stage) -> bool:
+        """Return whether it writes an entry that another stage reads."""
+        read = {scalar.args for scalar in ordered(item.value for item in other.stores) if scalar.op == "input"}
+        return any((item.array, *item.index) in read for item in self.stores)
 
     def read_tables(self) -> set[str]:
         """Return the names of the tables that the stored values depend on."""
@@ -168,14 +173,16 @@ class Stage:
         touched = {array for listing in listings for array, _ in listing.indices} - {DRAW, ROW_NUMBER}
         touched |= self.read_tables()
         words = [f"((unsigned int*)key.data)[{i}]" for i in range(3)]
-        world, step = f"{words[2]} + (unsigned int)world", buffers["tick"].place("tick", "0")
+        world, step = f"{words[2]} + (unsigned int)world", "((unsigned int*)tick.data)[world]"
+        count = f"{step} += {self.ticks};" if self.ticks else ""
+        step += f" - ({self.late})" if self.late else ""
         first = f"row * {-(-self.draws // 4)}" if self.rows else "0"
-        late = any(x.op == "branch" for x in ordered(item.value for item in self.stores))
-        random = philox.draws(self.draws, (words[0], words[1]), self.stream, world, step, first, late)
+        rare = any(x.op == "branch" for x in ordered(item.value for item in self.stores))
+        random = philox.draws(self.draws, (words[0], words[1]), self.stream, world, step, first, rare)
         touched |= {"key"} if self.draws else set()
         touched |= {"tick"} if self.draws or self.ticks else set()
-        touched |= {name for name in ("advance", "chosen") if name in self.ticks}
-        count = f"((unsigned int*)tick.data)[world] += ({self.ticks}) ? 1u : 0u;" if self.ticks else ""
+        words_read = self.ticks + (self.late if self.draws else "")
+        touched |= {name for name in ("advance", "chosen") if name in words_read}
         names = sorted(touched)
         if wide:
             head = [row_chunks.define(BLOCK), "const bool mine = thread < worlds;"]

@@ -75,6 +75,12 @@ class Tracing:
         """Names of the arrays that the stages read."""
         return set().union(*(stage.read_arrays() for stage in self.stages.values()))
 
+    @property
+    def in_turn(self) -> set[str]:
+        """Names of stages whose kernels run one after the other, because one overwrites what another one reads."""
+        pairs = ((stage, self.stages[stage.name]) for stage in self.stages.values() if stage.rows)
+        return {of_rows.name for of_rows, main in pairs if main.overwrites(of_rows)}
+
     def run(self, steps: int, final: bool) -> None:
         """Trace all stages; ``steps`` are those of an episode; ``final`` asks for the stage of that name."""
         self._act()
@@ -113,6 +119,7 @@ class Tracing:
     # -- judge -----------------------------------------------------------------------------------------------------
     def _judge(self, steps: int) -> None:
         stage = self.stages["judge"]
+        stage.ticks = "1u"  # before observations, whose kernels run side by side
         w = self.judge = World(self.layout, stage)
         length = w.read("episode_length", 1)[0] + 1.0
         w.__dict__["time"] = length * self.layout.step_dt
@@ -249,7 +256,7 @@ class Tracing:
     def _first(self) -> None:
         """Draw what is drawn once: values of the scene, and memory."""
         stage = self.stages["start"]
-        stage.ticks = "true"
+        stage.ticks = "1u"
         w = World(self.layout, stage)
         for event in self.events:
             if isinstance(event, Values):
@@ -266,8 +273,11 @@ class Tracing:
     # -- observe ---------------------------------------------------------------------------------------------------
     def _observe(self) -> None:
         stage = self.stages["observe"]
-        stage.ticks = f"advance.data[0] > 0 || {CHOSEN_WORLD}"
-        begin = lambda one: World(self.layout, one, fresh=Condition(one.graph.input("chosen", 0)))  # noqa: E731
+
+        def begin(one: Stage) -> World:
+            one.late = f"advance.data[0] > 0 || {CHOSEN_WORLD} ? 1u : 0u"
+            return World(self.layout, one, fresh=Condition(one.graph.input("chosen", 0)))
+
         self.observed = begin(stage)
         self._observe_groups(self.observed, begin, "")
 
@@ -339,7 +349,7 @@ class Tracing:
     def _reset(self) -> None:
         stage = self.stages["reset"]
         chosen = Condition(stage.graph.input("chosen", 0))
-        stage.ticks = CHOSEN_WORLD
+        stage.ticks = f"{CHOSEN_WORLD} ? 2u : 0u"  # of its own, and of the look that follows
         w = World(self.layout, stage)
         self._start(w, chosen, intervals=False)
         stage.store("episode_length", 0, as_value(where(chosen, 0.0, w.read("episode_length", 1)[0])))

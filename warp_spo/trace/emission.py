@@ -345,8 +345,8 @@ class Emitter:
         """Return the statements of all entries of a table's row, which the compiler loads together if it may."""
         (table, row, width, _), T = scalar.args, C_TYPE[self.dtype]
         place, entries = f"{table}.data + {width}ll * (int){self._text(row)}", lookup(scalar.graph, table, row, width)
-        if width % 4 == 0:
-            place = f"(const {T}*)__builtin_assume_aligned({place}, 16)"
+        if width % 2 == 0:
+            place = f"(const {T}*)__builtin_assume_aligned({place}, {8 if width % 4 else 16})"
         names = {i: self._name(entry, step) for i, entry in enumerate(entries) if entry.key not in self._names}
         at = f"{self._names[scalar.key]}_row"
         return [f"const {T}* {at} = {place};", *(f"const {T} {name} = {at}[{i}];" for i, name in names.items())]
