@@ -21,7 +21,7 @@ SPIN = 2e-4  # in radians a second: friction at a slip near eps turns rounding o
 @pytest.fixture(scope="module")
 def made():
     model = spheres()
-    return model, SolverSPO(model, contacts="pipeline"), SolverSPO(model)
+    return model, SolverSPO(model, contacts="pipeline"), SolverSPO(model, pairs=[])
 
 
 def listed(rows, room=32, count=None):

@@ -16,8 +16,8 @@ from ..scene.scene import Scene
 from ..scene.shapes import Choice, moving_bodies
 from ..status import Status
 from .elevations import Elevations
-from .model_contacts import CONTACT_MATERIALS, ModelContacts, ModelShapes, model_contacts
-from .pairs import ModelPairs
+from .model_contacts import CONTACT_MATERIALS, ModelContacts, model_contacts
+from .pairs import ModelPairs, refuse_still
 from .slots import Slots
 from .worlds import Worlds, to_numpy
 
@@ -56,52 +56,19 @@ def find_contacts(
         raise UnsupportedError("SolverSPO", f"contacts={mode!r} with {lacking}", "leave out one of them")
     if mode == "pipeline":
         if pairs is not None and pairs.still:
-            _refuse_still(model, worlds, scene, frozenset(), "contacts='pipeline'")
+            refuse_still(model, worlds, scene, frozenset(), "contacts='pipeline'")
         return Slots(model, worlds, scene, points, pairs)
     named = frozenset() if pairs is None else pairs.still
     found = _on_ground(model, worlds, scene, mode, points, apart, named)
     if found is not None or mode == "ground" or not model.shape_count:
         return found
     if named:
-        _refuse_still(model, worlds, scene, named, "shapes in no pair")
+        refuse_still(model, worlds, scene, named, "shapes in no pair")
         return None
     try:
         return Slots(model, worlds, scene, points, pairs)
     except UnsupportedError:
         return None
-
-
-def find_pairs(model: newton.Model, worlds: Worlds, scene: Scene, asked: Any, lacking: str) -> ModelPairs | None:
-    """Return the pairs of a model's shapes that touch each other, None if none are asked for.
-
-    Args:
-        asked: "all", pairs of names, or None. lacking: why the solver's steps have no contacts, "" if they do.
-
-    Raises:
-        UnsupportedError: steps have no contacts; or as :class:`ModelPairs`.
-    """
-    if asked is None:
-        return None
-    if lacking:
-        raise UnsupportedError("SolverSPO", f"pairs={asked!r} with {lacking}", "leave out one of them")
-    return ModelPairs(model, worlds, scene, asked)
-
-
-def _refuse_still(model: newton.Model, worlds: Worlds, scene: Scene, named: frozenset[int], beside: str) -> None:
-    """Raise an error if a shape stands still and is none of those that pairs have.
-
-    A list of contacts would have those of pairs, too.
-    """
-    moving = np.append(moving_bodies(scene), False)  # the last entry is the inertial frame's
-    still = [shape for shape in ModelShapes(model, worlds).first() if not moving[shape.body]]
-    others = [shape for shape in still if shape.index not in named]
-    if others:
-        raise UnsupportedError(
-            "SolverSPO",
-            f"pairs of shapes that stand still beside {beside}, such as {others[0].words(scene.body_labels)}",
-            "name all that stand still in pairs, but for the ground, and pass contacts='ground' or 'none'; or name "
-            "none of them, and pass the contacts of a pipeline to step",
-        )
 
 
 def _on_ground(

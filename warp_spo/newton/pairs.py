@@ -9,6 +9,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from ..errors import UnsupportedError
 from ..kernels import contact_pairs as kernels
 from ..kernels import declare
 from ..scene.contacts import GROUND_VALUES
@@ -16,6 +17,57 @@ from ..scene.scene import Scene
 from ..scene.shape_pairs import PairChoice
 from .model_contacts import CONTACT_MATERIALS, ModelShapes
 from .worlds import Worlds
+
+
+def find_pairs(model: newton.Model, worlds: Worlds, scene: Scene, asked: Any, lacking: str) -> ModelPairs | None:
+    """Return the pairs of a model's shapes that touch each other, None if none are asked for.
+
+    Args:
+        asked: "all", pairs of names, an empty list, or None. lacking: why steps have no contacts, "" if they do.
+
+    Raises:
+        UnsupportedError: steps have no contacts; or as :class:`ModelPairs`.
+    """
+    if asked is None or (isinstance(asked, list | tuple) and not asked):
+        return None
+    if lacking:
+        raise UnsupportedError("SolverSPO", f"pairs={asked!r} with {lacking}", "leave out one of them")
+    return ModelPairs(model, worlds, scene, asked)
+
+
+def warn_of_bodies_apart(model: newton.Model, worlds: Worlds, scene: Scene) -> None:
+    """Warn if bodies of separate trees may collide by a model's filters: they pass through each other."""
+    found = _choice(ModelShapes(model, worlds), scene).first_of_separate_trees()
+    if found is not None:
+        warnings.warn(
+            f"SolverSPO: bodies that no joint connects pass through each other, such as "
+            f"{found.words(scene.body_labels)}, which the model lets collide; pairs= takes contacts between them, "
+            "pairs=[] says that there are none",
+            UserWarning,
+            stacklevel=4,
+        )
+
+
+def refuse_still(model: newton.Model, worlds: Worlds, scene: Scene, named: frozenset[int], beside: str) -> None:
+    """Raise an error if a shape stands still and is none of those that pairs have.
+
+    A list of contacts would have those of pairs, too.
+    """
+    choice = _choice(ModelShapes(model, worlds), scene)
+    others = [shape for shape in choice.shapes if not choice.moves(shape) and shape.index not in named]
+    if others:
+        raise UnsupportedError(
+            "SolverSPO",
+            f"pairs of shapes that stand still beside {beside}, such as {others[0].words(scene.body_labels)}",
+            "name all that stand still in pairs, but for the ground, and pass contacts='ground' or 'none'; or name "
+            "none of them, and pass the contacts of a pipeline to step",
+        )
+
+
+def _choice(shapes: ModelShapes, scene: Scene) -> PairChoice:
+    """Return what chooses pairs of a model's shapes."""
+    first = shapes.first() if shapes.model.shape_count else []
+    return PairChoice("SolverSPO", scene, first, shapes.touches, {shape.index: shape for shape in first})
 
 
 class ModelPairs:
@@ -36,9 +88,7 @@ class ModelPairs:
 
     def __init__(self, model: newton.Model, worlds: Worlds, scene: Scene, asked: Any):
         self._shapes = ModelShapes(model, worlds)
-        shapes = self._shapes.first() if model.shape_count else []
-        numbers = {shape.index: shape for shape in shapes}
-        choice = PairChoice("SolverSPO", scene, shapes, self._shapes.touches, numbers)
+        choice = _choice(self._shapes, scene)
         pairs, left_out = choice.resolve(asked)
         if left_out:
             more = f" and {len(left_out) - 4} more" if len(left_out) > 4 else ""

@@ -23,13 +23,14 @@ from ..scene.parts import DOF_VALUES
 from ..scene.scene import Scene
 from ..scene.shapes import POINTS
 from .checks import check_state, read_flags
-from .contacts import ELEVATIONS, MODES, VALUES, StatusWords, find_contacts, find_pairs, sources_of
+from .contacts import ELEVATIONS, MODES, VALUES, StatusWords, find_contacts, sources_of
 from .drives import GAINS, Drives
 from .joint_forces import JointForces
 from .layout import Layout, Layouts
 from .loop_joints import check_loop_joints
 from .model import from_newton
 from .model_arrays import ModelArrays
+from .pairs import find_pairs, warn_of_bodies_apart
 from .plugs import Plugs
 from .slots import VARIABLE as SLOT_VALUES
 from .slots import Slots
@@ -146,7 +147,9 @@ class SolverSPO(Plugs, SolverBase):
             for every two shapes that they match and that the model lets collide; forces are those on the first. A
             table or a wall may be the other one: pairs then name all shapes that stand still, but for the ground.
             "all": every two shapes of bodies that move which the model lets collide, 32 pairs at most, with a warning
-            of those that are no spheres, capsules or boxes, or are a capsule and a box. None: none.
+            of those that are no spheres, capsules or boxes, or are a capsule and a box. An empty list: none. None:
+            none, with a warning if bodies of separate trees may collide by the model's filters and the ground is the
+            solver's own.
         passes: Of a step with contacts, see :meth:`warp_spo.Dynamics.step`.
         substeps: A step takes so many of dt / substeps, see there, and writes the bodies' states once. Joint forces of
             free joints on bodies keep the axes of the first. The observables are then status, contact_f (the mean),
@@ -226,6 +229,8 @@ class SolverSPO(Plugs, SolverBase):
         heights, lacking = ELEVATIONS in self._asked, self._lacks_contacts(scene)
         pairs = find_pairs(model, worlds, scene, self._pairs_asked, lacking)
         touching = find_contacts(model, worlds, scene, pairs, *self._contact_options, lacking, heights)
+        if self._pairs_asked is None and touching is not None and not isinstance(touching, Slots):
+            warn_of_bodies_apart(model, worlds, scene)
         if isinstance(touching, Slots) and self._substeps > 1:
             if self._contact_options[0] == "pipeline":
                 raise UnsupportedError("SolverSPO", "contacts='pipeline' with substeps", "call step for each substep")

@@ -107,6 +107,17 @@ class PairChoice:
                 found.setdefault(frozenset(shape.index for shape in pair), pair)
         return list(found.values()), []
 
+    def first_of_separate_trees(self) -> ShapePair | None:
+        """Return two shapes of bodies that no joint connects, and which may touch; None if there are none."""
+        trees: dict[int, list[Shape]] = {}
+        for shape in filter(self.moves, self.shapes):
+            body = shape.body
+            while self.scene.tree.parent[body] >= 0:
+                body = self.scene.tree.parent[body]
+            trees.setdefault(body, []).append(shape)
+        sides = (pair for one, other in combinations(trees.values(), 2) for pair in product(one, other))
+        return next((ShapePair(*pair) for pair in sides if self.allowed(*pair)), None)
+
     def _all(self, solid: Sequence[Shape]) -> tuple[list[ShapePair], list[str]]:
         """Return every pair that may touch, and in words those that no contact represents."""
         pairs = [ShapePair(*pair) for pair in combinations(solid, 2) if self._may_touch(*pair)]
