@@ -22,9 +22,9 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ...scene.contacts import AWAY, HEIGHTS, PLACE, ContactPoint, Listed
+from ...scene.contacts import AWAY, HEIGHTS, PLACE, ContactPoint, HeightField, Listed
 from ...scene.scene import Scene
-from ...trace.scalars import Value, branch, is_constant, less, lost, select
+from ...trace.scalars import Value, branch, is_constant, less, lost, reciprocal, select
 from ...trace.spatial import IDENTITY, ZERO, Vector, cross, dot, total
 from .. import neutral
 from ..kinematics import carried_velocity, frame_on_link, zero
@@ -228,10 +228,14 @@ def _listed(impedance: Impedance, number: int) -> Surface:
 
 
 def ground_place(impedance: Impedance) -> Place:
-    """Return where the ground is, from the scene's values."""
-    sets = impedance.scene.values["ground_field"].size
+    """Return where the ground is, from the scene's values; NaN in a world that asks for a field which the set lacks."""
+    ground, sets = impedance.scene.ground, impedance.scene.values["ground_field"].size
     origin = Vector(impedance.value("ground_origin", i) for i in range(3))
-    return Place(origin, impedance.value("ground_field", 0) if sets else 0.0, HEIGHTS in impedance.links.variable)
+    field = impedance.value("ground_field", 0) if sets else 0.0
+    if isinstance(ground, HeightField) and not is_constant(field):
+        there = less(-0.5, field) * less(field, ground.count - 0.5)
+        origin = Vector([*origin[:2], origin[2] + lost(reciprocal(there))])
+    return Place(origin, field, HEIGHTS in impedance.links.variable)
 
 
 def with_ancestors(links: list[Link | None]) -> set[int]:
