@@ -6,7 +6,6 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from rendering import assert_is_whole
 from solver_models import H
 
 import warp_spo as spo
@@ -455,7 +454,7 @@ def test_a_gripper_holds_a_cube(capsys, tmp_path):
     assert height[-1, 0] > 0.17 and np.ptp(apart[late, 0]) < SLIP  # 0.37 mm here
     assert height[-1, 1] < grasp.CUBE + 1e-3  # a friction of 0.05 holds nothing
     assert not words.any() and "slips by 0.4" in capsys.readouterr().out
-    assert_is_whole((tmp_path / "cube.svg").read_text())
+    assert "upward force [N]" in (tmp_path / "cube.svg").read_text()
 
 
 def test_the_limit_of_all_is_above_what_is_solved_exactly():

@@ -72,6 +72,16 @@ def test_products_fused_with_sums(dtype, tolerance, device):
         np.testing.assert_allclose(got[:, at], want, rtol=4 * tolerance, atol=4 * tolerance, err_msg=str(values[at]))
 
 
+def test_regions_of_one_scope_reduce_angles_apart():
+    """Names that both declare would not compile on CUDA."""
+    emitter = Emitter("float32", lambda array, entry: f"{array}[{entry}]", lambda _, entry, value: f"{value};",
+                      lambda array, index: index[0])  # fmt: skip
+    graph = g.Graph()
+    texts = [render(emitter.region([Store("out", (i,), g.sin(graph.input("q", i)))]), "float32") for i in range(3)]
+    declared = re.findall(r"(?:const )?float (\w+) = ", "".join(texts))
+    assert sum("farthest" in name for name in declared) == 3 and len(declared) == len(set(declared))
+
+
 def test_products_have_no_statement_where_sums_alone_use_them():
     """A product that is stored, multiplied or used twice by one sum keeps its statement; a later region repeats it."""
     graph = g.Graph()

@@ -132,6 +132,7 @@ class Emitter:
         self.counts: Counter = Counter()
         self._names: dict[tuple, str] = {}
         self._count = 0
+        self._reductions = 0
         self._constants: list[float] = []
         self._indices: list[tuple[str, int]] = []
         self._labels: list[str] = []
@@ -265,7 +266,8 @@ class Emitter:
                 place = name
             places.append(place)
         reduced = [*(f"    {place} = on::within_reach({place});" for place in places), "}"]
-        farthest = "farthest" if self._angles is RangeReduction.AGAIN else f"{PREFIX}farthest"
+        farthest = "farthest" if self._angles is RangeReduction.AGAIN else f"{PREFIX}farthest{self._reductions or ''}"
+        self._reductions += 1  # regions may share a scope
         largest = [f"{T} {farthest} = 0;"]
         largest += [f"{farthest} = max({farthest}, on::absolute({place}));" for place in places]
         if self._angles is RangeReduction.AGAIN:
