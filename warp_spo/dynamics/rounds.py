@@ -16,7 +16,7 @@ from ..execution.routine import Routine
 from ..kernels import combination
 from ..recursions.contact import step as contact
 from ..recursions.contact.middle import FOUND, MEAN, MIDDLE, middle_bias
-from ..recursions.derivatives.middle import middle_bias_vjp
+from ..recursions.derivatives import middle
 from ..scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -28,7 +28,13 @@ MANY = 4  # passes from which on a step begins with rounds
 EARLY = (3, 3)  # passes of each round
 CONTACT_STEP = Routine("contact_step", contact.step, letters="PzafSE", passes=True, counted=True, wide=True)
 BIAS = Routine("middle_bias", middle_bias, letters="z", short=True)
-BIAS_VJP = Routine("middle_bias_vjp", middle_bias_vjp)
+
+
+def _divides(scene: Scene, inputs: Any, apart: bool, **_: Any) -> bool:
+    return apart
+
+
+BIAS_VJP = Routine("middle_bias_vjp", middle.middle_bias_vjp, letters="B", divides=_divides)
 
 
 class Round(NamedTuple):
@@ -37,6 +43,7 @@ class Round(NamedTuple):
     Attributes:
         before, found_before: the mean v and qd' of the round before; of the first round, qd.
         mean, bias: v of this round, and the velocity terms there. found: qd' of this round; None: it is the last one.
+        middle: q half way along v, where asked for.
     """
 
     before: wp.array
@@ -44,6 +51,7 @@ class Round(NamedTuple):
     mean: wp.array
     bias: wp.array
     found: wp.array | None
+    middle: wp.array | None = None
 
 
 def taken(scene: Scene, passes: float) -> bool:
@@ -51,24 +59,34 @@ def taken(scene: Scene, passes: float) -> bool:
     return passes >= MANY and not scene.contact_pairs
 
 
-def run(dyn: Dynamics, dt: float, q: wp.array, qd: wp.array, body_f: wp.array | None, **given: Any) -> list[Round]:
+def run(
+    dyn: Dynamics,
+    dt: float,
+    q: wp.array,
+    qd: wp.array,
+    body_f: wp.array | None,
+    poses: bool = False,
+    **given: Any,
+) -> list[Round]:
     """Launch the rounds of a step, and return them; the last one found only the velocity terms of the step itself.
 
     Args:
-        given: forces and targets by name.
+        poses: fill in :attr:`Round.middle`. given: forces and targets by name.
     """
     launch, found = dyn._engine.launch_routine, list[Round]()
     before = found_before = qd
     for number in range(len(EARLY) + 1):
         bias, mean, rates = (dyn.recursions.array((name, number), *qd.shape) for name in (MIDDLE, MEAN, FOUND))
-        more = {FOUND: found_before, "dt": dt, "body_f": body_f}
-        launch(BIAS, bias, {f"{MEAN}_out": mean}, q=q, qd=before, **more)
+        at = dyn.recursions.array(("way back", MIDDLE, number), *q.shape) if poses else None
+        outs = {f"{MEAN}_out": mean} | ({} if at is None else {"q_out": at})
+        more = {FOUND: found_before} | ({"poses": True} if poses else {})
+        launch(BIAS, bias, outs, q=q, qd=before, dt=dt, body_f=body_f, **more)
         if number == len(EARLY):
-            return [*found, Round(before, found_before, mean, bias, None)]
-        poses = dyn.recursions.array((FOUND, "q"), *q.shape)
+            return [*found, Round(before, found_before, mean, bias, None, at)]
+        ends = dyn.recursions.array((FOUND, "q"), *q.shape)
         options = {MIDDLE: bias, "passes": float(EARLY[number]), "reports": ()}  # in the order of the step's own call
-        launch(CONTACT_STEP, rates, {"q_out": poses}, q=q, qd=qd, dt=dt, **given, **options)
-        found.append(Round(before, found_before, mean, bias, rates))
+        launch(CONTACT_STEP, rates, {"q_out": ends}, q=q, qd=qd, dt=dt, **given, **options)
+        found.append(Round(before, found_before, mean, bias, rates, at))
         before, found_before = mean, rates
     raise AssertionError("a step has a last round")
 
@@ -93,7 +111,7 @@ def pull_back(
     """
     q, qd, dt = given["q"], given["qd"], given["dt"]
     forces = {name: value for name, value in given.items() if name not in ("q", "qd", "dt")}
-    rounds = run(dyn, dt, q, qd, body_f, **forces)
+    rounds = run(dyn, dt, q, qd, body_f, poses=True, **forces)
     entering = [name for name in results if name in ("q", "body_f", "value")]
 
     def array(*key: Any) -> wp.array:
@@ -116,9 +134,11 @@ def pull_back(
         one = rounds[number]
         later, by_mean = by_mean, array("mean", number)
         more = {f"{name}_bar": like(name, "bias") for name in entering} | {f"{FOUND}_bar": by_found}
-        read = {"qd": one.before, FOUND: one.found_before, "dt": dt, "body_f": body_f}
-        cotangents = {"cotangent": by_bias, f"{MEAN}_cotangent": later}
-        dyn._engine.launch_routine(BIAS_VJP, by_mean, more, q=q, **read, **cotangents, wrt=("qd", *entering, FOUND))
+        read = {"q": one.middle, "qd": one.mean, "q_from": q, "qd_from": one.before, FOUND: one.found_before, "dt": dt}
+        read |= {"cotangent": by_bias, f"{MEAN}_cotangent": later} | ({} if body_f is None else {"body_f": body_f})
+        wrt = ("qd", *entering, FOUND)
+        apart = middle.divides(dyn.scene, dyn.variable, read, wrt)
+        dyn._engine.launch_routine(BIAS_VJP, by_mean, more, **read, wrt=wrt, apart=apart)
         for name in entering:
             add(name, more[f"{name}_bar"])
         if number == 0:

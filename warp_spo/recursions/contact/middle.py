@@ -24,8 +24,11 @@ MIDDLE, MEAN, FOUND = "middle_bias", "mean", "found"
 """Arrays [world, dof]: what the step reads in place of its own velocity terms; v; qd' of the round before."""
 
 
-def middle_bias(trace: Trace) -> list[Store]:
-    """out = bias_force half way along the mean v of "qd", the v before, and "found"; mean_out = v"""
+def middle_bias(trace: Trace, poses: bool = False) -> list[Store]:
+    """out = bias_force half way along the mean v of "qd", the v before, and "found"; mean_out = v
+
+    With ``poses`` q_out, the coordinates half way.
+    """
     before, found, h = trace.vector("qd"), trace.vector(FOUND), trace.graph.input("dt", 0)
     v = {dof: 0.5 * (before(dof) + found(dof)) for link in trace.links.leaders for dof in link.dofs}
     coordinates: dict[int, Value] = {}
@@ -35,5 +38,10 @@ def middle_bias(trace: Trace) -> list[Store]:
         coordinates |= {link.coordinate + c: value for c, value in enumerate(values)}
     trace.instead = {"q": coordinates.__getitem__, "qd": v.__getitem__}
     trace.compensate_gravity()
-    own = [dof for link in trace.own_links if link.leads for dof in link.dofs]
-    return inverse_dynamics(trace, qdd=zero) + [Store(f"{MEAN}_out", (dof,), v[dof]) for dof in own]
+    own = [link for link in trace.own_links if link.leads]
+    stores = inverse_dynamics(trace, qdd=zero)
+    stores += [Store(f"{MEAN}_out", (dof,), v[dof]) for link in own for dof in link.dofs]
+    for link in own if poses else ():
+        places = range(link.coordinate, link.coordinate + link.hinge.coordinates)
+        stores += [Store("q_out", (at,), coordinates[at]) for at in places]
+    return stores
