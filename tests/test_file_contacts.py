@@ -165,6 +165,24 @@ def test_margins_hold_shapes_where_mujoco_does(override):
     assert (friction["listed"], friction["ball"]) == ((0.4, 0.4) if override == "enable" else (0.6, 1.0))
 
 
+LOST = """<mujoco><asset><mesh name="hoof" file="nowhere.stl"/><texture type="2d" name="t" file="no.png"/></asset>
+ <worldbody><geom name="floor" type="plane" size="1 1 1"/><body name="leg"><freejoint/>
+ <inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/><geom name="hoof" type="mesh" mesh="hoof" pos="0 0 -1"/>
+ <geom name="ball" size="0.1"/></body></worldbody>
+ <contact><pair geom1="ball" geom2="floor" friction="0.3 0.3 0.1 0.1 0.1"/></contact></mujoco>"""
+
+
+def test_a_mesh_that_is_missing_touches_nothing(tmp_path):
+    """Its place holder in MuJoCo's model is no contact; pairs of the file stay."""
+    file = tmp_path / "lost.xml"
+    file.write_text(LOST)
+    with pytest.warns(UserWarning, match=r"nowhere.stl.*; mesh that MuJoCo cannot read 'hoof' of body 'leg'"):
+        scene = spo.load(file, contacts=True)
+    assert [(c.label, c.friction) for c in scene.contacts] == [("ball", 0.3)]
+    with pytest.raises(spo.UnsupportedError, match=r"contacts='hoof', which matches mesh that MuJoCo cannot read"):
+        spo.load(file, contacts="hoof")
+
+
 def test_patterns_choose_shapes():
     """By the names of shapes, bodies and meshes; the first pattern says how many points."""
     model = compiled()

@@ -28,34 +28,47 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool = True, choice: Ch
         raise ValueError(
             f"load: {str(file)!r} holds <{tag}>; expected <mujoco>; if it is URDF, let its name end in .urdf"
         )
-    model, dropped = compiled(file)
-    source = Source(model, "load", str(file))
+    model, dropped, missing = compiled(file)
+    source = Source(model, "load", str(file), missing)
     source.left_out += dropped
     return scene_of(source, floating, choice)
 
 
-def compiled(file: Path) -> tuple[mujoco.MjModel, list[str]]:
-    """Return MuJoCo's model of a file, and in words what had to be dropped from it.
+def compiled(file: Path) -> tuple[mujoco.MjModel, list[str], dict[int, str]]:
+    """Return MuJoCo's model of a file, in words what had to be dropped from it, and by geom what cannot be read of it.
 
-    A file that MuJoCo refuses is compiled again without sensors, contact pairs, skins and textures, and without the
-    meshes and height fields that give no body its mass: a scene needs none of them, and files are often without them.
+    A file that MuJoCo refuses is compiled again without sensors, skins and textures, and without the meshes and height
+    fields that give no body its mass, at last without contact pairs: a scene needs none of them, and files are often
+    without them.
     """
     try:
-        return mujoco.MjModel.from_xml_path(os.fspath(file)), []
+        return mujoco.MjModel.from_xml_path(os.fspath(file)), [], {}
     except ValueError as error:
         refusal = _one_line(error)
-    try:
-        spec = mujoco.MjSpec.from_file(os.fspath(file))
-        dropped = _drop_unneeded(spec)
-        return spec.compile(), [f"{', '.join(dropped)}, with which MuJoCo refuses the file ({refusal})"]
-    except ValueError as error:
-        raise ValueError(f"load: {str(file)!r}: MuJoCo refuses it: {_one_line(error)}; correct the file") from None
+    for unneeded in (UNNEEDED, (*UNNEEDED, *OF_CONTACT)):
+        try:
+            spec = mujoco.MjSpec.from_file(os.fspath(file))
+            dropped, shapeless = _drop(spec, unneeded)
+            model = spec.compile()
+        except ValueError as error:
+            last = error
+            continue
+        missing = {int(geom.id): kind for geom, kind in shapeless}
+        return model, [f"{', '.join(dropped)}, with which MuJoCo refuses the file ({refusal})"], missing
+    raise ValueError(f"load: {str(file)!r}: MuJoCo refuses it: {_one_line(last)}; correct the file") from None
 
 
-def _drop_unneeded(spec: Any) -> list[str]:
-    """Take from a specification what changes no mass and no joint; return in words what it was."""
+UNNEEDED, OF_CONTACT = ("sensors", "skins", "tuples"), ("pairs", "excludes")
+
+
+def _drop(spec: Any, unneeded: tuple[str, ...]) -> tuple[list[str], list[tuple[Any, str]]]:
+    """Take from a specification what changes no mass and no joint.
+
+    Returns:
+        In words what it was; and the geoms that lost their shape, with what it was.
+    """
     dropped = []
-    for name in ("sensors", "pairs", "excludes", "skins", "tuples"):
+    for name in unneeded:
         elements = list(getattr(spec, name))
         for element in elements:
             spec.delete(element)
@@ -64,17 +77,19 @@ def _drop_unneeded(spec: Any) -> list[str]:
         texture.file, texture.cubefiles = "", [""] * 6
         texture.builtin, texture.width, texture.height = mujoco.mjtBuiltin.mjBUILTIN_FLAT, 1, 1
         texture.nchannel = 3
-    shapes = [geom for geom in spec.geoms if (geom.meshname or geom.hfieldname) and _gives_no_mass(spec, geom)]
-    for geom in shapes:
-        geom.type, geom.size = mujoco.mjtGeom.mjGEOM_SPHERE, [1e-3, 0.0, 0.0]
-        geom.meshname = geom.hfieldname = ""
-        geom.mass = 0.0
-    dropped += [f"the meshes and height fields of {len(shapes)} geoms"] if shapes else []
+    shapeless = []
+    for geom in spec.geoms:
+        if (geom.meshname or geom.hfieldname) and _gives_no_mass(spec, geom):
+            shapeless.append((geom, f"{'mesh' if geom.meshname else 'height field'} that MuJoCo cannot read"))
+            geom.type, geom.size = mujoco.mjtGeom.mjGEOM_SPHERE, [1e-3, 0.0, 0.0]
+            geom.meshname = geom.hfieldname = ""
+            geom.mass = 0.0
+    dropped += [f"the meshes and height fields of {len(shapeless)} geoms"] if shapeless else []
     used = {name for geom in spec.geoms for name in (geom.meshname, geom.hfieldname)}
     for asset in [*spec.meshes, *spec.hfields]:
         if (asset.name or Path(asset.file).stem) not in used:  # MuJoCo's rule for the name of an asset without one
             spec.delete(asset)
-    return dropped
+    return dropped, shapeless
 
 
 def _gives_no_mass(spec: Any, geom: Any) -> bool:

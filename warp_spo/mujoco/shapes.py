@@ -95,7 +95,7 @@ def _margin(source: Source, geom: int, ground: int | None, pairs: Pairs) -> floa
 
 
 def _shape(source: Source, geom: int, friction: float | None, margin: float) -> Shape:
-    m, kind = source.model, _name(source.model, geom)
+    m, kind = source.model, source.missing.get(geom) or _name(source.model, geom)
     names: tuple[str, ...] = ()
     if kind in ("mesh", "hfield"):
         names = (source.name(kind, int(m.geom_dataid[geom])),)
@@ -104,7 +104,7 @@ def _shape(source: Source, geom: int, friction: float | None, margin: float) -> 
         int(m.geom_bodyid[geom]) - 1,
         KINDS.get(kind, kind),
         np.concatenate([m.geom_pos[geom], xyzw(m.geom_quat[geom])]),
-        _sizes(m, geom, kind),
+        () if geom in source.missing else _sizes(m, geom, kind),
         rounding=margin,
         friction=friction,
         names=names,

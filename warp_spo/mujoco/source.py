@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import types
+from collections.abc import Mapping
 from typing import Any, NoReturn
 
 import mujoco
@@ -17,14 +19,21 @@ class Source:
         model: the ``mujoco.MjModel``.
         call: name of the call, for errors.
         file: path of the file that the model was compiled from, for errors; "" if there is none.
+        missing: geoms that are not the shapes of the file: what each of them is there.
 
     Attributes:
-        model, call, file: as given.
+        model, call, file, missing: as given.
         left_out: what the scene does not hold, in words, for one warning.
     """
 
-    def __init__(self, model: mujoco.MjModel, call: str = "from_mujoco", file: str = ""):
-        self.model, self.call, self.file = model, call, file
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        call: str = "from_mujoco",
+        file: str = "",
+        missing: Mapping[int, str] = types.MappingProxyType({}),
+    ):
+        self.model, self.call, self.file, self.missing = model, call, file, missing
         self.left_out: list[str] = []
 
     @property

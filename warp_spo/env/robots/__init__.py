@@ -85,7 +85,7 @@ def load(
     from ...mujoco.files import compiled
 
     path = FILES / f"{name}.xml"
-    model, _ = compiled(path)
+    model, *_ = compiled(path)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*left out: contacts")  # which are added here
         scene = from_mujoco(model)
