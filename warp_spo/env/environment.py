@@ -17,15 +17,16 @@ from ..recursions.contact.ground import GROUND
 from ..scene.contacts import HeightField
 from ..scene.scene import Scene
 from ..torch import stream
-from .checks import check_function, check_mapping, check_number, check_whole
+from .checks import check_number, check_whole
 from .events import Delays, Values, changed_values
+from .given import RESULTS, checked_actions, checked_lengths, checked_mask, checked_terms
 from .graphs import Part, Replay, run_all
 from .layout import Layout
 from .logs import Log, explain
-from .observations import Observation, TorchTerm
+from .observations import TorchTerm
 from .stage import Launch
 from .storage import Storage
-from .tracing import NOT_FINITE, Tracing
+from .tracing import Tracing
 
 try:
     from rsl_rl.env import VecEnv
@@ -125,7 +126,7 @@ class Env(VecEnv):
             raise ValueError(f"Env: default_q has shape {default.shape}; expected ({scene.coord_count},) [coordinate]")
         if not np.isfinite(default).all():
             raise ValueError(f"Env: default_q is {default.tolist()}; expected finite numbers")
-        groups, rewards, terminations = _checked_terms(observations, rewards, terminations or {}, events)
+        groups, rewards, terminations = checked_terms(observations, rewards, terminations or {}, events)
         layout = self._layout = Layout(scene, default, self.step_dt, commands, changed_values(scene, events))
         parts = list(actions) if isinstance(actions, list | tuple) else [actions]
         for part in parts:
@@ -181,12 +182,7 @@ class Env(VecEnv):
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
-        value = torch.as_tensor(value)
-        if value.shape not in ((), (self.num_envs,)):
-            raise ValueError(
-                f"Env.episode_length_buf: got shape {tuple(value.shape)}; expected ({self.num_envs},) [world]"
-            )
-        self._tensors["episode_length"].copy_(value)
+        self._tensors["episode_length"].copy_(checked_lengths("Env.episode_length_buf", value, self.num_envs))
 
     @property
     def default_q(self) -> np.ndarray:
@@ -220,11 +216,7 @@ class Env(VecEnv):
         if mask is None:
             self.chosen.fill_(True)
         else:
-            mask = torch.as_tensor(mask, device=self.device)
-            if mask.shape != (self.num_envs,) or mask.dtype != torch.bool:
-                raise ValueError(
-                    f"Env.reset: mask is {mask.dtype} {tuple(mask.shape)}; expected bool ({self.num_envs},) [world]"
-                )
+            mask = checked_mask("Env.reset", mask, self.num_envs, self.device)
             self.chosen.copy_(mask)
         before = self._store.out.clone()
         self._launch("reset")
@@ -251,7 +243,7 @@ class Env(VecEnv):
             Observations by group; rewards [world]; whether the episode ended, int [world]; a dictionary with
             ``time_outs`` [world], 1 where it ended for its length alone, and now and then ``log``.
         """
-        self._read_actions("Env.step", actions)
+        self.actions.copy_(checked_actions("Env.step", actions, self.num_envs, self.action_labels))
         self.replay()
         self._steps += 1
         out = self._store.out.clone()
@@ -265,7 +257,7 @@ class Env(VecEnv):
 
     def controls(self, actions: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return what actions set, "ctrl", "target_q" or "tau" [world, ...]; worlds remember them as their actions."""
-        self._read_actions("Env.controls", actions)
+        self.actions.copy_(checked_actions("Env.controls", actions, self.num_envs, self.action_labels))
         self._launch("act")
         return {name: controls.clone() for name, controls in self._controls.items()}
 
@@ -289,19 +281,6 @@ class Env(VecEnv):
         """Do nothing: memory is freed with the object."""
 
     # -- inside ----------------------------------------------------------------------------------------------------
-    def _read_actions(self, call: str, actions: Any) -> None:
-        try:
-            given = torch.as_tensor(actions)
-        except (TypeError, ValueError, RuntimeError):
-            raise TypeError(f"{call}: actions is {type(actions).__name__}; expected a tensor or an array") from None
-        if tuple(given.shape) != (self.num_envs, self.num_actions) or given.is_complex():
-            kind = "complex numbers of " if given.is_complex() else ""
-            raise ValueError(
-                f"{call}: actions has {kind}shape {tuple(given.shape)}; expected ({self.num_envs}, {self.num_actions}) "
-                f"[world, action]: {', '.join(self.action_labels)}"
-            )
-        self.actions.copy_(given)
-
     def _observations(self, out: torch.Tensor, kind: str = "") -> Any:
         groups = {name: self._store.part(out, kind + name) for name in self.num_obs}
         return groups if TensorDict is None else TensorDict(groups, batch_size=[self.num_envs], device=self.device)
@@ -412,36 +391,3 @@ class Env(VecEnv):
             came = tuple(found.shape) if isinstance(found, torch.Tensor) else type(found).__name__
             raise ValueError(f"Env: the term {term.name} returned {came}; expected a tensor {expected}")
         self._tensors["user"][:, start : start + term.size].copy_(found.reshape(self.num_envs, term.size))
-
-
-RESULTS = ("reward", "done", "time_out")
-
-
-def _checked_terms(
-    observations: Any, rewards: Any, terminations: Any, events: Any
-) -> tuple[dict[str, list[Observation]], dict[str, tuple[float, Any]], dict[str, Any]]:
-    """Return observations, rewards and terminations by name; ValueError and TypeError as :class:`Env` says."""
-    groups = check_mapping("Env", "observations", observations, "lists of terms")
-    if not groups:
-        raise ValueError("Env: observations is {}; expected a list of terms for each group")
-    for name, terms in groups.items():
-        if not isinstance(terms, list | tuple) or not terms:
-            raise TypeError(f"Env: observations[{name!r}] is {terms!r}; expected a list of terms for each group")
-        if name in RESULTS or name.startswith("final "):
-            raise ValueError(
-                f"Env: observations has a group {name!r}, which names another result; expected another name"
-            )
-        groups[name] = [term if isinstance(term, Observation) else Observation(term) for term in terms]
-    rewards = check_mapping("Env", "rewards", rewards, "pairs (weight, term)")
-    for name, reward in rewards.items():
-        if not isinstance(reward, tuple | list) or len(reward) != 2 or not callable(reward[1]):
-            raise TypeError(f"Env: rewards[{name!r}] is {reward!r}; expected (weight, term)")
-        check_number("Env", f"the weight of rewards[{name!r}]", reward[0])
-    terminations = check_mapping("Env", "terminations", terminations, "terms")
-    for name, term in terminations.items():
-        check_function("Env", f"terminations[{name!r}]", term)
-        if name == NOT_FINITE:
-            raise ValueError(f"Env: terminations has {name!r}, which every environment has; expected another name")
-    if not isinstance(events, list | tuple):
-        raise TypeError(f"Env: events is {events!r}; expected a list of those of warp_spo.env.events")
-    return groups, rewards, terminations

@@ -122,10 +122,9 @@ def base(
         x, y, z: [m], inertial axes. yaw, roll, pitch: [rad]. velocity: of each axis [m/s]. angular_velocity: of each
             axis [rad/s].
     """
-    for name, each in (("x", x), ("y", y), ("z", z), ("yaw", yaw), ("roll", roll), ("pitch", pitch)):
+    given = {"x": x, "y": y, "z": z, "yaw": yaw, "roll": roll, "pitch": pitch}
+    for name, each in (given | {"velocity": velocity, "angular_velocity": angular_velocity}).items():
         check_span("events.base", name, each)
-    check_span("events.base", "velocity", velocity)
-    check_span("events.base", "angular_velocity", angular_velocity)
 
     def change(w: World) -> None:
         start, rate = int(w.scene.q_start[w.base]), int(w.scene.qd_start[w.base])

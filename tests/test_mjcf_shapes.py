@@ -1,0 +1,58 @@
+"""Margins of MJCF shapes against MuJoCo's constraints, and shapes that MuJoCo cannot read."""
+
+import mujoco
+import numpy as np
+import pytest
+
+import warp_spo as spo
+from warp_spo.reference_rotations import rotation
+
+EXACT = 1e-12  # float64 on both sides; sizes of a metre
+MARGINS = """<mujoco><option o_margin="0.07" o_friction="0.4 0.4 0.01 0.01 0.01"><flag override="{override}"/></option>
+ <worldbody> <geom name="floor" type="plane" size="1 1 1" margin="0.03"/><body name="all" pos="0 0 0.05"><freejoint/>
+ <geom name="ball" size="0.1" margin="0.05" gap="0.02"/><geom name="slab" type="box" size="0.1 0.2 0.03" margin="0.02"/>
+ <geom name="stick" type="capsule" size="0.02 0.3"/><geom name="listed" size="0.12" margin="0.5"/></body></worldbody>
+ <contact><pair geom1="listed" geom2="floor" margin="0.01" friction="0.6 0.6 0.01 0.01 0.01"/></contact></mujoco>"""
+
+
+@pytest.mark.parametrize("override", ["disable", "enable"])
+def test_margins_hold_shapes_where_mujoco_does(override):
+    """Both margins, that of a pair, or the option's: depths are those of MuJoCo's constraints, frictions its own."""
+    model, rng = mujoco.MjModel.from_xml_string(MARGINS.replace("{override}", override)), np.random.default_rng(2)
+    scene = spo.from_mujoco(model, contacts=True)
+    qpos = np.array([0.0, 0.0, 0.02, *rng.normal(size=4)])
+    qpos[3:] /= np.linalg.norm(qpos[3:])
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    want = {}
+    for contact in data.contact:
+        depth = (data.efc_pos - data.efc_margin)[contact.efc_address]
+        name = model.geom(max(contact.geom)).name
+        want[name] = min(want.get(name, np.inf), depth)
+    up, found = rotation(qpos[[4, 5, 6, 3]])[2], {}
+    for contact in scene.contacts:  # of the box eight spheres
+        low = qpos[2] + (contact.positions @ up).min() - contact.radius
+        found[contact.label] = min(found.get(contact.label, np.inf), low)
+    assert found.keys() == want.keys() == {"ball", "slab", "stick", "listed"}
+    np.testing.assert_allclose([found[name] for name in want], list(want.values()), atol=EXACT)
+    friction = {c.label: c.friction for c in scene.contacts}
+    assert (friction["listed"], friction["ball"]) == ((0.4, 0.4) if override == "enable" else (0.6, 1.0))
+
+
+LOST = """<mujoco><asset><mesh name="hoof" file="nowhere.stl"/><texture type="2d" name="t" file="no.png"/></asset>
+ <worldbody><geom name="floor" type="plane" size="1 1 1"/><body name="leg"><freejoint/>
+ <inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/><geom name="hoof" type="mesh" mesh="hoof" pos="0 0 -1"/>
+ <geom name="ball" size="0.1"/></body></worldbody>
+ <contact><pair geom1="ball" geom2="floor" friction="0.3 0.3 0.1 0.1 0.1"/></contact></mujoco>"""
+
+
+def test_a_mesh_that_is_missing_touches_nothing(tmp_path):
+    """Its place holder in MuJoCo's model is no contact; pairs of the file stay."""
+    file = tmp_path / "lost.xml"
+    file.write_text(LOST)
+    with pytest.warns(UserWarning, match=r"nowhere.stl.*; mesh that MuJoCo cannot read 'hoof' of body 'leg'"):
+        scene = spo.load(file, contacts=True)
+    assert [(c.label, c.friction) for c in scene.contacts] == [("ball", 0.3)]
+    with pytest.raises(spo.UnsupportedError, match=r"contacts='hoof', which matches mesh that MuJoCo cannot read"):
+        spo.load(file, contacts="hoof")
