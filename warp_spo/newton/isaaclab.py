@@ -22,6 +22,7 @@ class Options:
     loops: str = "raise"
     integrator: str = "semi_implicit"
     granularity: str | None = None
+    pairs: Any = None
     tune: bool = False
 
 
