@@ -129,6 +129,7 @@ def add_runs(T) -> wp.Kernel:
 @functools.cache
 def add_carries(T) -> wp.Kernel:
     """Write the sums of each cell by its corners; one lane, or the lanes of a warp, take turns at its carries."""
+    vec4 = wp.types.vector(4, T)
 
     @wp.kernel(module=f"warp_spo_heights_{T.__name__}", enable_backward=False)
     def kernel(
@@ -138,13 +139,14 @@ def add_carries(T) -> wp.Kernel:
         end = range_of[1, cell]
         if end > 0:
             first, behind = range_of[0, cell] // RUN, (end - 1) // RUN
+            found = vec4()
+            for part in range(first + lane, behind, lanes):
+                for corner in range(4):
+                    found[corner] += carry[corner, part]
             for corner in range(4):
-                found = T(0.0)
-                for part in range(first + lane, behind, lanes):
-                    found += carry[corner, part]
-                found = sum_of_lanes(found)
+                whole = sum_of_lanes(found[corner])
                 if lane == 0:
-                    sums_out[corner, cell] = found + last[corner, cell]
+                    sums_out[corner, cell] = whole + last[corner, cell]
 
     return kernel
 

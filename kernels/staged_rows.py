@@ -30,7 +30,7 @@ class Copy(NamedTuple):
     """Code that copies the rows of 32 worlds between an array and shared memory.
 
     Attributes:
-        declared: the declaration of the pointers ``NAME_from`` and ``NAME_to``.
+        declared: the declaration of the pointers ``from_NAME`` and ``to_NAME``.
         entries: of a row.
         wide: entries in 16 bytes; 0 where single entries are copied.
         array: the name of the pointer into the caller's array.
@@ -157,7 +157,7 @@ def _run(copies: list[Copy], team: int) -> str:
 
 def _copy_in(row: Row, offset: int, c: str, asynchronous: bool) -> Copy:
     n, (kind, start), (vector, _, names) = row.entries, source(row, c), VECTORS[c]
-    origin, to = f"{row.name}_from", f"{row.name}_to"
+    origin, to = f"from_{row.name}", f"to_{row.name}"  # q_from is the name of an array
     padded, to_one = n != pitch(n), f"{to} + {_padded('i', n, pitch(n))}"
     one = f"*({to_one}) = __ldg({origin} + i);"
     several = f"(({vector}*){to})[i] = __ldg((const {vector}*){origin} + i);"

@@ -266,3 +266,10 @@ def test_a_product_begins_with_the_other_summand_of_its_sum(device):
     for some in (slice(None), slice(0, 6), slice(1, 2), slice(3, 4), slice(4, 5), slice(5, 6)):
         got = compiled(sums[some], rows, "float64", device, fuses=True)
         np.testing.assert_allclose(got, wanted[:, some], rtol=0.0, atol=4e-15)
+
+
+def test_pointers_into_rows_have_names_of_their_own():
+    """Steps of other integrators read q beside q_from."""
+    for row in ("q", "qd"):
+        copy = staged_rows._copy_in(staged_rows.Row(row, 2, 7), 0, "float", False)
+        assert not re.search(rf"\b{row}_(from|to)\b", copy.declared + copy.one + copy.several)
