@@ -168,6 +168,13 @@ struct solids
         {
             return {x + share * (b.x - x), y + share * (b.y - y), depth + share * (b.depth - depth)};
         }
+
+        // A corner of the face with this middle and these halves of its sides; they go round.
+        CUDA_CALLABLE inline Corner corner(const Corner& p, const Corner& q, int number) const
+        {
+            const REAL s = number % 4 == 0 || number % 4 == 3 ? 1 : -1, t = number % 4 < 2 ? 1 : -1;
+            return {x + s * p.x + t * q.x, y + s * p.y + t * q.y, depth + s * p.depth + t * q.depth};
+        }
     };
 
     // The face that both boxes share: where it is, and half its widths.
@@ -192,7 +199,8 @@ struct solids
             REAL start = 0, end = 0;
             UNROLL
             for (int side = 1; side >= -1; side -= 2) {
-                const REAL from = side * a.y - height, to = side * b.y - height, share = from / (from - to);
+                const REAL from = side * a.y - height, to = side * b.y - height;
+                const REAL share = from * on::reciprocal(from - to);
                 inside = inside && from <= 0;
                 enters = enters || (from > 0 && to < 0);
                 start = from > 0 && to < 0 ? share : start;
@@ -308,39 +316,40 @@ struct solids
         const Corner m = {dot(face.one, middle), dot(face.other, middle), face.half - dot(face.normal, middle)};
         const Corner p = {dot(face.one, u), dot(face.other, u), -dot(face.normal, u)};
         const Corner q = {dot(face.one, v), dot(face.other, v), -dot(face.normal, v)};
-        Corner corners[4], out_of[2], into[2];
+        // four edges, each cut by both sides, and then the edges along these sides that close the polygon
+        Corner from = m.corner(p, q, 0), out_of[2] = {m, m}, into[2] = {m, m};
         bool leaves[2] = {false, false}, enters[2] = {false, false};
-        UNROLL
-        for (int c = 0; c < 4; ++c) {
-            const REAL s = c == 0 || c == 3 ? 1 : -1, t = c < 2 ? 1 : -1;
-            corners[c] = {m.x + s * p.x + t * q.x, m.y + s * p.y + t * q.y, m.depth + s * p.depth + t * q.depth};
-        }
-        UNROLL
-        for (int c = 0; c < 4; ++c) {
-            const Corner from = corners[c], to = corners[(c + 1) % 4];
+        LOOP
+        for (int c = 0; c < 6; ++c) {
+            const Corner to = m.corner(p, q, c + 1);
             Corner begin = from, end = to;
             bool stays = true;
-            UNROLL
-            for (int way = 0; way < 2; ++way) {
-                const REAL x = (way ? -from.x : from.x) - face.width, y = (way ? -to.x : to.x) - face.width;
-                const Corner crossing = from.towards(to, x / (x - y));
-                stays = stays && (x < 0 || y < 0 || (x == 0 && y == 0));
-                if (x < 0 && y > 0) end = crossing;
-                if (x > 0 && y < 0) begin = crossing;
-                if (x <= 0 && y > 0) {
-                    leaves[way] = true;
-                    out_of[way] = x < 0 ? crossing : from;
+            if (c < 4) {
+                UNROLL
+                for (int way = 0; way < 2; ++way) {
+                    const REAL x = (way ? -from.x : from.x) - face.width, y = (way ? -to.x : to.x) - face.width;
+                    const Corner crossing = from.towards(to, x * on::reciprocal(x - y));
+                    stays = stays && (x < 0 || y < 0 || (x == 0 && y == 0));
+                    if (x < 0 && y > 0) end = crossing;
+                    if (x > 0 && y < 0) begin = crossing;
+                    if (x <= 0 && y > 0) {
+                        leaves[way] = true;
+                        out_of[way] = x < 0 ? crossing : from;
+                    }
+                    if (x > 0 && y <= 0) {
+                        enters[way] = true;
+                        into[way] = y < 0 ? crossing : to;
+                    }
                 }
-                if (x > 0 && y <= 0) {
-                    enters[way] = true;
-                    into[way] = y < 0 ? crossing : to;
-                }
+            } else {
+                const bool way = c == 5;
+                begin = way ? out_of[1] : out_of[0];
+                end = way ? into[1] : into[0];
+                stays = way ? leaves[1] && enters[1] : leaves[0] && enters[0];
             }
             if (stays) face.put_edge(begin, end, out);
+            from = to;
         }
-        UNROLL
-        for (int way = 0; way < 2; ++way)
-            if (leaves[way] && enters[way]) face.put_edge(out_of[way], into[way], out);
     }
 
     // Puts the points of two shapes, and then those that are not there, up to ``most``.

@@ -152,3 +152,37 @@ def thrown(chosen):
         row[9] += q_above - rng.uniform(-1e-3, 4e-3)
     qd[:, 6:] = rng.normal(size=(worlds, 6)) * np.repeat([1.0, 6.0], 3)
     return scene, q[chosen], qd[chosen]
+
+
+def ring():
+    """Four balls in a ring, an arm that touches two of them, and another arm that touches the first one's tip."""
+    ball = dict(sphere=0.1)
+    bodies = [cube(1.0 + i, 0.1) for i in range(4)]
+    hinges = [spo.Hinge("free", -1, i) for i in range(4)]
+    for x, axis in ((-0.45, (0, 0, 1)), (0.65, (0, 1, 0))):
+        first = len(bodies)
+        hinges.append(
+            spo.Hinge("revolute", -1, first, axis=(0, 1, 0), parent_pose=(x, 0.0, 0, 0, 0, 0, 1), armature=0.01)
+        )
+        hinges.append(spo.Hinge("revolute", first, first + 1, axis=axis, parent_pose=(0.1, 0, 0, 0, 0, 0, 1)))
+        bodies += [spo.Body(0.5, inertia=1e-3 * np.eye(3)), spo.Body(0.4, (0.05, 0, 0), 1e-3 * np.eye(3))]
+    law = dict(stiffness=2e4, damping=30.0)
+    pairs = [(0, 1), (1, 2), (3, 2), (0, 3)]
+    contacts = [spo.Contact(i, **ball, other=spo.Contact(j, **ball), **law) for i, j in pairs]
+    tip = dict(sphere=((0.25, 0.0, 0.0), 0.06))
+    contacts += [spo.Contact(5, **tip, other=spo.Contact(0, **ball), **law)]
+    contacts += [spo.Contact(5, **tip, other=spo.Contact(3, **ball), **law)]
+    contacts += [spo.Contact(7, sphere=((-0.55, 0, 0), 0.15), other=spo.Contact(5, **tip), **law)]
+    return spo.Scene(bodies, hinges, contacts=contacts)
+
+
+def ring_states(seed, worlds):
+    """Return q, qd of ``ring`` in which bodies touch."""
+    rng, scene = np.random.default_rng(seed), ring()
+    q, qd = np.tile(scene.neutral_q, (worlds, 1)), 0.5 * rng.normal(size=(worlds, scene.dof_count))
+    for i, (x, y) in enumerate(((0.0, -0.098), (0.196, -0.098), (0.196, 0.098), (0.0, 0.098))):
+        q[:, 7 * i : 7 * i + 2] = (x, y) + 0.001 * rng.normal(size=(worlds, 2))
+        turns = np.concatenate([0.2 * rng.normal(size=(worlds, 3)), np.ones((worlds, 1))], axis=1)
+        q[:, 7 * i + 3 : 7 * i + 7] = turns / np.linalg.norm(turns, axis=1)[:, None]
+    q[:, 28:] = 0.05 * rng.normal(size=(worlds, 4))
+    return np.float64(np.float32(q)), np.float64(np.float32(qd))

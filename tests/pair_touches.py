@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 from warp_spo.kernels import native, touches
-from warp_spo.kernels.elementary import C_TYPE
+from warp_spo.kernels.elementary import C_TYPE, NATIVE
 
 ENTRIES = 11  # of a shape: its pose in the body, half its sizes, its radius
 
@@ -66,7 +66,9 @@ def find_touches(T) -> wp.Kernel:
     for name, value in {"ENTRIES": ENTRIES, "HEADER": touches.HEADER, "MOST": touches.MOST}.items():
         text = text.replace(name, str(value))
     arrays = {"poses": wp.array3d[T], "pairs": wp.array2d[int], "shapes": wp.array2d[T], "touches_out": wp.array2d[T]}
-    find = native.function("find_touch", touches.native(T) + text, {"pair": int, "world": int, **arrays})
+    find = native.function(
+        "find_touch", NATIVE[C_TYPE[T]] + touches.native(T) + text, {"pair": int, "world": int, **arrays}
+    )
 
     @wp.kernel(module=f"warp_spo_touches_{T.__name__}", enable_backward=False)
     def kernel(poses: wp.array3d[T], pairs: wp.array2d[int], shapes: wp.array2d[T], touches_out: wp.array2d[T]):

@@ -1,6 +1,8 @@
 """Bodies that touch each other: their points, the coupled step against the dense one, and what it conserves."""
 
 import functools
+import inspect
+import textwrap
 
 import numpy as np
 import pytest
@@ -14,6 +16,8 @@ from pair_scenes import (
     mixed,
     mixed_states,
     palm,
+    ring,
+    ring_states,
     shelf,
     shelf_states,
     stack,
@@ -25,7 +29,8 @@ from pair_touches import find_touches
 import warp_spo as spo
 from warp_spo import reference_pairs
 from warp_spo.examples import grasp
-from warp_spo.kernels import coupling, coupling_blocks, coupling_points, coupling_shared, straight, touches
+from warp_spo.kernels import couples, coupling, coupling_blocks, coupling_points, coupling_shared, straight, touches
+from warp_spo.recursions.contact import aggregates, coupled, pair_pieces
 from warp_spo.reference_pairs import PairStep
 from warp_spo.reference_rotations import homogeneous
 
@@ -120,10 +125,11 @@ def test_a_step_is_the_dense_one(device):
         assert_is_dense(dyn, q, qd, passes, least=WORLDS, contact_friction=friction)
 
 
-def test_a_hand_is_the_dense_one(device):
+def test_a_hand_is_the_dense_one(device, granularity=None):
     """Limbs on a base, four pairs of which are of the same two bodies, and a world in which nothing touches."""
     q, qd = hand_states(0, 6)
-    assert_is_dense(spo.Dynamics(hand(), 6, device=device, dtype="float64"), q, qd, least=12)
+    dyn = spo.Dynamics(hand(), 6, device=device, dtype="float64", granularity=granularity)
+    assert_is_dense(dyn, q, qd, least=12)
 
 
 @pytest.mark.slow
@@ -143,6 +149,23 @@ def test_limbs_do_what_one_thread_does(device, name):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["hand", "mixed"])
+def test_the_response_of_whole_trees_does_the_same(monkeypatch, device, name):
+    """Scenes take it whose links share dofs, or whose aggregates would be too long, and whose limbs cannot share."""
+    for each in ("suits", "by_limbs"):
+        monkeypatch.setattr(pair_pieces, each, lambda scene: False)
+    monkeypatch.setattr(coupled, "suits", lambda links: False)
+    scene, states = {"hand": (hand, hand_states), "mixed": (mixed, mixed_states)}[name]
+    assert_is_dense(spo.Dynamics(scene(), 6, device=device, dtype="float64"), *states(1, 6))
+
+
+@pytest.mark.slow
+def test_a_ring_of_bodies_between_arms(device):
+    """Bodies that fly are carried by others, couples close a ring, and two trees meet."""
+    assert_is_dense(spo.Dynamics(ring(), 6, device=device, dtype="float64"), *ring_states(0, 6), least=12)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("granularity", ["tree", "segment"])
 def test_shapes_that_stand_still(device, granularity):
     """Of the inertial frame, as of a body that is fixed there."""
@@ -158,7 +181,6 @@ def test_shapes_that_stand_still(device, granularity):
 
 @pytest.mark.slow
 def test_a_pair_of_the_base_itself(device):
-    """Then one thread takes each world, with the response of whole trees."""
     q, qd = hand_states(2, 4)
     dyn = spo.Dynamics(palm(), 4, device=device, dtype="float64")
     assert_is_dense(dyn, q, qd, least=8)
@@ -197,7 +219,7 @@ def momentum(scene, q, qd):
     return total
 
 
-def head_on(dtype, device, count=60):
+def head_on(dtype, device, count=60, granularity=None):
     """Two balls that meet off centre, spinning; return the scene and momenta before and after."""
     scene = free([cube(1.0, 0.05), cube(3.0, 0.05)],
                  [spo.Contact(0, sphere=0.05, other=spo.Contact(1, sphere=0.05), stiffness=1e5)])  # fmt: skip
@@ -206,7 +228,8 @@ def head_on(dtype, device, count=60):
     qd = np.zeros((2, 12), dtype)
     qd[:, 0], qd[:, 6], qd[:, 3:6] = 1.0, -0.5, 2.0
     before, met = momentum(scene, q, qd), 0.0
-    dyn, force = spo.Dynamics(scene, 2, device=device, dtype=dtype), np.zeros((2, 1, 3), dtype)
+    dyn = spo.Dynamics(scene, 2, device=device, dtype=dtype, granularity=granularity)
+    force = np.zeros((2, 1, 3), dtype)
     for _ in range(count):
         q, qd = dyn.step(q, qd, None, H, contact_f=force)
         met = max(met, np.abs(force).max())
@@ -226,8 +249,8 @@ def test_every_array_of_a_thread_has_entries(device, monkeypatch):
     """Also where no hinge has a law with bounds; compilers for CUDA refuse an array without entries."""
     texts, assemble = [], straight.assemble
     monkeypatch.setattr(straight, "assemble", lambda *given: texts.append(assemble(*given)) or texts[-1])
-    head_on("float64", device)
-    assert any("coupling::begin" in text for text in texts) and not any("[0] = {}" in text for text in texts)
+    head_on("float64", device, granularity="tree")
+    assert any("couples::judge" in text for text in texts) and not any("[0] = {}" in text for text in texts)
 
 
 @pytest.mark.slow
@@ -327,8 +350,11 @@ def row(count):
 
 
 @pytest.mark.slow
-def test_more_pairs_than_are_solved_together(device):
-    """Eight pairs are exact; ten are as near as the residual says, and keep momentum."""
+@pytest.mark.parametrize("together", [True, False])
+def test_more_pairs_than_are_solved_together(monkeypatch, device, together):
+    """Aggregates solve all; otherwise eight are exact, ten as near as the residual says. Momentum is kept."""
+    for module in (coupled, pair_pieces):
+        monkeypatch.setattr(module, "suits", lambda links: together)
     for count, pairs in ((9, 8), (11, 10)):
         scene, q, qd = row(count)
         dyn, residual = spo.Dynamics(scene, 2, device=device, dtype="float64"), np.full(2, np.nan)
@@ -336,7 +362,7 @@ def test_more_pairs_than_are_solved_together(device):
         for w in range(2):
             _, wanted = PairStep(scene, q[w], qd[w], H).run(passes=4)
             most, error = np.abs(wanted.f).max(), np.abs(found["qd"][w] - wanted.v).max()
-            if pairs <= coupling.EXACT:
+            if together or pairs <= coupling.EXACT:
                 assert residual[w] == 0.0 and error < 1e-10
             else:
                 assert 0.0 < residual[w] < 1e-5 * most and error < 1e-5  # 8e-6 N and 2e-6 m/s
@@ -408,11 +434,23 @@ def test_a_gripper_holds_a_cube(device, drives):
     assert slip < 1e-3 and height > 0.15 and words == {spo.Status.OK}
 
 
+FIND = "counts[pair] = find(pair, places, touches);"
 BUGS = {
-    "unequal forces": (coupling_shared, "side ? -at(s, from", "side ? (REAL)(-0.9) * at(s, from"),
-    "no lever": (coupling_shared, "add_cross(f + 3, arm, f);", ""),
     "adhesion": (coupling_points, "touch.depth - h * normal > 0;", "true;"),
     "opens at last": (coupling_points, "(closing && closed) || ", ""),
+    "no friction": (couples, "sides.add(a, touch.at);", ""),
+    "no lever of friction": (couples, "skew[3 * i + j - 3]", "0"),
+    "no lever of springs": (couples, "add_cross(load, push + 1, normal);", ""),
+    "a pair of two is forgotten": (couples, FIND, FIND.replace("= find", "= e > first_pair_of(p) ? 0 : find")),
+    "dampers before the step are forgotten": (couples, "FUSED(-K[e], start[(j + 3) % 6], load[i])", "load[i]"),
+    "unequal forces": (coupled.CoupledStep._columns, "(1.0, -1.0)", "(1.0, -0.9)"),
+    "no other dof": (aggregates.Node._system, "if other <= at:", "if other == at:"),
+    "the base has no part": (aggregates.Node.close, "P.less(U[at], G[-1])", "P"),
+    "the base stands still": (aggregates.Node.open, "x - dot(self.G[-1 - at], alpha) if self.G else x", "x"),
+}
+BUGS_OF_LIMBS = {
+    "unequal forces": (coupling_shared, "side ? -at(s, from", "side ? (REAL)(-0.9) * at(s, from"),
+    "no lever": (coupling_shared, "add_cross(f + 3, arm, f);", ""),
     "no other pair": (coupling_blocks, "limb_of(a) != limb_of(b)", "p != q"),
     "no friction": (coupling_points, "K[r * (r + 1) / 2 + r] += a;", ""),
     "a pair of two is forgotten": (coupling_shared, "if (touch.missing()) break;", "if (a > first_pair_of(p)) break;"),
@@ -421,24 +459,45 @@ BUGS = {
 }
 
 
+def plant(monkeypatch, place, old, new):
+    """Put a bug into native code, or into the text of a method."""
+    if inspect.ismodule(place):
+        assert place.NATIVE.count(old) == 1
+        monkeypatch.setattr(place, "NATIVE", place.NATIVE.replace(old, new))
+        return
+    text, names = textwrap.dedent(inspect.getsource(place)), dict(place.__globals__)
+    assert text.count(old) == 1
+    exec(text.replace(old, new), names)
+    owner = getattr(inspect.getmodule(place), place.__qualname__.split(".")[0])
+    monkeypatch.setattr(owner, place.__name__, names[place.__name__])
+
+
 TELLING = [0, 1, 20, 71, 112, 194]
 """Throws in which points open and close between passes: found as those whose step a planted bug changes."""
 
 
-def test_a_cube_that_is_thrown_at_another(device):
+def test_a_cube_that_is_thrown_at_another(device, granularity=None):
     scene, q, qd = thrown(TELLING)
-    assert_is_dense(spo.Dynamics(scene, len(q), device=device, dtype="float64"), q, qd, 3)
+    dyn = spo.Dynamics(scene, len(q), device=device, dtype="float64", granularity=granularity)
+    assert_is_dense(dyn, q, qd, 3)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bug", BUGS)
 def test_a_planted_bug_is_seen(monkeypatch, device, bug):
-    file, old, new = BUGS[bug]
-    assert file.NATIVE.count(old) == 1
-    monkeypatch.setattr(file, "NATIVE", file.NATIVE.replace(old, new))
+    plant(monkeypatch, *BUGS[bug])
     with pytest.raises(AssertionError):
-        test_a_cube_that_is_thrown_at_another(device)
-        test_a_hand_is_the_dense_one(device)
+        test_a_cube_that_is_thrown_at_another(device, "tree")
+        test_a_hand_is_the_dense_one(device, "tree")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bug", BUGS_OF_LIMBS)
+def test_a_bug_of_limbs_is_seen(monkeypatch, device, bug):
+    plant(monkeypatch, *BUGS_OF_LIMBS[bug])
+    with pytest.raises(AssertionError):
+        test_a_cube_that_is_thrown_at_another(device, "segment")
+        test_a_hand_is_the_dense_one(device, "segment")
 
 
 STICK = dict(capsule=((0, 0, 0), (0, 0, 1), 0.1))

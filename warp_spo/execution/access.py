@@ -5,6 +5,7 @@ from __future__ import annotations
 from ..kernels import straight
 from ..kernels.straight import DIRECT, RELAYED, TILED, KernelLayout
 from ..kernels.substeps import SUBSTEPS
+from ..recursions.contact import coupled
 from ..recursions.contact.secants import SECANT
 from ..recursions.messages import INWARD, OUTWARD
 from ..recursions.step import GUESS, LOOPED, MISSED
@@ -22,7 +23,9 @@ _IS_WORSE = (  # as kernels.combination.worst: a state that an earlier substep l
 )
 
 
-def make_emitter(dtype: str, shapes: dict, layout: KernelLayout, pieces: bool = False) -> Emitter:
+def make_emitter(
+    dtype: str, shapes: dict, layout: KernelLayout, pieces: bool = False, branches: bool = False
+) -> Emitter:
     """Return an emitter of statements for a kernel of this layout.
 
     Args:
@@ -30,6 +33,7 @@ def make_emitter(dtype: str, shapes: dict, layout: KernelLayout, pieces: bool = 
         shapes: of the arrays that the kernel reads and writes, [world, ...], by name.
         layout: how it reads and writes them.
         pieces: the statements are those of a piece, whose names have a prefix.
+        branches: CUDA branches, too; slower on an H200 but where a branch leaves out much.
     """
     result = layout.result
     pieces = pieces or layout.warps > 1
@@ -51,7 +55,7 @@ def make_emitter(dtype: str, shapes: dict, layout: KernelLayout, pieces: bool = 
             return f"SENT({entry}) = {value};"
         if array == "out" and result.way == RELAYED:
             return f"RELAY({entry}) = {value};"
-        if array in (HELD, SECANT):
+        if array in (HELD, SECANT, *coupled.ARRAYS):
             return f"{load(array, entry)} = {value};"
         if array == MISSED and pieces:
             return f"missed_row[0] += {value};"
@@ -78,4 +82,4 @@ def make_emitter(dtype: str, shapes: dict, layout: KernelLayout, pieces: bool = 
             return places[array][index[0]]
         return index[0] if len(index) == 1 else staging.flat_index(index, shapes[array][1:])
 
-    return Emitter(dtype, load, store, flat, angles, FIELDS, fuses=True, branches=False)  # slower on an H200
+    return Emitter(dtype, load, store, flat, angles, FIELDS, fuses=True, branches=branches)

@@ -67,7 +67,7 @@ class Plan:
         device: what it is that runs them.
         dtype: "float32" or "float64".
         dofs: of the scene.
-        limbs: serial chains that end in a leaf; counted where it matters.
+        limbs: serial chains that end in a leaf; counted where it matters. alike: enough of them share code.
         apart: forward dynamics takes velocity terms and loads first, and keeps no link's velocity for the rest. It does
             not depend on the number of worlds, because the results have other bits.
         varies: inertias or hinge frames come from memory.
@@ -88,6 +88,7 @@ class Plan:
     dtype: str
     dofs: int
     limbs: int = 1
+    alike: bool = True
     apart: bool = False
     varies: bool = False
     stretch: int = 0
@@ -119,6 +120,10 @@ class Plan:
     def _rule(self, routine: Routine) -> str:
         if self.granularity == "node" or self.limbs == 1 or self.limbs > MOST_WARPS:
             return self.granularity
+        if routine.couples:
+            return self.granularity if self.alike else "tree"
+        if routine.counted and not self.alike and self.dofs <= HELD:
+            return "tree"
         if routine.long_result or routine.passes or routine.crowded:  # a thread holds too little even of a dozen dofs
             return "segment"
         if self.granularity == "segment" and not self.few:
@@ -271,7 +276,20 @@ def choose(
     else:
         stretch = (0, "granularity is asked for") if asked else _stretch(scene, worlds, device, varies)
     return Plan(
-        chosen, reason, asked is not None, staged, levels, worlds, device, dtype, dofs, limbs, apart, varies, *stretch
+        chosen,
+        reason,
+        asked is not None,
+        staged,
+        levels,
+        worlds,
+        device,
+        dtype,
+        dofs,
+        limbs,
+        alike,
+        apart,
+        varies,
+        *stretch,
     )
 
 

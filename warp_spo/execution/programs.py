@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from .. import launches
+from ..kernels import couples as couple_points
 from ..kernels import coupling, coupling_teams, native, straight
 from ..kernels.elementary import C_TYPE
 from ..kernels.fields import axes
@@ -20,10 +21,11 @@ from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout
 from ..kernels.substeps import SUBSTEPS
 from ..recursions import messages
-from ..recursions.contact import pair_pieces, pairs
+from ..recursions.contact import coupled, pair_pieces, pairs
 from ..recursions.contact.couples import Team as Couplings
 from ..recursions.contact.ground import GROUND
 from ..recursions.contact.secants import SECANT
+from ..recursions.contact.ties import couples_of
 from ..recursions.flexible import attach
 from ..recursions.links import TABLES, Links
 from ..recursions.messages import INWARD, OUTWARD
@@ -194,7 +196,7 @@ class Programs:
         if routine.bias_first is not None and self.plan.at(routine).apart and "qd" in shapes:
             routine = routine.bias_first
         attempts = [(False, False)] if shared else []
-        if routine.couples and routine.divides(self.run.scene, shapes, **options):
+        if routine.couples and not coupled.suits(links) and routine.divides(self.run.scene, shapes, **options):
             attempts += [(True, False), (True, True)]
         pieces = Pieces(links) if attempts else None
         for alone, local in attempts:
@@ -212,7 +214,8 @@ class Programs:
         stores = [self._flattened(item, shapes) for item in routine.trace(trace, **options)]
         apart = [item for item in stores if item.array in more]  # each straight to memory
         outs = [item for item in stores if item.array == "out"]
-        looped = [item for item in stores if item.array in PASSED]
+        looped = [item for item in stores if item.array in (*PASSED, coupled.TWIST)]
+        aggregates = any(item.array == coupled.TWIST for item in stores)
         kept = [Store("ahead", (), value) for value in trace.ahead] if looped else []  # may read what no store needs
         layout = self._layout(routine, outs, trace.begin + stores + kept, shapes, more)
         once = routine.passes or any(item.array in LOOPED for item in stores)  # may write over what it reads
@@ -221,22 +224,28 @@ class Programs:
         )
         placed, table = staging.arrange_stores(outs, layout.result)
         placed += apart
-        emitter = make_emitter(self.run.dtype.__name__, shapes, layout)
-        coupled = [item for item in stores if item.array in pairs.READ]
+        emitter = make_emitter(self.run.dtype.__name__, shapes, layout, branches=aggregates)
+        responses = [item for item in stores if item.array in pairs.READ]
         regions = [emitter.region(trace.begin, trace.ahead)] if looped else []
-        regions += emitter.branches([coupled, looped] if coupled else [looped]) if looped else []
+        regions += emitter.branches([responses, looped] if responses else [looped]) if looped else []
         *before, body = (render(each, self.run.dtype.__name__) for each in [*regions, emitter.region(placed)])
         if trace.begin:
             entries = {
                 GAIN: self.run.scene.dof_count,
                 SECANT: max(1, sum(item.array == SECANT for item in trace.begin)),
             }
-            if coupled:
+            if responses:
                 couples = self._couples(links)
                 entries |= coupling.shared_arrays(couples)
                 first, read, *rest = before
                 declared = coupling.declare(couples, self.run.dtype)
                 before = [f"{declared}\n{first}\n{coupling.BEGIN}", "\n".join([read, coupling.PASS, *rest])]
+            if aggregates:
+                found = self._aggregated(links, options)
+                entries |= couple_points.arrays(found)
+                first, a_pass = before
+                declared = couple_points.declare(found, self.run.dtype)
+                before = [f"{declared}\n{first}\n{couple_points.BEGIN}", f"{a_pass}\n{couple_points.PASS}"]
             body = straight.repeat_counted_passes([*before, body], entries, self.run.dtype)
         elif looped:
             ahead, a_pass = before
@@ -247,7 +256,7 @@ class Programs:
         layout = layout._replace(retries=layout.retries and "farthest" in body, block=block, direct=direct, late=late)
         tables: dict[str, Any] = {} if table is None else {"place": table}
         tables |= self._heights(emitter.counts["lookup"] > 0)
-        if coupled:
+        if responses:
             tables["touches"] = self.run.array(*self._touches(couples.points))
         return self._finished(routine, layout, body, body, tables, emitter.operations)
 
@@ -379,8 +388,20 @@ class Programs:
         )
 
     @staticmethod
+    def _aggregated(links: Links, options: dict) -> couple_points.Couples:
+        """Return the pairs of bodies of a scene as aggregates couple them, as their native code needs them."""
+        scene, couples = links.scene, couples_of(links)
+        signs = dict(one for couple in couples for one in zip(couple.pairs, couple.signs, strict=True))
+        points, eps = zip(*((pair.points, pair.eps) for pair in scene.contact_pairs), strict=True)
+        looks = bool({"contact_gap", "contact_slip"} & set(options.get("reports", ())))
+        return couple_points.Couples(
+            tuple(couple.pairs for couple in couples), tuple(signs[i] for i in range(len(points))), points, eps,
+            tuple(pairs.inverse_weights(scene)), pairs.solids_of(links)[0], looks,
+        )  # fmt: skip
+
+    @staticmethod
     def _flattened(item: Store, shapes: dict) -> Store:
-        if item.array in (INWARD, OUTWARD, *PASSED, *pairs.READ):
+        if item.array in (INWARD, OUTWARD, *PASSED, *pairs.READ, *coupled.ARRAYS):
             return item
         return item._replace(index=(staging.flat_index(item.index, shapes[item.array][1:]),))
 

@@ -23,6 +23,7 @@ from ..links import Link, Links
 from ..messages import INWARD, OUTWARD
 from ..motion import STILL
 from ..pieces import Piece, Pieces
+from .coupled import CoupledStep, suits
 from .couples import EXCESS, Team
 from .pairs import (
     RESIDUAL,
@@ -282,5 +283,6 @@ class PairedPiece(ContactStep):
 
 def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> list[Store]:
     """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world; and the ``reports``"""
-    form = PairedStep if trace.piece is None else PairedPiece
+    alone = CoupledStep if suits(trace.links) else PairedStep
+    form = alone if trace.piece is None else PairedPiece
     return form(trace, reports).stores(qdd, status)

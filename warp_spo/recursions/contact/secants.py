@@ -7,9 +7,11 @@ in. A limit is closed or open; the first pass closes those that the step may rea
 
 from __future__ import annotations
 
+from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Graph, Value, absolute, inverse_root, less, reciprocal, select
 from ..impedance import CREEP, FRICTION, LIMIT, Law, is_number
+from ..remembered import remembered
 
 SECANT = "secant"
 """Variables that passes leave for the next one, of a thread."""
@@ -145,3 +147,11 @@ def largest(values: list[Value]) -> Value:
         if not is_number(value, 0.0):
             found = select(less(found, value), value, found)
     return found
+
+
+@remembered
+def single_dofs(scene: Scene) -> frozenset[int]:
+    """Return the dofs of the hinges that have one."""
+    return frozenset(
+        int(first) for hinge, first in zip(scene.hinges, scene.qd_start, strict=False) if hinge.dof_count == 1
+    )

@@ -11,9 +11,9 @@ last of three or more opens none. :mod:`warp_spo.reference_contact` is the speci
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
-from ...scene.scene import Scene
 from ...status import Status
 from ...trace.emission import Store
 from ...trace.scalars import Value, branch, inverse_root, is_constant, less, reciprocal, select, sqrt
@@ -25,12 +25,11 @@ from ..kinematics import zero
 from ..links import Link
 from ..newton_euler import inverse_dynamics
 from ..pieces import Piece, Pieces
-from ..remembered import remembered
 from ..step import GAIN, Step
 from .dampers import SEVERAL, chosen, damper, load
 from .middle import MIDDLE
 from .points import Point, ground_place, own_points, place_points
-from .secants import Kept, Secant, largest
+from .secants import Kept, Secant, largest, single_dofs
 
 if TYPE_CHECKING:
     from ..tracing import Trace
@@ -41,14 +40,6 @@ FELT = 64.0  # roundings of a pivot; an inertia that is less of it may be roundi
 TINY = 1e-24  # square of a slip [m^2/s^2] that is nothing; its derivative is still a number in float32
 NOTHING, NO_PUSH = Articulated.build(lambda i, j: 0.0), Vector([0.0] * 6)  # damper and load of no point
 REPORTS = ("contact_f", "contact_gap", "contact_slip", "contact_excess")
-
-
-@remembered
-def single_dofs(scene: Scene) -> frozenset[int]:
-    """Return the dofs of the hinges that have one."""
-    return frozenset(
-        int(first) for hinge, first in zip(scene.hinges, scene.qd_start, strict=False) if hinge.dof_count == 1
-    )
 
 
 class Touch(NamedTuple):
@@ -90,10 +81,10 @@ class ContactStep(Step):
         self._press(points, touches)
         trace.stiffened = self._stiffened
         tau = trace.vector("tau")
-        done, rates, sent = reduce(trace, lambda dof: tau(dof) + self.forces[dof] - bias[dof], moves=False, loads=False)
+        done, rates, sent = self.inward(lambda dof: tau(dof) + self.forces[dof] - bias[dof])
         rates = self.close(done, rates)
         alpha: dict[int, tuple[Vector, Vector]] = {}
-        moved = expand(trace, done, rates, (ZERO, ZERO), alpha=alpha)
+        moved = self.outward(done, rates, alpha)
         gains = {item.index[0]: self.h * item.value for item in moved if item.array == "out"}
         gains = self.couple(done, gains, alpha)
         passed = [item for item in moved if item.array != "out"]
@@ -136,6 +127,14 @@ class ContactStep(Step):
         found = inverse_dynamics(trace, qdd=zero, letter="f")
         bias = {item.index[0]: item.value for item in found if item.array == "out"}
         return bias, [item for item in found if item.array != "out"]
+
+    def inward(self, tau: Callable[[int], Value]) -> tuple[Factors, dict, list[Store]]:
+        """Return factors and D^-1 eps of a pass by link, for forces of the dofs, and the stores that send."""
+        return reduce(self.trace, tau, moves=False, loads=False)
+
+    def outward(self, done: Factors, rates: dict, alpha: dict[int, tuple[Vector, Vector]]) -> list[Store]:
+        """Return the stores of qdd; ``alpha`` receives the accelerations of links by id."""
+        return expand(self.trace, done, rates, (ZERO, ZERO), alpha=alpha)
 
     # -- bodies that touch each other ------------------------------------------------------------------------------
     def close(self, done: dict, rates: dict) -> dict:
@@ -228,8 +227,7 @@ class ContactStep(Step):
 
     def _press(self, points: list[Point], touches: list[Touch]) -> None:
         """Add dampers and loads of the points to their links."""
-        trace = self.trace
-        on: dict[int, list[tuple[Point, Touch]]] = {}
+        trace, on = self.trace, dict[int, list[tuple[Point, Touch]]]()
         for point, touch in zip(points, touches, strict=True):
             if point.link is not None:
                 on.setdefault(id(point.link), []).append((point, touch))
@@ -345,6 +343,8 @@ class ContactStep(Step):
             stores += self.finished[name]
         if trace.piece is not None:
             return stores + self._sent_to_the_first(trace.piece, results, status)
+        if self.excess and any(more := self.last_excess()):
+            self.excess = [largest([own, *others]) for own, others in zip(self.excess, more, strict=True)]
         stores += self._excess_stores()
         if status:
             trace.graph.step = "status|s"

@@ -18,8 +18,8 @@ from ...trace.scalars import Value, cut, reciprocal, select
 from ..contact.ground import surface_count
 from ..contact.middle import MIDDLE
 from ..contact.points import own_points
-from ..contact.secants import Kept
-from ..contact.step import ContactStep, Touch, single_dofs
+from ..contact.secants import Kept, single_dofs
+from ..contact.step import ContactStep, Touch
 from ..impedance import LIMIT, Law
 from ..links import Link, Links
 from ..pieces import Pieces

@@ -1,0 +1,357 @@
+"""Native code of pairs of bodies that aggregates of links couple: their points, dampers and loads.
+
+Pairs between the same two links are a couple, whose twist t = (v; omega) is that of its link f less that of the other
+one, at the origin and in the axes of f, as are all its points. Before the first pass and after each one, every point's
+law at t becomes a damper G across and along its normal and a load, and what the next pass eliminates is their sum,
+
+    K = sum phi* G phi,  f0 = sum phi* k p n        in the order (omega; v), (n; f).
+
+All points of a pair have the same normal n, so that K comes from sums of a, a s, a s s* over its points s, with a
+across the normal, and likewise with what is more along it.
+
+A couple whose shapes are farther apart than they can come near in a step has no points: balls around them say so.
+"""
+
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from . import coupling_points, touches
+from .coupling import FEW, VALUES, entries, table
+from .elementary import C_TYPE
+from .touches import AWAY, HEADER, POINT
+
+FIELDS, EXCESS, LAST, PLACES = 5, 3, 27, 24  # as in warp_spo.recursions.contact.coupled
+
+
+class Couples(NamedTuple):
+    """The pairs of a scene.
+
+    Attributes:
+        pairs: those of each couple. signs: of each pair, 1 where its first body is on the couple's link f, else
+            -1. points, eps, weight: of each pair: points at most, speed below which friction is a damper, inverse
+            weight that predicts slip.
+        solids: their shapes, with ``lists`` and ``reals``. looks: points are found however far shapes are apart.
+    """
+
+    pairs: tuple[tuple[int, ...], ...]
+    signs: tuple[float, ...]
+    points: tuple[int, ...]
+    eps: tuple[float, ...]
+    weight: tuple[float, ...]
+    solids: Any
+    looks: bool
+
+
+def declare(couples: Couples, T: type) -> str:
+    """Return the definition of ``couples`` and of the thread's arrays."""
+    c, pairs, count = C_TYPE[T], len(couples.points), len(couples.pairs)
+    number = "f" if T is wp.float32 else ""
+    first_pair, first_point = [0], [0]
+    for each in couples.pairs:
+        first_pair.append(first_pair[-1] + len(each))
+    for points in couples.points:
+        first_point.append(first_point[-1] + points)
+    half, radius = couples.solids.reals["half"], couples.solids.reals["radius"]
+    balls = [sum(x * x for x in half[3 * i : 3 * i + 3]) ** 0.5 + radius[i] for i in range(2 * pairs)]
+    lists = {
+        "first_pair": first_pair, "pair": [pair for each in couples.pairs for pair in each], "points": couples.points,
+        "first_point": first_point[:-1], "entry": entries(couples.points)[:-1], "box": couples.solids.lists["box"],
+    }  # fmt: skip
+    reals = {"eps": couples.eps, "weight": couples.weight, "sign": couples.signs, "half": half, "radius": radius}
+    reals["ball"] = balls
+    few = pairs <= FEW
+    tables = [table("int", f"{name}_of", [str(x) for x in row], few) for name, row in lists.items()]
+    tables += [table(c, f"{name}_of", [f"{x!r}{number}" for x in row], few) for name, row in reals.items()]
+    sizes = {
+        "PAIRS": pairs, "COUPLES": count, "HEADER": HEADER, "POINT": POINT, "LAST": LAST, "FIELDS": FIELDS,
+        "PLACES": PLACES, "LOOKS": int(couples.looks),
+    }  # fmt: skip
+    shapes = coupling_points.NATIVE[: coupling_points.NATIVE.index("    // Finds the points of a pair")]
+    laws = coupling_points.NATIVE[coupling_points.NATIVE.index("    // Begins the damper of a point") :]
+    text = NATIVE.replace("SHAPES", shapes.strip()).replace("LAWS", laws.strip())
+    text = text.replace("REAL", c).replace("FUSED", f"FUSED_{c}").replace("TABLES", "\n    ".join(tables))
+    text = text.replace("NOTHING", f"1e-24{number}").replace("AWAY", f"{AWAY!r}{number}")
+    for word, pragma in (("UNROLL", "#pragma unroll"), ("LOOP", "#pragma unroll 1")):
+        text = text.replace(f"{word}\n", f"{pragma}\n")
+    constants = ", ".join(f"{name} = {value}" for name, value in sizes.items())
+    own = {"across": first_point[-1], "touch": entries(couples.points)[-1], "bound": 2 * pairs}
+    arrays = [f"{c} couple_{name}_row[{count}] = {{}};" for name, count in own.items()]
+    arrays += [f"int couple_{name}_row[{pairs}] = {{}};" for name in ("count", "closed", "candidate")]
+    return "\n".join([touches.native(T), text.replace("CONSTANTS", constants), *arrays])
+
+
+def arrays(couples: Couples) -> dict[str, int]:
+    """Return the sizes of the thread's arrays that statements around ``couples`` write and read, by name."""
+    pairs, count = len(couples.points), len(couples.pairs)
+    sizes = {"place": PLACES * pairs, "value": VALUES * pairs + 2, "start": 6 * count, "twist": 6 * count}
+    sizes |= {"damper": LAST * count, "coupled": count, "report": FIELDS * pairs + EXCESS}
+    return {f"couple_{name}": size for name, size in sizes.items()}
+
+
+CALL = """
+couples::judge(STAGE, couple_value_row, couple_place_row, couple_start_row, couple_twist_row, dt_row[0],
+    couple_touch_row, couple_across_row, couple_bound_row, couple_count_row, couple_closed_row, couple_candidate_row,
+    couple_damper_row, couple_coupled_row, couple_report_row);
+"""
+BEGIN = CALL.replace("STAGE", "couples::FIRST")
+PASS = CALL.replace(
+    "STAGE",
+    "turn + 1 == (int)passes_row[0] ? couples::AT_LAST\n"
+    "    : turn > passes_row[0] - 2.5 && passes_row[0] > 2.5 ? couples::CLOSING : couples::BETWEEN",
+)
+"""Native code before the first pass and after each one; only the last pass of three or more closes and never opens."""
+
+NATIVE = r"""
+enum { CONSTANTS };
+#if defined(__CUDA_ARCH__)
+#define APART __noinline__
+#else
+#define APART inline
+#endif
+struct couples
+{
+    enum { FIRST, BETWEEN, CLOSING, AT_LAST };
+    TABLES
+
+    SHAPES
+
+    LAWS
+
+    static CUDA_CALLABLE APART int find(int pair, const REAL* places, REAL* touches)
+    {
+        solids::Solid both[2];
+        UNROLL
+        for (int side = 0; side < 2; ++side) {
+            const int which = 2 * pair + side;
+            const REAL* from = places + PLACES * pair + 12 * side;
+            UNROLL
+            for (int c = 0; c < 3; ++c) {
+                both[side].at[c] = from[c];
+                both[side].size[c] = half_of(3 * which + c);
+            }
+            UNROLL
+            for (int c = 0; c < 9; ++c) both[side].turn[c] = from[3 + c];
+            both[side].radius = radius_of(which);
+            both[side].box = box_of(which);
+        }
+        solids::touch(both[0], both[1], touches + entry_of(pair) + HEADER, 1, points_of(pair));
+        int count = 0;
+        while (count < points_of(pair) && !Touch(touches, 1, pair, count).missing()) ++count;
+        return count;
+    }
+
+    // Most that the shapes can be in each other, and how far from the origin a point of one of them can be.
+    static CUDA_CALLABLE inline void bound(int pair, const REAL* places, REAL* to)
+    {
+        const REAL *one = places + PLACES * pair, *two = one + 12;
+        REAL between[3];
+        UNROLL
+        for (int c = 0; c < 3; ++c) between[c] = one[c] - two[c];
+        const REAL distance = length(between);
+        to[0] = ball_of(2 * pair) + ball_of(2 * pair + 1) - distance;
+        to[1] = length(one) + ball_of(2 * pair) + distance;
+    }
+
+    static CUDA_CALLABLE inline bool apart(const REAL* bound, const REAL* twist, REAL h, REAL falls)
+    {
+        const REAL speed = length(twist) + length(twist + 3) * bound[1];
+        return bound[0] + falls + (REAL)1.001 * h * speed + (REAL)1e-3 * size_of(bound[0]) < 0;
+    }
+
+    static CUDA_CALLABLE inline REAL size_of(REAL x) { return x < 0 ? -x : x; }
+
+    static CUDA_CALLABLE inline REAL length(const REAL* x)
+    {
+        const REAL square = dot(x, x);
+        return square * on::inverse_root(square + NOTHING);
+    }
+
+    // Sums over the points of a pair, of which each has the place s and the weight a: a, a s, a s s*.
+    struct Moments
+    {
+        REAL zero, one[3], two[6];
+
+        CUDA_CALLABLE inline Moments() : zero(0)
+        {
+            UNROLL
+            for (int i = 0; i < 3; ++i) one[i] = 0;
+            UNROLL
+            for (int i = 0; i < 6; ++i) two[i] = 0;
+        }
+
+        CUDA_CALLABLE inline void add(REAL a, const REAL* s)
+        {
+            zero += a;
+            UNROLL
+            for (int i = 0, e = 0; i < 3; ++i) {
+                const REAL x = a * s[i];
+                one[i] += x;
+                UNROLL
+                for (int j = i; j < 3; ++j, ++e) two[e] = FUSED(x, s[j], two[e]);
+            }
+        }
+
+        CUDA_CALLABLE inline REAL square(int i, int j) const
+        {
+            return two[i == 0 ? j : j == 0 ? i : i + j + 1];  // 00 01 02 11 12 22
+        }
+    };
+
+    // Adds the dampers of a pair to the upper triangle of K, order (omega; v), and its push to the load (n; f).
+    static CUDA_CALLABLE inline void add_pair(const Moments& across, const Moments& more, const REAL* push,
+        const REAL* normal, REAL* K)
+    {
+        REAL lever[3] = {0, 0, 0}, half[3][3], load[3] = {0, 0, 0};
+        add_cross(lever, more.one, normal);
+        add_cross(load, push + 1, normal);
+        UNROLL
+        for (int j = 0; j < 3; ++j) {  // rows of [s x n] s*
+            const REAL column[3] = {more.square(0, j), more.square(1, j), more.square(2, j)};
+            REAL turned[3] = {0, 0, 0};
+            add_cross(turned, column, normal);
+            UNROLL
+            for (int i = 0; i < 3; ++i) half[i][j] = turned[i];
+        }
+        const REAL all = across.square(0, 0) + across.square(1, 1) + across.square(2, 2);
+        const REAL *a = across.one;
+        const REAL skew[9] = {0, -a[2], a[1], a[2], 0, -a[0], -a[1], a[0], 0};
+        UNROLL
+        for (int i = 0, e = 0; i < 6; ++i)
+            UNROLL
+            for (int j = i; j < 6; ++j, ++e) {
+                REAL x;
+                if (j < 3) {
+                    const int k = (j + 1) % 3, l = (j + 2) % 3;  // half times [n]x*, the entry (i, j)
+                    x = half[i][k] * normal[l] - half[i][l] * normal[k] - across.square(i, j) + (i == j ? all : 0);
+                } else if (i < 3) {
+                    x = FUSED(lever[i], normal[j - 3], skew[3 * i + j - 3]);
+                } else {
+                    x = FUSED(more.zero * normal[i - 3], normal[j - 3], i == j ? across.zero : 0);
+                }
+                K[e] += x;
+            }
+        UNROLL
+        for (int i = 0; i < 3; ++i) {
+            K[21 + i] += load[i];
+            K[24 + i] += push[0] * normal[i];
+        }
+    }
+
+    // h K, and f0 - K t for the twist t before the step.
+    static CUDA_CALLABLE inline void leave(const REAL* K, const REAL* start, REAL h, REAL* to)
+    {
+        REAL load[6];
+        UNROLL
+        for (int i = 0; i < 6; ++i) load[i] = K[21 + i];
+        UNROLL
+        for (int i = 0, e = 0; i < 6; ++i)
+            UNROLL
+            for (int j = i; j < 6; ++j, ++e) {  // twists are (v; omega)
+                load[i] = FUSED(-K[e], start[(j + 3) % 6], load[i]);
+                if (i != j) load[j] = FUSED(-K[e], start[(i + 3) % 6], load[j]);
+                to[e] = h * K[e];
+            }
+        UNROLL
+        for (int i = 0; i < 6; ++i) to[21 + i] = load[i];
+    }
+
+    // What the points of all couples leave for the next pass, or report after the last one.
+    static CUDA_CALLABLE APART void judge(int stage, const REAL* value, const REAL* places, const REAL* starts,
+        const REAL* twists, REAL h, REAL* touches, REAL* across, REAL* bounds, int* counts, int* closed,
+        int* candidate, REAL* dampers, REAL* coupled, REAL* report)
+    {
+        REAL* excess = report + FIELDS * PAIRS;
+        const Pair origin = {{{0, 0, 0}, {0, 0, 0}}, {0, 0}, 0};
+        UNROLL
+        for (int i = 0; i < 3; ++i) excess[i] = 0;
+        LOOP
+        for (int p = 0; p < COUPLES; ++p) {
+            REAL twist[6], K[LAST];
+            bool acts = false, quiet = true;
+            UNROLL
+            for (int i = 0; i < 6; ++i) twist[i] = twists[6 * p + i];
+            UNROLL
+            for (int i = 0; i < LAST; ++i) K[i] = 0;
+            LOOP
+            for (int e = first_pair_of(p); e < first_pair_of(p + 1); ++e) {
+                const int pair = pair_of(e);
+                const REAL *law = value + 3 * pair, bad = law[0] + law[1] + law[2];
+                K[24] += bad - bad;  // NaN even where the pair does not touch
+                acts = acts || bad != bad;
+                quiet = quiet && !acts;
+                if (stage == FIRST) {
+                    bound(pair, places, bounds + 2 * pair);
+                    counts[pair] = -1;
+                }
+                if (counts[pair] < 0) {
+                    const REAL falls = stage == FIRST ? value[3 * PAIRS] : 0;
+                    if (!LOOKS && apart(bounds + 2 * pair, twist, h, falls)) {
+                        UNROLL
+                        for (int c = 0; c < FIELDS; ++c) report[FIELDS * pair + c] = 0;
+                        continue;
+                    }
+                    counts[pair] = find(pair, places, touches);
+                }
+                const int count = counts[pair];
+                quiet = false;
+                const REAL share = on::reciprocal((REAL)(count ? count : 1)), k = law[0] * share;
+                const REAL kd = FUSED(k, h, law[1] * share), friction = law[2];
+                REAL v[3], slip, normal[3] = {0, 0, 0}, force[3] = {0, 0, 0}, push[4] = {0, 0, 0, 0};
+                REAL deepest = AWAY, along = 0;
+                Moments sides, more;
+                int shut_points = closed[pair], near_points = candidate[pair];
+                LOOP
+                for (int i = 0; i < count; ++i) {
+                    Touch touch(touches, 1, pair, i);
+                    UNROLL
+                    for (int c = 0; c < 3; ++c) normal[c] = touch.normal[c] = touch.normal[c] * sign_of(pair);
+                    const REAL speed = rate(twist, origin, touch, v, slip);
+                    const int at = first_point_of(pair) + i;
+                    const REAL before = across[at];
+                    REAL a = before;
+                    bool shut = shut_points >> i & 1, near = near_points >> i & 1;
+                    if (stage == FIRST) {
+                        near = shut =
+                            begin_point(touch, pair, speed, slip, h, k, kd, friction, value[3 * PAIRS], a);
+                    } else {
+                        const After now(
+                            touch, pair, speed, slip, h, k, kd, friction, stage >= CLOSING, a, shut, near);
+                        if (stage == AT_LAST) {
+                            excess[0] = now.over > excess[0] ? now.over : excess[0];
+                            excess[1] = now.pull > excess[1] ? now.pull : excess[1];
+                            excess[2] = now.lacking > excess[2] ? now.lacking : excess[2];
+                            along = touch.depth > deepest ? slip : along;
+                            deepest = touch.depth > deepest ? touch.depth : deepest;
+                            UNROLL
+                            for (int c = 0; c < 3; ++c)
+                                force[c] += touch.normal[c] * (now.push + before * speed) - before * v[c];
+                        }
+                    }
+                    across[at] = a;
+                    shut_points = (shut_points & ~(1 << i)) | ((int)shut << i);
+                    near_points = (near_points & ~(1 << i)) | ((int)near << i);
+                    acts = acts || shut || a > 0;
+                    sides.add(a, touch.at);
+                    more.add((shut ? kd : 0) - a, touch.at);
+                    const REAL x = shut ? k * touch.depth : 0;
+                    push[0] += x;
+                    UNROLL
+                    for (int c = 0; c < 3; ++c) push[1 + c] = FUSED(x, touch.at[c], push[1 + c]);
+                }
+                closed[pair] = shut_points;
+                candidate[pair] = near_points;
+                add_pair(sides, more, push, normal, K);
+                if (stage != AT_LAST) continue;
+                UNROLL
+                for (int c = 0; c < 3; ++c) report[FIELDS * pair + c] = force[c];
+                report[FIELDS * pair + 3] = count ? -deepest : INFINITY;
+                report[FIELDS * pair + 4] = along;
+            }
+            if (quiet) continue;  // and it was before
+            leave(K, starts + 6 * p, h, dampers + LAST * p);
+            coupled[p] = acts;
+        }
+    }
+};
+"""
