@@ -22,6 +22,7 @@ from warp_spo.examples import (
     hop,
     identify,
     identify_boom,
+    newton_grasp,
     newton_ground,
     options,
     parts,
@@ -196,6 +197,13 @@ def test_a_panda_lifts_a_cube(tmp_path, device, capsys):
     grasp.main(device=str(device), picture=tmp_path / "grasp.svg")
     said = capsys.readouterr().out
     assert said.count("slips by") == 2 and said.count("stays on the ground") == 1
+    assert_is_whole((tmp_path / "grasp.svg").read_text())
+
+
+@pytest.mark.slow
+def test_a_newton_model_of_a_panda_draws_its_forces(tmp_path, device):
+    rows, words = newton_grasp.main(worlds=2, seconds=2.0, device=str(device), picture=tmp_path / "grasp.svg")
+    assert rows[-1][1][0] > 0.15 > 0.05 > rows[-1][1][1] and not words.any()  # friction of 0.8, and of 0.05
     assert_is_whole((tmp_path / "grasp.svg").read_text())
 
 
