@@ -28,14 +28,14 @@ def made(model, stiffness=None, **options):
     return SolverSPO(model, points=4, **options)
 
 
-def run(name, solver, frames, worlds=2, stiffness=None, folder=None, pairs=None, **options):
+def run(name, solver, frames, worlds=2, stiffness=None, folder=None, pairs=None, loops="raise", **options):
     """Run an example with SolverSPO where it makes the solver of that name; return the example.
 
     What its own test finds wrong is raised.
     """
     module = importlib.import_module(f"newton.examples.{folder or name.split('_')[0]}.example_{name}")
     theirs = getattr(newton.solvers, solver)
-    stand_in = mock.Mock(side_effect=lambda model, **_: made(model, stiffness, pairs=pairs))
+    stand_in = mock.Mock(side_effect=lambda model, **_: made(model, stiffness, pairs=pairs, loops=loops))
     stand_in.register_custom_attributes = getattr(theirs, "register_custom_attributes", None)
     types_of = isinstance
     args = types.SimpleNamespace(world_count=worlds, solver=solver.removeprefix("Solver").lower(), test=True,
@@ -66,6 +66,8 @@ RUN = {
     "selection_articulations": ("SolverMuJoCo", 10, {}),  # as many frames as Newton's tests
     "selection_multiple": ("SolverMuJoCo", 10, {}),
     "selection_materials": ("SolverMuJoCo", 10, {}),  # friction changes between frames
+    "basic_joints": ("SolverXPBD", 500, {}),  # its slider is at rest after 8 s
+    "basic_mimic_joint": ("SolverXPBD", 120, {"loops": "embed", "pitch": 1.2}),
     "newton_cradle": ("SolverXPBD", 100, {"folder": "contacts", "pairs": "all"}),  # ten pairs of five balls
 }
 """Examples that pass their own test with no word of any world: the solver that they make, frames, and options."""
