@@ -19,7 +19,7 @@ import warp_spo as spo
 from warp_spo.env import robots
 from warp_spo.examples import hop
 from warp_spo.newton import SolverSPO
-from warp_spo.recursions.contact import step
+from warp_spo.recursions.contact import law
 from warp_spo.recursions.derivatives.contact import PassAdjoint, PassGradient, PassSolve
 
 torch = pytest.importorskip("torch")
@@ -123,7 +123,7 @@ def test_a_cube_at_rest_has_a_gradient(monkeypatch):
     cotangents = [np.ones((2, 7)), np.ones((2, 6))]
     found = contact_gradients.gradient(scene, a, H, 3, cotangents, ("q", "qd", "tau"))
     assert all(np.isfinite(x).all() for x in found.values())
-    monkeypatch.setattr(step, "TINY", 0.0)
+    monkeypatch.setattr(law, "TINY", 0.0)
     with np.errstate(all="ignore"):
         found = contact_gradients.gradient(scene, a, H, 3, cotangents, ("qd",))
     assert np.isnan(found["qd"]).all()

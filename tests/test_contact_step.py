@@ -13,7 +13,7 @@ from step_scenes import furnished, states
 
 import warp_spo as spo
 from warp_spo.dynamics import contacts
-from warp_spo.recursions.contact import dampers, ground, middle, points, secants, step
+from warp_spo.recursions.contact import dampers, ground, law, middle, points, secants, step
 from warp_spo.reference_contact import MANY, ContactStep
 
 H, WORLDS = 5e-3, 4
@@ -251,10 +251,10 @@ def test_a_ground_that_is_not_there_is_an_error(values, words):
 
 BUGS = {
     "active set": (secants.Secant, "finish", "bound * reciprocal(share), 1.0", "0.0, 1.0"),
-    "candidates frozen": (step.ContactStep, "_finish", "select(touch.candidate, touch.candidate, reached)",
+    "candidates frozen": (law, "finish_point", "select(touch.candidate, touch.candidate, reached)",
                           "touch.candidate"),
-    "dampers above ground": (step.ContactStep, "_finish", "candidate * pushes", "pushes"),
-    "last pass opens": (step.ContactStep, "_finish", "kept.closing * touch.closed", "0.0"),
+    "dampers above ground": (law, "finish_point", "candidate * pushes", "pushes"),
+    "last pass opens": (law, "finish_point", "closing * touch.closed", "0.0"),
     "wrong lever": (dampers, "_mass", "r * weight", "r * (2.0 * weight)"),
     "riser unseen": (ground, "surfaces", "_cell((x + moves[0] - ground.origin[0]) * rate_x, rows)[0]", "i"),
     "velocity terms at the start": (middle, "middle_bias", "v.__getitem__, 0.5 * h", "v.__getitem__, 0.0 * h"),
@@ -263,8 +263,9 @@ BUGS = {
     "straight paths": (points, "place_points", "(0.5 * h) * faster", "0.0"),
     "damper of straight paths": (points, "place_points", "k * below - damping * faster", "k * below"),
     "damping that does not grow": (points, "place_points", "d * (k * select(less(0.0, depth), depth, 0.0))", "d"),
-    "tangent friction": (step.ContactStep, "_secant", "inverse_root(w * w + point.eps * point.eps)",
-                         "reciprocal(w * w + point.eps * point.eps) * point.eps"),
+    "tangent friction": (law, "secant", "inverse_root(w * w + point.eps * point.eps)",
+                         "inverse_root(w * w + point.eps * point.eps) * inverse_root(w * w + point.eps * point.eps)"
+                         " * point.eps"),
 }  # fmt: skip
 
 

@@ -115,6 +115,7 @@ RULES = {
     "lost": lambda x, y: x.graph.make("lost", x) + x * y,
     "select": lambda x, y: g.select(x, x * y, y) + g.select(x.graph.make("lost", x), x, y * y),
     "branch": lambda x, y: g.branch(x, x * y, y, "a") + g.branch(x.graph.make("lost", x), x, y * y, "b"),
+    "fork": lambda x, y: g.branch(x, x * y, y, "a", "fork") + g.branch(x.graph.make("lost", x), x, y * y, "b", "fork"),
     "less": lambda x, y: g.less(x, y) + x * y,
     "floor": lambda x, y: g.floor(x) + x * y,
     "inverse_root": lambda x, y: g.inverse_root(1.0 + x * x + y * y),

@@ -208,7 +208,7 @@ def translated(cuda):
             depth += 1
             continue
         if mask:
-            line = re.sub(r"^(\w+) = (.*);$", rf"\1 = where({mask} != 0, \2, \1);", line)
+            line = re.sub(r"^(\w+(?:\[\d+\])?) = (.*);$", rf"\1 = where({mask} != 0, \2, \1);", line)
         branch = re.match(r"^(else )?(?:if \((.*)\) )?\{$", line)
         if branch:
             condition = "False" if "reach" in (branch[2] or "") else (branch[2] or "").replace("||", "or")

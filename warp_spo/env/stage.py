@@ -11,7 +11,7 @@ from ..kernels import native, philox, row_chunks
 from ..kernels.elementary import C_TYPE
 from ..kernels.elementary import NATIVE as ELEMENTARY
 from ..trace.emission import Emitter, Listing, RangeReduction, Store, render, replaces
-from ..trace.scalars import Graph, Scalar, ordered
+from ..trace.scalars import BRANCHES, Graph, Scalar, ordered
 
 ROW, COLUMN, INT, LONG, CHOSEN, SHARED = "row", "column", "int", "long", "chosen", "shared"
 DRAW = "draw"  # random numbers of the thread's own
@@ -177,7 +177,7 @@ class Stage:
         count = f"{step} += {self.ticks};" if self.ticks else ""
         step += f" - ({self.late})" if self.late else ""
         first = f"row * {-(-self.draws // 4)}" if self.rows else "0"
-        rare = any(x.op == "branch" for x in ordered(item.value for item in self.stores))
+        rare = any(x.op in BRANCHES for x in ordered(item.value for item in self.stores))
         random = philox.draws(self.draws, (words[0], words[1]), self.stream, world, step, first, rare)
         touched |= {"key"} if self.draws else set()
         touched |= {"tick"} if self.draws or self.ticks else set()

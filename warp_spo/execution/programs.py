@@ -20,10 +20,11 @@ from ..kernels.native import INTEGERS
 from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout
 from ..kernels.substeps import SUBSTEPS
-from ..recursions import messages
+from ..recursions import alike, messages
 from ..recursions.contact import coupled, pair_pieces, pairs
 from ..recursions.contact.couples import Team as Couplings
 from ..recursions.contact.ground import GROUND
+from ..recursions.contact.points import own_points
 from ..recursions.contact.secants import SECANT
 from ..recursions.contact.ties import couples_of
 from ..recursions.flexible import attach
@@ -34,7 +35,7 @@ from ..recursions.step import GAIN, GUESS, LOOPED, MISSED
 from ..recursions.tracing import Trace
 from ..scene.contacts import HeightField
 from ..trace.emission import Store, render, under
-from ..trace.scalars import Scalar, is_constant
+from ..trace.scalars import Scalar, is_literal
 from ..trace.set_aside import set_aside
 from . import link_values, products, searches, staging
 from .access import make_emitter
@@ -70,6 +71,23 @@ class Program(NamedTuple):
     slots: int = 0
     places: tuple[int, ...] = ()
     entry: Any = None
+
+
+class Gathered(NamedTuple):
+    """The work of all pieces before it is one text.
+
+    Attributes:
+        table: which value each entry of the result receives, if a table says so. sent: the scalars that pieces send.
+        looks_up: some piece reads heights. couples: the pairs of bodies. numbers: the constants of each piece.
+    """
+
+    team: Team
+    layout: KernelLayout
+    table: list[int] | None
+    sent: int
+    looks_up: bool
+    couples: Couplings | None
+    numbers: list[alike.Numbers]
 
 
 class Programs:
@@ -180,9 +198,9 @@ class Programs:
             self._links = Links(self.run.scene, self.run.parameters.variable)
         return self._links
 
-    def _copied(self, options: dict) -> Links:
+    def _copied(self, options: dict, copies: bool = False) -> Links:
         """Return links of their own for one trace, with what the frames in its options sit on."""
-        links = self.links.with_tables()
+        links = self.links.with_tables(copies)
         attach(links, ((body, place[:3]) for body, place in options.get("frames", ())))
         return links
 
@@ -272,11 +290,35 @@ class Programs:
 
         ``alone``: one thread takes them all. ``local``: it keeps what they tell each other in memory of its own.
         """
+        found = self._team(routine, shapes, pieces, more, options, alone, local, [frozenset()] * len(pieces.pieces))
+        if found is not None and routine.alike:
+            apart = alike.differing(pieces.pieces, found.numbers, found.team.texts)
+            other = self._team(routine, shapes, pieces, more, options, alone, local, apart) if any(apart) else None
+            if other is not None and len(set(other.team.texts)) < len(set(found.team.texts)):
+                found = other
+        return None if found is None else self._team_program(routine, pieces, found, alone, local)
+
+    def _team(
+        self,
+        routine: Routine,
+        shapes: dict,
+        pieces: Pieces,
+        more: tuple,
+        options: dict,
+        alone: bool,
+        local: bool,
+        unfolded: list[frozenset],
+    ) -> Gathered | None:
+        """Return the work of all pieces, None if there is no room.
+
+        ``unfolded``: by piece, constants that do not fold, see :mod:`..recursions.alike`.
+        """
         letters = messages.needed(routine.letters, shapes)
         dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(letters, pieces)
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         couples = self._team_of_pairs(slots, sent) if routine.couples else None
         sent = couples.layout["end"] if couples is not None else sent
+        numbers: list[alike.Numbers] = []
         everything: list[Store] = []
         traced: list[list[Store]] = []
         apart: list[tuple[list[Store], list[Store], list[list[Store]]]] = []
@@ -286,16 +328,20 @@ class Programs:
             tuple[list[tuple[int, list[Store]]], list[Any]]
         ] = []  # what each piece leaves for pairs of bodies
         for index in range(len(pieces.pieces)):
-            links = self._copied(options)  # its own: pieces of equal structure then give equal text
+            links = self._copied(options, routine.alike)  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             trace.team = couples
+            if routine.alike and trace.piece is not None:
+                points = [number for number, _ in own_points(trace)]
+                links.numbers = alike.Numbers(links.graph, trace.piece, points, unfolded[index])
+                numbers.append(links.numbers)
             traced.append([self._flattened(item, shapes) for item in routine.trace(trace, **options)])
             rounds = [[self._flattened(item, shapes) for item in turn] for turn in trace.rounds]
             news = [self._flattened(item, shapes) for item in trace.news]
             apart.append((trace.checks, news, rounds))
             begins.append(trace.begin)
             responses.append((trace.couples, trace.carried))
-            held.append(list({x.key: x for x in trace.ahead if not is_constant(x) and x.op != "input"}.values()))
+            held.append(list({x.key: x for x in trace.ahead if not is_literal(x) and x.op != "input"}.values()))
             everything += trace.begin + traced[-1] + trace.checks + news + [item for turn in rounds for item in turn]
             everything += [item for _, items in trace.couples for item in items]
         bends = any(item.array == MISSED for item in everything)
@@ -344,6 +390,12 @@ class Programs:
             emitters = {first, emitter, checking, later}
             team.add(work, sum(each.operations for each in emitters))
             looks_up |= any(each.counts["lookup"] for each in emitters)
+        return Gathered(team, layout, table, sent, looks_up, couples, numbers)
+
+    def _team_program(self, routine: Routine, pieces: Pieces, found: Gathered, alone: bool, local: bool) -> Program:
+        """Return the program of a team."""
+        team, layout, table, sent, looks_up, couples, _ = found
+        dtype = self.run.dtype.__name__
         cpu = team.cpu()
         if local:
             cpu = f"{C_TYPE[self.run.dtype]} sent[{sent}];\n#undef SENT\n#define SENT(i) sent[i]\n{cpu}"

@@ -121,6 +121,11 @@ class Team:
         self.operations += operations
 
     @property
+    def texts(self) -> list[tuple[str, ...]]:
+        """What is equal for pieces that share their code, by piece."""
+        return [self._work[piece.index].text for piece in self.pieces.pieces]
+
+    @property
     def _defined(self) -> list[str]:
         return [self.pairs] if self.pairs else []
 

@@ -183,7 +183,12 @@ class Impedance:
         column = self.scene.values[name][:, index]
         if name in self.links.variable or (column != column[0]).any():
             return self.links.graph.input(name, index)
-        return float(column[0])
+        return self._constant(name, index, column[0])
+
+    def _constant(self, name: str, index: int, value: float) -> Value:
+        """Return a constant; pieces of one make may keep it from folding, see :mod:`.alike`."""
+        numbers = self.links.numbers
+        return float(value) if numbers is None else numbers.of_scene(name, index, float(value))
 
     def _bound(self, name: str, dof: int, none: float) -> Value | None:
         """Return a bound; None if it is ``none`` or larger in all worlds, and stays so."""
@@ -206,11 +211,11 @@ class Impedance:
         return self.value("joint_rest_q", coordinate)
 
     def _neutral(self, coordinate: int) -> Value:
-        return float(self.scene.neutral_q[coordinate])
+        return self._constant("neutral_q", coordinate, self.scene.neutral_q[coordinate])
 
-    def inertia(self, dof: int) -> float:
+    def inertia(self, dof: int) -> Value:
         """Return the inertia at a dof in the neutral configuration of world 0, all other dofs being free."""
-        return float(neutral_inertias(self.scene)[dof])
+        return self._constant("joint_inertia", dof, neutral_inertias(self.scene)[dof])
 
     # -- laws ------------------------------------------------------------------------------------------------------
     def _damper(self, dof: int) -> list[Law]:
@@ -283,7 +288,7 @@ class Impedance:
             return []
         qd, inertia = self.qd(dof), self.inertia(dof)
         r = HOLD * inertia * reciprocal(self.h)
-        if inertia == 0.0:
+        if is_number(inertia, 0.0):
             r = HOLD * total(law.scale * law.resistance for law in others)
         return [Law(r * (bound - qd), r, None, 0.0), Law(-(r * (bound + qd)), r, 0.0, None)]
 

@@ -61,8 +61,13 @@ def frame_on_link(trace: Trace, body: int, origin: tuple) -> tuple[Link | None, 
     if (body, tuple(origin)) in trace.links.ports:
         return trace.links.ports[body, tuple(origin)].link, ZERO
     seat = trace.links.seats[body]
+    return seat.link, seat.offset + arm_on_link(trace, body, origin)
+
+
+def arm_on_link(trace: Trace, body: int, origin: tuple) -> Vector:
+    """Return the way from a body's node frame to the origin of a frame of the body, in the axes of its link."""
     R, p = trace.links.nodes[body].anchor
-    return seat.link, seat.offset + seat.matrix @ (R.T @ (Vector(origin) - p))
+    return trace.links.seats[body].matrix @ (R.T @ (Vector(origin) - p))
 
 
 def jacobian(trace: Trace, frames: tuple) -> list[Store]:

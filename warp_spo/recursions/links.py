@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from .link import Link as Link
 from .link import Node as Node
 from .link import Seat as Seat
 from .rotations import aligned, folded, numbers, pose_of, still
+
+if TYPE_CHECKING:
+    from .alike import Numbers
 
 MOTION_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c", "joint_armature", "gravity")
 LINK_VALUES = (*MOTION_VALUES, "body_gravcomp")
@@ -54,6 +57,7 @@ class Links:
         tables: the scalars that an :meth:`with_tables` copy reads, by name, in order.
         reverses: what takes gradients by the tables back to the values, see :mod:`warp_spo.execution.link_values`.
         values: one world's values; symbols where they vary. poses: of hinges' anchors, (rotation, position).
+        numbers: of the piece that a trace works on, see :mod:`.alike`; None: constants fold.
         flexible: bodies with modes. ports: where children, by body, and frames, by (body, position), of them sit.
     """
 
@@ -64,6 +68,7 @@ class Links:
         self.nodes: dict[int, Node] = {}
         self.tables: dict[str, dict[Scalar, int]] = {table: {} for table in TABLES}
         self.reverses: dict[Any, Any] = {}
+        self.numbers: Numbers | None = None
         self.flexible: dict[int, Flexible] = {}
         self.ports: dict[Any, Seat] = {}
         self.values = {name: self._symbols(name, name in variable) for name in LINK_VALUES}
@@ -85,11 +90,14 @@ class Links:
         """The links at which dofs are accounted for, each dof at one."""
         return [link for link in self.links if link.leads]
 
-    def with_tables(self) -> Links:
-        """Return a copy with a graph of its own, in which quantities that are not constant are entries of a table."""
+    def with_tables(self, copies: bool = False) -> Links:
+        """Return a copy with a graph of its own, in which quantities that are not constant are entries of a table.
+
+        ``copies``: its links are copies even if all quantities are constant.
+        """
         other = copy.copy(self)
         other.graph = Graph()
-        if self.graph.empty and not self.flexible:
+        if self.graph.empty and not self.flexible and not copies:
             return other
 
         def table(name: str) -> Callable[[Any], Any]:

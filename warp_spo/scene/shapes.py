@@ -24,6 +24,7 @@ POINTS = 8
 """Points of a shape that is the hull of points, if the caller does not say."""
 SPREAD = 256  # points on a round surface, of which those of a hull are chosen
 RIM = 64  # points on the rim of a cylinder, of which those of a hull are chosen
+ROUNDING = 1e-15  # share of a shape's size by which an entry of a point that should be zero may differ
 UPRIGHT = 0.5  # least cosine between the normal of a ground and the upward direction
 TURNED = 1e-6  # by which axes of a height field may differ from the inertial ones
 GROUNDS = ("plane", "height field")
@@ -213,7 +214,7 @@ def moving_bodies(scene: Scene) -> np.ndarray:
 def contacts_of(shape: Shape, most: int = POINTS) -> list[Contact]:
     """Return the contacts that stand for a shape, none for one that has no points."""
     place = pose_matrix(shape.pose)
-    at = lambda points: np.asarray(points, dtype=np.float64) @ place[:3, :3].T + place[:3, 3]  # noqa: E731
+    at = lambda points: _placed(np.asarray(points, dtype=np.float64), place)  # noqa: E731
     values: dict[str, Any] = {"stiffness": shape.stiffness, "damping": shape.damping, "label": shape.label}
     if shape.friction is not None:
         values["friction"] = shape.friction
@@ -229,6 +230,13 @@ def contacts_of(shape: Shape, most: int = POINTS) -> list[Contact]:
     if not shape.rounding:
         return [Contact(shape.body, hull=points, **values)] if len(points) else []
     return [Contact(shape.body, sphere=(point, shape.rounding), **values) for point in points]
+
+
+def _placed(points: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Return points where a pose puts them, with zeros where entries are zero but for rounding: zeros cost nothing."""
+    found = points @ place[:3, :3].T + place[:3, 3]
+    size = max(np.abs(points).max(initial=0.0), np.abs(found).max(initial=0.0))
+    return np.where(np.abs(found) <= ROUNDING * size, 0.0, found)
 
 
 def _box(half: Any, most: int) -> np.ndarray:

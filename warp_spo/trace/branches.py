@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Container
 
-from .scalars import Scalar
+from .scalars import BRANCHES, Scalar
 
 in_order = operator.attrgetter("number")  # sorts scalars as their graph grew
 
@@ -24,7 +24,7 @@ def find_blocks(needed: list[Scalar], used: Container[tuple]) -> dict[tuple, lis
     Args:
         needed: the scalars of a region. used: the keys of those that are stored, used later, or known.
     """
-    blocks: dict[tuple, list[Scalar]] = {branch_of(x): [] for x in needed if x.op == "branch"}
+    blocks: dict[tuple, list[Scalar]] = {branch_of(x): [] for x in needed if x.op in BRANCHES}
     if not blocks:
         return blocks
     owners: dict[tuple, set] = {}  # the branches in which each scalar is used; None: outside of all
@@ -32,12 +32,12 @@ def find_blocks(needed: list[Scalar], used: Container[tuple]) -> dict[tuple, lis
         at = owners.get(scalar.key, {None})
         own = next(iter(at)) if len(at) == 1 else None
         turns = scalar.op in ("sin", "cos") and scalar.args[0].op == "input"  # angles that are reduced first
-        if scalar.key in used or turns or scalar.op in ("input", "branch"):
+        if scalar.key in used or turns or scalar.op in ("input", *BRANCHES):
             own = None
         if own is not None:
             blocks[own].append(scalar)
         for place, value in enumerate(scalar.args):
             if value.__class__ is Scalar:
-                takes = branch_of(scalar) if scalar.op == "branch" and place == 1 else own
+                takes = branch_of(scalar) if scalar.op in BRANCHES and place == 1 else own
                 owners.setdefault(value.key, set()).add(takes)
     return {key: block[::-1] for key, block in blocks.items()}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from .scalars import Scalar, Value, cos, is_constant, logarithm, ordered, power, reciprocal, select, sin
+from .scalars import BRANCHES, Scalar, Value, cos, is_constant, logarithm, ordered, power, reciprocal, select, sin
 
 INFINITE = ("sqrt", "reciprocal", "quotient")  # may have an infinite derivative
 UNIT_DERIVATIVE = ("add", "cut", "reduced", "guarded")  # by each argument, except the limit of "guarded"
@@ -92,7 +92,7 @@ def partial(scalar: Scalar, at: int) -> Value:
         return reciprocal(args[1]) if at == 0 else -(scalar * reciprocal(args[1]))
     if op == "absolute":
         return select(args[0] + scalar, 1.0, -1.0)  # the derivative at zero is 1
-    if op in ("select", "branch"):
+    if op in ("select", *BRANCHES):
         return select(args[0], 1.0, 0.0) if at == 1 else select(args[0], 0.0, 1.0) if at == 2 else 0.0
     if op == "arctangent":
         y, x = args

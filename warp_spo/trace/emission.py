@@ -12,7 +12,7 @@ import numpy as np
 
 from .branches import branch_of, find_blocks, in_order
 from .fusion import Chain, choose_chains, choose_products
-from .scalars import Scalar, Value, is_constant, lookup, ordered
+from .scalars import BRANCHES, Scalar, Value, is_constant, is_literal, lookup, ordered
 
 C_TYPE = {"float32": "float", "float64": "double"}
 LIBRARY = {"exponential": "exp", "logarithm": "log", "power": "pow", "floor": "floor"}  # functions of C, also on CUDA
@@ -26,9 +26,7 @@ COST = {  # floating-point operations of a statement
     "absolute": 0,
     "guarded": 1,
     "select": 1,
-    "branch": 1,
-    "less": 1,
-    "lost": 1,
+    **dict.fromkeys((*BRANCHES, "less", "lost"), 1),
     "input": 0,
     "lookup": 1,
     "floor": 1,
@@ -106,8 +104,8 @@ class Emitter:
         angles: when full turns are subtracted from large angles.
         late: the names of the arrays whose entries are loaded where they are first used, instead of where the trace
             first read them.
-        branches: whether CUDA branches, too. Otherwise it computes the values of a branch always, which must be the
-            same then.
+        branches: whether CUDA branches, too. Otherwise it computes the values of a "branch" always, which must be the
+            same then; it branches at a "fork" anyway.
         fuses: products and the sums that take them are one statement, FUSED_T(a, b, c) = a b + c, rounded once on CUDA;
             :mod:`.fusion` chooses which. Otherwise the compiler decides, and may decide differently in another kernel
             with the same formulas.
@@ -125,8 +123,7 @@ class Emitter:
         branches: bool = True,
     ):
         self.dtype, self._load, self._store, self._flat = dtype, load, store, flat
-        self._angles, self._late, self._fuses = angles, tuple(late), fuses
-        self._branches = branches
+        self._angles, self._late, self._fuses, self._branches = angles, tuple(late), fuses, branches
         self._products: dict[tuple, Scalar] = {}
         self._chains: dict[tuple, Chain] = {}
         self.counts: Counter = Counter()
@@ -164,9 +161,9 @@ class Emitter:
         self._constants, self._indices, self._labels, self._place = [], [], [], None
         lines = self._lines = []
         due: dict[tuple, list[Store]] = {}
-        values, known = [value for value in ahead if not is_constant(value)], []
+        values, known = [value for value in ahead if not is_literal(value)], []
         for item in stores:
-            if is_constant(item.value) or item.value.key in self._names:
+            if is_literal(item.value) or item.value.key in self._names:
                 known.append(item)  # stored last, because earlier statements may read the entry that it overwrites
             else:
                 values.append(item.value)
@@ -191,7 +188,7 @@ class Emitter:
                 self._place = where
                 self._labels.append(where)
                 lines.append(f"// {LABEL}{len(self._labels) - 1}\x04")
-            if scalar.op == "branch":
+            if scalar.op in BRANCHES:
                 block = blocks.pop(branch_of(scalar), None)
                 if block is not None:
                     self._emit_branch(scalar, needed, block, fused, due)
@@ -212,17 +209,18 @@ class Emitter:
         A value that replaces an entry, or leaves it, is stored inside the branch, and is no longer ``due``.
         """
         T, lines, mask = C_TYPE[self.dtype], self._lines, self._text(first.args[0])
-        results = [x for x in sorted(needed, key=in_order) if x.op == "branch" and branch_of(x) == branch_of(first)]
+        results = [x for x in sorted(needed, key=in_order) if x.op in BRANCHES and branch_of(x) == branch_of(first)]
         inside = {x.key: due.pop(x.key)[0] for x in results if [*map(replaces, due.get(x.key, ()))] == [True]}
         taken = {value.key for x in needed for value in x.args if value.__class__ is Scalar}
         for scalar in results:
-            self.counts["branch"] += 1
+            self.counts[scalar.op] += 1
             if scalar.key in taken or scalar.key not in inside:
                 otherwise = self._text(scalar.args[2])
                 lines.append(f"{T} {self._name(scalar, scalar.step.rpartition('|')[2])} = {otherwise};")
         names = dict(self._names)
         condition = f"if ({mask} != 0) {{"
-        lines += [condition] if self._branches else ["#if defined(__CUDA_ARCH__)", "{", "#else", condition, "#endif"]
+        always = self._branches or first.op == "fork"
+        lines += [condition] if always else ["#if defined(__CUDA_ARCH__)", "{", "#else", condition, "#endif"]
         for scalar in block:
             if scalar.key not in fused and scalar.key not in self._names:  # a sine comes with its cosine
                 lines += self._statement(scalar, scalar.step.rpartition("|")[2])
@@ -242,7 +240,7 @@ class Emitter:
         for scalar in sorted(unknown, key=lambda scalar: -scalar.number):
             if scalar.key in used:
                 used.update(value.key for value in scalar.args if value.__class__ is Scalar)
-        return [scalar for scalar in unknown if scalar.key in used]
+        return [scalar for scalar in unknown if scalar.key in used and not is_literal(scalar)]
 
     def _reduce_angles(self, needed: list[Scalar]) -> list[str]:
         """Return statements that subtract full turns from coordinates beyond the reach of the branch-free sine.
@@ -282,11 +280,11 @@ class Emitter:
         return sum(count * COST.get(op, COST_ELSE) for op, count in self.counts.items())
 
     def _text(self, value: Value) -> str:
-        if not is_constant(value):
+        if not is_literal(value):
             if self._is_late(value) and value.key not in self._names:
                 self._lines += self._statement(value, value.args[0])
             return self._names[value.key]
-        self._constants.append(float(value))
+        self._constants.append(float(value if is_constant(value) else value.args[0]))
         return f"{CONSTANT}{len(self._constants) - 1}\x04"
 
     def _entry(self, array: str, index: tuple) -> str:
@@ -377,7 +375,7 @@ class Emitter:
 
 def replaces(item: Store) -> bool:
     """Return whether a store writes over an entry in a branch, and leaves it as it is otherwise."""
-    if is_constant(item.value) or item.value.op != "branch":
+    if is_constant(item.value) or item.value.op not in BRANCHES:
         return False
     old = item.value.args[2]
     return old.__class__ is Scalar and old.op == "input" and old.args == (item.array, *item.index)

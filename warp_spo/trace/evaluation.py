@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .scalars import Value, is_constant, ordered
+from .scalars import BRANCHES, Value, is_constant, ordered
 
 FUNCTIONS: dict[str, Callable] = {
     "add": lambda a, b: a + b,
@@ -32,7 +32,7 @@ FUNCTIONS: dict[str, Callable] = {
     "logarithm": np.log,
     "power": np.power,
     "select": lambda mask, a, b: np.where(mask != 0.0, a, b),
-    "branch": lambda mask, a, b: np.where(mask != 0.0, a, b),
+    **{op: lambda mask, a, b: np.where(mask != 0.0, a, b) for op in BRANCHES},
     "sum_of_logarithms": lambda *terms: sum(np.log(term.astype(np.float64)) for term in terms),
 }
 
@@ -50,6 +50,8 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
     for scalar in ordered(outputs):
         if scalar.op == "input":
             values[scalar.key] = np.asarray(load(scalar.args[0], scalar.args[1:]), dtype=dtype)
+        elif scalar.op == "number":
+            values[scalar.key] = np.asarray(scalar.args[0], dtype=dtype)
         elif scalar.op == "lookup":
             table, row, width, column = scalar.args
             row = np.asarray(row if is_constant(row) else values[row.key], dtype=np.int64)

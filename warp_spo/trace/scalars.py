@@ -19,6 +19,8 @@ FUNCTIONS = {
     "inverse_root": lambda x: 1.0 / math.sqrt(x) if x > 0.0 else math.nan,
 }
 
+BRANCHES = ("branch", "fork")  # operations of :func:`branch`
+
 Value = Any  # a Scalar, or a float, which is a constant
 
 
@@ -99,6 +101,11 @@ class Scalar:
 def is_constant(x: Value) -> bool:
     """Return whether a value is a constant."""
     return x.__class__ is not Scalar
+
+
+def is_literal(x: Value) -> bool:
+    """Return whether a value is a constant, folding or not; code needs no statement for it."""
+    return x.__class__ is not Scalar or x.op == "number"
 
 
 def negative(x: Value) -> Value:
@@ -222,15 +229,18 @@ def select(mask: Value, x: Value, y: Value) -> Value:
     return mask.graph.make("select", mask, x, y)
 
 
-def branch(mask: Value, x: Value, y: Value, name: str) -> Value:
+def branch(mask: Value, x: Value, y: Value, name: str, op: str = "branch") -> Value:
     """Return ``x`` where ``mask`` is not zero, else ``y``; where it is zero, code skips what only ``x`` needs.
 
     For what is rarely needed: a warp takes the branch if one of its threads does. All values of one ``mask`` and
     ``name`` share one branch; they must be made one after the other, when all that they choose from is there.
+
+    Args:
+        op: one of BRANCHES: "branch" where a kernel for GPUs may compute ``x`` always, "fork" where it skips, too.
     """
     if is_constant(mask):
         return x if mask else y
-    return x if select(mask, x, y) is x else mask.graph.make("branch", mask, x, y, name)
+    return x if select(mask, x, y) is x else mask.graph.make(op, mask, x, y, name)
 
 
 def less(x: Value, y: Value) -> Value:
@@ -293,6 +303,11 @@ def _of_number(rule: Callable[..., float], *numbers: float) -> float:
         return math.nan
     except OverflowError:
         return math.inf
+
+
+def number(graph: Graph, value: float, *key: Any) -> Scalar:
+    """Return a constant that does not fold: two of them are one scalar if their keys are equal, too."""
+    return graph.make("number", value, *key)
 
 
 def cut(x: Value) -> Value:

@@ -24,10 +24,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...scene.contacts import AWAY, HEIGHTS, PLACE, ContactPoint, HeightField, Listed
 from ...scene.scene import Scene
-from ...trace.scalars import Value, branch, is_constant, less, lost, reciprocal, select
+from ...trace.scalars import Value, absolute, branch, is_constant, less, lost, reciprocal, select
 from ...trace.spatial import IDENTITY, ZERO, Vector, cross, dot, total
 from .. import neutral
-from ..kinematics import carried_velocity, frame_on_link, zero
+from ..impedance import is_number
+from ..kinematics import arm_on_link, carried_velocity, frame_on_link, zero
 from ..links import Link, Links
 from ..motion import Motion, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
@@ -53,6 +54,7 @@ class Point:
         depth, push: how far below ground it would be after a step that ends with n* J v = 0, and its normal force then.
         cell: of the height field, whose heights the ground has there; None on a plane.
         near: 1 where the surface is near, else 0; None: code shall not branch.
+        lever: the arm is not longer [m].
     """
 
     number: int
@@ -64,13 +66,14 @@ class Point:
     k: Value
     d: Value
     mu: Value
-    eps: float
-    weight: float
+    eps: Value
+    weight: Value
     axes: list[Vector]
     depth: Value
     push: Value
     cell: Corners | None = None
     near: Value | None = None
+    lever: Value = 0.0
 
     @property
     def state(self) -> list[Value]:
@@ -140,7 +143,7 @@ def place_points(
     ground, weights = scene.ground, inverse_weights(scene)
     assert ground is not None
     place_of_ground = ground_place(impedance)
-    seats = {number: frame_on_link(trace, body, place) for number, body, place in _places(trace, impedance)}
+    seats = {number: _seat(trace, number, body, place) for number, body, place in _places(trace, impedance)}
     needed = with_ancestors([link for link, _ in seats.values()] if carry is None else point_links(trace.links))
     asked = directions(ground)
     count = len(asked)
@@ -160,11 +163,15 @@ def place_points(
     found = []
     for number, (on, centre) in seats.items():
         point, mine = scene.contact_points[number], carried[None if on is None else id(on)]
+        radius, eps, weight = point.radius, point.eps, weights[number]
+        if trace.links.numbers is not None:
+            radius, eps, weight = trace.links.numbers.of_point(number, "contact", (radius, eps, weight))
         trace.graph.step = f"contact {number}|c"
         toward = mine.axes[:count]
-        arm = centre - toward[lowest(ground)] * point.radius if point.radius else centre
+        arm = centre if is_number(radius, 0.0) else centre - toward[lowest(ground)] * radius
+        lever = radius + total(absolute(x) for x in centre)
         at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
-        at[lowest(ground)] = at[lowest(ground)] - point.radius
+        at[lowest(ground)] = at[lowest(ground)] - radius
         k, d, mu = (impedance.value(f"contact_{name}", number) for name in ("stiffness", "damping", "friction"))
         turned = mine.axes[-len(IDENTITY) :] if oriented else []
         h, moving = impedance.h, mine.motion
@@ -180,9 +187,9 @@ def place_points(
             faster = h * dot(inward, bend)
             below = depth - (0.5 * h) * faster
             damping = d * (k * select(less(0.0, depth), depth, 0.0)) if point.dissipates else d
-            material = k, damping, mu, point.eps, weights[number]
+            material = k, damping, mu, eps, weight
             push = k * below - damping * faster
-            state = turned, below, push, cell, near if branches else None
+            state = turned, below, push, cell, near if branches else None, lever
             found.append(Point(number, on, arm, inward, -depth, mine.twist, *material, *state))
     return found
 
@@ -211,6 +218,19 @@ def own_points(trace: Trace) -> list[tuple[int, ContactPoint]]:
         each, first = len(shared) // len(sharers), sharers.index(piece)
         found += shared[first * each : (first + 1) * each]
     return found
+
+
+def _seat(trace: Trace, number: int, body: int, place: tuple) -> tuple[Link | None, Vector]:
+    """Return the link that carries a contact point, and the point in the link's frame."""
+    numbers, seat = trace.links.numbers, trace.links.seats[body]
+    if numbers is None or (body, tuple(place)) in trace.links.ports:
+        return frame_on_link(trace, body, place)
+    arm = arm_on_link(trace, body, place)
+    fixed = seat.offset + arm  # where the body's place in its link varies, only the arm is a constant
+    arm = Vector(0.0 if is_constant(x) else y for x, y in zip(fixed, arm, strict=True))
+    free = seat.offset + Vector(numbers.of_point(number, "arm", arm))
+    fixed = Vector(numbers.of_point(number, "centre", fixed))
+    return seat.link, Vector(y if is_constant(o) else x for o, x, y in zip(seat.offset, free, fixed, strict=True))
 
 
 def _places(trace: Trace, impedance: Impedance) -> Iterator[tuple[int, int, tuple]]:

@@ -12,11 +12,11 @@ last of three or more opens none. :mod:`warp_spo.reference_contact` is the speci
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from ...status import Status
 from ...trace.emission import Store
-from ...trace.scalars import Value, branch, inverse_root, is_constant, less, reciprocal, select, sqrt
+from ...trace.scalars import Value, branch, is_constant, less, reciprocal, select
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from ..articulated_sweeps import Factors, expand, reduce
 from ..impedance import Law, add_laws
@@ -26,7 +26,9 @@ from ..links import Link
 from ..newton_euler import inverse_dynamics
 from ..pieces import Piece, Pieces
 from ..step import GAIN, Step
+from .crowds import Crowd, gather
 from .dampers import SEVERAL, chosen, damper, load
+from .law import Found, Touch, begin_point, finish_point, force_at, normal_force
 from .middle import MIDDLE
 from .points import Point, ground_place, own_points, place_points
 from .secants import Kept, Secant, largest, single_dofs
@@ -37,17 +39,8 @@ if TYPE_CHECKING:
 PASSES = 3  # what a step with contacts takes if the caller does not say
 TOLERANCE = 0.1  # share of the weight, or of an effort limit, by which the last pass may exceed its laws without a word
 FELT = 64.0  # roundings of a pivot; an inertia that is less of it may be rounding alone
-TINY = 1e-24  # square of a slip [m^2/s^2] that is nothing; its derivative is still a number in float32
 NOTHING, NO_PUSH = Articulated.build(lambda i, j: 0.0), Vector([0.0] * 6)  # damper and load of no point
 REPORTS = ("contact_f", "contact_gap", "contact_slip", "contact_excess")
-
-
-class Touch(NamedTuple):
-    """Variables of a contact point between passes: friction's damper; 1 where it is closed, where it is a candidate."""
-
-    across: Value
-    closed: Value
-    candidate: Value
 
 
 class ContactStep(Step):
@@ -61,6 +54,7 @@ class ContactStep(Step):
         super().__init__(trace)
         self.reports, self.kept = reports, Kept(trace.graph)
         self.secants: dict[int, list[Secant]] = {}  # by dof
+        self.crowds: dict[int, Crowd] = {}  # by id of the link
         self.excess: list[Value] = []  # of cone, adhesion, effort; largest push of a point that the last pass left open
         self.finished: dict[str, list[Store]] = {name: [] for name in reports}
 
@@ -71,13 +65,16 @@ class ContactStep(Step):
         """
         trace, kept = self.trace, self.kept
         bias, sent_ahead = self._bias()
-        points, touches = [], []
+        points, touches, candidates = [], [], []
         alone = trace.piece is None  # limbs side by side are for GPUs, where branches cost more than they spare
         for raw in place_points(trace, self.impedance, self.qd, "contact_f" in self.reports, branches=alone):
             point, first = raw.settled(*self._first(raw))
             points.append(point)
             touches.append(self._touch(*first))
+            candidates.append(first[1])
+        self._gather(points, touches, candidates)
         trace.ahead = [*bias.values(), *(value for point in points for value in point.state)]
+        trace.ahead += [value for crowd in self.crowds.values() for value in (crowd.highest, crowd.reach)]
         self._press(points, touches)
         trace.stiffened = self._stiffened
         tau = trace.vector("tau")
@@ -95,27 +92,41 @@ class ContactStep(Step):
             efforts += [
                 law.finish(gains[dof], self._felt(law, link, done)) for dof in link.dofs for law in self.secants[dof]
             ]
-        cones, pulls, missed = self.coupled_excess()
-        forces: dict[int, list[tuple[Point, Vector, Value]]] = {}  # by point
-        for point, touch in zip(points, touches, strict=True):
-            trace.graph.step = f"contact {point.number}|f"
-            force, slip, cone, pull, push = self._finish(point, touch, alpha)
-            cones.append(cone)
-            pulls.append(pull)
-            missed.append(push)
-            forces.setdefault(point.number, []).append((point, force, slip))
+        excess = self.coupled_excess()
+        forces = self._forces(points, touches, alpha, excess)
         for number, surfaces in forces.items():
             self._report(number, surfaces)
         trace.ahead += [item.value for item in self.finished.get("contact_gap", ())]  # of the state before the step
         if status or "contact_excess" in self.reports:
             trace.graph.step = "excess|e"
-            self.excess = [self._last(largest(values)) for values in (cones, pulls, efforts, missed)]
+            self.excess = [self._last(largest(values)) for values in (*excess[:2], efforts, excess[2])]
         trace.begin = sent_ahead + kept.begin
         after = self._after(qdd, status)
         if trace.piece is None:
             return passed + kept.end + after
         trace.news = after
         return sent + passed + kept.end
+
+    def _forces(
+        self, points: list[Point], touches: list[Touch], alpha: dict, excess: tuple[list[Value], ...]
+    ) -> dict[int, list[tuple[Point, Vector, Value]]]:
+        """Return force and slip of the points by number; ``excess`` receives by how much they leave their laws."""
+        found: dict[int, list[tuple[Point, Vector, Value]]] = {}
+        for point, touch in zip(points, touches, strict=True):
+            self.trace.graph.step = f"contact {point.number}|f"
+            crowd = self.crowds.get(id(point.link))
+            if crowd is None:
+                one = self._finish(point, touch, alpha)
+                some, worst = [(point, one.force, one.slip)], list(one.excess)
+            elif touch is crowd.points[0][1]:
+                some, worst = crowd.finish(self.kept, alpha[id(point.link)], self.h)
+            else:
+                continue
+            for each in some:
+                found.setdefault(each[0].number, []).append(each)
+            for values, value in zip(excess, worst, strict=True):
+                values.append(value)
+        return found
 
     def _bias(self) -> tuple[dict[int, Value], list[Store]]:
         """Return velocity terms, gravity and loads as forces of the dofs, and the stores that send for them."""
@@ -188,6 +199,10 @@ class ContactStep(Step):
         return self.h * reciprocal(select(less(least, felt), felt, least))
 
     # -- contacts --------------------------------------------------------------------------------------------------
+    def _gather(self, points: list[Point], touches: list[Touch], candidates: list[Value]) -> None:
+        """Make crowds of points of one link."""
+        self.crowds = gather(self.trace, self.kept, points, touches, candidates)
+
     def _begin(self, point: Point) -> Touch:
         """Return the variables of a point."""
         return self._touch(*self._first(point))
@@ -199,31 +214,7 @@ class ContactStep(Step):
 
     def _first(self, point: Point) -> tuple[Value, Value]:
         """Return friction's damper before the first pass, and whether the step may reach the ground."""
-        h = self.h
-        normal = dot(point.normal, point.velocity)
-        squares = total(x * x for x in self.trace.links.gravity)
-        reach = (0.5 * sqrt(squares)) * (h * h)
-        falls = select(less(normal, 0.0), -(h * normal), 0.0)
-        candidate = less(0.0, point.depth + falls + reach)
-        push = self._push(point, normal)
-        fn = candidate * select(less(0.0, push), push, 0.0)
-        return self._secant(point, fn, self._slip(point, point.velocity, normal)), candidate
-
-    @staticmethod
-    def _slip(point: Point, x: Vector, normal: Value) -> Value:
-        """Return the size of a vector's part across the normal."""
-        rest = x - point.normal * normal
-        square = dot(rest, rest)
-        return square * inverse_root(square + TINY)
-
-    @staticmethod
-    def _secant(point: Point, fn: Value, w: Value) -> Value:
-        """Return the damper that gives friction's bound at the speed ``w``."""
-        return point.mu * fn * inverse_root(w * w + point.eps * point.eps)
-
-    def _push(self, point: Point, speed: Value) -> Value:
-        """Return the normal force of a closed point that leaves the ground at ``speed`` after the step."""
-        return point.push - (point.k * self.h + point.d) * speed
+        return begin_point(point, self.trace.links.gravity, self.h)
 
     def _press(self, points: list[Point], touches: list[Touch]) -> None:
         """Add dampers and loads of the points to their links."""
@@ -243,6 +234,8 @@ class ContactStep(Step):
                 more, pushed = self._sum(walls)
                 touched = total(touch.candidate for _, touch in walls)
                 P, push = chosen(touched, (P + more, push + pushed), (P, push), f"walls of {key}")
+            if key in self.crowds:
+                P, push = self.crowds[key].damped(P, push)
             trace.dampers[key], trace.pushes[key] = P, push
 
     def _sum(self, pressed: list[tuple[Point, Touch]]) -> tuple[Articulated, Vector]:
@@ -254,53 +247,26 @@ class ContactStep(Step):
             loads: dict[int, tuple[Point, Vector]] = {}  # by place, which a floor and its wall share
             for point, touch in pressed:
                 first, load_there = loads.get(id(point.arm), (point, ZERO))
-                loads[id(point.arm)] = first, load_there + self._load(point, touch)
+                loads[id(point.arm)] = first, load_there + force_at(point, touch, point.velocity, h)
             wrenches = [point.wrench(force) for point, force in loads.values()]
             return P, Vector(total(wrench[i] for wrench in wrenches) for i in range(6))
-        return P, load(mine, [touch.closed * self._push(point, 0.0) for point, touch in pressed], P, h)
+        return P, load(mine, [touch.closed * normal_force(point, 0.0, h) for point, touch in pressed], P, h)
 
-    def _load(self, point: Point, touch: Touch) -> Vector:
-        """Return f0 - G v before the step."""
-        return self._force(point, touch, point.velocity)
-
-    def _force(self, point: Point, touch: Touch, v: Vector) -> Vector:
-        """Return f0 - G v."""
-        normal = dot(point.normal, v)
-        push = touch.closed * self._push(point, normal)
-        return point.normal * (push + touch.across * normal) - v * touch.across
-
-    def _finish(self, point: Point, touch: Touch, alpha: dict) -> tuple[Vector, Value, Value, Value, Value]:
-        """Keep what the next pass reads of a point; return its force, its slip, by how much the force leaves the cone,
-        how much it pulls, and the push that it lacks because the pass left the point open."""
-        kept, h = self.kept, self.h
-        v = point.velocity
-        if point.link is not None:
-            v = point.rate(
-                *(before + change * h for before, change in zip(point.twist, alpha[id(point.link)], strict=True))
-            )
-        normal = dot(point.normal, v)
-        force = self._force(point, touch, v) if point.link is not None else ZERO
-        push = self._push(point, normal)
-        pushed = 0.0 if point.link is None else touch.closed * push
-        slip = self._slip(point, v, normal)
-        fn = select(less(0.0, pushed), pushed, 0.0)
-        cone = touch.across * slip - point.mu * fn
-        over = select(less(0.0, cone), cone, 0.0)
-        across = self._secant(point, fn, slip + (h * point.weight) * over)
-        reached = less(0.0, point.depth - h * normal)
-        candidate = select(touch.candidate, touch.candidate, reached)
-        pushes = less(0.0, push)
-        stays = kept.closing * touch.closed
-        closed = select(stays, 1.0, candidate * pushes)
-        lacking = select(touch.closed, 0.0, candidate * select(pushes, push, 0.0))
-        pulls = select(less(pushed, 0.0), -pushed, 0.0)
+    def _finish(self, point: Point, touch: Touch, alpha: dict) -> Found:
+        """Return what a pass finds of a point, and keep what the next one reads."""
+        moved = None if point.link is None else alpha[id(point.link)]
+        found = finish_point(point, touch, moved, self.h, self.kept.closing)
         if point.near is not None:
-            values = (*force, over, pulls, lacking, across, closed)
-            found = [branch(point.works(candidate), x, 0.0, f"force at {point.number}") for x in values]
-            force, (over, pulls, lacking, across, closed) = Vector(found[:3]), found[3:]
-        for variable, value in ((touch.across, across), (touch.candidate, candidate), (touch.closed, closed)):
-            kept.keep(variable, value)
-        return force, slip, over, pulls, lacking
+            mask, left = point.works(found.left.candidate), found.left
+            values = (*found.force, *found.excess, left.across, left.closed)
+            *force, over, pulls, lacking, across, closed = (
+                branch(mask, x, 0.0, f"force at {point.number}") for x in values
+            )
+            left = Touch(across, closed, left.candidate)
+            found = Found(Vector(force), found.slip, over, pulls, lacking, left)
+        for name in ("across", "candidate", "closed"):
+            self.kept.keep(getattr(touch, name), getattr(found.left, name))
+        return found
 
     # -- results ---------------------------------------------------------------------------------------------------
     def _report(self, number: int, surfaces: list[tuple[Point, Vector, Value]]) -> None:

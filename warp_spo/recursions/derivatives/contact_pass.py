@@ -17,7 +17,7 @@ from ...trace.emission import Store
 from ...trace.scalars import Value, cut, reciprocal, select
 from ..contact.ground import surface_count
 from ..contact.middle import MIDDLE
-from ..contact.points import own_points
+from ..contact.points import Point, own_points
 from ..contact.secants import Kept, single_dofs
 from ..contact.step import ContactStep, Touch
 from ..impedance import LIMIT, Law
@@ -123,6 +123,9 @@ class OnePass(ContactStep):
     def _touch(self, across: Value, candidate: Value) -> Touch:
         self.kept.places = itertools.count(self._count + OF_POINT * next(self._next))
         return super()._touch(across, candidate)
+
+    def _gather(self, points: list[Point], touches: list[Touch], candidates: list[Value]) -> None:
+        """Make no crowds: every point is computed in every pass, and what a pass leaves are variables of points."""
 
     def forward(self) -> list[Store]:
         """Return the stores of what the pass leaves, and messages to other pieces."""

@@ -1,0 +1,110 @@
+"""The law of one contact point in a pass: a damper and a load, and what follows from the velocity that the pass finds.
+
+A point is a candidate once the step may carry it to the ground. The first pass closes all candidates, later ones those
+that push; friction is the damper that gives its bound at the speed of the pass before.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from ...trace.scalars import Value, inverse_root, less, select, sqrt
+from ...trace.spatial import ZERO, Vector, dot, total
+from .points import Point
+
+TINY = 1e-24  # square of a slip [m^2/s^2] that is nothing; its derivative is still a number in float32
+
+
+class Touch(NamedTuple):
+    """Variables of a contact point between passes: friction's damper; 1 where it is closed, where it is a candidate."""
+
+    across: Value
+    closed: Value
+    candidate: Value
+
+
+class Found(NamedTuple):
+    """What a pass finds of a point.
+
+    Attributes:
+        force, slip: force on it, and its speed along the ground.
+        over, pulls, lacking: by how much the force leaves the cone, how much it pulls, and the push that it lacks
+            because the pass left the point open.
+        left: what the next pass reads.
+    """
+
+    force: Vector
+    slip: Value
+    over: Value
+    pulls: Value
+    lacking: Value
+    left: Touch
+
+    @property
+    def excess(self) -> tuple[Value, Value, Value]:
+        return self.over, self.pulls, self.lacking
+
+
+def begin_point(point: Point, gravity: Vector, h: Value) -> tuple[Value, Value]:
+    """Return friction's damper before the first pass, and whether the step may reach the ground."""
+    normal = dot(point.normal, point.velocity)
+    squares = total(x * x for x in gravity)
+    reach = (0.5 * sqrt(squares)) * (h * h)
+    falls = select(less(normal, 0.0), -(h * normal), 0.0)
+    candidate = less(0.0, point.depth + falls + reach)
+    push = normal_force(point, normal, h)
+    fn = candidate * select(less(0.0, push), push, 0.0)
+    return secant(point, fn, slip_speed(point, point.velocity, normal)), candidate
+
+
+def slip_speed(point: Point, x: Vector, normal: Value) -> Value:
+    """Return the size of a vector's part across the normal."""
+    rest = x - point.normal * normal
+    square = dot(rest, rest)
+    return square * inverse_root(square + TINY)
+
+
+def secant(point: Point, fn: Value, w: Value) -> Value:
+    """Return the damper that gives friction's bound at the speed ``w``."""
+    return point.mu * fn * inverse_root(w * w + point.eps * point.eps)
+
+
+def normal_force(point: Point, speed: Value, h: Value) -> Value:
+    """Return the normal force of a closed point that leaves the ground at ``speed`` after the step."""
+    return point.push - (point.k * h + point.d) * speed
+
+
+def force_at(point: Point, touch: Touch, v: Vector, h: Value) -> Vector:
+    """Return f0 - G v."""
+    normal = dot(point.normal, v)
+    push = touch.closed * normal_force(point, normal, h)
+    return point.normal * (push + touch.across * normal) - v * touch.across
+
+
+def finish_point(point: Point, touch: Touch, moved: tuple[Vector, Vector] | None, h: Value, closing: Value) -> Found:
+    """Return what a pass finds of a point.
+
+    Args:
+        moved: rates (omega'; v') of its link in this pass; None: it does not move. closing: 1 before a last pass that
+            only closes, else 0.
+    """
+    v = point.velocity
+    if moved is not None:
+        v = point.rate(*(before + change * h for before, change in zip(point.twist, moved, strict=True)))
+    normal = dot(point.normal, v)
+    force = force_at(point, touch, v, h) if moved is not None else ZERO
+    push = normal_force(point, normal, h)
+    pushed = 0.0 if moved is None else touch.closed * push
+    slip = slip_speed(point, v, normal)
+    fn = select(less(0.0, pushed), pushed, 0.0)
+    cone = touch.across * slip - point.mu * fn
+    over = select(less(0.0, cone), cone, 0.0)
+    across = secant(point, fn, slip + (h * point.weight) * over)
+    reached = less(0.0, point.depth - h * normal)
+    candidate = select(touch.candidate, touch.candidate, reached)
+    pushes = less(0.0, push)
+    stays = closing * touch.closed
+    closed = select(stays, 1.0, candidate * pushes)
+    lacking = select(touch.closed, 0.0, candidate * select(pushes, push, 0.0))
+    pulls = select(less(pushed, 0.0), -pushed, 0.0)
+    return Found(force, slip, over, pulls, lacking, Touch(across, closed, candidate))
