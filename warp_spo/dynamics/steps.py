@@ -213,7 +213,9 @@ def step(
     With four passes and more, velocity terms are those in the middle of the step at the rates that the step itself
     finds, where their work is that by which the kinetic energy changes along the path. Two rounds of three passes find
     these rates. How much faster a joint gets when its drive saturates is then found by each pass's own sweep, not from
-    the mass at the neutral pose.
+    the mass at the neutral pose. These terms meet the mass matrix of the beginning: where a floating base carries ten
+    times its mass, rates are off by a hundred times as much as with three passes, and at a hundred times the rounds
+    diverge, without a status.
 
     Where Dynamics closes loops, accelerations obey the closures, with all of the above on every dof, those that a loop
     moves included. Two Newton steps then move q', and qd' there, onto the closures; they leave O((h rate)^6), 1e-10 at
