@@ -280,7 +280,7 @@ def step(
             force beyond its cone and the largest pull of a contact [N], and the largest force of a drive beyond its
             effort limit [N m or N].
         contact_residual: of a scene with pairs of bodies, written with the largest change of a pair's force in the last
-            of 16 rounds, where more than eight pairs touch [world] [N]; zero where they are solved exactly.
+            of 16 rounds, where pairs are solved in rounds [world] [N]; zero where they are solved exactly.
         out: (q, qd) after the step, each an array or None. They may be the arrays of the state itself.
 
     Returns:

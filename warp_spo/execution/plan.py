@@ -121,7 +121,8 @@ class Plan:
         if self.granularity == "node" or self.limbs == 1 or self.limbs > MOST_WARPS:
             return self.granularity
         if routine.couples:
-            return self.granularity if self.alike else "tree"
+            few = self.alike and self.worlds <= self.device.scaled(ALIKE_WORLDS)
+            return "segment" if few else "tree"
         if routine.counted and not self.alike and self.dofs <= HELD:
             return "tree"
         if routine.long_result or routine.passes or routine.crowded:  # a thread holds too little even of a dozen dofs
