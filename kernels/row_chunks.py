@@ -9,12 +9,24 @@ PITCH = CHUNK + 1  # scalars between rows in shared memory, odd against bank con
 WARP = 32
 
 
+STORES = """
+#define SET(place, value) place = (value)
+#if defined(__CUDA_ARCH__)
+#define SET_PASSING(place, value) __stcs(&(place), value)
+#else
+#define SET_PASSING(place, value) place = (value)
+#endif
+"""
+"""``SET(place, value)`` stores; ``SET_PASSING`` stores what is to leave the caches before everything else."""
+
+
 def define(block: int) -> str:
     """Return the definitions of PUT and FLUSH, for blocks of so many threads, of which each has one world.
 
     ``BEGIN(start)`` comes before the entries from ``start`` on. ``PUT(name, entries, entry, value)`` sets an entry of
-    the own row of the array ``name`` [world, entries]. ``FLUSH(name, entries, start, count)`` writes the entries from
-    ``start`` on; all that were put since BEGIN must be of these ``count``, at most 64.
+    the own row of the array ``name`` [world, entries]. ``FLUSH(name, entries, start, count, set)`` writes the entries
+    from ``start`` on; all that were put since BEGIN must be of these ``count``, at most 64. ``set`` is SET or
+    SET_PASSING of :data:`STORES`, which must come before.
     """
     return f"""
 #if defined(__CUDA_ARCH__)
@@ -27,18 +39,19 @@ const int worlds_of_warp = worlds - first_world < {WARP} ? (int)(worlds - first_
 int first_entry = 0;
 #define BEGIN(start) first_entry = start;
 #define PUT(name, entries, entry, value) own_chunk[(entry) - first_entry] = (value);
-#define FLUSH(name, entries, start, count) \\
+#define FLUSH(name, entries, start, count, set) \\
     __syncwarp(); \\
     for (int i = lane; i < worlds_of_warp * (count); i += {WARP}) \\
-        name.data[(first_world + i / (count)) * (entries) + (start) + i % (count)] = \\
-            chunks_of_warp[i / (count) * {PITCH} + i % (count)]; \\
+        set(name.data[(first_world + i / (count)) * (entries) + (start) + i % (count)], \\
+            chunks_of_warp[i / (count) * {PITCH} + i % (count)]); \\
     __syncwarp();
 #else
 #define BEGIN(start)
 #define PUT(name, entries, entry, value) name.data[world * (entries) + (entry)] = (value);
-#define FLUSH(name, entries, start, count)
+#define FLUSH(name, entries, start, count, set)
 #endif
 """
 
 
+END_STORES = "#undef SET\n#undef SET_PASSING"
 UNDEFINE = "#undef BEGIN\n#undef PUT\n#undef FLUSH"

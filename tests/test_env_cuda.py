@@ -100,17 +100,24 @@ def test_bad_actions_stay_in_their_world(gpu):
 
 
 def test_kernels_of_an_observation_run_side_by_side(gpu):
-    """In a graph they have the same bits as in turn, with noise, new starts, and looks after resets of some worlds."""
+    """In a graph they have the same bits as in turn, with noise, new starts, and looks after resets of some worlds.
+
+    Rows that a block writes together are those of a list that each thread writes.
+    """
     each = observations.Each(lambda w, row: row[0] * w.q[1] + row[1] * w.time, torch.rand(50, 2).numpy())
-    terms = {"a": [Observation(each, noise=0.1), Observation(lambda w: w.q, noise=0.1, history=3)], "b": [each]}
-    own, plain = (cart_env(1000, gpu, observations=terms, graph=graph) for graph in (True, False))
+    noisy = [Observation(each, noise=0.1), Observation(lambda w: w.q, noise=0.1, history=3)]
+    terms = {"a": noisy, "b": [each, lambda w: w.q, each], "list": [lambda w: each(w)]}
+    own, plain = (cart_env(1001, gpu, observations=terms, graph=graph) for graph in (True, False))
     generator = torch.Generator(device=gpu).manual_seed(0)
     for step in range(30):
-        given = torch.randn(1000, 1, generator=generator, device=gpu)
+        given = torch.randn(1001, 1, generator=generator, device=gpu)
         seen, expected = own.step(given)[0], plain.step(given)[0]
         assert all(seen[name].equal(expected[name]) for name in terms)
+        for rows in (seen["b"][:, :50], seen["b"][:, -50:]):
+            assert torch.allclose(rows, seen["list"], atol=1e-6)
+        assert ((seen["a"][:, :50] - seen["list"]).abs() <= 0.1 + 1e-6).all()
         if step % 10 == 5:
-            chosen = torch.rand(1000, generator=generator, device=gpu) < 0.3
+            chosen = torch.rand(1001, generator=generator, device=gpu) < 0.3
             seen, expected = own.reset(chosen)[0], plain.reset(chosen)[0]
             assert all(seen[name].equal(expected[name]) for name in terms)
     assert own.replay.captured == 1 and own._tensors["tick"].equal(plain._tensors["tick"])

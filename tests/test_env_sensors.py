@@ -55,6 +55,8 @@ def test_a_term_of_rows_is_its_list():
     terms = {"rows": [lambda w: w.q, each, noisy], "list": [lambda w: each(w)], "again": [noisy]}
     env, few = (cart_env(worlds, observations=terms, final_observations=True) for worlds in (8, 3))
     assert env.num_obs == {"rows": 44, "list": 21, "again": 21}
+    seen = env.get_observations()  # rows that several kernels write begin at whole lines of 128 bytes
+    assert [seen[name].stride() for name in terms] == [(64, 1), (21, 1), (32, 1)]
     before = None
     for _ in range(25):  # with new starts
         observed, _, _, extras = env.step(torch.zeros(8, 1))

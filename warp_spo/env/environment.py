@@ -13,8 +13,7 @@ import warp as wp
 from ..arrays import parse_device
 from ..dynamics.dynamics import Dynamics
 from ..launches import compile_side_by_side
-from ..recursions.contact.ground import GROUND
-from ..scene.contacts import HeightField
+from ..recursions.contact.ground import GROUND, SINGLE
 from ..scene.scene import Scene
 from ..torch import stream
 from .checks import check_number, check_whole
@@ -143,10 +142,10 @@ class Env(VecEnv):
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=layout.values, granularity=granularity)
         finals = [(f"final {name}", size) for name, size in self.num_obs.items()] if self.final else []
         results = [*((name, 1) for name in RESULTS), *self.num_obs.items(), *finals]
-        tables = {}  # of the ground, the same memory that the dynamics read
-        if isinstance(scene.ground, HeightField):
-            tables[GROUND] = wp.to_torch(self.dyn.recursions.parameters.ground_cells)
-        store = self._store = Storage(layout, worlds, self.device, tracing.arrays, results, tables)
+        of_ground = {GROUND: "ground_cells", SINGLE: "ground_heights"}  # the same memory that the dynamics read
+        held = self.dyn.recursions.parameters
+        tables = {name: wp.to_torch(getattr(held, of_ground[name])) for name in of_ground.keys() & tracing.tables}
+        store = self._store = Storage(layout, worlds, self.device, tracing.arrays, results, tracing.apart, tables)
         self.q, self.qd, self.actions, self.chosen = (store.tensors[n] for n in ("q", "qd", "actions", "chosen"))
         self._tensors, self._controls, self._step_arrays = store.tensors, store.controls, store.written
         self.values = store.values

@@ -22,7 +22,8 @@ class Each:
     """A term of many numbers that are computed alike: a function of a world and of a row of numbers, for each row.
 
     Equals ``lambda w: [function(w, row) for row in rows]``. With 16 rows or more, an observation of it that asks for
-    neither bias, delay nor history has a kernel of its own, in which a thread works on a few rows of a world.
+    neither bias, delay nor history has a kernel of its own, in which a thread works on a few rows of a world. The
+    observations of its group are then views of rows that begin 32 numbers apart, or a multiple.
 
     Args:
         function: of a ``World`` and a row (k,), which returns one number. It may not keep anything with ``w.keep``.

@@ -29,10 +29,17 @@ class Buffer(NamedTuple):
         way: ROW: float32 [world, entry]. COLUMN: float32 [entry, world], which neighbouring threads read side by side.
             SHARED: float32 [entry], the same for all worlds. INT: int32 [world]. LONG: int64 [world]. CHOSEN: bool
             [world].
+        passes: it is large, and no kernel reads it: it shall not displace from the caches what others read.
     """
 
     tensor: Any
     way: str = ROW
+    passes: bool = False
+
+    @property
+    def set(self) -> str:
+        """C++ macro that stores an entry, see ``kernels.row_chunks``."""
+        return "SET_PASSING" if self.passes else "SET"
 
     def place(self, name: str, entry: str) -> str:
         """Return C++ for an entry in the thread's world."""
@@ -53,6 +60,8 @@ class Buffer(NamedTuple):
 
     def store(self, name: str, entry: str, value: str) -> str:
         """Return C++ that writes an entry."""
+        if self.passes:
+            return f"{self.set}({self.place(name, entry)}, {value});"
         kind = {INT: "(int)", LONG: "(long long)", CHOSEN: "0 != "}.get(self.way, "")
         return f"{self.place(name, entry)} = {kind}({value});"
 
@@ -195,6 +204,8 @@ class Stage:
         else:
             head = ["if (thread >= worlds) return;", "const long long world = thread;"]
             tail = [count]
+        if wide or any(buffers[name].passes for name in names):
+            head, tail = [row_chunks.STORES, *head], [*tail, row_chunks.END_STORES]
         tail += [philox.UNDEFINE] if self.draws else []
         text = "\n".join([ELEMENTARY[C_TYPE[wp.float32]], *head, random, *parts, *tail, ""])
         kernel = native.kernel(f"env_{self.name}", text, [(name, 1) for name in names], wp.float32)
@@ -225,7 +236,7 @@ class Stage:
                     inside = [x for x in self.stores if x.array == name and start <= x.index[0] < start + part]
                     listings.append(emitter.region(inside))
                     parts += [f"BEGIN({start})", render(listings[-1], "float32")]
-                    parts.append(f"FLUSH({name}, {entries}, {start}, {part})")
+                    parts.append(f"FLUSH({name}, {entries}, {start}, {part}, {buffers[name].set})")
         listings.append(emitter.region(late))
         return listings, [*parts, render(listings[-1], "float32")]
 

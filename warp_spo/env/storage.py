@@ -11,7 +11,7 @@ from .layout import Layout
 from .stage import CHOSEN, COLUMN, INT, LONG, ROW, SHARED, Buffer, output_name
 
 CONTACT_ARRAYS = {"contact_f": 3, "contact_gap": 1, "contact_slip": 1}  # entries of each point
-ALIGNMENT = 4  # scalars
+LINE = 32  # scalars of a line of the caches
 
 
 class Storage:
@@ -20,13 +20,14 @@ class Storage:
     Args:
         layout: what the stages agreed on. worlds: number of worlds. device: torch device.
         read: names of the arrays that stages read. results: entries of each result, in order.
+        apart: names of results that several kernels write, whose rows begin at whole lines of the caches.
         tables: which all worlds share, besides those of the layout, by name.
 
     Attributes:
         tensors: by name. buffers: the same memory as kernels see it.
         controls: tensors that actions set, by name. written: tensors that a step of the dynamics writes besides the
             state, by name. values: the scene's values that events change [world, ...], by name.
-        out: all results, one after the other. places: (start, entries) of each result in it.
+        out: all results, one after the other. places: (start, entries, distance of rows) of each result in it.
     """
 
     def __init__(
@@ -36,6 +37,7 @@ class Storage:
         device: torch.device,
         read: set[str],
         results: list[tuple[str, int]],
+        apart: set[str],
         tables: Mapping[str, torch.Tensor],
     ):
         self.worlds, self.device = worlds, device
@@ -48,12 +50,16 @@ class Storage:
         self._add_controls(layout, read)
         self._add_measured(layout, read)
         self._add_numbers(layout, tables)
-        self._add_results(results)
+        self._add_results(results, apart)
 
     def part(self, out: torch.Tensor, name: str) -> torch.Tensor:
         """Return a result in a copy of ``out`` [world, entries]."""
-        start, size = self.places[name]
-        return out[start : start + self.worlds * size].view(self.worlds, size)
+        _, size, _ = self.places[name]
+        return self._rows(out, name)[:, :size]
+
+    def _rows(self, out: torch.Tensor, name: str) -> torch.Tensor:
+        start, _, pitch = self.places[name]
+        return out[start : start + self.worlds * pitch].view(self.worlds, pitch)
 
     @property
     def bytes_per_world(self) -> int:
@@ -120,14 +126,16 @@ class Storage:
         if layout.users:
             self._add("user", self._zeros(self.worlds, layout.user_size))
 
-    def _add_results(self, results: list[tuple[str, int]]) -> None:
-        self.places: dict[str, tuple[int, int]] = {}
+    def _add_results(self, results: list[tuple[str, int]], apart: set[str]) -> None:
+        self.places: dict[str, tuple[int, int, int]] = {}
         at = 0
         for name, size in results:
-            self.places[name] = at, size
-            at += -(-self.worlds * size // ALIGNMENT) * ALIGNMENT
+            pitch = -(-size // LINE) * LINE if name in apart else size
+            self.places[name] = at, size, pitch
+            at += -(-self.worlds * pitch // LINE) * LINE
         self.out = self._zeros(at)
         for name in self.places:
-            part = self.part(self.out, name)
+            rows, held = self._rows(self.out, name), output_name(name)
             whole = name == "done"
-            self._add(output_name(name), part.view(-1).view(torch.int32) if whole else part, INT if whole else ROW)
+            self._add(held, rows.view(-1).view(torch.int32) if whole else rows, INT if whole else ROW)
+            self.buffers[held] = self.buffers[held]._replace(passes=name in apart)

@@ -40,7 +40,8 @@ class Tracing:
 
     Attributes:
         stages: by name; those of rows have the name of the one that they belong to. group_sizes: how many numbers each
-            group of observations has. ends: names of terminations.
+            group of observations has. ends: names of terminations. apart: names of observations that several kernels
+            write.
     """
 
     def __init__(
@@ -69,11 +70,17 @@ class Tracing:
         names = ("act", "judge", "observe", "reset", "start", "final")
         self.stages = {name: Stage(name, stream) for stream, name in enumerate(names)}
         self.group_sizes: dict[str, int] = {}
+        self.apart: set[str] = set()
 
     @property
     def arrays(self) -> set[str]:
         """Names of the arrays that the stages read."""
         return set().union(*(stage.read_arrays() for stage in self.stages.values()))
+
+    @property
+    def tables(self) -> set[str]:
+        """Names of the tables that the stages read."""
+        return set().union(*(stage.read_tables() for stage in self.stages.values()))
 
     @property
     def in_turn(self) -> set[str]:
@@ -299,6 +306,7 @@ class Tracing:
             for term in terms:
                 rows = term.rows
                 if rows:
+                    self.apart.add(kind + group)
                     if rows not in of_rows:
                         stage = Stage(w._stage.name, len(self.stages), rows)
                         self.stages[f"{w._stage.name}, {rows} rows"] = stage

@@ -256,7 +256,8 @@ class World:
         origin, field = self.value("ground_origin"), self.value("ground_field")
         moved = [as_value(each) for each in origin] if len(origin) else [0.0] * 3
         place = Place(spatial.Vector(moved), as_value(field[0]) if len(field) else 0.0)
-        return AbstractScalar(height(self._stage.graph, self.scene.ground, as_value(x), as_value(y), place))
+        stage, ground = self._stage, self.scene.ground
+        return AbstractScalar(height(stage.graph, ground, as_value(x), as_value(y), place, together=not stage.rows))
 
     def table(self, name: str, numbers: np.ndarray) -> Callable[[Any], Vector]:
         """Return a function from a row, a whole number, to that row of a table of numbers [row, n].

@@ -185,6 +185,19 @@ class Parameters:
         return self.derived_arrays(name, build)[0]
 
     @property
+    def ground_heights(self) -> wp.array:
+        """Heights of the ground's height field, rounded, row after row, field after field [height]."""
+
+        def build() -> DerivedArrays:
+            value = self._values[HEIGHTS]
+            own: Any = wp.empty((value.size, 1), dtype=self.dtype, device=self.device)
+            inputs, kernel = [value.reshape((1, value.size))], kernels.transpose(node_functions(self.dtype))
+            fill = lambda: launches.launch(kernel, own.shape, inputs, [own], device=self.device)  # noqa: E731
+            return DerivedArrays([own.reshape(value.size)], (HEIGHTS,), fill)
+
+        return self.derived_arrays("heights of the ground", build)[0]
+
+    @property
     def ground_cells(self) -> wp.array:
         """Table of the cells of a height field [height, 4], rounded, see :func:`recursions.contact.ground.by_cell`."""
 

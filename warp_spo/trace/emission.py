@@ -16,6 +16,7 @@ from .scalars import BRANCHES, Scalar, Value, is_constant, is_literal, lookup, o
 
 C_TYPE = {"float32": "float", "float64": "double"}
 LIBRARY = {"exponential": "exp", "logarithm": "log", "power": "pow", "floor": "floor"}  # functions of C, also on CUDA
+SIGN = {"neg": "-", "cut": ""}
 BINARY = {"add": "+", "sub": "-", "mul": "*", "quotient": "/"}
 COST = {  # floating-point operations of a statement
     "add": 1,
@@ -295,8 +296,7 @@ class Emitter:
         return scalar.op == "input" and scalar.args[0] in self._late
 
     def _emit_store(self, item: Store) -> None:
-        entry = self._entry(item.array, item.index)
-        self._lines.append(self._store(item.array, entry, self._text(item.value)))
+        self._lines.append(self._store(item.array, self._entry(item.array, item.index), self._text(item.value)))
 
     def _name(self, scalar: Scalar, step: str) -> str:
         self._count += 1
@@ -322,10 +322,8 @@ class Emitter:
         name = self._name(scalar, step)
         if op in BINARY:
             return [f"const {T} {name} = {texts[0]} {BINARY[op]} {texts[1]};"]
-        if op == "neg":
-            return [f"const {T} {name} = -{texts[0]};"]
-        if op == "cut":
-            return [f"const {T} {name} = {texts[0]};"]
+        if op in SIGN:
+            return [f"const {T} {name} = {SIGN[op]}{texts[0]};"]
         if op == "guarded":
             return [f"const {T} {name} = {texts[0]} > {texts[1]} ? {texts[0]} : nan;"]
         if op == "select":
@@ -343,7 +341,9 @@ class Emitter:
 
     def _lookup_statements(self, scalar: Scalar, step: str) -> list[str]:
         """Return the statements of all entries of a table's row, which the compiler loads together if it may."""
-        (table, row, width, _), T = scalar.args, C_TYPE[self.dtype]
+        (table, row, width, column), T = scalar.args, C_TYPE[self.dtype]
+        if width == 1:
+            return [f"const {T} {self._name(scalar, step)} = {table}.data[(int){self._text(row)} + {column}];"]
         place, entries = f"{table}.data + {width}ll * (int){self._text(row)}", lookup(scalar.graph, table, row, width)
         if width % 2 == 0:
             place = f"(const {T}*)__builtin_assume_aligned({place}, {8 if width % 4 else 16})"

@@ -266,6 +266,11 @@ def lookup(graph: Graph, table: str, row: Value, width: int) -> list[Scalar]:
     return [graph.make("lookup", table, row, width, column) for column in range(width)]
 
 
+def entry(graph: Graph, table: str, place: Value, step: int) -> Scalar:
+    """Return entry ``place`` + ``step`` of a table of the kernel's own; ``place`` is as a row of :func:`lookup`."""
+    return graph.make("lookup", table, place, 1, step)
+
+
 def arctangent(y: Value, x: Value) -> Value:
     """Return the angle of the point (x, y) [rad]."""
     if is_constant(x) and is_constant(y):
@@ -308,11 +313,6 @@ def _of_number(rule: Callable[..., float], *numbers: float) -> float:
 def number(graph: Graph, value: float, *key: Any) -> Scalar:
     """Return a constant that does not fold: two of them are one scalar if their keys are equal, too."""
     return graph.make("number", value, *key)
-
-
-def constant_of(x: Value) -> Value:
-    """Return a constant as one that folds; other values as they are."""
-    return x.args[0] if not is_constant(x) and x.op == "number" else x
 
 
 def cut(x: Value) -> Value:

@@ -13,12 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from ...scene.contacts import AWAY, STEEP, HeightField, Listed, Plane
-from ...trace.scalars import Graph, Value, floor, inverse_root, less, lookup, select
+from ...trace.scalars import Graph, Value, entry, floor, inverse_root, less, lookup, select
 from ...trace.spatial import IDENTITY, Vector, dot
 
 CORNERS = 4  # of a cell
 GROUND = "ground"
 """Name of the table of cells: the heights at the corners of each, see :func:`by_cell`."""
+SINGLE = "heights"
+"""Name of the table of heights, row after row."""
 
 
 class Surface(NamedTuple):
@@ -109,13 +111,19 @@ class Corners(NamedTuple):
     first: Value
 
     @classmethod
-    def of(cls, graph: Graph, ground: HeightField, place: Place, i: Value, j: Value) -> Corners:
-        """Return the corners of the cell (i, j) of a world's field."""
+    def of(cls, graph: Graph, ground: HeightField, place: Place, i: Value, j: Value, together: bool = True) -> Corners:
+        """Return the corners of the cell (i, j) of a world's field, from the table of cells or, one by one, of heights.
+
+        One by one is faster where neighbouring threads need neighbouring cells, and each height several times.
+        """
         rows, columns = ground.heights.shape[-2:]
         first = i * float(columns) + j
         if ground.count > 1:
             first = floor(_between(place.field, ground.count - 1.0)) * float(rows * columns) + first
-        h00, h01, h10, h11 = lookup(graph, GROUND, first, CORNERS)
+        if together:
+            h00, h01, h10, h11 = lookup(graph, GROUND, first, CORNERS)
+        else:
+            h00, h01, h10, h11 = (entry(graph, SINGLE, first, step) for step in corner_steps(ground))
         return cls(h00, h01, h10, h11, first)
 
     @property
@@ -179,8 +187,11 @@ def by_cell(heights: np.ndarray) -> np.ndarray:
     return np.stack([heights, beside[0], far, beside[1]], axis=-1)
 
 
-def height(graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place: Place) -> Value:
-    """Return the height of the ground at a point of the horizontal plane [m]; the plane must not be vertical."""
+def height(graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place: Place, together: bool = True) -> Value:
+    """Return the height of the ground at a point of the horizontal plane [m]; the plane must not be vertical.
+
+    ``together``: as :meth:`Corners.of`.
+    """
     x, y = x - place.origin[0], y - place.origin[1]
     if isinstance(ground, Plane):
         a, b, c = ground.normal
@@ -188,7 +199,7 @@ def height(graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place:
     rows, columns = ground.heights.shape[-2:]
     i, s = _cell((x - ground.origin[0]) * (1.0 / ground.cells[0]), rows)
     j, t = _cell((y - ground.origin[1]) * (1.0 / ground.cells[1]), columns)
-    cell = Corners.of(graph, ground, place, i, j)
+    cell = Corners.of(graph, ground, place, i, j, together)
     return cell.base + cell.run * s + (cell.rise + cell.twist * s) * t + (ground.origin[2] + place.origin[2])
 
 
