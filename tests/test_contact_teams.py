@@ -171,6 +171,22 @@ def test_legs_share_one_text_and_the_points_of_the_trunk():
     assert numbers in text.cuda
 
 
+@pytest.mark.slow
+def test_mirrored_legs_write_states_of_bodies(monkeypatch):
+    """By one text, with the signs of quaternions that a whole tree gives."""
+    texts, (scene, a) = warp_machine.recorded(monkeypatch), case("crowded")
+    tree, limbs = (
+        spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity=g) for g in ("tree", "segment")
+    )
+    wanted = tree.body_states(a["q"], a["qd"])
+    for found, right in zip(limbs.body_states(a["q"], a["qd"]), wanted, strict=True):
+        np.testing.assert_allclose(found, right, atol=1e-12)
+    poses = warp_machine.run(texts[-1], a, further=(more := {}))
+    assert 2 * len(texts[-1].cuda) < len(texts[-1].cpu)
+    for found, right in zip((poses, more["velocities_out"]), wanted, strict=True):
+        np.testing.assert_allclose(found, right.reshape(WORLDS, -1), atol=1e-12)
+
+
 def test_mirrored_legs_share_one_text():
     """Numbers in which they differ come from a table, and shins away from the ground cost a look."""
     text, _, _ = known("crowded", True)

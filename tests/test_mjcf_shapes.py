@@ -40,6 +40,23 @@ def test_margins_hold_shapes_where_mujoco_does(override):
     assert (friction["listed"], friction["ball"]) == ((0.4, 0.4) if override == "enable" else (0.6, 1.0))
 
 
+BASE = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1" friction="0.2"/><body name="base">
+ <geom name="sole" type="box" size="0.1 0.1 0.1" friction="0.3"/>
+ <geom name="apart" size="0.5" contype="2" conaffinity="2"/>
+ <body name="arm"><joint axis="0 1 0"/><geom name="rod" size="0.05" friction="0.25"/></body></body>
+ </worldbody></mujoco>"""
+
+
+def test_a_base_that_is_set_free_touches_as_the_file_says(tmp_path):
+    """Shapes of a body that the file welds to the world have masks and friction, too, once floating= lets it move."""
+    file = tmp_path / "base.xml"
+    file.write_text(BASE)
+    found = {c.label: c.friction for c in spo.load(file, floating=True, contacts=True).contacts}
+    assert found == {"sole": 0.3, "rod": 0.25}
+    with pytest.warns(UserWarning, match="left out: box 'sole' of body 'base'"):
+        assert [c.label for c in spo.load(file, contacts=True).contacts] == ["rod"]
+
+
 LOST = """<mujoco><asset><mesh name="hoof" file="nowhere.stl"/><texture type="2d" name="t" file="no.png"/></asset>
  <worldbody><geom name="floor" type="plane" size="1 1 1"/><body name="leg"><freejoint/>
  <inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/><geom name="hoof" type="mesh" mesh="hoof" pos="0 0 -1"/>

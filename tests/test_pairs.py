@@ -28,7 +28,10 @@ from pair_touches import find_touches
 
 import warp_spo as spo
 from warp_spo import reference_pairs
+from warp_spo.dynamics.integrators import CONTACT_STEP, PAIRED_STEP
 from warp_spo.examples import grasp
+from warp_spo.execution import plan
+from warp_spo.execution.device_facts import MEASURED
 from warp_spo.kernels import couples, coupling, coupling_blocks, coupling_points, coupling_shared, straight, touches
 from warp_spo.recursions.contact import aggregates, coupled, pair_pieces
 from warp_spo.reference_pairs import PairStep
@@ -518,6 +521,17 @@ def test_mistakes_have_names(mistake):
     make, kind, message = MISTAKES[mistake]
     with pytest.raises(kind, match=message):
         free([cube(1.0, 0.1)] * 2, make())
+
+
+def test_the_plan_takes_the_form_that_was_faster():
+    """A thread a world for arms and for many worlds, limbs for cubes that are alike; see the measured facts."""
+    forms = {}
+    for name, scene in (("arm", grasp.scene()), ("stack", stack())):
+        for worlds in (4096, 65536):
+            chosen = plan.choose(scene, worlds, MEASURED, "float32")
+            forms[name, worlds] = [chosen.of(routine) for routine in (PAIRED_STEP, CONTACT_STEP)]
+    assert forms["arm", 4096] == forms["arm", 65536] == ["tree", "tree"]
+    assert forms["stack", 4096] == ["segment", "segment"] and forms["stack", 65536] == ["tree", "segment"]
 
 
 def test_calls_without_a_kernel_have_names(device):

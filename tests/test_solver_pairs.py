@@ -9,11 +9,9 @@ from solver_pair_models import arm, free_cube, many, with_table
 import warp_spo as spo
 from warp_spo.errors import UnsupportedError
 from warp_spo.examples import newton_grasp
-from warp_spo.kernels import coupling
 from warp_spo.newton import SolverSPO
 from warp_spo.newton.pairs import ModelPairs, warn_of_bodies_apart
 from warp_spo.newton.worlds import Worlds
-from warp_spo.scene import shape_pairs
 
 
 @pytest.fixture(autouse=True)
@@ -113,7 +111,3 @@ def test_pairs_name_all_that_stands_still_or_nothing():
         SolverSPO(model, pairs=pairs, contacts="ground")
     with pytest.raises(UnsupportedError, match=r"beside contacts='pipeline', such as box '.*table' of the world"):
         SolverSPO(model, pairs=pairs, contacts="pipeline")
-
-
-def test_the_limit_of_all_is_above_what_is_solved_exactly():
-    assert shape_pairs.MOST >= coupling.EXACT

@@ -110,7 +110,8 @@ def make(name: str, worlds: int | None = None, device: Any = None, seed: int = 0
     Args:
         name: "cartpole", "ant", "panda-reach", "go2-flat", "go2-rough" or "g1-flat".
         worlds: how many; None: as many as the task is trained with.
-        device: Warp or torch device. seed: of all random numbers. options: further arguments of ``Env``.
+        device: Warp or torch device. seed: of all random numbers. options: arguments of ``Env`` that the task leaves
+            open, such as ``first_world`` and ``final_observations``.
 
     Raises:
         ValueError: there is no task of this name.

@@ -291,7 +291,7 @@ class Programs:
         ``alone``: one thread takes them all. ``local``: it keeps what they tell each other in memory of its own.
         """
         found = self._team(routine, shapes, pieces, more, options, alone, local, [frozenset()] * len(pieces.pieces))
-        if found is not None and routine.alike:
+        if found is not None and self._unfolds(routine):
             apart = alike.differing(pieces.pieces, found.numbers, found.team.texts)
             other = self._team(routine, shapes, pieces, more, options, alone, local, apart) if any(apart) else None
             if other is not None and len(set(other.team.texts)) < len(set(found.team.texts)):
@@ -328,10 +328,12 @@ class Programs:
             tuple[list[tuple[int, list[Store]]], list[Any]]
         ] = []  # what each piece leaves for pairs of bodies
         for index in range(len(pieces.pieces)):
-            links = self._copied(options, routine.alike)  # its own: pieces of equal structure then give equal text
+            links = self._copied(
+                options, self._unfolds(routine)
+            )  # its own: pieces of equal structure then give equal text
             trace = Trace(links, dtype, tuple(shapes), Pieces(links).pieces[index], slot)
             trace.team = couples
-            if routine.alike and trace.piece is not None:
+            if self._unfolds(routine) and trace.piece is not None:
                 points = [number for number, _ in own_points(trace)]
                 links.numbers = alike.Numbers(links.graph, trace.piece, points, unfolded[index])
                 numbers.append(links.numbers)
@@ -391,6 +393,10 @@ class Programs:
             team.add(work, sum(each.operations for each in emitters))
             looks_up |= any(each.counts["lookup"] for each in emitters)
         return Gathered(team, layout, table, sent, looks_up, couples, numbers)
+
+    def _unfolds(self, routine: Routine) -> bool:
+        """Return whether constants in which limbs differ may be kept from folding; without contacts they all fold."""
+        return routine.alike and bool(self.run.scene.contacts)
 
     def _team_program(self, routine: Routine, pieces: Pieces, found: Gathered, alone: bool, local: bool) -> Program:
         """Return the program of a team."""

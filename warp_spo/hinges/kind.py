@@ -31,6 +31,7 @@ class Carrier(Protocol):
     dofs: tuple[int, ...]
     coordinate: int
     com: Vector
+    rest: Quaternion | None
 
 
 class Placed(NamedTuple):
@@ -118,6 +119,8 @@ class Kind:
     @staticmethod
     def quaternion_at_rest(link: Carrier) -> Quaternion:
         """Return the quaternion of the hinge's axes at rest in the parent link's."""
+        if link.rest is not None:
+            return link.rest
         return Vector((0.0, 0.0, 0.0, 1.0)) if link.matrix is None else constant_quaternion(link.matrix)
 
     # -- velocity, force, acceleration -----------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import UnsupportedError
 from ..scene.actuators import Keyframe
 from ..scene.scene import Scene
-from ..scene.shapes import NONE, POINTS, Choice
+from ..scene.shapes import NONE, POINTS, Choice, moving_bodies
 from .actuators import read_actuators
 from .mechanism import BALL, FREE, SIZES, Mechanism, rotation, scene_entries, xyzw
 from .refusals import refuse_unsupported
@@ -78,7 +78,7 @@ def scene_of(source: Source, floating: bool | None, choice: Choice = NONE) -> Sc
         raise
     except ValueError as error:  # of a body, a hinge or the scene, which know neither call nor file
         raise ValueError(f"{source.title}: {error}; correct the model") from None
-    scene, lost = choice.applied(source.title, scene, lambda: collision_shapes(source))
+    scene, lost = choice.applied(source.title, scene, lambda: collision_shapes(source, moving_bodies(scene)))
     source.left_out += lost
     _warn(source, choice.contacts is not None)
     return scene

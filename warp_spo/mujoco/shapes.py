@@ -19,8 +19,10 @@ Pairs = dict[frozenset[int], int]  # number of an explicit pair by its two geoms
 KINDS = {"mesh": "hull", "hfield": "height field"}
 
 
-def collision_shapes(source: Source) -> list[Shape]:
+def collision_shapes(source: Source, moving: np.ndarray) -> list[Shape]:
     """Return the collision shapes of a model, those that explicit pairs name included.
+
+    ``moving`` says which bodies of the scene can move, bool [body]; body k of it is body k + 1 of the model.
 
     A shape that moves has the friction that it has on the model's ground, if there is one: by the rule of MuJoCo for
     priorities, and zero where the contact has one dimension. Its rounding is the margin of the contact, the sum of both
@@ -30,7 +32,7 @@ def collision_shapes(source: Source) -> list[Shape]:
     pairs = _pairs(source)
     solid = {int(geom) for geom in np.flatnonzero(m.geom_contype | m.geom_conaffinity)}
     solid |= {geom for pair in pairs for geom in pair}
-    still = lambda geom: m.body_weldid[m.geom_bodyid[geom]] == 0  # noqa: E731
+    still = lambda geom: m.geom_bodyid[geom] == 0 or not moving[m.geom_bodyid[geom] - 1]  # noqa: E731
     grounds = [geom for geom in sorted(solid) if still(geom) and _name(m, geom) in ("plane", "hfield")]
     found = []
     for geom in sorted(solid):

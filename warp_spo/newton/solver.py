@@ -79,8 +79,8 @@ class Observables(SolverBase.Observables):
     contact_residual: Any = SolverBase.Observables.field(  # noqa: RUF009
         dtype=wp.float32, frequency=newton.Model.AttributeFrequency.WORLD
     )
-    """Largest change of a pair's force in the last round [N], where more than eight pairs touch and are solved in
-    rounds; else 0. Shape (world_count,)."""
+    """Largest change of a pair's force in the last round [N], where pairs are solved in rounds; else 0. Shape
+    (world_count,)."""
 
 
 class SolverSPO(Plugs, SolverBase):

@@ -59,9 +59,15 @@ class Numbers:
         """Return the same for numbers of a contact point."""
         return [self.take((name, self._points[point], at), value) for at, value in enumerate(values)]
 
+    def of_body(self, at: int, name: str, values: Iterable[Value]) -> list[Value]:
+        """Return the same for numbers of the piece's ``at``-th body."""
+        return [self.take((name, at, i), value) for i, value in enumerate(values)]
+
     def _take_link(self, at: int, link: Link) -> None:
         """Replace the constants of a link that shall not fold."""
         read = lambda name, values: [self.take((name, at, i), x) for i, x in enumerate(values)]  # noqa: E731
+        if all(map(is_constant, (x for row in link.matrix or () for x in row))):
+            link.rest = Vector(read("rest", link.hinge.quaternion_at_rest(link)))
         rows = read("matrix", (x for row in (link.matrix or IDENTITY) for x in row))
         matrix = Matrix.of([rows[3 * i : 3 * i + 3] for i in range(3)])
         link.matrix = None if matrix == IDENTITY else matrix

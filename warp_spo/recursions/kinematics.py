@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..hinges.quaternions import Quaternion, constant_quaternion, multiplied, turned
 from ..trace.emission import Store
-from ..trace.scalars import Value
+from ..trace.scalars import Value, constant_of
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, dot
 from .links import Link, Links, Placed, place_link
 from .motion import hinge_motion
@@ -112,7 +112,8 @@ def quaternions_in_links(links: Links) -> dict[int, Quaternion]:
     by_links: dict[int | None, Quaternion] = {None: by_anchors[-1]}
     for link in links.links:
         over = None if link.parent is None else id(link.parent)
-        by_links[id(link)] = multiplied(by_links[over], link.hinge.quaternion_at_rest(link))
+        rest = Vector(map(constant_of, link.hinge.quaternion_at_rest(link)))
+        by_links[id(link)] = multiplied(by_links[over], rest)
     found = {}
     for body, seat in links.seats.items():  # parents first; all at neutral coordinates
         hinge = scene.hinge_of[body]
@@ -128,13 +129,16 @@ def quaternions_in_links(links: Links) -> dict[int, Quaternion]:
 def body_poses(trace: Trace) -> list[Store]:
     """out [body, 7] = position, quaternion xyzw"""
     (at, turns), within = link_poses(trace), quaternions_in_links(trace.links)
-    stores = []
-    for body in trace.own_bodies:
+    stores, numbers = [], trace.links.numbers
+    for number, body in enumerate(trace.own_bodies):
         seat, (R, p) = trace.links.seats[body], trace.links.nodes[body].anchor
         key = None if seat.link is None else id(seat.link)
         axes = seat.matrix @ R.T
-        position = at[key] + turned(turns[key], seat.offset - axes @ p)
-        pose = (*position, *multiplied(turns[key], within[body]))
+        origin, turn = seat.offset - axes @ p, within[body]
+        if numbers is not None:
+            origin, turn = (Vector(numbers.of_body(number, *each)) for each in (("origin", origin), ("turn", turn)))
+        position = at[key] + turned(turns[key], origin)
+        pose = (*position, *multiplied(turns[key], turn))
         stores += [Store("out", (body, c), value) for c, value in enumerate(pose)]
     return stores
 

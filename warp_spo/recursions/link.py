@@ -41,6 +41,7 @@ class Link:
             that.
         children: the links that move on it.
         group: the links that share its dofs; None where it has them for itself.
+        rest: quaternion of the matrix; None: it follows from the matrix.
     """
 
     parent: Link | None
@@ -59,6 +60,7 @@ class Link:
     lift: Lift | None = None
     children: list = dataclasses.field(default_factory=list)
     group: Group | None = None
+    rest: Vector | None = None
 
     @property
     def leads(self) -> bool:

@@ -315,6 +315,11 @@ def number(graph: Graph, value: float, *key: Any) -> Scalar:
     return graph.make("number", value, *key)
 
 
+def constant_of(x: Value) -> Value:
+    """Return a constant as one that folds; other values as they are."""
+    return x.args[0] if not is_constant(x) and x.op == "number" else x
+
+
 def cut(x: Value) -> Value:
     """Return a new scalar equal to ``x``, at which simplification stops and which can be an independent input."""
     return x if is_constant(x) else x.graph.make("cut", x)

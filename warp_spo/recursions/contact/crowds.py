@@ -20,7 +20,7 @@ from .secants import Kept, largest
 if TYPE_CHECKING:
     from ..tracing import Trace
 
-CROWD = 8  # points of a link from which a look at all of them pays, see docs/measured_facts.md
+CROWD = 8  # points of a link from which a look at all of them pays, see docs/contact_measured.md
 MARGIN = 1.001  # of the bound of a speed; what rounds in it, and in a point's own speed, is 1e-6 of it
 
 
