@@ -4,10 +4,10 @@
 
 For each robot and number of worlds, in microseconds: SolverSPO.step of states that drives hold near their targets, of
 states of joints alone, without bodies and forces on them, and of random states, some of them outside of their limits;
-Dynamics.step, with and without forces on bodies, and Dynamics.body_states, which the solver launches; forward dynamics
-of the same robot without laws. A line also has the ratio to forward dynamics, the number of launches, registers and
-stack of a thread, the seconds in which the solver was built, kernels included, and the largest error of a step from
-random states against float64 on the CPU.
+Dynamics.step, with and without forces on bodies, and Dynamics.body_states, whose results the solver's step has, too;
+forward dynamics of the same robot without laws. A line also has the ratio to forward dynamics, the number of launches,
+registers and stack of a thread, the seconds in which the solver was built, kernels included, and the largest error of a
+step from random states against float64 on the CPU.
 """
 
 from __future__ import annotations

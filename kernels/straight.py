@@ -34,6 +34,7 @@ MOST_PASSES = 32  # limit for the passes of a loop; 25 was the largest count eve
 PASS = "pass_row"  # counts the passes from zero
 IN_PLACE, STAGED, MAPPED, RELAYED, TILED, DIRECT = "in place", "staged", "mapped", "relayed", "tiled", "direct"
 BY_TABLE = (MAPPED, RELAYED)  # the ways in which a table says which value each entry of a row receives
+OVER = {"velocities_out": "body_f"}  # a result in shared memory, and the row that nobody reads any more when it is made
 TILE = 8  # worlds in a tile of a TILED result
 
 
@@ -123,7 +124,7 @@ class KernelLayout(NamedTuple):
     def shared_scalars(self) -> int:
         """The scalars of shared memory that a group needs; tiles of a RELAYED result reuse the space of the rows."""
         rows = sum(pitch(row.entries) for row in self.shared_rows)
-        rows += sum(pitch(row.entries) for row in self.staged_further)
+        rows += sum(pitch(row.entries) for row in self.staged_further if self.replaced(row) is None)
         rows += pitch(self.result.array.entries) if self.result.way == STAGED else 0
         scalars = WARP_SIZE * (rows + self.messages + self.warps * self.aside + sum(map(len, self.cached)))
         if self.result.way == RELAYED:
@@ -139,6 +140,11 @@ class KernelLayout(NamedTuple):
     def staged_further(self) -> tuple[Row, ...]:
         """The further results that go to memory through shared memory."""
         return tuple(row for row in self.apart if self.further_staged and row.name not in INTEGERS)
+
+    def replaced(self, row: Row) -> Row | None:
+        """Return the row in shared memory whose place a further result in shared memory takes, if there is one."""
+        rows = (one for one in self.shared_rows if one.name == OVER.get(row.name) and one.entries == row.entries)
+        return next(rows, None)
 
     @property
     def apart(self) -> tuple[Row, ...]:
@@ -184,7 +190,9 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
             text += [hold_state(row, c) if row in layout.state else _own_row(row, c)]
     for row in layout.apart:
         if row in layout.staged_further:
-            offset[row.name], at = at, at + WARP_SIZE * pitch(row.entries)
+            before = layout.replaced(row)
+            offset[row.name] = at if before is None else offset[before.name]
+            at += WARP_SIZE * pitch(row.entries) if before is None else 0
             text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
         else:
             text += [_own_result(row, c)]

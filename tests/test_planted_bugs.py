@@ -182,8 +182,7 @@ TEAM_MUTANTS = {
                                     "child.inward + (child.warp != piece.warp)", "child.inward"),
     "no barrier after the trunk": (pieces.Pieces, "__init__",
                                    "piece.parent.outward + (piece.warp != piece.parent.warp)", "piece.parent.outward"),
-    "another limb's entries": (teams.Team, "_fill_in", "zip(*shifts.columns, strict=True)",
-                               "[*zip(*shifts.columns, strict=True)][::-1]"),
+    "another limb's entries": (teams.Team, "_distances", "who * {step}", "who * {step + 1}"),
     "another limb's constants": (teams.Team, "_fill_in", "zip(*constants.columns, strict=True)",
                                  "[*zip(*constants.columns, strict=True)][::-1]"),
 }  # fmt: skip
@@ -213,8 +212,8 @@ INVERSE_MUTANTS = {
     "a turn too few": (
         teams.Team,
         "_take_turns",
-        "counts.values())}; ++turn",
-        "[n - 1 for n in counts.values()])}; ++turn",
+        "counts.values())}; ++each",
+        "[n - 1 for n in counts.values()])}; ++each",
     ),
 }
 

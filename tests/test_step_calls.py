@@ -39,6 +39,30 @@ def test_in_place_and_without_allocation(device):
         dyn.step(q, qd, tau, H, out=(q, tau))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("granularity", ["segment", "tree", "node"])
+def test_states_of_bodies(granularity, device):
+    """Those of the state after the step, whatever else it is asked for; over arrays full of NaN."""
+    scene, worlds = furnished(zoo.fork()), 3
+    dyn = spo.Dynamics(scene, worlds, device=device, granularity=granularity)
+    on = laws.to_device(dyn, states(scene, worlds, "float32"))
+    given = on["q"], on["qd"], on["tau"], H, *(on[n] for n in FORCES[1:])
+    sizes = dict(poses=7, velocities=6)
+    word = dict(status=wp.empty(worlds, dtype=wp.int32, device=device))
+    for more in (word, dict(substeps=2), *([dict(integrator="midpoint")] if granularity == "tree" else [])):
+        alone = dyn.step(*given, **more)
+        expected = dict(zip(sizes, dyn.body_states(*alone), strict=True))
+        for names in (("poses", "velocities"), ("velocities",)):
+            bodies = {n: wp.full((worlds, scene.body_count, sizes[n]), np.nan, dyn.dtype, device) for n in names}
+            after = dyn.step(*given, **more, **bodies)
+            for got, wanted in zip(after, alone, strict=True):
+                np.testing.assert_array_equal(got.numpy(), wanted.numpy())
+            for name, got in bodies.items():
+                np.testing.assert_allclose(got.numpy(), expected[name].numpy(), rtol=0.0, atol=1e-5)
+    with pytest.raises(ValueError, match=r"velocities .* expected \(3, 5, 6\) \[world, body, 6\]"):
+        dyn.step(*given, velocities=np.zeros((3, 5, 7), np.float32))
+
+
 def test_a_step_in_place_reads_its_state_once(device, monkeypatch):
     """No second try for far angles after the state has been written over: they are looked at first."""
     texts, kernel = [], native.kernel

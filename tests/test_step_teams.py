@@ -19,6 +19,8 @@ import warp_spo as spo
 from warp_spo.execution import plan, teams
 from warp_spo.kernels import straight
 from warp_spo.kernels.substeps import repeat_on_cuda
+from warp_spo.recursions import body_frames
+from warp_spo.recursions import step as steps
 from warp_spo.recursions.step import SHORT, Step, by_pieces
 
 WORLDS = 4
@@ -114,6 +116,24 @@ def test_equals_the_step_by_trees(integrator, device):
         assert dyn.programs.described()[0].startswith("step  segment")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("most", [0, 1 << 10])
+@pytest.mark.parametrize(("name", "dtype"), [("hand", "float64"), ("fork", "float64"), ("driven", "float32")])
+def test_laws_in_turns_or_in_statements(name, dtype, most, device, monkeypatch):
+    """Both are the dense step, of all worlds."""
+    monkeypatch.setattr(steps, "MOST_LAWS", most)
+    scene = scene_of(name)
+    dyn = spo.Dynamics(scene, WORLDS, device=device, dtype=dtype, granularity="segment")
+    a = states(scene, WORLDS, dtype)
+    status = np.full(WORLDS, -1, np.int32)
+    q, qd = step(dyn, a, status=status)
+    assert not status.any()
+    for w in range(WORLDS):
+        wanted = implicit.step(scene, w, H, *(a[n][w] for n in ("q", "qd", *FORCES)))
+        np.testing.assert_allclose(qd[w], wanted[1], atol=TOLERANCE[dtype])
+        np.testing.assert_allclose(q[w], wanted[0], atol=TOLERANCE[dtype])
+
+
 def test_what_stays_a_thread_a_world(device):
     """Few dofs, and loops that are closed."""
     assert zoo.SCENES["chain7"]().dof_count <= SHORT < scene_of("fork").dof_count
@@ -143,6 +163,8 @@ def texts_of(monkeypatch, name, staged=False, substeps=None, **options):
     shapes |= {} if substeps is None else {"substeps": ()}
     more = {"q_out": wide} | ({"qdd_out": rate} if "qdd" in options else {})
     more |= {"status": (WORLDS,)} if "status" in options else {}
+    bodies = (WORLDS, scene.body_count)
+    more |= {"poses_out": (*bodies, 7), "velocities_out": (*bodies, 6)} if "bodies" in options else {}
     program = dyn.programs.find(ROUTINES["step"], shapes, rate, more, **options)
     assert program.warps > 1 and texts[-1].frame.staged == staged
     numbers = {"dt": H} | ({} if substeps is None else {"substeps": substeps})
@@ -163,6 +185,42 @@ def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
             np.testing.assert_allclose(more["q_out"], q, rtol=0.0, atol=TOLERANCE["float64"])
             np.testing.assert_allclose(a["qd"] + H * more["qdd_out"], qd, rtol=0.0, atol=TOLERANCE["float64"])
             assert not more["status"].any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("together", [True, False])
+@pytest.mark.parametrize("name", ["hand", "forest"])
+def test_the_step_writes_the_states_of_bodies(name, together, monkeypatch):
+    """They are those of the state after the step, whichever warp goes first, written over the state or not.
+
+    ``together``: bodies share a text; otherwise each has statements of its own.
+    """
+    monkeypatch.setattr(body_frames, "BY_STATEMENTS", 0 if together else 1 << 10)
+    text, a, (q, qd, _) = texts_of(monkeypatch, name, True, status=True, bodies=True)
+    dense = spo.Dynamics(scene_of(name), WORLDS, device="cpu", dtype="float64", granularity="tree")
+    expected = dense.body_states(q, qd)
+    for backwards in (False, True):
+        for over in (None, {"q_out": "q", "out": "qd"}):
+            got = warp_machine.run(text, a, backwards, more := {}, over)
+            np.testing.assert_allclose(got, qd, rtol=0.0, atol=TOLERANCE["float64"])
+            for found, right in zip((more["poses_out"], more["velocities_out"]), expected, strict=True):
+                np.testing.assert_allclose(found.reshape(right.shape), right, rtol=0.0, atol=TOLERANCE["float64"])
+            assert not more["status"].any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("most", [0, 1 << 10])
+@pytest.mark.parametrize("name", SCENES)
+def test_warps_take_turns(name, most, monkeypatch):
+    """Laws and checks in loops, and in statements."""
+    monkeypatch.setattr(steps, "MOST_LAWS", most)
+    text, a, (q, qd, _) = texts_of(monkeypatch, name, status=True)
+    assert ("force_row" in text.cuda) == (most == 0)
+    for backwards in (False, True):
+        got = warp_machine.run(text, a, backwards, more := {})
+        np.testing.assert_allclose(got, qd, rtol=0.0, atol=TOLERANCE["float64"])
+        np.testing.assert_allclose(more["q_out"], q, rtol=0.0, atol=TOLERANCE["float64"])
+        assert not more["status"].any()
 
 
 def test_equal_limbs_share_one_text(monkeypatch):

@@ -96,7 +96,8 @@ def run(text, arrays, backwards=False, further=None, over=None):
     fields = {name: arrays[name] for name in frame.fields}
     space = FUNCTIONS | rows | fields | {"result_row": result, "sent": sent}
     space |= {f"{name}_row": [arrays[name]] for name in frame.numbers}
-    space |= {name: text.tables.get(name) for name in ("table", "shifts", "ground")} | {"worlds": np.arange(worlds)}
+    space |= {name: text.tables.get(name) for name in ("table", "shifts", "ground", "geometry")}
+    space |= {"worlds": np.arange(worlds)}
     exec(translated(text.cuda), space)
     stretch, going, ayes = 0, {warp: space["work"](warp) for warp in range(frame.warps)}, None
     while going:
@@ -161,7 +162,7 @@ FUNCTIONS = {
 FORMS = [
     (r"^const int going = __syncthreads_or\((.*)\);$", r"going = yield bool((\1).any())"),
     (r"^(?:const )?bool (\w+) = true;$", r"\1 = worlds == worlds"),
-    (r"^if \(open\) (\w+_row\[\d+\]) = (.*);$", r"\1 = where(open, \2, \1)"),
+    (r"^if \(open\) (\w+_row\[[^\]]*(?:\[\d+\])?\]) = (.*);$", r"\1 = where(open, \2, \1)"),
     (r"^if \(!going\) break;$", "if not going: break"),
     (r"^const int going = (.*);$", r"going = (\1).any()"),
     (r"^(?:const )?(?:float|double) (\w+)\[(\d+)\] = \{\};$", r"\1 = [0.0 * worlds] * \2"),
@@ -187,7 +188,7 @@ def translated(cuda):
     """``def work(warp)``: the statements for CUDA in Python."""
     lines, depth, mask = ["def work(warp):"], 1, ""  # of a branch of some worlds
     for line in map(str.strip, cuda.split("\n")):
-        if not line or line.startswith(("//", "#")) or line == FENCE:
+        if not line or line.startswith(("//", "#", 'asm("" :')) or line == FENCE:
             continue
         if line == "}":
             depth, mask = depth - 1, ""
@@ -235,6 +236,7 @@ def _statement(line):
     line = re.sub(r"\((?:float|double)\)", "", line).replace("on::", "")
     line = re.sub(r"(?<![\w.])(\d+\.?\d*(?:e[-+]?\d+)?)f\b", r"\1", line)
     line = re.sub(r"ground\.data\[\(int\)(\w+) \+ (\d+)\]", r"ground[int64(\1) + \2]", line).replace("::", "")
+    line = re.sub(r"GEOMETRY\(([^()]*)\)", r"geometry[\1]", line)
     line = re.sub(r"FIELD\((\w+), ([^()]*)\)", r"\1[\2]", line)
     line = re.sub(r"__ldg\(shifts\.data \+ (.*?)\)", r"int(shifts[\1])", line)
     line = re.sub(r"__ldg\((\w+ \+ \d+)\)", r"table[\1]", line)

@@ -16,6 +16,7 @@ from ..gradients import records_gradient
 from .operation import Argument, Closed, Derivative, Operation, Refused, Result
 
 if TYPE_CHECKING:
+    from ..execution.programs import Program
     from .dynamics import Dynamics
 
 OPEN_TREE = "loops='cut' leaves the loops open"
@@ -240,14 +241,24 @@ class Engine:
             if dyn.scene.dof_count == 0:
                 launches.fill(out, 0)
                 return False
-        arrays = {name: value for name, value in given.items() if isinstance(value, wp.array | float)}
-        options = {name: value for name, value in given.items() if value is not None and name not in arrays}
-        shapes = {name: getattr(array, "shape", ()) for name, array in arrays.items()}
-        further = {name: array.shape for name, array in more.items()}
-        program = dyn.programs.find(routine, shapes, out.shape, further, **options)
+        program, arrays, options = self._find(routine, out, more, given)
         if program is None:
             assert routine.sweeps is not None, f"{routine.name} has no form for this scene"
             routine.sweeps(dyn.recursions, out, **arrays, **more, **options)
             return True
         dyn.programs.launch(program, arrays, out, *more.values())
         return False
+
+    def has_program(self, routine: Routine, out: wp.array, more: dict[str, wp.array], **given: Any) -> bool:
+        """Return whether one kernel computes a routine for these arguments; as :meth:`launch_routine`."""
+        return bool(out.size and self._dyn.scene.dof_count) and self._find(routine, out, more, given)[0] is not None
+
+    def _find(
+        self, routine: Routine, out: wp.array, more: dict[str, wp.array], given: dict[str, Any]
+    ) -> tuple[Program | None, dict[str, Any], dict[str, Any]]:
+        """Return the program of a routine, and the arrays and the options among the arguments ``given``."""
+        arrays = {name: value for name, value in given.items() if isinstance(value, wp.array | float)}
+        options = {name: value for name, value in given.items() if value is not None and name not in arrays}
+        shapes = {name: getattr(array, "shape", ()) for name, array in arrays.items()}
+        further = {name: array.shape for name, array in more.items()}
+        return self._dyn.programs.find(routine, shapes, out.shape, further, **options), arrays, options

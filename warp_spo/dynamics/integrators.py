@@ -22,11 +22,13 @@ from ..recursions.loops.closed_step import NEWTON_STEPS
 from ..scene.scene import Scene
 from . import rounds
 from .forward_dynamics import accelerations
+from .kinematics import BODY_STATES
 from .rounds import CONTACT_STEP
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
 
+BODIES = {"poses": "world, body, 7", "velocities": "world, body, 6"}  # of the bodies after a step, and their axes
 MIDPOINT_ITERATIONS = 6  # after the first guess; each gains an order in dt of the velocity terms
 RK4 = ((0.0, 1.0 / 6.0), (0.5, 1.0 / 3.0), (0.5, 1.0 / 3.0), (1.0, 1.0 / 6.0))
 """Where each stage starts, in dt along the stage before it, and its weight."""
@@ -40,7 +42,7 @@ def _limbs_couple(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
     return pair_pieces.by_limbs(scene)
 
 
-STEP = Routine("step", recursion.step, letters="PzaS", divides=_divides, passes=True, wide=True)
+STEP = Routine("step", recursion.step, letters="PzaSXF", divides=_divides, passes=True, wide=True)
 PAIRED_STEP = Routine(
     "paired_step", pair_pieces.step, letters="PzafSE", divides=_limbs_couple, passes=True, counted=True, wide=True,
     couples=True,
@@ -75,6 +77,7 @@ def semi_implicit(
     interval: Interval,
     qdd: wp.array | None = None,
     status: wp.array | None = None,
+    bodies: tuple[wp.array, wp.array] | None = None,
     reports: dict[str, wp.array] | None = None,
     passes: int | None = None,
     substeps: int = 1,
@@ -83,8 +86,9 @@ def semi_implicit(
     """Launch the implicit step of order 1.
 
     Args:
-        qdd, status: arrays to fill, see :meth:`Dynamics.step`; reports: others, by name. passes: of scenes with
-            contacts. substeps: more than one only where :func:`several_launches` names no reason against it.
+        qdd, status: arrays to fill, see :meth:`Dynamics.step`; reports: others, by name. bodies: arrays for poses and
+            velocities of the bodies after the step. passes: of scenes with contacts.
+        substeps: more than one only where :func:`several_launches` names no reason against it.
         given: forces and targets by name. With ``q_from``, ``qd_from`` the step starts from that state, while its sweep
             and the laws of its joints are evaluated at q, qd.
     """
@@ -103,11 +107,33 @@ def semi_implicit(
         given |= {"passes": count, "reports": tuple(reports or ()), **option}
         launch(contact_routine(dyn), qd_out, more | (reports or {}), q=q, qd=qd, dt=dt, **given)
     elif not dyn.closed:
+        if bodies is not None and substeps == 1:
+            further = more | {"poses_out": bodies[0], "velocities_out": bodies[1]}
+            arguments = dict(q=q, qd=qd, dt=dt, **given, **option, bodies=True)
+            if dyn._engine.has_program(STEP, qd_out, further, **arguments):
+                launch(STEP, qd_out, further, **arguments)
+                return
         launch(STEP, qd_out, more, q=q, qd=qd, dt=dt, **given, **option)
     elif dyn.embedding is not None:
         launch(EMBEDDED_STEP, qd_out, more, q=q, qd=qd, dt=dt, embedding=dyn.embedding, **given, **option)
     else:
         _step_under_multipliers(dyn, q_out, qd_out, asked, option, q=q, qd=qd, dt=dt, **given)
+    if bodies is not None:
+        write_bodies(dyn, q_out, qd_out, bodies)
+
+
+def arrays_of_bodies(dyn: Dynamics, states: dict[str, Any]) -> tuple[wp.array, wp.array]:
+    """Return the arrays for poses and velocities of the bodies; one that is not given comes from the workspace."""
+    poses, velocities = (
+        states[name] if name in states else dyn.recursions.array(f"{name} of a step", *dyn._engine.shape(axes)[0])
+        for name, axes in BODIES.items()
+    )
+    return poses, velocities
+
+
+def write_bodies(dyn: Dynamics, q: wp.array, qd: wp.array, bodies: tuple[wp.array, wp.array]) -> None:
+    """Launch the poses and velocities of the bodies at a state."""
+    dyn._engine.launch(BODY_STATES, bodies[0], {"velocities_out": bodies[1]}, q=q, qd=qd)
 
 
 def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool, passes: int | None = None) -> str:

@@ -86,7 +86,7 @@ def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
         return "qdd is given; expected no qdd=, which the way back uses itself"
     if arguments.pop("actuator_state", None) is not None and actuators.delays_controls(dyn):
         return "actuators delay ctrl; expected a scene without delays, whose buffers have no gradients"
-    for name in ("status", *contacts.REPORTS):
+    for name in ("status", *integrators.BODIES, *contacts.REPORTS):
         if arguments.get(name) is not None and arguments.get("substeps", 1) != 1:
             return f"{name} is given with substeps; expected one of the two"
         if getattr(arguments.get(name), "requires_grad", False):
@@ -124,6 +124,7 @@ STEP = Operation(
         STATUS,
         CTRL,
         Option("actuator_state", asked=False, stand_in=actuators.stand_in),
+        *(Argument(name, axes, optional=True, asked=True, written=True) for name, axes in integrators.BODIES.items()),
         Option("substeps", default=lambda scene: 1),
         Option("passes", default=lambda scene: None),
         *contacts.ARGUMENTS,
@@ -171,6 +172,8 @@ def step(
     contact_slip: AnyArray | None = None,
     contact_excess: AnyArray | None = None,
     contact_residual: AnyArray | None = None,
+    poses: AnyArray | None = None,
+    velocities: AnyArray | None = None,
     out: tuple[ArrayT | None, ArrayT | None] = (None, None),
 ) -> tuple[ArrayT, ArrayT]:
     """Compute the state after ``dt``: forward dynamics with the forces of all hinges, and q moved along the new qd.
@@ -281,6 +284,8 @@ def step(
             effort limit [N m or N].
         contact_residual: of a scene with pairs of bodies, written with the largest change of a pair's force in the last
             of 16 rounds, where pairs are solved in rounds [world] [N]; zero where they are solved exactly.
+        poses, velocities: written with :meth:`body_poses` and :meth:`body_velocities` of the state after the last
+            substep. With a warp for each limb, see :meth:`explain`, the kernel of the step writes them.
         out: (q, qd) after the step, each an array or None. They may be the arrays of the state itself.
 
     Returns:
@@ -305,8 +310,11 @@ def step(
         if not given["dt"] > 0.0:
             raise ValueError(f"{call.name}: dt is {given['dt']} s; expected more than zero")
         buffers = actuators.read_state(self, call, actuator_state)
+        states = {name: x for name, x in (("poses", poses), ("velocities", velocities)) if x is not None}
+        states = engine.read(call, STEP, **states)
         reports = engine.read(call, STEP, **{name: array for name, array in asked.items() if array is not None})
         given |= {} if taken is None else {"passes": taken, "reports": reports}
+        given["bodies"] = integrators.arrays_of_bodies(self, states) if states else None
         q_out, qd_out = engine.write(call, STEP, outs, given)
         interval = Interval(given["q"], given["qd"], q_out, qd_out, given["dt"])
         given = {name: value for name, value in given.items() if name not in Interval._fields}
@@ -328,11 +336,12 @@ def _launch(
     Args:
         given: forces, targets, controls, and arrays to fill, by name. buffers: of delayed controls; None: no delays.
     """
-    ctrl, status = given.pop("ctrl"), given.get("status")
+    ctrl, status, bodies = given.pop("ctrl"), given.get("status"), given.pop("bodies")
+    last = {"bodies": bodies} if integrator == "semi_implicit" else {}  # of the last substep; others leave them out
     several = integrators.several_launches(dyn, integrator, ctrl is not None, buffers is not None, given.get("passes"))
     if 1 < count <= MOST_FUSED and not several:
         ctrl = ctrl if dyn.scene.actuators else None
-        INTEGRATORS[integrator](dyn, call, interval, **given, ctrl=ctrl, substeps=count)
+        INTEGRATORS[integrator](dyn, call, interval, **given, **last, ctrl=ctrl, substeps=count)
         return
     force = given.get("reports", {}).get("contact_f") if count > 1 else None
     if force is not None:
@@ -342,12 +351,14 @@ def _launch(
         now = ctrl if ctrl is None or buffers is None else actuators.delayed(dyn, ctrl, buffers)
         if substep and status is not None:
             given["status"] = dyn._later_status
-        INTEGRATORS[integrator](dyn, call, interval, **given, ctrl=now)
+        INTEGRATORS[integrator](dyn, call, interval, **given, **(last if substep == count - 1 else {}), ctrl=now)
         if force is not None:
             contacts.add_share(dyn, substep, count, given["reports"]["contact_f"], force)
         if substep and status is not None:
             dyn.recursions.launch(combination.worst, dyn.worlds, [SEVERITY, dyn._later_status], [status])
         interval = interval._replace(q=interval.q_out, qd=interval.qd_out)
+    if bodies is not None and not last:
+        integrators.write_bodies(dyn, interval.q_out, interval.qd_out, bodies)
 
 
 def explain(dyn: Dynamics) -> str:

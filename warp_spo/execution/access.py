@@ -5,10 +5,11 @@ from __future__ import annotations
 from ..kernels import straight
 from ..kernels.straight import DIRECT, RELAYED, TILED, KernelLayout
 from ..kernels.substeps import SUBSTEPS
+from ..recursions.body_frames import GEOMETRY
 from ..recursions.contact import coupled
 from ..recursions.contact.secants import SECANT
 from ..recursions.messages import INWARD, OUTWARD
-from ..recursions.step import GUESS, LOOPED, MISSED
+from ..recursions.step import FORCE, GUESS, LOOPED, MISSED, RESISTANCE
 from ..status import Status
 from ..trace.emission import C_TYPE, PREFIX, Emitter, RangeReduction
 from . import staging
@@ -44,8 +45,10 @@ def make_emitter(
     def load(array: str, entry: str) -> str:
         if array in (INWARD, OUTWARD):
             return f"SENT({entry})"
-        if array == HELD or (array in (*LOOPED, SECANT) and pieces):
+        if array in (HELD, FORCE, RESISTANCE) or (array in (*LOOPED, SECANT) and pieces):
             return f"{'' if array == MISSED else PREFIX}{array}_row[{entry}]"
+        if array == GEOMETRY:
+            return f"{GEOMETRY.upper()}({entry})"
         if array in FIELDS:
             return f"FIELD({array}, {entry})"
         return f"{array}_row[{entry}]"
@@ -55,7 +58,7 @@ def make_emitter(
             return f"SENT({entry}) = {value};"
         if array == "out" and result.way == RELAYED:
             return f"RELAY({entry}) = {value};"
-        if array in (HELD, SECANT, *coupled.ARRAYS):
+        if array in (HELD, SECANT, FORCE, RESISTANCE, *coupled.ARRAYS):
             return f"{load(array, entry)} = {value};"
         if array == MISSED and pieces:
             return f"missed_row[0] += {value};"

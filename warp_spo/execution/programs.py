@@ -20,7 +20,7 @@ from ..kernels.native import INTEGERS
 from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import BY_TABLE, DIRECT, RELAYED, TILED, KernelLayout
 from ..kernels.substeps import SUBSTEPS
-from ..recursions import alike, messages
+from ..recursions import alike, body_frames, messages
 from ..recursions.contact import coupled, pair_pieces, pairs
 from ..recursions.contact.couples import Team as Couplings
 from ..recursions.contact.ground import GROUND
@@ -31,7 +31,7 @@ from ..recursions.flexible import attach
 from ..recursions.links import TABLES, Links
 from ..recursions.messages import INWARD, OUTWARD
 from ..recursions.pieces import PARTS, Pieces
-from ..recursions.step import GAIN, GUESS, LOOPED, MISSED
+from ..recursions.step import FORCE, GAIN, GUESS, LOOPED, MISSED, RESISTANCE
 from ..recursions.tracing import Trace
 from ..scene.contacts import HeightField
 from ..trace.emission import Store, render, under
@@ -45,8 +45,9 @@ from .routine import Routine
 from .sweeps import Sweeps
 from .teams import HELD, Passes, Team, Work
 
-PASSED = (*LOOPED, SECANT)  # variables of the loops over passes
+PASSED = (*LOOPED, SECANT, FORCE, RESISTANCE)  # variables of the loops over passes
 MOST_REGISTERS = 255  # of a thread
+BODIES = "bodies"  # option of a step by limbs whose kernel writes the states of bodies, too
 PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
 
 
@@ -225,6 +226,8 @@ class Programs:
             program = self._segment_program(routine, both, pieces, tuple(more), options, *form) if several else None
             if program is not None:
                 return program
+        if options.get(BODIES):
+            return None
         return self._tree_program(routine, links, {**shapes, **more}, tuple(more), options)
 
     def _tree_program(self, routine: Routine, links: Links, shapes: dict, more: tuple, options: dict) -> Program:
@@ -314,6 +317,8 @@ class Programs:
         ``unfolded``: by piece, constants that do not fold, see :mod:`..recursions.alike`.
         """
         letters = messages.needed(routine.letters, shapes)
+        by_frames = BODIES in options and body_frames.suits(self.links)
+        letters = letters if by_frames else letters.replace("F", "")
         dtype, (slots, sent) = self.run.dtype.__name__, messages.slots(letters, pieces)
         slot = lambda letter, piece: slots[letter, piece.index]  # noqa: E731
         couples = self._team_of_pairs(slots, sent) if routine.couples else None
@@ -321,7 +326,7 @@ class Programs:
         numbers: list[alike.Numbers] = []
         everything: list[Store] = []
         traced: list[list[Store]] = []
-        apart: list[tuple[list[Store], list[Store], list[list[Store]]]] = []
+        apart: list[tuple[list[list[Store]], list[list[Store]], list[Store], list[list[Store]], list[list[Store]]]] = []
         begins: list[list[Store]] = []  # what each piece stores and sends before its passes
         held: list[list[Scalar]] = []  # what each piece computes once before its passes
         responses: list[
@@ -340,16 +345,19 @@ class Programs:
             traced.append([self._flattened(item, shapes) for item in routine.trace(trace, **options)])
             rounds = [[self._flattened(item, shapes) for item in turn] for turn in trace.rounds]
             news = [self._flattened(item, shapes) for item in trace.news]
-            apart.append((trace.checks, news, rounds))
+            bodies = [[self._flattened(item, shapes) for item in turn] for turn in trace.states]
+            apart.append((trace.laws, trace.checks, news, rounds, bodies))
             begins.append(trace.begin)
             responses.append((trace.couples, trace.carried))
             held.append(list({x.key: x for x in trace.ahead if not is_literal(x) and x.op != "input"}.values()))
-            everything += trace.begin + traced[-1] + trace.checks + news + [item for turn in rounds for item in turn]
+            everything += trace.begin + traced[-1] + news
+            everything += [item for turn in (*trace.laws, *trace.checks, *rounds, *bodies) for item in turn]
             everything += [item for _, items in trace.couples for item in items]
         bends = any(item.array == MISSED for item in everything)
         held = held if bends or routine.counted else [[] for _ in held]
         sizes = {index: len(values) for index, values in enumerate(held)}
-        passes = Passes((GUESS, GAIN), sent if bends else None, sizes) if routine.passes else None
+        kept = (GUESS, GAIN, FORCE, RESISTANCE) if any(laws for laws, *_ in apart) else (GUESS, GAIN)
+        passes = Passes(kept, sent if bends else None, sizes) if routine.passes else None
         if routine.counted:
             counts = [sum(item.array == SECANT for item in begin) for begin in begins]
             passes = Passes((GAIN,), None, sizes, dict(enumerate(counts)))
@@ -360,18 +368,22 @@ class Programs:
         )
         if layout.result.way == DIRECT and layout.result.array.entries > staging.LONG_ROW:
             return None  # no room for the result in shared memory, which matters more
-        if not layout.fits(self.run.dtype, self.room(routine.wide, routine.couples)):
+        if not layout.fits(self.run.dtype, self.room(routine.wide, routine.couples, BODIES in options)):
             return None  # nor for what limbs tell each other
+        if options.get(BODIES) and not layout.further_staged:
+            return None  # nor for the states of bodies, which another kernel then writes
         declared = "" if couples is None else coupling_teams.declare(couples, self.run.dtype, local)
         team, looks_up = Team(pieces, dtype, passes, declared), False
         outs = [[item for item in stores if item.array == "out"] for stores in traced]
         placed, table = staging.arrange_stores(whole, layout.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
         by_slot = lambda found: found if table is None else staging.stores_by_slot(found, table)  # noqa: E731
-        for piece, stores, items, (checks, news, rounds), begin, values, (response, carried) in zip(
-            pieces.pieces, traced, outs, apart, begins, held, responses, strict=True
-        ):
-            first, emitter, checking, later = (make_emitter(dtype, shapes, layout, True) for _ in range(4))
+        for piece, stores, items, (laws, checks, news, rounds, bodies), begin, values, (
+            response,
+            carried,
+        ) in zip(pieces.pieces, traced, outs, apart, begins, held, responses, strict=True):
+            first, emitter, later, *others = (make_emitter(dtype, shapes, layout, True) for _ in range(5))
+            ruling, checking = others
             ahead = first.region([*begin, *(Store(HELD, (at,), value) for at, value in enumerate(values))])
             later = later if passes else emitter
             emitter.keep(HELD, values)
@@ -388,8 +400,11 @@ class Programs:
             ends = [item for item in news if item.array == "out"]
             news = [item for item in news if item.array != "out"] + by_slot(ends)
             branches = later.branch(news), [later.branch(by_slot(turn)) for turn in rounds]
-            work = Work(piece, *regions, checking.region(checks), *branches, ahead, response)
-            emitters = {first, emitter, checking, later}
+            own = [(make_emitter(dtype, shapes, layout, True), turn) for turn in bodies]
+            states = [emitter.region(turn) for emitter, turn in own]
+            turns = [ruling.branch(turn) for turn in laws], [checking.branch(turn) for turn in checks]
+            work = Work(piece, *regions, *turns, *branches, ahead, response, states)
+            emitters = {first, emitter, later, *others, *(emitter for emitter, _ in own)}
             team.add(work, sum(each.operations for each in emitters))
             looks_up |= any(each.counts["lookup"] for each in emitters)
         return Gathered(team, layout, table, sent, looks_up, couples, numbers)
@@ -420,6 +435,11 @@ class Programs:
             layout, registers = layout._replace(aside=places), routine.aside
             cuda = set_aside(cuda, C_TYPE[T], places)
         lists = {"place": table, "table": team.table, "shifts": team.shifts}
+        if team.shares_bodies:
+            lists[body_frames.GEOMETRY] = body_frames.geometry(self.run.scene)
+            name = body_frames.GEOMETRY.upper()
+            cuda = f"#define {name}(i) __ldg(geometry.data + i)\n{cuda}\n#undef {name}"
+            cpu = f"#define {name}(i) geometry.data[i]\n{cpu}\n#undef {name}"
         tables = {name: values for name, values in lists.items() if values} | self._heights(looks_up)
         if couples is not None:
             tables["touches"] = self.run.array(*self._touches(couples.points))
@@ -507,14 +527,16 @@ class Programs:
             entry,
         )
 
-    def room(self, wide: bool = False, couples: bool = False) -> int:
+    def room(self, wide: bool = False, couples: bool = False, whole: bool = False) -> int:
         """Bytes of shared memory that a block may have: for as many scalars in float64 as in float32 if the GPU can.
 
-        ``wide``: for long rows that all go through it. ``couples``: for what limbs couple in it.
+        ``wide``: for long rows that all go through it. ``couples``: for what limbs couple in it. ``whole``: all that a
+        multiprocessor has.
         """
         more = straight.COUPLED_BYTES if couples else straight.WIDE_BYTES if wide else 0
         wanted = max(straight.SHARED_BYTES, more) * wp.types.type_size_in_bytes(self.run.dtype) // 4
         allowed = self.plan.device.shared_bytes - 3 * RESERVED  # Warp takes a share, too
+        wanted = max(wanted, allowed) if whole else wanted
         return min(wanted, max(allowed, straight.SHARED_BYTES)) if self.plan.device.cuda else wanted
 
     def _registers(self, warps: int) -> int:
@@ -531,9 +553,11 @@ class Programs:
         sent: int = 0,
         warps: int = 1,
     ) -> KernelLayout:
-        ways = self.plan.stages(routine, warps), self.plan.gathers(routine, warps, 1 + len(more)), routine.tiled
+        whole = "poses_out" in more
+        gathers = whole or self.plan.gathers(routine, warps, 1 + len(more))
+        ways = self.plan.stages(routine, warps), gathers, routine.tiled
         wide = routine.wide and warps > 1
-        dtype, relays, room = self.run.dtype, self.relays, self.room(wide)
+        dtype, relays, room = self.run.dtype, self.relays, self.room(wide, whole=whole)
         return staging.choose_layout(stores, everything, shapes, more, sent, warps, dtype, *ways, relays, room, wide)
 
 

@@ -18,6 +18,8 @@ from ..trace.emission import C_TYPE, Listing, fill_in, literal, render
 HELD = "held"
 """Name of the values that a piece computes once before its passes."""
 BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
+KEEP = 'asm("" : "+r"({}));'  # keeps the compiler from computing a number anew wherever it is used
+IN_A_ROW = 5  # most turns of a loop without a jump, which wait together for what they read
 CACHED = 8192  # largest number of operations of a world whose code fits into the instruction cache
 
 
@@ -28,22 +30,26 @@ class Work(NamedTuple):
         piece: the piece.
         inward: the inward sweep.
         outward: the outward sweep.
-        check: the check whether the guesses of a pass were right.
+        laws: what comes before the inward sweep of a pass, in turns of which many may be alike.
+        checks: whether the guesses of a pass were right; with laws in such turns, otherwise in one turn at most.
         news: what the piece sends to the others after the outward sweep; in work with passes, after the last pass.
         rounds: what the piece computes, message by message, from the news of the other pieces.
         ahead: in work with passes, what the piece computes once before them and keeps. Where a fixed number of passes
             is counted, pieces send each other messages inward ahead, too.
         couples: what the piece leaves for each couple of bodies that touches, after the inward sweep.
+        bodies: of the first piece, what limbs compute after the rounds of all pieces, each for some bodies.
     """
 
     piece: Piece
     inward: Listing
     outward: Listing
-    check: Listing
+    laws: Sequence[Listing]
+    checks: Sequence[Listing]
     news: Listing
     rounds: list[Listing]
     ahead: Listing = Listing("", [], [], [])
     couples: Sequence[Listing] = ()
+    bodies: Sequence[Listing] = ()
 
     @property
     def text(self) -> tuple[str, ...]:
@@ -52,7 +58,7 @@ class Work(NamedTuple):
             self.ahead.text,
             self.inward.text,
             self.outward.text,
-            self.check.text,
+            *(each.text for each in self.checks),
             *(each.text for each in self.couples),
         )
 
@@ -147,6 +153,7 @@ class Team:
         for stage in range(self._last + 1):
             for piece in reversed(self.pieces.pieces):
                 if piece.inward == stage:
+                    text += [self._branch(piece, each) for each in self._work[piece.index].laws]
                     text.append(render(self._work[piece.index].inward, self.dtype, f"p{piece.index}_"))
                     responses = [self._branch(piece, each) for each in self._work[piece.index].couples]
                     text += ["if (coupled) {", *responses, "}"] if responses else []
@@ -155,11 +162,12 @@ class Team:
             for piece in self.pieces.pieces:
                 if piece.outward == stage:
                     text.append(render(self._work[piece.index].outward, self.dtype, f"p{piece.index}_"))
-                    if self._work[piece.index].check.text:
-                        text.append(self._branch(piece, self._work[piece.index].check))
+                    text += [self._branch(piece, each) for each in self._work[piece.index].checks if each.text]
                     (later if self.passes else text).append(self._branch(piece, self._work[piece.index].news))
         for work in self._work.values():
             later += [self._branch(work.piece, listing) for listing in work.rounds]
+        for work in self._work.values():
+            later += [self._branch(work.piece, listing) for listing in work.bodies]
         if self.passes:
             kept = {f"p{piece.index}_": [piece] for piece in self.pieces.pieces}
             order = reversed(self._work.values()) if self.passes.counted else self._work.values()  # children first
@@ -201,6 +209,11 @@ class Team:
             text.append("}")
         return self._in_passes("\n".join(text)) if self.passes else "\n".join(text)
 
+    @property
+    def shares_bodies(self) -> bool:
+        """Whether all warps share the states of bodies."""
+        return any(work.bodies for work in self._work.values())
+
     def _in_passes(self, a_pass: str) -> str:
         """Return ``a_pass`` in a loop, then the news of every piece, then the rounds."""
         assert self.passes is not None
@@ -216,10 +229,15 @@ class Team:
         names = ["", *(f"i{at}_" for at in range(len(ranks) - 1))]
         kept = {name: [work.piece for work in rank.values()] for name, rank in zip(names, ranks, strict=True)}
         text = [*self._defined, self.passes.declare(kept, self.c)]
-        text += self._ahead(leaves, dict(zip(names, ranks, strict=True)))
+        ranks_by_name = dict(zip(names, ranks, strict=True))
+        text += self._ahead(leaves, ranks_by_name)
         if self.pairs:
             text += [BARRIER, begin_pairs("warp", self.pieces.warps)]
             a_pass = "\n".join([a_pass, BARRIER, judge_pairs("warp", self.pieces.warps)])
+        if self._in_turns:
+            a_pass = "\n".join(
+                [self._each(leaves, ranks_by_name, "laws"), a_pass, self._each(leaves, ranks_by_name, "checks")]
+            )
         if self.passes.counted:
             text.append(straight.count_team_passes(a_pass, BARRIER, self.c))
         elif self.passes.flags is None:
@@ -235,6 +253,22 @@ class Team:
             if last and any(text_of_ranks):
                 text.append(BARRIER)
             text += text_of_ranks
+        bodies = [listing for work in self._work.values() for listing in work.bodies]
+        text += [BARRIER, self._share(leaves, bodies)] if bodies else []
+        return "\n".join(text)
+
+    @property
+    def _in_turns(self) -> bool:
+        """Whether laws are found, and passes checked, in turns."""
+        return any(work.laws for work in self._work.values())
+
+    def _each(self, leaves: list[Work], ranks: dict[str, dict[int, Work]], name: str) -> str:
+        """Return the turns of pieces, the "laws" or the "checks", in loops; ``ranks`` as for :meth:`_ahead`."""
+        text = []
+        for at, (prefix, rank) in enumerate(ranks.items()):
+            works = [rank.get(leaf.piece.warp) for leaf in leaves]
+            turns = [[] if work is None else [*getattr(work, name)] for work in works]
+            text.append(self._take_turns(leaves, turns, f"{name}{at}_", prefix, loops=True))
         return "\n".join(text)
 
     def _ahead(self, leaves: list[Work], ranks: dict[str, dict[int, Work]]) -> list[str]:
@@ -291,20 +325,31 @@ class Team:
         """Return the rounds of pieces of equal structure."""
         return self._take_turns(alike, [work.rounds for work in alike], f"{prefix}x_", prefix)
 
-    def _take_turns(self, alike: Sequence[Work], turns: list[list[Listing]], tables: str, prefix: str = "") -> str:
-        """Return the statements that pieces of equal structure execute in turns; equal statements share one text."""
+    def _take_turns(
+        self,
+        alike: Sequence[Work],
+        turns: list[list[Listing]],
+        tables: str,
+        prefix: str = "",
+        loops: bool | None = None,
+    ) -> str:
+        """Return the statements that pieces of equal structure execute in turns; equal statements share one text.
+
+        ``loops``: turns are loops; None: see :attr:`_loops`.
+        """
+        loops = self._loops if loops is None else loops
         kinds: dict[str, list[tuple[int, Listing]]] = {}
         for work, listings in zip(alike, turns, strict=True):
             for at, listing in enumerate(listings):
                 if listing.text:
-                    kind = listing.text if self._loops else f"{at} {listing.text}"
+                    kind = listing.text if loops else f"{at} {listing.text}"
                     kinds.setdefault(kind, []).append((work.piece.warp, listing))
         text: list[str] = []
         for at, some in enumerate(kinds.values()):
             counts = Counter(warp for warp, _ in some)
             warps, name = list(counts), f"{tables}{at}_"
             several = max(counts.values()) > 1
-            who = f"{name}first + turn" if several else _choose(warps, range(len(warps)))
+            who = f"{name}first + each" if several else _choose(warps, range(len(warps)))
             head, (body,) = self._fill_in([[listing for _, listing in some]], prefix, name, who)
             condition = "" if len(warps) == len(alike) else f"if ({_any_of(warps)}) "
             inside = [head, body]
@@ -313,11 +358,31 @@ class Team:
                 inside = [
                     f"const int {name}first = {_choose(warps, starts)};",
                     "#pragma unroll 1",
-                    f"for (int turn = 0; turn < {_choose(warps, counts.values())}; ++turn) {{",
+                    f"for (int each = 0; each < {_choose(warps, counts.values())}; ++each) {{",
                     *inside,
                     "}",
                 ]
             text.append("\n".join([f"{condition}{{", *inside, "}"]))
+        return "\n".join(text)
+
+    def _share(self, leaves: Sequence[Work], listings: Sequence[Listing]) -> str:
+        """Return loops in which all warps execute ``listings``, each equally many; equal ones share a text.
+
+        Where they do not come out even, the last warp executes its last listing again.
+        """
+        kinds: dict[str, list[Listing]] = {}
+        for listing in listings:
+            kinds.setdefault(listing.text, []).append(listing)
+        text, warps = [], [work.piece.warp for work in leaves]
+        for at, alike in enumerate(kinds.values()):
+            turns, name = -(-len(alike) // len(leaves)), f"b{at}_"
+            in_a_row = max(range(3, IN_A_ROW + 1), key=lambda count: (-(-turns % count), count))
+            turns += -turns % in_a_row if turns > IN_A_ROW else 0
+            who = f"min({name}first + each, {len(alike) - 1})"
+            head, (body,) = self._fill_in([alike], "", name, who)
+            first = f"const int {name}first = {_choose(warps, range(0, turns * len(leaves), turns))};"
+            loop = f"for (int each = 0; each < {turns}; ++each) {{"
+            text += ["{", first, f"#pragma unroll {in_a_row}", loop, head, body, "}", "}"]
         return "\n".join(text)
 
     @property
@@ -327,10 +392,12 @@ class Team:
 
     def _shared(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str]:
         """Return one text for the inward and one for the outward sweeps of pieces of equal structure."""
-        regions = [[work.inward for work in alike], [work.outward for work in alike], [work.check for work in alike]]
+        checks = [] if self._in_turns else [list(each) for each in zip(*(work.checks for work in alike), strict=True)]
+        regions = [[work.inward for work in alike], [work.outward for work in alike], *checks]
         regions += [list(each) for each in zip(*(work.couples for work in alike), strict=True)]
         who = _choose([work.piece.warp for work in alike], range(len(alike)))
-        head, (inward, outward, check, *couples) = self._fill_in(regions, prefix, prefix, who)
+        head, (inward, outward, *others) = self._fill_in(regions, prefix, prefix, who)
+        check, couples = "\n".join(others[: len(checks)]), others[len(checks) :]
         inward = "\n".join([inward, "if (coupled) {", *couples, "}"]) if any(couples) else inward
         outward = "\n".join([outward, "{", check, "}"]) if check else outward
         return f"{head}\n{inward}" if head else inward, outward
@@ -372,12 +439,28 @@ class Team:
             head.append(f"const {self.c}* {tables}numbers = table.data + {first} + {tables}who * {count};")
             self.table += [value for row in zip(*constants.columns, strict=True) for value in row]
         if shifts.columns:
-            first, count = len(self.shifts), len(shifts.columns)
-            head.append(f"int {tables}shift[{count}];")
-            read = "__ldg(shifts.data + {} + {}who * {})"
-            head += [f"{tables}shift[{k}] = {read.format(first + k, tables, count)};" for k in range(count)]
-            self.shifts += [value for row in zip(*shifts.columns, strict=True) for value in row]
+            head.append(f"int {tables}shift[{len(shifts.columns)}];")
+            head += self._distances(shifts.columns, tables)
         return "\n".join(head), texts
+
+    def _distances(self, columns: list[tuple], tables: str) -> list[str]:
+        """Return statements that find how far the entries of a warp's piece lie from those of the first.
+
+        Where pieces lie in equal steps this is a product; a table would be waited for.
+        """
+        places = range(len(columns[0]))
+        steps = [column[1] if column == tuple(column[1] * at for at in places) else None for column in columns]
+        uneven = [column for column, step in zip(columns, steps, strict=True) if step is None]
+        found, first = [], len(self.shifts)
+        for k, step in enumerate(steps):
+            name = f"{tables}shift[{k}]"
+            if step is not None:
+                found += [f"{name} = {tables}who * {step};", KEEP.format(name)]
+            else:
+                found.append(f"{name} = __ldg(shifts.data + {first} + {tables}who * {len(uneven)});")
+                first += 1
+        self.shifts += [value for row in zip(*uneven, strict=True) for value in row]
+        return found
 
 
 def begin_pairs(warp: str, warps: int) -> str:

@@ -423,11 +423,15 @@ class SolverSPO(Plugs, SolverBase):
                     "SolverSPO.step: state_in.body_q is None; expected poses, at which the contacts of a pipeline are"
                 )
             self._slots.fill(contacts, state_in.body_q, self._words.role, self.dynamics)
+        bodies = None
         if observables is None or not observables.kinds:
             q_out, qd_out = self._q.target(state_out.joint_q, "q_out"), self._qd.target(state_out.joint_qd, "qd_out")
             more: dict[str, Any] = (
                 {} if qdd is None else {"qdd": qdd, "status": self._status}
             )  # the kernel of steps with observables
+            if contacts is None:  # which are marked by the poses before the step
+                bodies = self._bodies(state_out)
+                more |= {} if bodies is None else {"poses": bodies[0], "velocities": bodies[1]}
             self.dynamics.step(q, qd, dt=dt, integrator=self.integrator, out=(q_out, qd_out), **more, **given)
             if contacts is not None:
                 self._words.mark(contacts, self._words.kept, state_in.body_q)
@@ -449,21 +453,31 @@ class SolverSPO(Plugs, SolverBase):
                 wp.copy(getattr(state_out, name), getattr(state_in, name))
         self._q.write(q_out, state_out.joint_q)
         self._qd.write(qd_out, state_out.joint_qd)
-        self._write_bodies(q_out, qd_out, state_out)
+        self._write_bodies(q_out, qd_out, state_out, bodies)
 
     def _empty_slots(self) -> None:
         """Take the contacts of a list, which the last step may have been given, out of the dynamics; launches only."""
         if self._slots is not None:
             self._slots.fill(None, self.model.body_q, self._words.role, self.dynamics)
 
-    def _write_bodies(self, q: wp.array, qd: wp.array, state: newton.State) -> None:
-        """Launch the bodies' poses and velocities, unless the state has none."""
+    def _bodies(self, state: newton.State) -> tuple[wp.array, wp.array] | None:
+        """Return the arrays that receive the bodies' poses and velocities; None if the state has neither."""
         pairs = (self._poses, state.body_q, "body_q"), (self._wrenches, state.body_qd, "body_qd")
         if all(flat is None for _, flat, _ in pairs):
-            return
+            return None
         poses, rates = (at.buffer(name) if flat is None else at.target(flat, name) for at, flat, name in pairs)
-        self.dynamics.body_states(q, qd, out=(poses, rates))
-        for (at, flat, _), array in zip(pairs, (poses, rates), strict=True):
+        return poses, rates
+
+    def _write_bodies(
+        self, q: wp.array, qd: wp.array, state: newton.State, done: tuple[wp.array, wp.array] | None
+    ) -> None:
+        """Write the bodies' poses and velocities, which are ``done``, or are launched; do nothing without them."""
+        found = self._bodies(state) if done is None else done
+        if found is None:
+            return
+        if done is None:
+            self.dynamics.body_states(q, qd, out=found)
+        for at, flat, array in zip((self._poses, self._wrenches), (state.body_q, state.body_qd), found, strict=True):
             if flat is not None:
                 at.write(array, flat)
 

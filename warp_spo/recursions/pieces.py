@@ -45,6 +45,11 @@ class Piece:
         return len(self.dofs)
 
     @property
+    def coordinates(self) -> int:
+        """How many entries of q its links have."""
+        return sum(link.hinge.coordinates for link in self.links)
+
+    @property
     def ancestors(self) -> list[Piece]:
         """The pieces that it moves on, its parent first."""
         return [] if self.parent is None else [self.parent, *self.parent.ancestors]
@@ -140,6 +145,12 @@ class Pieces:
             below = {other.warp for other in self.pieces if piece.root is other.root and not other.children}
             piece.warp = min(below, key=lambda warp: (sum(load[warp % PARTS :: PARTS]), load[warp], -warp))
         piece.inward = max(child.inward + (child.warp != piece.warp) for child in piece.children)
+
+    @property
+    def unlike(self) -> int:
+        """How many dofs are in pieces that are not alike, one of each kind counted; free hinges are left out."""
+        kinds = {tuple(link.hinge.name for link in piece.links): piece for piece in self.pieces}
+        return sum(len(link.dofs) for piece in kinds.values() for link in piece.links if not link.hinge.unconstrained)
 
     @property
     def alike(self) -> float:

@@ -17,13 +17,15 @@ from collections.abc import Callable
 from ..scene.scene import Scene
 from ..status import Status
 from ..trace.emission import Store
-from ..trace.scalars import Value, floor, less, reciprocal, select
+from ..trace.scalars import Value, alone, floor, less, reciprocal, select
 from ..trace.spatial import total
+from . import body_frames
 from .actuation import hinge_laws
 from .articulated_sweeps import expand, reduce
 from .impedance import Law, add_laws, is_number
 from .integration import integrate_link
 from .joint_space import JointSpace
+from .kinematics import body_states
 from .links import Link
 from .pieces import Piece, Pieces
 from .tracing import Trace
@@ -32,6 +34,11 @@ GUESS, GAIN, MISSED, PASS = "guess", "gain", "missed", "pass"
 """Variables of the loop over passes, zero at first: guess of u, and u, by dof of a piece; number of wrong guesses. And
 the number of the pass, from zero."""
 LOOPED = (GUESS, GAIN, MISSED)
+FORCE, RESISTANCE = "force", "resistance"
+"""Of the laws of a piece's dofs at their guesses, where these are found in turns."""
+MOST_LAWS = (
+    12  # dofs of unlike pieces; beyond, laws take turns in loops, because their statements are fetched too slowly
+)
 SHORT = 10  # dofs; up to so many, passes solve a system that is formed once
 PATIENCE, TURNS = 8, 3  # passes after which a dof changes its guess in every third one only, one dof after the other
 FAINT = 1e-12  # resistance of a massless dof without active law, as a share of the resistances of its laws
@@ -56,6 +63,9 @@ class Step:
         self.forces: dict[int, Value] = {}
         self.messages: list[Store] = []  # to other pieces
         self._kept = {dof: at for at, dof in enumerate(trace.piece.dofs)} if trace.piece else {}
+        self._in_turns = trace.piece is not None and Pieces(trace.links).unlike > MOST_LAWS
+        if self._in_turns:
+            reciprocal(self.h)  # older than what turns compute alone
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
         """Return the stores out = qd', q_out = q'; with ``qdd`` qdd_out = (qd' - qd) / h, with ``status`` the status.
@@ -139,8 +149,18 @@ class Step:
             faint = FAINT * total(law.scale * law.resistance for law in self.laws[link.dofs[0]])
             held = pieces[0].resistance
             pieces = [pieces[0]._replace(resistance=select(less(0.0, held), held, faint))]
+        if self._in_turns:
+            pieces = [self._in_turn(dof, piece) for dof, piece in zip(link.dofs, pieces, strict=True)]
         self.forces |= {dof: piece.force for dof, piece in zip(link.dofs, pieces, strict=True)}
         return pieces
+
+    def _in_turn(self, dof: int, piece: Law) -> Law:
+        """Return the active piece of a dof as it is read in a pass: found in a turn before the pass, if laws bend."""
+        if not any(law.bends for law in self.laws[dof]):
+            return piece
+        at = (self._kept[dof],)
+        self.trace.laws.append(_turn([Store(FORCE, at, piece.force), Store(RESISTANCE, at, piece.resistance)]))
+        return Law(self._kept_as(FORCE, dof), self._kept_as(RESISTANCE, dof))
 
     def _weightless(self, link: Link) -> bool:
         """Whether the link's one dof carries no mass and has a law with bounds, so that forces alone move it."""
@@ -177,6 +197,7 @@ class Step:
         if not bends and self.trace.piece is None:
             return []
         stores, missed, found = [], [], []
+        turns: list[list[Store]] = []
         for link in self.links:
             self.trace.label(link, "u")
             for dof in link.dofs:
@@ -189,16 +210,19 @@ class Step:
                 if not any(law.bends for law in laws):
                     continue
                 guess = self._guess(dof)
-                missed += [law.missed(guess, gain, self.trace.epsilon) for law in laws]
+                wrong = [law.missed(guess, gain, self.trace.epsilon) for law in laws]
+                missed += wrong
+                turns.append([Store(MISSED, (0,), total(wrong))])
                 if guess.args[0] == GUESS:
                     after = gain
                     for law in laws:
                         after = select(law.skipped(guess, gain), law.middle, after)
                     stores.append(Store(GUESS, (at,), select(self._waits(at), guess, after)))
+                    turns[-1].append(stores[-1])
         stores += [Store(MISSED, (0,), total(missed))] if bends else []
         if self.trace.piece is None:
             return stores
-        self.trace.checks = stores
+        self.trace.checks = list(map(_turn, turns)) if self._in_turns else [stores]
         return found
 
     def _waits(self, at: int) -> Value:
@@ -207,7 +231,7 @@ class Step:
         Guesses that all change at once may repeat for ever, in cycles of four or five passes. Where a third of the dofs
         changes at a time, in turns, the cycles of all random states of G1 that were found ended.
         """
-        number = self.trace.graph.input(PASS, 0) + float(at % TURNS)
+        number = self.trace.graph.input(PASS, 0) + float(at % TURNS or TURNS)  # with a text that is equal for all dofs
         turn = number - float(TURNS) * floor(number * (1.0 / TURNS) + 0.5 / TURNS)
         return less(PATIENCE - 0.5, self.trace.graph.input(PASS, 0)) * less(0.5, turn)
 
@@ -230,6 +254,25 @@ class Step:
                 worst = select(less(worst, word), word, worst)
             trace.rounds = [[Store("status", (), self._verdict(worst))]]
         return trace.send("S", own, [finite])
+
+    def add_bodies(self) -> None:
+        """Let a piece store poses_out, velocities_out = body_poses, body_velocities of its bodies after the step.
+
+        It reads the state after the step from the pieces that its bodies move with.
+        """
+        trace, own = self.trace, self.trace.piece
+        assert own is not None, "by whole trees, another kernel computes the states of bodies"
+        after = {(item.array, item.index[0]): item.value for item in trace.news if item.array in ("q_out", "out")}
+        trace.news = trace.news + trace.send("X", own, map(after.__getitem__, _entries(own)))
+        sent: dict[tuple[str, int], Value] = {}
+        for piece in Pieces(trace.links).pieces:
+            sent |= dict(zip(_entries(piece), trace.receive("X", piece), strict=True))
+        moved = trace.at({"q": lambda c: sent["q_out", c], "qd": lambda dof: sent["out", dof]})
+        if body_frames.suits(trace.links):
+            body_frames.add_bodies(trace, moved)
+            return
+        found = [item._replace(array="poses_out") if item.array == "out" else item for item in body_states(moved)]
+        trace.rounds = [*trace.rounds, found]
 
     def _verdict(self, worst: Value) -> Value:
         """Return ``worst``, the most severe word of all pieces, or what the last pass adds where they are well."""
@@ -262,9 +305,21 @@ class Step:
         return [number for number, moved in enumerate(own) if moved.intersection(dofs)]
 
 
+def _entries(piece: Piece) -> list[tuple[str, int]]:
+    """Return the arrays and indices of the entries of a piece in the state after a step."""
+    coordinates = [link.coordinate + c for link in piece.links for c in range(link.hinge.coordinates)]
+    return [*(("q_out", c) for c in coordinates), *(("out", dof) for dof in piece.dofs)]
+
+
 def by_pieces(scene: Scene) -> bool:
     """Return whether pieces can share the work of a step: sweeps, not a matrix, serve its passes."""
     return scene.dof_count > SHORT
+
+
+def _turn(stores: list[Store]) -> list[Store]:
+    """Return stores whose statements do not show what came before them."""
+    values = alone((item.value for item in stores), "laws|l")
+    return [item._replace(value=value) for item, value in zip(stores, values, strict=True)]
 
 
 def carries_nothing(link: Link) -> bool:
@@ -277,6 +332,11 @@ def all_finite(values: list[Value]) -> Value:
     return less(-1.0, total(v.graph.make("lost", v) for v in values if not isinstance(v, float)))
 
 
-def step(trace: Trace, qdd: bool = False, status: bool = False) -> list[Store]:
-    """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world."""
-    return Step(trace).stores(qdd, status)
+def step(trace: Trace, qdd: bool = False, status: bool = False, bodies: bool = False) -> list[Store]:
+    """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world, with ``bodies`` poses_out
+    and velocities_out."""
+    one = Step(trace)
+    stores = one.stores(qdd, status)
+    if bodies:
+        one.add_bodies()
+    return stores

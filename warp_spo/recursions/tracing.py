@@ -6,7 +6,8 @@ link and which letter of the paper a value belongs to.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import copy
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from ..trace.emission import Store
@@ -38,11 +39,13 @@ class Trace:
         stiffened: returns a link with what a time step adds to its armature.
         news: messages that a piece sends apart from the others, because pieces of equal structure do not all send them.
         rounds: what a piece stores after it has received all news, in turns of which many may be alike.
+        states: of the first piece, what limbs store after that, body by body.
         ahead: values that the passes of a loop share, formed once before the loop.
         begin: stores before the passes of a loop, of the variables that they read.
         dampers, pushes: by id of the link: what contacts add to its articulated inertia, and to the forces on it; of a
             piece also for the link that it moves on.
-        checks: stores that check a pass; they read their inputs anew, so that no register is kept for them.
+        laws: in turns of which many may be alike, stores before each pass: the laws of a dof at its guess.
+        checks: in such turns or in one, stores that check a pass; they read their inputs anew, which keeps no register.
         instead: entries that take the place of those of an array, by its name.
         team: of a piece, the pairs of bodies that native code couples between its sweeps. couples: what it stores for
             each couple of bodies that touches, and the entry that says so; carried: values that both sweeps use.
@@ -60,11 +63,13 @@ class Trace:
         self.piece, self.slot = piece, slot
         self.news: list[Store] = []
         self.rounds: list[list[Store]] = []
+        self.states: list[list[Store]] = []
         self.ahead: list[Value] = []
         self.begin: list[Store] = []
         self.dampers: dict[int, Articulated] = {}
         self.pushes: dict[int, Vector] = {}
-        self.checks: list[Store] = []
+        self.laws: list[list[Store]] = []
+        self.checks: list[list[Store]] = []
         self.instead: dict[str, Callable[[int], Value]] = {}
         self.team: Any = None
         self.couples: list[tuple[int, list[Store]]] = []
@@ -95,6 +100,13 @@ class Trace:
         if name not in self.inputs:
             return lambda i: 0.0
         return lambda i: self.graph.input(name, i)
+
+    def at(self, state: Mapping[str, Callable[[int], Value]]) -> Trace:
+        """Return a trace of the same links at another ``state``: functions of entries of "q" and "qd", no forces."""
+        other = copy.copy(self)
+        other.inputs, other.instead, other.compensates = tuple(state), dict(state), False
+        other.places, other.motions, other.axes = {}, {}, {}
+        return other
 
     def label(self, link: Link, letter: str) -> None:
         """Name the scalars that follow after a link and a letter."""

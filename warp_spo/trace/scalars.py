@@ -342,6 +342,17 @@ def sum_of_logarithms(terms: Iterable[Value]) -> Value:
     return add(symbols[0].graph.make("sum_of_logarithms", *symbols), constant) if symbols else float(constant)
 
 
+def alone(outputs: Iterable[Value], step: str) -> list[Value]:
+    """Return the values in a graph of their own, whose order depends on their formulas only; ``step`` names them."""
+    outputs, graph = list(outputs), Graph()
+    found: dict[tuple, Scalar] = {}
+    graph.step = step
+    for scalar in ordered(outputs):
+        args = (found[a.key] if a.__class__ is Scalar else a for a in scalar.args)
+        found[scalar.key] = graph.make(scalar.op, *args)
+    return [x if is_constant(x) else found[x.key] for x in outputs]
+
+
 def ordered(outputs: Iterable[Value], known: Iterable[Scalar] = ()) -> list[Scalar]:
     """Return every scalar that the outputs need, depth first, so that few values are alive at the same time.
 
