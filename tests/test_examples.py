@@ -159,7 +159,8 @@ def test_pictures_of_linkages_have_legends(module, tmp_path, device, capsys):
     ("arguments", "expected"),
     [
         (["--device", "abacus"], "device is 'abacus'; expected one of this machine's devices"),
-        (["--worlds", "0"], "worlds is 0; expected 1 to"),
+        (["--worlds", "0"], "--worlds: '0' given; expected an integer, 1 or more"),
+        (["--seconds", "-1"], "unrecognized arguments: --seconds -1"),
         (
             ["--picture", "drawing.txt"],
             "--picture is 'drawing.txt'; expected a file in an existing folder that ends in",

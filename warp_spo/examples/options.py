@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
+from warp_spo.commands import Parser, count, seconds
+
 OPTIONS = {
     "seconds": "simulated time [s]",
     "dt": "time step [s]",
@@ -18,6 +20,7 @@ OPTIONS = {
     "noise": "measurement noise, as a multiple of that of good encoders",
     "seed": "seed of the random numbers",
 }
+CHECKED: dict = {"seconds": seconds, "dt": seconds, "worlds": count, "iterations": count}
 PICTURES = (".png", ".svg", ".pdf")
 FEW = 8  # worlds whose results are printed
 POINTS, LEAST = 50, 1e-18  # of a line of errors: how many points, and the smallest error drawn
@@ -29,7 +32,7 @@ def command(main):
     What is wrong with an option is one line on stderr, and the exit code is 2.
     """
     module = sys.modules[main.__module__]
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=f"python -m {module.__spec__.name}",
         description=module.__doc__,
         epilog="The first run compiles kernels, which takes up to a minute. Later runs load them from Warp's cache.",
@@ -42,7 +45,8 @@ def command(main):
             text = "Warp device, such as cpu or cuda:0; default: the current one"
             parser.add_argument("--device", metavar="D", help=text)
         else:
-            kind, text = type(parameter.default), f"{OPTIONS[name]}; default: {parameter.default}"
+            kind = CHECKED.get(name, type(parameter.default))
+            text = f"{OPTIONS[name]}; default: {parameter.default}"
             parser.add_argument(f"--{name}", type=kind, default=parameter.default, metavar="N", help=text)
     options = vars(parser.parse_args())
     wp.config.log_level = wp.LOG_WARNING  # the example's sentences are all that is printed
@@ -50,7 +54,7 @@ def command(main):
         check_picture(options["picture"])
         main(**options)
     except (ValueError, ImportError) as error:
-        parser.exit(2, f"{parser.prog}: {error}\n")
+        parser.error(str(error))
 
 
 def check_picture(file):
