@@ -4,7 +4,9 @@ import pytest
 import torch
 from env_scenes import cart_env
 
+import warp_spo as spo
 from warp_spo.env import Observation, TorchTerm, actions, commands, events
+from warp_spo.examples import fourbar
 
 NAN = float("nan")
 Q = lambda w: w.q  # noqa: E731
@@ -90,6 +92,9 @@ def test_calls_name_what_is_wrong():
         env.set_seed("x")
     with pytest.raises(TypeError, match=r"Env: scene is NoneType; expected spo.Scene"):
         type(env)(None, 8, "cpu", actions=None, observations={}, rewards={})
+    linkage = fourbar.scene()
+    with pytest.raises(spo.UnsupportedError, match=r"Env: a scene with 1 loop joint.*spo.Dynamics\(scene, loops=...\)"):
+        type(env)(linkage, 8, "cpu", actions=actions.Effort(), observations={"a": [Q]}, rewards={})
     turned = TorchTerm(lambda env: env.q.t(), size=2, name="turned")
     with pytest.raises(ValueError, match=r"the term turned returned \(2, 8\); expected a tensor \(8, 2\)"):
         cart_env(observations={"actor": [turned]})

@@ -12,6 +12,7 @@ import warp as wp
 
 from ..arrays import parse_device
 from ..dynamics.dynamics import Dynamics
+from ..errors import UnsupportedError
 from ..launches import compile_side_by_side
 from ..recursions.contact.ground import GROUND, SINGLE
 from ..scene.scene import Scene
@@ -105,6 +106,9 @@ class Env(VecEnv):
     ):
         if not isinstance(scene, Scene):
             raise TypeError(f"Env: scene is {type(scene).__name__}; expected spo.Scene")
+        if scene.ties:
+            way_out = "leave them out of the scene; spo.Dynamics(scene, loops=...) steps it outside of environments"
+            raise UnsupportedError("Env", f"a scene with {scene.ties}", way_out)
         self.scene, self.num_envs = scene, worlds
         self.warp_device = parse_device(str(device) if device is not None else None, "Env")
         self.device = torch.device(wp.device_to_torch(self.warp_device))
