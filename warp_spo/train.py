@@ -23,6 +23,7 @@ BEGAN = time.time()
 def main(arguments: list[str] | None = None) -> int:
     """Train the task that the arguments name."""
     from .commands import Parser, count, seconds
+    from .env.checks import check_folder
     from .env.tasks import TASKS, task
 
     parser = Parser(
@@ -41,9 +42,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--resume", type=Path, help="checkpoint to continue from")
     parser.add_argument("--save-interval", type=count, default=100, help="iterations between checkpoints")
     options = parser.parse_args(arguments)
+    folder = options.out or Path("runs") / options.task
+    try:
+        check_folder(folder, options.resume)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
     if options.gpus > 1 and "LOCAL_RANK" not in os.environ:
         if options.device not in (None, "cpu"):
             parser.error(f"--gpus {options.gpus} with --device {options.device}; expected no --device, or cpu")
+        if math.isfinite(options.seconds):
+            parser.error(f"--gpus {options.gpus} with --seconds; expected --iterations, for all processes to stop at")
         given = sys.argv[1:] if arguments is None else arguments
         run = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={options.gpus}"]
         return subprocess.call([*run, "-m", "warp_spo.train", *given])
@@ -52,9 +60,7 @@ def main(arguments: list[str] | None = None) -> int:
     rank = int(os.environ.get("RANK", 0))
     chosen = task(options.task)
     worlds = options.worlds or chosen.LEARNER.worlds
-    folder = options.out or Path("runs") / options.task
     try:
-        learning.check_folder(folder, options.resume)
         device = learning.pick_device(options.device)
         env = chosen.build(worlds, device, seed=options.seed, first_world=rank * worlds)
         print(f"{options.task}: {worlds} worlds on {device}, {time.time() - BEGAN:.1f} s", flush=True)

@@ -1,9 +1,10 @@
-"""Checks of what users give to actions, commands, events and observations."""
+"""Checks of what users give to actions, commands, events, observations and trainings."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -76,6 +77,17 @@ def check_mapping(call: str, name: str, value: Any, expected: str) -> dict[str, 
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
         raise TypeError(f"{call}: {name} is {value!r}; expected {expected} by name")
     return dict(value)
+
+
+def check_folder(folder: str | Path, resume: str | Path | None) -> None:
+    """Raise ValueError for a folder that holds another training, and OSError for a checkpoint that is not there."""
+    if resume is not None:
+        Path(resume).open("rb").close()
+    elif (Path(folder) / "progress.jsonl").exists():
+        raise ValueError(
+            f"train: {str(folder)!r} holds a training; expected a new folder (out), or a checkpoint to go on from "
+            "(resume); remove the folder if it is not needed"
+        )
 
 
 def _number(value: Any) -> float | None:

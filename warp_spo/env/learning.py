@@ -22,6 +22,7 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.runners import OnPolicyRunner
 
 from ..arrays import parse_device
+from .checks import check_folder
 from .environment import Env
 
 
@@ -274,17 +275,6 @@ def load_checkpoint(runner: OnPolicyRunner, file: str | Path, learns: bool = Tru
     if learns:
         runner.current_learning_iteration = found["iter"] + 1
     return int(found["iter"])
-
-
-def check_folder(folder: str | Path, resume: str | Path | None) -> None:
-    """Raise ValueError for a folder that holds another training, and OSError for a checkpoint that is not there."""
-    if resume is not None:
-        Path(resume).open("rb").close()
-    elif (Path(folder) / "progress.jsonl").exists():
-        raise ValueError(
-            f"train: {str(folder)!r} holds a training; expected a new folder (out), or a checkpoint to go on from "
-            "(resume); remove the folder if it is not needed"
-        )
 
 
 def prepare(
