@@ -178,6 +178,7 @@ def test_a_bad_file_is_one_line_about_the_file(tmp_path, capfd, name):
         (["cartpole", "--worlds", "0"], "worlds is 0; expected 1 to 2147483647"),
         (["cartpole", "--worlds", "99999999999"], "worlds is 99999999999; expected 1 to 2147483647"),
         (["panda", "--ground"], "--ground with 'panda'; expected one of ant, go2, g1"),
+        (["ant", "--ground", "--worlds", "3"], "--worlds with --ground; expected one of them"),
         (["cartpole", "--device", "abacus"], "--device is 'abacus'; expected one of this machine's devices: cpu"),
     ],
 )

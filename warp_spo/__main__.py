@@ -140,12 +140,14 @@ def run_on_ground(options: argparse.Namespace, pyplot: Any) -> int:
     """Let a robot fall onto the ground, print a table, draw the film strip, and return the exit code.
 
     Raises:
-        ValueError: The robot is not one that can stand; the message names those.
+        ValueError: The robot is not one that can stand, or worlds are asked for.
     """
     from .env import robots
 
     if options.robot not in FALLING:
         raise ValueError(f"--ground with {options.robot!r}; expected one of {', '.join(FALLING)}")
+    if options.worlds is not None:
+        raise ValueError("--worlds with --ground; expected one of them: a single robot falls")
     device = find_device(options.device)
     robot = robots.load(options.robot, film.make_ground(options.ground))
     title = f"{options.robot} falls {film.FALL} m onto {options.ground} ground, in steps of {1e3 * film.DT:g} ms"
