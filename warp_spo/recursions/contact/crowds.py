@@ -31,12 +31,14 @@ class Crowd(NamedTuple):
         points: with their variables.
         live: variable that is not zero where some point is a candidate, or one of its values is no number.
         highest: the largest depth of a point. reach: no point is farther from the link's origin.
+        op: of the branches, see :func:`...trace.scalars.branch`.
     """
 
     points: list[tuple[Point, Touch]]
     live: Value
     highest: Value
     reach: Value
+    op: str
 
     def may_touch(self, twist: tuple[Vector, Vector], h: Value) -> Value:
         """Return what is not zero where a pass that ends with this (omega; v) of the link may have a candidate."""
@@ -76,13 +78,16 @@ class Crowd(NamedTuple):
     def _only(self, mask: Value, values: list[Value], otherwise: list[Value]) -> list[Value]:
         """Return values that code computes where ``mask`` is not zero, and what they are elsewhere."""
         name = f"crowd {self.points[0][0].number}"
-        return [branch(mask, x, y, name, "fork") for x, y in zip(values, otherwise, strict=True)]
+        return [branch(mask, x, y, name, self.op) for x, y in zip(values, otherwise, strict=True)]
 
 
 def gather(
     trace: Trace, kept: Kept, points: list[Point], touches: list[Touch], candidates: list[Value]
 ) -> dict[int, Crowd]:
     """Return the crowds by id of the link; none where code skips points one by one, as on a CPU those of walls.
+
+    A GPU skips them only where limbs share the work. With a thread a world, and with pairs of bodies, the one body with
+    so many points is often the one on the ground, and branches cost a few per cent.
 
     Args:
         candidates: whether the first pass closes each point.
@@ -92,12 +97,15 @@ def gather(
         if point.link is not None:
             on.setdefault(id(point.link), []).append(at)
     found: dict[int, Crowd] = {}
+    if trace.links.scene.contact_pairs:
+        return found
+    op = "branch" if trace.piece is None else "fork"
     for key, places in on.items():
         some = [points[at] for at in places]
         if len(some) >= CROWD and all(point.near is None for point in some):
             trace.label(some[0].link, "k")  # type: ignore[arg-type]
             live = total(candidates[at] for at in places) + lost(total(x for one in some for x in (one.push, one.mu)))
-            state = kept.variable(live), most([one.depth for one in some]), most([one.lever for one in some])
+            state = kept.variable(live), most([one.depth for one in some]), most([one.lever for one in some]), op
             found[key] = Crowd([(points[at], touches[at]) for at in places], *state)
     return found
 
