@@ -70,6 +70,7 @@ COST = _dynamics("go2", "forward_dynamics", dtype="float32")  # of one call, rep
 CALLED = "torch: forward_dynamics, out="  # the same from Python, in rows of the host's time
 BESIDE = "torch: add, out="
 HEADLINE_WORLDS = 4096
+NOTABLE = 0.1  # relative difference of two times
 
 
 def plain(evidence: Evidence) -> list[dict]:
@@ -181,26 +182,36 @@ def others(evidence: Evidence, op: str = "forward_dynamics") -> str:
     return "\n".join(text) + "\n\n"
 
 
-def later(run: dict, evidence: Evidence) -> str:
+def later(run: dict, evidence: Evidence, seen: set[tuple]) -> str:
     """Return a table of what a run of :mod:`.speed` measured after the rows of the tables, beside what these say.
 
-    Steps with contacts are left out; they have a page of their own.
+    Steps with contacts are left out; they have a page of their own. So is what differs by less than ``NOTABLE``, which
+    is counted, and what is in ``seen``, to which this run's measurements are added.
     """
     rows: list[dict] = [*plain(evidence), *evidence.capabilities]
     lines: list[str] = []
+    alike = 0
     for row in run["rows"]:
         robot, op, dtype = (row[key] for key in ("robot", "operation", "dtype"))
+        key = robot, op, dtype, row["worlds"], str(row["variable"])
+        if key in seen:
+            continue
+        seen.add(key)
         for old in rows:
             same = (old.get("scene"), old.get("op"), old.get("dtype")) == (robot, op, dtype)
             same |= old.get("name") == f"{robot} {op}" and dtype == "float32"
             if same and old["worlds"] == row["worlds"] and not row["variable"]:
+                if abs(row["us"] / old["us"] - 1.0) < NOTABLE:
+                    alike += 1
+                    break
                 cells = [f"{robot}, `{op}`", dtype, f"{row['worlds']:,}", time(old), time(row), f"{row['error']:.1e}"]
                 lines.append("| " + " | ".join(cells) + " |")
                 break
     if not lines:
         return ""
     head = (
-        f"Measured after these tables, at commit {run['commit'][:12]} on {run['date'][:10]}; these are the newer times:"
+        f"Measured after these tables, at commit {run['commit'][:12]} on {run['date'][:10]}; these are the newer "
+        f"times, and {alike} more are within {100 * NOTABLE:.0f} %:"
     )
     columns = ["| | | worlds | µs in the tables | µs later | its error |", "|---|---|---:|---:|---:|---:|"]
     return "\n".join([head, "", *columns, *lines]) + "\n\n"
@@ -263,12 +274,13 @@ def ratio(row: dict, ours: dict) -> str:
     return f"{float(f'{quotient:.2g}'):,.0f}"
 
 
-def page(everything: Sequence[Evidence], speed: dict | None = None) -> str:
+def page(everything: Sequence[Evidence], speed: Sequence[dict] = ()) -> str:
     """Return what stands between the markers of the results' page: every machine's tables, and the pictures.
 
-    ``speed``: a run of :mod:`.speed`, of which rows that are newer than the tables are shown beside them.
+    ``speed``: runs of :mod:`.speed`, newest first, of which rows that are newer than the tables are shown beside them.
     """
-    text = []
+    text: list[str] = []
+    seen: set[tuple] = set()
     for evidence in everything:
         worlds = usual_worlds(plain(evidence))
         shown = evidence._replace(rows=[row for row in evidence.rows if row["worlds"] == worlds])
@@ -277,7 +289,7 @@ def page(everything: Sequence[Evidence], speed: dict | None = None) -> str:
         text += [rates(evidence) + markdown(shown, operations)]
         if evidence is everything[0]:
             text += [others(evidence) + (beyond(evidence) if evidence.capabilities else "")]
-            text += [later(speed, evidence)] if speed else []
+            text += [later(run, evidence, seen) for run in speed]
             text += [line for name, what in PICTURES.items() for line in (f"![{what}]({name})", "")]
     return "\n".join(text).rstrip("\n") + "\n"
 
@@ -289,8 +301,8 @@ def filled(root: Path, results: Path, everything: Sequence[Evidence]) -> dict[Pa
         ValueError: a file is missing, or has not one of each of its markers, in order.
     """
     runs = [json.loads(file.read_text()) for file in (results / "speed").glob("*.json")]
-    speed = max(runs, key=lambda run: run["date"], default=None)
-    texts = {results / "README.md": between(results / "README.md", "benchmarks", page(everything, speed))}
+    runs.sort(key=lambda run: run["date"], reverse=True)
+    texts = {results / "README.md": between(results / "README.md", "benchmarks", page(everything, runs))}
     if first := headline(everything[0]):
         texts[root / "README.md"] = between(root / "README.md", "headline", first)
     return texts
