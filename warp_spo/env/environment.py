@@ -13,6 +13,7 @@ import warp as wp
 from ..arrays import parse_device
 from ..dynamics.dynamics import Dynamics
 from ..errors import UnsupportedError
+from ..execution.device_facts import read_facts
 from ..launches import compile_side_by_side
 from ..recursions.contact.ground import GROUND, SINGLE
 from ..scene.scene import Scene
@@ -33,6 +34,8 @@ try:
     from tensordict import TensorDict
 except ImportError:  # optional packages
     VecEnv, TensorDict = object, None  # type: ignore[assignment,misc]
+
+SIDE_BY_SIDE_WORLDS = 16384  # up to which kernels of a stage do not fill a GPU each by itself
 
 
 class Env(VecEnv):
@@ -298,6 +301,7 @@ class Env(VecEnv):
         """Return the kernels of each stage: that of a thread a world first, unless it overwrites what others read."""
         found: dict[str, list[Launch]] = {stage.name: [] for stage in tracing.stages.values()}
         in_turn = self._in_turn = tracing.in_turn
+        self._few = self.num_envs <= read_facts(self.warp_device).scaled(SIDE_BY_SIDE_WORLDS)
         for stage in sorted(tracing.stages.values(), key=lambda each: (each.rows == 0) == (each.name in in_turn)):
             launch = stage.build(self._store.buffers, self.warp_device)
             found[stage.name] += [] if launch is None else [launch]
@@ -309,7 +313,7 @@ class Env(VecEnv):
                 kernel(self.num_envs)
 
         works = [functools.partial(run, kernel) for kernel in self._kernels[name]]
-        run_all(works, None if name in self._in_turn else self.device)
+        run_all(works, self.device if self._few and name not in self._in_turn else None)
 
     def _compile(self) -> None:
         """Compile all kernels side by side, by a step in which nothing counts."""
