@@ -26,6 +26,7 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
+from warp_spo import launches
 from warp_spo.dynamics import dynamics
 from warp_spo.examples import biped, fivebar, fourbar, slider_crank, stewart
 from warp_spo.execution.device_facts import MEASURED
@@ -108,6 +109,7 @@ def recording(recorder: Recorder) -> Iterator[None]:
         mock.patch.object(native, "kernel", record),
         mock.patch.object(wp, "launch", lambda *args, **more: None),
         mock.patch.object(wp, "zeros", lambda shape, **more: empty(shape, **more)),
+        mock.patch.object(launches, "compile_side_by_side", contextlib.nullcontext),
     ):
         yield
 

@@ -14,6 +14,7 @@ from benchmarks import (
     breakdown,
     capabilities,
     cases,
+    kernel_texts,
     operation_counts,
     robots,
     roofline,
@@ -215,3 +216,14 @@ def test_inputs_are_reproducible_and_exact_in_both_precisions():
         assert a.array(name).size == 0 or not np.array_equal(a.array(name), other.array(name))
     (first,) = rotations(scene)
     np.testing.assert_allclose(np.linalg.norm(a.array("q")[:, first : first + 4], axis=1), 1.0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_texts_of_kernels_are_recorded_and_compared(tmp_path, capsys):
+    folders = [str(tmp_path / name) for name in ("before", "after")]
+    for folder in folders:
+        assert kernel_texts.main([folder, "--limit", r"^arm\.float32\.w4096\.(forward_dynamics|step midpoint)$"]) == 0
+    assert capsys.readouterr().out.startswith("2 cases, ")
+    assert kernel_texts.main(["--compare", *folders]) == 0 and capsys.readouterr().out == "all texts are equal\n"
+    next((tmp_path / "after").glob("index.json")).write_text("{}")
+    assert kernel_texts.main(["--compare", *folders]) == 1
