@@ -86,6 +86,11 @@ def subject(
     return spo.Dynamics(one if contacts else one.with_contacts([]), worlds, device, **options), sets
 
 
+def force_array(dyn: spo.Dynamics) -> wp.array:
+    """Return an array for the forces of a step."""
+    return wp.empty((dyn.worlds, len(dyn.scene.contact_points), 3), dtype=dyn.dtype, device=dyn.device)
+
+
 def measure(
     robot: str,
     worlds: int,
@@ -105,7 +110,7 @@ def measure(
     found["kernel"] = dyn.programs.described()[0]
     if not contacts:
         return found
-    force = wp.empty((worlds, len(dyn.scene.contact_points), 3), dtype=q.dtype, device=device)
+    force = force_array(dyn)
     after = dyn.step(q, qd, None, DT, passes=passes, contact_f=force)[1].numpy()
     weight, start = 9.81 * dyn.scene.values["body_mass"].sum(), [x.numpy().astype(np.float64) for x in (q, qd)]
     errors = []

@@ -5,8 +5,10 @@
 A line gives the time of one call of all worlds [us], the largest error of the results against the dense float64
 reference, the figure that has a limit, and the limit. A figure is the time itself, a rate [1e9 worlds/s], or the time
 over that of another call in the same run. ``PATTERN`` is a regular expression on the lines' names. ``--compile``
-compiles the kernels into Warp's cache, several at a time, and times nothing. The exit code is 1 if an error exceeds
-its tolerance; a limit that is missed is printed, and is no error.
+compiles the kernels into Warp's cache, several at a time and those that take longest first, and times nothing.
+``--seconds`` is the time after which compiling ends, and no further line begins. Each line is printed and saved as soon
+as it is known, and one that fails is named. The exit code is 1 if an error exceeds its tolerance or a line failed; a
+limit that is missed is printed, and is no error.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import multiprocessing
 import os
 import re
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -41,7 +44,8 @@ ON_PLANE, ON_FIELD = "contact_step", "contact_step on a height field"
 SUBSTEPS = 4
 FUSED = {f"step of {SUBSTEPS} substeps": "", f"contact_step of {SUBSTEPS} substeps": substeps.ON_PLANE}
 CONTACT_TOLERANCE = 1e-4  # of velocities after a step with contacts, in float32
-SETS, SAMPLE, REPEATS, WARM_UP, BUDGET = 3, 2, 15, 0.1, 0.3
+SETS, SAMPLE, REPEATS, WARM_UP, BUDGET = 3, 2, 15, 0.1, 0.3  # of MOST worlds one set is larger than every cache
+WORK = {SOLVER_STEP: 8.0, "forward_dynamics_derivatives": 6.0}  # of compiling, for a dof; the others 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +102,7 @@ def _over_folded(robot: str, limit: float) -> Line:
 
 
 LINES = (
-    *(_step_over_forward_dynamics(robot, step, FEW, 2.5) for step in STEPS for robot in step_parts.NAMES),
+    *(_step_over_forward_dynamics(robot, step, FEW, 2.5) for robot in step_parts.NAMES for step in STEPS),
     *(_step_over_forward_dynamics(robot, SOLVER_STEP, SOME, 2.0) for robot in ("go2", "b1_z1", "centauro")),
     *(_over_float32("centauro", "forward_dynamics", worlds, 3.0) for worlds in (FEW, MANY)),
     Line(Call("centauro", "forward_dynamics", MOST), "rate", 0.8),
@@ -120,11 +124,24 @@ LINES = (
 def trial_of(call: Call, device: wp.Device, sets: int = SETS) -> Trial | step_parts.SolverTrial:
     """Return the trial of a call, after its first evaluation."""
     if call.operation in STEPS:
-        return step_parts.SolverTrial(call.robot, call.worlds, device, call.operation == LEAN_STEP)
-    scene = robots.scene(call.robot)
-    dyn = spo.Dynamics(scene, call.worlds, device, call.dtype, variable=call.variable)
-    inputs = [Inputs(scene, call.worlds, seed) for seed in range(sets)]
+        trial = _solver_trial(call.robot, call.worlds, str(device))
+        trial.lean = call.operation == LEAN_STEP
+        trial.driven()(0)
+        return trial
+    inputs = _inputs(call.robot, call.worlds, 1 if call.worlds >= MOST else sets)
+    dyn = spo.Dynamics(inputs[0].scene, call.worlds, device, call.dtype, variable=call.variable)
     return Trial(Subject(dyn, inputs), (OPERATIONS | APPLICATIONS)[call.operation], SAMPLE)
+
+
+@functools.lru_cache(maxsize=1)
+def _solver_trial(robot: str, worlds: int, device: str) -> step_parts.SolverTrial:
+    return step_parts.SolverTrial(robot, worlds, wp.get_device(device))
+
+
+@functools.lru_cache(maxsize=2)  # of as many worlds they take seconds; lines beside each other share them
+def _inputs(robot: str, worlds: int, sets: int) -> list[Inputs]:
+    scene = robots.scene(robot)
+    return [Inputs(scene, worlds, seed) for seed in range(sets)]
 
 
 def measure(call: Call, device: wp.Device) -> dict:
@@ -150,21 +167,50 @@ def calls_of(lines: list[Line]) -> list[Call]:
     return list(dict.fromkeys(call for line in lines for call in (line.call, line.beside) if call is not None))
 
 
-def _compile(call: Call, device: str) -> None:
-    if call.operation in (ON_PLANE, ON_FIELD):
-        dyn, ((q, qd), *_) = contacts.subject(
-            call.robot, call.worlds, wp.get_device(device), call.operation == ON_FIELD
-        )
-        dyn.step(q, qd, None, contacts.DT)
-        return
-    if call.operation in FUSED:
-        dyn, (given, *_) = substeps.subject(call.robot + FUSED[call.operation], call.worlds, wp.get_device(device))
-        for count in (1, SUBSTEPS):
-            dyn.step(**given, dt=substeps.DT, substeps=count)
-        return
-    trial = trial_of(call, wp.get_device(device), sets=1)
-    if isinstance(trial, step_parts.SolverTrial):
-        trial.check()  # with kernels in float64 on the CPU
+def _compile(calls: list[Call], device: str) -> None:
+    """Compile the kernels of calls that differ in the number of worlds alone, most of which share them."""
+    wp.config.log_level, on = wp.LOG_WARNING, wp.get_device(device)
+    for call in calls:
+        if call.operation in (ON_PLANE, ON_FIELD):
+            dyn, ((q, qd), *_) = contacts.subject(call.robot, call.worlds, on, call.operation == ON_FIELD)
+            dyn.step(q, qd, None, contacts.DT)
+            dyn.step(q, qd, None, contacts.DT, contact_f=contacts.force_array(dyn))
+        elif call.operation in FUSED:
+            dyn, (given, *_) = substeps.subject(call.robot + FUSED[call.operation], call.worlds, on)
+            for count in (1, SUBSTEPS):
+                dyn.step(**given, dt=substeps.DT, substeps=count)
+        else:
+            trial = trial_of(call, on, sets=1)
+            if isinstance(trial, step_parts.SolverTrial):
+                trial.check()  # with kernels in float64 on the CPU
+
+
+def _compile_all(calls: list[Call], device: str, seconds: float) -> int:
+    """Compile in processes side by side; return how many tasks failed, or were not done in so many seconds."""
+    begin, groups = time.perf_counter(), dict[Call, list[Call]]()
+    for call in calls:
+        same = dataclasses.replace(call, operation=SOLVER_STEP if call.operation in STEPS else call.operation, worlds=0)
+        groups.setdefault(same, []).append(call)
+
+    def work(group: Call) -> float:
+        return WORK.get(group.operation, 2.0) * robots.scene(group.robot).dof_count * (1 + (group.dtype == "float64"))
+
+    failed, context = 0, multiprocessing.get_context("spawn")
+    pool = concurrent.futures.ProcessPoolExecutor(os.cpu_count(), context)
+    tasks = {pool.submit(_compile, groups[one], device): groups[one] for one in sorted(groups, key=work, reverse=True)}
+    try:
+        for task in concurrent.futures.as_completed(tasks, seconds):
+            failed += task.exception() is not None
+            word = "compiled" if task.exception() is None else repr(task.exception())[:300]
+            print(f"{time.perf_counter() - begin:.0f} s, {'; '.join(map(str, tasks[task]))}: {word}", flush=True)
+    except TimeoutError:
+        left = [str(call) for task, group in tasks.items() if not task.done() for call in group]
+        print(f"not compiled in {seconds:.0f} s: {'; '.join(left)}", flush=True)
+        for process in multiprocessing.active_children():
+            process.terminate()
+        failed += len(left)
+    pool.shutdown(cancel_futures=True)
+    return failed
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -173,29 +219,28 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--device", help="Warp device, default: the current one")
     parser.add_argument("--json", type=Path, help="file for the rows, written after each line")
     parser.add_argument("--compile", action="store_true", help="compile all kernels, and time nothing")
+    parser.add_argument("--seconds", type=float, default=3600.0, help="time for all of it, default: 3600")
     options = parser.parse_args(arguments)
     device = wp.get_device(options.device)
     lines = [line for line in LINES if re.search(options.pattern, str(line.call))]
     if options.compile:
-        context = multiprocessing.get_context("spawn")
-        with concurrent.futures.ProcessPoolExecutor(os.cpu_count(), context) as pool:
-            tasks = {call: pool.submit(_compile, call, str(device)) for call in calls_of(lines)}
-        for call, task in tasks.items():
-            if task.exception() is not None:
-                print(f"{call}: {task.exception()!r}")
-        return 0
+        return 1 if _compile_all(calls_of(lines), str(device), options.seconds) else 0
     rows: list[dict] = []
 
     @functools.cache
-    def time(call: Call) -> dict:
+    def timed(call: Call) -> dict:
         gc.collect()
         rows.append(measure(call, device))
         return rows[-1]
 
-    failed = 0
+    failed, end = 0, time.perf_counter() + options.seconds
     for line in lines:
+        if time.perf_counter() > end:
+            print(f"{line.call!s}: not measured in {options.seconds:.0f} s", flush=True)
+            failed += 1
+            continue
         try:
-            figure = line.figure(time)
+            figure = line.figure(timed)
         except Exception as error:  # the other lines go on
             print(f"{line.call!s}: {type(error).__name__}: {str(error)[:200]}", flush=True)
             failed += 1
@@ -203,11 +248,11 @@ def main(arguments: list[str] | None = None) -> int:
         unit = {"us": "us", "rate": "1e9/s", "ratio": "times"}[line.kind]
         error = max(row["error"] for row in rows if Call(*(row[f.name] for f in dataclasses.fields(Call))) == line.call)
         limit = f"{'at least' if line.kind == 'rate' else 'at most'} {line.limit:g}"
-        beside = f" of {line.beside}, {time(line.beside)['us']:.4g} us" if line.beside else ""
+        beside = f" of {line.beside}, {timed(line.beside)['us']:.4g} us" if line.beside else ""
         if line.call.operation in FUSED:
-            beside = f" of {SUBSTEPS} calls, {time(line.call)['calls_us']:.4g} us"
+            beside = f" of {SUBSTEPS} calls, {timed(line.call)['calls_us']:.4g} us"
         word = "kept" if line.keeps(figure) else "MISSED"
-        own = f"{time(line.call)['us']:.4g} us, error {error:.1e}"
+        own = f"{timed(line.call)['us']:.4g} us, error {error:.1e}"
         print(f"{line.call!s}: {own}; {figure:.4g} {unit}{beside}; {limit}: {word}", flush=True)
         if options.json:
             runner.save(runner.record(rows, device), options.json)
