@@ -6,106 +6,55 @@ the hinge that carries the body. N = 6 bodies rows, node after node; the columns
 
 There are two independent formulations of the dynamics, which share only poses: the paper's matrices, built by
 ``inv(I - E)`` (``E_phi``, ``phi``, ``H``, ``M``, ``mass_matrix``, ``P``, ``D``, ...), and Newton's and Euler's
-equations for each body in three-vectors in world axes (``inverse_dynamics``, ``bias_force``, ``jacobian``). This file
-imports NumPy only and reads a scene by the names of its attributes.
+equations for each body in three-vectors in world axes (``inverse_dynamics``, ``bias_force``), from the accelerations of
+``reference_motion.py``. The specification imports NumPy only and reads a scene by the names of its attributes.
 """
 
 from functools import cached_property
 
 import numpy as np
 
-from .reference_jets import curve
-from .reference_rotations import homogeneous, pose7, quaternion_product, rotation, rotation_about, rotation_vector, skew
-from .reference_rotations import quaternion as quaternion
+from .reference_motion import Motion
+from .reference_rotations import (
+    homogeneous,
+    pose7,
+    quaternion,
+    quaternion_product,
+    rotation,
+    rotation_about,
+    rotation_vector,
+    skew,
+)
 from .reference_rotors import Rotors, moving
 
+__all__ = [
+    "Dense",
+    "homogeneous",
+    "pose7",
+    "quaternion",
+    "quaternion_product",
+    "rotation",
+    "rotation_about",
+    "rotation_vector",
+    "skew",
+]
 
-class Dense:
-    """A scene at one configuration of one world.
+
+class Dense(Motion):
+    """Matrices and dynamics of a scene at one configuration of one world.
 
     Args:
-        scene: an object with the attributes hinges, hinge_of, values, q_start and qd_start of a Scene.
-        q: coordinates [coordinate], [m, rad, unit quaternion xyzw]; quaternions are normalised when read.
-        qd: velocities [dof] for methods that are called without qd; by default zero.
-        world: the row of ``scene.values``; of an array with fewer rows, the last row is used.
+        scene, q, qd, world: as in :class:`warp_spo.reference_motion.Motion`.
 
     Raises:
-        ValueError: q or qd has a wrong length.
+        ValueError: q or qd has a wrong length, or a body has modes.
         numpy.linalg.LinAlgError: a property needs D^-1 or the inverse mass matrix, and a hinge moves no inertia.
     """
 
     def __init__(self, scene, q, qd=None, world=0):
-        if any(getattr(body, "modes", None) is not None for body in getattr(scene, "bodies", ())):
-            raise ValueError("Dense: the scene has bodies with modes; expected rigid bodies")
-        self.scene, self.world = scene, world
-        self.body_count, self.dof_count = len(scene.hinge_of), int(scene.qd_start[-1])
-        self.q = self._vector("q", q, int(scene.q_start[-1]))
-        self.qd = self._vector("qd", np.zeros(self.dof_count) if qd is None else qd, self.dof_count)
-        self.hinge = [scene.hinges[h] for h in scene.hinge_of]  # by node
-        self.parent = [hinge.parent for hinge in self.hinge]
-        self.dofs = [np.arange(scene.qd_start[h], scene.qd_start[h + 1]) for h in scene.hinge_of]
-        self.rows = [np.arange(6 * k, 6 * k + 6) for k in range(self.body_count)]
-        children = [[k for k, p in enumerate(self.parent) if p == node] for node in range(-1, self.body_count)]
-        self.outward = list(children[0])  # grows while it is read: parents before children
-        for node in self.outward:
-            self.outward += children[node + 1]
-        self._place()
+        super().__init__(scene, q, qd, world)
         self.moves = moving(self)
         self._rotors = Rotors(self)
-
-    @staticmethod
-    def _vector(name, value, size):
-        value = np.asarray(value, dtype=np.float64)
-        if value.shape != (size,):
-            raise ValueError(f"reference.Dense: {name} has shape {value.shape}; expected ({size},), one world's")
-        return value
-
-    def value(self, name):
-        """Return ``scene.values[name]`` of this world."""
-        array = self.scene.values[name]
-        return array[min(self.world, array.shape[0] - 1)]
-
-    # -- poses -------------------------------------------------------------------------------------------------------
-    def _place(self):
-        """Set the world poses of bodies, node frames, and the frames between a hinge's screws, as 4 x 4 matrices."""
-        self.body_matrix, self.node_matrix = np.empty((2, self.body_count, 4, 4))
-        self.stages = [[] for _ in self.hinge]  # by node: the parent anchor, then the frame after each screw
-        for k in self.outward:
-            h, hinge, inboard = self.scene.hinge_of[k], self.hinge[k], np.eye(4)
-            q = self.q[self.scene.q_start[h] : self.scene.q_start[h + 1]]
-            if self.parent[k] >= 0:
-                inboard = self.body_matrix[self.parent[k]]
-            self.stages[k].append(inboard @ homogeneous(self.value("joint_X_p")[h]))
-            if hinge.kind == "ball":
-                self.stages[k].append(self.stages[k][0] @ homogeneous([0.0, 0.0, 0.0, *q]))
-            elif hinge.kind == "free":
-                self.stages[k].append(self.stages[k][0] @ homogeneous(q))
-            elif hinge.kind == "custom":
-                step = np.eye(4)
-                (step[:3, 3], *_), (step[:3, :3], *_) = curve(hinge.pose, q, 0.0 * q, 0.0 * q)
-                self.stages[k].append(self.stages[k][0] @ step)
-            else:
-                for (axis, angular, linear), x in zip(hinge.screws, q, strict=True):
-                    step = np.eye(4)
-                    step[:3, :3], step[:3, 3] = rotation_about(axis, angular * x), linear * x * axis
-                    self.stages[k].append(self.stages[k][-1] @ step)
-            self.node_matrix[k] = self.stages[k][-1]
-            self.body_matrix[k] = self.node_matrix[k] @ np.linalg.inv(homogeneous(self.value("joint_X_c")[h]))
-
-    @property
-    def frames(self):
-        """World pose of every node frame [node, 7], [m, unit quaternion xyzw of either sign]."""
-        return np.array([pose7(matrix) for matrix in self.node_matrix])
-
-    @property
-    def body_poses(self):
-        """World pose of every body frame [body, 7], [m, unit quaternion xyzw of either sign]; Newton's body_q."""
-        return np.array([pose7(matrix) for matrix in self.body_matrix])
-
-    @cached_property
-    def com(self):
-        """Centre of mass of every body in the world [body, 3], [m]."""
-        return np.einsum("kij,kj->ki", self.body_matrix[:, :3, :3], self.value("body_com")) + self.body_matrix[:, :3, 3]
 
     # -- the paper's matrices ----------------------------------------------------------------------------------------
     @cached_property
@@ -225,152 +174,7 @@ class Dense:
         """log det of the mass matrix, natural logarithm."""
         return np.linalg.slogdet(self.mass_matrix)[1]
 
-    # -- classical mechanics in the world ----------------------------------------------------------------------------
-    def _motion(self, qd, qdd):
-        """Return angular velocity, velocity and acceleration of the origin, and angular acceleration of node frames.
-
-        All are [node, 3] in world axes; the formulas are the derivatives of the poses along the chain of frames.
-        """
-        W, V, A, AL = np.zeros((4, self.body_count, 3))
-        cross = np.cross
-        for k in self.outward:
-            anchor, node, p = self.stages[k][0], self.node_matrix[k], self.parent[k]
-            w, v, a, al = np.zeros((4, 3))
-            if p >= 0:  # the anchor moves with the parent
-                r = anchor[:3, 3] - self.node_matrix[p][:3, 3]
-                w, al = W[p], AL[p]
-                v, a = V[p] + cross(w, r), A[p] + cross(al, r) + cross(w, cross(w, r))
-            x, xd = qd[self.dofs[k]], qdd[self.dofs[k]]
-            if self.hinge[k].kind == "ball":
-                spin, spin_rate = anchor[:3, :3] @ x, anchor[:3, :3] @ xd
-                w, al = w + spin, al + cross(w, spin) + spin_rate
-            elif self.hinge[k].kind == "free":
-                slide, spin = anchor[:3, :3] @ x[:3], anchor[:3, :3] @ x[3:]
-                r, s = self.com[k] - anchor[:3, 3], node[:3, 3] - self.com[k]
-                v = v + cross(w, r) + slide
-                a = a + cross(al, r) + cross(w, cross(w, r)) + 2.0 * cross(w, slide) + anchor[:3, :3] @ xd[:3]
-                w, al = w + spin, al + cross(w, spin) + anchor[:3, :3] @ xd[3:]
-                v, a = v + cross(w, s), a + cross(al, s) + cross(w, cross(w, s))
-            elif self.hinge[k].kind == "custom":
-                axes, (path, spin, turning) = anchor[:3, :3], self._custom(k, x, xd)
-                r, slide, push, spin, turning = (axes @ u for u in (*path, spin, turning))
-                v = v + cross(w, r) + slide
-                a = a + cross(al, r) + cross(w, cross(w, r) + 2.0 * slide) + push
-                w, al = w + spin, al + cross(w, spin) + turning
-            else:
-                for i, (axis, angular, linear) in enumerate(self.hinge[k].screws):
-                    direction = self.stages[k][i][:3, :3] @ axis
-                    r = self.stages[k][i + 1][:3, 3] - self.stages[k][i][:3, 3]
-                    slide, spin = linear * x[i] * direction, angular * x[i] * direction
-                    v = v + cross(w, r) + slide
-                    a = a + cross(al, r) + cross(w, cross(w, r) + 2.0 * slide) + linear * xd[i] * direction
-                    w, al = w + spin, al + cross(w, spin) + angular * xd[i] * direction
-            W[k], V[k], A[k], AL[k] = w, v, a, al
-        return W, V, A, AL
-
-    def _custom(self, k, qd, qdd):
-        """Of node k's custom hinge, in the parent anchor's axes: position with its two rates, angular velocity,
-        angular acceleration."""
-        h = self.scene.hinge_of[k]
-        q = self.q[self.scene.q_start[h] : self.scene.q_start[h + 1]]
-        path, (R, R_1, R_2) = curve(self.hinge[k].pose, q, qd, qdd)
-        axial = lambda A: 0.5 * np.array([A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1]])  # noqa: E731
-        return path, axial(R_1 @ R.T), axial(R_2 @ R.T + R_1 @ R_1.T)
-
-    @cached_property
-    def _node_jacobian(self):
-        """Velocity of every node frame's origin, then angular velocity, per unit qd, world axes [node, 6, dof]."""
-        J = np.zeros((self.body_count, 6, self.dof_count))
-        for i, unit in enumerate(np.eye(self.dof_count)):
-            J[:, 3:, i], J[:, :3, i], _, _ = self._motion(unit, 0.0 * unit)
-        return J
-
-    def _jacobian_at(self, body, point):
-        """Return the Jacobian [6, dof] of a body's material point at ``point`` in the world."""
-        J = self._node_jacobian[body].copy()
-        J[:3] -= skew(point - self.node_matrix[body][:3, 3]) @ J[3:]
-        return J
-
-    def frame_poses(self, frames):
-        """Return the world pose of frames [frame, 7], [m, unit quaternion xyzw of either sign]; as :meth:`jacobian`."""
-        matrices = []
-        for frame in frames:
-            body, pose = frame if isinstance(frame, (tuple, list)) else (frame, (0, 0, 0, 0, 0, 0, 1))
-            matrices.append(self.body_matrix[body] @ homogeneous(np.asarray(pose, dtype=np.float64)))
-        return np.array([pose7(matrix) for matrix in matrices])
-
-    @property
-    def potential_energy(self):
-        """-m g . c of all bodies, zero at the origin, and stiffness (q - rest)^2 / 2 of all dofs [J]."""
-        springs = 0.5 * self.value("joint_stiffness") @ self._deviation**2
-        return springs - sum(mass * com for mass, com, *_ in self._matter) @ self.value("gravity")
-
-    def inverse_dynamics_regressor(self, qd, qdd):
-        """Return Y [dof, 10 bodies] of tau = Y parameters + armature qdd, for each body m, m c and
-        Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the body frame's origin, in its axes.
-
-        A column is Newton's and Euler's equations of a body with one parameter, about that origin in world axes.
-        """
-        W, _, A, AL = self._motion(self._qd(qd), self._vector("qdd", qdd, self.dof_count))
-        Y = np.zeros((self.dof_count, 10 * self.body_count))
-        for k, matrix in enumerate(self.body_matrix):
-            R, origin, w, al = matrix[:3, :3], matrix[:3, 3], W[k], AL[k]
-            r = origin - self.node_matrix[k][:3, 3]
-            a = A[k] + np.cross(al, r) + np.cross(w, np.cross(w, r)) - self.value("gravity")
-            J = self._jacobian_at(k, origin)
-            for i, unit in enumerate(np.eye(10)):
-                m, h, I = unit[0], R @ unit[1:4], np.zeros((3, 3))
-                I[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]] = I[[0, 1, 1, 2, 2, 2], [0, 0, 1, 0, 1, 2]] = unit[4:]
-                I = R @ I @ R.T
-                force = m * a + np.cross(al, h) + np.cross(w, np.cross(w, h))
-                moment = np.cross(h, a) + I @ al + np.cross(w, I @ w)
-                Y[:, 10 * k + i] = J.T @ np.concatenate([force, moment])
-        return Y
-
-    def jacobian(self, frames):
-        """Return the Jacobian of frames: velocity of the origin, then angular velocity, world axes [frame, 6, dof].
-
-        Args:
-            frames: each a body index, or (body index, pose (7,) in the body).
-        """
-        rows = []
-        for frame in frames:
-            body, pose = frame if isinstance(frame, (tuple, list)) else (frame, (0, 0, 0, 0, 0, 0, 1))
-            matrix = self.body_matrix[body] @ homogeneous(np.asarray(pose, dtype=np.float64))
-            rows.append(self._jacobian_at(body, matrix[:3, 3]))
-        return np.array(rows).reshape(len(rows), 6, self.dof_count)
-
-    def operational_inertia_inverse(self, frames):
-        """Return J mass_matrix^-1 J^T [6 frames, 6 frames], with J of :meth:`jacobian`, frame after frame."""
-        J = self.jacobian(frames).reshape(6 * len(frames), self.dof_count)
-        return J @ np.linalg.solve(self.mass_matrix, J.T)
-
-    def body_velocities(self, qd=None):
-        """Return CoM velocity [m/s], then angular velocity [rad/s] of bodies, world axes [body, 6]; as body_qd."""
-        W, V, _, _ = self._motion(self._qd(qd), np.zeros(self.dof_count))
-        return np.concatenate([V + np.cross(W, self.com - self.node_matrix[:, :3, 3]), W], axis=1)
-
-    def _qd(self, qd):
-        return self.qd if qd is None else self._vector("qd", qd, self.dof_count)
-
-    def inverse_dynamics(self, qd, qdd, body_f=None):
-        """Return tau = mass_matrix qdd + bias [dof], dual to qd [N m, N].
-
-        Newton's and Euler's equations for each body at its CoM in world axes, m (a - g) and I alpha + omega x I omega
-        minus the external wrench, projected with the Jacobian of the CoM (d'Alembert), plus armature qdd.
-
-        Args:
-            qd, qdd: [dof]; qd None is the constructor's qd, qdd is the time derivative of qd.
-            body_f: external force [N], then torque [N m] at the CoM, world axes [body, 6]; None: none.
-        """
-        qdd = self._vector("qdd", qdd, self.dof_count)
-        tau = self.value("joint_armature") * qdd
-        for (mass, _, _, J), wrench in zip(self._matter, self._efforts(self._qd(qd), qdd), strict=True):
-            tau = tau + J.T @ (wrench - np.concatenate([mass * self.value("gravity"), np.zeros(3)]))
-        for k, load in enumerate(() if body_f is None else np.asarray(body_f)):
-            tau = tau - self._jacobian_at(k, self.com[k]).T @ load
-        return tau
-
+    # -- classical mechanics in the world ---------------------------------------------------------------------------
     @cached_property
     def _matter(self):
         """List mass, centre of mass, inertia about it, Jacobian of it and of the turn [6, dof]: bodies, then rotors."""
@@ -389,6 +193,24 @@ class Dense:
             a = A[k] + np.cross(AL[k], r) + np.cross(W[k], np.cross(W[k], r))
             found.append(np.concatenate([mass * a, inertia @ AL[k] + np.cross(W[k], inertia @ W[k])]))
         return found + self._rotors.efforts(qd, qdd, (W, V, A, AL))
+
+    def inverse_dynamics(self, qd, qdd, body_f=None):
+        """Return tau = mass_matrix qdd + bias [dof], dual to qd [N m, N].
+
+        Newton's and Euler's equations for each body at its CoM in world axes, m (a - g) and I alpha + omega x I omega
+        minus the external wrench, projected with the Jacobian of the CoM (d'Alembert), plus armature qdd.
+
+        Args:
+            qd, qdd: [dof]; qd None is the constructor's qd, qdd is the time derivative of qd.
+            body_f: external force [N], then torque [N m] at the CoM, world axes [body, 6]; None: none.
+        """
+        qdd = self._vector("qdd", qdd, self.dof_count)
+        tau = self.value("joint_armature") * qdd
+        for (mass, _, _, J), wrench in zip(self._matter, self._efforts(self._qd(qd), qdd), strict=True):
+            tau = tau + J.T @ (wrench - np.concatenate([mass * self.value("gravity"), np.zeros(3)]))
+        for k, load in enumerate(() if body_f is None else np.asarray(body_f)):
+            tau = tau - self._jacobian_at(k, self.com[k]).T @ load
+        return tau
 
     def bias_force(self, qd=None, body_f=None):
         """Return inverse dynamics at qdd = 0 [dof]: velocity terms and gravity, minus the effect of body_f."""
@@ -415,6 +237,34 @@ class Dense:
         qdd[free] = np.linalg.solve(M[np.ix_(free, free)], right[free])
         return qdd, np.where(under_mask, self.inverse_dynamics(qd, qdd, body_f), tau)
 
+    def inverse_dynamics_regressor(self, qd, qdd):
+        """Return Y [dof, 10 bodies] of tau = Y parameters + armature qdd, for each body m, m c and
+        Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the body frame's origin, in its axes.
+
+        A column is Newton's and Euler's equations of a body with one parameter, about that origin in world axes.
+        """
+        W, _, A, AL = self._motion(self._qd(qd), self._vector("qdd", qdd, self.dof_count))
+        Y = np.zeros((self.dof_count, 10 * self.body_count))
+        for k, matrix in enumerate(self.body_matrix):
+            R, origin, w, al = matrix[:3, :3], matrix[:3, 3], W[k], AL[k]
+            r = origin - self.node_matrix[k][:3, 3]
+            a = A[k] + np.cross(al, r) + np.cross(w, np.cross(w, r)) - self.value("gravity")
+            J = self._jacobian_at(k, origin)
+            for i, unit in enumerate(np.eye(10)):
+                m, h, I = unit[0], R @ unit[1:4], np.zeros((3, 3))
+                I[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]] = I[[0, 1, 1, 2, 2, 2], [0, 0, 1, 0, 1, 2]] = unit[4:]
+                I = R @ I @ R.T
+                force = m * a + np.cross(al, h) + np.cross(w, np.cross(w, h))
+                moment = np.cross(h, a) + I @ al + np.cross(w, I @ w)
+                Y[:, 10 * k + i] = J.T @ np.concatenate([force, moment])
+        return Y
+
+    @property
+    def potential_energy(self):
+        """-m g . c of all bodies, zero at the origin, and stiffness (q - rest)^2 / 2 of all dofs [J]."""
+        springs = 0.5 * self.value("joint_stiffness") @ self._deviation**2
+        return springs - sum(mass * com for mass, com, *_ in self._matter) @ self.value("gravity")
+
     # -- operational space, momentum, the determinant ----------------------------------------------------------------
     def operational_inertia(self, frames):
         """Return (J mass_matrix^-1 J^T)^-1 [6 frames, 6 frames]; LinAlgError if it is singular to working precision."""
@@ -424,20 +274,10 @@ class Dense:
             raise np.linalg.LinAlgError("reference.Dense.operational_inertia: the frames cannot move in all directions")
         return np.linalg.inv(inverse)
 
-    def jacobian_bias(self, qd, frames):
-        """Return J' qd for J of :meth:`jacobian` [frame, 6], world axes, [m/s^2, rad/s^2].
-
-        It is the acceleration of each frame's origin, then its angular acceleration, at qdd = 0 without gravity.
-        """
-        W, _, A, AL = self._motion(self._qd(qd), np.zeros(self.dof_count))
-        rows = []
-        for frame in frames:
-            body, pose = frame if isinstance(frame, (tuple, list)) else (frame, (0, 0, 0, 0, 0, 0, 1))
-            point = (self.body_matrix[body] @ homogeneous(np.asarray(pose, dtype=np.float64)))[:3, 3]
-            r = point - self.node_matrix[body][:3, 3]
-            acceleration = A[body] + np.cross(AL[body], r) + np.cross(W[body], np.cross(W[body], r))
-            rows.append(np.concatenate([acceleration, AL[body]]))
-        return np.array(rows)
+    def operational_inertia_inverse(self, frames):
+        """Return J mass_matrix^-1 J^T [6 frames, 6 frames], with J of :meth:`jacobian`, frame after frame."""
+        J = self.jacobian(frames).reshape(6 * len(frames), self.dof_count)
+        return J @ np.linalg.solve(self.mass_matrix, J.T)
 
     @cached_property
     def _moving(self):
@@ -521,35 +361,6 @@ class Dense:
                 force += self.jacobian([(k, (*self.value("body_com")[k], 0, 0, 0, 1))])[0, :3].T @ lift
         return force
 
-    @property
-    def _deviation(self):
-        """How far each dof is from rest [dof], see :meth:`passive_force`."""
-        rest, deviation = self.value("joint_rest_q"), np.zeros(self.dof_count)
-        for k, h in enumerate(self.scene.hinge_of):
-            q, r = (array[self.scene.q_start[h] : self.scene.q_start[h + 1]] for array in (self.q, rest))
-            if self.hinge[k].kind in ("ball", "free"):
-                turn = rotation_vector(rotation(q[-4:]) @ rotation(r[-4:]).T)
-                deviation[self.dofs[k]] = np.concatenate([q[:-4] - r[:-4], turn])
-            else:
-                deviation[self.dofs[k]] = q - r
-        return deviation
-
-    def difference(self, q1):
-        """Return the velocity [dof] that :meth:`integrate` takes from q to ``q1`` in 1 s, rotations the short way."""
-        q1 = self._vector("q1", q1, len(self.q))
-        velocity = np.zeros(self.dof_count)
-        for k, h in enumerate(self.scene.hinge_of):
-            a, b = (array[self.scene.q_start[h] : self.scene.q_start[h + 1]] for array in (self.q, q1))
-            if self.hinge[k].kind not in ("ball", "free"):
-                velocity[self.dofs[k]] = b - a
-                continue
-            velocity[self.dofs[k][-3:]] = rotation_vector(rotation(b[-4:]) @ rotation(a[-4:]).T)
-            if self.hinge[k].kind == "free":
-                to_node = np.linalg.inv(homogeneous(self.value("joint_X_c")[h]))
-                c = to_node[:3, :3] @ self.value("body_com")[k] + to_node[:3, 3]
-                velocity[self.dofs[k][:3]] = (b[:3] + rotation(b[3:]) @ c) - (a[:3] + rotation(a[3:]) @ c)
-        return velocity
-
     def actuator_force(self, qd, ctrl):
         """Return the forces of the scene's actuators for the controls ``ctrl`` [dof]."""
         qd, tau, first = self._qd(qd), np.zeros(self.dof_count), 0
@@ -571,27 +382,3 @@ class Dense:
                 force = np.clip(force, min(-stall * (1.0 + slip), 0.0), max(stall * (1.0 - slip), 0.0))
             tau[dofs] += of["strength"][a] * gear * force
         return tau
-
-    def integrate(self, qd, dt):
-        """Return q after dt [s] at constant qd, with quaternions of unit length.
-
-        Screws: q + qd dt. Ball and free: the quaternion becomes exp(omega dt) * quaternion, omega in the parent
-        anchor's axes. Free: the CoM moves by v dt, and the anchor's origin follows from it.
-        """
-        qd, new = self._qd(qd), self.q.copy()
-        for k, h in enumerate(self.scene.hinge_of):
-            entries = slice(self.scene.q_start[h], self.scene.q_start[h + 1])
-            q, x = self.q[entries], qd[self.dofs[k]]
-            if self.hinge[k].kind not in ("ball", "free"):
-                new[entries] = q + x * dt
-                continue
-            half = 0.5 * dt * x[-3:]
-            angle = np.linalg.norm(half)
-            turn = np.array([*(np.sinc(angle / np.pi) * half), np.cos(angle)])
-            turned = quaternion_product(turn, q[-4:] / np.linalg.norm(q[-4:]))
-            new[entries][-4:] = turned / np.linalg.norm(turned)
-            if self.hinge[k].kind == "free":
-                to_node = np.linalg.inv(homogeneous(self.value("joint_X_c")[h]))
-                c = to_node[:3, :3] @ self.value("body_com")[k] + to_node[:3, 3]
-                new[entries][:3] = q[:3] + rotation(q[3:]) @ c + x[:3] * dt - rotation(turned) @ c
-        return new
