@@ -1,14 +1,16 @@
-"""Training beside an environment that costs nothing: env-steps/s of stepping, of collecting, of training.
+"""Training beside an environment that costs nothing: env-steps/s of stepping, collecting, training.
 
     python -m benchmarks.training [--task go2-flat] [--worlds 4096 16384] [--device cuda:0] [--json FILE]
 
 The environment that costs nothing has the same observations, actions and learner; its step returns the same tensors
-every time. Both take turns in one process; figures are medians over iterations.
+every time. Both take turns in one process; figures are medians over iterations. On a GPU the learner's bytes are the
+largest number that torch held while it trained, less what it held before: networks, optimizer, rollouts, temporaries.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import statistics
 import sys
@@ -61,7 +63,12 @@ class Times(learning.Course):
 
 
 def measure(env: Any, learner: Any) -> dict[str, float]:
-    """Return milliseconds of collecting and learning, and env-steps/s of both."""
+    """Return milliseconds of collecting and learning, env-steps/s of both, and on a GPU the learner's bytes at most."""
+    gc.collect()
+    on_gpu = torch.device(env.device).type == "cuda"
+    if on_gpu:
+        torch.cuda.reset_peak_memory_stats(env.device)
+    before = torch.cuda.memory_allocated(env.device) if on_gpu else 0
     runner = learning.make_runner(env, learner)
     runner.logger = times = Times(env, None, 1, time.time(), False)  # type: ignore[assignment]
     runner.learn(WARM + ITERATIONS)
@@ -69,8 +76,9 @@ def measure(env: Any, learner: Any) -> dict[str, float]:
     collect, learn = (statistics.median(row[i] for row in rows) for i in (0, 1))
     total = statistics.median(sum(row) for row in rows)
     steps = env.num_envs * learner.steps
-    return {"collecting ms": 1e3 * collect, "learning ms": 1e3 * learn, "collecting env-steps/s": steps / collect,
-            "training env-steps/s": steps / total}  # fmt: skip
+    found = {"collecting ms": 1e3 * collect, "learning ms": 1e3 * learn, "collecting env-steps/s": steps / collect,
+             "training env-steps/s": steps / total}  # fmt: skip
+    return found | ({"learner's bytes": torch.cuda.max_memory_allocated(env.device) - before} if on_gpu else {})
 
 
 def step_rate(env: Any, steps: int = 200) -> float:

@@ -11,8 +11,8 @@ pytest.importorskip("rsl_rl")
 
 from warp_spo import env as envs  # noqa: E402
 from warp_spo import play, terrain, train  # noqa: E402
-from warp_spo.env import evaluation, export, film, learning, recording, robots  # noqa: E402
-from warp_spo.env.tasks import TASKS, task  # noqa: E402
+from warp_spo.env import evaluation, export, film, learning, observations, recording, robots  # noqa: E402
+from warp_spo.env.tasks import TASKS, go2_flat, go2_rough, task, velocity  # noqa: E402
 
 
 def roll(env, steps, seed=0):
@@ -52,6 +52,19 @@ def test_cartpole_steps():
 def test_a_seed_repeats_a_course():
     first, again, other = (roll(envs.make("cartpole", 4, "cpu", seed=seed), 20)[3] for seed in (5, 5, 6))
     assert torch.equal(first, again) and not torch.equal(first, other)
+
+
+def test_the_critic_of_velocity_tasks_sees_the_truth():
+    """The observations that actors see with noise, bias and delay have none of these for critics; scales are equal."""
+    late = observations.Observation(observations.command, noise=0.1, bias=0.2, delay=(0, 2), scale=3.0, history=2)
+    groups = velocity.observed(go2_flat.FEET, go2_rough.SCAN, late)
+    of_critic = [each for each in groups["critic"] if isinstance(each, observations.Observation)]
+    assert len(of_critic) == len(groups["actor"])
+    for seen, true in zip(groups["actor"], of_critic, strict=True):
+        assert (true.noise, true.bias, true.delay) == (0.0, 0.0, 0)
+        assert (true.scale, true.clip, true.history) == (seen.scale, seen.clip, seen.history)
+        assert true.term is seen.term or seen.term is velocity.ACTOR[3][1]  # encoders of critics have no bias
+    assert go2_rough.SCAN.noise > 0.0 and groups["actor"][-2] is go2_rough.SCAN
 
 
 def test_an_unknown_task_is_refused():

@@ -191,6 +191,7 @@ class Course:
             "learning": learn_time,
             "deviation": float(others["action_std"].detach().mean()),
             "rate": float(others["learning_rate"]),
+            **peak_memory(self.env.device),
             **{f"loss/{name}": float(value) for name, value in loss_dict.items()},
             **dict(zip(found, numbers, strict=True)),
         }
@@ -210,6 +211,17 @@ class Course:
 
     def stop_logging_writer(self) -> None:
         """Do nothing: each row is written when it is known."""
+
+
+def peak_memory(device: Any) -> dict[str, float]:
+    """Return the largest number of bytes that torch has held so far on a GPU, by the name "torch bytes"; {} on a CPU.
+
+    These are networks, optimizer, rollouts, temporaries and the environment's tensors; Warp's arrays, such as the
+    dynamics' values of each world, are beside them.
+    """
+    return (
+        {"torch bytes": float(torch.cuda.max_memory_allocated(device))} if torch.device(device).type == "cuda" else {}
+    )
 
 
 def pick_device(asked: str | None) -> str:

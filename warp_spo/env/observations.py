@@ -103,6 +103,10 @@ class Observation:
             ]
         return vector(x for row in chosen for x in row)
 
+    def truth(self) -> Observation:
+        """Return the observation without noise, bias and delay, as a critic sees it; scale, clip and history stay."""
+        return dataclasses.replace(self, noise=0.0, bias=0.0, delay=0)
+
     @property
     def rows(self) -> int:
         """How many rows of :class:`Each` threads of their own work on; 0: the thread of all terms does."""

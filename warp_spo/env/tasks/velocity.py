@@ -25,14 +25,15 @@ ACTOR = (
 def observed(feet: Any, *more: Any) -> dict[str, list]:
     """Return what the actor sees, with noise, and what the critic sees: the truth, the base's height and the feet.
 
-    ``more``: further terms that both see.
+    ``more``: further terms that both see, the critic without the noise, bias and delay of an ``Observation``.
     """
     truth = [
         Observation(obs.joint_position(biased=False) if name == "joint position" else term, scale)
         for name, term, scale, _ in ACTOR
     ]
     noisy = [Observation(term, scale, noise) for _, term, scale, noise in ACTOR]
-    return {"actor": [*noisy, *more], "critic": [*truth, *more, base_height, feet_state(feet)]}
+    true = [term.truth() if isinstance(term, Observation) else term for term in more]
+    return {"actor": [*noisy, *more], "critic": [*truth, *true, base_height, feet_state(feet)]}
 
 
 def base_height(w: World) -> Any:
