@@ -49,7 +49,10 @@ def parser() -> argparse.ArgumentParser:
         "--gpus", type=int, default=1, metavar="N", help="GPUs for --everything; of 3 or more the last one compiles"
     )
     p.add_argument("--check", action="store_true", help="compare with the reference, and time nothing")
-    p.add_argument("--compile", action="store_true", help="compile the kernels into Warp's cache, and time nothing")
+    p.add_argument(
+        "--compile", action="store_true", help="compile the kernels into Warp's cache, and time nothing; also those of "
+        "--compare and --history"
+    )  # fmt: skip
     p.add_argument("--json", type=Path, metavar="OUT", help="write the run to this file, or by date into this folder")
     p.add_argument("--report", type=Path, metavar="DIR", help="write the run as one page, DIR/report.html")
     p.add_argument(
@@ -58,7 +61,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--table", type=Path, metavar="JSON", help="print the Markdown table of a run, and run nothing")
     p.add_argument(
         "--compare", nargs=2, metavar=("A", "B"), help="print the differences of two runs, JSON files; or measure two "
-        "commits in turns, in the cases that FILTER matches"
+        "commits in turns, in the cases that FILTER matches. A commit may be a folder that git archive has filled"
     )  # fmt: skip
     p.add_argument(
         "--rounds", type=int, default=commits.ROUNDS, metavar="N", help="processes of each commit to compare"
@@ -73,7 +76,10 @@ def parser() -> argparse.ArgumentParser:
         "page of charts",
     )
     p.add_argument(
-        "--commits", nargs="*", metavar="C", help="commits for --history to measure; none: only draw the page"
+        "--commits",
+        nargs="*",
+        metavar="C",
+        help="commits, or folders of them, for --history to measure; none: only draw the page",
     )
     p.add_argument("--past", action="store_true", help="for --history: take the committed results of earlier commits")
     p.add_argument(
@@ -208,6 +214,9 @@ def compare_commits(options: Any) -> int:
         raise ValueError(f"benchmarks: --rounds is {options.rounds}; expected 2 or more")
     device = find_device(options.device)
     chosen = _cases_of_commits(options, device)
+    if options.compile:
+        commits.compile_kernels(options.compare, chosen, device.alias)
+        return 0
     verdicts, noise = commits.compare(*options.compare, chosen, device.alias, options.rounds)
     print(*verdicts, sep="\n")
     words = [verdict.word for verdict in verdicts]
@@ -220,6 +229,10 @@ def keep_history(options: Any, pyplot: Any) -> int:
     """Measure commits, keep their run times and draw the page; return 0."""
     runner.check_place("--history", options.history)
     device = find_device(options.device)
+    if options.compile:
+        names = options.commits or [str(evidence.ROOT)]
+        commits.compile_kernels(names, _cases_of_commits(options, device), device.alias)
+        return 0
     if options.past:
         print(f"wrote {len(history.harvest(options.history))} files", file=sys.stderr)
     for commit in [None] if options.commits is None and not options.past else options.commits or []:

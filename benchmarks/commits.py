@@ -1,5 +1,8 @@
 """Commits of this repository, measured by one text: in worktrees, by processes that take turns.
 
+A commit may also be a folder that ``git archive`` has filled, for a machine that has no git or no history; a file in it
+tells which commit it is.
+
 Two commits that are measured one after the other differ by the temperature of the machine, by what else it does, and by
 the process, whose kernels lie elsewhere in memory. So processes of both take turns, each measures all cases, and the
 verdict looks at the medians of processes: a commit is faster in a case if the slowest of its processes is faster than
@@ -8,6 +11,7 @@ the fastest of the other's.
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import json
 import math
@@ -30,6 +34,7 @@ OPERATIONS = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "step")
 SCENES = ("panda", "go2", "g1")
 WORLDS, CPU_WORLDS = (4096, 65536), (64, 1024)
 ROUNDS = 5  # processes of each commit that count
+ARCHIVED = ".git_archival.txt"  # git archive writes hash, date and subject into it
 LIMIT = 1800.0  # [s] for one process, which may have to compile all kernels
 
 
@@ -59,11 +64,14 @@ def name_of(row: dict) -> str:
 
 @contextlib.contextmanager
 def checkout(commit: str) -> Iterator[Path]:
-    """Check a commit out into a temporary folder, which is removed at the end.
+    """Check a commit out into a temporary folder, which is removed at the end; a folder is taken as it is.
 
     Raises:
         ValueError: git knows no such commit.
     """
+    if is_folder(commit):
+        yield Path(commit).resolve()
+        return
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "tree"
         git("worktree", "add", "--detach", "--force", str(place), commit)
@@ -77,10 +85,21 @@ def resolve(commit: str) -> tuple[str, str, str]:
     """Return the whole hash of a commit, its date and its subject.
 
     Raises:
-        ValueError: git knows no such commit.
+        ValueError: git knows no such commit, or a folder does not tell its own.
     """
+    if is_folder(commit):
+        told = Path(commit, ARCHIVED)
+        lines = told.read_text().strip().split("\n") if told.is_file() else []
+        if len(lines) != 3:
+            raise ValueError(f"benchmarks: {told} tells no commit; expected a folder that git archive has filled")
+        return lines[0], lines[1], lines[2]
     found = git("show", "--no-patch", "--format=%H%n%cI%n%s", f"{commit}^{{commit}}").split("\n")
     return found[0], found[1], found[2]
+
+
+def is_folder(commit: str) -> bool:
+    """Return whether the name of a commit is that of a folder with this package in it."""
+    return Path(commit, "warp_spo", "__init__.py").is_file()
 
 
 def git(*arguments: str) -> str:
@@ -170,6 +189,19 @@ def by_chance(rounds: int) -> float:
     return 2.0 / math.comb(2 * rounds, rounds)
 
 
+def compile_kernels(names: Sequence[str], chosen: Sequence[dict], device: str | None) -> None:
+    """Compile the kernels of commits into Warp's cache, a process for each case, several at a time.
+
+    Raises:
+        ValueError: git knows no such commit, or a process failed.
+    """
+    with contextlib.ExitStack() as stack, concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        roots = [stack.enter_context(checkout(name)) for name in names]
+        tasks = [pool.submit(measure, root, [case], device) for case in chosen for root in roots]
+        for task in tasks:
+            task.result()
+
+
 def compare(
     first: str, second: str, chosen: Sequence[dict], device: str | None, rounds: int = ROUNDS
 ) -> tuple[list[Verdict], str]:
@@ -179,13 +211,16 @@ def compare(
         ValueError: git knows no such commit, or a process failed.
     """
     for commit in (first, second):
-        resolve(commit)
+        if not is_folder(commit):
+            resolve(commit)
     times: list[dict[str, list[float]]] = [{}, {}]
     with checkout(first) as a, checkout(second) as b:
         for turn in range(rounds + 1):
             order = (0, 1) if turn % 2 else (1, 0)
             for which in order:
                 rows = measure((a, b)[which], chosen, device)
+                shown = ", ".join(f"{name_of(row)} {row.get('us', math.nan):.4g}" for row in rows)
+                print(f"round {turn}, {(first, second)[which]} [us]: {shown}", file=sys.stderr, flush=True)
                 if turn:  # the first round compiles
                     for row in rows:
                         times[which].setdefault(name_of(row), []).append(row.get("us", math.nan))

@@ -1,5 +1,6 @@
 """Run cases: compare each with the reference, then time it. A case gives one row of numbers, a run one JSON file."""
 
+import contextlib
 import dataclasses
 import datetime
 import json
@@ -39,9 +40,15 @@ METRICS = (  # those that a row has are printed
 
 
 def run(
-    cases: Iterable[dict], device: Any = None, check: bool = False, roof: roofline.Roof | None = None
+    cases: Iterable[dict],
+    device: Any = None,
+    check: bool = False,
+    roof: roofline.Roof | None = None,
+    turn: contextlib.AbstractContextManager | None = None,
 ) -> Iterator[dict]:
     """Yield one row for each case, with the numbers that were measured. A case that is not offered is named on stderr.
+
+    Cases are timed inside of ``turn``, such as a lock that processes share.
 
     Every row has:
 
@@ -65,7 +72,7 @@ def run(
     for case, subject, name in _subjects_of(cases, device, 1 if check else SETS):
         granularity = OPERATIONS[case["op"]].granularity(subject.dyn)
         row = case | dict(granularity=granularity, chosen=case["granularity"] is None)
-        yield row | dict(reference=name) | _measure(case, subject, name, check, roof)
+        yield row | dict(reference=name) | _measure(case, subject, name, check, roof, turn or contextlib.nullcontext())
 
 
 def compile_only(cases: Iterable[dict], device: Any = None) -> None:
@@ -109,7 +116,14 @@ def _subjects_of(cases: Iterable[dict], device: Any, sets: int) -> Iterator[tupl
                 print(f"skipped {case['scene']} {case['dtype']}: {error}", file=sys.stderr)
 
 
-def _measure(case: dict, subject: Any, reference: str, check: bool, roof: roofline.Roof | None) -> dict:
+def _measure(
+    case: dict,
+    subject: Any,
+    reference: str,
+    check: bool,
+    roof: roofline.Roof | None,
+    turn: contextlib.AbstractContextManager,
+) -> dict:
     precision, dyn = PRECISIONS[case["dtype"]], subject.dyn
     operation = precision.operations[case["op"]]
     if reference != "dense":  # there is no matrix to compute a residual with
@@ -122,12 +136,13 @@ def _measure(case: dict, subject: Any, reference: str, check: bool, roof: roofli
     row |= dict(compile_s=trial.first_call) | resources(launched, dyn.device)
     trial.check()
     if not check:
-        timing, _ = trial.measure(warm_up=WARM_UP, budget=BUDGET)
+        with turn:
+            timing, _ = trial.measure(warm_up=WARM_UP, budget=BUDGET)
+            row["eager_us"] = 1e6 * trial.eager().median
+            if precision.scalar and _torch_serves(dyn.device):
+                row["torch_us"] = 1e6 * trial.eager(wp.to_torch).median
         row |= dict(us=1e6 * timing.median, p10_us=1e6 * timing.low, p90_us=1e6 * timing.high)
         row |= dict(spread=(timing.high - timing.low) / timing.median, evals_per_s=case["worlds"] / timing.median)
-        row["eager_us"] = 1e6 * trial.eager().median
-        if precision.scalar and _torch_serves(dyn.device):
-            row["torch_us"] = 1e6 * trial.eager(wp.to_torch).median
         row |= _rates(case, trial, precision.scalar, timing.median, roof)
         if dyn.device.is_cuda and dyn.device.is_mempool_enabled:
             row["memory_MiB"] = wp.get_mempool_used_mem_current(dyn.device) / 2**20

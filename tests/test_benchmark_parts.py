@@ -14,6 +14,7 @@ from benchmarks import (
     evidence,
     parts,
     peers,
+    rows,
     runner,
 )
 from benchmarks import report as reports
@@ -157,3 +158,21 @@ def test_parts_are_cases_that_there_are():
                 assert any(re.search(options.filter, work) for work in works), part.name
     with pytest.raises(ValueError, match="no part matches"):
         parts.choose("nothing", True, "cuda:0")
+
+
+def test_all_rows_of_a_commit_can_be_measured_in_slices(tmp_path, monkeypatch, capsys):
+    """Every case of the parts is in one group; a file continues with what it lacks, and only for its own commit."""
+    cases = rows.cases()
+    groups = rows.grouped(cases)
+    assert sum(map(len, groups.values())) == len(cases) > 400 and len(groups["g1.w4096.float32"]) == 33
+    assert any(case.get("sweep") for case in cases) and {case["dtype"] for case in cases} == set(PRECISIONS)
+    file = tmp_path / "run.json"
+    monkeypatch.setattr(rows.roofline, "measure", lambda device: None)
+    monkeypatch.setattr(runner, "machine", lambda device: RUN["machine"])
+    monkeypatch.setattr(runner, "commit", lambda: RUN["commit"])
+    runner.save(RUN | dict(rows=[case | dict(us=1.0) for case in groups["g1.w4096.float32"]]), file)
+    assert rows.main([str(file), "g1.w4096.float32", "--device", "cpu"]) == 0
+    assert "0 groups; 1 are there" in capsys.readouterr().out
+    monkeypatch.setattr(runner, "commit", lambda: "b" * 40)
+    with pytest.raises(ValueError, match=r"is of commit .* this is bbbb.*; expected another file"):
+        rows.main([str(file), "--device", "cpu"])

@@ -123,6 +123,37 @@ def test_processes_of_two_commits_take_turns(monkeypatch, capsys):
     assert not any(str(root) in commits.git("worktree", "list") or root.exists() for root in names)
 
 
+def test_folders_stand_for_commits(monkeypatch, capsys, tmp_path):
+    """On a machine without git: git archive fills folders, and a file in each tells which commit it is."""
+    names = [str(tmp_path / name) for name in ("old", "new")]
+    for name in names:
+        (Path(name) / "warp_spo").mkdir(parents=True)
+        (Path(name) / "warp_spo" / "__init__.py").touch()
+    times = {Path(name): us for name, us in zip(names, (10.0, 20.0), strict=True)}
+    monkeypatch.setattr(commits, "git", None)
+    monkeypatch.setattr(
+        commits, "measure", lambda root, chosen, device: [case | dict(us=times[root]) for case in chosen]
+    )
+    options = ["panda.step", "--device", "cpu", "--worlds", "64"]
+    assert main([*options, "--compare", *names, "--rounds", "2"]) == 1
+    assert "panda.step.w64: 10 to 20 us, +100.0%" in capsys.readouterr().out
+    keep = [*options, "--history", str(tmp_path / "kept"), "--commits", names[0]]
+    assert main(keep) == 2 and "tells no commit; expected a folder that git archive" in capsys.readouterr().err
+    (Path(names[0]) / commits.ARCHIVED).write_text(f"{'d' * 40}\n2026-11-23T10:00:00+00:00\nCommit d\n")
+    assert main(keep) == 0 and (tmp_path / "kept" / "history-cpu.svg").is_file()
+    (mine,) = history.entries(tmp_path / "kept").values()
+    assert (mine[0]["commit"], mine[0]["subject"], mine[0]["rows"][0]["us"]) == ("d" * 40, "Commit d", 10.0)
+
+
+@needs_git
+def test_archives_tell_their_commit(tmp_path):
+    done = subprocess.run(
+        ["git", "archive", "HEAD", commits.ARCHIVED], cwd=evidence.ROOT, capture_output=True, check=True
+    )
+    subprocess.run(["tar", "x"], cwd=tmp_path, input=done.stdout, check=True)
+    assert tuple((tmp_path / commits.ARCHIVED).read_text().strip().split("\n")) == commits.resolve("HEAD")
+
+
 @needs_git
 def test_mistakes_are_named(capsys, tmp_path):
     for call, words in [
