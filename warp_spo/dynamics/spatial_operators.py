@@ -24,7 +24,7 @@ from ..graph.factorization import Factorization
 from ..graph.operators import BWA
 from ..graph.similarity import ChangeOfVariables, check_together
 from ..kernels import common_frames, declare, kinematics, rigid_blocks
-from ..recursions import node_blocks
+from ..recursions import expressions, node_blocks
 from ..recursions import operators as recursion
 from .operation import AS_WRITTEN, Operation, Q, Refused
 
@@ -37,9 +37,9 @@ EXPRESSION = Routine(
     "expression",
     recursion.expression,
     blocks=True,
-    suits=lambda links, shapes, expression: recursion.spaces_agree(expression),
+    suits=lambda links, shapes, expression: expressions.spaces_agree(expression),
     variants=64,
-    title=lambda inputs, expression: recursion.format_expression(expression),
+    title=lambda inputs, expression: expressions.format_expression(expression),
 )
 NODE_BLOCKS = Routine("node_blocks", node_blocks.node_blocks)
 
