@@ -12,8 +12,7 @@ from solver_models import advance, replicated
 
 import warp_spo as spo
 from warp_spo.errors import UnsupportedError
-from warp_spo.newton import SolverSPO
-from warp_spo.newton import solver as solvers
+from warp_spo.newton import SolverSPO, resets
 
 CLOSED = 1e-6  # [m]: rounding of float32 at angles of up to 8 rad, and of the chain of bars
 OPEN = (0.3, -1.3, 2.0)  # joint angles that do not meet
@@ -126,7 +125,7 @@ def test_reset_closes_what_it_puts_back(pinned, monkeypatch):
     q = state.joint_q.numpy()[dyn.scene.q_index]
     np.testing.assert_allclose(dyn.project(q, rates, iterations=0)[1], rates, atol=1e-6)
     assert np.abs(rates - 1.0).max() > 0.1
-    monkeypatch.setattr(solvers, "CLOSING_STEPS", 0)
+    monkeypatch.setattr(resets, "CLOSING_STEPS", 0)
     solver.reset(state)
     assert gap(solver, state).min() > 0.1
 

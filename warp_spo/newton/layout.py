@@ -7,11 +7,14 @@ import functools
 import math
 from typing import Any
 
+import newton
 import numpy as np
 import warp as wp
 
 from ..kernels import exchange
 from ..memory import view
+from ..scene.scene import Scene
+from .worlds import Worlds
 
 
 class Layout:
@@ -117,6 +120,23 @@ class Layouts:
     poses: Layout
     wrenches: Layout
     anchors: Layout
+
+    @classmethod
+    def of(cls, model: newton.Model, worlds: Worlds, scene: Scene) -> Layouts:
+        """Return the layouts of a model's state."""
+        rows = {
+            "joint_q": (scene.q_index, ()),
+            "joint_qd": (scene.dof_index, ()),
+            "body_q": (worlds.bodies, (7,)),
+            "body_qd": (worlds.bodies, (6,)),
+            "joint_X_p": (worlds.hinges, (7,)),
+        }
+        return cls(*(lay_out(model, name, *found) for name, found in rows.items()))
+
+
+def lay_out(model: newton.Model, name: str, rows: np.ndarray, shape: tuple[int, ...] = ()) -> Layout:
+    """Return how the model's array ``name`` is laid out: ``rows`` [world, n], each an entry of ``shape``."""
+    return Layout(rows, (*rows.shape[1:], *shape), model.device, getattr(model, name))
 
 
 def _scalars(flat: Any) -> wp.array:

@@ -13,7 +13,8 @@ from ..dynamics.dynamics import Dynamics
 from ..scene.parts import DOF_VALUES
 from .contacts import VALUES, Materials
 from .elevations import Elevations
-from .layout import Layout
+from .layout import Layout, Layouts, lay_out
+from .worlds import Worlds, to_numpy
 
 FORCE_VALUES = tuple(name for name in DOF_VALUES if name != "joint_armature")
 FLAGS = {
@@ -38,7 +39,8 @@ class ModelArrays:
 
     Args:
         model: The Newton model.
-        layouts: How the model's array is laid out, for each name that Dynamics may have as a variable value.
+        worlds: The rows of its worlds.
+        state: How its state is laid out.
         factors: 1 or 0 for each dof [dof], for the gains that count only in some modes of a drive.
         sources: What turns arrays of the model into values of the contacts that the solver computes, by name; {} if
             it computes none.
@@ -52,11 +54,13 @@ class ModelArrays:
     def __init__(
         self,
         model: newton.Model,
-        layouts: Mapping[str, Layout],
+        worlds: Worlds,
+        state: Layouts,
         factors: Mapping[str, wp.array],
         sources: Mapping[str, Materials | Elevations],
     ):
-        self.model, self._layouts, self._factors, self._sources = model, layouts, factors, sources
+        self.model, self._factors, self._sources = model, factors, sources
+        self._layouts = _layouts_of_values(model, worlds, state)
         self.flags: Mapping[ModelFlags, Sequence[str]] = {**FLAGS, **SHAPE_FLAGS} if sources else FLAGS
         watched = (*WATCHED, *SHAPES) if sources else WATCHED
         self.used = {name: wp.clone(getattr(model, name)) for name in watched}
@@ -136,3 +140,19 @@ class ModelArrays:
                     f"SolverSPO.notify_model_changed: {flag.name} inside a graph capture; expected flags of "
                     f"variable arrays; build the solver with variable=({', '.join(map(repr, names))})"
                 )
+
+
+def _layouts_of_values(model: newton.Model, worlds: Worlds, state: Layouts) -> dict[str, Layout]:
+    """Return how the model's array is laid out, for each name that Dynamics may have as a variable value."""
+    vectors = len(to_numpy(model, "gravity"))  # one for each world, or a last one for a model without worlds
+    gravity = np.arange(worlds.count) if worlds.declared else np.full(worlds.count, vectors - 1)
+    return {
+        **{name: state.qd for name in DOF_VALUES},
+        "joint_rest_q": state.q,
+        "joint_X_p": state.anchors,
+        "joint_X_c": state.anchors,
+        "body_mass": lay_out(model, "body_mass", worlds.bodies),
+        "body_com": lay_out(model, "body_com", worlds.bodies, (3,)),
+        "body_inertia": lay_out(model, "body_inertia", worlds.bodies, (3, 3)),
+        "gravity": Layout(gravity[:, None], (3,), model.device, model.gravity),
+    }

@@ -14,7 +14,7 @@ from newton.solvers.experimental.coupled import CouplingInterface
 from ..dynamics.dynamics import Dynamics
 from ..errors import UnsupportedError
 from ..scene.frames import Frame
-from .layout import Layout
+from .layout import Layouts
 from .tape import refuse_tape
 from .worlds import to_numpy
 
@@ -24,7 +24,8 @@ class Plugs(CouplingInterface):
 
     model: newton.Model
     dynamics: Dynamics
-    _q: Layout
+    _layouts: Layouts
+    _body_rows: np.ndarray  # the model's bodies [world, body]
 
     def solve_inverse(self, state: newton.State) -> Callable[[wp.array, wp.array], None]:
         """Return ``solve(x, y)``, which writes x = Mass^-1 y at ``state``, armature included.
@@ -36,7 +37,7 @@ class Plugs(CouplingInterface):
         """
         self._check_open("solve_inverse")
         refuse_tape("SolverSPO.solve_inverse", state)
-        q = self._q.read(state.joint_q, "q")
+        q = self._layouts.q.read(state.joint_q, "q")
 
         def solve(x: wp.array, y: wp.array) -> None:
             self.dynamics.solve_mass_matrix(q, y, out=x)
@@ -61,7 +62,7 @@ class Plugs(CouplingInterface):
         """
         self._check_open("operational_space")
         refuse_tape("SolverSPO.operational_space", state)
-        dyn, q = self.dynamics, self._q.read(state.joint_q, "q")
+        dyn, q = self.dynamics, self._layouts.q.read(state.joint_q, "q")
         worlds, dofs = dyn.worlds, dyn.scene.dof_count
         dyn.jacobian(q, [frame], out=inputs.jacobian_tool_world.reshape((worlds, 1, 6, dofs)))
         if inputs.mass_matrix is not None:
@@ -118,7 +119,7 @@ class Plugs(CouplingInterface):
                 "couple a point of a body"
             )
         dyn, scene = self.dynamics, self.dynamics.scene
-        q = self._q.read(self.model.joint_q, "coupled").numpy()
+        q = self._layouts.q.read(self.model.joint_q, "coupled").numpy()
         frames = list(range(scene.body_count))
         J = dyn.jacobian(q, frames).astype(np.float64)
         poses, minv = dyn.body_poses(q), dyn.mass_matrix_inverse(q).astype(np.float64)
@@ -155,5 +156,3 @@ class Plugs(CouplingInterface):
 
     coupling_rewind_proxy_body = coupling_rewind_proxy_particle = coupling_prepare_proxy_contacts
     coupling_harvest_proxy_wrenches = coupling_harvest_proxy_particle_forces = coupling_prepare_proxy_contacts
-
-    _body_rows: np.ndarray

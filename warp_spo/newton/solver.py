@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, NoReturn
 
 import newton
-import numpy as np
 import warp as wp
 from newton import ModelFlags, StateFlags
 from newton.solvers import SolverBase
@@ -18,24 +16,26 @@ from ..dynamics.dynamics import Dynamics
 from ..dynamics.steps import INTEGRATORS
 from ..errors import UnsupportedError, as_integer, as_names
 from ..kernels import declare, exchange
-from ..memory import view
-from ..scene.parts import DOF_VALUES
 from ..scene.scene import Scene
 from ..scene.shapes import POINTS
+from .body_states import BodyStates
 from .checks import check_state, read_flags
 from .contacts import ELEVATIONS, MODES, VALUES, StatusWords, find_contacts, sources_of
 from .drives import GAINS, Drives
 from .joint_forces import JointForces
-from .layout import Layout, Layouts
+from .layout import Layouts
 from .loop_joints import check_loop_joints
 from .model import from_newton
 from .model_arrays import ModelArrays
-from .pairs import find_pairs, warn_of_bodies_apart
+from .model_contacts import ModelContacts
+from .observables import Observables, Reports
+from .pairs import ModelPairs, find_pairs, warn_of_bodies_apart
 from .plugs import Plugs
+from .resets import reset_state
 from .slots import VARIABLE as SLOT_VALUES
 from .slots import Slots
 from .tape import StepGradients, paused_tape, refuse_tape
-from .worlds import Worlds, to_numpy
+from .worlds import Worlds
 
 DEFAULT_VARIABLE = (
     "body_mass",
@@ -48,39 +48,6 @@ DEFAULT_VARIABLE = (
     "gravity",
     "shape_material_mu",
 )
-REPORTS = frozenset({"contact_f", "contact_slip", "contact_residual"})
-"""Observables of contacts."""
-CLOSING_STEPS = 8  # iterations of Newton's method that close the loops in a reset; each squares the error
-
-
-@dataclasses.dataclass(eq=False)
-class Observables(SolverBase.Observables):
-    """Results of a step beside the state."""
-
-    joint_qdd: Any = SolverBase.Observables.field(  # noqa: RUF009
-        dtype=wp.float32, frequency=newton.Model.AttributeFrequency.JOINT_DOF
-    )
-    """(qd after - qd before) / dt [m/s^2, rad/s^2], shape (joint_dof_count,)."""
-    status: Any = SolverBase.Observables.field(  # noqa: RUF009
-        dtype=wp.int32, frequency=newton.Model.AttributeFrequency.WORLD
-    )
-    """A :class:`warp_spo.Status` for each world, 0 if the step can be trusted, shape (world_count,)."""
-    contact_f: Any = SolverBase.Observables.field(  # noqa: RUF009
-        dtype=wp.vec3, frequency=newton.Model.AttributeFrequency.WORLD
-    )
-    """Force of the ground on each contact point [N], then of the second body of each pair on the first one, world axes,
-    shape (world_count, points + pairs), not Newton's by contact. They are ``solver.dynamics.scene.contact_points`` and
-    ``contact_pairs``."""
-    contact_slip: Any = SolverBase.Observables.field(  # noqa: RUF009
-        dtype=wp.float32, frequency=newton.Model.AttributeFrequency.WORLD
-    )
-    """Speed of each contact point along the ground, and of the bodies of each pair along each other, after the step
-    [m/s], shape (world_count, points + pairs)."""
-    contact_residual: Any = SolverBase.Observables.field(  # noqa: RUF009
-        dtype=wp.float32, frequency=newton.Model.AttributeFrequency.WORLD
-    )
-    """Largest change of a pair's force in the last round [N], where pairs are solved in rounds; else 0. Shape
-    (world_count,)."""
 
 
 class SolverSPO(Plugs, SolverBase):
@@ -166,17 +133,7 @@ class SolverSPO(Plugs, SolverBase):
     """
 
     Observables = Observables
-    SUPPORTED_OBSERVABLES: ClassVar[frozenset[str]] = frozenset(
-        {
-            "joint_qdd",
-            "status",
-            "contact_f",
-            "contact_slip",
-            "contact_residual",
-            SolverBase.ObservableKind.BODY_QDD,
-            SolverBase.ObservableKind.BODY_PARENT_F,
-        }
-    )
+    SUPPORTED_OBSERVABLES: ClassVar[frozenset[str]] = Reports.SUPPORTED
 
     def __init__(
         self,
@@ -225,16 +182,8 @@ class SolverSPO(Plugs, SolverBase):
             raise UnsupportedError(
                 "SolverSPO", f"mimic joints: {names}", "loops='embed' closes them, loops='cut' leaves them open"
             )
-        worlds = Worlds(model)
-        heights, lacking = ELEVATIONS in self._asked, self._lacks_contacts(scene)
-        pairs = find_pairs(model, worlds, scene, self._pairs_asked, lacking)
-        touching = find_contacts(model, worlds, scene, pairs, *self._contact_options, lacking, heights)
-        if self._pairs_asked is None and touching is not None and not isinstance(touching, Slots):
-            warn_of_bodies_apart(model, worlds, scene)
-        if isinstance(touching, Slots) and self._substeps > 1:
-            if self._contact_options[0] == "pipeline":
-                raise UnsupportedError("SolverSPO", "contacts='pipeline' with substeps", "call step for each substep")
-            touching = None
+        worlds, heights = Worlds(model), ELEVATIONS in self._asked
+        touching, pairs = self._contacts_of(worlds, scene)
         self._drives = Drives(model, scene)
         scene = scene if touching is None else touching.scene
         scene = self._drives.apply(scene if pairs is None else pairs.added_to(scene))
@@ -246,49 +195,38 @@ class SolverSPO(Plugs, SolverBase):
             raise UnsupportedError("SolverSPO", what, "leave it out, or see what contacts='ground' says")
         self._values = {name: VALUES.get(name, name) for name in variable if name not in VALUES or name in sources}
         changing = tuple(self._values.values()) + (SLOT_VALUES if self._slots else ())
-        W, device = scene.worlds, model.device
-        self.dynamics = Dynamics(scene, W, device, "float32", changing, **self._options)
+        self.dynamics = Dynamics(scene, scene.worlds, model.device, "float32", changing, **self._options)
         if self._tunes:
             self.dynamics.tune("forward_dynamics" if self.integrator == "rk4" else "step")
         if self.dynamics.closed:
             check_loop_joints(model, worlds.loops)
         declare(exchange, wp.float32)
-        bodies, hinges = worlds.bodies, worlds.hinges
-        self._body_rows = bodies
-        gravity = np.arange(W) if worlds.declared else np.full(W, len(to_numpy(model, "gravity")) - 1)
+        self._body_rows = worlds.bodies
         self._mask_from = 0 if worlds.declared else -1  # a mask's last entry is for bodies outside worlds
-
-        def layout(like: str, rows: np.ndarray, *shape: int) -> Layout:
-            return Layout(rows, (*rows.shape[1:], *shape), device, getattr(model, like))
-
-        self._q, self._qd = layout("joint_q", scene.q_index), layout("joint_qd", scene.dof_index)
-        self._poses, self._wrenches = layout("body_q", bodies, 7), layout("body_qd", bodies, 6)
-        anchors = layout("joint_X_p", hinges, 7)
-        state = Layouts(self._q, self._qd, self._poses, self._wrenches, anchors)
-        layouts = {name: self._qd for name in DOF_VALUES} | {
-            "joint_rest_q": self._q,
-            "joint_X_p": anchors,
-            "joint_X_c": anchors,
-            "body_mass": layout("body_mass", bodies),
-            "body_com": layout("body_com", bodies, 3),
-            "body_inertia": layout("body_inertia", bodies, 3, 3),
-            "gravity": Layout(gravity[:, None], (3,), device, model.gravity),
-        }
-        self._arrays = ModelArrays(model, layouts, self._drives.factors, sources)
-        # Steps with observables write status here if the caller does not ask for it: one kernel serves both.
-        self._status = wp.zeros(W, dtype=wp.int32, device=device)
+        self._layouts = state = Layouts.of(model, worlds, scene)
+        self._bodies = BodyStates(self.dynamics, state)
+        self._arrays = ModelArrays(model, worlds, state, self._drives.factors, sources)
         self._words = StatusWords(model, worlds, touching, pairs)
-        # One kernel serves all observables of contacts: those that nobody asks for are written here.
-        shape = W, scene.contact_count
-        kinds: dict[str, Any] = {"contact_f": (shape, wp.vec3), "contact_slip": (shape, wp.float32)}
-        kinds = kinds if scene.contacts else {}
-        kinds |= {} if pairs is None else {"contact_residual": ((W,), wp.float32)}
-        self._unasked = {name: wp.zeros(size, dtype=kind, device=device) for name, (size, kind) in kinds.items()}
+        self._reports = Reports(self.dynamics, state, pairs is not None, self._substeps)
         self._joint_forces = JointForces(self.dynamics, state)
         self._gradients = StepGradients(
             model, self.dynamics, state, self._joint_forces, self._drives, self._arrays, self._passes, self._empty_slots
         )
         self._prepare()
+
+    def _contacts_of(self, worlds: Worlds, scene: Scene) -> tuple[ModelContacts | Slots | None, ModelPairs | None]:
+        """Return the contacts with the ground that steps compute, or slots for a list of them; and pairs of bodies."""
+        lacking = self._lacks_contacts(scene)
+        pairs = find_pairs(self.model, worlds, scene, self._pairs_asked, lacking)
+        options = (*self._contact_options, lacking, ELEVATIONS in self._asked)
+        found = find_contacts(self.model, worlds, scene, pairs, *options)
+        if self._pairs_asked is None and found is not None and not isinstance(found, Slots):
+            warn_of_bodies_apart(self.model, worlds, scene)
+        if isinstance(found, Slots) and self._substeps > 1:
+            if self._contact_options[0] == "pipeline":
+                raise UnsupportedError("SolverSPO", "contacts='pipeline' with substeps", "call step for each substep")
+            return None, pairs
+        return found, pairs
 
     def _prepare(self) -> None:
         """Run a step and a reset, so that later calls compile and allocate nothing."""
@@ -323,18 +261,12 @@ class SolverSPO(Plugs, SolverBase):
         contact_slip are missing if they have none, contact_residual without pairs. Accelerations and BODY_PARENT_F are
         missing with substeps.
         """
-        touches, found = bool(self._unasked), self.SUPPORTED_OBSERVABLES - (REPORTS - self._unasked.keys())
-        if self.dynamics.closed or not self.dynamics.scene.dof_count or touches:
-            found = found - {SolverBase.ObservableKind.BODY_PARENT_F}
-        if self._substeps > 1:
-            found = found & {"status", *REPORTS}
-        return found
+        return self._reports.supported
 
     def observables(self, kinds: Iterable[str], **options: Any) -> Any:
         """Return arrays for observables, see ``newton.solvers.SolverBase.observables``."""
         found = super().observables(kinds, **options)
-        for name in self._unasked.keys() & found.kinds:
-            setattr(found, name, wp.zeros_like(self._unasked[name]))
+        self._reports.allocate(found)
         return found
 
     @property
@@ -409,11 +341,12 @@ class SolverSPO(Plugs, SolverBase):
         contacts: newton.Contacts | None,
     ) -> None:
         """Launch a step; ``qdd`` is filled, and worlds with ``contacts`` get a status word."""
-        q, qd = self._q.read(state_in.joint_q, "joint_q"), self._qd.read(state_in.joint_qd, "joint_qd")
-        body_f = None if state_in.body_f is None else self._wrenches.read(state_in.body_f, "body_f")
+        at = self._layouts
+        q, qd = at.q.read(state_in.joint_q, "joint_q"), at.qd.read(state_in.joint_qd, "joint_qd")
+        body_f = None if state_in.body_f is None else at.wrenches.read(state_in.body_f, "body_f")
         tau = self._joint_forces.read(control.joint_f, q, self._arrays.used["joint_X_p"])
-        given: dict[str, Any] = dict(tau=tau, body_f=body_f, **self._drives.targets(control, self._q, self._qd))
-        if self._unasked:
+        given: dict[str, Any] = dict(tau=tau, body_f=body_f, **self._drives.targets(control, at.q, at.qd))
+        if self._reports.of_contacts:
             given["passes"] = self._passes
         if self._substeps > 1:
             dt, given["substeps"] = dt / self._substeps, self._substeps
@@ -425,74 +358,39 @@ class SolverSPO(Plugs, SolverBase):
             self._slots.fill(contacts, state_in.body_q, self._words.role, self.dynamics)
         bodies = None
         if observables is None or not observables.kinds:
-            q_out, qd_out = self._q.target(state_out.joint_q, "q_out"), self._qd.target(state_out.joint_qd, "qd_out")
-            more: dict[str, Any] = (
-                {} if qdd is None else {"qdd": qdd, "status": self._status}
-            )  # the kernel of steps with observables
+            q_out, qd_out = at.q.target(state_out.joint_q, "q_out"), at.qd.target(state_out.joint_qd, "qd_out")
+            if qdd is not None:  # the kernel of steps with observables
+                given |= {"qdd": qdd, "status": self._reports.status}
             if contacts is None:  # which are marked by the poses before the step
-                bodies = self._bodies(state_out)
-                more |= {} if bodies is None else {"poses": bodies[0], "velocities": bodies[1]}
-            self.dynamics.step(q, qd, dt=dt, integrator=self.integrator, out=(q_out, qd_out), **more, **given)
+                bodies = self._bodies.targets(state_out)
+                given |= {} if bodies is None else {"poses": bodies[0], "velocities": bodies[1]}
+            self.dynamics.step(q, qd, dt=dt, integrator=self.integrator, out=(q_out, qd_out), **given)
             if contacts is not None:
                 self._words.mark(contacts, self._words.kept, state_in.body_q)
         else:  # observables are computed from the state before the step, which state_out must not overwrite yet
-            q_out, qd_out = self._q.buffer("q_out"), self._qd.buffer("qd_out")
-            qdd = self._qd.buffer("qdd") if qdd is None else qdd
-            status = self._status if observables.status is None else observables.status
-            for name, unasked in self._unasked.items():
-                array = unasked if getattr(observables, name) is None else getattr(observables, name)
-                shape = (*array.shape, 3) if name == "contact_f" else array.shape
-                given[name] = view(array.ptr, shape, wp.float32, self.device.alias)
+            q_out, qd_out = at.q.buffer("q_out"), at.qd.buffer("qd_out")
+            qdd = at.qd.buffer("qdd") if qdd is None else qdd
+            status = self._reports.status if observables.status is None else observables.status
+            given |= self._reports.contact_arguments(observables)
             self.dynamics.step(q, qd, dt=dt, out=(q_out, qd_out), qdd=qdd, status=status, **given)
             if contacts is not None:
                 self._words.mark(contacts, status, state_in.body_q)
             self._words.keep(status)
-            self._observe(observables, q, qd, qdd, body_f)
-        if state_out is not state_in and not self._q.plain:  # entries of loop joints keep their values
+            self._reports.write(observables, q, qd, qdd, body_f)
+        if state_out is not state_in and not at.q.plain:  # entries of loop joints keep their values
             for name in ("joint_q", "joint_qd"):
                 wp.copy(getattr(state_out, name), getattr(state_in, name))
-        self._q.write(q_out, state_out.joint_q)
-        self._qd.write(qd_out, state_out.joint_qd)
-        self._write_bodies(q_out, qd_out, state_out, bodies)
+        at.q.write(q_out, state_out.joint_q)
+        at.qd.write(qd_out, state_out.joint_qd)
+        if bodies is None:
+            self._bodies.compute(q_out, qd_out, state_out)
+        else:  # the step has filled them
+            self._bodies.write(bodies, state_out)
 
     def _empty_slots(self) -> None:
         """Take the contacts of a list, which the last step may have been given, out of the dynamics; launches only."""
         if self._slots is not None:
             self._slots.fill(None, self.model.body_q, self._words.role, self.dynamics)
-
-    def _bodies(self, state: newton.State) -> tuple[wp.array, wp.array] | None:
-        """Return the arrays that receive the bodies' poses and velocities; None if the state has neither."""
-        pairs = (self._poses, state.body_q, "body_q"), (self._wrenches, state.body_qd, "body_qd")
-        if all(flat is None for _, flat, _ in pairs):
-            return None
-        poses, rates = (at.buffer(name) if flat is None else at.target(flat, name) for at, flat, name in pairs)
-        return poses, rates
-
-    def _write_bodies(
-        self, q: wp.array, qd: wp.array, state: newton.State, done: tuple[wp.array, wp.array] | None
-    ) -> None:
-        """Write the bodies' poses and velocities, which are ``done``, or are launched; do nothing without them."""
-        found = self._bodies(state) if done is None else done
-        if found is None:
-            return
-        if done is None:
-            self.dynamics.body_states(q, qd, out=found)
-        for at, flat, array in zip((self._poses, self._wrenches), (state.body_q, state.body_qd), found, strict=True):
-            if flat is not None:
-                at.write(array, flat)
-
-    def _observe(self, observables: Any, q: wp.array, qd: wp.array, qdd: wp.array, body_f: Any) -> None:
-        kinds = SolverBase.ObservableKind
-        if observables.is_requested("joint_qdd"):
-            self._qd.write(qdd, observables.joint_qdd)
-        if observables.is_requested(kinds.BODY_QDD):
-            out = self._wrenches.target(observables.body_qdd, "body_qdd")
-            self.dynamics.body_accelerations(q, qd, qdd, out=out)
-            self._wrenches.write(out, observables.body_qdd)
-        if observables.is_requested(kinds.BODY_PARENT_F):
-            out = self._wrenches.target(observables.body_parent_f, "body_parent_f")
-            self.dynamics.body_reactions(q, qd, qdd, body_f, out=out)
-            self._wrenches.write(out, observables.body_parent_f)
 
     # -- resets ----------------------------------------------------------------------------------------------------
     def reset(self, state: newton.State, world_mask: Any = None, flags: Any = None) -> None:
@@ -517,28 +415,7 @@ class SolverSPO(Plugs, SolverBase):
             mask = mask[self._mask_from :]
         if flags:
             self._words.clear(mask)
-        if flags & StateFlags.JOINT_Q:
-            wp.copy(self._q.buffer("first"), self._q.read(self.model.joint_q, "first"))
-            self._q.write(self._q.buffer("first"), state.joint_q, mask)
-        if flags & StateFlags.JOINT_QD:
-            wp.copy(self._qd.buffer("first"), self._qd.read(self.model.joint_qd, "first"))
-            self._qd.write(self._qd.buffer("first"), state.joint_qd, mask)
-        if self.dynamics.closed and flags & (StateFlags.JOINT_Q | StateFlags.JOINT_QD):
-            q, qd = self._q.read(state.joint_q, "q"), self._qd.read(state.joint_qd, "qd")
-            closed = self._q.buffer("closed"), self._qd.buffer("closed")
-            self.dynamics.project(q, qd, iterations=CLOSING_STEPS if flags & StateFlags.JOINT_Q else 0, out=closed)
-            if flags & StateFlags.JOINT_Q:
-                self._q.write(closed[0], state.joint_q, mask)
-            if flags & StateFlags.JOINT_QD:
-                self._qd.write(closed[1], state.joint_qd, mask)
-        if flags & StateFlags.BODY_F and state.body_f is not None:
-            self._wrenches.write(self._wrenches.buffer("none"), state.body_f, mask)
-        if flags & (StateFlags.BODY_Q | StateFlags.BODY_QD):
-            q, qd = self._q.read(state.joint_q, "q"), self._qd.read(state.joint_qd, "qd")
-            poses, rates = self._poses.buffer("poses"), self._wrenches.buffer("rates")
-            self.dynamics.body_states(q, qd, out=(poses, rates))
-            self._poses.write(poses, state.body_q, mask)
-            self._wrenches.write(rates, state.body_qd, mask)
+        reset_state(self.model, self.dynamics, self._layouts, state, flags, mask)
 
     # -- values ----------------------------------------------------------------------------------------------------
     def notify_model_changed(self, flags: ModelFlags | int) -> None:
