@@ -228,13 +228,15 @@ def test_a_ground_that_is_nowhere_leaves_other_worlds_alone(device):
     dyn = spo.Dynamics(scene, WORLDS, device, variable=("ground_origin", "ground_field"))
     q, qd = np.float32(a["q"]), np.float32(a["qd"])
     _, before = dyn.step(q, qd, None, H)
-    moved, field = np.float32(scene.values["ground_origin"]), np.float32(scene.values["ground_field"])
-    moved[1, 2], field[2], field[3] = np.nan, 7.0, np.nan
-    dyn.set(ground_origin=moved, ground_field=field)
-    status = np.zeros(WORLDS, np.int32)
-    _, after = dyn.step(q, qd, None, H, status=status)
-    assert np.isnan(after[1:]).all() and (status[1:] == spo.Status.NOT_FINITE).all()
-    assert (after[0] == before[0]).all() and np.isfinite(after[0]).all() and status[0] == spo.Status.OK
+    field, status = np.float32(scene.values["ground_field"]), np.zeros(WORLDS, np.int32)
+    field[2], field[3] = 7.0, np.nan
+    for axis in range(3):
+        moved = np.float32(scene.values["ground_origin"])
+        moved[1, axis] = np.nan
+        dyn.set(ground_origin=moved, ground_field=field)
+        _, after = dyn.step(q, qd, None, H, status=status)
+        assert np.isnan(after[1:]).all() and (status[1:] == spo.Status.NOT_FINITE).all()
+        assert (after[0] == before[0]).all() and np.isfinite(after[0]).all() and status[0] == spo.Status.OK
 
 
 @pytest.mark.parametrize("values, words", [

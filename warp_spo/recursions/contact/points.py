@@ -248,13 +248,19 @@ def _listed(impedance: Impedance, number: int) -> Surface:
 
 
 def ground_place(impedance: Impedance) -> Place:
-    """Return where the ground is, from the scene's values; NaN in a world that asks for a field which the set lacks."""
+    """Return where the ground is, from the scene's values.
+
+    It is nowhere, at a height that is NaN, in a world that asks for a field which the set lacks, and where the field is
+    moved aside by NaN, which no cell would show.
+    """
     ground, sets = impedance.scene.ground, impedance.scene.values["ground_field"].size
     origin = Vector(impedance.value("ground_origin", i) for i in range(3))
     field = impedance.value("ground_field", 0) if sets else 0.0
     if isinstance(ground, HeightField) and not is_constant(field):
         there = less(-0.5, field) * less(field, ground.count - 0.5)
         origin = Vector([*origin[:2], origin[2] + lost(reciprocal(there))])
+    if isinstance(ground, HeightField):
+        origin = Vector([*origin[:2], origin[2] + lost(origin[0]) + lost(origin[1])])
     return Place(origin, field, HEIGHTS in impedance.links.variable)
 
 
