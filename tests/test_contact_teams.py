@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 
 import numpy as np
 import pytest
@@ -169,6 +170,14 @@ def test_legs_share_one_text_and_the_points_of_the_trunk():
     assert 2 * len(text.cuda) < len(text.cpu)
     numbers = "contact 4, contact 6, contact 8, contact 10"
     assert numbers in text.cuda
+
+
+def test_passes_compute_no_velocity_terms():
+    """What comes before the passes leaves them, differences a - b that passes take as b - a, too."""
+    for name in ("quadruped", "crowded"):
+        cuda = known(name, True)[0].cuda
+        passes = cuda[cuda.index("turn < (int)passes_row[0]") :]
+        assert re.findall(r" w\d+ = (?!qd_row)", cuda) and not re.findall(r" w\d+ = (?!qd_row)", passes)
 
 
 @pytest.mark.slow

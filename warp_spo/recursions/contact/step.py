@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from ...status import Status
 from ...trace.emission import Store
-from ...trace.scalars import Value, branch, is_constant, less, reciprocal, select
+from ...trace.scalars import Value, as_subtracted, branch, is_constant, less, reciprocal, select
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from ..articulated_sweeps import Factors, expand, reduce
 from ..impedance import Law, add_laws
@@ -73,7 +73,7 @@ class ContactStep(Step):
             touches.append(self._touch(*first))
             candidates.append(first[1])
         self._gather(points, touches, candidates)
-        trace.ahead = [*bias.values(), *(value for point in points for value in point.state)]
+        trace.ahead = [*map(as_subtracted, bias.values()), *(value for point in points for value in point.state)]
         trace.ahead += [value for crowd in self.crowds.values() for value in (crowd.highest, crowd.reach)]
         self._press(points, touches)
         trace.stiffened = self._stiffened
