@@ -29,6 +29,7 @@ import warp as wp
 
 import warp_spo as spo
 from warp_spo.dynamics import dynamics
+from warp_spo.examples import grasp
 from warp_spo.execution.device_facts import DeviceFacts, read_facts
 from warp_spo.trials.operations import OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, Trial
@@ -41,7 +42,8 @@ sys.path.append(str(Path(__file__).parent.parent / "tests"))  # the random trees
 import zoo
 
 NAMES = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "step")
-SCENES = ("panda", "go2", "g1", *map(str, range(len(zoo.BRANCHED))))
+ARMS = ("hand", "hand_cube", "panda_cube")  # a Panda with fingers, the same beside a cube, without fingers beside one
+SCENES = ("panda", "go2", "g1", *ARMS, *map(str, range(len(zoo.BRANCHED))))
 WORLDS = (1, 256, 4096, 16384, 65536)
 NODE_WORLDS = 256  # largest number of worlds at which granularity "node", a launch for each level, is timed
 ALLOWED = 1.1  # largest time of the plan's choice, over the shortest
@@ -52,8 +54,14 @@ PLAN = "plan"  # where it has other kernels than each granularity by itself
 
 
 def scene_of(name: str) -> spo.Scene:
-    """Return a robot, or a random tree by its number, with drives."""
-    scene = zoo.branched(int(name)) if name.isdigit() else robots.scene(name)
+    """Return a robot, or a random tree by its number, with drives; nothing touches anything."""
+    if name in ARMS:
+        whole = grasp.scene()
+        left = {"hand": range(9), "hand_cube": range(10), "panda_cube": (*range(7), 9)}[name]
+        hinges = [dataclasses.replace(whole.hinges[at], child=k) for k, at in enumerate(left)]
+        scene = spo.Scene([whole.bodies[at] for at in left], hinges)
+    else:
+        scene = zoo.branched(int(name)) if name.isdigit() else robots.scene(name)
     driven = np.concatenate([np.full(hinge.dof_count, hinge.kind != "free") for hinge in scene.hinges])
     return scene.with_values(joint_target_ke=KE * driven, joint_target_kd=KD * driven)
 

@@ -531,6 +531,10 @@ def test_the_plan_takes_the_form_that_was_faster():
             chosen = plan.choose(scene, worlds, MEASURED, "float32")
             forms[name, worlds] = [chosen.of(routine) for routine in (PAIRED_STEP, CONTACT_STEP)]
     assert forms["arm", 4096] == forms["arm", 65536] == ["tree", "tree"]
+    arm = grasp.scene()
+    held = plan.choose(arm, 256, MEASURED, "float32")
+    assert held.granularity == "tree" and "most of its links are on one path" in held.reason
+    assert plan.choose(stack(), 256, MEASURED, "float32").granularity == "segment"
     assert forms["stack", 4096] == ["segment", "segment"] and forms["stack", 65536] == ["tree", "segment"]
 
 

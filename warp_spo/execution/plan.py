@@ -28,6 +28,9 @@ MOST_DOFS = 128  # straight-line code of more takes too long to compile
 SPILLS = {"float32": 32, "float64": 15}  # dofs at which one thread no longer holds a whole tree in registers,
 SOLVES = {"float32": 32, "float64": 20}  # and at which it does not without velocities
 ALIKE = {"float32": 0.5, "float64": 0.0}  # share of limbs that share code; below it a thread a world is faster then
+SERIAL = (
+    0.75  # share of the links on one path from a root, beyond which limbs save less than they cost: an arm's fingers
+)
 HELD = 16  # dofs of which a thread holds the variable values, too
 SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as through shared memory,
 LONG_ROWS = 24  # in segments; longer rows come in together already at fewer worlds
@@ -256,7 +259,8 @@ def choose(
     side_by_side = device.cuda and not shared and asked != "node" and 0 < scene.dof_count <= MOST_DOFS
     pieces = Pieces(Links(scene)) if side_by_side else None
     limbs, alike = (pieces.warps, pieces.alike >= ALIKE[dtype]) if pieces else (1, True)
-    rule = _chosen(scene.dof_count, limbs, alike, worlds, device, dtype, varies)
+    serial = pieces is not None and pieces.serial >= SERIAL
+    rule = _chosen(scene.dof_count, limbs, alike, serial, worlds, device, dtype, varies)
     chosen, reason = (asked, ASKED) if asked else rule
     if shared:
         reason = SHARED
@@ -334,8 +338,9 @@ def _depth(scene: Scene) -> int:
 
 
 def _chosen(
-    dofs: int, limbs: int, alike: bool, worlds: int, device: DeviceFacts, dtype: str, varies: bool
+    dofs: int, limbs: int, alike: bool, serial: bool, worlds: int, device: DeviceFacts, dtype: str, varies: bool
 ) -> tuple[str, str]:
+    held = min(HELD, SPILLS[dtype]) if varies else SPILLS[dtype]
     few_worlds = device.scaled(ALIKE_WORLDS if alike else FEW_WORLDS)
     if dofs == 0:
         return "node", "nothing moves"
@@ -347,9 +352,11 @@ def _chosen(
         return "tree", "the scene is one chain"
     if limbs > MOST_WARPS:
         return "tree", f"more than {MOST_WARPS} limbs"
+    if serial and dofs <= held:
+        return "tree", "most of its links are on one path, so that limbs side by side save no time"
     if worlds <= few_worlds:
         return "segment", f"up to {few_worlds} worlds, {limbs} limbs side by side take less time"
-    if dofs > (min(HELD, SPILLS[dtype]) if varies else SPILLS[dtype]):
+    if dofs > held:
         if not alike:
             return "tree", f"{limbs} limbs with code of their own each do not fit into the instruction cache"
         return "segment", f"{dofs} dof in {dtype} do not fit into one thread's registers"

@@ -160,6 +160,12 @@ class Pieces:
         twice = sum(piece.weight for piece, kind in zip(limbs, kinds, strict=True) if kinds.count(kind) > 1)
         return twice / sum(piece.weight for piece in limbs)
 
+    @property
+    def serial(self) -> float:
+        """Largest share of the links that is on one path from a root to a leaf: the time that limbs cannot save."""
+        paths = [sum(len(each.links) for each in (piece, *piece.ancestors)) for piece in self.pieces]
+        return max(paths) / sum(len(piece.links) for piece in self.pieces)
+
 
 def _parted(leaves: list[Piece]) -> list[int]:
     """Return the warp of each leaf: leaves of one kind share a part of the multiprocessor, which fetches its own code.
