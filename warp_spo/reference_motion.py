@@ -211,7 +211,7 @@ class Motion:
     # -- configurations that differ ---------------------------------------------------------------------------------
     @property
     def _deviation(self):
-        """How far each dof is from rest [dof], see :meth:`passive_force`."""
+        """Distance of each dof from rest [dof], see :meth:`passive_force`."""
         rest, deviation = self.value("joint_rest_q"), np.zeros(self.dof_count)
         for k, h in enumerate(self.scene.hinge_of):
             q, r = (array[self.scene.q_start[h] : self.scene.q_start[h + 1]] for array in (self.q, rest))

@@ -1,4 +1,4 @@
-"""What users call: :class:`Dynamics`."""
+"""The public class :class:`Dynamics` and its operations."""
 
 from .dynamics import Dynamics
 

@@ -325,17 +325,17 @@ class Dynamics:
 
     @functools.cached_property
     def _later_status(self) -> wp.array:
-        """Where a step writes the status of all substeps but the first [world]."""
+        """Array into which a step writes the status of all substeps but the first [world]."""
         return wp.empty(self.worlds, dtype=wp.int32, device=self.device)
 
     @functools.cached_property
     def _mask(self) -> wp.array:
-        """Where hybrid_dynamics spreads a mask that all worlds share [world, dof]."""
+        """Array into which hybrid_dynamics copies a mask that all worlds share [world, dof]."""
         return wp.empty((self.worlds, self.scene.dof_count), dtype=wp.bool, device=self.device)
 
     @functools.cached_property
     def _starts(self) -> dict[int, wp.array]:
-        """Where inverse_kinematics starts [seed, coordinate], by the number of seeds."""
+        """Starts of inverse_kinematics [seed, coordinate], by the number of seeds."""
         return {}
 
 

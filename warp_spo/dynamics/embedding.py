@@ -1,4 +1,4 @@
-"""What is found out about the loops of a scene once, on the host: which rows count, and which dofs are independent.
+"""Facts about the loops of a scene, found once on the host: which rows count, and which dofs are independent.
 
 Configurations are drawn at random and closed by damped least squares in float64; rank and independence are what the
 Jacobians of the closures say there. The draw is the same every time.
@@ -202,7 +202,7 @@ def _spanning(Y: np.ndarray) -> tuple[list[int], np.ndarray]:
 
 
 def _hold(X: np.ndarray, dofs: list[int]) -> np.ndarray:
-    """How well some dofs hold the others, by draw: nothing where they do not; whatever the units of a dof are."""
+    """Return how well some dofs determine the others [draw]: 0 where they do not. Units of dofs do not matter."""
     if not dofs:
         return np.ones(len(X))
     scale = _mobility(X)
@@ -212,13 +212,13 @@ def _hold(X: np.ndarray, dofs: list[int]) -> np.ndarray:
 
 
 def _mobility(X: np.ndarray) -> np.ndarray:
-    """How far each dof moves, over all draws [column]: zero where only rounding does, as in a truss."""
+    """Return how far each dof moves, over all draws [column]; zero where only rounding moves it, as in a truss."""
     size = np.sqrt((X**2).sum(axis=2).mean(axis=0))
     return np.where(size > RANK * size.max(initial=0.0), size, 0.0)
 
 
 def _independent(X: np.ndarray) -> list[int]:
-    """The first dofs that hold the others nearly as well as any: in the worst tenth of the draws."""
+    """Return the first dofs that determine the others nearly as well as any, in the worst tenth of the draws."""
     count = X.shape[2]
     measure = lambda dofs: float(np.quantile(_hold(X, list(dofs)), WORST))  # noqa: E731
     subsets = {tuple(_pivots(x, count)) for x in X}

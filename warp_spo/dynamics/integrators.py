@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 BODIES = {"poses": "world, body, 7", "velocities": "world, body, 6"}  # of the bodies after a step, and their axes
 MIDPOINT_ITERATIONS = 6  # after the first guess; each gains an order in dt of the velocity terms
 RK4 = ((0.0, 1.0 / 6.0), (0.5, 1.0 / 3.0), (0.5, 1.0 / 3.0), (1.0, 1.0 / 6.0))
-"""Where each stage starts, in dt along the stage before it, and its weight."""
+"""For each stage its start, in dt along the stage before it, and its weight."""
 
 
 def _divides(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:

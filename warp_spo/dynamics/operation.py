@@ -1,4 +1,4 @@
-"""How an operation of :class:`warp_spo.Dynamics` is declared: one object, from which everything else derives.
+"""The declaration of an operation of :class:`warp_spo.Dynamics`: one object, from which everything else derives.
 
 An :class:`Operation` stands right above the method that it declares::
 
@@ -234,7 +234,7 @@ class Derivative:
 # -- trials ------------------------------------------------------------------------------------------------------------
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """How trials compare an operation with the dense float64 reference, in one world.
+    """Comparison of an operation with the dense float64 reference, in one world.
 
     Attributes:
         dense: ``dense(reference, *arguments)``, the first result from :class:`warp_spo.reference.Dense`.

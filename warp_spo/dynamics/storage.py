@@ -1,4 +1,4 @@
-"""How a Dynamics pickles: as its arguments and the numbers of its variable values, which build it anew."""
+"""Pickling of a Dynamics: as its arguments and the numbers of its variable values, which build it anew."""
 
 from __future__ import annotations
 

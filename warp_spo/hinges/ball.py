@@ -97,7 +97,7 @@ class Ball(Kind):
         return [*linear, *(turn * w + cross(turn, u)), -sum((a * b for a, b in zip(turn, u, strict=True)), 0.0)]
 
     def _linear(self, link: Carrier, place: Placed, rates: list[Value]) -> list[Value]:
-        """How the coordinates before the quaternion change along tangent coordinates."""
+        """Return the changes of the coordinates before the quaternion along tangent coordinates."""
         return []
 
     def displacement(self, i: int, q: Entry, rest: Entry) -> Value:

@@ -185,7 +185,7 @@ class AbstractScalar:
 
 
 def _value(x: Any) -> Value:
-    """What is traced of an abstract scalar, or a number."""
+    """Return the traced value of an abstract scalar, or a number as it is."""
     if isinstance(x, AbstractScalar):
         return x.value
     if isinstance(x, int | float | np.integer | np.floating) or (isinstance(x, np.ndarray) and x.ndim == 0):

@@ -23,7 +23,7 @@ Twist = tuple[Vector, Vector]  # (omega; v), (n; f), or (omega'; v')
 
 
 class Carrier(Protocol):
-    """What a hinge sees of the link that it moves; see :class:`warp_spo.recursions.links.Link`."""
+    """The attributes of a link that its hinge reads; see :class:`warp_spo.recursions.links.Link`."""
 
     parent: Any
     matrix: Matrix | None

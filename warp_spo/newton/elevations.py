@@ -32,7 +32,7 @@ class Fields:
 
 
 class Elevations:
-    """Where the heights of a scene's fields lie among the elevations of a model.
+    """Places of the heights of a scene's fields among the elevations of a model.
 
     Args:
         model: The Newton model. rows: Index of the shape that is each field [field], each once.

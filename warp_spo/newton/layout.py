@@ -113,7 +113,7 @@ class Layout:
 
 @dataclasses.dataclass(frozen=True)
 class Layouts:
-    """How Newton's state is laid out: joint_q, joint_qd, body_q, body_qd (as body_f), and the joints' anchors."""
+    """Layouts of Newton's state: joint_q, joint_qd, body_q, body_qd (as body_f), and the joints' anchors."""
 
     q: Layout
     qd: Layout

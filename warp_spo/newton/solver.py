@@ -61,8 +61,8 @@ class SolverSPO(Plugs, SolverBase):
 
     A step writes ``joint_q``, ``joint_qd``, ``body_q`` and ``body_qd`` of its second state, which may be the first. It
     allocates nothing, reads nothing back and is bitwise repeatable, and a CUDA graph may capture any number of steps. A
-    NaN in one world stays in that world. Who reads no poses of bodies sets ``body_q`` and ``body_qd`` of the second
-    state to None, which saves a launch; ``body_f = None`` of the first saves reading forces.
+    NaN in one world stays in that world. If you read no poses of bodies, set ``body_q`` and ``body_qd`` of the second
+    state to None, which saves a launch. ``body_f = None`` of the first state saves reading forces.
 
     Shapes touch the ground by the solver's own contacts, see :class:`warp_spo.Contact` and ``contacts``: it needs no
     collision pipeline, and ``contacts`` of :meth:`step` may be None. The ground is the model's level plane or height

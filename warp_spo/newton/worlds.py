@@ -1,4 +1,4 @@
-"""Which rows of a Newton model's flat arrays belong to which world, and whether all worlds have the same topology."""
+"""Rows of a Newton model's flat arrays that belong to each world, and whether all worlds have the same topology."""
 
 from __future__ import annotations
 

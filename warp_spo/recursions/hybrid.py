@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Given(NamedTuple):
-    """What is known of a link's dofs: where ``mask`` is not 0 its qdd, elsewhere its tau."""
+    """The given entries of a link's dofs: qdd where ``mask`` is not 0, tau elsewhere."""
 
     mask: list[Value]
     tau: list[Value]

@@ -103,7 +103,7 @@ class Group:
 
 
 class Seat(NamedTuple):
-    """Where a body's node frame sits: fixed in a link, or in the inertial frame (link None)."""
+    """The place of a body's node frame: fixed in a link, or in the inertial frame (link None)."""
 
     link: Link | None
     matrix: Matrix

@@ -1,4 +1,4 @@
-"""What the pieces of a robot send each other, and where each message lies among those of an operation.
+"""Messages that the pieces of a robot send each other, and the place of each among those of an operation.
 
 Letters: inward P = phi P+ phi*, z and y = phi z+ or a force, f = a force, R = the composite inertia, B = how a sum
 changes with the parent's motion, G = how another one changes with what contact points know of the parent, O = with the

@@ -1,4 +1,4 @@
-"""How heavy hinges and points are at the neutral configuration of world 0, from which steps choose scales."""
+"""Effective masses of hinges and points at the neutral configuration of world 0, from which steps choose scales."""
 
 from __future__ import annotations
 

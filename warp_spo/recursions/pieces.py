@@ -46,7 +46,7 @@ class Piece:
 
     @property
     def coordinates(self) -> int:
-        """How many entries of q its links have."""
+        """Number of entries of q of its links."""
         return sum(link.hinge.coordinates for link in self.links)
 
     @property
@@ -148,7 +148,7 @@ class Pieces:
 
     @property
     def unlike(self) -> int:
-        """How many dofs are in pieces that are not alike, one of each kind counted; free hinges are left out."""
+        """Number of dofs in pieces that are not alike, one of each kind counted; free hinges are left out."""
         kinds = {tuple(link.hinge.name for link in piece.links): piece for piece in self.pieces}
         return sum(len(link.dofs) for piece in kinds.values() for link in piece.links if not link.hinge.unconstrained)
 

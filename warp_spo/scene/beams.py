@@ -113,7 +113,7 @@ def _relative(curves: Curves, terms: int) -> Curves:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BeamShapes(StoredPart):
-    """How sections of a beam and what is attached to them move with the modes.
+    """Motion of a beam's sections, and of bodies attached to them, with the modes.
 
     Calling it with a position at the undeformed beam (3,) [m], body axes, returns the slopes (6, n) of a frame there,
     rotation then displacement per unit amplitude, and its stiffening (3, n, n), or None: the displacement has the

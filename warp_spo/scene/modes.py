@@ -40,7 +40,7 @@ class Amplitudes(Kind):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MassPoints(StoredPart):
-    """Where the mass of a flexible body is, and how it is displaced.
+    """Places and displacements of the mass of a flexible body.
 
     Args:
         mass: of each point [kg], shape (s,), not negative.
@@ -273,7 +273,7 @@ def _refuse_ambiguous_names(scene: Any, body: int) -> None:
 
 
 class MeanMotion(NamedTuple):
-    """How a body moves on average in its modes.
+    """Average motion of a body in its modes.
 
     Attributes:
         center: centre of mass [m]. slopes: rotation and displacement there, (6, n).

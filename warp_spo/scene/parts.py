@@ -119,7 +119,7 @@ CLOSING = (
 )
 """Kinds of hinges that a loop can close with."""
 KINDS = (*CLOSING, *(name for name in BY_NAME if name not in CLOSING))
-"""What a hinge's kind may be, beside "custom": see :meth:`Hinge.custom`."""
+"""Kinds of hinges beside "custom", which :meth:`Hinge.custom` makes."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -63,7 +63,7 @@ def _solid(shape: Shape) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class PairChoice:
-    """Which shapes of a source touch each other.
+    """Pairs of shapes of a source that touch each other.
 
     Args:
         call: for errors.

@@ -83,7 +83,7 @@ class Shape:
 
 
 class Chosen(NamedTuple):
-    """What a :class:`Choice` makes of a source.
+    """Contacts and ground that a :class:`Choice` finds in a source.
 
     Attributes:
         taken: each chosen shape with its contacts. ground: what they touch, None: the plane at height zero.
@@ -98,7 +98,7 @@ class Chosen(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """Which shapes of a source touch which ground, as :func:`warp_spo.load` takes it.
+    """Choice of the shapes of a source that touch the ground, as :func:`warp_spo.load` takes it.
 
     Attributes:
         contacts: None: none. True, a pattern, several, or points by pattern.

@@ -1,4 +1,4 @@
-"""How scenes and their parts pickle: as they are, and their arrays are read-only again when they are loaded."""
+"""Pickling of scenes and their parts: as they are, and their arrays are read-only again when they are loaded."""
 
 from __future__ import annotations
 

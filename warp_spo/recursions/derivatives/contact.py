@@ -58,7 +58,7 @@ and lambda [world, dof]."""
 INERTIA = "inertia_cotangent"
 """The gradient by the packed articulated inertia that each piece of :attr:`.OnePass.weighed` carries [world, entry]."""
 HEIGHTS_AT = "heights_at"
-"""Where the heights lie in the table by which each surface has its gradient [world, surface]: those of a cell."""
+"""Columns of the heights of a cell in the table of gradients by surface [world, surface]."""
 ORIGIN = "ground_origin"
 OF_DOFS = ("q", "qd", "tau", "target_q", "target_qd", "joint_rest_q", *DOF_VALUES)
 BY_PIECES = (*OF_DOFS, "ctrl", *CONTACT_VALUES, HEIGHTS, ORIGIN, MIDDLE)
@@ -67,7 +67,7 @@ Twists = dict[int, tuple[Vector, Vector]]
 
 
 class PassAdjoint(OnePass):
-    """What both traces of the way back through a pass know.
+    """Base class of both traces of the backward pass through a pass of a step.
 
     Attributes:
         last: 1 in the last pass, else 0. qdd: what the pass found by dof, cut from its history. gains: h qdd.
@@ -118,7 +118,7 @@ class PassAdjoint(OnePass):
 
     @property
     def _packed(self) -> list[Value]:
-        """What the piece sends of its articulated inertia, with the dampers of its points on the link it moves on."""
+        """Message of the piece's articulated inertia, with the dampers of its points on the link that it moves on."""
         piece = self.trace.piece
         if self._carrier is None or piece is None:
             return []

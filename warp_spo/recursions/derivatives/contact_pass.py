@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ..tracing import Trace
 
 ROW, BEFORE = "row", "qdd_before"
-"""What the pass before left: variables [world, variable] and qdd [world, dof]."""
+"""Inputs that the pass before left: variables [world, variable] and qdd [world, dof]."""
 NUMBER = "number"
 """Input that counts the passes from zero; "passes" is how many there are."""
 OF_POINT = len(Touch._fields)  # variables of a surface

@@ -201,7 +201,7 @@ def mass_matrix_derivative(trace: Trace) -> list[Store]:
 
 
 def _column_changes(link: Link, place: Placed, heads: dict, dof: int) -> dict[int, tuple[Vector, Vector]]:
-    """How columns H* change as the link sees them when it moves by one of its own."""
+    """Changes of the columns H*, in the link's axes, when the link moves by one of its own dofs."""
     theta, d = heads[dof]
     changes = link.hinge.column_changes(place)
     found = {} if changes is None else dict(zip(link.dofs, changes[link.dofs.index(dof)], strict=True))

@@ -1,4 +1,4 @@
-"""What moving one coordinate does to the forces of all that its link carries: steps of the analytic derivatives.
+"""Changes of the forces on all that a link carries when one coordinate moves: steps of the analytic derivatives.
 
 Seen from the link, the bodies that it carries stay as they are, and the rest of the world moves: with the displacement
 (theta; d) of the link, what is fixed in the parent turns by -theta. So the carried bodies get, as one rigid body, a
@@ -19,7 +19,7 @@ from ..motion import NONE, Motion, carry_acceleration, hinge_motion, whirl
 
 
 class Sensitivity(NamedTuple):
-    """How all that a link carries moves otherwise, in the link's axes, per unit of a coordinate or a rate.
+    """Change of the motion of all that a link carries, in the link's axes, per unit of a coordinate or a rate.
 
     Attributes:
         turn, shift: theta and d, zero for a rate.
@@ -133,7 +133,7 @@ def under_load(moment_arm: Vector, force: Vector, torque: Vector) -> CarriedSums
 
 
 def to_parent(place: Placed, drifting: Vector, own: CarriedSums) -> CarriedSums:
-    """What a link carries, about its parent's origin and in its axes."""
+    """Inertia, momentum and force of all that a link carries, about its parent's origin and in its axes."""
     pose, l = place.pose, place.pose.l
     body = pose.rigid_to_parent(own.body)
     momentum = pose.to_parent(own.momentum)
