@@ -9,8 +9,9 @@ from collections.abc import Sequence
 
 from .slots import WARP_SIZE
 
-TILED = ("value", "node_value")
-"""Names of the tables of links: what links are made of; what bodies by themselves are, for the operators."""
+TILED = ("value", "node_value", "lost_value")
+"""Names of the tables of links: what links are made of; what bodies by themselves are, for the operators; whether some
+value is not finite."""
 
 
 def axes(name: str) -> int:

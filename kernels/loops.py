@@ -145,9 +145,17 @@ def solve_least_norm(T: type) -> wp.Kernel:
 def status_word(T) -> wp.Kernel:
     """Write the first word of NOT_FINITE, LOOPS, PIVOT that applies to a world; one thread for each world.
 
-    NOT_FINITE: an input is not finite. LOOPS: a margin [world, n] is NaN or not above ``least``. PIVOT: the result is
-    not finite for another reason.
+    NOT_FINITE: an input, or a value of bodies or hinges, is not finite. LOOPS: a margin [world, n] is NaN or not above
+    ``least``. PIVOT: the result is not finite for another reason.
     """
+
+    @wp.func
+    def all_finite(a: wp.array3d[T], world: int):
+        for i in range(a.shape[0]):
+            for c in range(a.shape[1]):
+                if not wp.isfinite(a[i, c, world]):
+                    return False
+        return True
 
     @wp.kernel(module=f"warp_spo_loops_{T.__name__}", enable_backward=False)
     def kernel(
@@ -155,17 +163,27 @@ def status_word(T) -> wp.Kernel:
         qd: wp.array2d[T],
         tau: wp.array2d[T],
         body_f: wp.array3d[T],
+        tree: wp.array3d[T],
+        com: wp.array3d[T],
+        rigid: wp.array3d[T],
+        armature: wp.array2d[T],
+        gravity: wp.array2d[T],
         qdd: wp.array2d[T],
         margin: wp.array2d[T],
         least: T,
         status_out: wp.array[wp.int32],
     ):
         world = wp.tid()
-        inputs_finite, finite, resolved = bool(True), bool(True), bool(True)
+        inputs_finite = all_finite(tree, world) and all_finite(com, world) and all_finite(rigid, world)
+        finite, resolved = bool(True), bool(True)
+        if gravity:
+            for c in range(3):
+                inputs_finite = inputs_finite and wp.isfinite(gravity[c, world])
         for i in range(q.shape[1]):
             inputs_finite = inputs_finite and wp.isfinite(q[world, i])
         for dof in range(qdd.shape[1]):
             finite = finite and wp.isfinite(qdd[world, dof])
+            inputs_finite = inputs_finite and wp.isfinite(armature[dof, world])
             if qd:
                 inputs_finite = inputs_finite and wp.isfinite(qd[world, dof])
             if tau:

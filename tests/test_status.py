@@ -3,9 +3,11 @@
 import importlib
 import pkgutil
 
+import mechanisms
 import numpy as np
 import pytest
 import zoo
+from mechanisms import MECHANISMS
 
 import warp_spo as spo
 from warp_spo import kernels
@@ -64,3 +66,49 @@ def test_the_most_severe_state_is_reported(granularity):
     tau[1, 0] = np.nan
     dyn.forward_dynamics(q, None, tau, status=status)
     assert [spo.Status(number) for number in status] == [spo.Status.PIVOT, spo.Status.NOT_FINITE, spo.Status.OK]
+
+
+VALUES = ("body_mass", "gravity", "joint_target_kd", "joint_limit_upper", "actuator_gain")
+
+
+def words_of_bad_values(scene, q, name, granularity, **options):
+    """Return the words of forward dynamics and of steps: a value is NaN in world 1, infinite in 2, fine in 0 and 3."""
+    dyn = spo.Dynamics(scene, 4, "cpu", variable=(name,), granularity=granularity, **options)
+    value = np.tile(scene.values[name][:1], (4,) + (1,) * (scene.values[name].ndim - 1))
+    value[1].flat[-1], value[2].flat[-1] = np.nan, np.inf
+    dyn.set(**{name: value})
+    q, rates = np.tile(q, (4, 1)), np.zeros((4, scene.dof_count))
+    found = np.full((3, 4), -1, np.int32)
+    dyn.forward_dynamics(q, rates, rates, status=found[0])
+    for word, count in zip(found[1:], (1, 3), strict=True):
+        dyn.step(q, rates, rates, 1e-3, substeps=count, ctrl=np.zeros((4, len(scene.actuators))), status=word)
+    return found
+
+
+def driven_fork():
+    """A fork with a motor at each hinge of one coordinate."""
+    scene = zoo.fork()
+    motors = [spo.Actuator(number) for number, hinge in enumerate(scene.hinges) if hinge.coord_count == 1]
+    return spo.Scene(scene.bodies, scene.hinges, actuators=motors)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("granularity", ["tree", "segment"])
+@pytest.mark.parametrize("name", VALUES)
+def test_values_that_are_not_finite_are_named(name, granularity):
+    """NOT_FINITE in their worlds alone; an infinite bound is none, and forward dynamics read bodies and hinges."""
+    scene = driven_fork()
+    forward, step, steps = words_of_bad_values(scene, scene.neutral_q, name, granularity)
+    worse = [0, 2, 0 if name == "joint_limit_upper" else 2, 0]
+    assert step.tolist() == steps.tolist() == worse
+    assert forward.tolist() == (worse if name in ("body_mass", "gravity") else [0, 0, 0, 0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loops", ["embed", "multipliers"])
+def test_a_mass_that_is_nan_is_named_in_closed_loops(loops):
+    """NOT_FINITE, not LOOPS or PIVOT, in forward dynamics and in steps."""
+    scene = MECHANISMS["fourbar"]()
+    (q,) = mechanisms.states(scene, 1).q
+    for words in words_of_bad_values(scene, q, "body_mass", None, loops=loops):
+        assert words[[0, 3]].max() <= 0 and words[[1, 2]].tolist() == [2, 2]

@@ -24,8 +24,7 @@ class Status(enum.IntEnum):
     PIVOT = 1
     """The mass matrix is not positive definite to working precision. A pivot of its factorisation is not positive."""
     NOT_FINITE = 2
-    """An input, or a value of the scene, is NaN or infinite in this dtype. A step tells values that are NaN from PIVOT
-    only where they are those of contacts."""
+    """An input, or a value of the scene, is NaN or infinite in this dtype. Infinite limits and bounds are none."""
     DIGITS = 3
     """The result may keep fewer than half of the dtype's digits, by an estimate from above."""
     RANGE = 4
@@ -72,8 +71,7 @@ _ADVICE = {
     Status.OK: "Nothing needs to be done.",
     Status.PIVOT: (
         "Give the joint armature or its body inertia: a massless leaf, three hinges at a gimbal lock and a point mass "
-        "on a ball joint have no positive pivot. Use one ball joint in place of three hinges. After a step also look "
-        "for a NaN in the values passed to Dynamics.set."
+        "on a ball joint have no positive pivot. Use one ball joint in place of three hinges."
     ),
     Status.NOT_FINITE: (
         "Look for the NaN or the infinity in this world's q, qd, tau, body_f and in the values passed to Dynamics.set, "

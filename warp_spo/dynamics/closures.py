@@ -18,6 +18,7 @@ import warp as wp
 from .. import launches
 from ..arrays import Call
 from ..errors import UnsupportedError
+from ..execution import status_words
 from ..execution.routine import Routine
 from ..kernels import declare
 from ..kernels import loops as kernels
@@ -113,8 +114,7 @@ class Closures:
             dyn._engine.launch_routine(FORWARD_DYNAMICS, out, more, **options, **given)
             least = 4.0 * kernels.EPSILON[dyn.dtype]
         if status is not None:
-            read = [q, qd, tau, body_f, out, margin, dyn.dtype(least)]
-            dyn.recursions.launch(kernels.status_word, dyn.worlds, read, [status])
+            status_words.write_of_rank(dyn.recursions, q, qd, tau, body_f, out, margin, least, status)
 
     # -- projection ------------------------------------------------------------------------------------------------
     def project(

@@ -244,7 +244,7 @@ def step(
         status: int32 [world], written with one :class:`warp_spo.Status` for each world, of the semi-implicit step, the
             worst that applies in any substep:
 
-            * 2, NOT_FINITE: an input is NaN or infinite.
+            * 2, NOT_FINITE: an input, or a value of the scene, is NaN or infinite; infinite limits and bounds are none.
             * 1, PIVOT: the result is not finite though the inputs are, as 1 and 4 in :meth:`forward_dynamics`. A
               massless hinge without armature moves to where its forces cancel; it is NaN where no law can hold it, and
               where its mass or armature is variable or differs between worlds.

@@ -29,9 +29,7 @@ def write(
     are not estimated: a world is NOT_FINITE, PIVOT or OK.
     """
     if run.scene.shares_dofs:
-        declare(loops, run.dtype)
-        margin, least = run.array("no margin", run.worlds, 0), run.dtype(0.0)
-        run.launch(loops.status_word, run.worlds, [q, qd, tau, body_f, qdd, margin, least], [status])
+        write_of_rank(run, q, qd, tau, body_f, qdd, run.array("no margin", run.worlds, 0), 0.0, status)
         return
     declare(kernels, run.functions)
     if not factored:
@@ -49,3 +47,17 @@ def write(
         launches.launch(kernel, (count, run.worlds), arguments, [rounding, lost], device=run.device)
     values = [p.tree, p.com, p.rigid, armature, p.gravity]
     run.launch_nodes(kernels.status_word, run.worlds, [q, qd, tau, body_f, *values, lost, qdd], [status])
+
+
+def write_of_rank(
+    run: Sweeps, q: wp.array, qd: wp.array | None, tau: wp.array | None, body_f: wp.array | None, qdd: wp.array,
+    margin: wp.array, least: float, status: wp.array,
+) -> None:  # fmt: skip
+    """Write ``status`` [world] after forward dynamics whose digits are not estimated, by one launch over the worlds.
+
+    LOOPS where a ``margin`` [world, n] of the closures is not above ``least``.
+    """
+    declare(loops, run.dtype)
+    p = run.parameters
+    values = [p.tree, p.com, p.rigid, p.field("joint_armature"), p.gravity]
+    run.launch(loops.status_word, run.worlds, [q, qd, tau, body_f, *values, qdd, margin, run.dtype(least)], [status])

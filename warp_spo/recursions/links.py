@@ -18,10 +18,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..hinges.kind import Placed as Placed
+from ..scene.actuators import ACTUATOR_VALUES, RANGES
 from ..scene.modes import Amplitudes
+from ..scene.parts import DOF_VALUES
 from ..scene.scene import Scene
-from ..trace.scalars import Graph, Scalar, Value, is_constant
-from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
+from ..trace.scalars import Graph, Scalar, Value, is_constant, less, lost, select
+from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric, total
 from . import flexible, rotors
 from .flexible import Flexible
 from .link import Group as Group
@@ -35,7 +37,9 @@ if TYPE_CHECKING:
 
 MOTION_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c", "joint_armature", "gravity")
 LINK_VALUES = (*MOTION_VALUES, "body_gravcomp")
-TABLES = ("value", "node_value")  # what links are made of; what bodies by themselves are, for the operators
+TABLES = ("value", "node_value", "lost_value")
+"""What links are made of; what bodies are by themselves, for the operators; see :meth:`Links.lost_values`."""
+BOUNDS = (*RANGES, "joint_limit_lower", "joint_limit_upper", "joint_effort_limit", "joint_velocity_limit")
 NOTHING = Rigid(0.0, ZERO, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 PRICES = (6, 10, 10, 10, 4, 4, 4, 8, 8, 8)  # of mass, first moment, moments and products of inertia
 POINT = 1e-15  # share of a body's largest moment about its CoM below which another one is zero
@@ -163,14 +167,30 @@ class Links:
         return mass if is_constant(mass) else None
 
     # -- values ----------------------------------------------------------------------------------------------------
-    def _symbols(self, name: str, all_vary: bool) -> np.ndarray:
-        """One world's value: numbers, or objects where some are inputs."""
+    def lost_values(self) -> list[Value]:
+        """Return an input that is 0, or NaN in worlds where a value of the scene is not finite; [] if all values fold.
+
+        Of ranges and bounds NaN alone counts, because infinity is no bound. Values of contacts are not among them.
+        """
+        slots = self.tables["lost_value"]
+        if not slots:
+            graph, found = Graph(), []
+            for name in dict.fromkeys((*LINK_VALUES, *DOF_VALUES, "joint_rest_q", *ACTUATOR_VALUES)):
+                symbols = self._symbols(name, name in self.variable, graph).flat
+                vary = [x for x in symbols if not is_constant(x)]
+                found += [_lost_bound(x) if name in BOUNDS else lost(x) for x in vary]
+            slots |= {total(found): 0} if found else {}
+        return [self.graph.input("lost_value", 0)] if slots else []
+
+    def _symbols(self, name: str, all_vary: bool, graph: Graph | None = None) -> np.ndarray:
+        """One world's value: numbers, or objects where some are inputs of a graph, left out: of this one."""
+        graph = graph or self.graph
         values = self.scene.values[name]
         vary = np.flatnonzero((values != values[:1]).any(axis=0) | all_vary)
         if not vary.size:
             return values[0]
         symbols = values[0].astype(object)
-        symbols.flat[vary] = [self.graph.input(name, int(entry)) for entry in vary]
+        symbols.flat[vary] = [graph.input(name, int(entry)) for entry in vary]
         return symbols
 
     def _node(self, node: int) -> Node:
@@ -341,6 +361,11 @@ def place_link(link: Link, q: Any) -> Placed:
 def _price(inertia: Rigid) -> int:
     """Operations, roughly, in which the numbers of an inertia that are not zero take part."""
     return sum(price for x, price in zip(inertia.packed, PRICES, strict=True) if not is_constant(x) or x != 0.0)
+
+
+def _lost_bound(x: Value) -> Value:
+    """Return 0, or NaN where ``x`` is NaN."""
+    return select(less(x, 0.0) + less(0.0, x), 0.0, lost(x))
 
 
 def _changed(values: Any, change: Callable[[Value], Value]) -> Any:

@@ -240,7 +240,8 @@ class Step:
         settled = less(self.trace.graph.input(MISSED, 0), 0.5) if looped else 1.0
         word = select(self._open(), Status.OPEN, select(settled, 0.0, Status.NOT_SETTLED))
         word = select(all_finite(results), word, Status.PIVOT)
-        return select(all_finite(self._inputs()), select(self._unresolved(), Status.LOOPS, word), Status.NOT_FINITE)
+        known = self._inputs() + self.trace.links.lost_values()
+        return select(all_finite(known), select(self._unresolved(), Status.LOOPS, word), Status.NOT_FINITE)
 
     def _words(self, own: Piece, results: list[Value]) -> list[Store]:
         """Return the stores that send a piece's status to the first piece, which stores the most severe of all."""
@@ -252,7 +253,10 @@ class Step:
             for piece in Pieces(trace.links).pieces:
                 (word,) = trace.receive("S", piece)
                 worst = select(less(worst, word), word, worst)
-            trace.rounds = [[Store("status", (), self._verdict(worst))]]
+            word = self._verdict(worst)
+            values = trace.links.lost_values()  # here, because texts of pieces of equal structure are equal
+            word = select(all_finite(values), word, Status.NOT_FINITE) if values else word
+            trace.rounds = [[Store("status", (), word)]]
         return trace.send("S", own, [finite])
 
     def add_bodies(self) -> None:
