@@ -54,7 +54,8 @@ def test_sites_are_frames_by_name_and_bear_poses(device):
     pose, half = (0.3, 0.1, -0.2, 0.0, 0.0, 0.6, 0.8), np.sqrt(0.5)
     bodies = [spo.Body(1.0, inertia=np.eye(3), label=label) for label in ("thigh", "robot/shin")]
     hinges = [spo.Hinge("revolute", k - 1, k, axis=np.eye(3)[k]) for k in range(2)]
-    sites = {"tool": (1, POSE), "thigh": (1, POSE), "shin": (0, POSE), "turned": (1, (1, 2, 3, 0, 0, half, half))}
+    sites = {"tool": (1, POSE), "thigh": (1, POSE), "shin": (0, POSE), "turned": (1, (1, 2, 3, 0, 0, half, half)),
+             "door": (-1, POSE)}  # fmt: skip
     dyn = spo.Dynamics(spo.Scene(bodies, hinges, sites=sites), 1, device=device, dtype="float64")
     q = np.array([[0.4, -0.7]])
     np.testing.assert_array_equal(dyn.jacobian(q, ["tool"]), dyn.jacobian(q, [(1, POSE)]))
@@ -71,6 +72,8 @@ def test_sites_are_frames_by_name_and_bear_poses(device):
     np.testing.assert_array_equal(dyn.jacobian(q, [sites["thigh"]]), dyn.jacobian(q, ["tool"]))
     with explained(ValueError, "no body and no site 'toool'", "scene.sites", "such as 'tool'"):
         dyn.jacobian(q, ["toool"])
+    with explained(ValueError, "site 'door' is on no body", "inertial frame", "scene.sites['door'] has its pose"):
+        dyn.jacobian(q, ["door"])
 
 
 BAD_FRAMES = {

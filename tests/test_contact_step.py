@@ -397,3 +397,7 @@ def test_scenes_without_a_kernel_have_names(device, monkeypatch):
     for name, value in (("passes", 3), ("contact_gap", np.zeros((1, 0), np.float32))):
         with pytest.raises(ValueError, match=f"{name} is given, and the scene has no contacts"):
             bare.step(q, qd, None, H, **{name: value})
+    post = spo.Scene([spo.Body(1.0)], [spo.Hinge("fixed", -1, 0)], contacts=[spo.Contact(0, point=(0, 0, 0))])
+    none, gap = np.zeros((1, 0), np.float32), np.full((1, 1), np.nan, np.float32)
+    with pytest.raises(spo.UnsupportedError, match="contact_gap of a scene in which nothing can move"):
+        spo.Dynamics(post, device=device).step(none, none, None, H, contact_gap=gap)

@@ -46,6 +46,10 @@ def check_step(dyn: Dynamics, call: Call, integrator: str, passes: Any, asked: d
     if count is None or count < 1:
         raise ValueError(f"{call.name}: passes is {passes!r}; expected an integer, 1 or more")
     refuse(dyn, call, integrator)
+    reports = [name for name, value in asked.items() if value is not None]
+    if reports and dyn.scene.dof_count == 0:
+        what = f"{' and '.join(reports)} of a scene in which nothing can move"
+        raise UnsupportedError(call.name, what, "leave it out")
     return count
 
 

@@ -62,6 +62,11 @@ def _named(scene: Scene, call: str, name: str) -> tuple[int, tuple[float, ...]]:
                 f"{call}: {name!r} is a body and a site; expected a name that stands for one of them; pass the body's "
                 f"index, {matches[0]}, or scene.sites[{name!r}]"
             )
+        if scene.sites[name][0] < 0:
+            raise ValueError(
+                f"{call}: site {name!r} is on no body: it stands still in the inertial frame; expected a site of a body; "
+                f"scene.sites[{name!r}] has its pose"
+            )
         return scene.sites[name]
     if not matches:
         near = difflib.get_close_matches(name, [*ends, *scene.sites], 3)
