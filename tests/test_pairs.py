@@ -546,6 +546,12 @@ def test_calls_without_a_kernel_have_names(device):
         spo.Dynamics(many, 2, device=device, granularity="segment").step(
             *np.float32([states]), *np.float32([rates]), None, H
         )
+    still = spo.Contact(2, sphere=0.1, other=spo.Contact(-1, sphere=0.1))  # neither of the two can move
+    fixed = shelf(2).with_contacts([*shelf(2).contacts, still])
+    assert pair_pieces.by_limbs(shelf(2)) and not pair_pieces.by_limbs(fixed)
+    with pytest.raises(spo.UnsupportedError, match="granularity='segment' where pairs of bodies are not all on limbs"):
+        at = np.float32(shelf_states(0, 2)[0])
+        spo.Dynamics(fixed, 2, device=device, granularity="segment").step(at, np.zeros_like(at[:, 2:]), None, H)
     alone = spo.Dynamics(scene.with_contacts(scene.contacts[:1]), device=device)
     with pytest.raises(ValueError, match="contact_residual is given, and no bodies of the scene touch each other"):
         alone.step(q, qd, None, H, contact_residual=np.zeros(1, np.float32))

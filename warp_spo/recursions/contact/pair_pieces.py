@@ -68,8 +68,9 @@ def seats_of(links: Links, pieces: Pieces) -> Seats | None:
             return None
         found.append(piece)
     bases = {piece.parent.index: piece.parent for piece in found if piece.parent is not None}
-    if len(bases) > 1 or len(couples_of(links)) > MOST:
-        return None
+    couples = couples_of(links)
+    if len(bases) > 1 or len(couples) > MOST or any(max(bodies) < 0 for bodies, _ in couples):
+        return None  # a couple of two bodies that stand still has no limb
     base = next(iter(bases.values()), None)
     if base is not None and base.links[-1].group is not None:
         return None
