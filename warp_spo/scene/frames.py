@@ -64,8 +64,8 @@ def _named(scene: Scene, call: str, name: str) -> tuple[int, tuple[float, ...]]:
             )
         if scene.sites[name][0] < 0:
             raise ValueError(
-                f"{call}: site {name!r} is on no body: it stands still in the inertial frame; expected a site of a body; "
-                f"scene.sites[{name!r}] has its pose"
+                f"{call}: site {name!r} is on no body: it stands still in the inertial frame; expected a site of a "
+                f"body; scene.sites[{name!r}] has its pose"
             )
         return scene.sites[name]
     if not matches:
