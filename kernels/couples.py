@@ -32,6 +32,7 @@ class Couples(NamedTuple):
             -1. points, eps, weight: of each pair: points at most, speed below which friction is a damper, inverse
             weight that predicts slip.
         solids: their shapes, with ``lists`` and ``reals``. looks: points are found however far shapes are apart.
+        reports: what the points do after the last pass is asked for.
     """
 
     pairs: tuple[tuple[int, ...], ...]
@@ -41,6 +42,7 @@ class Couples(NamedTuple):
     weight: tuple[float, ...]
     solids: Any
     looks: bool
+    reports: bool
 
 
 def declare(couples: Couples, T: type) -> str:
@@ -65,7 +67,7 @@ def declare(couples: Couples, T: type) -> str:
     tables += [table(c, f"{name}_of", [f"{x!r}{number}" for x in row], few) for name, row in reals.items()]
     sizes = {
         "PAIRS": pairs, "COUPLES": count, "HEADER": HEADER, "POINT": POINT, "LAST": LAST, "FIELDS": FIELDS,
-        "PLACES": PLACES, "LOOKS": int(couples.looks),
+        "PLACES": PLACES, "LOOKS": int(couples.looks), "REPORTS": int(couples.reports),
     }  # fmt: skip
     shapes = coupling_points.NATIVE[: coupling_points.NATIVE.index("    // Finds the points of a pair")]
     laws = coupling_points.NATIVE[coupling_points.NATIVE.index("    // Begins the damper of a point") :]
@@ -135,10 +137,7 @@ struct couples
             both[side].radius = radius_of(which);
             both[side].box = box_of(which);
         }
-        solids::touch(both[0], both[1], touches + entry_of(pair) + HEADER, 1, points_of(pair));
-        int count = 0;
-        while (count < points_of(pair) && !Touch(touches, 1, pair, count).missing()) ++count;
-        return count;
+        return solids::touch(both[0], both[1], touches + entry_of(pair) + HEADER, 1, points_of(pair));
     }
 
     // Most that the shapes can be in each other, and how far from the origin a point of one of them can be.
@@ -261,6 +260,7 @@ struct couples
         const REAL* twists, REAL h, REAL* touches, REAL* across, REAL* bounds, int* counts, int* closed,
         int* candidate, REAL* dampers, REAL* coupled, REAL* report)
     {
+        if (stage == AT_LAST && !REPORTS) return;
         REAL* excess = report + FIELDS * PAIRS;
         const Pair origin = {{{0, 0, 0}, {0, 0, 0}}, {0, 0}, 0};
         UNROLL
@@ -326,6 +326,7 @@ struct couples
                             UNROLL
                             for (int c = 0; c < 3; ++c)
                                 force[c] += touch.normal[c] * (now.push + before * speed) - before * v[c];
+                            continue;
                         }
                     }
                     across[at] = a;
@@ -341,14 +342,16 @@ struct couples
                 }
                 closed[pair] = shut_points;
                 candidate[pair] = near_points;
-                add_pair(sides, more, push, normal, K);
-                if (stage != AT_LAST) continue;
+                if (stage != AT_LAST) {
+                    add_pair(sides, more, push, normal, K);
+                    continue;
+                }
                 UNROLL
                 for (int c = 0; c < 3; ++c) report[FIELDS * pair + c] = force[c];
                 report[FIELDS * pair + 3] = count ? -deepest : INFINITY;
                 report[FIELDS * pair + 4] = along;
             }
-            if (quiet) continue;  // and it was before
+            if (quiet || stage == AT_LAST) continue;  // quiet, and it was before
             leave(K, starts + 6 * p, h, dampers + LAST * p);
             coupled[p] = acts;
         }

@@ -352,8 +352,8 @@ struct solids
         }
     }
 
-    // Puts the points of two shapes, and then those that are not there, up to ``most``.
-    static CUDA_CALLABLE inline void touch(const Solid& a, const Solid& b, REAL* to, long long apart, int most)
+    // Puts the points of two shapes, and then those that are not there, up to ``most``; returns how many are there.
+    static CUDA_CALLABLE inline int touch(const Solid& a, const Solid& b, REAL* to, long long apart, int most)
     {
         Out out = {to, apart, 0};
         if (a.box && b.box) faces(a, b, out);
@@ -361,6 +361,7 @@ struct solids
         else if (b.box) ball_in_box(a, b, false, out);
         else rounds(a, b, out);
         for (int i = out.count; i < most; ++i) to[(POINT * i + 6) * apart] = AWAY;
+        return out.count;
     }
 };
 """

@@ -114,8 +114,6 @@ RULES = {
     "guarded": lambda x, y: g.guarded(x * x + 2.0, y * y) * y,
     "lost": lambda x, y: x.graph.make("lost", x) + x * y,
     "select": lambda x, y: g.select(x, x * y, y) + g.select(x.graph.make("lost", x), x, y * y),
-    "branch": lambda x, y: g.branch(x, x * y, y, "a") + g.branch(x.graph.make("lost", x), x, y * y, "b"),
-    "fork": lambda x, y: g.branch(x, x * y, y, "a", "fork") + g.branch(x.graph.make("lost", x), x, y * y, "b", "fork"),
     "less": lambda x, y: g.less(x, y) + x * y,
     "floor": lambda x, y: g.floor(x) + x * y,
     "inverse_root": lambda x, y: g.inverse_root(1.0 + x * x + y * y),
@@ -124,7 +122,9 @@ RULES = {
     "logarithm": lambda x, y: g.logarithm(x * x + y * y),
     "power": lambda x, y: g.power(x * x + 0.5, 1.7) + g.power(y * y, x),
     "sum_of_logarithms": lambda x, y: g.sum_of_logarithms([x * x, x * x + y * y]),
-}
+    **{op: lambda x, y, op=op: g.branch(x, x * y, y, "a", op) + g.branch(x.graph.make("lost", x), x, y * y, "b", op)
+       for op in g.BRANCHES},
+}  # fmt: skip
 
 
 def test_every_operation_has_a_rule():

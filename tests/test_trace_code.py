@@ -72,6 +72,29 @@ def test_products_fused_with_sums(dtype, tolerance, device):
         np.testing.assert_allclose(got[:, at], want, rtol=4 * tolerance, atol=4 * tolerance, err_msg=str(values[at]))
 
 
+@pytest.mark.parametrize("op", g.BRANCHES)
+def test_branches_skip_what_one_side_needs(op, device):
+    """Values of both sides, one used on both, one that is a side of another branch; masks of either kind, and NaN."""
+    graph = g.Graph()
+    x, y, mask = (graph.input("x", i) for i in range(3))
+    both, one, other = x * y, x * 3.0, y * 5.0
+    sides = (both + one, both - other), (one, other * x)
+    values = [*(g.branch(mask, *each, "a", op) for each in sides), both]
+    sides = values[0] * 2.0, x + 1.0
+    values.append(g.branch(x - 1.0, *sides, "b", op))
+    rows = np.random.default_rng(5).uniform(0.5, 2.0, (33, 3))
+    rows[::2, 2], rows[3::8, 2], rows[::3, 0] = 0.0, math.nan, 1.0
+    wanted = evaluate(values, lambda _, index: rows[:, index[0]])
+    np.testing.assert_allclose(compiled(values, rows, "float64", device), np.transpose(wanted), rtol=4e-15)
+    alone = Emitter("float64", lambda array, entry: f"x[{entry}]", lambda array, entry, value: f"out = {value};",
+                    lambda array, index: index[0])  # fmt: skip
+    text = render(alone.region([Store("out", (0,), value) for value in values[:2]]), "float64")
+    before, _, sides = text.partition("!= 0) {\n")
+    taken, _, otherwise = sides.partition("}")
+    assert ("3.0" not in before and "3.0" in taken) and ("5.0" in before) == (op != "either")
+    assert ("5.0" in otherwise) == (op == "either")
+
+
 def test_regions_of_one_scope_reduce_angles_apart():
     """Names that both declare would not compile on CUDA."""
     emitter = Emitter("float32", lambda array, entry: f"{array}[{entry}]", lambda _, entry, value: f"{value};",

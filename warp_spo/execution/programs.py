@@ -262,7 +262,7 @@ class Programs:
                 declared = coupling.declare(couples, self.run.dtype)
                 before = [f"{declared}\n{first}\n{coupling.BEGIN}", "\n".join([read, coupling.PASS, *rest])]
             if aggregates:
-                found = self._aggregated(links, options)
+                found = self._aggregated(links, options, coupled.REPORT in body)
                 entries |= couple_points.arrays(found)
                 first, a_pass = before
                 declared = couple_points.declare(found, self.run.dtype)
@@ -466,7 +466,7 @@ class Programs:
         )
 
     @staticmethod
-    def _aggregated(links: Links, options: dict) -> couple_points.Couples:
+    def _aggregated(links: Links, options: dict, reports: bool) -> couple_points.Couples:
         """Return the pairs of bodies of a scene as aggregates couple them, as their native code needs them."""
         scene, couples = links.scene, couples_of(links)
         signs = dict(one for couple in couples for one in zip(couple.pairs, couple.signs, strict=True))
@@ -474,7 +474,7 @@ class Programs:
         looks = bool({"contact_gap", "contact_slip"} & set(options.get("reports", ())))
         return couple_points.Couples(
             tuple(couple.pairs for couple in couples), tuple(signs[i] for i in range(len(points))), points, eps,
-            tuple(pairs.inverse_weights(scene)), pairs.solids_of(links)[0], looks,
+            tuple(pairs.inverse_weights(scene)), pairs.solids_of(links)[0], looks, reports,
         )  # fmt: skip
 
     @staticmethod

@@ -16,18 +16,19 @@ def branch_of(scalar: Scalar) -> tuple:
     return mask.key, name
 
 
-def find_blocks(needed: list[Scalar], used: Container[tuple]) -> dict[tuple, list[Scalar]]:
-    """Return, by branch, the scalars that only the values of this branch need, in their order.
+def find_blocks(needed: list[Scalar], used: Container[tuple]) -> dict[tuple, tuple[list[Scalar], list[Scalar]]]:
+    """Return, by branch, the scalars that only the values of this branch need, and only the others, in their order.
 
     What a kernel reads stays outside, because statements before the branch may write over it.
 
     Args:
         needed: the scalars of a region. used: the keys of those that are stored, used later, or known.
     """
-    blocks: dict[tuple, list[Scalar]] = {branch_of(x): [] for x in needed if x.op in BRANCHES}
+    blocks: dict[tuple, tuple[list[Scalar], list[Scalar]]]
+    blocks = {branch_of(x): ([], []) for x in needed if x.op in BRANCHES}
     if not blocks:
         return blocks
-    owners: dict[tuple, set] = {}  # the branches in which each scalar is used; None: outside of all
+    owners: dict[tuple, set] = {}  # the sides of branches on which each scalar is used; None: outside of all
     for scalar in sorted(needed, key=in_order, reverse=True):
         at = owners.get(scalar.key, {None})
         own = next(iter(at)) if len(at) == 1 else None
@@ -35,9 +36,10 @@ def find_blocks(needed: list[Scalar], used: Container[tuple]) -> dict[tuple, lis
         if scalar.key in used or turns or scalar.op in ("input", *BRANCHES):
             own = None
         if own is not None:
-            blocks[own].append(scalar)
+            blocks[own[0]][own[1]].append(scalar)
         for place, value in enumerate(scalar.args):
             if value.__class__ is Scalar:
-                takes = branch_of(scalar) if scalar.op in BRANCHES and place == 1 else own
+                sides = 2 if scalar.op == "either" else 1 if scalar.op in BRANCHES else 0
+                takes = (branch_of(scalar), place - 1) if 1 <= place <= sides else own
                 owners.setdefault(value.key, set()).add(takes)
-    return {key: block[::-1] for key, block in blocks.items()}
+    return {key: (one[::-1], other[::-1]) for key, (one, other) in blocks.items()}

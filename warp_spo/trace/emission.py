@@ -179,7 +179,7 @@ class Emitter:
             self._chains, inner = choose_chains(needed, stored, self._products, fused)
             fused |= inner
         blocks = find_blocks(needed, {value.key for value in values} | self._names.keys())
-        inside = {scalar.key for block in blocks.values() for scalar in block}
+        inside = {scalar.key for sides in blocks.values() for block in sides for scalar in block}
         for scalar in sorted(needed, key=in_order):
             if scalar.key in inside:
                 self.counts[scalar.op] += 1
@@ -190,9 +190,9 @@ class Emitter:
                 self._labels.append(where)
                 lines.append(f"// {LABEL}{len(self._labels) - 1}\x04")
             if scalar.op in BRANCHES:
-                block = blocks.pop(branch_of(scalar), None)
-                if block is not None:
-                    self._emit_branch(scalar, needed, block, fused, due)
+                sides = blocks.pop(branch_of(scalar), None)
+                if sides is not None:
+                    self._emit_branch(scalar, needed, sides, fused, due)
             elif scalar.key not in self._names:
                 lines += self._statement(scalar, step) if scalar.key not in fused else []
                 self.counts[scalar.op] += 1
@@ -203,9 +203,14 @@ class Emitter:
         return Listing("\n".join(lines), self._constants, self._indices, self._labels)
 
     def _emit_branch(
-        self, first: Scalar, needed: list[Scalar], block: list[Scalar], fused: set[tuple], due: dict[tuple, list[Store]]
+        self,
+        first: Scalar,
+        needed: list[Scalar],
+        sides: tuple[list[Scalar], list[Scalar]],
+        fused: set[tuple],
+        due: dict[tuple, list[Store]],
     ) -> None:
-        """Emit the statements ``block`` inside a branch, and all values of the branch of ``first``, its first value.
+        """Emit the statements of both ``sides`` of a branch, and all values of the branch of ``first``, the first one.
 
         A value that replaces an entry, or leaves it, is stored inside the branch, and is no longer ``due``.
         """
@@ -216,23 +221,25 @@ class Emitter:
         for scalar in results:
             self.counts[scalar.op] += 1
             if scalar.key in taken or scalar.key not in inside:
-                otherwise = self._text(scalar.args[2])
-                lines.append(f"{T} {self._name(scalar, scalar.step.rpartition('|')[2])} = {otherwise};")
+                start = "" if first.op == "either" else f" = {self._text(scalar.args[2])}"
+                lines.append(f"{T} {self._name(scalar, scalar.step.rpartition('|')[2])}{start};")
         names = dict(self._names)
         condition = f"if ({mask} != 0) {{"
-        always = self._branches or first.op == "fork"
+        always = self._branches or first.op != "branch"
         lines += [condition] if always else ["#if defined(__CUDA_ARCH__)", "{", "#else", condition, "#endif"]
-        for scalar in block:
-            if scalar.key not in fused and scalar.key not in self._names:  # a sine comes with its cosine
-                lines += self._statement(scalar, scalar.step.rpartition("|")[2])
-        for scalar in results:
-            value = self._text(scalar.args[1])
-            if scalar.key in names:
-                lines.append(f"{names[scalar.key]} = {value};")
-            if scalar.key in inside:
-                self._emit_store(inside[scalar.key]._replace(value=scalar.args[1]))
+        for side, block in enumerate(sides[: 2 if first.op == "either" else 1]):
+            lines += ["} else {"] if side else []
+            for scalar in block:
+                if scalar.key not in fused and scalar.key not in self._names:  # a sine comes with its cosine
+                    lines += self._statement(scalar, scalar.step.rpartition("|")[2])
+            for scalar in results:
+                value = scalar.args[1 + side]
+                if scalar.key in names:
+                    lines.append(f"{names[scalar.key]} = {self._text(value)};")
+                if scalar.key in inside and side == 0:
+                    self._emit_store(inside[scalar.key]._replace(value=value))
+            self._names = dict(names)
         lines.append("}")
-        self._names = names
 
     def _find_needed(self, values: list[Scalar]) -> list[Scalar]:
         """Return the scalars without a name on which ``values`` depend, other than through scalars with a name."""

@@ -19,7 +19,7 @@ FUNCTIONS = {
     "inverse_root": lambda x: 1.0 / math.sqrt(x) if x > 0.0 else math.nan,
 }
 
-BRANCHES = ("branch", "fork")  # operations of :func:`branch`
+BRANCHES = ("branch", "fork", "either")  # operations of :func:`branch`
 
 Value = Any  # a Scalar, or a float, which is a constant
 
@@ -242,7 +242,8 @@ def branch(mask: Value, x: Value, y: Value, name: str, op: str = "branch") -> Va
     ``name`` share one branch; they must be made one after the other, when all that they choose from is there.
 
     Args:
-        op: one of BRANCHES: "branch" where a kernel for GPUs may compute ``x`` always, "fork" where it skips, too.
+        op: one of BRANCHES: "branch" where a kernel for GPUs may compute ``x`` always, "fork" where it skips, too,
+            "either" where code also skips what only ``y`` needs, where the mask is not zero.
     """
     if is_constant(mask):
         return x if mask else y

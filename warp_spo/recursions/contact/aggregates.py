@@ -72,7 +72,7 @@ class Node:
         """Return the values where a couple acts, else others or zeros."""
         others = [0.0] * len(values) if otherwise is None else otherwise
         name = f"{name} of {self.aggregate.links[0].label}"
-        return [branch(self.mask, value, other, name) for value, other in zip(values, others, strict=True)]
+        return [branch(self.mask, value, other, name, "either") for value, other in zip(values, others, strict=True)]
 
     # -- inward ----------------------------------------------------------------------------------------------------
     def close(

@@ -86,8 +86,8 @@ def gather(
 ) -> dict[int, Crowd]:
     """Return the crowds by id of the link; none where code skips points one by one, as on a CPU those of walls.
 
-    A GPU skips them only where limbs share the work. With a thread a world, and with pairs of bodies, the one body with
-    so many points is often the one on the ground, and branches cost a few per cent.
+    A GPU skips them where limbs share the work, and where aggregates couple pairs of bodies. With a thread a world
+    otherwise, the one body with so many points is often the one on the ground, and branches cost a few per cent.
 
     Args:
         candidates: whether the first pass closes each point.
@@ -97,8 +97,6 @@ def gather(
         if point.link is not None:
             on.setdefault(id(point.link), []).append(at)
     found: dict[int, Crowd] = {}
-    if trace.links.scene.contact_pairs:
-        return found
     op = "branch" if trace.piece is None else "fork"
     for key, places in on.items():
         some = [points[at] for at in places]

@@ -107,6 +107,8 @@ def team(links: Links, pieces: Pieces, alpha: int, first: int) -> Team:
 class PairedPiece(ContactStep):
     """The part of one piece in a step with pairs; arguments as those of ContactStep."""
 
+    looks = False
+
     def __init__(self, trace: Trace, reports: tuple[str, ...]):
         super().__init__(trace, reports)
         links, self.plan = trace.links, trace.team

@@ -168,6 +168,8 @@ class PairedStep(ground.ContactStep):
         first: stores before the first pass of what the coupling reads.
     """
 
+    looks = False
+
     def stores(self, qdd: bool, status: bool) -> list[Store]:
         """Return the stores of a pass, among them those that the coupling reads, then those after the last pass."""
         self.members = members(self.trace.links)

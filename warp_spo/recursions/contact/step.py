@@ -48,7 +48,12 @@ class ContactStep(Step):
 
     Args:
         trace: the evaluation. reports: names among REPORTS of what the step stores beside the state.
+
+    Attributes:
+        looks: whether many points of a link cost a look where they are far from the ground, see :mod:`.crowds`.
     """
+
+    looks = True
 
     def __init__(self, trace: Trace, reports: tuple[str, ...]):
         super().__init__(trace)
@@ -201,7 +206,7 @@ class ContactStep(Step):
     # -- contacts --------------------------------------------------------------------------------------------------
     def _gather(self, points: list[Point], touches: list[Touch], candidates: list[Value]) -> None:
         """Make crowds of points of one link."""
-        self.crowds = gather(self.trace, self.kept, points, touches, candidates)
+        self.crowds = gather(self.trace, self.kept, points, touches, candidates) if self.looks else {}
 
     def _begin(self, point: Point) -> Touch:
         """Return the variables of a point."""
