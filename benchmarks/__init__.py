@@ -1,1 +1,24 @@
-"""Benchmarks: error and run time of every operation on a handful of robots. ``python -m benchmarks --help``."""
+"""Benchmarks: error and run time of every operation on a handful of robots. ``python -m benchmarks --help``.
+
+Each file that is a command says so in its first lines; CONTRIBUTING.md has the usual calls.
+
+The table of results:
+    ``cases``, ``precisions``, ``robots``, ``shapes`` and ``arms`` are the scenes and operations; ``runner`` checks and
+    times them, with ``resources``, ``roofline`` and ``operation_counts``; ``rows``, ``parts`` and ``everything`` run
+    all of it on one machine, ``peers/`` what other libraries compute; ``table``, ``pictures``, ``report`` and
+    ``evidence`` make pages of the rows; ``commits``, ``probe`` and ``history`` compare commits.
+One question each, on a GPU:
+    ``speed`` (times beside limits), ``breakdown`` (launches of a call), ``plans`` and ``crowding`` (the plan's choice),
+    ``depth`` (scans), ``variable`` (values that are read), ``substeps``, ``step_parts`` (SolverSPO's step),
+    ``actuators``, ``flexible``, ``capabilities`` (other solvers), ``host_time``, ``jax_check``, ``many_gpus``.
+Accuracy, mostly on a CPU:
+    ``stress/``, ``stability`` (robots under gravity), ``frames`` (where frames lie), ``gradients`` (rollouts),
+    ``robot_files`` and ``mjcf_files`` (readers), ``inverse_kinematics``, ``flexible_peers`` and ``boom`` (beams).
+Contact:
+    ``contacts`` (times and errors), ``contact_motions`` and ``contact_courses`` (every promised figure),
+    ``contact_throws`` (energy), ``contact_gradients``, ``contact_mujoco`` and ``contact_peers`` (other engines).
+Learning:
+    ``training`` (env-steps/s), ``learning_curves``.
+Documentation and refactoring:
+    ``blocks`` (code of pages), ``site``, ``site_pictures``, ``gallery``, ``terrain``; ``kernel_texts`` (generated).
+"""

@@ -20,8 +20,8 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.trials import drawing
 
-from .exact import Sweep
-from .stress_scenes import far_origin
+from .stress.exact import Sweep
+from .stress.scenes import far_origin
 
 DISTANCES = (0.1, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5)  # of the root from the world's origin [m]
 LENGTH = 0.1  # of a link [m]

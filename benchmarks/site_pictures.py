@@ -13,7 +13,7 @@ import numpy as np
 from warp_spo.trials import drawing
 
 from .blocks import ROOT, STATIC
-from .stress_cases import ALLOWED
+from .stress.cases import ALLOWED
 
 FILES = ROOT / "docs" / "robot_files.md"
 READERS = {"urdf": ("Pinocchio", "o", None), "mjcf": ("MuJoCo", "s", "MuJoCo C")}

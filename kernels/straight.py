@@ -267,8 +267,8 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
         cpu,
     ]
     if result.way in BY_TABLE:
-        text += [f"result_row[{result.slots}] = 0;", f"{c}* row = out.data + world * {out.entries};"]
-        text += [f"for (int i = 0; i < {out.entries}; ++i) row[i] = result_row[place.data[i]];"]
+        text += [f"result_row[{result.slots}] = 0;", f"{c}* own = out.data + world * {out.entries};"]
+        text += [f"for (int i = 0; i < {out.entries}; ++i) own[i] = result_row[place.data[i]];"]
     text += ["#endif", "#undef SENT", "#undef RELAY", *(["#undef FIELD"] if layout.fields else []), ""]
     return "\n".join(text)
 

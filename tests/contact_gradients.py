@@ -7,7 +7,8 @@ which a difference across a switch is known and left out.
 import numpy as np
 
 from warp_spo.recursions.contact import step as contact
-from warp_spo.recursions.contact.ground import CORNERS, GROUND, by_cell, corner_steps, surface_count
+from warp_spo.recursions.contact.ground import CORNERS, GROUND, by_cell, corner_steps
+from warp_spo.recursions.contact.points import surface_numbers
 from warp_spo.recursions.contact.secants import SECANT
 from warp_spo.recursions.derivatives import contact as back
 from warp_spo.recursions.derivatives import contact_pass as one
@@ -97,7 +98,7 @@ def gradient(scene, a, h, passes, cotangents, wrt, ran=None):
     known = a | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
     known |= dict(zip(("q_cotangent", "qd_cotangent"), cotangents, strict=True))
     known[GROUND] = cells_of(known)
-    surfaces = len(scene.contact_points) * surface_count(scene.ground, varies=HEIGHTS in a)
+    surfaces = sum(map(len, surface_numbers(scene, varies=HEIGHTS in a)))
     shapes = {name: a[name].shape[1:] for name in wrt} | ({HEIGHTS: (surfaces, CORNERS)} if HEIGHTS in wrt else {})
 
     def run(kernel, **found):

@@ -39,6 +39,31 @@ def test_heights_add_up(device):
     assert np.flatnonzero(np.isnan(out.numpy())).tolist() == (cells[3] + np.array(steps))[2:3].tolist()
 
 
+def test_points_with_and_without_walls_have_gradients(device):
+    """A point that sees slopes has one surface, others have two; their numbers must not be mixed up."""
+    contacts = [spo.Contact(0, point=(0.05, 0.0, z), stiffness=1e4, walls=walls, friction=0.0)
+                for z, walls in ((0.0, False), (-1e-3, True), (-2e-3, False))]  # fmt: skip
+    heights = np.array([[0.0, 0.01], [0.2, 0.2]])
+    slide = spo.Hinge("prismatic", -1, 0, axis=(0.6, 0, 0.8))
+    scene = spo.Scene([spo.Body(1.0)], [slide], contacts=contacts, ground=spo.HeightField(heights, 0.1))
+    dyn = spo.Dynamics(scene, 2, device, "float64", variable=("ground_heights",))
+    kind = dict(dtype=torch.float64, device=str(device).replace("cuda:0", "cuda"))
+    q, qd = torch.tensor([[0.02], [0.05]], **kind), torch.tensor([[0.1], [-0.2]], **kind)
+
+    def end(heights):
+        dyn.set(ground_heights=heights)
+        return dyn.step(q, qd, None, H)[1].sum()
+
+    given = torch.tensor(heights, **kind, requires_grad=True)
+    end(given).backward()
+    assert (given.grad != 0.0).any()
+    for at in np.ndindex(2, 2):
+        nudge = torch.zeros_like(given)
+        nudge[at] = 1e-7
+        wanted = (end(given.detach() + nudge) - end(given.detach() - nudge)) / 2e-7
+        assert abs(given.grad[at] - wanted) <= 1e-6 * abs(given.grad).max()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2])
 def test_torch_differentiates_heights(count, device):
@@ -48,6 +73,8 @@ def test_torch_differentiates_heights(count, device):
     heights = heights[0] if count == 1 else heights
     scene = box(ground=spo.HeightField(heights, field.cell, field.origin), friction=0.3)
     if count == 2:
+        ball = spo.Contact(0, sphere=0.1, walls=False)
+        scene = scene.with_contacts([ball, *scene.contacts], scene.ground)
         scene = scene.with_values(ground_field=np.arange(8)[:, None] % 2)
     a = above(scene, 1, 8)
     dyn = spo.Dynamics(scene, 8, device, "float64", variable=("ground_heights",))

@@ -170,6 +170,14 @@ def test_the_reference_imports_numpy_alone():
         assert {room for _, room in rooms_imported(PACKAGE / name)} <= own_of.get(name, set())
 
 
+def test_the_map_of_the_benchmarks_names_every_file():
+    folder = REPOSITORY / "benchmarks"
+    names = {path.stem for path in folder.glob("*.py")} - {"__init__", "__main__"}
+    text = (folder / "__init__.py").read_text()
+    missing = sorted(name for name in names if f"``{name}``" not in text)
+    assert not missing, f"benchmarks/__init__.py says nothing of {missing}"
+
+
 def test_import_is_light():
     heavy = {"torch", "jax", "newton", "mujoco", "matplotlib"}
     script = f"import sys, warp_spo.examples.parts; print(sorted({heavy} & set(sys.modules)))"

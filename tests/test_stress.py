@@ -6,10 +6,10 @@ import warp as wp
 from granularities import GRANULARITIES, SLOW, skip_unless_served
 
 import warp_spo as spo
-from benchmarks import stress, stress_checks, stress_measure, stress_scenes
-from benchmarks.exact import Sweep
-from benchmarks.stress_cases import ALLOWED, CASES, CAUSES, choose
-from benchmarks.stress_scenes import Setting
+from benchmarks.stress import checks, measure, scenes, suite
+from benchmarks.stress.cases import ALLOWED, CASES, CAUSES, choose
+from benchmarks.stress.exact import Sweep
+from benchmarks.stress.scenes import Setting
 from warp_spo import reference
 from warp_spo.kernels import status as status_kernels
 
@@ -39,7 +39,7 @@ def served(reads_pivots):
 )
 def test_error_obeys_its_law(case, precision, granularity, device):
     skip_unless_served(case.problem.scene, granularity)
-    row = stress_measure.row(case, stress_measure.Subject(case.problem, device, granularity), precision)
+    row = measure.row(case, measure.Subject(case.problem, device, granularity), precision)
     assert not row["misjudged"], f"{row['misjudged']} of {row['flagged']} words {row['status']} do not fit the law"
     assert row["ratio"] <= ALLOWED, f"error {row['max_error']:.1e}, law {row['law']:.1e} ({row['source']})"
 
@@ -48,30 +48,30 @@ def test_error_obeys_its_law(case, precision, granularity, device):
     "name, dtype, granularity",
     [
         marked(name, name, dtype, granularity, name == "stiff_arm")  # 10 000 steps
-        for name in stress_checks.CHECKS
+        for name in checks.CHECKS
         for dtype in ("float32", "float64")
-        for granularity in served(name in stress_checks.READS_PIVOTS)
+        for granularity in served(name in checks.READS_PIVOTS)
     ],
 )
 def test_check(name, dtype, granularity, device):
-    skip_unless_served(stress_scenes.floating_chain(1).scene, granularity)
-    stress_checks.CHECKS[name][0](Setting(device, dtype, granularity))
+    skip_unless_served(scenes.floating_chain(1).scene, granularity)
+    checks.CHECKS[name][0](Setting(device, dtype, granularity))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("granularity", GRANULARITIES)
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("name", stress_checks.LONG)
+@pytest.mark.parametrize("name", checks.LONG)
 def test_long_check(name, dtype, granularity, device):
     if name == "stiff_arm_million_steps" and not device.is_cuda:
         pytest.skip("a million steps need a graph: run with --device cuda:0; the check stiff_arm does 10 000")
-    stress_checks.LONG[name][0](Setting(device, dtype, granularity))
+    checks.LONG[name][0](Setting(device, dtype, granularity))
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("bodies, fits", [(7, True), (31, False)])
 def test_limbs_that_tell_each_other_more_than_shared_memory_holds_run_as_a_tree(bodies, fits, dtype, device):
-    p = stress_scenes.binary_tree(bodies)
+    p = scenes.binary_tree(bodies)
     dyn = spo.Dynamics(p.scene, p.worlds, device, dtype, granularity="segment")
     qdd = dyn.forward_dynamics(p.q, p.qd, p.tau)
     wanted = spo.Dynamics(p.scene, p.worlds, "cpu", "float64", granularity="node").forward_dynamics(p.q, p.qd, p.tau)
@@ -92,9 +92,9 @@ def test_digits_lost_are_estimated_from_above_and_not_far(dtype, device):
         dyn = spo.Dynamics(p.scene, p.worlds, device, dtype, granularity="node")
         dyn.forward_dynamics(p.q, p.qd, p.tau, status=status)
         pivot, lost = (dyn.recursions.array(name).numpy().T for name in ("pivot", "lost"))
-        sweep = stress_measure.exact(case)[0]
+        sweep = measure.exact(case)[0]
         error = np.abs(((sweep.arithmetic.number(pivot) - sweep.D) / sweep.D).astype(np.float64))
-        share = error / (lost * stress_measure.EPS[dtype])
+        share = error / (lost * measure.EPS[dtype])
         assert share.max() <= 1.5, f"{case.id}: the error is {share.max():.1f} times the estimate"
         shares.append(share.max())
     assert min(shares) >= 0.01 and np.median(shares) >= 0.1, f"the estimate is far off: {np.array(shares)}"
@@ -102,7 +102,7 @@ def test_digits_lost_are_estimated_from_above_and_not_far(dtype, device):
 
 def test_a_word_costs_nothing_where_it_is_not_asked_for(device, monkeypatch):
     """Not asked for: no launch more, and none of its kernels is made. Asked for: one a level, and one."""
-    p = stress_scenes.floating_chain(2)
+    p = scenes.floating_chain(2)
     counts, made = [], []
     launch, factories = wp.launch, {name: getattr(status_kernels, name) for name in ("lost_digits", "status_word")}
     monkeypatch.setattr(wp, "launch", lambda *args, **kw: (counts.append(0), launch(*args, **kw))[1])
@@ -124,7 +124,7 @@ def test_a_word_costs_nothing_where_it_is_not_asked_for(device, monkeypatch):
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_the_worst_word_wins(dtype, device):
     """One world has each pair of causes: 2 before 1 before 4 before 3."""
-    eps = stress_measure.EPS[dtype]
+    eps = measure.EPS[dtype]
     low = {"float32": -124, "float64": -1020}[dtype]
     light = [np.diag([1.0, 1.0, eps**0.75]), np.eye(3) * 2.0**low, np.zeros((3, 3)), np.full((3, 3), np.nan)]
     words = [3, 4, 1, 2]
@@ -156,10 +156,10 @@ def test_sweep_is_the_dense_reference(name):
 def test_extended_precision_is_good_enough(name):
     """Against 50 digits, its error is a hundredth of what float64 leaves."""
     case = next(case for case in CASES if case.id == name)
-    p, wanted = case.problem, stress_measure.exact(case)[1]
-    error = stress_measure.distance(case, Sweep(p.scene, p.q, "float64").forward(p.tau)).max()
+    p, wanted = case.problem, measure.exact(case)[1]
+    error = measure.distance(case, Sweep(p.scene, p.q, "float64").forward(p.tau)).max()
     extended = Sweep(p.scene, p.q, "extended").forward(p.tau)
-    difference = (stress_measure.exact(case)[0].arithmetic.number(extended) - wanted).astype(np.float64)
+    difference = (measure.exact(case)[0].arithmetic.number(extended) - wanted).astype(np.float64)
     assert np.linalg.norm(difference) / np.linalg.norm(wanted.astype(np.float64)) <= 1e-2 * error
 
 
@@ -171,18 +171,18 @@ def test_forms_that_the_library_does_not_offer_are_worse(device):
         ("S16.far_base.x100", "world origin", 100.0),
     ):
         (case,) = (case for case in CASES if case.id == name)
-        ours = stress_measure.row(case, stress_measure.Subject(case.problem, device), "float32")
-        theirs = {row["precision"]: row for row in stress_measure.contrasts(case)}[form]
+        ours = measure.row(case, measure.Subject(case.problem, device), "float32")
+        theirs = {row["precision"]: row for row in measure.contrasts(case)}[form]
         assert theirs["max_error"] >= factor * ours["max_error"], f"{name}: {form} {theirs['max_error']:.1e}"
 
 
 def test_table_and_json(tmp_path, capsys, device):
-    assert stress.main(["S12.*r0.01", "--device", str(device), "--json", str(tmp_path / "run.json")]) == 0
+    assert suite.main(["S12.*r0.01", "--device", str(device), "--json", str(tmp_path / "run.json")]) == 0
     out = capsys.readouterr().out
     assert "S12.light_tip r=0.01" in out and "refined" in out and "ok" in out
     assert (tmp_path / "run.json").is_file()
-    assert stress.main(["no such case"]) == 2 and stress.main(["("]) == 2
-    assert stress.main(["S12", "--granularity", "atom"]) == 2 and "'atom'" in capsys.readouterr().err
+    assert suite.main(["no such case"]) == 2 and suite.main(["("]) == 2
+    assert suite.main(["S12", "--granularity", "atom"]) == 2 and "'atom'" in capsys.readouterr().err
 
 
 def test_choose():

@@ -114,6 +114,25 @@ def test_refused_in_words_and_nothing_is_set(case):
     np.testing.assert_array_equal(dyn.recursions.parameters.value("body_mass").numpy(), before)
 
 
+def test_numbers_below_zero_are_refused_in_worlds_that_change():
+    """Of NumPy arrays and lists; the worlds that a mask leaves alone may hold anything."""
+    ball = spo.Scene(
+        [spo.Body(1.0, inertia=np.eye(3))], [spo.Hinge("free", -1, 0)], contacts=[spo.Contact(0, point=(0, 0, 0))]
+    )
+    names = ("contact_friction", "contact_stiffness", "contact_damping", "body_mass")
+    dyn = spo.Dynamics(ball, WORLDS, device="cpu", variable=names)
+    held = dyn.recursions.parameters.value
+    for name in names:
+        value = np.where(MASK, 2.0, -1.0)[:, None]
+        dyn.set(worlds=MASK, **{name: value})
+        assert (held(name).numpy()[MASK] == 2.0).all() and (held(name).numpy() >= 0.0).all()
+        for bad in (dict(worlds=MASK, **{name: -value}), {name: value}, {name: [-1.0]}):
+            with pytest.raises(ValueError, match=f"Dynamics.set: {name} holds -[12].0; expected zero or more"):
+                dyn.set(**bad)
+        dyn.set(worlds=MASK, **{name: np.where(MASK, 2.0, -1.0).astype(np.float32)[:, None]})
+        assert (held(name).numpy()[MASK] == 2.0).all()
+
+
 def test_a_tensor_with_gradient_is_not_overwritten_in_some_worlds():
     """Its gradient would be that of worlds that no longer have its value."""
     dyn = spo.Dynamics(scene(), WORLDS, device="cpu", dtype="float64", variable=("body_mass",))

@@ -14,7 +14,8 @@ import warp as wp
 
 from ..execution.heights import HeightSums
 from ..execution.routine import Routine
-from ..recursions.contact.ground import CORNERS, corner_steps, surface_count
+from ..recursions.contact.ground import CORNERS, corner_steps
+from ..recursions.contact.points import surface_numbers
 from ..recursions.contact.step import PASSES
 from ..recursions.derivatives import contact
 from ..recursions.derivatives.adjoints import result_name
@@ -101,9 +102,9 @@ def _launch(dyn: Dynamics, asked: dict[str, wp.array], count: int, **given: Any)
         more = {f"{COTANGENT}_out": left[number]} | ({f"{INERTIA}_out": inertias[number]} if weighed else {})
         launch(solve, solved[number], more, **known[number], **read)
     results = dict(asked)
-    ground, surfaces = dyn.scene.ground, len(dyn.scene.contact_points)
+    ground, surfaces = dyn.scene.ground, 0
     if HEIGHTS in results:
-        surfaces *= surface_count(ground, varies=True)
+        surfaces = sum(map(len, surface_numbers(dyn.scene, varies=True)))
         results[HEIGHTS] = dyn.recursions.array("heights by surface", dyn.worlds, surfaces, CORNERS)
         results[HEIGHTS_AT] = dyn.recursions.array("cells by surface", dyn.worlds, surfaces)
     bars = {result_name(name, wrt): array for name, array in results.items() if name != wrt[0]}

@@ -15,6 +15,7 @@ from ..execution.rows import as_rows, copy_rows
 from ..gradients import records_gradient
 from ..scene.actuators import check_actuator_value
 from ..scene.parts import real
+from ..scene.scene import refuse_negative
 from . import actuators
 from .refinement import Refinement
 
@@ -28,8 +29,9 @@ def set_values(self: Dynamics, *, worlds: AnyArray | None = None, **values: Any)
     All worlds share "ground_heights", which has no world axis.
 
     Names in ``variable`` are copied by launches, one for all names and one or two for what kernels derive from them,
-    which a graph may capture; their numbers are not inspected, but for delays in NumPy arrays. Any other name rebuilds
-    the kernels' data that was derived from it, with a warning, and is checked as a scene's values are.
+    which a graph may capture. Their numbers are not inspected, but for those of NumPy arrays that may not be negative,
+    and delays. Any other name rebuilds the kernels' data that was derived from it, with a warning, and is checked as a
+    scene's values are.
 
     Args:
         worlds: bool [world]; only worlds where it is True change. None: all change.
@@ -37,9 +39,9 @@ def set_values(self: Dynamics, *, worlds: AnyArray | None = None, **values: Any)
             buffers of :meth:`actuator_state`; controls with another one are NaN.
 
     Raises:
-        ValueError: unknown name, wrong shape, dtype or device; a NumPy array of delays that are negative or not whole;
-            a name that is not variable inside a graph capture or
-            with ``worlds``; a tensor that requires grad, now or in an earlier call, with ``worlds``.
+        ValueError: unknown name, wrong shape, dtype or device; a NumPy array with a number below zero where none may
+            be, or with a delay that is not whole; a name that is not variable inside a graph capture or with
+            ``worlds``; a tensor that requires grad, now or in an earlier call, with ``worlds``.
     """
     folded: dict[str, Any] = {}
     settle((worlds, *values.values()))
@@ -64,8 +66,7 @@ def set_values(self: Dynamics, *, worlds: AnyArray | None = None, **values: Any)
             )
             array = call.read(name, plain, shape, meaning)
             if name in self.variable:
-                if name == "actuator_delay" and isinstance(value, np.ndarray):
-                    check_actuator_value("Dynamics.set", name, value)
+                _inspect(name, value, worlds, self.scene.values[name].ndim)
                 variable[name] = array
             else:
                 folded[name] = value if isinstance(value, np.ndarray) else array
@@ -155,6 +156,25 @@ def read_mask(call: Call, name: str, mask: Any, worlds: int) -> wp.array:
     if not hasattr(mask, "shape"):
         mask = np.asarray(mask)
     return call.read(name, mask, (worlds,), "[world]", dtype=wp.bool)
+
+
+def _inspect(name: str, value: Any, worlds: Any, axes: int) -> None:
+    """Raise ValueError where a NumPy array holds what a variable value cannot be, in the worlds that change.
+
+    Nothing is read back from a device: with a mask there, values that differ between worlds are not inspected.
+
+    Args:
+        value: as the caller gave it. worlds: mask of worlds, or None. axes: of the value with that of worlds.
+    """
+    if not isinstance(value, np.ndarray):
+        return
+    if worlds is not None and value.ndim == axes:
+        if hasattr(worlds, "shape") and not isinstance(worlds, np.ndarray):
+            return
+        value = value[np.asarray(worlds)]
+    if name == "actuator_delay":
+        check_actuator_value("Dynamics.set", name, value)
+    refuse_negative("Dynamics.set", name, value[np.isfinite(value)])  # status= names others, in their worlds
 
 
 def _refuse_with_mask(dyn: Dynamics, values: dict[str, Any], folded: dict[str, Any]) -> None:

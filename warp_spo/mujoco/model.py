@@ -78,8 +78,9 @@ def scene_of(source: Source, floating: bool | None, choice: Choice = NONE) -> Sc
         raise
     except ValueError as error:  # of a body, a hinge or the scene, which know neither call nor file
         raise ValueError(f"{source.title}: {error}; correct the model") from None
+    choice, disabled = choice.unless(source.disabled("CONTACT") or source.disabled("CONSTRAINT"))
     scene, lost = choice.applied(source.title, scene, lambda: collision_shapes(source, moving_bodies(scene)))
-    source.left_out += lost
+    source.left_out += disabled + lost
     _warn(source, choice.contacts is not None)
     return scene
 

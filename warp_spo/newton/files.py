@@ -72,12 +72,13 @@ def load(
             MuJoCo refuses an MJCF file that has such. False keeps the file's numbers; where they make the mass matrix
             singular, results are NaN and ``status=`` says so.
         contacts: Which collision shapes touch the ground in :meth:`Dynamics.step`: None, none; True, those of all
-            bodies that can move; a pattern such as ``"*foot*"``, or a list of patterns, those whose name, or that of
-            their body or mesh, matches (``fnmatch``, in any case; a name also by what follows its last slash); or
-            {pattern: points}. The scene's ``contacts`` hold the result. A sphere and the ends of a capsule touch with
-            their lowest point, a box with its corners. A mesh, a cylinder, a cone and an ellipsoid touch with
-            ``points`` of their surface. Friction is the file's: MuJoCo's of the two geoms, Bullet's
-            ``lateral_friction``, Gazebo's ``mu1``, a USD material's; 0.8 where a file has none.
+            bodies that can move, or none, with a warning, where an MJCF file's options disable contacts; a pattern such
+            as ``"*foot*"``, or a list of patterns, those whose name, or that of their body or mesh, matches
+            (``fnmatch``, in any case; a name also by what follows its last slash); or {pattern: points}. The scene's
+            ``contacts`` hold the result. A sphere and the ends of a capsule touch with their lowest point, a box with
+            its corners. A mesh, a cylinder, a cone and an ellipsoid touch with ``points`` of their surface. Friction is
+            the file's: MuJoCo's of the two geoms, Bullet's ``lateral_friction``, Gazebo's ``mu1``, a USD material's;
+            0.8 where a file has none.
         ground: What they touch. None: the file's plane or height field, or else the plane at height zero.
         points: Of a shape that is the hull of points, at most.
 

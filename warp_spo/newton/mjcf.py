@@ -70,6 +70,11 @@ def mjcf_gravity(root: ET.Element) -> list[float] | None:
     return [float(g) for g in options[-1].get("gravity", "").split()] if options else None
 
 
+def mjcf_disables_contacts(root: ET.Element) -> bool:
+    """Whether the options of the MJCF tree disable contacts, or all constraints."""
+    return any(root.find(f"option/flag[@{flag}='disable']") is not None for flag in ("contact", "constraint"))
+
+
 def mjcf_source(file: Path, root: ET.Element) -> str:
     """Return the source for an MJCF importer: the path of the file, or text in which "main" is a class like others.
 
@@ -147,6 +152,9 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool, choice: Choice = 
     if gravity is not None:
         builder.gravity = gravity
     lost = [what for what in left_out(root) if choice.contacts is None or "ground plane" not in what]
+    choice, disabled = choice.unless(mjcf_disables_contacts(root))
+    if disabled:
+        warnings.warn(f"load: {str(file)!r}: left out: {disabled[0]}", UserWarning, stacklevel=3)
     if lost:
         warnings.warn(
             f"load: {str(file)!r}: {', '.join(lost)} left out; install the package mujoco, with which load reads "

@@ -63,9 +63,9 @@ NOT_NEGATIVE = (
 )
 
 
-def _refuse_negative(call: str, name: str, array: np.ndarray) -> None:
+def refuse_negative(call: str, name: str, array: np.ndarray) -> None:
     """Raise ValueError if a value that may not be negative is."""
-    if name in NOT_NEGATIVE and array.size and array.min() < 0.0:
+    if name in NOT_NEGATIVE and (array < 0.0).any():
         raise ValueError(f"{call}: {name} holds {array.min()}; expected zero or more")
 
 
@@ -169,7 +169,7 @@ class Scene(Stored):
         for name in DOF_VALUES:
             field = name.removeprefix("joint_")
             values[name] = np.concatenate([getattr(hinge, field) for hinge in self.hinges])[None]
-            _refuse_negative("Scene", name, values[name])
+            refuse_negative("Scene", name, values[name])
         values["joint_armature"] = values["joint_armature"] + np.concatenate([h.reflected_inertia for h in self.hinges])
         self._refuse_impossible_inertias("Scene", values["body_inertia"])
         self._refuse_crossed_limits("Scene", values)
@@ -441,7 +441,7 @@ class Scene(Stored):
         if name == "body_inertia":
             array = checked_inertia(call, array, [body.any_inertia for body in self.bodies])
             self._refuse_impossible_inertias(call, array)
-        _refuse_negative(call, name, array)
+        refuse_negative(call, name, array)
         return read_only(array)
 
     def _refuse_impossible_inertias(self, call: str, inertias: np.ndarray) -> None:

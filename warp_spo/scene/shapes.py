@@ -126,6 +126,12 @@ class Choice(NamedTuple):
         found = self.resolve(call, scene, shapes())
         return scene.with_contacts([one for _, made in found.taken for one in made], found.ground), found.left_out
 
+    def unless(self, disabled: bool) -> tuple[Choice, list[str]]:
+        """Return the choice of a source that may disable contacts, and in words what is left out: True obeys it."""
+        if not disabled or self.contacts is not True:
+            return self, []
+        return NONE, ["all contacts, which its options disable (a pattern, such as contacts='*', takes them anyway)"]
+
     def wants(self, call: str) -> bool:
         """Return whether contacts are wanted; ValueError for a ground without any."""
         if self.contacts is None and self.ground is not None:

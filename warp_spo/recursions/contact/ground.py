@@ -223,9 +223,12 @@ def _facing(slope_x: Value, slope_y: Value) -> Vector:
     return Vector((-(slope_x * size), -(slope_y * size), size))
 
 
-def surface_count(ground: Plane | HeightField | Listed | None, varies: bool) -> int:
-    """Return how many surfaces a point may touch; ``varies``: the heights of a field are variable."""
-    return 2 if has_walls(ground, varies) else 1
+def surface_count(ground: Plane | HeightField | Listed | None, varies: bool, walls: bool) -> int:
+    """Return how many surfaces a point may touch.
+
+    ``varies``: the heights of a field are variable. ``walls``: as for :func:`surfaces`.
+    """
+    return 2 if walls and has_walls(ground, varies) else 1
 
 
 def has_walls(ground: Plane | HeightField | Listed | None, varies: bool) -> bool:

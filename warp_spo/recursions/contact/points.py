@@ -19,6 +19,7 @@ numbers, and only the rest stays: they know that link's motion, and their messag
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -34,7 +35,7 @@ from ..motion import Motion, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
 from ..remembered import remembered
 from ..tracing import Trace
-from .ground import Corners, Place, Surface, directions, lowest, surfaces
+from .ground import Corners, Place, Surface, directions, lowest, surface_count, surfaces
 
 if TYPE_CHECKING:
     from ..impedance import Impedance
@@ -192,6 +193,13 @@ def place_points(
             state = turned, below, push, cell, near if branches else None, lever
             found.append(Point(number, on, arm, inward, -depth, mine.twist, *material, *state))
     return found
+
+
+def surface_numbers(scene: Scene, varies: bool) -> list[range]:
+    """Return the numbers of the surfaces that each contact point may touch; ``varies``: heights are variable."""
+    counts = [surface_count(scene.ground, varies, point.walls) for point in scene.contact_points]
+    ends = itertools.accumulate(counts)
+    return [range(end - count, end) for end, count in zip(ends, counts, strict=True)]
 
 
 def point_links(links: Links) -> list[Link | None]:

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 from ...scene.contacts import HEIGHTS
 from ...trace.emission import Store
 from ...trace.scalars import Value, cut, reciprocal, select
-from ..contact.ground import surface_count
 from ..contact.middle import MIDDLE
-from ..contact.points import Point, own_points
+from ..contact.points import Point, own_points, surface_numbers
 from ..contact.secants import Kept, single_dofs
 from ..contact.step import ContactStep, Touch
 from ..impedance import LIMIT, Law
@@ -76,9 +75,8 @@ class OnePass(ContactStep):
     def __init__(self, trace: Trace, laws: tuple[int, ...] | None):
         super().__init__(trace, ())
         self.kept = RowKept(trace)
-        each = surface_count(trace.links.scene.ground, HEIGHTS in trace.links.variable)
-        numbers = (number for number, _ in own_points(trace))
-        self.surfaces = [number * each + i for number in numbers for i in range(each)]
+        numbers = surface_numbers(trace.links.scene, HEIGHTS in trace.links.variable)
+        self.surfaces = [surface for number, _ in own_points(trace) for surface in numbers[number]]
         self._next = iter(self.surfaces)
         starts = itertools.accumulate(laws or (), initial=0)
         self._starts = dict(zip(map(id, trace.links.leaders), starts, strict=False))
@@ -161,6 +159,5 @@ def weighed_pieces(trace: Trace) -> tuple[int, ...]:
 
 def count_variables(links: Links, laws: tuple[int, ...]) -> int:
     """Return how many variables a pass leaves."""
-    scene = links.scene
-    surfaces = len(scene.contact_points) * surface_count(scene.ground, HEIGHTS in links.variable)
-    return sum(laws) + OF_POINT * surfaces
+    surfaces = surface_numbers(links.scene, HEIGHTS in links.variable)
+    return sum(laws) + OF_POINT * sum(map(len, surfaces))

@@ -13,12 +13,11 @@ import warp as wp
 
 import warp_spo as spo
 
-from . import stress_scenes as scenes
-from . import stress_status
-from .stress_contact import check_falling_cubes
-from .stress_scenes import GRAVITY, NONE, Problem, Setting, draw, problem
-from .stress_status import run
-from .stress_steps import check_stiff_arm
+from . import scenes, status
+from .contact import check_falling_cubes
+from .scenes import GRAVITY, NONE, Problem, Setting, draw, problem
+from .status import run
+from .steps import check_stiff_arm
 
 
 def check_straight_chain(where: Setting) -> None:
@@ -180,7 +179,7 @@ CHECKS = {
     "massless_robot": (check_massless_robot, "unusual inputs"),
     "stiff_arm": (check_stiff_arm, "unusual inputs"),
     "one_world": (check_double_pendulum, "closed form"),
-} | stress_status.CHECKS
+} | status.CHECKS
 """Name -> (check, section of the stress suite that it belongs to)."""
 
 LONG = {

@@ -6,7 +6,7 @@ import numpy as np
 
 import warp_spo as spo
 
-from .stress_scenes import Setting
+from .scenes import Setting
 
 DT, SECONDS, HALF = 1e-2, 2.0, 0.1  # [s], [s], half an edge [m]
 RANGE = 0.01  # k dt^2 over a mass, in 1 / eps, up to which a state stays finite

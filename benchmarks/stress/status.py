@@ -12,9 +12,9 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.execution.parameters import VARIABLE
 
-from . import stress_scenes as scenes
+from . import scenes
 from .exact import Sweep
-from .stress_scenes import GRAVITY, Problem, Setting, draw, problem
+from .scenes import GRAVITY, Problem, Setting, draw, problem
 
 HINGE = 3  # of an 8-link chain: its armature is changed by a check
 SPOILED = 5  # world whose values a check changes

@@ -1,4 +1,4 @@
-"""Run ``python -m benchmarks.stress [FILTER]``: the stress suite as one table of error, law, verdict and run time."""
+"""``python -m benchmarks.stress [FILTER]``: the stress suite as one table of error, law, verdict and run time."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from typing import Any
 
 import warp as wp
 
-from . import runner
-from .stress_cases import Case, choose
-from .stress_checks import CHECKS, LONG, READS_PIVOTS
-from .stress_measure import Subject, contrasts, row
-from .stress_scenes import Setting
+from .. import runner
+from .cases import Case, choose
+from .checks import CHECKS, LONG, READS_PIVOTS
+from .measure import Subject, contrasts, row
+from .scenes import Setting
 
 HEADS = (
     "case",
@@ -190,7 +190,3 @@ def main(argv: list[str] | None = None) -> int:
     for one in failed:
         print(f"fails: {line(one)} {one.get('why', '')}", file=sys.stderr)
     return 1 if failed else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -13,9 +13,9 @@ import warp as wp
 import warp_spo as spo
 
 from . import contrast
+from .cases import ALLOWED, CAUSES, EPS32, EPS64, Case
 from .exact import Sweep
-from .stress_cases import ALLOWED, CAUSES, EPS32, EPS64, Case
-from .stress_scenes import Problem
+from .scenes import Problem
 
 PRECISIONS = ("float32", "refined", "float64")  # refined: float32, then one step with a float64 residual
 EPS = {"float32": EPS32, "float64": EPS64}

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from . import stress_scenes as scenes
-from .stress_scenes import Problem
+from . import scenes
+from .scenes import Problem
 
 EPS32, EPS64 = 2.0**-23, 2.0**-52
 ALLOWED = 10.0

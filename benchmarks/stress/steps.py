@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from . import stress_scenes as scenes
-from .stress_scenes import Setting
+from . import scenes
+from .scenes import Setting
 
 LINKS, WORLDS = 4, 8
 DT = 1e-3  # [s]
