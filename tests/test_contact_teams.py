@@ -181,6 +181,16 @@ def test_passes_compute_no_velocity_terms():
 
 
 @pytest.mark.slow
+def test_arms_found_anew_in_each_pass(monkeypatch):
+    """As of limbs with many spheres: a thread keeps three values less for each of them, and takes the same step."""
+    monkeypatch.setattr(points, "ARMS", 0)
+    case = text_of(monkeypatch, "quadruped", True)
+    held = [int(re.search(r"held_row\[(\d+)\] = {}", text.cuda)[1]) for text in (case[0], known("quadruped", True)[0])]
+    assert held[1] - held[0] >= 3
+    assert_right(case)
+
+
+@pytest.mark.slow
 def test_mirrored_legs_write_states_of_bodies(monkeypatch):
     """By one text, with the signs of quaternions that a whole tree gives."""
     texts, (scene, a) = warp_machine.recorded(monkeypatch), case("crowded")
@@ -204,8 +214,8 @@ def test_mirrored_legs_share_one_text():
 
 
 BUGS = {
-    "a point that nobody takes": (points, "own_points", "first * each", "(first + 1) * each"),
-    "a point that two take": (points, "own_points", "mine[each * len(piece.children) :]", "mine"),
+    "a point that nobody takes": (points, "points_of", "first * each", "(first + 1) * each"),
+    "a point that two take": (points, "points_of", "mine[each * len(piece.children) :]", "mine"),
     "what a message leaves out": (Trace, "add_contacts", "z - self.pushes[key]", "z"),
     "excess of one limb": (step.ContactStep, "_sent_to_the_first", "largest(list(values))", "values[0]"),
     "no barrier after the passes": (straight, "count_team_passes", '"}", barrier]', '"}"]'),

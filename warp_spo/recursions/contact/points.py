@@ -33,6 +33,7 @@ from ..kinematics import arm_on_link, carried_velocity, frame_on_link, zero
 from ..links import Link, Links
 from ..motion import Motion, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
+from ..pieces import Piece, Pieces
 from ..remembered import remembered
 from ..tracing import Trace
 from .ground import Corners, Place, Surface, directions, lowest, surface_count, surfaces
@@ -40,6 +41,7 @@ from .ground import Corners, Place, Surface, directions, lowest, surface_count, 
 if TYPE_CHECKING:
     from ..impedance import Impedance
 
+ARMS = 8  # spheres of a limb up to which their arms are kept, see docs/contact_measured.md
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
 
 
@@ -76,11 +78,11 @@ class Point:
     near: Value | None = None
     lever: Value = 0.0
 
-    @property
-    def state(self) -> list[Value]:
-        """The values that every pass reads: arm, normal, depth, push, damping, and the link's motion before it."""
+    def state(self, arm: bool) -> list[Value]:
+        """Return what passes keep: normal, depth, push, damping, motion of the link before; ``arm``: that, too."""
         damping = [] if is_constant(self.d) or self.d.op == "input" else [self.d]
-        return [*self.arm, *self.normal, self.depth, self.push, *damping, *self.twist[0], *self.twist[1]]
+        kept = [*self.arm] if arm else []
+        return [*kept, *self.normal, self.depth, self.push, *damping, *self.twist[0], *self.twist[1]]
 
     def settled(self, *more: Value) -> tuple[Point, list[Value]]:
         """Return the point, and more values that are zero away from its surface; code computes both only near it."""
@@ -209,12 +211,27 @@ def point_links(links: Links) -> list[Link | None]:
 
 def own_points(trace: Trace) -> list[tuple[int, ContactPoint]]:
     """Return the contact points that a trace works on, with their numbers."""
-    points, piece = list(enumerate(trace.links.scene.contact_points)), trace.piece
+    return points_of(trace.links, trace.piece)
+
+
+def keeps_arms(trace: Trace) -> bool:
+    """Return whether passes keep the arms of points, rather than find each from the normal anew, in three operations.
+
+    Where limbs share the work they do, unless a limb has so many spheres that registers run out.
+    """
+    pieces = [] if trace.piece is None else Pieces(trace.links).pieces
+    spheres = (sum(point.radius > 0.0 for _, point in points_of(trace.links, piece)) for piece in pieces)
+    return max(spheres, default=0) <= ARMS
+
+
+def points_of(links: Links, piece: Piece | None) -> list[tuple[int, ContactPoint]]:
+    """Return the contact points that a piece works on, or the whole tree, with their numbers."""
+    points = list(enumerate(links.scene.contact_points))
     if piece is None:
         return points
     on: dict[int | None, list[tuple[int, ContactPoint]]] = {}
     for number, point in points:
-        link = trace.links.seats[point.body].link
+        link = links.seats[point.body].link
         on.setdefault(None if link is None else id(link), []).append((number, point))
     found = on.get(None, []) if piece.index == 0 else []
     for link in piece.links:

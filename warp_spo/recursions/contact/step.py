@@ -30,7 +30,7 @@ from .crowds import Crowd, gather
 from .dampers import SEVERAL, chosen, damper, load
 from .law import Found, Touch, begin_point, finish_point, force_at, normal_force
 from .middle import MIDDLE
-from .points import Point, ground_place, own_points, place_points
+from .points import Point, ground_place, keeps_arms, own_points, place_points
 from .secants import Kept, Secant, largest, single_dofs
 
 if TYPE_CHECKING:
@@ -78,7 +78,9 @@ class ContactStep(Step):
             touches.append(self._touch(*first))
             candidates.append(first[1])
         self._gather(points, touches, candidates)
-        trace.ahead = [*map(as_subtracted, bias.values()), *(value for point in points for value in point.state)]
+        arms = keeps_arms(trace)
+        trace.ahead = [*map(as_subtracted, bias.values())]
+        trace.ahead += [value for point in points for value in point.state(arms)]
         trace.ahead += [value for crowd in self.crowds.values() for value in (crowd.highest, crowd.reach)]
         self._press(points, touches)
         trace.stiffened = self._stiffened
