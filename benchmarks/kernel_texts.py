@@ -117,7 +117,7 @@ def recording(recorder: Recorder) -> Iterator[None]:
 def dynamics_of(scene: spo.Scene, worlds: int, **options: Any) -> spo.Dynamics:
     """A Dynamics whose results would leave as they do on a GPU."""
     dyn = spo.Dynamics(scene, worlds, device="cpu", **options)
-    dyn.programs.relays = True
+    dyn.programs.builder.relays = True
     return dyn
 
 

@@ -154,7 +154,7 @@ def test_every_text_of_a_routine_has_the_same_bits(granularity, monkeypatch):
             monkeypatch.setattr(plan, name, limit)
         for worlds in (1, 70):
             dyn = dynamics("two arms", granularity, worlds, "float32", wp.get_device("cpu"))
-            dyn.programs.relays = True
+            dyn.programs.builder.relays = True
             for operation in ("forward_dynamics", "inverse_dynamics", "mass_matrix_inverse"):
                 laws.numpy_call(dyn, operation, states(dyn))
     arrays = states(dynamics("two arms", granularity, 3, "float32", wp.get_device("cpu")))

@@ -9,7 +9,7 @@ from contact_cases import box, quadruped
 
 import warp_spo as spo
 from warp_spo.dynamics.integrators import CONTACT_STEP
-from warp_spo.execution.programs import Programs
+from warp_spo.execution.builder import Builder
 from warp_spo.reference import Dense
 from warp_spo.scene.contacts import Stand
 
@@ -74,7 +74,7 @@ def test_contacts_are_told_kept_and_changed():
 def test_explain_says_whether_limbs_have_room(room, monkeypatch):
     """As the kernel says that was built: what limbs tell each other may not fit into shared memory."""
     if room is not None:
-        monkeypatch.setattr(Programs, "room", lambda *_, **__: room)
+        monkeypatch.setattr(Builder, "room", lambda *_, **__: room)
     scene = quadruped()
     dyn = spo.Dynamics(scene, 2, "cpu", granularity="segment")
     assert dyn.explain().split("contacts  ")[1].split("\n")[0].endswith("a warp for each limb")

@@ -21,7 +21,7 @@ def test_a_long_result_that_shared_memory_cannot_hold(granularity, device, monke
     texts = warp_machine.recorded(monkeypatch)
     dyn = dynamics("two arms", granularity, MANY, "float64", device, varied=True)
     monkeypatch.setattr(straight, "SHARED_BYTES", 5_000)  # twice as many in float64
-    dyn.programs.relays = True
+    dyn.programs.builder.relays = True
     for operation in ("mass_matrix", "mass_matrix_inverse"):
         equals_reference(dyn, operation, states(dyn), laws.TOLERANCE["float64"])
     assert {text.frame.result.way for text in texts} == {straight.RELAYED}
@@ -39,7 +39,7 @@ def test_long_results_that_begin_anywhere(granularity, dtype, way, device, monke
         monkeypatch.setattr(straight, "SHARED_BYTES", room * 4)  # in float32
     for worlds in (1, 3, 33, 70):
         dyn = dynamics("two arms", granularity, worlds, dtype, device)
-        dyn.programs.relays = True
+        dyn.programs.builder.relays = True
         arrays, size = states(dyn), dyn.scene.dof_count**2 * worlds
         wanted = equals_reference(dyn, operation, arrays, laws.TOLERANCE[dtype])
         q = laws.to_device(dyn, arrays)["q"]

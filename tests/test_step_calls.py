@@ -183,7 +183,7 @@ def test_a_kernel_reads_rows_through_shared_memory_too(device):
     """The staged form of the same text; on a CPU it is not compiled, but its rows are laid out."""
     scene = furnished(zoo.fork())
     dyn = spo.Dynamics(scene, 3, device=device)
-    dyn.programs.plan = dataclasses.replace(dyn.plan, staged=True)
+    dyn.programs.builder.plan = dataclasses.replace(dyn.plan, staged=True)
     plain = spo.Dynamics(scene, 3, device=device)
     a = states(scene, 3, "float32")
     for x, y in zip(dyn.step(a["q"], a["qd"], a["tau"], H), plain.step(a["q"], a["qd"], a["tau"], H), strict=True):

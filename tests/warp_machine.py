@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.execution.programs import Programs
+from warp_spo.execution.builder import Builder
 from warp_spo.execution.teams import BARRIER
 from warp_spo.kernels.straight import BY_TABLE, IN_PLACE, TILED, KernelLayout
 from warp_spo.kernels.substeps import FENCE, SYNC
@@ -36,14 +36,14 @@ class Text(NamedTuple):
 
 def recorded(monkeypatch):
     """A list that from here on receives the :class:`Text` of every kernel that is built."""
-    texts, finished = [], Programs._finished
+    texts, finished = [], Builder.finish
 
     def record(self, operation, frame, cuda, cpu, tables, operations, *more):
         held = {name: np.array(values) for name, values in tables.items()}
         texts.append(Text(operation, frame, cuda, cpu, held, operations))
         return finished(self, operation, frame, cuda, cpu, tables, operations, *more)
 
-    monkeypatch.setattr(Programs, "_finished", record)
+    monkeypatch.setattr(Builder, "finish", record)
     return texts
 
 

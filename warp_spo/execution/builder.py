@@ -1,0 +1,207 @@
+"""What all programs of a scene are built from: links, the layout of a kernel's arrays, tables, and the last step."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from ..kernels import coupling, native, straight
+from ..kernels.fields import axes
+from ..kernels.native import INTEGERS
+from ..kernels.straight import BY_TABLE, TILED, KernelLayout
+from ..recursions.contact import coupled, pairs
+from ..recursions.contact.ground import GROUND
+from ..recursions.contact.secants import SECANT
+from ..recursions.flexible import attach
+from ..recursions.links import Links
+from ..recursions.messages import INWARD, OUTWARD
+from ..recursions.step import FORCE, LOOPED, RESISTANCE
+from ..scene.contacts import HeightField
+from ..trace.emission import Store
+from . import staging
+from .device_facts import RESERVED
+from .plan import Plan
+from .routine import Routine
+from .sweeps import Sweeps
+
+PASSED = (*LOOPED, SECANT, FORCE, RESISTANCE)  # variables of the loops over passes
+
+
+class Program(NamedTuple):
+    """One kernel.
+
+    Attributes:
+        rows: names of the callers' arrays, and then numbers, that it reads. fields: of FIELDS.
+        tables: arrays of its own.
+        operations: floating-point operations of one world.
+        slots: values of one world in the tiles that it writes; places, entry: where each entry of the result is among
+            them, -1 being zero, on the host and on the device. See :mod:`warp_spo.kernels.tiles`.
+    """
+
+    kernel: wp.Kernel
+    rows: tuple[str, ...]
+    fields: tuple[str, ...]
+    tables: tuple[wp.array, ...]
+    warps: int
+    block: int
+    operations: int
+    slots: int = 0
+    places: tuple[int, ...] = ()
+    entry: Any = None
+
+
+class Job(NamedTuple):
+    """What a program is to compute.
+
+    Attributes:
+        routine: its routine.
+        shapes: of all arrays that the routine reads and writes, [world, ...], by name; "out" is the result.
+        more: names of further results.
+        options: of the routine's trace.
+    """
+
+    routine: Routine
+    shapes: dict[str, tuple[int, ...]]
+    more: tuple[str, ...]
+    options: dict[str, Any]
+
+    @property
+    def inputs(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of what it reads, and of "out"."""
+        return {name: shape for name, shape in self.shapes.items() if name not in self.more}
+
+
+class Builder:
+    """The parts of the programs of one scene that all granularities share.
+
+    Args:
+        run: the sweeps of the scene, whose parameters programs read.
+        plan: which granularity each operation has.
+
+    Attributes:
+        relays: what is too long for shared memory waits in the rows of the result.
+    """
+
+    def __init__(self, run: Sweeps, plan: Plan):
+        self.run, self.plan, self.dtype = run, plan, run.dtype.__name__
+        self.relays = run.device.is_cuda
+        self._links: Links | None = None
+
+    def forget(self) -> None:
+        """Drop the links: values that they folded have changed."""
+        self._links = None
+
+    @property
+    def links(self) -> Links:
+        """The links of the scene."""
+        if self._links is None:
+            self._links = Links(self.run.scene, self.run.parameters.variable)
+        return self._links
+
+    def own_links(self, options: dict[str, Any], copies: bool = False) -> Links:
+        """Return links of their own for one trace, with what the frames in its options sit on."""
+        links = self.links.with_tables(copies)
+        attach(links, ((body, place[:3]) for body, place in options.get("frames", ())))
+        return links
+
+    def layout(
+        self, job: Job, stores: list[Store], everything: list[Store], sent: int = 0, warps: int = 1
+    ) -> KernelLayout:
+        """Return how a kernel holds its arrays.
+
+        Args:
+            job: what it computes.
+            stores: those of the result. everything: all that the kernel stores.
+            sent: how many values its warps send each other. warps: how many share the worlds of a block.
+        """
+        routine, more = job.routine, job.more
+        whole = "poses_out" in more
+        gathers = whole or self.plan.gathers(routine, warps, 1 + len(more))
+        ways = self.plan.stages(routine, warps), gathers, routine.tiled
+        wide = routine.wide and warps > 1
+        room = self.room(wide, whole=whole)
+        given = stores, everything, job.shapes, more, sent, warps, self.run.dtype
+        return staging.choose_layout(*given, *ways, self.relays, room, wide)
+
+    def room(self, wide: bool = False, couples: bool = False, whole: bool = False) -> int:
+        """Bytes of shared memory that a block may have: for as many scalars in float64 as in float32 if the GPU can.
+
+        ``wide``: for long rows that all go through it. ``couples``: for what limbs couple in it. ``whole``: all that a
+        multiprocessor has.
+        """
+        more = straight.COUPLED_BYTES if couples else straight.WIDE_BYTES if wide else 0
+        wanted = max(straight.SHARED_BYTES, more) * wp.types.type_size_in_bytes(self.run.dtype) // 4
+        allowed = self.plan.device.shared_bytes - 3 * RESERVED  # Warp takes a share, too
+        wanted = max(wanted, allowed) if whole else wanted
+        return min(wanted, max(allowed, straight.SHARED_BYTES)) if self.plan.device.cuda else wanted
+
+    def height_tables(self, reads: bool) -> dict[str, Any]:
+        """Return the table of the ground's cells, if a program ``reads`` it."""
+        ground = self.run.scene.ground
+        return {GROUND: self.run.parameters.ground_cells} if reads and isinstance(ground, HeightField) else {}
+
+    def touch_tables(self, points: tuple[int, ...]) -> dict[str, Any]:
+        """Return the array of touches, for so many points of each pair of bodies."""
+        shape = coupling.entries(points)[-1], coupling.columns(self.run.worlds)
+        return {"touches": self.run.array("touches", *shape)}
+
+    def finish(
+        self,
+        routine: Routine,
+        layout: KernelLayout,
+        cuda: str,
+        cpu: str,
+        tables: dict[str, Any],
+        operations: int,
+        registers: int | None = None,
+    ) -> Program:
+        """Return the program of a kernel's statements.
+
+        Args:
+            routine: its routine.
+            layout: how it holds its arrays.
+            cuda, cpu: the statements.
+            tables: arrays of its own, or their values, by name.
+            operations: of one world.
+            registers: of a thread at most; None: as the compiler chooses.
+        """
+        text = straight.assemble(layout, cuda, cpu, self.run.dtype)
+        rows, fields = (*(row.name for row in layout.rows), *layout.numbers), tuple(layout.fields)
+        arrays = [(row.name, row.ndim) for row in layout.rows] + [(name, 0) for name in layout.numbers]
+        arrays += [(name, axes(name)) for name in fields]
+        result, entry, places = layout.result, None, ()
+        if result.way in BY_TABLE:
+            tables = tables | {"place": result.slot_layout.table(tables["place"], self.run.dtype)}
+        held: dict[str, wp.array] = {
+            name: values
+            if isinstance(values, wp.array)
+            else wp.array(values, dtype=int if name in INTEGERS else self.run.dtype, device=self.run.device)
+            for name, values in tables.items()
+        }
+        if result.way == TILED:
+            entry, places = held.pop("place"), tuple(tables["place"])
+        arrays += [(name, array.ndim) for name, array in held.items()]
+        arrays += [("out", result.array.ndim if entry is None else 3)]
+        arrays += [(row.name, row.ndim) for row in layout.further]
+        asks = layout.shared_bytes(self.run.dtype) if layout.asks_for_shared_memory(self.run.dtype) else 0
+        kernel = native.kernel(routine.name, text, arrays, self.run.dtype, registers, shared=asks)
+        return Program(
+            kernel,
+            rows,
+            fields,
+            tuple(held.values()),
+            layout.warps,
+            layout.block,
+            operations,
+            result.slots,
+            places,
+            entry,
+        )
+
+
+def flatten(item: Store, shapes: dict[str, tuple[int, ...]]) -> Store:
+    """Return a store with one index; entries of a kernel's own arrays have one already."""
+    if item.array in (INWARD, OUTWARD, *PASSED, *pairs.READ, *coupled.ARRAYS):
+        return item
+    return item._replace(index=(staging.flat_index(item.index, shapes[item.array][1:]),))

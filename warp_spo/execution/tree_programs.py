@@ -1,0 +1,92 @@
+"""Programs at tree granularity: a thread computes one world, in program order."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..kernels import couples as couple_points
+from ..kernels import coupling, straight
+from ..kernels.slots import WARP_SIZE
+from ..kernels.straight import DIRECT, RELAYED, TILED
+from ..recursions.contact import coupled, pairs
+from ..recursions.contact.secants import SECANT
+from ..recursions.contact.ties import couples_of
+from ..recursions.links import Links
+from ..recursions.step import GAIN, LOOPED
+from ..recursions.tracing import Trace
+from ..trace.emission import Store, render
+from . import staging
+from .access import make_emitter
+from .builder import PASSED, Builder, Job, Program, flatten
+
+PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner
+
+
+def build(builder: Builder, job: Job, links: Links) -> Program:
+    """Return the program in which a thread computes one world."""
+    run, plan, dtype = builder.run, builder.plan, builder.dtype
+    routine, shapes, more, options = job
+    trace = Trace(links, dtype, tuple(shapes))
+    stores = [flatten(item, shapes) for item in routine.trace(trace, **options)]
+    apart = [item for item in stores if item.array in more]  # each straight to memory
+    outs = [item for item in stores if item.array == "out"]
+    looped = [item for item in stores if item.array in (*PASSED, coupled.TWIST)]
+    aggregates = any(item.array == coupled.TWIST for item in stores)
+    kept = [Store("ahead", (), value) for value in trace.ahead] if looped else []  # may read what no store needs
+    layout = builder.layout(job, outs, trace.begin + stores + kept)
+    once = routine.passes or any(item.array in LOOPED for item in stores)  # may write over what it reads
+    layout = layout._replace(retries=not once and not layout.staged and layout.result.way in (DIRECT, TILED, RELAYED))
+    placed, table = staging.arrange_stores(outs, layout.result)
+    placed += apart
+    emitter = make_emitter(dtype, shapes, layout, branches=aggregates)
+    responses = [item for item in stores if item.array in pairs.READ]
+    regions = [emitter.region(trace.begin, trace.ahead)] if looped else []
+    regions += emitter.branches([responses, looped] if responses else [looped]) if looped else []
+    *before, body = (render(each, dtype) for each in [*regions, emitter.region(placed)])
+    tables: dict[str, Any] = {} if table is None else {"place": table}
+    tables |= builder.height_tables(emitter.counts["lookup"] > 0)
+    if trace.begin:
+        entries = {GAIN: run.scene.dof_count, SECANT: max(1, sum(item.array == SECANT for item in trace.begin))}
+        if responses:
+            couples = _couples(links)
+            entries |= coupling.shared_arrays(couples)
+            first, read, *rest = before
+            declared = coupling.declare(couples, run.dtype)
+            before = [f"{declared}\n{first}\n{coupling.BEGIN}", "\n".join([read, coupling.PASS, *rest])]
+            tables |= builder.touch_tables(couples.points)
+        if aggregates:
+            found = _aggregated(links, options, coupled.REPORT in body)
+            entries |= couple_points.arrays(found)
+            first, a_pass = before
+            declared = couple_points.declare(found, run.dtype)
+            before = [f"{declared}\n{first}\n{couple_points.BEGIN}", f"{a_pass}\n{couple_points.PASS}"]
+        body = straight.repeat_counted_passes([*before, body], entries, run.dtype)
+    elif looped:
+        ahead, a_pass = before
+        body = straight.repeat_passes(ahead, a_pass, body, LOOPED, run.scene.dof_count, run.dtype)
+    direct = layout.staged and plan.copies_directly(routine)
+    late = direct and routine.waits_late
+    block = PAIR * WARP_SIZE if late or (plan.few and not layout.shared_scalars) else WARP_SIZE
+    layout = layout._replace(retries=layout.retries and "farthest" in body, block=block, direct=direct, late=late)
+    return builder.finish(routine, layout, body, body, tables, emitter.operations)
+
+
+def _couples(links: Links) -> coupling.Couples:
+    """Return the pairs of bodies of a scene as their native code needs them."""
+    scene, of_pairs = links.scene, pairs.members(links).of_pairs
+    points, eps = zip(*((pair.points, pair.eps) for pair in scene.contact_pairs), strict=True)
+    return coupling.Couples(
+        of_pairs, points, eps, tuple(pairs.inverse_weights(scene)), pairs.blocks(links), pairs.solids_of(links)[0]
+    )
+
+
+def _aggregated(links: Links, options: dict[str, Any], reports: bool) -> couple_points.Couples:
+    """Return the pairs of bodies of a scene as aggregates couple them, as their native code needs them."""
+    scene, couples = links.scene, couples_of(links)
+    signs = dict(one for couple in couples for one in zip(couple.pairs, couple.signs, strict=True))
+    points, eps = zip(*((pair.points, pair.eps) for pair in scene.contact_pairs), strict=True)
+    looks = bool({"contact_gap", "contact_slip"} & set(options.get("reports", ())))
+    return couple_points.Couples(
+        tuple(couple.pairs for couple in couples), tuple(signs[i] for i in range(len(points))), points, eps,
+        tuple(pairs.inverse_weights(scene)), pairs.solids_of(links)[0], looks, reports,
+    )  # fmt: skip
