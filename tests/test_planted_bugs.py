@@ -11,7 +11,7 @@ from mutants import mutant
 from routines import ROUTINES
 
 import warp_spo as spo
-from warp_spo.execution import node_functions, teams
+from warp_spo.execution import node_functions, shared_text, teams
 from warp_spo.execution import sweeps as levels
 from warp_spo.graph import blocks
 from warp_spo.kernels import straight
@@ -182,8 +182,8 @@ TEAM_MUTANTS = {
                                     "child.inward + (child.warp != piece.warp)", "child.inward"),
     "no barrier after the trunk": (pieces.Pieces, "__init__",
                                    "piece.parent.outward + (piece.warp != piece.parent.warp)", "piece.parent.outward"),
-    "another limb's entries": (teams.Team, "_distances", "who * {step}", "who * {step + 1}"),
-    "another limb's constants": (teams.Team, "_fill_in", "zip(*constants.columns, strict=True)",
+    "another limb's entries": (shared_text.SharedText, "_distances", "who * {step}", "who * {step + 1}"),
+    "another limb's constants": (shared_text.SharedText, "merge", "zip(*constants.columns, strict=True)",
                                  "[*zip(*constants.columns, strict=True)][::-1]"),
 }  # fmt: skip
 
@@ -208,10 +208,10 @@ INVERSE_MUTANTS = {
     "what lies further in": (inverse.Inverse, "_come_back", "[dot(row, force) for row in N]", "[0.0 for row in N]"),
     "parted too early": (pieces.Piece, "fork", "(other, *other.ancestors)", "reversed((other, *other.ancestors))"),
     "no barrier before they meet": (teams.Team, "cuda", "BARRIER, self._rounds(alike)", "self._rounds(alike)"),
-    "another limb's turns": (teams.Team, "_take_turns", "initial=0", "initial=1"),
+    "another limb's turns": (shared_text.SharedText, "take_turns", "initial=0", "initial=1"),
     "a turn too few": (
-        teams.Team,
-        "_take_turns",
+        shared_text.SharedText,
+        "take_turns",
         "counts.values())}; ++each",
         "[n - 1 for n in counts.values()])}; ++each",
     ),
@@ -221,7 +221,7 @@ INVERSE_MUTANTS = {
 @pytest.mark.parametrize("bug", INVERSE_MUTANTS)
 def test_a_wrong_inverse(bug, monkeypatch):
     """Branches that meet where limbs part, and part again, in loops."""
-    monkeypatch.setattr(teams, "CACHED", 0)
+    monkeypatch.setattr(shared_text, "CACHED", 0)
     assert team_error(monkeypatch, "mass_matrix_inverse", "dancer") <= TOLERANCE["float64"]
     symbolic.plant(monkeypatch, *INVERSE_MUTANTS[bug])
     try:

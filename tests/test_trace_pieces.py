@@ -11,7 +11,7 @@ from robots import ROBOTS
 from routines import ROUTINES
 
 import warp_spo as spo
-from warp_spo.execution import plan, teams
+from warp_spo.execution import plan, shared_text
 from warp_spo.kernels import straight
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.pieces import Pieces
@@ -155,8 +155,8 @@ def test_results_that_leave_through_shared_memory(monkeypatch):
 def test_turns_are_loops_where_code_is_long(name, monkeypatch):
     """Columns that meet one another's, in a row and in loops."""
     texts, got = warp_machine.recorded(monkeypatch), []
-    for most in (teams.CACHED, 0):
-        monkeypatch.setattr(teams, "CACHED", most)
+    for most in (shared_text.CACHED, 0):
+        monkeypatch.setattr(shared_text, "CACHED", most)
         text, arrays, wanted = built(texts, TREES[name](), "mass_matrix_inverse")
         assert ("++each" in text.cuda) == (most == 0)
         got.append(warp_machine.run(text, arrays))

@@ -258,7 +258,7 @@ class _Limbs:
         ):
             layout, registers = layout._replace(aside=places), routine.aside
             cuda = set_aside(cuda, C_TYPE[T], places)
-        lists = {"place": table, "table": team.table, "shifts": team.shifts}
+        lists = {"place": table, "table": team.shared.table, "shifts": team.shared.shifts}
         if team.shares_bodies:
             lists[body_frames.GEOMETRY] = body_frames.geometry(self.run.scene)
             name = body_frames.GEOMETRY.upper()
@@ -268,7 +268,7 @@ class _Limbs:
         if couples is not None:
             tables |= self.builder.touch_tables(couples.points)
         cap = registers if registers < MOST_REGISTERS else None
-        return self.builder.finish(routine, layout, cuda, cpu, tables, team.operations, cap)
+        return self.builder.finish(routine, layout, cuda, cpu, tables, team.shared.operations, cap)
 
     def _registers(self, layout: KernelLayout) -> int:
         """Return how many registers a thread may take, so that a multiprocessor holds as many blocks as help."""

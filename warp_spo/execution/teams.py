@@ -5,22 +5,18 @@ Barriers separate the stages, because a piece reads what other pieces have sent.
 
 from __future__ import annotations
 
-import itertools
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from ..kernels import straight
 from ..recursions.contact.secants import SECANT
 from ..recursions.pieces import Piece, Pieces
-from ..trace.emission import C_TYPE, Listing, fill_in, literal, render
+from ..trace.emission import C_TYPE, Listing, render
+from .shared_text import SharedText, any_of, choose
 
 HELD = "held"
 """Name of the values that a piece computes once before its passes."""
 BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
-KEEP = 'asm("" : "+r"({}));'  # keeps the compiler from computing a number anew wherever it is used
-IN_A_ROW = 5  # most turns of a loop without a jump, which wait together for what they read
-CACHED = 8192  # largest number of operations of a world whose code fits into the instruction cache
 
 
 class Work(NamedTuple):
@@ -108,23 +104,19 @@ class Team:
         pairs: the definition of ``team_coupling``, which couples pairs of bodies; "" if there are none.
 
     Attributes:
-        table: the constants in which equal pieces differ, as the kernel's array holds them.
-        shifts: the distances of the entries that equal pieces read and write, as the kernel's array holds them.
-        operations: the number of floating-point operations of one world.
+        shared: the texts that its warps share, and their tables.
     """
 
     def __init__(self, pieces: Pieces, dtype: str, passes: Passes | None = None, pairs: str = ""):
         self.pairs = pairs
         self.pieces, self.dtype, self.c, self.passes = pieces, dtype, C_TYPE[dtype], passes
-        self.table: list[float] = []
-        self.shifts: list[int] = []
-        self.operations = 0
+        self.shared = SharedText(dtype)
         self._work: dict[int, Work] = {}
 
     def add(self, work: Work, operations: int) -> None:
         """Add the work of a piece and its number of operations."""
         self._work[work.piece.index] = work
-        self.operations += operations
+        self.shared.operations += operations
 
     @property
     def texts(self) -> list[tuple[str, ...]]:
@@ -194,7 +186,7 @@ class Team:
                 kinds.setdefault(work.text, []).append(work)
         text: list[str] = []
         for alike in kinds.values():
-            text.append(f"{'else ' if text else ''}if ({_any_of([work.piece.warp for work in alike])}) {{")
+            text.append(f"{'else ' if text else ''}if ({any_of(_warps(alike))}) {{")
             inward, outward = self._shared(alike)
             warps = [work.piece.warp for work in alike]
             between = self._inner(warps)
@@ -254,7 +246,7 @@ class Team:
                 text.append(BARRIER)
             text += text_of_ranks
         bodies = [listing for work in self._work.values() for listing in work.bodies]
-        text += [BARRIER, self._share(leaves, bodies)] if bodies else []
+        text += [BARRIER, self.shared.share_out(_warps(leaves), bodies)] if bodies else []
         return "\n".join(text)
 
     @property
@@ -300,7 +292,7 @@ class Team:
                 owners.setdefault(tuple((w.text, w.piece.inward, w.piece.outward) for w in mine), []).append(mine)
         text: list[str] = []
         for chains in owners.values():
-            text.append(f"{'else ' if text else ''}if ({_any_of([chain[0].piece.warp for chain in chains])}) {{")
+            text.append(f"{'else ' if text else ''}if ({any_of([chain[0].piece.warp for chain in chains])}) {{")
             shared = [self._shared(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
             for stage in range(1, self._last + 1):
                 text.append(BARRIER)
@@ -327,140 +319,26 @@ class Team:
 
     def _take_turns(
         self,
-        alike: Sequence[Work],
+        works: Sequence[Work],
         turns: list[list[Listing]],
         tables: str,
         prefix: str = "",
         loops: bool | None = None,
     ) -> str:
-        """Return the statements that pieces of equal structure execute in turns; equal statements share one text.
-
-        ``loops``: turns are loops; None: see :attr:`_loops`.
-        """
-        loops = self._loops if loops is None else loops
-        kinds: dict[str, list[tuple[int, Listing]]] = {}
-        for work, listings in zip(alike, turns, strict=True):
-            for at, listing in enumerate(listings):
-                if listing.text:
-                    kind = listing.text if loops else f"{at} {listing.text}"
-                    kinds.setdefault(kind, []).append((work.piece.warp, listing))
-        text: list[str] = []
-        for at, some in enumerate(kinds.values()):
-            counts = Counter(warp for warp, _ in some)
-            warps, name = list(counts), f"{tables}{at}_"
-            several = max(counts.values()) > 1
-            who = f"{name}first + each" if several else _choose(warps, range(len(warps)))
-            head, (body,) = self._fill_in([[listing for _, listing in some]], prefix, name, who)
-            condition = "" if len(warps) == len(alike) else f"if ({_any_of(warps)}) "
-            inside = [head, body]
-            if several:
-                starts = itertools.accumulate(counts.values(), initial=0)
-                inside = [
-                    f"const int {name}first = {_choose(warps, starts)};",
-                    "#pragma unroll 1",
-                    f"for (int each = 0; each < {_choose(warps, counts.values())}; ++each) {{",
-                    *inside,
-                    "}",
-                ]
-            text.append("\n".join([f"{condition}{{", *inside, "}"]))
-        return "\n".join(text)
-
-    def _share(self, leaves: Sequence[Work], listings: Sequence[Listing]) -> str:
-        """Return loops in which all warps execute ``listings``, each equally many; equal ones share a text.
-
-        Where they do not come out even, the last warp executes its last listing again.
-        """
-        kinds: dict[str, list[Listing]] = {}
-        for listing in listings:
-            kinds.setdefault(listing.text, []).append(listing)
-        text, warps = [], [work.piece.warp for work in leaves]
-        for at, alike in enumerate(kinds.values()):
-            turns, name = -(-len(alike) // len(leaves)), f"b{at}_"
-            in_a_row = max(range(3, IN_A_ROW + 1), key=lambda count: (-(-turns % count), count))
-            turns += -turns % in_a_row if turns > IN_A_ROW else 0
-            who = f"min({name}first + each, {len(alike) - 1})"
-            head, (body,) = self._fill_in([alike], "", name, who)
-            first = f"const int {name}first = {_choose(warps, range(0, turns * len(leaves), turns))};"
-            loop = f"for (int each = 0; each < {turns}; ++each) {{"
-            text += ["{", first, f"#pragma unroll {in_a_row}", loop, head, body, "}", "}"]
-        return "\n".join(text)
-
-    @property
-    def _loops(self) -> bool:
-        """Whether turns are loops, which are slower than a sequence of statements if that fits into the cache."""
-        return self.operations > CACHED
+        """Return the statements that pieces execute in turns, see :meth:`.SharedText.take_turns`."""
+        return self.shared.take_turns(_warps(works), turns, tables, prefix, loops)
 
     def _shared(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str]:
         """Return one text for the inward and one for the outward sweeps of pieces of equal structure."""
         checks = [] if self._in_turns else [list(each) for each in zip(*(work.checks for work in alike), strict=True)]
         regions = [[work.inward for work in alike], [work.outward for work in alike], *checks]
         regions += [list(each) for each in zip(*(work.couples for work in alike), strict=True)]
-        who = _choose([work.piece.warp for work in alike], range(len(alike)))
-        head, (inward, outward, *others) = self._fill_in(regions, prefix, prefix, who)
+        who = choose(_warps(alike), range(len(alike)))
+        head, (inward, outward, *others) = self.shared.merge(regions, prefix, prefix, who)
         check, couples = "\n".join(others[: len(checks)]), others[len(checks) :]
         inward = "\n".join([inward, "if (coupled) {", *couples, "}"]) if any(couples) else inward
         outward = "\n".join([outward, "{", check, "}"]) if check else outward
         return f"{head}\n{inward}" if head else inward, outward
-
-    def _fill_in(self, regions: list[list[Listing]], prefix: str, tables: str, who: str) -> tuple[str, list[str]]:
-        """Return one text for each region; a warp reads the numbers and entries in which it differs from the tables.
-
-        Args:
-            regions: for each region, the listings of all pieces of equal structure.
-            prefix: the prefix of the names of values.
-            tables: the prefix of the names of values that are read from the tables.
-            who: C++ for the index of the warp's listing.
-
-        Returns:
-            The statements that read the tables, and the text of each region.
-        """
-        constants, shifts = _Columns(), _Columns()
-
-        def constant(values: tuple[float, ...]) -> str:
-            texts = {literal(value, self.dtype) for value in values}
-            return texts.pop() if len(texts) == 1 else f"__ldg({tables}numbers + {constants.of(values)})"
-
-        def entry(places: tuple[tuple[str, int], ...]) -> str:
-            first = places[0][1]
-            distances = tuple(at - first for _, at in places)
-            return f"{first} + {tables}shift[{shifts.of(distances)}]" if any(distances) else str(first)
-
-        texts = []
-        for listings in regions:
-            names = [", ".join(dict.fromkeys(label)) for label in zip(*(x.labels for x in listings), strict=True)]
-            numbers = [constant(values) for values in zip(*(x.constants for x in listings), strict=True)]
-            entries = [entry(places) for places in zip(*(x.indices for x in listings), strict=True)]
-            texts.append(fill_in(listings[0], numbers, entries, names, prefix))
-        head = []
-        if constants.columns or shifts.columns:
-            head.append(f"const int {tables}who = {who};")
-        if constants.columns:
-            first, count = len(self.table), len(constants.columns)
-            head.append(f"const {self.c}* {tables}numbers = table.data + {first} + {tables}who * {count};")
-            self.table += [value for row in zip(*constants.columns, strict=True) for value in row]
-        if shifts.columns:
-            head.append(f"int {tables}shift[{len(shifts.columns)}];")
-            head += self._distances(shifts.columns, tables)
-        return "\n".join(head), texts
-
-    def _distances(self, columns: list[tuple], tables: str) -> list[str]:
-        """Return statements that find how far the entries of a warp's piece lie from those of the first.
-
-        Where pieces lie in equal steps this is a product; a table would be waited for.
-        """
-        places = range(len(columns[0]))
-        steps = [column[1] if column == tuple(column[1] * at for at in places) else None for column in columns]
-        uneven = [column for column, step in zip(columns, steps, strict=True) if step is None]
-        found, first = [], len(self.shifts)
-        for k, step in enumerate(steps):
-            name = f"{tables}shift[{k}]"
-            if step is not None:
-                found += [f"{name} = {tables}who * {step};", KEEP.format(name)]
-            else:
-                found.append(f"{name} = __ldg(shifts.data + {first} + {tables}who * {len(uneven)});")
-                first += 1
-        self.shifts += [value for row in zip(*uneven, strict=True) for value in row]
-        return found
 
 
 def begin_pairs(warp: str, warps: int) -> str:
@@ -503,29 +381,6 @@ def _any_world(call: str, warps: int) -> str:
     return f"__syncthreads_or({call})" if warps > 1 else call
 
 
-class _Columns:
-    """Distinct tuples, one value for each piece of equal structure, in the order of their first use."""
-
-    def __init__(self) -> None:
-        self.columns: list[tuple] = []
-        self._known: dict[tuple, int] = {}
-
-    def of(self, values: tuple) -> int:
-        """Return the position of a tuple, which is appended if it is new."""
-        if values not in self._known:
-            self._known[values] = len(self.columns)
-            self.columns.append(values)
-        return self._known[values]
-
-
-def _any_of(warps: list[int]) -> str:
-    """Return a C++ condition that is true in these warps."""
-    return " || ".join(f"warp == {warp}" for warp in warps)
-
-
-def _choose(warps: Sequence[int], numbers: Iterable[int]) -> str:
-    """Return C++ for the number that belongs to the executing warp, one of ``warps``."""
-    *others, last = zip(warps, numbers, strict=False)
-    if all(number == last[1] for _, number in others):
-        return str(last[1])
-    return f"({' : '.join([*(f'warp == {warp} ? {number}' for warp, number in others), str(last[1])])})"
+def _warps(works: Sequence[Work]) -> list[int]:
+    """Return the warp of each piece."""
+    return [work.piece.warp for work in works]
