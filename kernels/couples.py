@@ -12,16 +12,17 @@ across the normal, and likewise with what is more along it.
 A couple whose shapes are farther apart than they can come near in a step has no points: balls around them say so.
 """
 
+import itertools
 from typing import Any, NamedTuple
 
 import warp as wp
 
-from . import coupling_points, touches
+from . import coupling_points, straight, touches
 from .coupling import FEW, VALUES, entries, table
 from .elementary import C_TYPE
 from .touches import AWAY, HEADER, POINT
 
-FIELDS, EXCESS, LAST, PLACES = 5, 3, 27, 24  # as in warp_spo.recursions.contact.coupled
+FIELDS, EXCESS, LAST, PLACES, MOST_WARPS = 5, 3, 27, 24, 4  # the first ones as in warp_spo.recursions.contact.coupled
 
 
 class Couples(NamedTuple):
@@ -45,8 +46,8 @@ class Couples(NamedTuple):
     reports: bool
 
 
-def declare(couples: Couples, T: type) -> str:
-    """Return the definition of ``couples`` and of the thread's arrays."""
+def declare(couples: Couples, T: type, shared: bool = False) -> str:
+    """Return the definition of ``couples`` and of the thread's arrays; ``shared``: it shares :func:`arrays`."""
     c, pairs, count = C_TYPE[T], len(couples.points), len(couples.pairs)
     number = "f" if T is wp.float32 else ""
     first_pair, first_point = [0], [0]
@@ -67,7 +68,7 @@ def declare(couples: Couples, T: type) -> str:
     tables += [table(c, f"{name}_of", [f"{x!r}{number}" for x in row], few) for name, row in reals.items()]
     sizes = {
         "PAIRS": pairs, "COUPLES": count, "HEADER": HEADER, "POINT": POINT, "LAST": LAST, "FIELDS": FIELDS,
-        "PLACES": PLACES, "LOOKS": int(couples.looks), "REPORTS": int(couples.reports),
+        "PLACES": PLACES, "EXCESS": EXCESS, "LOOKS": int(couples.looks), "REPORTS": int(couples.reports),
     }  # fmt: skip
     shapes = coupling_points.NATIVE[: coupling_points.NATIVE.index("    // Finds the points of a pair")]
     laws = coupling_points.NATIVE[coupling_points.NATIVE.index("    // Begins the damper of a point") :]
@@ -80,30 +81,62 @@ def declare(couples: Couples, T: type) -> str:
     own = {"across": first_point[-1], "touch": entries(couples.points)[-1], "bound": 2 * pairs}
     arrays = [f"{c} couple_{name}_row[{count}] = {{}};" for name, count in own.items()]
     arrays += [f"int couple_{name}_row[{pairs}] = {{}};" for name in ("count", "closed", "candidate")]
-    return "\n".join([touches.native(T), text.replace("CONSTANTS", constants), *arrays])
+    column = SHARED if shared else "typedef REAL* Column;"
+    return "\n".join([column.replace("REAL", c), touches.native(T), text.replace("CONSTANTS", constants), *arrays])
 
 
 def arrays(couples: Couples) -> dict[str, int]:
-    """Return the sizes of the thread's arrays that statements around ``couples`` write and read, by name."""
+    """Return the sizes of the arrays that statements around ``couples`` write and read, by name."""
     pairs, count = len(couples.points), len(couples.pairs)
     sizes = {"place": PLACES * pairs, "value": VALUES * pairs + 2, "start": 6 * count, "twist": 6 * count}
-    sizes |= {"damper": LAST * count, "coupled": count, "report": FIELDS * pairs + EXCESS}
+    sizes |= {"damper": LAST * count, "coupled": count, "report": FIELDS * pairs + EXCESS * count}
     return {f"couple_{name}": size for name, size in sizes.items()}
 
 
+def text(couples: Couples, parts: list[str], entries: dict[str, int], T: type, warps: int = 1) -> str:
+    """Return the code of a step whose couples are judged before the first pass and after each one.
+
+    Args:
+        parts: what else is done before, in and after a pass.
+        entries: sizes of further arrays of the thread, by name.
+        warps: so many share the couples, each with its points in memory of its own; the first one does all else.
+    """
+    (first, a_pass, last), sizes = parts, arrays(couples)
+    call = CALL.replace("WARPS", str(warps)).replace("WARP", "warp" if warps > 1 else "0")
+    call = f"{BARRIER}{call}{BARRIER}" if warps > 1 else call
+    begin, judge = call.replace("STAGE", FIRST), call.replace("STAGE", PASS)
+    around = [f"{first}{begin}", f"{a_pass}{judge}", last]
+    if warps == 1:
+        return f"{declare(couples, T)}\n{straight.repeat_counted_passes(around, entries | sizes, T)}"
+    own = straight.repeat_counted_passes(around, entries, T)
+    others = straight.repeat_counted_passes([begin, judge, ""], {}, T)
+    shared = itertools.accumulate(sizes.values(), initial=0)
+    columns = [f"const Column {name}_row = {{sent + {32 * at}}};" for name, at in zip(sizes, shared, strict=False)]
+    work = f"if (warp == 0) {{\n{own}\n}} else {{\n{others}\n}}"
+    return "\n".join([declare(couples, T, shared=True), *columns, work])
+
+
 CALL = """
-couples::judge(STAGE, couple_value_row, couple_place_row, couple_start_row, couple_twist_row, dt_row[0],
+couples::judge(STAGE, WARP, WARPS, couple_value_row, couple_place_row, couple_start_row, couple_twist_row, dt_row[0],
     couple_touch_row, couple_across_row, couple_bound_row, couple_count_row, couple_closed_row, couple_candidate_row,
     couple_damper_row, couple_coupled_row, couple_report_row);
 """
-BEGIN = CALL.replace("STAGE", "couples::FIRST")
-PASS = CALL.replace(
-    "STAGE",
+BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
+FIRST = "couples::FIRST"
+PASS = (
     "turn + 1 == (int)passes_row[0] ? couples::AT_LAST\n"
-    "    : turn > passes_row[0] - 2.5 && passes_row[0] > 2.5 ? couples::CLOSING : couples::BETWEEN",
+    "    : turn > passes_row[0] - 2.5 && passes_row[0] > 2.5 ? couples::CLOSING : couples::BETWEEN"
 )
-"""Native code before the first pass and after each one; only the last pass of three or more closes and never opens."""
+"""Stages: before the first pass, and after each one; only the last pass of three or more closes and never opens."""
 
+SHARED = """
+struct Column
+{
+    REAL* first;
+    CUDA_CALLABLE inline REAL& operator[](int i) const { return first[i * 32]; }
+    CUDA_CALLABLE inline Column operator+(int i) const { return {first + i * 32}; }
+};
+"""
 NATIVE = r"""
 enum { CONSTANTS };
 #if defined(__CUDA_ARCH__)
@@ -120,13 +153,13 @@ struct couples
 
     LAWS
 
-    static CUDA_CALLABLE APART int find(int pair, const REAL* places, REAL* touches)
+    static CUDA_CALLABLE APART int find(int pair, Column places, REAL* touches)
     {
         solids::Solid both[2];
         UNROLL
         for (int side = 0; side < 2; ++side) {
             const int which = 2 * pair + side;
-            const REAL* from = places + PLACES * pair + 12 * side;
+            const Column from = places + (PLACES * pair + 12 * side);
             UNROLL
             for (int c = 0; c < 3; ++c) {
                 both[side].at[c] = from[c];
@@ -141,12 +174,14 @@ struct couples
     }
 
     // Most that the shapes can be in each other, and how far from the origin a point of one of them can be.
-    static CUDA_CALLABLE inline void bound(int pair, const REAL* places, REAL* to)
+    static CUDA_CALLABLE inline void bound(int pair, Column places, REAL* to)
     {
-        const REAL *one = places + PLACES * pair, *two = one + 12;
-        REAL between[3];
+        REAL one[3], between[3];
         UNROLL
-        for (int c = 0; c < 3; ++c) between[c] = one[c] - two[c];
+        for (int c = 0; c < 3; ++c) {
+            one[c] = places[PLACES * pair + c];
+            between[c] = one[c] - places[PLACES * pair + 12 + c];
+        }
         const REAL distance = length(between);
         to[0] = ball_of(2 * pair) + ball_of(2 * pair + 1) - distance;
         to[1] = length(one) + ball_of(2 * pair) + distance;
@@ -238,7 +273,7 @@ struct couples
     }
 
     // h K, and f0 - K t for the twist t before the step.
-    static CUDA_CALLABLE inline void leave(const REAL* K, const REAL* start, REAL h, REAL* to)
+    static CUDA_CALLABLE inline void leave(const REAL* K, Column start, REAL h, Column to)
     {
         REAL load[6];
         UNROLL
@@ -256,18 +291,15 @@ struct couples
     }
 
     // What the points of all couples leave for the next pass, or report after the last one.
-    static CUDA_CALLABLE APART void judge(int stage, const REAL* value, const REAL* places, const REAL* starts,
-        const REAL* twists, REAL h, REAL* touches, REAL* across, REAL* bounds, int* counts, int* closed,
-        int* candidate, REAL* dampers, REAL* coupled, REAL* report)
+    static CUDA_CALLABLE APART void judge(int stage, int warp, int warps, Column value, Column places, Column starts,
+        Column twists, REAL h, REAL* touches, REAL* across, REAL* bounds, int* counts, int* closed, int* candidate,
+        Column dampers, Column coupled, Column report)
     {
         if (stage == AT_LAST && !REPORTS) return;
-        REAL* excess = report + FIELDS * PAIRS;
         const Pair origin = {{{0, 0, 0}, {0, 0, 0}}, {0, 0}, 0};
-        UNROLL
-        for (int i = 0; i < 3; ++i) excess[i] = 0;
         LOOP
-        for (int p = 0; p < COUPLES; ++p) {
-            REAL twist[6], K[LAST];
+        for (int p = warp; p < COUPLES; p += warps) {
+            REAL twist[6], K[LAST], excess[3] = {0, 0, 0};
             bool acts = false, quiet = true;
             UNROLL
             for (int i = 0; i < 6; ++i) twist[i] = twists[6 * p + i];
@@ -276,7 +308,8 @@ struct couples
             LOOP
             for (int e = first_pair_of(p); e < first_pair_of(p + 1); ++e) {
                 const int pair = pair_of(e);
-                const REAL *law = value + 3 * pair, bad = law[0] + law[1] + law[2];
+                const REAL law[3] = {value[3 * pair], value[3 * pair + 1], value[3 * pair + 2]};
+                const REAL bad = law[0] + law[1] + law[2];
                 K[24] += bad - bad;  // NaN even where the pair does not touch
                 acts = acts || bad != bad;
                 quiet = quiet && !acts;
@@ -351,7 +384,12 @@ struct couples
                 report[FIELDS * pair + 3] = count ? -deepest : INFINITY;
                 report[FIELDS * pair + 4] = along;
             }
-            if (quiet || stage == AT_LAST) continue;  // quiet, and it was before
+            if (stage == AT_LAST) {
+                UNROLL
+                for (int i = 0; i < EXCESS; ++i) report[FIELDS * PAIRS + EXCESS * p + i] = excess[i];
+                continue;
+            }
+            if (quiet && stage != FIRST) continue;  // and it was before
             leave(K, starts + 6 * p, h, dampers + LAST * p);
             coupled[p] = acts;
         }

@@ -121,7 +121,7 @@ class Programs:
         """A line for each kernel: its granularity, its operations in one world, and on CUDA what it takes."""
         lines = []
         for key, program in self._used:
-            granularity = f"segment, {program.warps} warps" if program.warps > 1 else "tree"
+            granularity = f"{key[3]}, {program.warps} warps" if program.warps > 1 else "tree"
             line = f"{_title(key)}  {granularity}, {program.operations} operations a world"
             if self.run.device.is_cuda:
                 found = wp.get_cuda_kernel_properties(program.kernel, self.run.device, program.block)

@@ -7,7 +7,7 @@ from typing import Any
 from ..kernels import couples as couple_points
 from ..kernels import coupling, straight
 from ..kernels.slots import WARP_SIZE
-from ..kernels.straight import DIRECT, RELAYED, TILED
+from ..kernels.straight import DIRECT, RELAYED, TILED, KernelLayout
 from ..recursions.contact import coupled, pairs
 from ..recursions.contact.secants import SECANT
 from ..recursions.contact.ties import couples_of
@@ -54,13 +54,8 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
             declared = coupling.declare(couples, run.dtype)
             before = [f"{declared}\n{first}\n{coupling.BEGIN}", "\n".join([read, coupling.PASS, *rest])]
             tables |= builder.touch_tables(couples.points)
-        if aggregates:
-            found = _aggregated(links, options, coupled.REPORT in body)
-            entries |= couple_points.arrays(found)
-            first, a_pass = before
-            declared = couple_points.declare(found, run.dtype)
-            before = [f"{declared}\n{first}\n{couple_points.BEGIN}", f"{a_pass}\n{couple_points.PASS}"]
-        body = straight.repeat_counted_passes([*before, body], entries, run.dtype)
+        if not aggregates:
+            body = straight.repeat_counted_passes([*before, body], entries, run.dtype)
     elif looped:
         ahead, a_pass = before
         body = straight.repeat_passes(ahead, a_pass, body, LOOPED, run.scene.dof_count, run.dtype)
@@ -68,7 +63,30 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
     late = direct and routine.waits_late
     block = PAIR * WARP_SIZE if late or (plan.few and not layout.shared_scalars) else WARP_SIZE
     layout = layout._replace(retries=layout.retries and "farthest" in body, block=block, direct=direct, late=late)
-    return builder.finish(routine, layout, body, body, tables, emitter.operations)
+    cuda = cpu = body
+    if aggregates:
+        found = _aggregated(links, options, coupled.REPORT in body)
+        layout, cuda, cpu = _coupled(builder, layout, found, [*before, body], entries)
+    return builder.finish(routine, layout, cuda, cpu, tables, emitter.operations)
+
+
+def _coupled(
+    builder: Builder, layout: KernelLayout, couples: couple_points.Couples, parts: list[str], entries: dict[str, int]
+) -> tuple[KernelLayout, str, str]:
+    """Return the layout and the code, for CUDA and for the CPU, of a step in which aggregates couple bodies.
+
+    Where worlds are few, couples have warps of their own.
+
+    Args:
+        parts: what a thread does before, in and after a pass. entries: sizes of its arrays.
+    """
+    plan, T, warps = builder.plan, builder.run.dtype, min(len(couples.pairs), couple_points.MOST_WARPS)
+    cpu, shared = couple_points.text(couples, parts, entries, T), sum(couple_points.arrays(couples).values())
+    team = layout._replace(block=WARP_SIZE * warps, warps=warps, messages=shared, late=False)
+    helps = plan.few and plan.device.cuda and warps > 1 and not layout.result.slots
+    if not helps or not team.fits(T, builder.room(True)):
+        return layout, cpu, cpu
+    return team, couple_points.text(couples, parts, entries, T, warps), cpu
 
 
 def _couples(links: Links) -> coupling.Couples:

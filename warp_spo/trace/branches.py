@@ -7,6 +7,7 @@ from collections.abc import Container
 
 from .scalars import BRANCHES, Scalar
 
+Sides = tuple[list[Scalar], list[Scalar]]  # what only the values of a branch need, and only the others
 in_order = operator.attrgetter("number")  # sorts scalars as their graph grew
 
 
@@ -16,7 +17,7 @@ def branch_of(scalar: Scalar) -> tuple:
     return mask.key, name
 
 
-def find_blocks(needed: list[Scalar], used: Container[tuple]) -> dict[tuple, tuple[list[Scalar], list[Scalar]]]:
+def find_blocks(needed: list[Scalar], used: Container[tuple]) -> dict[tuple, Sides]:
     """Return, by branch, the scalars that only the values of this branch need, and only the others, in their order.
 
     What a kernel reads stays outside, because statements before the branch may write over it.
@@ -24,8 +25,7 @@ def find_blocks(needed: list[Scalar], used: Container[tuple]) -> dict[tuple, tup
     Args:
         needed: the scalars of a region. used: the keys of those that are stored, used later, or known.
     """
-    blocks: dict[tuple, tuple[list[Scalar], list[Scalar]]]
-    blocks = {branch_of(x): ([], []) for x in needed if x.op in BRANCHES}
+    blocks: dict[tuple, Sides] = {branch_of(x): ([], []) for x in needed if x.op in BRANCHES}
     if not blocks:
         return blocks
     owners: dict[tuple, set] = {}  # the sides of branches on which each scalar is used; None: outside of all

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .branches import branch_of, find_blocks, in_order
+from .branches import Sides, branch_of, find_blocks, in_order
 from .fusion import Chain, choose_chains, choose_products
 from .scalars import BRANCHES, Scalar, Value, is_constant, is_literal, lookup, ordered
 
@@ -202,14 +202,7 @@ class Emitter:
             self._emit_store(item)
         return Listing("\n".join(lines), self._constants, self._indices, self._labels)
 
-    def _emit_branch(
-        self,
-        first: Scalar,
-        needed: list[Scalar],
-        sides: tuple[list[Scalar], list[Scalar]],
-        fused: set[tuple],
-        due: dict[tuple, list[Store]],
-    ) -> None:
+    def _emit_branch(self, first: Scalar, needed: list[Scalar], sides: Sides, fused: set[tuple], due: dict) -> None:
         """Emit the statements of both ``sides`` of a branch, and all values of the branch of ``first``, the first one.
 
         A value that replaces an entry, or leaves it, is stored inside the branch, and is no longer ``due``.

@@ -188,8 +188,9 @@ class CoupledStep(ContactStep):
     def last_excess(self) -> tuple[list[Value], ...]:
         """Return cone, pull, effort and lacking push of all couples after the last pass."""
         first = FIELDS * len(self.trace.links.scene.contact_pairs)
-        cone, pull, missed = (self.trace.graph.input(REPORT, first + i) for i in range(EXCESS))
-        return [cone], [pull], [], [missed]
+        read = lambda i: [self.trace.graph.input(REPORT, first + EXCESS * p + i) for p in range(len(self.couples))]  # noqa: E731
+        cone, pull, missed = (read(i) for i in range(EXCESS))
+        return cone, pull, [], missed
 
     def _reported(self, name: str) -> list[Store]:
         """Return the stores of what couples report, after the rows of the points."""
