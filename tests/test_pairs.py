@@ -500,7 +500,7 @@ def test_a_bug_of_limbs_is_seen(monkeypatch, device, bug):
     plant(monkeypatch, *BUGS_OF_LIMBS[bug])
     with pytest.raises(AssertionError):
         test_a_cube_that_is_thrown_at_another(device, "segment")
-        test_a_hand_is_the_dense_one(device, "segment")
+        test_a_hand_is_the_dense_one("cpu", "segment")  # a GPU has no room for its limbs in float64
 
 
 STICK = dict(capsule=((0, 0, 0), (0, 0, 1), 0.1))
