@@ -357,6 +357,29 @@ def test_substeps_report_the_mean_force(device):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("granularity", ["tree", "segment"])
+def test_points_are_switched_off_in_some_worlds(device, granularity):
+    """A point without stiffness and damping is as one that is not there, and returns when it has them again."""
+    scene = quadruped()
+    q, qd, tau = touching(scene, 3, WORLDS)
+    options = dict(worlds=WORLDS, device=device, dtype="float64", granularity=granularity)
+    dyn = spo.Dynamics(scene, variable=("contact_stiffness", "contact_damping"), **options)
+    trunk = spo.Dynamics(scene.with_contacts(scene.contacts[4:]).with_values(**{
+        name: scene.values[name][:, 4:] for name in ("contact_stiffness", "contact_damping")
+    }), **options)  # fmt: skip
+    off, no_feet = np.arange(WORLDS) % 2 == 0, np.where(np.arange(12) < 4, 0.0, 1.0)
+    found, force = [], np.full((WORLDS, 12, 3), np.nan)
+    for factor in (None, no_feet, 1.0):
+        if factor is not None:
+            dyn.set(worlds=off, **{name: factor * scene.values[name][0] for name in dyn.variable})
+        found.append(dyn.step(q, qd, tau, H, contact_f=force)[1])
+        assert force[~off, :4].any() and force[off, :4].any() == (factor is not no_feet)
+    np.testing.assert_array_equal(found[1][~off], found[0][~off])
+    np.testing.assert_array_equal(found[2], found[0])
+    np.testing.assert_allclose(found[1][off], trunk.step(q, qd, tau, H)[1][off], rtol=0.0, atol=1e-10 * abs(qd).max())
+
+
+@pytest.mark.slow
 def test_impulse_is_the_change_of_momentum(device):
     """Of a quadruped that falls on its feet and trunk: sum of forces and weight, times dt."""
     dyn, (q, qd, tau) = dynamics(str(device), "float64"), touching(quadruped(), 5, WORLDS)

@@ -39,6 +39,7 @@ def test_heights_add_up(device):
     assert np.flatnonzero(np.isnan(out.numpy())).tolist() == (cells[3] + np.array(steps))[2:3].tolist()
 
 
+@pytest.mark.slow
 def test_points_with_and_without_walls_have_gradients(device):
     """A point that sees slopes has one surface, others have two; their numbers must not be mixed up."""
     contacts = [spo.Contact(0, point=(0.05, 0.0, z), stiffness=1e4, walls=walls, friction=0.0)

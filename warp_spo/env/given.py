@@ -60,7 +60,10 @@ def checked_actions(call: str, actions: Any, worlds: int, labels: list[str]) -> 
 
 def checked_mask(call: str, mask: Any, worlds: int, device: torch.device) -> torch.Tensor:
     """Return a mask of worlds as a tensor on the device; ValueError for what is none."""
-    found = torch.as_tensor(mask, device=device)
+    try:
+        found = torch.as_tensor(mask, device=device)
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"{call}: mask is {mask!r}; expected bool ({worlds},) [world]") from None
     if found.shape != (worlds,) or found.dtype != torch.bool:
         raise ValueError(f"{call}: mask is {found.dtype} {tuple(found.shape)}; expected bool ({worlds},) [world]")
     return found
