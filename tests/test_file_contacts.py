@@ -13,8 +13,7 @@ import pytest
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.newton import mjcf
-from warp_spo.scene.shapes import Choice, reduced
+from warp_spo.scene.shapes import reduced
 
 EXACT = 1e-12  # float64 on both sides; sizes of a metre
 SINGLE = 3e-6  # MuJoCo keeps the vertices of meshes in float32
@@ -158,23 +157,6 @@ def test_patterns_choose_shapes():
 def test_what_cannot_be_chosen_is_an_error(options, error, words):
     with pytest.raises(error, match=words):
         quiet(spo.from_mujoco, compiled(), **options)
-
-
-@pytest.mark.parametrize("flag", ["contact", "constraint"])
-def test_a_file_that_disables_contacts_is_obeyed(flag, tmp_path):
-    """By True, with a warning, through MuJoCo and without it; a pattern takes the shapes anyway."""
-    file = tmp_path / "ball.xml"
-    body = '<body name="b"><freejoint/><geom name="s" type="sphere" size="0.1"/></body>'
-    text = '<mujoco><option>{}</option><worldbody><geom type="plane" size="1 1 1"/>{}</worldbody></mujoco>'
-    file.write_text(text.format(f'<flag {flag}="disable"/>', body))
-    through_newton = lambda contacts: mjcf.read_mjcf(file, None, True, Choice(contacts, None, 8))  # noqa: E731
-    for read in (lambda contacts: spo.load(file, contacts=contacts), through_newton):
-        with pytest.warns(UserWarning, match=r"left out: all contacts, which its options disable .*contacts='\*'"):
-            scene = read(True)
-        assert not scene.contacts and scene.ground is None
-        assert len(quiet(read, "*").contacts) == 1
-    file.write_text(text.format("", body))
-    assert len(quiet(spo.load, file, contacts=True).contacts) == 1
 
 
 def test_what_is_left_out_is_said_by_name():

@@ -1,11 +1,13 @@
-"""Margins of MJCF shapes against MuJoCo's constraints, and shapes that MuJoCo cannot read."""
+"""Margins of MJCF shapes against MuJoCo's constraints, shapes that MuJoCo cannot read, and files without contacts."""
 
 import mujoco
 import numpy as np
 import pytest
 
 import warp_spo as spo
+from warp_spo.newton import mjcf
 from warp_spo.reference_rotations import rotation
+from warp_spo.scene.shapes import Choice
 
 EXACT = 1e-12  # float64 on both sides; sizes of a metre
 MARGINS = """<mujoco><option o_margin="0.07" o_friction="0.4 0.4 0.01 0.01 0.01"><flag override="{override}"/></option>
@@ -73,3 +75,20 @@ def test_a_mesh_that_is_missing_touches_nothing(tmp_path):
     assert [(c.label, c.friction) for c in scene.contacts] == [("ball", 0.3)]
     with pytest.raises(spo.UnsupportedError, match=r"contacts='hoof', which matches mesh that MuJoCo cannot read"):
         spo.load(file, contacts="hoof")
+
+
+@pytest.mark.parametrize("flag", ["contact", "constraint"])
+def test_a_file_that_disables_contacts_is_obeyed(flag, tmp_path):
+    """By True, with a warning, through MuJoCo and without it; a pattern takes the shapes anyway."""
+    file = tmp_path / "ball.xml"
+    body = '<body name="b"><freejoint/><geom name="s" type="sphere" size="0.1"/></body>'
+    text = '<mujoco><option>{}</option><worldbody><geom type="plane" size="1 1 1"/>{}</worldbody></mujoco>'
+    file.write_text(text.format(f'<flag {flag}="disable"/>', body))
+    through_newton = lambda contacts: mjcf.read_mjcf(file, None, True, Choice(contacts, None, 8))  # noqa: E731
+    for read in (lambda contacts: spo.load(file, contacts=contacts), through_newton):
+        with pytest.warns(UserWarning, match=r"left out: all contacts, which its options disable .*contacts='\*'"):
+            scene = read(True)
+        assert not scene.contacts and scene.ground is None
+        assert len(read("*").contacts) == 1
+    file.write_text(text.format("", body))
+    assert len(spo.load(file, contacts=True).contacts) == 1

@@ -65,7 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError, ImportError) as error:
         parser.error(str(error))
     policy = learning.policy_of(runner)
-    print(f"{options.checkpoint}: {iteration} iterations")
+    print(f"{options.checkpoint}: after {iteration + 1} iteration(s)", flush=True)
     if options.measure:
         print(json.dumps(chosen.measure(env, policy), indent=1))
     if options.export:
