@@ -100,9 +100,9 @@ def test_commands_of_all_pages_exist():
         for module, rest in COMMAND.findall(page.read_text()):
             module = module.rstrip(".")
             path = ROOT / module.replace(".", "/")
-            file = path / "__main__.py" if path.is_dir() else path.with_suffix(".py")
-            assert file.exists(), f"{page.name}: python -m {module}"
-            text = '"--help"' + file.read_text() + OPTIONS.get(module.rpartition(".")[0], "")
+            files = sorted(path.glob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
+            assert (path / "__main__.py" if path.is_dir() else files[0]).exists(), f"{page.name}: python -m {module}"
+            text = '"--help"' + "".join(file.read_text() for file in files) + OPTIONS.get(module.rpartition(".")[0], "")
             for option in re.findall(r"(?<!\S)--[a-z][a-z-]*", rest):
                 seen.add((module, option))
                 assert f'"{option}"' in text, f"{page.name}: python -m {module} {option}"
