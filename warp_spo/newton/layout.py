@@ -36,8 +36,9 @@ class Layout:
         self._index: Any = wp.array(flat, dtype=wp.int32, device=device)
         self._buffers: dict[str, wp.array] = {}
         self._own: Any = None
-        others = np.setdiff1d(np.arange(self._count), flat.ravel())
-        self._others: Any = wp.array(others[None, :], dtype=wp.int32, device=device)
+        others = np.ones(self._count, bool)  # a mask: setdiff1d takes seconds for a million entries
+        others[flat] = False
+        self._others: Any = wp.array(np.flatnonzero(others)[None, :], dtype=wp.int32, device=device)
 
     def buffer(self, name: str) -> wp.array:
         """Return the solver's own array [world, ...] of that name, allocated at the first call."""

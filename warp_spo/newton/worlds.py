@@ -100,7 +100,7 @@ class Worlds:
         articulated = self.articulation >= 0
         order = np.lexsort((np.arange(len(self.child)), ~articulated))
         carried, first = np.unique(self.child[order], return_index=True)
-        lost = np.setdiff1d(np.arange(self.model.body_count), carried)
+        lost = np.flatnonzero(np.bincount(carried, minlength=self.model.body_count) == 0)
         if len(lost):
             labels = self.model.body_label
             raise UnsupportedError(
