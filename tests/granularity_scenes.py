@@ -52,6 +52,21 @@ def hand():
     return spo.Scene(boxes(11, rng, 0.3), hinges)
 
 
+def mirrored():
+    """Four legs around a trunk, whose frames and bodies mirror each other: zeros and signs differ from leg to leg."""
+    rng = np.random.default_rng(56)
+    bodies, hinges = boxes(9, rng), [spo.Hinge("free", -1, 0)]
+    for k, turn in enumerate((0.5 * math.pi, -0.5 * math.pi, math.pi, 0.6)):
+        at = (0.2, 0.1 * (k - 1.5), 0.0, math.sin(0.5 * turn), 0.0, 0.0, math.cos(0.5 * turn))
+        side = (1.0, -1.0, 0.0, 1.0)[k]
+        for j, (axis, pose) in enumerate((((0, 0, 1), at), ((1, 0, 0), (0, 0, -0.2, 0, 0, 0, 1)))):
+            body = 1 + 2 * k + j
+            bodies[body] = spo.Body(1.0, (0.02 * side, 0.0, -0.1), np.diag([0.01, 0.02, 0.015]))
+            armature = 0.01 * (k + 1)
+            hinges.append(spo.Hinge("revolute", j * (body - 1), body, axis=axis, parent_pose=pose, armature=armature))
+    return spo.Scene(bodies, hinges)
+
+
 def deep():
     """Thirty levels of a trunk with aligned axes, in and out of the plane, and a limb at its middle."""
     rng = np.random.default_rng(53)
@@ -102,6 +117,7 @@ SCENES = {
     "arm": ROBOTS["arm"],
     "fixed": fixed,
     "hand": hand,
+    "mirrored": mirrored,
     "deep": deep,
     "massless": massless,
     "no armature": unarmed,
@@ -126,6 +142,7 @@ FEW = {  # operations that a quick run takes of a scene; the others have all
     "two arms": ("forward_dynamics", "mass_matrix"),
     "dancer": ("mass_matrix_inverse",),
     "hand": (*SEGMENTED, "bias_force"),
+    "mirrored": ("forward_dynamics",),
     "arm": (*SEGMENTED, "log_det_mass_matrix", "body_poses"),
     "three roots": (*SEGMENTED, "bias_force", "jacobian"),
 }

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 import warp_machine
 import zoo
+from granularity_scenes import mirrored
 from robots import ROBOTS
 from routines import ROUTINES
 
 import warp_spo as spo
 from warp_spo.execution import plan, shared_text
 from warp_spo.kernels import straight
+from warp_spo.recursions import alike
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.pieces import Pieces
 
@@ -48,6 +50,7 @@ TREES = {
     "star": lambda: zoo.star(6),
     "tree20": lambda: zoo.random_tree(20, 24),
     "hand": lambda: hand(spread=0.3),
+    "mirrored": mirrored,
     "humanoid": ROBOTS["tall_humanoid"],
     "three roots": lambda: zoo.random_tree(25, 24, roots=3),
     "comb": lambda: zoo.from_parents([-1, 0, 0, 1, 1, 3, 3, 5, 5], ["revolute", "prismatic"] * 4 + ["ball"], 9),
@@ -210,6 +213,17 @@ def test_four_legs_are_one_program(monkeypatch):
     text, arrays, wanted = built(texts, hand(4, 3, floating=True), "forward_dynamics")
     assert branches(text) == [[0, 1, 2, 3]]
     assert laws.error(warp_machine.run(text, arrays), wanted) <= laws.TOLERANCE["float64"]
+
+
+@pytest.mark.parametrize("operation", SEGMENTED)
+def test_mirrored_limbs_share_one_text(operation, monkeypatch):
+    """Numbers in which they differ come from a table, where each leg alone would drop zeros, ones and signs."""
+    texts = warp_machine.recorded(monkeypatch)
+    together, *_ = built(texts, mirrored(), operation)
+    monkeypatch.setattr(alike, "differing", lambda pieces, *_: [frozenset()] * len(pieces))
+    apart, *_ = built(texts, mirrored(), operation)
+    assert len(branches(together)) <= 2 < len(branches(apart))
+    assert together.cuda.count(" = ") < 0.8 * apart.cuda.count(" = ")
 
 
 def test_what_differs_between_limbs_is_in_the_table(monkeypatch):

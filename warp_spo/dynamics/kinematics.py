@@ -108,7 +108,7 @@ BODY_STATES = Operation(
     arguments=(Q, required(QD)),
     results=(POSES, VELOCITIES),
     routine=Routine(
-        "body_states", recursion.body_states, nodes.body_states, suits=_anchors_fixed, alone=True, wide=True, alike=True
+        "body_states", recursion.body_states, nodes.body_states, suits=_anchors_fixed, alone=True, wide=True
     ),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 MANY = 4  # passes from which on a step begins with rounds
 EARLY = (3, 3)  # passes of each round
-CONTACT_STEP = Routine("contact_step", contact.step, letters="PzafSE", passes=True, counted=True, wide=True, alike=True)
+CONTACT_STEP = Routine("contact_step", contact.step, letters="PzafSE", passes=True, counted=True, wide=True)
 BIAS = Routine("middle_bias", middle_bias, letters="z", short=True)
 
 

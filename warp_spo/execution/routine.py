@@ -38,7 +38,6 @@ class Routine:
         passes: the recursion is repeated until the laws of the joints hold, and its results may overwrite its inputs.
         counted: so often as the argument "passes" says.
         crowded: a thread holds too little even of a dozen dofs, so that limbs share the work with many worlds, too.
-        alike: by limbs, constants in which limbs of one make differ do not fold, so that these share a text.
         couples: by limbs, native code couples pairs of bodies between their sweeps.
         tiled: the result is left in tiles for the kernels of :mod:`warp_spo.kernels.tiles` to finish.
         bias_first: variant that computes velocity terms and loads first, for many worlds of shallow trees.
@@ -70,7 +69,6 @@ class Routine:
     passes: bool = False
     counted: bool = False
     crowded: bool = False
-    alike: bool = False
     couples: bool = False
     tiled: bool = False
     bias_first: Routine | None = None

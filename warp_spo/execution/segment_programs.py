@@ -106,8 +106,7 @@ class _Limbs:
         self.slots, self.sent = messages.slots(self.letters, pieces)
         self.couples = self._couples() if job.routine.couples else None
         self.sent = self.couples.layout["end"] if self.couples is not None else self.sent
-        # Constants in which limbs differ may be kept from folding; without contacts they all fold.
-        self.unfolds = job.routine.alike and bool(self.run.scene.contacts)
+        self.unfolds = not job.routine.couples  # constants in which limbs differ may be kept from folding
 
     def build(self) -> Program | None:
         """Return the program; of two, with constants that fold and with some that do not, that with fewer texts."""

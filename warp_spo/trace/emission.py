@@ -323,7 +323,8 @@ class Emitter:
         if op in BINARY:
             return [f"const {T} {name} = {texts[0]} {BINARY[op]} {texts[1]};"]
         if op in SIGN:
-            return [f"const {T} {name} = {SIGN[op]}{texts[0]};"]
+            text = f"({texts[0]})" if is_literal(scalar.args[0]) else texts[0]  # "--1" is no expression
+            return [f"const {T} {name} = {SIGN[op]}{text};"]
         if op == "guarded":
             return [f"const {T} {name} = {texts[0]} > {texts[1]} ? {texts[0]} : nan;"]
         if op == "select":
