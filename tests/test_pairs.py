@@ -2,11 +2,13 @@
 
 import functools
 import inspect
+import re
 import textwrap
 
 import numpy as np
 import pytest
 import warp as wp
+import warp_machine
 from pair_scenes import (
     box,
     cube,
@@ -536,6 +538,24 @@ def test_the_plan_takes_the_form_that_was_faster():
     assert held.granularity == "tree" and "most of its links are on one path" in held.reason
     assert plan.choose(stack(), 256, MEASURED, "float32").granularity == "segment"
     assert forms["stack", 4096] == ["segment", "segment"] and forms["stack", 65536] == ["tree", "segment"]
+
+
+def test_couples_have_warps_of_their_own_where_worlds_are_few(monkeypatch):
+    """All warps of a block come to the same barriers, and only the first one stores."""
+    monkeypatch.setattr("warp_spo.dynamics.dynamics.read_facts", lambda device: MEASURED)
+    texts, scene = warp_machine.recorded(monkeypatch), hand()
+    for worlds in (40, 1 << 17):
+        sizes = dict(q=scene.coord_count, qd=scene.dof_count, tau=scene.dof_count)
+        shapes = {name: (worlds, size) for name, size in sizes.items()} | dict(dt=(), passes=())
+        dyn = spo.Dynamics(scene, worlds, "cpu", "float32", granularity="tree")
+        dyn.programs.find(PAIRED_STEP, shapes, shapes["qd"], {"q_out": shapes["q"]})
+    few, many = texts
+    assert (few.frame.warps, few.frame.block, many.frame.warps) == (4, 128, 1) and many.cpu == many.cuda
+    own, _, others = few.cuda.split("if (warp == 0) {")[1].rpartition("} else {")
+    seen = r"bar.sync|couples::judge\(couples::FIRST|couples::judge\(turn|for \(int turn"
+    first, later = (["bar.sync", f"couples::judge({stage}", "bar.sync"] for stage in ("couples::FIRST", "turn"))
+    assert re.findall(seen, own)[-7:] == re.findall(seen, others) == [*first, "for (int turn", *later]
+    assert "result_row" in own and "result_row" not in others
 
 
 def test_calls_without_a_kernel_have_names(device):
