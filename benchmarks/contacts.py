@@ -14,6 +14,7 @@ import argparse
 import itertools
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,12 @@ def force_array(dyn: spo.Dynamics) -> wp.array:
     return wp.empty((dyn.worlds, len(dyn.scene.contact_points), 3), dtype=dyn.dtype, device=dyn.device)
 
 
-def measure(
+def measure(*given: Any, **options: Any) -> dict[str, Any]:
+    """Return what :func:`prepare` measures."""
+    return prepare(*given, **options)()
+
+
+def prepare(
     robot: str,
     worlds: int,
     device: wp.Device,
@@ -99,29 +105,39 @@ def measure(
     contacts: bool = True,
     passes: int | None = None,
     **options: Any,
-) -> dict[str, Any]:
-    """Return ``us`` of a step, and its errors against the dense step: of velocities, and of forces over the weight.
+) -> Callable[[], dict[str, Any]]:
+    """Take a step; return what measures ``us`` and errors against the dense step: of velocities, of forces over weight.
 
     ``contacts``: False measures the time of the step without ground, where drives and limits settle in passes.
     """
     dyn, sets = subject(robot, worlds, device, field, contacts, **options)
     out, (q, qd) = tuple(wp.empty_like(x) for x in sets[0]), sets[0]
-    found: dict[str, Any] = {"us": measure_time(lambda i: dyn.step(*sets[i], None, DT, passes=passes, out=out), device)}
-    found["kernel"] = dyn.programs.described()[0]
-    if not contacts:
+    force = force_array(dyn) if contacts else None
+
+    def step(index: int) -> None:
+        dyn.step(*sets[index], None, DT, passes=passes, out=out)
+
+    step(0)
+    if force is not None:
+        dyn.step(q, qd, None, DT, passes=passes, contact_f=force)
+
+    def run() -> dict[str, Any]:
+        found: dict[str, Any] = {"us": measure_time(step, device), "kernel": dyn.programs.described()[0]}
+        if force is None:
+            return found
+        after = dyn.step(q, qd, None, DT, passes=passes, contact_f=force)[1].numpy()
+        weight, start = 9.81 * dyn.scene.values["body_mass"].sum(), [x.numpy().astype(np.float64) for x in (q, qd)]
+        errors = []
+        for w in range(0, worlds, max(1, worlds // SAMPLE)):
+            at = ContactStep(dyn.scene, start[0][w], start[1][w], DT)
+            wanted, forces = at.run(passes=passes or 3)[1], np.zeros(force.shape[1:])
+            np.add.at(forces, at.numbers, wanted.f)
+            errors.append((np.abs(after[w] - wanted.v).max() / np.abs(wanted.v).max(),
+                           np.abs(force.numpy()[w] - forces).max() / weight))  # fmt: skip
+        found["error"], found["force error"] = np.max(errors, axis=0).tolist()
         return found
-    force = force_array(dyn)
-    after = dyn.step(q, qd, None, DT, passes=passes, contact_f=force)[1].numpy()
-    weight, start = 9.81 * dyn.scene.values["body_mass"].sum(), [x.numpy().astype(np.float64) for x in (q, qd)]
-    errors = []
-    for w in range(0, worlds, max(1, worlds // SAMPLE)):
-        at = ContactStep(dyn.scene, start[0][w], start[1][w], DT)
-        wanted, forces = at.run(passes=passes or 3)[1], np.zeros(force.shape[1:])
-        np.add.at(forces, at.numbers, wanted.f)
-        errors.append((np.abs(after[w] - wanted.v).max() / np.abs(wanted.v).max(),
-                       np.abs(force.numpy()[w] - forces).max() / weight))  # fmt: skip
-    found["error"], found["force error"] = np.max(errors, axis=0).tolist()
-    return found
+
+    return run
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -6,25 +6,29 @@ A line gives the time of one call of all worlds [us], the largest error of the r
 reference, the figure that has a limit, and the limit. A figure is the time itself, a rate [1e9 worlds/s], or the time
 over that of another call in the same run. ``PATTERN`` is a regular expression on the lines' names. ``--compile``
 compiles the kernels into Warp's cache, several at a time and those that take longest first, and times nothing.
-``--seconds`` is the time after which compiling ends, and no further line begins. Each line is printed and saved as soon
-as it is known, and one that fails is named. The exit code is 1 if an error exceeds its tolerance or a line failed; a
-limit that is missed is printed, and is no error.
+Lines are prepared by processes side by side, then timed one at a time; ``--seconds`` is the time for either run. A line
+is printed and saved as soon as it is known, and one that fails is named. The exit code is 1 if an error exceeds its
+tolerance or a line failed; a limit that is missed is printed, and is no error.
 """
 
 from __future__ import annotations
 
 import argparse
 import concurrent.futures
+import contextlib
 import dataclasses
 import functools
 import gc
 import multiprocessing
 import os
+import queue
 import re
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import warp as wp
 
@@ -144,22 +148,32 @@ def _inputs(robot: str, worlds: int, sets: int) -> list[Inputs]:
     return [Inputs(scene, worlds, seed) for seed in range(sets)]
 
 
-def measure(call: Call, device: wp.Device) -> dict:
-    """Return ``us``, percentiles, ``error``, and what the call's kernels take."""
+def prepare(call: Call, device: wp.Device) -> Callable[[], dict]:
+    """Make, compile and check all that a call needs.
+
+    Returns:
+        A function that times it and returns its row: ``us``, percentiles, ``error``, and what the call's kernels take.
+    """
     if call.operation in (ON_PLANE, ON_FIELD):
-        found = contacts.measure(call.robot, call.worlds, device, call.operation == ON_FIELD)
-        return dataclasses.asdict(call) | found | {"tolerance": CONTACT_TOLERANCE}
+        run = contacts.prepare(call.robot, call.worlds, device, call.operation == ON_FIELD)
+        return lambda: dataclasses.asdict(call) | run() | {"tolerance": CONTACT_TOLERANCE}
     if call.operation in FUSED:
-        name = call.robot + FUSED[call.operation]
-        return dataclasses.asdict(call) | substeps.measure(name, call.worlds, device, SUBSTEPS) | {"tolerance": 0.0}
+        run = substeps.prepare(call.robot + FUSED[call.operation], call.worlds, device, SUBSTEPS)
+        return lambda: dataclasses.asdict(call) | run() | {"tolerance": 0.0}
     with record_launches() as launched:
         trial = trial_of(call, device)
         del launched[:]
         trial.evaluate(0)
-    checked = trial.check()
-    timing, left = trial.measure(REPEATS, WARM_UP, BUDGET)
-    row = dataclasses.asdict(call) | dict(us=1e6 * timing.median, p10_us=1e6 * timing.low, p90_us=1e6 * timing.high)
-    return row | dict(error=max(checked, left), launches=len(launched)) | resources(launched, device)
+    checked, used = trial.check(), dict(launches=len(launched)) | resources(launched, device)
+
+    def timed() -> dict:
+        if isinstance(trial, step_parts.SolverTrial):
+            trial.lean = call.operation == LEAN_STEP  # both forms share it
+        timing, left = trial.measure(REPEATS, WARM_UP, BUDGET)
+        row = dataclasses.asdict(call) | dict(us=1e6 * timing.median, p10_us=1e6 * timing.low, p90_us=1e6 * timing.high)
+        return row | dict(error=max(checked, left)) | used
+
+    return timed
 
 
 def calls_of(lines: list[Line]) -> list[Call]:
@@ -169,20 +183,9 @@ def calls_of(lines: list[Line]) -> list[Call]:
 
 def _compile(calls: list[Call], device: str) -> None:
     """Compile the kernels of calls that differ in the number of worlds alone, most of which share them."""
-    wp.config.log_level, on = wp.LOG_WARNING, wp.get_device(device)
+    wp.config.log_level = wp.LOG_WARNING
     for call in calls:
-        if call.operation in (ON_PLANE, ON_FIELD):
-            dyn, ((q, qd), *_) = contacts.subject(call.robot, call.worlds, on, call.operation == ON_FIELD)
-            dyn.step(q, qd, None, contacts.DT)
-            dyn.step(q, qd, None, contacts.DT, contact_f=contacts.force_array(dyn))
-        elif call.operation in FUSED:
-            dyn, (given, *_) = substeps.subject(call.robot + FUSED[call.operation], call.worlds, on)
-            for count in (1, SUBSTEPS):
-                dyn.step(**given, dt=substeps.DT, substeps=count)
-        else:
-            trial = trial_of(call, on, sets=1)
-            if isinstance(trial, step_parts.SolverTrial):
-                trial.check()  # with kernels in float64 on the CPU
+        prepare(call, wp.get_device(device))
 
 
 def _compile_all(calls: list[Call], device: str, seconds: float) -> int:
@@ -213,6 +216,68 @@ def _compile_all(calls: list[Call], device: str, seconds: float) -> int:
     return failed
 
 
+def _serve(calls: list[Call], device: str, patience: float, gate: Any, turn: Any, rows: Any) -> None:
+    """Prepare calls, wait at the gate for other processes, and time the calls when it is this process's turn."""
+    wp.config.log_level, ready = wp.LOG_WARNING, {}
+    for call in calls:
+        try:
+            ready[call] = prepare(call, wp.get_device(device))
+        except Exception as error:  # the other calls go on
+            rows.put((call, f"{type(error).__name__}: {str(error)[:200]}"))
+    with contextlib.suppress(threading.BrokenBarrierError):
+        gate.wait(patience)
+    for call, run in ready.items():
+        with turn:
+            gc.collect()
+            try:
+                rows.put((call, run()))
+            except Exception as error:
+                rows.put((call, f"{type(error).__name__}: {str(error)[:200]}"))
+
+
+def _measured(calls: list[Call], device: str, seconds: float) -> Iterator[tuple[Call, dict | str]]:
+    """Yield each call with its row, or why it has none: prepared by processes side by side, timed by one at a time.
+
+    Processes that are not ready after half of the time do not hold the others up.
+    """
+    end, shares = time.monotonic() + seconds, dict[tuple, list[Call]]()
+    for call in calls:
+        kind = "solver" if call.operation in STEPS else call.operation in (ON_PLANE, ON_FIELD, *FUSED)
+        shares.setdefault((call.robot, call.worlds, kind), []).append(call)
+    context = multiprocessing.get_context("spawn")
+    rows: Any = context.Queue()
+    gate, turn = context.Barrier(len(shares)), context.Lock()
+    given = device, seconds / 2, gate, turn, rows
+    processes = [context.Process(target=_serve, args=(share, *given), daemon=True) for share in shares.values()]
+    for process in processes:
+        process.start()
+    left = dict.fromkeys(calls)
+    while (
+        left and time.monotonic() < end and (any(map(multiprocessing.Process.is_alive, processes)) or not rows.empty())
+    ):
+        with contextlib.suppress(queue.Empty):
+            call, row = rows.get(timeout=0.5)
+            del left[call]
+            yield call, row
+    for process in processes:
+        process.terminate()
+    for call in left:
+        yield call, f"not measured in {seconds:.0f} s"
+
+
+def describe(line: Line, rows: dict[Call, dict]) -> str:
+    """Return the line in words, with its figure."""
+    timed = rows.__getitem__
+    figure, row = line.figure(timed), rows[line.call]
+    unit = {"us": "us", "rate": "1e9/s", "ratio": "times"}[line.kind]
+    limit = f"{'at least' if line.kind == 'rate' else 'at most'} {line.limit:g}"
+    beside = f" of {line.beside}, {timed(line.beside)['us']:.4g} us" if line.beside else ""
+    if line.call.operation in FUSED:
+        beside = f" of {SUBSTEPS} calls, {row['calls_us']:.4g} us"
+    word, own = "kept" if line.keeps(figure) else "MISSED", f"{row['us']:.4g} us, error {row['error']:.1e}"
+    return f"{line.call!s}: {own}; {figure:.4g} {unit}{beside}; {limit}: {word}"
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="benchmarks.speed", description="Times beside limits.")
     parser.add_argument("pattern", nargs="?", default="", help="regular expression on the names of lines")
@@ -225,38 +290,20 @@ def main(arguments: list[str] | None = None) -> int:
     lines = [line for line in LINES if re.search(options.pattern, str(line.call))]
     if options.compile:
         return 1 if _compile_all(calls_of(lines), str(device), options.seconds) else 0
-    rows: list[dict] = []
-
-    @functools.cache
-    def timed(call: Call) -> dict:
-        gc.collect()
-        rows.append(measure(call, device))
-        return rows[-1]
-
-    failed, end = 0, time.perf_counter() + options.seconds
-    for line in lines:
-        if time.perf_counter() > end:
-            print(f"{line.call!s}: not measured in {options.seconds:.0f} s", flush=True)
+    rows: dict[Call, dict] = {}
+    failed, waiting = 0, list(lines)
+    for call, row in _measured(calls_of(lines), str(device), options.seconds):
+        if isinstance(row, str):
+            print(f"{call!s}: {row}", flush=True)
             failed += 1
             continue
-        try:
-            figure = line.figure(timed)
-        except Exception as error:  # the other lines go on
-            print(f"{line.call!s}: {type(error).__name__}: {str(error)[:200]}", flush=True)
-            failed += 1
-            continue
-        unit = {"us": "us", "rate": "1e9/s", "ratio": "times"}[line.kind]
-        error = max(row["error"] for row in rows if Call(*(row[f.name] for f in dataclasses.fields(Call))) == line.call)
-        limit = f"{'at least' if line.kind == 'rate' else 'at most'} {line.limit:g}"
-        beside = f" of {line.beside}, {timed(line.beside)['us']:.4g} us" if line.beside else ""
-        if line.call.operation in FUSED:
-            beside = f" of {SUBSTEPS} calls, {timed(line.call)['calls_us']:.4g} us"
-        word = "kept" if line.keeps(figure) else "MISSED"
-        own = f"{timed(line.call)['us']:.4g} us, error {error:.1e}"
-        print(f"{line.call!s}: {own}; {figure:.4g} {unit}{beside}; {limit}: {word}", flush=True)
+        rows[call] = row
+        for line in [line for line in waiting if {line.call, line.beside or line.call} <= rows.keys()]:
+            waiting.remove(line)
+            print(describe(line, rows), flush=True)
         if options.json:
-            runner.save(runner.record(rows, device), options.json)
-    wrong = [row for row in rows if not row["error"] <= row.get("tolerance", TOLERANCE[row["dtype"]])]
+            runner.save(runner.record(list(rows.values()), device), options.json)
+    wrong = [row for row in rows.values() if not row["error"] <= row.get("tolerance", TOLERANCE[row["dtype"]])]
     for row in wrong:
         print(f"error {row['error']:.1e} exceeds its tolerance in {row}", file=sys.stderr)
     return 1 if wrong or failed else 0

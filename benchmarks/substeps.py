@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,14 @@ def subject(name: str, worlds: int, device: wp.Device) -> tuple[spo.Dynamics, li
 
 
 def measure(name: str, worlds: int, device: wp.Device, count: int) -> dict[str, Any]:
-    """Return ``us`` of one launch, ``calls_us`` of as many calls, and ``error``, 0 if all bits agree.
+    """Return what :func:`prepare` measures."""
+    return prepare(name, worlds, device, count)()
+
+
+def prepare(name: str, worlds: int, device: wp.Device, count: int) -> Callable[[], dict[str, Any]]:
+    """Compare all bits, and return what measures ``us`` of one launch and ``calls_us`` of as many calls.
+
+    ``error`` is 0 if all bits agree.
 
     Raises:
         AssertionError: a result is not finite.
@@ -84,8 +92,12 @@ def measure(name: str, worlds: int, device: wp.Device, count: int) -> dict[str, 
         for got, wanted in zip(*([x.numpy() for x in out] for out in outs), strict=True):
             assert np.isfinite(wanted).all(), f"{name}: a state is not finite"
             error = max(error, float(np.abs(got.astype(np.float64) - wanted).max()))
-    row = {"us": measure_time(fused, device), "calls_us": measure_time(calls, device), "error": error}
-    return row | resources(launched, device)
+
+    def timed() -> dict[str, Any]:
+        row = {"us": measure_time(fused, device), "calls_us": measure_time(calls, device), "error": error}
+        return row | resources(launched, device)
+
+    return timed
 
 
 def main(arguments: list[str] | None = None) -> int:
