@@ -71,9 +71,9 @@ def test_the_most_severe_state_is_reported(granularity):
 VALUES = ("body_mass", "gravity", "joint_target_kd", "joint_limit_upper", "actuator_gain")
 
 
-def words_of_bad_values(scene, q, name, granularity, **options):
+def words_of_bad_values(scene, q, name, device, **options):
     """Return the words of forward dynamics and of steps: a value is NaN in world 1, infinite in 2, fine in 0 and 3."""
-    dyn = spo.Dynamics(scene, 4, "cpu", variable=(name,), granularity=granularity, **options)
+    dyn = spo.Dynamics(scene, 4, device, variable=(name,), **options)
     value = np.tile(scene.values[name][:1], (4,) + (1,) * (scene.values[name].ndim - 1))
     value[1].flat[-1], value[2].flat[-1] = np.nan, np.inf
     dyn.set(**{name: value})
@@ -95,10 +95,10 @@ def driven_fork():
 @pytest.mark.slow
 @pytest.mark.parametrize("granularity", ["tree", "segment"])
 @pytest.mark.parametrize("name", VALUES)
-def test_values_that_are_not_finite_are_named(name, granularity):
+def test_values_that_are_not_finite_are_named(name, granularity, device):
     """NOT_FINITE in their worlds alone; an infinite bound is none, and forward dynamics read bodies and hinges."""
     scene = driven_fork()
-    forward, step, steps = words_of_bad_values(scene, scene.neutral_q, name, granularity)
+    forward, step, steps = words_of_bad_values(scene, scene.neutral_q, name, device, granularity=granularity)
     worse = [0, 2, 0 if name == "joint_limit_upper" else 2, 0]
     assert step.tolist() == steps.tolist() == worse
     assert forward.tolist() == (worse if name in ("body_mass", "gravity") else [0, 0, 0, 0])
@@ -106,9 +106,9 @@ def test_values_that_are_not_finite_are_named(name, granularity):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("loops", ["embed", "multipliers"])
-def test_a_mass_that_is_nan_is_named_in_closed_loops(loops):
+def test_a_mass_that_is_nan_is_named_in_closed_loops(loops, device):
     """NOT_FINITE, not LOOPS or PIVOT, in forward dynamics and in steps."""
     scene = MECHANISMS["fourbar"]()
     (q,) = mechanisms.states(scene, 1).q
-    for words in words_of_bad_values(scene, q, "body_mass", None, loops=loops):
+    for words in words_of_bad_values(scene, q, "body_mass", device, loops=loops):
         assert words[[0, 3]].max() <= 0 and words[[1, 2]].tolist() == [2, 2]
