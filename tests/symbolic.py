@@ -141,20 +141,18 @@ def contact_step(scene, arrays, h, passes=3, dtype="float64"):
 
 
 def contact_step_in_rounds(scene, arrays, h, passes, dtype="float64"):
-    """The same for a step that begins with rounds, which see velocity terms in the middle of the step."""
-    loaded = {name: array for name, array in arrays.items() if name in ("q", "body_f")}
-    given = {name: array for name, array in arrays.items() if name != "body_f"}
-    before, found, worlds = arrays["qd"], {"out": arrays["qd"]}, len(arrays["q"])
+    """The same for a step that begins with rounds, whose velocity terms are kicks."""
+    found, worlds, n = {"out": arrays["qd"]}, len(arrays["q"]), scene.dof_count
+    left = {"out": np.zeros((worlds, n)), "q_out": np.zeros_like(arrays["q"])}
     for count in (*EARLY, passes):
-        known = loaded | {"qd": before, middle.FOUND: found["out"], "dt": np.full((worlds, 1), h)}
-        stores = middle.middle_bias(Trace(Links(scene), dtype, tuple(known)))
+        known = {"q": arrays["q"], "qd": arrays["qd"], middle.FOUND: found["out"], middle.KICKED: left["out"].copy()}
+        known["dt"] = np.full((worlds, 1), h)
+        stores = middle.middle_kick(Trace(Links(scene), dtype, tuple(known)))
         read = lambda name, at, known=known: known[name][(slice(None), *at)]  # noqa: E731
-        values = evaluate([item.value for item in stores], read, dtype)
-        result = {"out": np.zeros((worlds, scene.dof_count)), "mean_out": np.zeros((worlds, scene.dof_count))}
-        for item, value in zip(stores, values, strict=True):
-            result[item.array][(slice(None), *item.index)] = value
-        before = result["mean_out"]
-        found = contact_step(scene, given | {middle.MIDDLE: result["out"]}, h, count, dtype)
+        for item, value in zip(stores, evaluate([item.value for item in stores], read, dtype), strict=True):
+            left[item.array][(slice(None), *item.index)] = value
+        more = {"q": left["q_out"], middle.START: arrays["q"], middle.KICK: left["out"]}
+        found = contact_step(scene, arrays | more, h, count, dtype)
     return found
 
 

@@ -15,9 +15,10 @@ import warp_spo as spo
 from warp_spo.dynamics import contact_gradients as kernels
 from warp_spo.dynamics.operation import derivative_of
 from warp_spo.dynamics.steps import STEP
-from warp_spo.recursions.contact.middle import MIDDLE
+from warp_spo.recursions.contact.middle import KICK, START
 from warp_spo.recursions.derivatives.contact import INERTIA, PassGradient, PassSolve, divides
 from warp_spo.recursions.derivatives.contact_pass import weighed_pieces
+from warp_spo.reference import Dense
 
 H, WORLDS, PASSES = 5e-3, 4, 2
 ROUTINES = {"contact_pass": kernels.PASS, "contact_solve": kernels.SOLVE, "contact_gradient": kernels.GRADIENT}
@@ -25,25 +26,27 @@ OPTIONS = ("laws", "wrt", "apart")
 WRT = ("q", "qd", "tau", "contact_friction")
 
 
-def launches(scene, wrt, middle):
+def launches(scene, wrt, kicked):
     """For the last launch of each kernel its name, what it reads, and what the whole tree leaves.
 
-    ``middle``: velocity terms are given, so that what joints feel depends on what they carry.
+    ``kicked``: velocity terms are kicks, so that what joints feel depends on what they carry.
     """
     ran, rng = [], np.random.default_rng(0)
     a = dict(zip(("q", "qd", "tau"), touching(scene, 3, WORLDS), strict=True))
-    a |= {MIDDLE: 5.0 * rng.normal(size=a["qd"].shape)} if middle else {}
+    if kicked:
+        starts = np.array([Dense(scene, q).integrate(-qd, 0.5 * H) for q, qd in zip(a["q"], a["qd"], strict=True)])
+        a |= {START: starts, KICK: 0.05 * rng.normal(size=a["qd"].shape)}
     a = contact_gradients.furnish(scene, a)
     cotangents = [rng.normal(size=a[name].shape) for name in ("q", "qd")]
     contact_gradients.gradient(scene, a, H, PASSES, cotangents, wrt, ran)
     return {kernel: (known, found) for kernel, known, found in ran}
 
 
-def assert_right(monkeypatch, scene, wrt=WRT, only=tuple(ROUTINES), middle=False):
-    ran = launches(scene, wrt, middle)
+def assert_right(monkeypatch, scene, wrt=WRT, only=tuple(ROUTINES), kicked=False):
+    ran = launches(scene, wrt, kicked)
     texts = warp_machine.recorded(monkeypatch)
     dyn = spo.Dynamics(scene, WORLDS, "cpu", "float64", granularity="segment", variable=contact_gradients.VALUES)
-    terms = (MIDDLE,) if middle else ()
+    terms = (START, KICK) if kicked else ()
     laws, weighed = kernels._laws(dyn, ("q", "qd", "tau", "dt", "passes", *terms))
     for kernel in only:
         known, wanted = ran[kernel]
@@ -77,11 +80,11 @@ def test_limbs_share_gradients(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", [quadruped(contact_cases.EFFORT), waisted()], ids=["quadruped", "waisted"])
-def test_limbs_share_gradients_of_given_velocity_terms(monkeypatch, scene):
+def test_limbs_share_gradients_where_velocity_terms_are_kicks(monkeypatch, scene):
     """The waist and the arm of the second scene carry limbs, and feel their inertia."""
-    trace = contact_gradients.trace_of(scene, ("q", "qd", "tau", "dt", "passes", MIDDLE))
+    trace = contact_gradients.trace_of(scene, ("q", "qd", "tau", "dt", "passes", START, KICK))
     assert len(weighed_pieces(trace)) == (0 if scene.body_count == 13 else 2)
-    assert_right(monkeypatch, scene, (*WRT, MIDDLE, "joint_target_ke"), middle=True)
+    assert_right(monkeypatch, scene, (*WRT, START, KICK, "joint_target_ke"), kicked=True)
 
 
 @pytest.mark.slow
@@ -153,10 +156,10 @@ BUGS = {
 @pytest.mark.parametrize("bug", BUGS)
 def test_a_planted_bug_is_seen(bug, monkeypatch):
     only = "contact_solve" if bug in ("a push of a limb", "how inertias count") else "contact_gradient"
-    middle = "inertias" in bug
-    scene = waisted() if middle else quadruped()
-    launches_of = launches(scene, WRT, middle)
+    kicked = "inertias" in bug
+    scene = waisted() if kicked else quadruped()
+    launches_of = launches(scene, WRT, kicked)
     monkeypatch.setitem(globals(), "launches", lambda *_: launches_of)
     symbolic.plant(monkeypatch, *BUGS[bug])
     with pytest.raises(AssertionError):
-        assert_right(monkeypatch, scene, only=(only,), middle=middle)
+        assert_right(monkeypatch, scene, only=(only,), kicked=kicked)

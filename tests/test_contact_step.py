@@ -19,6 +19,7 @@ from warp_spo.reference_contact import MANY, ContactStep
 H, WORLDS = 5e-3, 4
 TOLERANCE = {"float64": (1e-10, 1e-10), "float32": (1e-4, 5e-4)}
 """Of velocities, over the largest one, and of forces, over the weight; 2e-5 and 5e-5 measured on G1 in float32."""
+PARABOLA = 1e-6  # of gaps [m] that a parabola finds from half way; 1.2e-7 measured
 SIZES = {"contact_f": (3,), "contact_gap": (), "contact_slip": ()}
 
 
@@ -51,7 +52,7 @@ def assert_is_dense(scene, a, passes):
         np.testing.assert_allclose(found["q_out"][w], q, atol=1e-10)
         force, gap = by_point(at, wanted.f)
         np.testing.assert_allclose(found["contact_f"][w], force, atol=1e-10 * max(1.0, np.abs(wanted.f).max()))
-        np.testing.assert_allclose(found["contact_gap"][w], gap, atol=1e-12)
+        np.testing.assert_allclose(found["contact_gap"][w], gap, atol=1e-12 if passes < MANY else PARABOLA)
         np.testing.assert_allclose(found["contact_excess"][w], wanted.excess, atol=1e-9 * np.abs(wanted.f).max() + 1e-9)
 
 
@@ -259,8 +260,9 @@ BUGS = {
     "last pass opens": (law, "finish_point", "closing * touch.closed", "0.0"),
     "wrong lever": (dampers, "_mass", "r * weight", "r * (2.0 * weight)"),
     "riser unseen": (ground, "surfaces", "_cell((x + moves[0] - ground.origin[0]) * rate_x, rows)[0]", "i"),
-    "velocity terms at the start": (middle, "middle_bias", "v.__getitem__, 0.5 * h", "v.__getitem__, 0.0 * h"),
-    "rounds that forget": (middle, "middle_bias", "0.5 * (before(dof) + found(dof))", "found(dof)"),
+    "velocity terms of the path alone": (middle, "middle_kick", "forces.__getitem__", "zero"),
+    "forces at the start": (step.ContactStep, "__init__", 'trace.instead.pop("q", None)', "None"),
+    "points half way": (points, "place_points", "depth + (0.5 * h)", "depth + (0.4 * h)"),
     "weights of the neutral pose": (step.ContactStep, "_felt", "not in single_dofs", "in single_dofs"),
     "straight paths": (points, "place_points", "(0.5 * h) * faster", "0.0"),
     "damper of straight paths": (points, "place_points", "k * below - damping * faster", "k * below"),

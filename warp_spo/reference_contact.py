@@ -10,9 +10,11 @@ where S and l are resistances and loads of the hinges' laws. G, S and l depend o
 the pass before. Friction, effort limits and dry friction are secants: dampers that give the bound at the v before. The
 first pass closes all candidates, later passes open those that pull, the last of three or more only closes.
 
-A step of four passes or more begins with rounds. Each takes bias half way along v, at v itself, where v is qd at first
-and then the mean of v and of what the round before found: there velocity terms do the work by which the kinetic energy
-changes along the path. How much faster a dof gets that a saturated drive lets go follows from each pass's own sweep.
+A step of four passes or more is made in rounds. Each finds the kick k = -h Mass^-1 c(u, v) / 2 half way along the mean
+v of qd and of the rates after the step, where c(u, v) = c((u + v) / 2) - c((u - v) / 2) are velocity terms of rates v
+along a path u, as the round before found both. Passes without velocity terms, half way along qd + k, then take qd + k
+to u, along which q moves, and the rates after the step are u + k. How much faster a dof gets that a saturated drive
+lets go follows from each pass's own sweep.
 """
 
 from typing import NamedTuple
@@ -222,31 +224,37 @@ class ContactStep:
         scene: a Scene with contact_points and a ground.
         q, qd: the state [coordinate], [dof]. h: length of the step [s].
         target_q, target_qd: of the drives; None: the neutral q, zero.
+        start: q before the step, if ``q`` is half way; None: ``q`` is before the step.
     """
 
-    def __init__(self, scene, q, qd, h, target_q=None, target_qd=None, world=0):
-        self.scene, self.h, self.world = scene, h, world
+    def __init__(self, scene, q, qd, h, target_q=None, target_qd=None, world=0, start=None):
+        self.scene, self.h, self.world, self.half_way = scene, h, world, start is not None
+        self.start = Dense(scene, q if start is None else start, world=world)
         self.dense, self.qd = Dense(scene, q, qd, world), np.asarray(qd, dtype=np.float64)
         self.neutral = Dense(scene, scene.neutral_q)
         self.points, self.limits = self._points(), self._limits()
+        self._targets = target_q, target_qd
         target_q = scene.neutral_q if target_q is None else target_q
         self.laws = self._laws(target_q, np.zeros(scene.dof_count) if target_qd is None else target_qd)
 
     def run(self, tau=None, body_f=None, passes=3):
         """Return q' and what the passes find."""
         dense, tau = self.dense, 0.0 if tau is None else np.asarray(tau)
-        system = dense.mass_matrix, self.laws, self.limits, self.points, self.qd
-        options = {"gravity": np.linalg.norm(dense.value("gravity"))}
         if passes < MANY or self.scene.contact_pairs:
-            found = solve(*system, tau - dense.bias_force(self.qd, body_f), self.h, passes, **options)
+            found = self._passes(tau - dense.bias_force(self.qd, body_f), passes)
             return dense.integrate(found.v, self.h), found
-        v, found = self.qd, None
+        u = rates = self.qd
         for count in (*EARLY, passes):
-            v = v if found is None else 0.5 * (v + found.v)
-            middle = Dense(self.scene, dense.integrate(v, 0.5 * self.h), v, self.world)
-            load = tau - middle.bias_force(v, body_f) + self._lift(middle) - self._lift(dense)
-            found = solve(*system, load, self.h, count, **options, outward=self._outward)
-        return dense.integrate(found.v, self.h), found
+            v = 0.5 * (self.qd + rates)
+            middle = Dense(self.scene.with_values(gravity=np.zeros(3)), dense.integrate(v, 0.5 * self.h), v, self.world)
+            terms = middle.bias_force(0.5 * (u + v)) - middle.bias_force(0.5 * (u - v))
+            kick = -0.5 * self.h * np.linalg.solve(middle.mass_matrix, terms)
+            half = dense.integrate(self.qd + kick, 0.5 * self.h)
+            there = ContactStep(self.scene, half, self.qd + kick, self.h, *self._targets, self.world, start=dense.q)
+            load = tau - there.dense.bias_force(np.zeros(len(v)), body_f) + there._lift(there.dense) - self._lift(dense)
+            found = there._passes(load, count, self._outward)
+            u, rates = found.v, found.v + kick
+        return dense.integrate(u, self.h), found._replace(v=rates)
 
     @staticmethod
     def _lift(dense):
@@ -254,6 +262,12 @@ class ContactStep:
         scene = dense.scene.with_values(body_gravcomp=np.zeros(len(dense.scene.bodies)))
         still = np.zeros(dense.dof_count)
         return dense.passive_force(still) - Dense(scene, dense.q, world=dense.world).passive_force(still)
+
+    def _passes(self, load, passes, outward=None):
+        """Return what the passes find for the hinges' forces ``load`` [dof]."""
+        gravity = np.linalg.norm(self.dense.value("gravity"))
+        system = self.dense.mass_matrix, self.laws, self.limits, self.points, self.qd
+        return solve(*system, load, self.h, passes, gravity, outward)
 
     @property
     def _outward(self):
@@ -277,7 +291,8 @@ class ContactStep:
         for number, point in enumerate(self.scene.contact_points):
             at = (dense.body_matrix[point.body] @ homogeneous([*point.position, 0, 0, 0, 1]))[:3, 3]
             turning = dense.jacobian_bias(self.qd, [(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
-            moves = self.h * dense.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3] @ self.qd
+            share = 0.5 if self.half_way else 1.0
+            moves = share * self.h * dense.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3] @ self.qd
             at = at - point.radius * np.array(ground.normal if plane else (0.0, 0.0, 1.0))
             there = self.neutral.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
             weight = SLIP * np.trace(there @ inverse @ there.T) / 3.0
@@ -287,9 +302,12 @@ class ContactStep:
             else:
                 touched = surfaces(ground, at - moved, int(field[0]) if len(field) else 0, moves, point.walls)
             for normal, depth in touched:
-                J = dense._jacobian_at(point.body, at)[:3]
+                J, bend = dense._jacobian_at(point.body, at)[:3], normal @ turning
+                if self.half_way:  # half a step back
+                    depth = depth + 0.5 * self.h * normal @ J @ self.qd - 0.125 * self.h**2 * bend
+                    bend = 0.0
                 damping = d * k * max(depth, 0.0) if point.dissipates else d
-                rows.append((J, normal, depth, k, damping, mu, point.eps, weight, normal @ turning))
+                rows.append((J, normal, depth, k, damping, mu, point.eps, weight, bend))
                 self.numbers.append(number)
         return Points(*(np.array(column) for column in zip(*rows, strict=True)))
 
@@ -298,7 +316,7 @@ class ContactStep:
         found, scene = np.full(self.dense.dof_count, np.nan), self.scene
         for hinge, q, v in zip(scene.hinges, scene.q_start, scene.qd_start, strict=False):
             if hinge.kind not in ("ball", "free"):
-                found[v : v + hinge.dof_count] = self.dense.q[q : q + hinge.dof_count]
+                found[v : v + hinge.dof_count] = self.start.q[q : q + hinge.dof_count]
         return found
 
     def _limits(self):
@@ -313,7 +331,7 @@ class ContactStep:
         return Limits(columns[0].astype(int), *columns[1:])
 
     def _laws(self, target_q, target_qd):
-        value, dense, h, n = self.dense.value, self.dense, self.h, self.dense.dof_count
+        value, dense, h, n = self.start.value, self.start, self.h, self.start.dof_count
         ke, kd, effort = value("joint_target_ke"), value("joint_target_kd"), value("joint_effort_limit")
         stiff, damp, lift = value("joint_stiffness"), value("joint_damping"), np.zeros(len(self.scene.bodies))
         drives = self.scene.with_values(

@@ -91,11 +91,15 @@ def root_force(
 
 
 def inverse_dynamics(
-    trace: Trace, gravity: bool = True, qdd: Callable[[int], Value] | None = None, letter: str = "z"
+    trace: Trace,
+    gravity: bool = True,
+    qdd: Callable[[int], Value] | None = None,
+    letter: str = "z",
+    moves: bool = True,
 ) -> list[Store]:
-    """out = Mass qdd + bias_force, for ``qdd`` or the array of that name"""
+    """out = Mass qdd + bias_force, for ``qdd`` or the array of that name; without velocity terms if not ``moves``"""
     base = trace.base_acceleration if gravity else (ZERO, ZERO)
-    qdd, moves = qdd or trace.vector("qdd"), "qd" in trace.inputs
+    qdd, moves = qdd or trace.vector("qdd"), moves and "qd" in trace.inputs
     alpha: dict[int, tuple[Vector, Vector]] = {}
     forces: dict[int, Vector] = {}
     shared: dict[int, Value] = {}  # of dofs that several links share

@@ -10,7 +10,8 @@ link.
 A point's path within the step is a parabola: at rates that stay as they are it accelerates by n* J' qd = ``bend`` along
 the normal, so that after the step it is h n* v + h^2 bend / 2 further out, and leaves the ground by h bend faster. The
 spring and the damper see that. Without it a point of a limb that turns fast ends up to h^2 bend / 2 deeper than the
-spring has worked for, and energy rises.
+spring has worked for, and energy rises. Where velocity terms are kicks, all is half way, where J* is the mean along the
+path: the point was half a step back before the step, and n* J v is its mean speed.
 
 A piece works on the points of its links. Those of the link on which other pieces begin are shared among these in equal
 numbers, and only the rest stays: they know that link's motion, and their messages to it carry what the points add.
@@ -37,6 +38,7 @@ from ..pieces import Piece, Pieces
 from ..remembered import remembered
 from ..tracing import Trace
 from .ground import Corners, Place, Surface, directions, lowest, surface_count, surfaces
+from .middle import KICK
 
 if TYPE_CHECKING:
     from ..impedance import Impedance
@@ -145,6 +147,7 @@ def place_points(
     scene = trace.links.scene
     ground, weights = scene.ground, inverse_weights(scene)
     assert ground is not None
+    half_way = KICK in trace.inputs
     place_of_ground = ground_place(impedance)
     seats = {number: _seat(trace, number, body, place) for number, body, place in _places(trace, impedance)}
     needed = with_ancestors([link for link, _ in seats.values()] if carry is None else point_links(trace.links))
@@ -181,17 +184,20 @@ def place_points(
         bend = mine.bend[1] + cross(mine.bend[0], centre)
         bend = bend if moving is None else bend + moving.whirl @ centre
         w, v = mine.twist
-        moves = [h * dot(axis, v + cross(w, centre)) for axis in toward]
+        ahead = 0.5 * h if half_way else h
+        moves = [ahead * dot(axis, v + cross(w, centre)) for axis in toward]
         touched = [_listed(impedance, number)] if isinstance(ground, Listed) else None
         for normal, depth, cell, near in touched or surfaces(
             trace.graph, ground, at, place_of_ground, moves, point.walls
         ):
             inward = Vector(total(n * axis[c] for n, axis in zip(normal, toward, strict=True)) for c in range(3))
             faster = h * dot(inward, bend)
-            below = depth - (0.5 * h) * faster
+            if half_way:  # half a step back, along a parabola
+                depth = depth + (0.5 * h) * dot(inward, v + cross(w, arm)) - (0.125 * h) * faster
+            below = depth if half_way else depth - (0.5 * h) * faster
             damping = d * (k * select(less(0.0, depth), depth, 0.0)) if point.dissipates else d
             material = k, damping, mu, eps, weight
-            push = k * below - damping * faster
+            push = k * below if half_way else k * below - damping * faster
             state = turned, below, push, cell, near if branches else None, lever
             found.append(Point(number, on, arm, inward, -depth, mine.twist, *material, *state))
     return found

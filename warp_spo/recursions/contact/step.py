@@ -29,7 +29,7 @@ from ..step import GAIN, Step
 from .crowds import Crowd, gather
 from .dampers import SEVERAL, chosen, damper, load
 from .law import Found, Touch, begin_point, finish_point, force_at, normal_force
-from .middle import MIDDLE
+from .middle import KICK, START
 from .points import Point, ground_place, keeps_arms, own_points, place_points
 from .secants import Kept, Secant, largest, single_dofs
 
@@ -50,13 +50,19 @@ class ContactStep(Step):
         trace: the evaluation. reports: names among REPORTS of what the step stores beside the state.
 
     Attributes:
+        kicked: velocity terms are kicks before and after the step, see :mod:`.middle`; ``qd`` is after the first one,
+            and all but the hinges' laws is half way.
         looks: whether many points of a link cost a look where they are far from the ground, see :mod:`.crowds`.
     """
 
     looks = True
 
     def __init__(self, trace: Trace, reports: tuple[str, ...]):
+        self.kicked, before, self.kick = KICK in trace.inputs, trace.vector("qd"), trace.vector(KICK)
+        if self.kicked:
+            trace.instead = {"q": trace.vector(START), "qd": lambda dof: before(dof) + self.kick(dof)}
         super().__init__(trace)
+        trace.instead.pop("q", None)  # the sweep is half way, its laws are not
         self.reports, self.kept = reports, Kept(trace.graph)
         self.secants: dict[int, list[Secant]] = {}  # by dof
         self.crowds: dict[int, Crowd] = {}  # by id of the link
@@ -136,13 +142,9 @@ class ContactStep(Step):
         return found
 
     def _bias(self) -> tuple[dict[int, Value], list[Store]]:
-        """Return velocity terms, gravity and loads as forces of the dofs, and the stores that send for them."""
-        trace = self.trace
-        if MIDDLE in trace.inputs:
-            for link in trace.active_links:
-                trace.place(link)
-            return {dof: trace.vector(MIDDLE)(dof) for link in self.links for dof in link.dofs}, []
-        found = inverse_dynamics(trace, qdd=zero, letter="f")
+        """Return velocity terms, unless kicks replace them, gravity and loads as forces of the dofs, and the stores
+        that send for them."""
+        found = inverse_dynamics(self.trace, qdd=zero, letter="f", moves=not self.kicked)
         bias = {item.index[0]: item.value for item in found if item.array == "out"}
         return bias, [item for item in found if item.array != "out"]
 
@@ -196,10 +198,10 @@ class ContactStep(Step):
     def _felt(self, law: Secant, link: Link, done: Factors) -> Value | None:
         """Return h over the inertia that a law's dof feels in this pass without it; None: that of the neutral pose.
 
-        The sweep knows it of hinges with one dof, and it is asked for where velocity terms are given.
+        The sweep knows it of hinges with one dof, and it is asked for where kicks are given.
         """
         scene = self.trace.links.scene
-        if MIDDLE not in self.trace.inputs or scene.shares_dofs or link.dofs[0] not in single_dofs(scene):
+        if not self.kicked or scene.shares_dofs or link.dofs[0] not in single_dofs(scene):
             return None
         D = done[id(link)].pivots[0].D
         felt, least = D - self.h * law.resistance, FELT * self.trace.epsilon * D
@@ -306,11 +308,12 @@ class ContactStep(Step):
         stores: list[Store] = []
         for link in self.links:
             trace.label(link, "q")
-            stores += [Store("out", (dof,), rates[dof]) for dof in link.dofs]
+            stores += [Store("out", (dof,), rates[dof] + self.kick(dof)) for dof in link.dofs]
             coordinates = integrate_link(link, self.q, rates.__getitem__, self.h)
             stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
             if qdd:
-                stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
+                changes = ((dof, gains[dof] + 2.0 * self.kick(dof)) for dof in link.dofs)
+                stores += [Store("qdd_out", (dof,), change * reciprocal(self.h)) for dof, change in changes]
         results = [item.value for item in stores]
         for name in self.reports:
             stores += self.finished[name]

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from ..tracing import Trace
 
 
-COORDINATES = ("q", "target_q", "q0", "q1", "joint_rest_q")  # arguments and values that are laid out as q
+COORDINATES = ("q", "q_before", "target_q", "q0", "q1", "joint_rest_q")  # arguments and values that are laid out as q
 
 
 class TreeEquations:

@@ -15,7 +15,7 @@ median.
 A pass takes two traces, so that limbs share both. The first one solves: inward, outward, and the cotangents of what
 the pass before left, for which the first trace of that pass waits. The second one takes gradients inward.
 
-Where velocity terms are given, s' depends on the inertia that joints feel in the pass, that is, on the articulated
+Where velocity terms are kicks, s' depends on the inertia that joints feel in the pass, that is, on the articulated
 inertia of all that they carry. Limbs that a joint carries are told, outward in the first trace, how the sum changes
 with their articulated inertia; the second one, which needs it before its sweep, reads it from memory.
 
@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ...scene.contacts import CONTACT_VALUES, HEIGHTS
 from ...scene.parts import DOF_VALUES
@@ -37,7 +37,7 @@ from ...trace.scalars import Scalar, Value, cut, is_constant, less, ordered, sel
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from ..articulated_sweeps import Factors, eliminate, expand, reduce
 from ..contact.ground import CORNERS
-from ..contact.middle import MIDDLE
+from ..contact.middle import KICK, START
 from ..contact.points import Carried, Point, own_points, place_points, point_links, with_ancestors
 from ..integration import integrate_link
 from ..kinematics import carried_velocity
@@ -61,7 +61,7 @@ HEIGHTS_AT = "heights_at"
 """Columns of the heights of a cell in the table of gradients by surface [world, surface]."""
 ORIGIN = "ground_origin"
 OF_DOFS = ("q", "qd", "tau", "target_q", "target_qd", "joint_rest_q", *DOF_VALUES)
-BY_PIECES = (*OF_DOFS, "ctrl", *CONTACT_VALUES, HEIGHTS, ORIGIN, MIDDLE)
+BY_PIECES = (*OF_DOFS, "ctrl", *CONTACT_VALUES, HEIGHTS, ORIGIN, START, KICK)
 """Arguments and values whose gradient a limb computes by itself, or by messages between limbs."""
 Twists = dict[int, tuple[Vector, Vector]]
 
@@ -159,7 +159,7 @@ class PassAdjoint(OnePass):
         for link in self.links:
             trace.label(link, "q")
             values = integrate_link(link, self.q, rates.__getitem__, self.h)
-            results += [*(rates[dof] for dof in link.dofs), *values]
+            results += [*(rates[dof] + self.kick(dof) for dof in link.dofs), *values]
             seeds += [trace.vector("qd_cotangent")(dof) for dof in link.dofs]
             seeds += [trace.vector("q_cotangent")(link.coordinate + c) for c in range(len(values))]
         seeds = [select(self.last, seed, 0.0) for seed in seeds]
@@ -316,14 +316,11 @@ class PassGradient(PassAdjoint):
         for (_, *at), way in zip(self.corners.values(), rest, strict=False):
             ways[(HEIGHTS, *at)] = way
         multiplier, qdd = self._or_input(self.solved, SOLVED), self._or_input(self.qdd, "qdd")
-        options: dict[str, Any] = {}
-        if MIDDLE in trace.inputs:  # velocity terms have a gradient of their own
-            trace.compensates, options = False, {"base": (ZERO, ZERO), "moves": False}
-        power = Power(trace, lambda dof: -multiplier(dof), qdd, **options)
+        power = Power(trace, lambda dof: -multiplier(dof), qdd, moves=not self.kicked)
         for entry, way in power.ways.items():
             ways[entry] = ways.get(entry, 0.0) + way
         for dof, value in self.solved.items():
-            ways["tau", dof], ways[MIDDLE, dof] = value, -value
+            ways["tau", dof] = value
         found: list[Store] = []
         for name in wrt:
             if name == HEIGHTS:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 from ...scene.contacts import HEIGHTS
 from ...trace.emission import Store
 from ...trace.scalars import Value, cut, reciprocal, select
-from ..contact.middle import MIDDLE
 from ..contact.points import Point, own_points, surface_numbers
 from ..contact.secants import Kept, single_dofs
 from ..contact.step import ContactStep, Touch
@@ -89,7 +88,7 @@ class OnePass(ContactStep):
     @functools.cached_property
     def weighed(self) -> tuple[int, ...]:
         """Numbers of the pieces that carry others whose inertia counts in what laws leave for the next pass."""
-        if MIDDLE not in self.trace.inputs:
+        if not self.kicked:
             return ()
         pieces = Pieces(self.trace.links).pieces
         own = {piece.index for piece in pieces if any(self._weighs(link) for link in piece.links if link.leads)}
@@ -99,7 +98,7 @@ class OnePass(ContactStep):
     def _weighs(self, link: Link) -> bool:
         """Whether what a law of the link leaves for the next pass depends on the inertia that its dof feels."""
         scene = self.trace.links.scene
-        if MIDDLE not in self.trace.inputs or scene.shares_dofs or link.dofs[0] not in single_dofs(scene):
+        if not self.kicked or scene.shares_dofs or link.dofs[0] not in single_dofs(scene):
             return False
         return any(law.bends and law.role != LIMIT for laws in self.impedance.laws(link) for law in laws)
 
