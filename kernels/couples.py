@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from . import coupling_points, straight, touches
+from . import coupling_points, pass_loops, touches
 from .coupling import FEW, VALUES, entries, table
 from .elementary import C_TYPE
 from .touches import AWAY, HEADER, POINT
@@ -107,9 +107,9 @@ def text(couples: Couples, parts: list[str], entries: dict[str, int], T: type, w
     begin, judge = call.replace("STAGE", FIRST), call.replace("STAGE", PASS)
     around = [f"{first}{begin}", f"{a_pass}{judge}", last]
     if warps == 1:
-        return f"{declare(couples, T)}\n{straight.repeat_counted_passes(around, entries | sizes, T)}"
-    own = straight.repeat_counted_passes(around, entries, T)
-    others = straight.repeat_counted_passes([begin, judge, ""], {}, T)
+        return f"{declare(couples, T)}\n{pass_loops.repeat_counted_passes(around, entries | sizes, T)}"
+    own = pass_loops.repeat_counted_passes(around, entries, T)
+    others = pass_loops.repeat_counted_passes([begin, judge, ""], {}, T)
     shared = itertools.accumulate(sizes.values(), initial=0)
     columns = [f"const Column {name}_row = {{sent + {32 * at}}};" for name, at in zip(sizes, shared, strict=False)]
     work = f"if (warp == 0) {{\n{own}\n}} else {{\n{others}\n}}"

@@ -30,8 +30,6 @@ from .substeps import STATE, hold_state, move_state, repeat_on_cuda, repeat_subs
 SHARED_BYTES = 46 * 1024
 COUPLED_BYTES = 220 * 1024  # of a block whose limbs couple pairs of bodies: all that a multiprocessor has
 WIDE_BYTES = 110 * 1024  # shared memory of a block with long rows, of which two fit into an H100's 228 KiB
-MOST_PASSES = 32  # limit for the passes of a loop; 25 was the largest count ever measured, see docs/measured_facts.md
-PASS = "pass_row"  # counts the passes from zero
 IN_PLACE, STAGED, MAPPED, RELAYED, TILED, DIRECT = "in place", "staged", "mapped", "relayed", "tiled", "direct"
 BY_TABLE = (MAPPED, RELAYED)  # the ways in which a table says which value each entry of a row receives
 OVER = {"velocities_out": "body_f"}  # a result in shared memory, and the row that nobody reads any more when it is made
@@ -164,94 +162,175 @@ class KernelLayout(NamedTuple):
         return self.shared_scalars * self.groups * wp.types.type_size_in_bytes(T)
 
 
+class _Places:
+    """Where rows and results lie in the shared memory of a team, ``stage``, in scalars.
+
+    Attributes:
+        rows: of rows and further results in shared memory, by name.
+        result: of the result, and its width for a world; 0, 0 where substeps write the state.
+        messages: of what warps send each other. aside: of what threads set aside.
+    """
+
+    def __init__(self, layout: KernelLayout):
+        at, result = 0, layout.result
+        self.rows: dict[str, int] = {}
+        for row in layout.shared_rows:
+            self.rows[row.name], at = at, at + WARP_SIZE * pitch(row.entries)
+        for row in layout.staged_further:
+            before = layout.replaced(row)
+            self.rows[row.name] = at if before is None else self.rows[before.name]
+            at += WARP_SIZE * pitch(row.entries) if before is None else 0
+        if layout.repeats:
+            self.result = 0, 0
+        elif result.way == IN_PLACE:
+            entries = next(row.entries for row in layout.rows if row.name == result.row)
+            self.result = self.rows[result.row], pitch(entries)
+        else:
+            width = result.slot_layout.pitch if result.way == MAPPED else pitch(result.array.entries)
+            self.result = at, width
+            at += WARP_SIZE * width if result.way in (STAGED, MAPPED) else 0
+        self.messages = at
+        self.aside = at + WARP_SIZE * layout.messages
+
+
 def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
     """Return the native code of one thread, given its statements for CUDA and for the CPU."""
-    c, result, out = C_TYPE[T], layout.result, layout.result.array
-    team, at, offset = WARP_SIZE * layout.warps, 0, {}
-    sync = "__syncwarp();" if layout.warps == 1 else "__syncthreads();"
-    text = [NATIVE[c], *(f"const {c} {name}_row[1] = {{{name}}};" for name in layout.numbers)]
-    text += ["#if defined(__CUDA_ARCH__)"]
-    text += [f"const int lane = threadIdx.x & 31, member = threadIdx.x % {team}, warp = member >> 5;"]
-    # Warp's own thread index costs a test whether to divide, 0.1 us of a kernel of 1.5 us, so it is not used here
-    text += [f"const int start = blockIdx.x * {layout.block // layout.warps} + threadIdx.x / {team} * {WARP_SIZE};"]
-    text += ["const int present = worlds - start < 32 ? worlds - start : 32;", "const bool mine = lane < present;"]
-    text += ["const long long first = start, world = mine ? start + lane : worlds - 1;"]
-    if layout.shared_scalars:
-        if layout.asks_for_shared_memory(T):
-            text += ["extern __shared__ __align__(16) char asked_for[];", f"{c}* shared = ({c}*)asked_for;"]
-        else:
-            text += [f"__shared__ __align__(16) {c} shared[{layout.groups * layout.shared_scalars}];"]
-        text += [f"{c}* stage = shared + (threadIdx.x / {team}) * {layout.shared_scalars};"]
+    c = C_TYPE[T]
+    numbers = [f"const {c} {name}_row[1] = {{{name}}};" for name in layout.numbers]
+    text = [NATIVE[c], *numbers, "#if defined(__CUDA_ARCH__)", *_cuda_text(layout, cuda, T)]
+    text += ["#else", *_cpu_text(layout, cpu, c), "#endif", "#undef SENT", "#undef RELAY"]
+    return "\n".join([*text, *(["#undef FIELD"] if layout.fields else []), ""])
+
+
+def _cuda_text(layout: KernelLayout, statements: str, T: type) -> list[str]:
+    """Return the code of a thread on CUDA around its statements."""
+    c, places, team = C_TYPE[T], _Places(layout), WARP_SIZE * layout.warps
+    copied, statements = _copy_in(layout, places, statements, c)
+    if layout.retries:
+        statements = (
+            f"for (int again = 0;; ++again) {{\n{statements}\nif (again || !(farthest > on::reach())) break;\n}}"
+        )
+    if layout.repeats:
+        statements = repeat_on_cuda(statements, layout.warps > 1)
+    text = [*_find_worlds(layout), *_declare_stage(layout, T), *_declare_rows(layout, places, c), *copied]
+    text += _declare_result(layout, places, T)
+    if layout.messages:
+        text += [f"{c}* sent = stage + {places.messages} + lane;", "#define SENT(i) sent[(i) * 32]"]
+    if layout.aside:  # volatile, because a compiler would keep in a register what it stores
+        text += [f"volatile {c}* aside = stage + {places.aside} + member;", f"#define ASIDE(i) aside[(i) * {team}]"]
+    text += [*([] if layout.cached else define_fields(layout.fields, c)), statements, *_copy_out(layout, places, T)]
+    text += ["#undef FIELD"] if layout.cached else []
+    return [*text, *(["#undef ASIDE"] if layout.aside else [])]
+
+
+def _find_worlds(layout: KernelLayout) -> list[str]:
+    """Return code that finds the worlds of a thread's team, and its own.
+
+    Warp's own thread index costs a test whether to divide, 0.1 us of a kernel of 1.5 us, so it is not used here.
+    """
+    team = WARP_SIZE * layout.warps
+    return [
+        f"const int lane = threadIdx.x & 31, member = threadIdx.x % {team}, warp = member >> 5;",
+        f"const int start = blockIdx.x * {layout.block // layout.warps} + threadIdx.x / {team} * {WARP_SIZE};",
+        "const int present = worlds - start < 32 ? worlds - start : 32;",
+        "const bool mine = lane < present;",
+        "const long long first = start, world = mine ? start + lane : worlds - 1;",
+    ]
+
+
+def _declare_stage(layout: KernelLayout, T: type) -> list[str]:
+    """Return the declaration of a team's shared memory, ``stage``; nothing if it needs none."""
+    if not layout.shared_scalars:
+        return []
+    c = C_TYPE[T]
+    declared = [f"__shared__ __align__(16) {c} shared[{layout.groups * layout.shared_scalars}];"]
+    if layout.asks_for_shared_memory(T):
+        declared = ["extern __shared__ __align__(16) char asked_for[];", f"{c}* shared = ({c}*)asked_for;"]
+    return [*declared, f"{c}* stage = shared + (threadIdx.x / {WARP_SIZE * layout.warps}) * {layout.shared_scalars};"]
+
+
+def _declare_rows(layout: KernelLayout, places: _Places, c: str) -> list[str]:
+    """Return the declarations of ``name_row`` of all arrays that are read, and of further results."""
+
+    def in_stage(row: Row) -> str:
+        return f"{c}* {row.name}_row = stage + {places.rows[row.name]} + lane * {pitch(row.entries)};"
+
+    text = []
     for row in layout.rows:
         if row in layout.shared_rows:
-            offset[row.name], at = at, at + WARP_SIZE * pitch(row.entries)
-            text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
+            text.append(in_stage(row))
         else:
-            text += [hold_state(row, c) if row in layout.state else _own_row(row, c)]
-    for row in layout.apart:
-        if row in layout.staged_further:
-            before = layout.replaced(row)
-            offset[row.name] = at if before is None else offset[before.name]
-            at += WARP_SIZE * pitch(row.entries) if before is None else 0
-            text += [f"{c}* {row.name}_row = stage + {offset[row.name]} + lane * {pitch(row.entries)};"]
-        else:
-            text += [_own_result(row, c)]
+            text.append(hold_state(row, c) if row in layout.state else _own_row(row, c))
+    return text + [in_stage(row) if row in layout.staged_further else _own_result(row, c) for row in layout.apart]
+
+
+def _copy_in(layout: KernelLayout, places: _Places, statements: str, c: str) -> tuple[list[str], str]:
+    """Return code that copies fields and rows to shared memory, and the statements with their waits for the copies."""
+    text: list[str] = []
     if layout.cached:
-        text += [
-            DEFINE_ASYNC_COPY,
-            *copy_cached_fields(layout.fields, layout.cached, layout.cached_at, c),
-            "#undef ON_ITS_WAY",
-        ]
-        lines = cuda.split("\n")
+        text += [DEFINE_ASYNC_COPY, *copy_cached_fields(layout.fields, layout.cached, layout.cached_at, c)]
+        text += ["#undef ON_ITS_WAY"]
+        lines = statements.split("\n")
         lines.insert(next(i for i, line in enumerate(lines) if "FIELD(" in line), WAIT_FOR_COPIES)
-        cuda = "\n".join(lines)
+        statements = "\n".join(lines)
     if layout.staged or layout.shared_rows:
-        some = layout.shared_rows
-        text += [copy_rows_in(some, offset, c, team, layout.direct, layout.late)] if some else []
-        text += [sync]
-        cuda = wait_where_used(cuda, rows_on_their_way(some, layout.direct)) if layout.late else cuda
+        some, team = layout.shared_rows, WARP_SIZE * layout.warps
+        text += [copy_rows_in(some, places.rows, c, team, layout.direct, layout.late)] if some else []
+        text += [_barrier(layout)]
+        if layout.late:
+            statements = wait_where_used(statements, rows_on_their_way(some, layout.direct))
+    return text, statements
+
+
+def _declare_result(layout: KernelLayout, places: _Places, T: type) -> list[str]:
+    """Return the declaration of ``result_row``, or of what takes its place."""
+    c, result = C_TYPE[T], layout.result
+    start, width = places.result
     if layout.repeats:
-        start, width = 0, 0
-    elif result.way == IN_PLACE:
-        start, width = offset[result.row], pitch(next(row.entries for row in layout.rows if row.name == result.row))
-    else:
-        width = result.slot_layout.pitch if result.way == MAPPED else pitch(out.entries)
-        start, at = at, at + (WARP_SIZE * width if result.way in (STAGED, MAPPED) else 0)
-    own_row = f"{c}* result_row = out.data + world * {out.entries};"
+        return [replace_state(row, c) for row in layout.state]
+    if result.way in (DIRECT, TILED):
+        return [_result_in_memory(result, c)]
+    if result.way == RELAYED:
+        return [result.slot_layout.define_relay(T)]
+    return [f"{c}* result_row = stage + {start} + lane * {width};"]
+
+
+def _result_in_memory(result: Result, c: str) -> str:
+    """Return the declaration of ``result_row`` where entries go to memory each by itself."""
     if result.way == TILED:
-        own_row = f"{c}* result_row = out.data + world / {TILE} * {result.slots * TILE} + world % {TILE};"
+        return f"{c}* result_row = out.data + world / {TILE} * {result.slots * TILE} + world % {TILE};"
+    return f"{c}* result_row = out.data + world * {result.array.entries};"
+
+
+def _copy_out(layout: KernelLayout, places: _Places, T: type) -> list[str]:
+    """Return code that writes results from shared memory to memory."""
+    c, result, team, sync = C_TYPE[T], layout.result, WARP_SIZE * layout.warps, _barrier(layout)
+    start, width = places.result
+    text: list[str] = []
     if layout.repeats:
-        text += [replace_state(row, c) for row in layout.state]
-    elif result.way in (DIRECT, TILED):
-        text += [own_row]
-    elif result.way == RELAYED:
-        text += [result.slot_layout.define_relay(T)]
-    else:
-        text += [f"{c}* result_row = stage + {start} + lane * {width};"]
-    if layout.messages:
-        text += [f"{c}* sent = stage + {at} + lane;", "#define SENT(i) sent[(i) * 32]"]
-    if layout.aside:  # volatile, because a compiler would keep in a register what it stores
-        at += WARP_SIZE * layout.messages
-        text += [f"volatile {c}* aside = stage + {at} + member;", f"#define ASIDE(i) aside[(i) * {team}]"]
-    if layout.retries:
-        cuda = f"for (int again = 0;; ++again) {{\n{cuda}\nif (again || !(farthest > on::reach())) break;\n}}"
-    if layout.repeats:
-        cuda, cpu = repeat_on_cuda(cuda, layout.warps > 1), repeat_substeps(cpu)
-    text += [*([] if layout.cached else define_fields(layout.fields, c)), cuda]
-    if layout.repeats:
-        text += [sync, *(_write_state(row, offset, c, team) for row in layout.state)]
+        text += [sync, *(_write_state(row, places.rows, c, team) for row in layout.state)]
     elif result.way in (IN_PLACE, STAGED):
-        text += [sync, copy_rows_out(out, start, width, c, team)]
+        text += [sync, copy_rows_out(result.array, start, width, c, team)]
     if result.way in (IN_PLACE, STAGED):
-        text += [copy_rows_out(row, offset[row.name], pitch(row.entries), c, team) for row in layout.staged_further]
+        further = layout.staged_further
+        text += [copy_rows_out(row, places.rows[row.name], pitch(row.entries), c, team) for row in further]
     if result.way == MAPPED:
         text += ["const int done = 0;", f"result_row[{result.slots}] = 0;", sync]
         text += [result.slot_layout.write_rows(f"(stage + {start})", team, T)]
     if result.way == RELAYED:
         text += [result.slot_layout.write_tiles("stage", team, sync, T)]
-    text += ["#undef FIELD"] if layout.cached else []
-    text += ["#undef ASIDE"] if layout.aside else []
-    text += ["#else", "const long long world = thread;", "const bool mine = true;"]
+    return text
+
+
+def _barrier(layout: KernelLayout) -> str:
+    """Return the statement at which the threads of a team wait for each other."""
+    return "__syncwarp();" if layout.warps == 1 else "__syncthreads();"
+
+
+def _cpu_text(layout: KernelLayout, statements: str, c: str) -> list[str]:
+    """Return the code of a thread on the CPU around its statements; it works on the arrays directly."""
+    result, out = layout.result, layout.result.array
+    text = ["const long long world = thread;", "const bool mine = true;"]
     text += [move_state(row, c) if row in layout.state else _own_row(row, c) for row in layout.rows]
     text += [_own_result(row, c) for row in layout.apart]
     if result.way in BY_TABLE:
@@ -259,18 +338,15 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
     elif layout.repeats:
         text += [replace_state(row, c) for row in layout.state]
     else:
-        text += [own_row]
+        text += [_result_in_memory(result, c)]
     if layout.messages:
         text += [f"{c} sent[{layout.messages}];", "#define SENT(i) sent[i]"]
-    text += [
-        *define_fields(layout.fields, c, layout.cached),
-        cpu,
-    ]
+    text += define_fields(layout.fields, c, layout.cached)
+    text += [repeat_substeps(statements) if layout.repeats else statements]
     if result.way in BY_TABLE:
         text += [f"result_row[{result.slots}] = 0;", f"{c}* own = out.data + world * {out.entries};"]
         text += [f"for (int i = 0; i < {out.entries}; ++i) own[i] = result_row[place.data[i]];"]
-    text += ["#endif", "#undef SENT", "#undef RELAY", *(["#undef FIELD"] if layout.fields else []), ""]
-    return "\n".join(text)
+    return text
 
 
 def assemble_per_world(fields: list[str], statements: str) -> str:
@@ -297,88 +373,3 @@ def _write_state(row: Row, offset: dict[str, int], c: str, team: int) -> str:
     if row.name not in offset:
         return write_state(row, c)
     return copy_rows_out(row._replace(name=STATE[row.name]), offset[row.name], pitch(row.entries), c, team)
-
-
-def repeat_passes(ahead: str, a_pass: str, last: str, names: tuple[str, str, str], entries: int, T: type) -> str:
-    """Return code that runs ``ahead``, ``a_pass`` until the last variable of ``names`` is zero, and then ``last``.
-
-    The variables are arrays of the thread, ``name_row[i]``, and begin as zeros. Their indices are constants, so that
-    the compiler keeps them in registers. The threads of a warp wait for the one that needs most passes.
-    """
-    c, missed = C_TYPE[T], names[-1]
-    declared = [f"{c} {name}_row[{entries}] = {{}};" for name in names[:-1]] + [f"{c} {missed}_row[1] = {{}};"]
-    body = f"{_numbered(a_pass, c)}\nif (!({missed}_row[0] > 0)) break;"
-    return "\n".join([ahead, *declared, f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{\n{body}\n}}", last])
-
-
-def _numbered(a_pass: str, c: str) -> str:
-    """Return code of a pass with its number, if it reads that."""
-    return f"const {c} {PASS}[1] = {{({c})turn}};\n{a_pass}" if PASS in a_pass else a_pass
-
-
-def repeat_counted_passes(parts: list[str], entries: dict[str, int], T: type) -> str:
-    """Return code that runs the first of three ``parts``, the second as often as ``passes`` says, and the third.
-
-    ``entries`` are the sizes of the thread's arrays by name, ``name_row[i]``, which begin as zeros; their indices are
-    constants. ``pass_row[0]`` counts the passes from zero.
-    """
-    c, (begin, a_pass, last) = C_TYPE[T], parts
-    declared = [f"{c} {name}_row[{count}] = {{}};" for name, count in entries.items()]
-    return "\n".join([*declared, begin, count_team_passes(a_pass, "", c), last])
-
-
-def repeat_team_passes(a_pass: str, flags: int, warps: int, c: str) -> str:
-    """Return code in which a team repeats ``a_pass`` until, in all its worlds, no warp has added to ``missed_row[0]``.
-
-    A settled world is not ``open``: it keeps its values, so that further passes for its neighbours repeat its results.
-    The vote of the warps is also the barrier before the next pass. Their flags alternate between two groups of
-    ``warps`` entries of SENT, from ``flags`` on, because a warp may write the next flags while another still reads the
-    last ones.
-    """
-    every = " + ".join(f"SENT(now + {warp})" for warp in range(warps))
-    return "\n".join(
-        [
-            "bool open = true;",
-            f"{c} missed_row[1] = {{}};",
-            f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{",
-            "missed_row[0] = 0;",
-            _numbered(a_pass, c),
-            f"const int now = {flags} + (turn & 1) * {warps};",
-            "SENT(now + warp) = missed_row[0];",
-            "const int going = __syncthreads_or(missed_row[0] > 0);",
-            f"missed_row[0] = {every};",
-            "open = missed_row[0] > 0;",
-            "if (!going) break;",
-            "}",
-        ]
-    )
-
-
-def count_team_passes(a_pass: str, barrier: str, c: str) -> str:
-    """Return code in which a team, or a thread with the work of one, runs ``a_pass`` as often as ``passes`` says.
-
-    ``pass_row[0]`` counts the passes from zero. Nothing separates them but the barriers in ``a_pass``: a message that
-    another warp reads in a stage is written again in an earlier one.
-    """
-    loop = "for (int turn = 0; turn < (int)passes_row[0]; ++turn) {"
-    return "\n".join([loop, f"const {c} {PASS}[1] = {{({c})turn}};", a_pass, "}", barrier])
-
-
-def run_one_pass(a_pass: str, barrier: str, c: str) -> str:
-    """Return code in which a team runs ``a_pass`` once, because no joint law of the scene has to be guessed."""
-    return "\n".join(["const bool open = true;", f"const {c} missed_row[1] = {{}};", "{", a_pass, "}", barrier])
-
-
-def repeat_thread_passes(a_pass: str, c: str) -> str:
-    """Return code in which one thread repeats ``a_pass``, the work of a whole team, until its own world has settled."""
-    return "\n".join(
-        [
-            "const bool open = true;",
-            f"{c} missed_row[1] = {{}};",
-            f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{",
-            "missed_row[0] = 0;",
-            _numbered(a_pass, c),
-            "if (!(missed_row[0] > 0)) break;",
-            "}",
-        ]
-    )

@@ -17,7 +17,7 @@ from test_step_teams import driven
 import warp_spo as spo
 from warp_spo.dynamics.integrators import CONTACT_STEP
 from warp_spo.execution import plan, teams
-from warp_spo.kernels import straight
+from warp_spo.kernels import pass_loops, straight
 from warp_spo.kernels.substeps import repeat_on_cuda
 from warp_spo.recursions.contact import points, step
 from warp_spo.recursions.contact.step import REPORTS
@@ -218,7 +218,7 @@ BUGS = {
     "a point that two take": (points, "points_of", "mine[each * len(piece.children) :]", "mine"),
     "what a message leaves out": (Trace, "add_contacts", "z - self.pushes[key]", "z"),
     "excess of one limb": (step.ContactStep, "_sent_to_the_first", "largest(list(values))", "values[0]"),
-    "no barrier after the passes": (straight, "count_team_passes", '"}", barrier]', '"}"]'),
+    "no barrier after the passes": (pass_loops, "count_team_passes", '"}", barrier]', '"}"]'),
     "no barrier ahead": (teams.Team, "_ahead", "[BARRIER] if stage else []", "[]"),
 }
 

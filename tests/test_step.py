@@ -14,7 +14,7 @@ import warp_spo as spo
 from benchmarks import contact_throws, robots
 from warp_spo.errors import UnsupportedError
 from warp_spo.hinges import ball, free
-from warp_spo.kernels import straight
+from warp_spo.kernels import pass_loops
 from warp_spo.recursions import impedance, joint_space, step
 
 
@@ -99,8 +99,8 @@ def test_passes_that_states_need():
     """Thrown at random into everything: the number of passes that the kernel allows is enough for every world."""
     for h in (2e-3, 2e-2):
         scene = furnished(zoo.SCENES["chain7"]())
-        *_, passes = symbolic.advance(scene, states(scene, 1000), h, most=straight.MOST_PASSES)
-        assert passes.max() <= straight.MOST_PASSES and passes.mean() < 7.0
+        *_, passes = symbolic.advance(scene, states(scene, 1000), h, most=pass_loops.MOST_PASSES)
+        assert passes.max() <= pass_loops.MOST_PASSES and passes.mean() < 7.0
 
 
 @pytest.mark.slow
@@ -111,9 +111,9 @@ def test_guesses_that_would_repeat_for_ever_end(monkeypatch):
     scene = bare.with_values(joint_target_ke=200.0 * drive, joint_target_kd=20.0 * drive)
     (q, qd), (target, _) = (contact_throws.states(bare, 2048, seed) for seed in (0, 1))
     a = {name: array[worlds].astype(float) for name, array in (("q", q), ("qd", qd), ("target_q", target))}
-    assert symbolic.advance(scene, a, 5e-3, most=straight.MOST_PASSES)[2].max() <= straight.MOST_PASSES
-    monkeypatch.setattr(step, "PATIENCE", 2 * straight.MOST_PASSES)
-    assert (symbolic.advance(scene, a, 5e-3, most=straight.MOST_PASSES)[2] > straight.MOST_PASSES).all()
+    assert symbolic.advance(scene, a, 5e-3, most=pass_loops.MOST_PASSES)[2].max() <= pass_loops.MOST_PASSES
+    monkeypatch.setattr(step, "PATIENCE", 2 * pass_loops.MOST_PASSES)
+    assert (symbolic.advance(scene, a, 5e-3, most=pass_loops.MOST_PASSES)[2] > pass_loops.MOST_PASSES).all()
 
 
 def test_a_slope_by_friction_where_there_is_none(device):

@@ -13,7 +13,7 @@ from step_scenes import FORCES, H, furnished, slider, states
 
 import warp_spo as spo
 from warp_spo.errors import UnsupportedError
-from warp_spo.kernels import native, straight
+from warp_spo.kernels import native, pass_loops
 from warp_spo.reference import Dense, rotation
 
 
@@ -106,7 +106,7 @@ def test_values_that_are_variable_or_differ_between_worlds(device):
 
 
 def test_status_words(device, monkeypatch):
-    monkeypatch.setattr(straight, "MOST_PASSES", 1)
+    monkeypatch.setattr(pass_loops, "MOST_PASSES", 1)
     dyn = spo.Dynamics(slider(friction=1.0), 4, device=device)
     q, qd, tau = np.zeros((4, 1)), np.array([[1.0], [3e38], [np.nan], [1e-3]]), np.zeros((4, 1))
     tau[1], h = 3e38, 10.0

@@ -17,7 +17,7 @@ from step_scenes import FORCES, TOLERANCE, H, furnished, states
 
 import warp_spo as spo
 from warp_spo.execution import plan, teams
-from warp_spo.kernels import straight
+from warp_spo.kernels import pass_loops, straight
 from warp_spo.kernels.substeps import repeat_on_cuda
 from warp_spo.recursions import body_frames
 from warp_spo.recursions import step as steps
@@ -243,7 +243,7 @@ def test_neighbours_change_nothing(monkeypatch):
 
 
 def test_a_world_that_does_not_settle_says_so(monkeypatch):
-    monkeypatch.setattr(straight, "MOST_PASSES", 1)
+    monkeypatch.setattr(pass_loops, "MOST_PASSES", 1)
     text, a, (*_, passes) = texts_of(monkeypatch, "fork", status=True)
     more = {}
     warp_machine.run(text, a, further=more)
@@ -314,15 +314,15 @@ def test_a_substep_begins_behind_a_barrier(name, monkeypatch):
 WAIT = """\'asm volatile("bar.sync 0;" ::: "memory");\', """
 BUGS = {
     "a warp that stops early": (
-        straight, "repeat_team_passes", '"const int going = __syncthreads_or(missed_row[0] > 0);"',
+        pass_loops, "repeat_team_passes", '"const int going = __syncthreads_or(missed_row[0] > 0);"',
         WAIT + '"const int going = missed_row[0] > 0;"'),
     "nobody asks for another pass": (
-        straight, "repeat_team_passes", "_or(missed_row[0] > 0)", "_or(missed_row[0] < 0)"),
-    "flags in one place": (straight, "repeat_team_passes", "(turn & 1)", "(turn & 0)"),
+        pass_loops, "repeat_team_passes", "_or(missed_row[0] > 0)", "_or(missed_row[0] < 0)"),
+    "flags in one place": (pass_loops, "repeat_team_passes", "(turn & 1)", "(turn & 0)"),
     "no barrier in the vote": (
-        straight, "repeat_team_passes", "going = __syncthreads_or(missed_row[0] > 0)", "going = missed_row[0] > -1"),
+        pass_loops, "repeat_team_passes", "going = __syncthreads_or(missed_row[0] > 0)", "going = missed_row[0] > -1"),
     "a guess that stays": (Step, "_looped", "after = gain\n", "after = 0.0 * gain\n"),
-    "a limb that is not asked": (straight, "repeat_team_passes", "for warp in range(warps)", "for warp in range(1)"),
+    "a limb that is not asked": (pass_loops, "repeat_team_passes", "for warp in range(warps)", "for warp in range(1)"),
     "a word before it is said": (teams.Team, "_in_passes", "if last and any(text_of_ranks)", "if False"),
     "a word unheard": (Step, "_words", "select(less(worst, word), word, worst)", "word"),
 }  # fmt: skip

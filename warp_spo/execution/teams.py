@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ..kernels import straight
+from ..kernels import pass_loops
 from ..recursions.contact.secants import SECANT
 from ..recursions.pieces import Piece, Pieces
 from ..trace.emission import C_TYPE, Listing, render
@@ -168,9 +168,10 @@ class Team:
                 ahead += [begin_pairs("0", 1)]
                 text = [push_pairs("LOAD", "0", 1), *text, judge_pairs("0", 1)]
             one, counted = "\n".join(text), self.passes.counted
-            loop = (
-                straight.count_team_passes(one, "", self.c) if counted else straight.repeat_thread_passes(one, self.c)
-            )
+            if counted:
+                loop = pass_loops.count_team_passes(one, "", self.c)
+            else:
+                loop = pass_loops.repeat_thread_passes(one, self.c)
             text = [*self._defined, self.passes.declare(kept, self.c), *ahead, loop]
         return "\n".join(text + later)
 
@@ -231,11 +232,11 @@ class Team:
                 [self._each(leaves, ranks_by_name, "laws"), a_pass, self._each(leaves, ranks_by_name, "checks")]
             )
         if self.passes.counted:
-            text.append(straight.count_team_passes(a_pass, BARRIER, self.c))
+            text.append(pass_loops.count_team_passes(a_pass, BARRIER, self.c))
         elif self.passes.flags is None:
-            text.append(straight.run_one_pass(a_pass, BARRIER, self.c))
+            text.append(pass_loops.run_one_pass(a_pass, BARRIER, self.c))
         else:
-            text.append(straight.repeat_team_passes(a_pass, self.passes.flags, self.pieces.warps, self.c))
+            text.append(pass_loops.repeat_team_passes(a_pass, self.passes.flags, self.pieces.warps, self.c))
         for last in (False, True):
             text_of_ranks = []
             for at, (name, rank) in enumerate(zip(names, ranks, strict=True)):

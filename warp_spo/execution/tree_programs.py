@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ..kernels import couples as couple_points
-from ..kernels import coupling, straight
+from ..kernels import coupling, pass_loops
 from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import DIRECT, RELAYED, TILED, KernelLayout
 from ..recursions.contact import coupled, pairs
@@ -55,10 +55,10 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
             before = [f"{declared}\n{first}\n{coupling.BEGIN}", "\n".join([read, coupling.PASS, *rest])]
             tables |= builder.touch_tables(couples.points)
         if not aggregates:
-            body = straight.repeat_counted_passes([*before, body], entries, run.dtype)
+            body = pass_loops.repeat_counted_passes([*before, body], entries, run.dtype)
     elif looped:
         ahead, a_pass = before
-        body = straight.repeat_passes(ahead, a_pass, body, LOOPED, run.scene.dof_count, run.dtype)
+        body = pass_loops.repeat_passes(ahead, a_pass, body, LOOPED, run.scene.dof_count, run.dtype)
     direct = layout.staged and plan.copies_directly(routine)
     late = direct and routine.waits_late
     block = PAIR * WARP_SIZE if late or (plan.few and not layout.shared_scalars) else WARP_SIZE
