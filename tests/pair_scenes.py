@@ -1,4 +1,4 @@
-"""Scenes whose bodies touch each other."""
+"""Scenes whose bodies touch each other, and one step of them."""
 
 import numpy as np
 from contact_cases import solid
@@ -7,6 +7,7 @@ import warp_spo as spo
 from warp_spo.reference_pairs import faces
 from warp_spo.reference_rotations import homogeneous
 
+H = 5e-3
 STRAIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -186,3 +187,25 @@ def ring_states(seed, worlds):
         q[:, 7 * i + 3 : 7 * i + 7] = turns / np.linalg.norm(turns, axis=1)[:, None]
     q[:, 28:] = 0.05 * rng.normal(size=(worlds, 4))
     return np.float64(np.float32(q)), np.float64(np.float32(qd))
+
+
+def cubes_in_a_row(count):
+    """Cubes side by side in a row between two that fly towards each other: ``count`` - 1 pairs touch."""
+    half = 0.05
+    contacts = [box(i, half, other=box(i - 1, half), stiffness=1e5, damping=50.0) for i in range(1, count)]
+    scene = free([cube(1.0, half) for _ in range(count)], contacts)
+    q, qd = np.zeros((2, 7 * count)), np.zeros((2, 6 * count))
+    q[:, ::7] = 2.0 * half * np.arange(count) - 1e-5 * np.arange(count)
+    q[:, 6::7] = 1.0
+    qd[:, 0], qd[:, -6], qd[1, 1::6] = 0.5, -0.5, 0.02 * np.arange(count)
+    return scene, q, qd
+
+
+def stepped(dyn, q, qd, **more):
+    """One step with all reports, which begin as NaN."""
+    count, dtype, worlds = dyn.scene.contact_count, dyn.dtype.__name__, len(q)
+    found = {"contact_f": np.full((worlds, count, 3), np.nan, dtype)}
+    found |= {name: np.full((worlds, count), np.nan, dtype) for name in ("contact_gap", "contact_slip")}
+    found |= {"contact_excess": np.full((worlds, 3), np.nan, dtype), "status": np.full(worlds, -1, np.int32)}
+    found["q"], found["qd"] = dyn.step(q.astype(dtype), qd.astype(dtype), None, H, **found, **more)
+    return found

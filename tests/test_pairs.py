@@ -1,4 +1,4 @@
-"""Bodies that touch each other: their points, the coupled step against the dense one, and what it conserves."""
+"""Bodies that touch each other: their points, and the coupled step against the dense one."""
 
 import functools
 import inspect
@@ -10,8 +10,10 @@ import pytest
 import warp as wp
 import warp_machine
 from pair_scenes import (
+    H,
     box,
     cube,
+    cubes_in_a_row,
     free,
     hand,
     hand_states,
@@ -23,7 +25,7 @@ from pair_scenes import (
     shelf,
     shelf_states,
     stack,
-    stacked,
+    stepped,
     thrown,
 )
 from pair_touches import find_touches
@@ -34,12 +36,12 @@ from warp_spo.dynamics.integrators import CONTACT_STEP, PAIRED_STEP
 from warp_spo.examples import grasp
 from warp_spo.execution import plan
 from warp_spo.execution.device_facts import MEASURED
-from warp_spo.kernels import couples, coupling, coupling_blocks, coupling_points, coupling_shared, straight, touches
+from warp_spo.kernels import couples, coupling_blocks, coupling_points, coupling_shared, touches
 from warp_spo.recursions.contact import aggregates, coupled, pair_pieces
 from warp_spo.reference_pairs import PairStep
 from warp_spo.reference_rotations import homogeneous
 
-H, WORLDS = 5e-3, 9
+WORLDS = 9
 TOLERANCE = {"float64": (1e-10, 1e-9), "float32": (1e-4, 1e-3)}
 """Of velocities, over the largest one, and of forces, over the largest one; 4e-13 and 3e-12, 2e-5 and 2e-4 measured."""
 
@@ -83,16 +85,6 @@ def test_points_are_those_of_the_reference(device, kinds):
             np.testing.assert_allclose(found_rows[nearest], row, atol=1e-12)
             found_rows = np.delete(found_rows, nearest, axis=0)
     assert counts >= ({4, 5, 6, 7} if sum(kinds) == 2 else {1})
-
-
-def stepped(dyn, q, qd, **more):
-    """One step with all reports, which begin as NaN."""
-    count, dtype, worlds = dyn.scene.contact_count, dyn.dtype.__name__, len(q)
-    found = {"contact_f": np.full((worlds, count, 3), np.nan, dtype)}
-    found |= {name: np.full((worlds, count), np.nan, dtype) for name in ("contact_gap", "contact_slip")}
-    found |= {"contact_excess": np.full((worlds, 3), np.nan, dtype), "status": np.full(worlds, -1, np.int32)}
-    found["q"], found["qd"] = dyn.step(q.astype(dtype), qd.astype(dtype), None, H, **found, **more)
-    return found
 
 
 def assert_is_dense(dyn, q, qd, passes=None, least=1, **values):
@@ -211,232 +203,6 @@ def test_nan_stays_in_its_world(device):
     assert found["status"].tolist()[1:3] == [spo.Status.NOT_FINITE] * 2 and np.isnan(found["qd"][1:3]).any(axis=1).all()
     for name in ("q", "qd", "contact_f", "status"):
         np.testing.assert_array_equal(np.delete(found[name], [1, 2], axis=0), np.delete(clean[name], [1, 2], axis=0))
-
-
-def momentum(scene, q, qd):
-    """Linear and angular momentum about the origin of free bodies, [world, 6]."""
-    total = np.zeros((len(q), 6))
-    for b in range(len(scene.bodies)):
-        m, inertia = scene.values["body_mass"][0, b], scene.values["body_inertia"][0, b, 0, 0]  # of cubes and balls
-        p = m * qd[:, 6 * b : 6 * b + 3]
-        total[:, :3] += p
-        total[:, 3:] += np.cross(q[:, 7 * b : 7 * b + 3], p) + inertia * qd[:, 6 * b + 3 : 6 * b + 6]
-    return total
-
-
-def head_on(dtype, device, count=60, granularity=None):
-    """Two balls that meet off centre, spinning; return the scene and momenta before and after."""
-    scene = free([cube(1.0, 0.05), cube(3.0, 0.05)],
-                 [spo.Contact(0, sphere=0.05, other=spo.Contact(1, sphere=0.05), stiffness=1e5)])  # fmt: skip
-    q = np.zeros((2, 14), dtype)
-    q[:, [6, 13]], q[:, 7], q[:, 8] = 1.0, 0.15, [0.0, 0.03]
-    qd = np.zeros((2, 12), dtype)
-    qd[:, 0], qd[:, 6], qd[:, 3:6] = 1.0, -0.5, 2.0
-    before, met = momentum(scene, q, qd), 0.0
-    dyn = spo.Dynamics(scene, 2, device=device, dtype=dtype, granularity=granularity)
-    force = np.zeros((2, 1, 3), dtype)
-    for _ in range(count):
-        q, qd = dyn.step(q, qd, None, H, contact_f=force)
-        met = max(met, np.abs(force).max())
-    assert met > 10.0
-    return before, momentum(scene, q, qd), np.linalg.norm(q[:, 7:10] - q[:, :3], axis=1)
-
-
-def test_a_collision_keeps_momentum(device):
-    """The impulses are equal and opposite at one point."""
-    before, after, apart = head_on("float64", device)
-    np.testing.assert_allclose(after[:, :3], before[:, :3], atol=1e-12 * np.abs(before).max())
-    np.testing.assert_allclose(after[0, 3:], before[0, 3:], atol=1e-12)
-    assert (apart > 0.09).all()  # they have not passed through each other
-
-
-def test_every_array_of_a_thread_has_entries(device, monkeypatch):
-    """Also where no hinge has a law with bounds; compilers for CUDA refuse an array without entries."""
-    texts, assemble = [], straight.assemble
-    monkeypatch.setattr(straight, "assemble", lambda *given: texts.append(assemble(*given)) or texts[-1])
-    head_on("float64", device, granularity="tree")
-    assert any("couples::judge" in text for text in texts) and not any("[0] = {}" in text for text in texts)
-
-
-@pytest.mark.slow
-def test_a_collision_keeps_momentum_in_float32(device):
-    before, after, _ = head_on("float32", device)
-    np.testing.assert_allclose(after[:, :3], before[:, :3], atol=1e-6 * np.abs(before).max())
-
-
-WALLS = (
-    [((x, 0, 0), 0) for x in (-0.2, 0.2)]
-    + [((0, y, 0), 1) for y in (-0.2, 0.2)]
-    + [((0, 0, z), 2) for z in (-0.2, 0.2)]
-)
-
-
-def cage(dtype, device, count):
-    """A ball in a free cage of six boxes; return momenta before and after, and how often it met a wall."""
-    walls = []
-    for place, axis in WALLS:
-        half = [0.2, 0.2, 0.2]
-        half[axis] = 0.02
-        walls.append(dict(box=(half, (*place, 0, 0, 0, 1))))
-    contacts = [
-        spo.Contact(1, sphere=0.05, other=spo.Contact(0, **wall), stiffness=1e5, damping=10.0) for wall in walls
-    ]
-    scene = free([cube(2.0, 0.2), cube(1.0, 0.05)], contacts)
-    q, qd = np.zeros((1, 14), dtype), np.zeros((1, 12), dtype)
-    q[:, [6, 13]], qd[0, 6:9] = 1.0, [2.0, 1.3, 0.7]
-    before, dyn, met = momentum(scene, q, qd), spo.Dynamics(scene, 1, device=device, dtype=dtype), 0
-    force = np.zeros((1, 6, 3), dtype)
-    for _ in range(count):
-        q, qd = dyn.step(q, qd, None, H, contact_f=force)
-        met += np.abs(force).max() > 0.0
-    return before, momentum(scene, q, qd), met
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("dtype", "bound"), [("float64", 1e-12), ("float32", 1e-6)])
-def test_a_ball_in_a_free_cage(device, dtype, bound):
-    before, after, met = cage(dtype, device, 400)
-    assert met > 5
-    np.testing.assert_allclose(after[:, :3], before[:, :3], atol=bound * np.abs(before).max())
-
-
-def stand(scene, q, settle, seconds, device, dtype="float64"):
-    """Let bodies come to rest; return largest speed and drift [m] after ``settle`` seconds, q and the last forces."""
-    dyn, q = spo.Dynamics(scene, 1, device=device, dtype=dtype), np.array(q, dtype)[None]
-    qd, force, fastest, drift = (
-        np.zeros((1, scene.dof_count), dtype),
-        np.zeros((1, scene.contact_count, 3), dtype),
-        0,
-        0,
-    )
-    for i in range(round((settle + seconds) / H)):
-        q, qd = dyn.step(q, qd, None, H, contact_f=force)
-        if i == round(settle / H):
-            first = q
-        if i > settle / H:
-            place = (q - first).reshape(-1, 7)[:, :3]
-            fastest, drift = max(fastest, np.abs(qd).max()), max(drift, np.abs(place).max())
-    return fastest, drift, q[0], force[0]
-
-
-@pytest.mark.slow
-def test_a_stack_stands(device):
-    """Five cubes, offset and turned: 10 s."""
-    scene = stack()
-    fastest, drift, _, force = stand(scene, stacked(5), 5.0, 10.0, device)
-    assert fastest < 1e-5 and drift < 1e-4
-    carried = 9.81 * 5.0 * np.arange(5, 0, -1)
-    np.testing.assert_allclose(np.append(force[:8, 2].sum(), force[8:, 2]), carried, rtol=1e-4)
-
-
-@pytest.mark.slow
-def test_a_heavy_cube_on_light_ones(device):
-    """100 kg on four of 1 kg, as deep as springs say."""
-    masses = (1.0, 1.0, 1.0, 1.0, 100.0)
-    scene = stack(masses, ground=1e6, stiffness=1e6, damping=4e3)
-    fastest, _, q, force = stand(scene, stacked(5, offset=0.0), 3.0, 0.5, device)
-    carried = 9.81 * np.cumsum(masses[::-1])[::-1]
-    np.testing.assert_allclose(force[8:, 2], carried[1:], rtol=1e-4)
-    sunk = carried[0] / 8e6 * 2.0 + (carried[1:] / 1e6).sum()  # four corners carry the lowest
-    assert fastest < 1e-4
-    np.testing.assert_allclose(0.9 - q[30], sunk, rtol=0.02)
-
-
-def row(count):
-    """Cubes side by side in a row between two that fly towards each other: ``count`` - 1 pairs touch."""
-    half = 0.05
-    contacts = [box(i, half, other=box(i - 1, half), stiffness=1e5, damping=50.0) for i in range(1, count)]
-    scene = free([cube(1.0, half) for _ in range(count)], contacts)
-    q, qd = np.zeros((2, 7 * count)), np.zeros((2, 6 * count))
-    q[:, ::7] = 2.0 * half * np.arange(count) - 1e-5 * np.arange(count)
-    q[:, 6::7] = 1.0
-    qd[:, 0], qd[:, -6], qd[1, 1::6] = 0.5, -0.5, 0.02 * np.arange(count)
-    return scene, q, qd
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("together", [True, False])
-def test_more_pairs_than_are_solved_together(monkeypatch, device, together):
-    """Aggregates solve all; otherwise eight are exact, ten as near as the residual says. Momentum is kept."""
-    for module in (coupled, pair_pieces):
-        monkeypatch.setattr(module, "suits", lambda links: together)
-    for count, pairs in ((9, 8), (11, 10)):
-        scene, q, qd = row(count)
-        dyn, residual = spo.Dynamics(scene, 2, device=device, dtype="float64"), np.full(2, np.nan)
-        found = stepped(dyn, q, qd, contact_residual=residual)
-        for w in range(2):
-            _, wanted = PairStep(scene, q[w], qd[w], H).run(passes=4)
-            most, error = np.abs(wanted.f).max(), np.abs(found["qd"][w] - wanted.v).max()
-            if together or pairs <= coupling.EXACT:
-                assert residual[w] == 0.0 and error < 1e-10
-            else:
-                assert 0.0 < residual[w] < 1e-5 * most and error < 1e-5  # 8e-6 N and 2e-6 m/s
-        before, after = momentum(scene, q, qd), momentum(scene, found["q"], found["qd"])
-        np.testing.assert_allclose(after[:, :3], before[:, :3], atol=1e-12)
-
-
-def legs(contacts=True):
-    """A free trunk and two legs of two links, without gravity; their links touch each other."""
-    bodies, hinges = [cube(7.0, 0.15)], [spo.Hinge("free", -1, 0)]
-    for y in (0.1, -0.1):
-        thigh = len(bodies)
-        bodies += [spo.Body(1.0, (0, 0, -0.1), 4.3e-3 * np.eye(3)), spo.Body(0.5, (0, 0, -0.1), 1.6e-3 * np.eye(3))]
-        hinges += [spo.Hinge("ball", 0, thigh, parent_pose=(0, y, -0.1, 0, 0, 0, 1)),
-                   spo.Hinge("revolute", thigh, thigh + 1, axis=(0, 1, 0),
-                             parent_pose=(0, 0, -0.2, 0, 0, 0, 1))]  # fmt: skip
-    link = dict(capsule=((0, 0, 0), (0, 0, -0.2), 0.04))
-    pairs = [spo.Contact(i, **link, other=spo.Contact(j, **link), stiffness=1e5, friction=0.5)
-             for i in (1, 2) for j in (3, 4)]  # fmt: skip
-    away = [spo.Contact(0, point=(0, 0, 100.0))]
-    return spo.Scene(bodies, hinges, contacts=pairs if contacts else away, gravity=(0, 0, 0))
-
-
-def largest_rise(scene, q, qd, device):
-    """Return the largest rise of energy in a step, over that at first, and in how many worlds bodies have met."""
-    worlds, k = len(q), scene.values["contact_stiffness"][0, len(scene.contact_points) :]
-    dyn, found, met = spo.Dynamics(scene, worlds, device=device, dtype="float64"), [], np.zeros(worlds, bool)
-    gap, energy = np.zeros((worlds, scene.contact_count)), dyn.kinetic_energy(q, qd)
-    force = np.zeros((*gap.shape, 3))
-    for _ in range(120):
-        q, qd = dyn.step(q, qd, None, H, contact_gap=gap, contact_f=force)
-        depth = np.maximum(-gap[:, len(scene.contact_points) :], 0.0)  # before the step
-        found.append(energy + 0.5 * depth**2 @ k)
-        energy, met = dyn.kinetic_energy(q, qd), met | force.any(axis=(1, 2))
-    return (np.diff(found, axis=0) / found[0]).max(), met.sum()
-
-
-@pytest.mark.slow
-def test_legs_that_cross_gain_no_more_than_free_ones(device):
-    rng, worlds, scene = np.random.default_rng(0), 40, legs()
-    q, qd = np.tile(scene.neutral_q, (worlds, 1)), 0.3 * rng.normal(size=(worlds, scene.dof_count))
-    qd[:, 6], qd[:, 10] = -rng.uniform(1, 4, worlds), rng.uniform(1, 4, worlds)
-    qd[:, [7, 9, 11, 13]] = rng.normal(size=(worlds, 4))
-    (rise, met), (without, _) = (largest_rise(each, q, qd, device) for each in (scene, legs(contacts=False)))
-    assert met > 30 and rise < without < 5e-4  # 3e-5 and 1.3e-4
-
-
-def held(device, drives, force=grasp.FORCE):
-    """Let a Panda lift a cube; return its slip in the last 5 s [m], how high it is, and all status words."""
-    dyn = spo.Dynamics(grasp.scene(drives), 1, device=device, dtype="float64")
-    heights, points, q = grasp.path(dyn, 7.0)
-    qd, tau, target = np.zeros((1, dyn.scene.dof_count)), np.zeros((1, dyn.scene.dof_count)), q.copy()
-    tau[:, 7:9], target[:, 7:9] = 0.0 if drives else -force, 0.0
-    apart, status, words, cube_ = [], np.zeros(1, np.int32), set(), dyn.scene.body_count - 1
-    for i in range(round(7.0 / H)):
-        target[0, :7] = [np.interp(np.clip(i * H - 0.5, 0.0, 1.0), heights, points[:, j]) for j in range(7)]
-        q, qd = dyn.step(q, qd, tau, H, target_q=target, status=status)
-        words.add(int(status[0]))
-        if i * H >= 2.0:
-            apart.append(np.subtract(*dyn.frame_poses(q, [cube_, grasp.TIP])[0, :, :3]))
-    return np.linalg.norm(np.ptp(apart, axis=0)), q[0, -5], words
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("drives", [False, True])
-def test_a_gripper_holds_a_cube(device, drives):
-    """0.5 kg, 40 N, friction 0.8, for 5 s: creep of 0.08 mm/s; fingers pressed by a force, and by saturated drives."""
-    slip, height, words = held(device, drives)
-    assert slip < 1e-3 and height > 0.15 and words == {spo.Status.OK}
 
 
 FIND = "counts[pair] = find(pair, places, touches);"
@@ -561,7 +327,7 @@ def test_couples_have_warps_of_their_own_where_worlds_are_few(monkeypatch):
 def test_calls_without_a_kernel_have_names(device):
     scene = stack((1.0, 1.0))
     q, qd = scene.neutral_q[None].astype(np.float32), np.zeros((1, 12), np.float32)
-    many, states, rates = row(11)
+    many, states, rates = cubes_in_a_row(11)
     with pytest.raises(spo.UnsupportedError, match="granularity='segment' where pairs of bodies are not all on limbs"):
         spo.Dynamics(many, 2, device=device, granularity="segment").step(
             *np.float32([states]), *np.float32([rates]), None, H
