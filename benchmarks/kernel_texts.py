@@ -32,7 +32,7 @@ from warp_spo.examples import biped, fivebar, fourbar, slider_crank, stewart
 from warp_spo.execution.device_facts import MEASURED
 from warp_spo.kernels import native
 
-from . import robots, shapes
+from . import contacts, robots, shapes
 
 WORLDS = (1, 4096, 65536)
 MANY_WORLDS = 1 << 18  # beyond every world count at which a plan changes
@@ -63,11 +63,26 @@ def every_hinge() -> spo.Scene:
     return spo.Scene(bodies, hinges)
 
 
+def tower() -> spo.Scene:
+    """Three cubes on each other and on the ground."""
+    cube, count = (0.05, 0.05, 0.05), 3
+    bodies = [spo.Body(1.0, inertia=0.0017 * np.eye(3)) for _ in range(count)]
+    pairs = [spo.Contact(i, box=cube, other=spo.Contact(i - 1, box=cube)) for i in range(1, count)]
+    hinges = [spo.Hinge("free", -1, i) for i in range(count)]
+    return spo.Scene(bodies, hinges, contacts=[spo.Contact(0, box=cube), *pairs])
+
+
 SCENES: dict[str, Callable[[], spo.Scene]] = {
     **{name: (lambda name=name: robots.scene(name)) for name in robots.ROBOTS if robots.is_available(name)},
     "arm": lambda: shapes.chain(7),
     "tree": lambda: shapes.random_tree(32),
     "hinges": every_hinge,
+    "tower": tower,
+    **{
+        f"{name}_on_ground": (lambda name=name: contacts.scene(name))
+        for name in ("go2", "g1")
+        if robots.is_available(name)
+    },
     **{file.__name__.rpartition(".")[2]: file.scene for file in (biped, fivebar, fourbar, slider_crank, stewart)},
 }
 VARIABLE = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c", "joint_armature", "joint_damping",
@@ -148,7 +163,9 @@ def calls(dyn: spo.Dynamics) -> Iterator[tuple[str, Callable[[], Any]]]:
         if operation == "mass_matrix_derivative" and size * dyn.scene.dof_count > 1 << 28:
             continue
         yield operation, lambda operation=operation, more=more: dyn.prepare(operation, **more)
-        optional = {one.name: True for one in declared[operation].arrays if one.asked}
+        optional = {
+            one.name: True for one in declared[operation].arrays if one.asked and _is_there(one.name, dyn.scene)
+        }
         if optional:
             yield f"{operation}+", lambda operation=operation, more=more | optional: dyn.prepare(operation, **more)
     backwards = {f"{name}_vjp": one.derivative for name, one in declared.items() if one.derivative is not None}
@@ -165,6 +182,13 @@ def calls(dyn: spo.Dynamics) -> Iterator[tuple[str, Callable[[], Any]]]:
     yield "forward_dynamics_vjp tangent", lambda: dyn.prepare("forward_dynamics_vjp", wrt=("tangent", "qd"))
     yield "step midpoint", lambda: dyn.prepare("step", integrator="midpoint")
     yield "operators", lambda: expressions(dyn)
+
+
+def _is_there(name: str, scene: spo.Scene) -> bool:
+    """Return whether the scene has what a result of its contacts is about."""
+    if name == "contact_residual":
+        return bool(scene.contact_pairs)
+    return not name.startswith("contact_") or bool(scene.contacts)
 
 
 def expressions(dyn: spo.Dynamics) -> None:
