@@ -1,5 +1,7 @@
 """Contacts that SolverSPO computes by itself: a model's shapes on its plane or height field."""
 
+import warnings
+
 import newton
 import numpy as np
 import pytest
@@ -170,8 +172,12 @@ def test_what_has_no_contacts_says_why(grounds, words):
     with pytest.raises(UnsupportedError, match=words):
         SolverSPO(model, contacts="ground")
     if len(grounds) > 1 or grounds[0] is None:
-        solver = SolverSPO(model)
+        with warnings.catch_warnings(record=True) as seen:
+            warnings.simplefilter("always")
+            solver = SolverSPO(model)
         assert bool(solver.dynamics.scene.contacts) == ("another normal" in words or "turned" in words)
+        passes = [str(one.message) for one in seen if "pass through shapes that stand still" in str(one.message)]
+        assert len(passes) == ("differs" in words) and all("different collision shapes" in one for one in passes)
         assert ("contact_f" in solver.supported_observables) == bool(solver.dynamics.scene.contacts)
 
 
@@ -183,4 +189,13 @@ def test_options_that_have_no_contacts():
         SolverSPO(model, contacts="ground", integrator="rk4")
     with pytest.raises(UnsupportedError, match="contacts='ground' with granularity='node'"):
         SolverSPO(model, contacts="ground", granularity="node")
-    assert not SolverSPO(model, integrator="midpoint").dynamics.scene.contacts
+    with pytest.warns(UserWarning, match="bodies pass through shapes.*integrator='midpoint' have no contacts") as seen:
+        assert not SolverSPO(model, integrator="midpoint").dynamics.scene.contacts
+    assert seen[0].filename == __file__
+    obstacle = boxes(lambda b: (plane()(b), block(b)))
+    with pytest.warns(UserWarning, match="bodies pass through shapes.*substeps take no list of contacts") as seen:
+        assert not SolverSPO(obstacle, substeps=2).dynamics.scene.contacts
+    assert seen[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not SolverSPO(boxes(None), integrator="midpoint").dynamics.scene.contacts  # nothing stands still

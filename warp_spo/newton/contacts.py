@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import newton
 import numpy as np
 import warp as wp
+from newton import ShapeFlags
 
 from ..errors import UnsupportedError
 from ..kernels import contacts as kernels
@@ -50,7 +52,10 @@ def find_contacts(
         UnsupportedError: with "ground", the model has no ground, or shapes that no contact represents; with "ground" or
             "pipeline", the worlds have different shapes, or steps have no contacts.
     """
-    if mode == "none" or (mode == "auto" and lacking):
+    if mode == "none":
+        return None
+    if mode == "auto" and lacking:
+        warn_of_contacts_left_out(model, f"steps with {lacking} have no contacts")
         return None
     if lacking:
         raise UnsupportedError("SolverSPO", f"contacts={mode!r} with {lacking}", "leave out one of them")
@@ -67,8 +72,24 @@ def find_contacts(
         return None
     try:
         return Slots(model, worlds, scene, points, pairs)
-    except UnsupportedError:
+    except UnsupportedError as error:
+        warn_of_contacts_left_out(model, str(error))
         return None
+
+
+def warn_of_contacts_left_out(model: newton.Model, why: str, depth: int = 6) -> None:
+    """Warn that bodies pass through shapes that stand still, if the model has shapes of both kinds that collide."""
+    if not model.shape_count:
+        return
+    flags, groups, bodies = (to_numpy(model, f"shape_{name}") for name in ("flags", "collision_group", "body"))
+    solid = (flags & int(ShapeFlags.COLLIDE_SHAPES) != 0) & (groups != 0)
+    if (solid & (bodies < 0)).any() and (solid & (bodies >= 0)).any():
+        warnings.warn(
+            f"SolverSPO: bodies pass through shapes that stand still, such as the ground: {why}; contacts='none' says "
+            "that they may",
+            UserWarning,
+            stacklevel=depth,
+        )
 
 
 def _on_ground(

@@ -20,7 +20,15 @@ from ..scene.scene import Scene
 from ..scene.shapes import POINTS
 from .body_states import BodyStates
 from .checks import check_state, read_flags
-from .contacts import ELEVATIONS, MODES, VALUES, StatusWords, find_contacts, sources_of
+from .contacts import (
+    ELEVATIONS,
+    MODES,
+    VALUES,
+    StatusWords,
+    find_contacts,
+    sources_of,
+    warn_of_contacts_left_out,
+)
 from .drives import GAINS, Drives
 from .joint_forces import JointForces
 from .layout import Layouts
@@ -106,7 +114,8 @@ class SolverSPO(Plugs, SolverBase):
             given. "none": contacts are left out, and a step that is given some says so. "auto": "ground" if the model
             has a level ground, no other shape that stands still, and only shapes that have points; else "pipeline" if
             a shape stands still, else "none". Where loops are closed, and with integrators and granularities that have
-            no contacts, "auto" is "none", and the others are an error.
+            no contacts, "auto" is "none", and the others are an error. A warning says so if that lets bodies pass
+            through shapes that stand still, and so it does where worlds have different shapes.
         points: With "ground", points at most of a mesh, a cylinder, a cone or an ellipsoid, see :func:`warp_spo.load`;
             with "pipeline", slots of each shape, of spheres and capsules four at most.
         pairs: Shapes that touch each other: a list of pairs of two names, such as ``[("cube", "*finger*")]``, each a
@@ -225,6 +234,7 @@ class SolverSPO(Plugs, SolverBase):
         if isinstance(found, Slots) and self._substeps > 1:
             if self._contact_options[0] == "pipeline":
                 raise UnsupportedError("SolverSPO", "contacts='pipeline' with substeps", "call step for each substep")
+            warn_of_contacts_left_out(self.model, "steps with substeps take no list of contacts", 5)
             return None, pairs
         return found, pairs
 
