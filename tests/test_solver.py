@@ -209,6 +209,10 @@ def test_masked_reset(turned):
     solver.reset(state, flags=StateFlags.JOINT_QD)
     np.testing.assert_array_equal(state.joint_q.numpy(), before)
     assert not state.joint_qd.numpy().any()
+    state = advance(solver, moving(model), 3)
+    state.body_q = state.body_qd = None  # of a user who reads no bodies
+    solver.reset(state)
+    np.testing.assert_array_equal(state.joint_q.numpy(), model.joint_q.numpy())
     with pytest.raises(ValueError, match="mask"):
         solver.reset(state, wp.zeros(2, dtype=wp.bool, device="cpu"))
 
