@@ -129,3 +129,27 @@ def test_limbs_share_kicks(scene, monkeypatch):
         got = {"out": warp_machine.run(texts[-1], given | {"dt": H}, backwards, further := {})} | further
         for name, array in wanted.items():
             np.testing.assert_allclose(got[name], array, atol=ROUNDING * abs(array).max(), err_msg=name)
+
+
+@pytest.mark.slow
+def test_gradients_by_centres_of_mass_of_a_free_base(device):
+    """Its rates are those of its centre of mass, so that half a step along them depends on it, too."""
+    torch = pytest.importorskip("torch")
+    scene, kind = contact_cases.box(), dict(dtype=torch.float64, device=str(device).replace("cuda:0", "cuda"))
+    dyn = spo.Dynamics(scene, 1, device, "float64", variable=("body_com",))
+    q = torch.tensor([[0.0, 0.0, 0.11, 0.1, 0.2, 0.0, np.sqrt(0.95)]], **kind)
+    qd, com = torch.tensor([[0.3, 0.1, -0.5, 2.0, -3.0, 1.0]], **kind), torch.tensor([[[0.02, 0.03, -0.01]]], **kind)
+    weights = torch.arange(1.0, 8.0, **kind)
+
+    def end(com):
+        dyn.set(body_com=com)
+        after, rates = dyn.step(q, qd, None, H, passes=4)
+        return (after * weights).sum() + (rates * weights[:6]).sum()
+
+    given = com.clone().requires_grad_()
+    end(given).backward()
+    for axis in range(3):
+        nudge = torch.zeros_like(com)
+        nudge[0, 0, axis] = 1e-6
+        wanted = (end(com + nudge) - end(com - nudge)) / 2e-6
+        assert abs(given.grad[0, 0, axis] - wanted) <= 1e-6 * abs(given.grad).max()

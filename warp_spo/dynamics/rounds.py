@@ -132,11 +132,14 @@ def pull_back(
 
     def moved_back(rates: wp.array, cotangent: wp.array) -> wp.array:
         """Add the gradient by q of q moved along the rates for half a step; return that by the rates."""
-        by_q, by_rates = like(q, "moved q"), like(qd, "moved")
-        wrt = {"wrt": ("q", "qd")}
-        launch(INTEGRATE_VJP, by_q, {"qd_bar": by_rates}, q=q, qd=rates, dt=h, cotangent=cotangent, **wrt)
-        add("q", by_q)
-        return by_rates
+        ways = {"q": like(q, "moved q"), "qd": like(qd, "moved")}
+        if "value" in results:  # rates of a free base are those of its centre of mass
+            ways["value"] = like(results["value"], "moved value")
+        more = {f"{name}_bar": way for name, way in ways.items() if name != "q"}
+        launch(INTEGRATE_VJP, ways["q"], more, q=q, qd=rates, dt=h, cotangent=cotangent, wrt=tuple(ways))
+        for name in ways.keys() - {"qd"}:
+            add(name, ways[name])
+        return ways["qd"]
 
     for array in results.values():
         launches.fill(array, 0)
