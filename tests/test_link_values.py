@@ -31,8 +31,8 @@ def entries_read(monkeypatch, scene, operation="forward_dynamics", **options):
     """How many entries of which tables one evaluation loads."""
     dyn = spo.Dynamics(scene, device="cpu", granularity="tree", **options)
     stores = []
-    frame = dyn.programs._layout
-    monkeypatch.setattr(dyn.programs, "_layout", lambda *given: stores.extend(given[1]) or frame(*given))
+    layout = dyn.programs.builder.layout
+    monkeypatch.setattr(dyn.programs.builder, "layout", lambda *given: stores.extend(given[1]) or layout(*given))
     find(dyn, operation)
     symbols = (item.value for item in stores if not isinstance(item.value, float))
     return [s.args for s in ordered(symbols) if s.op == "input" and s.args[0] in dyn.programs.links.tables]

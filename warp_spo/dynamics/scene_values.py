@@ -14,6 +14,7 @@ from ..execution.parameters import SHARED, VARIABLE
 from ..execution.rows import as_rows, copy_rows
 from ..gradients import records_gradient
 from ..scene.actuators import check_actuator_value
+from ..scene.contacts import CONTACT_VALUES
 from ..scene.parts import real
 from ..scene.scene import refuse_negative
 from . import actuators
@@ -29,9 +30,9 @@ def set_values(self: Dynamics, *, worlds: AnyArray | None = None, **values: Any)
     All worlds share "ground_heights", which has no world axis.
 
     Names in ``variable`` are copied by launches, one for all names and one or two for what kernels derive from them,
-    which a graph may capture. Their numbers are not inspected, but for those of NumPy arrays that may not be negative,
-    and delays. Any other name rebuilds the kernels' data that was derived from it, with a warning, and is checked as a
-    scene's values are.
+    which a graph may capture. Their numbers are not inspected, but for delays and values of contacts in NumPy arrays.
+    Any other name rebuilds the kernels' data that was derived from it, with a warning, and is checked as a scene's
+    values are.
 
     Args:
         worlds: bool [world]; only worlds where it is True change. None: all change.
@@ -39,8 +40,8 @@ def set_values(self: Dynamics, *, worlds: AnyArray | None = None, **values: Any)
             buffers of :meth:`actuator_state`; controls with another one are NaN.
 
     Raises:
-        ValueError: unknown name, wrong shape, dtype or device; a NumPy array with a number below zero where none may
-            be, or with a delay that is not whole; a name that is not variable inside a graph capture or with
+        ValueError: unknown name, wrong shape, dtype or device; a NumPy array with a value of contacts below zero,
+            or with a delay that is not whole; a name that is not variable inside a graph capture or with
             ``worlds``; a tensor that requires grad, now or in an earlier call, with ``worlds``.
     """
     folded: dict[str, Any] = {}
@@ -174,7 +175,8 @@ def _inspect(name: str, value: Any, worlds: Any, axes: int) -> None:
         value = value[np.asarray(worlds)]
     if name == "actuator_delay":
         check_actuator_value("Dynamics.set", name, value)
-    refuse_negative("Dynamics.set", name, value[np.isfinite(value)])  # status= names others, in their worlds
+    if name in CONTACT_VALUES:  # status= names the worlds of negative masses; others may lie a difference below zero
+        refuse_negative("Dynamics.set", name, value[np.isfinite(value)])
 
 
 def _refuse_with_mask(dyn: Dynamics, values: dict[str, Any], folded: dict[str, Any]) -> None:
