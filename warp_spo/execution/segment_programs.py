@@ -24,7 +24,7 @@ from ..recursions.pieces import PARTS, Piece, Pieces
 from ..recursions.step import FORCE, GAIN, GUESS, MISSED, RESISTANCE
 from ..recursions.tracing import Trace
 from ..trace.emission import Emitter, Store, under
-from ..trace.scalars import Scalar, Value, is_literal
+from ..trace.scalars import Scalar, Value, is_literal, negative, ordered
 from ..trace.set_aside import set_aside
 from . import staging
 from .access import make_emitter
@@ -141,10 +141,10 @@ class _Limbs:
             return [flatten(item, shapes) for item in items]
 
         stores = flat(self.job.routine.trace(trace, **options))
-        return Traced(
+        found = Traced(
             stores=stores,
             begin=trace.begin,
-            held=list({x.key: x for x in trace.ahead if not is_literal(x) and x.op != "input"}.values()),
+            held=trace.ahead,
             laws=trace.laws,
             checks=trace.checks,
             news=flat(trace.news),
@@ -154,6 +154,7 @@ class _Limbs:
             carried=trace.carried,
             numbers=links.numbers if self.unfolds else None,
         )
+        return found._replace(held=_read(found.held, [*found.everything][len(found.begin) :]))
 
     def _gather(self, unfolded: list[frozenset]) -> Gathered | None:
         """Return the work of all pieces, None if there is no room; ``unfolded``: by piece, see :meth:`_trace`."""
@@ -283,3 +284,15 @@ class _Limbs:
     def _shared_registers(self, warps: int) -> int:
         """Of a thread, if a multiprocessor is to hold so many warps: its parts share them, each with its registers."""
         return self.plan.device.registers // PARTS // (WARP_SIZE * -(-warps // PARTS)) // 8 * 8
+
+
+def _read(values: list[Value], stores: list[Store]) -> list[Scalar]:
+    """Return what ``stores`` read of values that are computed once: of a - b perhaps b - a, of -a what it negates."""
+    needed = {x.key for x in ordered(item.value for item in stores)}
+    found: dict[tuple, Scalar] = {}
+    for value in (x for x in values if not is_literal(x)):
+        for either in (value, negative(value)):
+            x = either.args[0] if either.op == "neg" else either
+            if x.key in needed and x.op != "input":
+                found[x.key] = x
+    return [*found.values()]

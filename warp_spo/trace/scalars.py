@@ -121,12 +121,6 @@ def negative(x: Value) -> Value:
     return x.graph.make("neg", x)
 
 
-def as_subtracted(x: Value) -> Value:
-    """Return the value that code reads where it subtracts ``x``: b - a of a - b, which is added; otherwise ``x``."""
-    opposite = negative(x)
-    return x if is_constant(opposite) or opposite.op == "neg" else opposite
-
-
 def add(x: Value, y: Value) -> Value:
     """Return x + y; a constant is stored as the second argument, otherwise the older scalar as the first."""
     if is_constant(x):

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from ...status import Status
 from ...trace.emission import Store
-from ...trace.scalars import Value, as_subtracted, branch, is_constant, less, reciprocal, select
+from ...trace.scalars import Value, branch, is_constant, less, reciprocal, select
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from ..articulated_sweeps import Factors, expand, reduce
 from ..impedance import Law, add_laws
@@ -85,7 +85,7 @@ class ContactStep(Step):
             candidates.append(first[1])
         self._gather(points, touches, candidates)
         arms = keeps_arms(trace)
-        trace.ahead = [*map(as_subtracted, bias.values())]
+        trace.ahead = [*bias.values()]
         trace.ahead += [value for point in points for value in point.state(arms)]
         trace.ahead += [value for crowd in self.crowds.values() for value in (crowd.highest, crowd.reach)]
         self._press(points, touches)
