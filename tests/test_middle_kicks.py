@@ -89,6 +89,7 @@ def test_a_planted_bug_is_seen(bug, monkeypatch):
         test_what_a_light_base_carries_turns_as_it_should(1000.0)
 
 
+@pytest.mark.slow
 def test_rounds_that_do_not_settle_have_a_word(device):
     """Links that turn slowly, by a radian in a step, and not at all."""
     scene = links(100.0)
