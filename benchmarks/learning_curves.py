@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from warp_spo.env.learning import read_rows
+from warp_spo.env.course import read_rows
 from warp_spo.env.tasks import TASKS
 from warp_spo.trials.drawing import OURS, load_pyplot, style
 

@@ -11,7 +11,7 @@ pytest.importorskip("rsl_rl")
 
 from warp_spo import env as envs  # noqa: E402
 from warp_spo import play, terrain, train  # noqa: E402
-from warp_spo.env import evaluation, export, film, learning, observations, recording, robots  # noqa: E402
+from warp_spo.env import course, evaluation, export, film, learning, observations, recording, robots  # noqa: E402
 from warp_spo.env.tasks import TASKS, go2_flat, go2_rough, task, velocity  # noqa: E402
 
 
@@ -73,7 +73,7 @@ def test_an_unknown_task_is_refused():
 
 
 def test_a_training_leaves_checkpoints_and_a_course(trained):
-    rows = learning.read_rows(trained / "progress.jsonl")
+    rows = course.read_rows(trained / "progress.jsonl")
     assert [row["iteration"] for row in rows] == [0, 1, 2] and all(
         np.isfinite(list(row.values())).all() for row in rows
     )
@@ -103,7 +103,7 @@ def test_a_resumed_training_drops_the_rows_after_its_checkpoint(trained, tmp_pat
     found = torch.load(tmp_path / "model_1.pt", weights_only=True) | {"iter": 1}
     torch.save(found, tmp_path / "model_1.pt")
     learning.train(env, learner, tmp_path, 5, resume=tmp_path / "model_1.pt")
-    rows = learning.read_rows(tmp_path / "progress.jsonl")
+    rows = course.read_rows(tmp_path / "progress.jsonl")
     assert [row["iteration"] for row in rows] == [0, 1, 2, 3, 4]
     assert (np.diff([row["seconds"] for row in rows]) > 0.0).all()
     with pytest.raises(ValueError, match=r"holds a training; expected a new folder \(out\), or a checkpoint"):

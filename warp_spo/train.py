@@ -57,6 +57,8 @@ def main(arguments: list[str] | None = None) -> int:
         return subprocess.call([*run, "-m", "warp_spo.train", *given])
 
     learning = load_learning(parser)
+    from .env.course import draw_curve
+
     rank = int(os.environ.get("RANK", 0))
     chosen = task(options.task)
     worlds = options.worlds or chosen.LEARNER.worlds
@@ -72,7 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(str(error))
     learning.run(runner, iterations)
     if rank == 0:
-        print(f"{folder}: checkpoints, progress.jsonl, {learning.draw_curve(folder, options.task).name}")
+        print(f"{folder}: checkpoints, progress.jsonl, {draw_curve(folder, options.task).name}")
     learning.leave()
     return 0
 

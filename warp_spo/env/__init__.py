@@ -115,8 +115,10 @@ def make(name: str, worlds: int | None = None, device: Any = None, seed: int = 0
 
     Raises:
         ValueError: there is no task of this name.
+        TypeError: an option is one that the task sets itself, such as ``dt``, or that ``Env`` does not have.
     """
-    from .tasks import task
+    from .tasks import check_options, task
 
     chosen = task(name)
+    check_options(name, options)
     return chosen.build(chosen.LEARNER.worlds if worlds is None else worlds, device, seed, **options)

@@ -12,6 +12,8 @@ from .checks import Range, check_interval, check_number, check_optional_span, ch
 from .vectors import Vector, vector
 from .world import World
 
+LEVEL = "command level"  # name under which a world remembers by how much its share has grown
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Level:
@@ -33,18 +35,18 @@ class Level:
 
     def update(self, w: World, done: Condition | None) -> Any:
         """Return the level, after an episode if ``done``."""
-        if "command level" in w.kept:
-            return self.first + w.kept["command level"][0]
+        if LEVEL in w.kept:
+            return self.first + w.kept[LEVEL][0]
         if self.reward not in w.weights:
             raise ValueError(f"commands.Level: no reward {self.reward!r}; expected one of {', '.join(w.weights)}")
-        level = self.first + w.memory("command level", 1, reset=None)[0]
+        level = self.first + w.memory(LEVEL, 1, reset=None)[0]
         if done is None:
             return level
         most = abs(w.weights[self.reward]) * w.time
         up = done & (w.memory(f"sum reward {self.reward}", 1)[0] > self.share * most)
         grown = level + where(up, self.step, 0.0)
         grown = where(grown < 1.0, grown, 1.0)
-        w.keep("command level", [grown - self.first])
+        w.keep(LEVEL, [grown - self.first])
         return grown
 
 

@@ -18,6 +18,7 @@ from ..launches import compile_side_by_side
 from ..recursions.contact.ground import GROUND, SINGLE
 from ..scene.scene import Scene
 from ..torch import stream
+from . import saving
 from .checks import check_number, check_whole
 from .events import Delays, Values, changed_values
 from .given import RESULTS, checked_actions, checked_lengths, checked_mask, checked_terms
@@ -133,6 +134,7 @@ class Env(VecEnv):
         if not np.isfinite(default).all():
             raise ValueError(f"Env: default_q is {default.tolist()}; expected finite numbers")
         groups, rewards, terminations = checked_terms(observations, rewards, terminations or {}, events)
+        self._levels = saving.level_names(events, commands)
         layout = self._layout = Layout(scene, default, self.step_dt, commands, changed_values(scene, events))
         parts = list(actions) if isinstance(actions, list | tuple) else [actions]
         for part in parts:
@@ -285,6 +287,13 @@ class Env(VecEnv):
 
     def close(self) -> None:
         """Do nothing: memory is freed with the object."""
+
+    # -- state outside of it ---------------------------------------------------------------------------------------
+    levels = saving.levels
+    start_at = saving.start_at
+    state_dict = saving.state_dict
+    load_state_dict = saving.load_state_dict
+    __reduce__ = saving.reduce
 
     # -- inside ----------------------------------------------------------------------------------------------------
     def _observations(self, out: torch.Tensor, kind: str = "") -> Any:

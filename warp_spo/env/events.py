@@ -12,7 +12,7 @@ from ..hinges.functions import where
 from ..scene.terrain import Tiles
 from .actions import actuator_labels
 from .checks import Range, check_interval, check_number, check_span, check_steps
-from .vectors import cross, find, vector
+from .vectors import find, multiply, vector
 from .world import World
 
 
@@ -24,10 +24,12 @@ class Reset:
         change: function of a ``World``, which assigns to entries of ``w.q`` and ``w.qd``. ``w.before`` is the
             world at the end of the episode. What it keeps with ``w.keep`` stays until the next reset.
         first: None, or a function that keeps what worlds remember for good, when the environment is made.
+        levels: names of what worlds remember that say how far they have come; a training that resumes goes on there.
     """
 
     change: Callable[[World], None]
     first: Callable[[World], None] | None = None
+    levels: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -188,7 +190,7 @@ def terrain(tiles: Tiles, rows: int | None = None, level: bool = True) -> Reset:
         for i, x in enumerate(origins(row * float(columns) + column)):
             w.q[start + i] = w.q[start + i] + x
 
-    return Reset(change, first)
+    return Reset(change, first, ("terrain",))
 
 
 def push(
@@ -379,12 +381,6 @@ def entries_of(scene: Any, name: str, names: Any) -> list[int]:
         return [i for hinge in hinges for i in range(int(start[hinge]), int(start[hinge + 1]))]
     labels = scene.body_labels if family == "body" else actuator_labels(scene)
     return list(range(len(labels))) if names is None else find("events.randomise", family, labels, names)
-
-
-def multiply(a: Any, b: Any) -> np.ndarray:
-    """Return the product of two quaternions, xyzw: the rotation ``b``, then ``a``."""
-    u = a[3] * vector(b[:3]) + b[3] * vector(a[:3]) + cross(a, b)
-    return vector([*u, a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2]])
 
 
 def changed_values(scene: Any, events: Sequence[Any]) -> tuple[str, ...]:

@@ -7,12 +7,12 @@ The learner, its losses and its storage are rsl_rl's.
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import os
 import pickle
 import time
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from rsl_rl.runners import OnPolicyRunner
 
 from ..arrays import parse_device
 from .checks import check_folder
+from .course import Course, OutOfTime
 from .environment import Env
 
 
@@ -125,15 +126,19 @@ class CapturedPPO(PPO):
         return losses
 
 
-class OutOfTime(Exception):
-    """The time that a training may take is over."""
-
-
 KEPT = ("actions", "values", "actions_log_prob", "distribution_params", "hidden_states")
 
 
 class Runner(OnPolicyRunner):
-    """rsl_rl's runner; processes without GPUs average gradients through gloo, where rsl_rl knows NCCL alone."""
+    """rsl_rl's runner, whose checkpoints hold the levels of curricula.
+
+    Processes without GPUs average gradients through gloo, where rsl_rl knows NCCL alone.
+    """
+
+    def save(self, path: str, infos: dict | None = None) -> None:
+        """Save networks, the optimizer's state, and how far this process's worlds have come in curricula."""
+        reached = {name: tensor.cpu().clone() for name, tensor in self.env.levels().items()}
+        super().save(path, (infos or {}) | {"levels": reached})
 
     def _configure_multi_gpu(self) -> None:
         size = int(os.environ.get("WORLD_SIZE", "1"))
@@ -144,84 +149,6 @@ class Runner(OnPolicyRunner):
         ranks = {"global_rank": self.gpu_global_rank, "local_rank": self.gpu_local_rank}
         self.cfg["multi_gpu"] = ranks | {"world_size": size}
         torch.distributed.init_process_group("gloo", rank=self.gpu_global_rank, world_size=size)
-
-
-class Course:
-    """The course of a training, in place of rsl_rl's logger: a printed line and a row of JSON for an iteration.
-
-    Means of rewards and of lengths of episodes come from the environment, which gathers them in its graph; an iteration
-    reads them once.
-    """
-
-    def __init__(
-        self, env: Env, folder: Path | None, every: int, began: float, writes: bool, seconds: float = math.inf
-    ):  # fmt: skip
-        self.env, self.log_dir, self.every, self.began = env, folder and str(folder), every, began
-        self.ends = began + seconds
-        self.writer = self if folder is not None and writes else None
-        self.first = 0  # iteration
-        self.rows: list[dict[str, float]] = []
-        self.git_status_repos: list[str] = []
-
-    def init_logging_writer(self) -> None:
-        """Continue the rows of the training that is resumed, up to its checkpoint; its seconds count."""
-        if self.writer is not None:
-            self.file = Path(self.log_dir) / "progress.jsonl"  # type: ignore[arg-type]
-            if self.file.exists():
-                self.rows = [row for row in read_rows(self.file) if row["iteration"] < self.first]
-                self.file.write_text("".join(json.dumps(row) + "\n" for row in self.rows))
-            if self.rows:
-                self.began -= self.rows[-1]["seconds"]
-
-    def process_env_step(self, *_: Any) -> None:
-        """Do nothing."""
-
-    def log(
-        self, it: int, total_it: int, collect_time: float, learn_time: float, loss_dict: dict, **others: Any
-    ) -> None:
-        """Write an iteration."""
-        if self.writer is None:
-            return
-        found = self.env.log()
-        numbers = torch.stack([value.float() for value in found.values()]).tolist()
-        row: dict[str, float] = {
-            "iteration": it,
-            "seconds": time.time() - self.began,
-            "collecting": collect_time,
-            "learning": learn_time,
-            "deviation": float(others["action_std"].detach().mean()),
-            "rate": float(others["learning_rate"]),
-            **peak_memory(self.env.device),
-            **{f"loss/{name}": float(value) for name, value in loss_dict.items()},
-            **dict(zip(found, numbers, strict=True)),
-        }
-        row["reward"] = sum(value for name, value in row.items() if name.startswith("/reward/"))
-        self.rows.append(row)
-        with self.file.open("a") as file:
-            file.write(json.dumps({name: float(f"{value:.6g}") for name, value in row.items()}) + "\n")
-        if it % self.every == 0 or it + 1 == total_it:
-            print(f"iteration {it:4d} of {total_it}  {row['seconds']:6.1f} s  reward {row['reward']:8.3f}  "
-                  f"episode {row['/episode/seconds']:5.1f} s  collecting {1e3 * collect_time:4.0f} ms  "
-                  f"learning {1e3 * learn_time:4.0f} ms", flush=True)  # fmt: skip
-        if time.time() > self.ends:
-            raise OutOfTime
-
-    def save_model(self, *_: Any) -> None:
-        """Do nothing: checkpoints stay in the folder."""
-
-    def stop_logging_writer(self) -> None:
-        """Do nothing: each row is written when it is known."""
-
-
-def peak_memory(device: Any) -> dict[str, float]:
-    """Return the largest number of bytes that torch has held so far on a GPU, by the name "torch bytes"; {} on a CPU.
-
-    These are networks, optimizer, rollouts, temporaries and the environment's tensors; Warp's arrays, such as the
-    dynamics' values of each world, are beside them.
-    """
-    return (
-        {"torch bytes": float(torch.cuda.max_memory_allocated(device))} if torch.device(device).type == "cuda" else {}
-    )
 
 
 def pick_device(asked: str | None) -> str:
@@ -238,11 +165,6 @@ def pick_device(asked: str | None) -> str:
         torch.cuda.set_device(device)
         torch.set_float32_matmul_precision("high")
     return device
-
-
-def read_rows(file: Path) -> list[dict[str, float]]:
-    """Return the rows of a ``progress.jsonl``."""
-    return [json.loads(line) for line in file.read_text().splitlines()]
 
 
 def make_runner(
@@ -286,7 +208,20 @@ def load_checkpoint(runner: OnPolicyRunner, file: str | Path, learns: bool = Tru
         ) from None
     if learns:
         runner.current_learning_iteration = found["iter"] + 1
+        resume_levels(runner.env, file, (found.get("infos") or {}).get("levels", {}))
     return int(found["iter"])
+
+
+def resume_levels(env: Env, file: str | Path, levels: Mapping[str, torch.Tensor]) -> None:
+    """Start worlds at a checkpoint's levels of curricula; warn where it has none and the environment has."""
+    if levels.keys() != env.levels().keys():
+        warnings.warn(
+            f"checkpoint {str(file)!r}: has levels of {', '.join(levels) or 'nothing'}, the task's curricula are "
+            f"{', '.join(env.levels()) or 'none'}; worlds begin at the first levels",
+            stacklevel=3,
+        )
+    elif levels:
+        env.start_at(levels)
 
 
 def prepare(
@@ -365,33 +300,3 @@ def policy_of(runner: OnPolicyRunner) -> Any:
             return model(observations)
 
     return policy
-
-
-def draw_curve(folder: str | Path, name: str) -> Path:
-    """Draw the learning curve of a folder's ``progress.jsonl`` as ``curve.png``, and return its path.
-
-    Without matplotlib the path returned is that of the rows.
-    """
-    folder = Path(folder)
-    rows = read_rows(folder / "progress.jsonl")
-    try:
-        from ..trials.drawing import OURS, load_pyplot, style
-
-        pyplot = load_pyplot("train")
-    except ImportError:
-        return folder / "progress.jsonl"
-    with style():
-        figure, panels = pyplot.subplots(1, 2, figsize=(9.0, 3.2), layout="constrained")
-        seconds = [row["seconds"] for row in rows]
-        terms = sorted((key for key in rows[-1] if key.startswith("/reward/")), key=lambda key: -abs(rows[-1][key]))
-        panels[0].plot(seconds, [row["reward"] for row in rows], color=OURS)
-        panels[0].set(title=f"{name}: reward of an episode", xlabel="seconds since the start of the process")
-        for key in terms[:6]:
-            panels[1].plot(seconds, [row.get(key, 0.0) for row in rows], label=key.removeprefix("/reward/"), lw=1.2)
-        panels[1].set(title="its largest terms", xlabel="seconds")
-        panels[1].legend(fontsize=8)
-        for panel in panels:
-            panel.grid(True)
-        figure.savefig(folder / "curve.png", dpi=110)
-        pyplot.close(figure)
-    return folder / "curve.png"

@@ -61,6 +61,12 @@ class Storage:
         start, _, pitch = self.places[name]
         return out[start : start + self.worlds * pitch].view(self.worlds, pitch)
 
+    def changing(self) -> dict[str, torch.Tensor]:
+        """Return the tensors that steps change, by name; "out" holds all results."""
+        results = {output_name(name) for name in self.places}
+        own = {name for name, buffer in self.buffers.items() if buffer.way != SHARED} | {"key"}
+        return {name: x for name, x in self.tensors.items() if name in own - results} | {"out": self.out}
+
     @property
     def bytes_per_world(self) -> int:
         """Bytes that a world takes, without what all worlds share."""

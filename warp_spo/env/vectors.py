@@ -28,6 +28,12 @@ def cross(a: Any, b: Any) -> Vector:
     return vector([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
+def multiply(a: Any, b: Any) -> Vector:
+    """Return the product of two quaternions, xyzw: the rotation ``b``, then ``a``."""
+    u = a[3] * vector(b[:3]) + b[3] * vector(a[:3]) + cross(a, b)
+    return vector([*u, a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2]])
+
+
 def rotate(quaternion: Any, v: Any) -> Vector:
     """Return ``v`` turned by a unit quaternion, xyzw."""
     u, w = quaternion[:3], quaternion[3]

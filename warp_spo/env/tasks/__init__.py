@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import inspect
+from collections.abc import Iterable
 from typing import Any
 
 TASKS = {
@@ -21,3 +23,19 @@ def task(name: str) -> Any:
     if name not in TASKS:
         raise ValueError(f"make: task {name!r} is unknown; expected one of {', '.join(TASKS)}")
     return importlib.import_module(f".{TASKS[name]}", __package__)
+
+
+OPEN = ("first_world", "passes", "granularity", "graph", "log_interval", "final_observations", "cfg")
+"""Arguments of ``Env`` that tasks leave to the caller."""
+
+
+def check_options(name: str, options: Iterable[str]) -> None:
+    """Raise TypeError for an argument that a task sets itself, or that nobody knows."""
+    chosen = task(name)
+    own = [each for each in inspect.signature(chosen.build).parameters if each not in ("worlds", "device", "options")]
+    wrong = [each for each in options if each not in (*own, *OPEN)]
+    if wrong:
+        raise TypeError(
+            f"make: {name!r} takes no {', '.join(wrong)}; expected some of {', '.join((*own, *OPEN))}. A task sets all "
+            f"other arguments of Env: to change one, copy its file, {chosen.__file__}, whose build() calls Env"
+        )

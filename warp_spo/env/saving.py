@@ -1,0 +1,93 @@
+"""State of an environment outside of it: all that a step reads, and the levels of its curricula."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import torch
+
+from .commands import LEVEL
+
+if TYPE_CHECKING:
+    from .environment import Env
+
+STEPS = "steps"  # of the environment, after which a log comes
+
+
+def level_names(events: Sequence[Any], commands: Any) -> list[str]:
+    """Return the names under which worlds remember how far they have come in curricula of events and commands."""
+    names = [name for event in events for name in getattr(event, "levels", ())]
+    return names + ([] if getattr(commands, "level", None) is None else [LEVEL])
+
+
+def levels(self: Env) -> dict[str, torch.Tensor]:
+    """Return how far worlds have come in curricula, tensors [world, number] that may be written.
+
+    "terrain" has rows and columns of tiles, "command level" by how much ranges of commands have grown. Without a
+    curriculum the dictionary is empty.
+    """
+    return {name: self.memory(name) for name in self._levels}
+
+
+def start_at(self: Env, levels: Mapping[str, torch.Tensor]) -> None:
+    """Start all worlds anew at levels that :meth:`levels` returned, of this environment or of one like it.
+
+    World w takes row w of them, counted in the whole run (``first_world``). If there are fewer rows, they are taken
+    again from the first.
+
+    Raises:
+        ValueError: names or numbers per world are not those of this environment.
+    """
+    held = self.levels()
+    if levels.keys() != held.keys() or any(levels[name].shape[1:] != held[name].shape[1:] for name in held):
+        came, expected = ({name: tuple(x.shape) for name, x in each.items()} for each in (levels, held))
+        raise ValueError(f"Env.start_at: levels have the shapes {came}; expected {expected}, with any number of worlds")
+    for name, own in held.items():
+        rows = (self.first_world + torch.arange(self.num_envs)) % len(levels[name])
+        own.copy_(levels[name].to(self.device)[rows.to(self.device)])
+    self.reset()
+
+
+def state_dict(self: Env) -> dict[str, torch.Tensor]:
+    """Return copies of all tensors that the next steps depend on, by name.
+
+    ``torch.save`` stores them. An environment that is made with the same arguments goes on from them to the bit, on the
+    same device: :meth:`load_state_dict`.
+    """
+    return {name: tensor.clone() for name, tensor in _tensors(self).items()} | {STEPS: torch.tensor(self._steps)}
+
+
+def load_state_dict(self: Env, state: Mapping[str, torch.Tensor]) -> None:
+    """Continue from what :meth:`state_dict` returned, of an environment that was made with the same arguments.
+
+    Raises:
+        ValueError: a tensor is missing, too many, or has another shape or dtype than here; nothing is changed then.
+    """
+    held = _tensors(self)
+    kinds = {name: (tuple(x.shape), x.dtype) for name, x in held.items()} | {STEPS: ((), torch.int64)}
+    came = {name: (tuple(x.shape), x.dtype) for name, x in state.items()}
+    for name in sorted(kinds.keys() | came.keys()):
+        if kinds.get(name) != came.get(name):
+            raise ValueError(
+                f"Env.load_state_dict: {name!r} is {came.get(name, 'missing')}; expected {kinds.get(name, 'none')}, as "
+                "env.state_dict() of an environment that was made with the same arguments has it"
+            )
+    for name, tensor in held.items():
+        tensor.copy_(state[name])
+    self._steps = int(state[STEPS])
+    self._set_values()
+
+
+def _tensors(env: Env) -> dict[str, torch.Tensor]:
+    """Return the tensors themselves."""
+    delays = env._actuator_state or ()
+    return env._store.changing() | {f"actuator state {i}": part for i, part in enumerate(delays)}
+
+
+def reduce(self: Env) -> NoReturn:
+    """Raise TypeError, which says how to store an environment."""
+    raise TypeError(
+        "Env: it cannot be pickled or copied, because it holds kernels, graphs and memory of a device; store "
+        "env.state_dict(), make an environment with the same arguments, and call its load_state_dict"
+    )
