@@ -92,3 +92,23 @@ def test_a_file_that_disables_contacts_is_obeyed(flag, tmp_path):
         assert len(read("*").contacts) == 1
     file.write_text(text.format("", body))
     assert len(spo.load(file, contacts=True).contacts) == 1
+
+
+MASKED = """<mujoco><default><default class="second"><geom contype="2" conaffinity="2"/></default></default><worldbody>
+ <geom name="floor" type="plane" size="1 1 1" {floor}/><body name="base"><freejoint/>
+ <geom name="sole" type="box" size="0.1 0.1 0.1"/><geom name="apart" type="sphere" size="0.5" class="second"/>
+ <geom name="lone" type="sphere" size="0.05" contype="0" conaffinity="2"/><body name="arm"><joint axis="0 1 0"/>
+ <geom name="rod" type="sphere" size="0.05" contype="0"/><geom name="tip" type="sphere" size="0.05" contype="4"
+ conaffinity="0"/></body></body></worldbody><contact>{contact}</contact></mujoco>"""
+
+
+@pytest.mark.parametrize("floor", ["", 'contype="2" conaffinity="2"', 'conaffinity="0"', 'contype="0" conaffinity="0"'])
+@pytest.mark.parametrize("contact", ["", '<pair geom1="lone" geom2="floor"/>', '<pair geom1="tip" geom2="floor"/>'])
+@pytest.mark.parametrize("exclude", ["", '<exclude body1="world" body2="base"/>'])
+def test_masks_pairs_and_excludes_hold_without_mujoco(floor, contact, exclude, tmp_path):
+    """Newton's importer keeps the shapes that MuJoCo's rules let touch the ground, and no others."""
+    file = tmp_path / "masked.xml"
+    file.write_text(MASKED.format(floor=floor, contact=contact + exclude))
+    wanted = [c.label for c in spo.load(file, contacts=True).contacts]
+    scene = mjcf.read_mjcf(file, None, True, Choice(True, None, 8))
+    assert [c.label.split("/")[-1] for c in scene.contacts] == wanted and 0 < len(wanted) + len(exclude)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
 from pathlib import Path
 
@@ -9,17 +10,22 @@ import newton
 import numpy as np
 
 from ..scene.scene import Scene
-from ..scene.shapes import NONE, Choice
+from ..scene.shapes import NONE, Choice, Shape, Touches
 from .model import from_newton
 from .model_contacts import ModelShapes
 from .repair import repair_bodies
 from .worlds import Worlds
 
 
-def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool, choice: Choice = NONE) -> Scene:
+def scene_of(
+    file: Path, builder: newton.ModelBuilder, repair: bool, choice: Choice = NONE, touches: Touches | None = None
+) -> Scene:
     """Return the scene of a builder that read a file; errors name the file.
 
-    With ``repair``, masses and inertias that no rigid body can have are replaced, and a warning names the bodies.
+    Args:
+        file: for errors. builder: what an importer made of the file. choice: of shapes that touch the ground.
+        repair: replace masses and inertias that no rigid body can have; a warning names the bodies.
+        touches: says whether a shape touches a ground of the file; None: by Newton's groups and filters.
     """
     try:
         if repair:
@@ -34,7 +40,15 @@ def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool, choice: Cho
         error.args = (f"load: {str(file)!r}: {error}",)
         raise
     call = f"load: {str(file)!r}"
-    scene, lost = choice.applied(call, scene, lambda: ModelShapes(model, Worlds(model), materials=False).first())
+
+    @functools.cache
+    def shapes() -> ModelShapes:
+        return ModelShapes(model, Worlds(model), materials=False)
+
+    def by_groups(shape: Shape, ground: Shape) -> bool:
+        return shapes().touches(shape, ground)
+
+    scene, lost = choice.applied(call, scene, lambda: shapes().first(), touches or by_groups)
     if lost:
         warnings.warn(f"{call}: left out: {', '.join(lost)}", UserWarning, stacklevel=4)
     return scene

@@ -13,13 +13,16 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import newton
+import warp as wp
 
 from ..errors import UnsupportedError
 from ..scene.scene import Scene
-from ..scene.shapes import NONE, Choice
+from ..scene.shapes import NONE, Choice, Shape, Touches
 from .imported import scene_of, unreadable
 from .mjcf_differences import MISREAD, find_misread, left_out
 from .worlds import quote_labels
+
+MASKS = ("contype", "conaffinity")
 
 
 def mjcf_tree(file: Path) -> ET.Element:
@@ -68,6 +71,32 @@ def mjcf_gravity(root: ET.Element) -> list[float] | None:
         return [0.0, 0.0, 0.0]
     options = root.findall("option[@gravity]")
     return [float(g) for g in options[-1].get("gravity", "").split()] if options else None
+
+
+def contact_rule(root: ET.Element, builder: newton.ModelBuilder) -> Touches:
+    """Return a function that says by MuJoCo's rules whether a shape of an MJCF file touches a ground of it.
+
+    A <pair> of their geoms counts first, then an <exclude> of the body and the world, which Newton 1.8 does not read,
+    then the masks of both. Shapes of pairs get a group in the builder, so that they collide whatever their masks say.
+    """
+    name = lambda label: label.rpartition("/")[2]  # noqa: E731
+    pairs = {frozenset((pair.get("geom1", ""), pair.get("geom2", ""))) for pair in root.iterfind("contact/pair")}
+    for i, label in enumerate(builder.shape_label):
+        if any(name(label) in pair for pair in pairs):
+            builder.shape_collision_group[i] = 1
+    excludes = [{exclude.get("body1"), exclude.get("body2")} for exclude in root.iterfind("contact/exclude")]
+    parted = {body for bodies in excludes if "world" in bodies for body in bodies}
+    contype, conaffinity = (dict(builder.custom_attributes[f"mujoco:{mask}"].values or {}) for mask in MASKS)
+
+    def touches(shape: Shape, ground: Shape) -> bool:
+        if frozenset((name(shape.label), name(ground.label))) in pairs:
+            return True
+        if name(shape.label.rpartition("/")[0]) in parted:
+            return False
+        one, other = ((contype.get(each.index, 1), conaffinity.get(each.index, 1)) for each in (shape, ground))
+        return bool(one[0] & other[1] | other[0] & one[1])
+
+    return touches
 
 
 def mjcf_disables_contacts(root: ET.Element) -> bool:
@@ -128,6 +157,12 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool, choice: Choice = 
 
     def import_with(parse_mujoco_options: bool) -> newton.ModelBuilder:
         builder = newton.ModelBuilder()
+        for mask in MASKS:  # which the importer reads where the builder knows them
+            builder.add_custom_attribute(
+                newton.ModelBuilder.CustomAttribute(
+                    mask, wp.int64, newton.Model.AttributeFrequency.SHAPE, namespace="mujoco", default=1
+                )
+            )
         builder.add_mjcf(
             source,
             floating=floating,
@@ -162,7 +197,7 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool, choice: Choice = 
             UserWarning,
             stacklevel=3,
         )
-    return scene_of(file, builder, repair, choice)
+    return scene_of(file, builder, repair, choice, contact_rule(root, builder))
 
 
 def _holder(feature: str) -> str:

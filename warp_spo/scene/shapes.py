@@ -82,6 +82,9 @@ class Shape:
         return f"{name} of {'the world' if self.body < 0 else f'body {bodies[self.body]!r}'}"
 
 
+Touches = Callable[[Shape, Shape], bool]
+
+
 class Chosen(NamedTuple):
     """Contacts and ground that a :class:`Choice` finds in a source.
 
@@ -110,11 +113,14 @@ class Choice(NamedTuple):
     ground: Any = None
     points: Any = POINTS
 
-    def applied(self, call: str, scene: Scene, shapes: Callable[[], Sequence[Shape]]) -> tuple[Scene, list[str]]:
+    def applied(
+        self, call: str, scene: Scene, shapes: Callable[[], Sequence[Shape]], touches: Touches | None = None
+    ) -> tuple[Scene, list[str]]:
         """Return the scene with contacts for the chosen shapes, and in words what is left out, such as "box 'table'".
 
         Args:
             call: for errors. shapes: returns those of the source; called only if some are wanted.
+            touches: says whether a shape collides with the ground of the source; None: each of ``shapes`` does.
 
         Raises:
             ValueError: a pattern matches no shape of a body that can move, a number of points is invalid, or there is a
@@ -123,7 +129,7 @@ class Choice(NamedTuple):
         """
         if not self.wants(call):
             return scene, []
-        found = self.resolve(call, scene, shapes())
+        found = self.resolve(call, scene, shapes(), touches)
         return scene.with_contacts([one for _, made in found.taken for one in made], found.ground), found.left_out
 
     def unless(self, disabled: bool) -> tuple[Choice, list[str]]:
@@ -141,9 +147,7 @@ class Choice(NamedTuple):
             )
         return self.contacts is not None
 
-    def resolve(
-        self, call: str, scene: Scene, shapes: Sequence[Shape], touches: Callable[[Shape, Shape], bool] | None = None
-    ) -> Chosen:
+    def resolve(self, call: str, scene: Scene, shapes: Sequence[Shape], touches: Touches | None = None) -> Chosen:
         """Return the contacts of the chosen shapes, and what is left out; errors as :meth:`applied`.
 
         ``touches`` says whether a shape collides with the ground of the source.
