@@ -10,6 +10,7 @@ import types
 import custom_hinges
 import laws
 import mechanisms
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -167,6 +168,28 @@ def test_a_solver_says_that_it_cannot():
     for way in WAYS.values():
         with explained(TypeError, "SolverSPO", "newton.Model", "solver.dynamics"):
             way(solver)
+
+
+def test_what_holds_memory_says_what_to_store(changed):
+    """Operators and coordinates, which ended in words of ctypes."""
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint/><geom size="0.1"/></body></worldbody></mujoco>'
+    )
+    q = np.tile(changed.scene.neutral_q, (WORLDS, 1))
+    operators, weights = changed.operators(q), [np.eye(2), None, np.eye(2)]
+    held = {
+        "Operator: .*memory of a device; store op.dense()": [
+            operators.H @ operators.phi,
+            spo.BWA(spo.Tree([1, -1, 1]), weights, dims=[2, 2, 2]).resolvent(),
+        ],
+        "operators of a scene: .*call dyn.operators": [operators],
+        "Coordinates: .*store the scene and the MjModel": [spo.mujoco.Coordinates(spo.from_mujoco(model), model)],
+    }
+    for words, things in held.items():
+        for thing in things:
+            for way in WAYS.values():
+                with pytest.raises(TypeError, match=words):
+                    way(thing)
 
 
 def test_a_spawned_worker(changed):

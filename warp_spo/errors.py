@@ -4,7 +4,8 @@ Every other mistake of a caller raises a plain ValueError or TypeError.
 """
 
 import operator
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -45,6 +46,15 @@ def as_integer(value: Any) -> int | None:
         return operator.index(value) if not is_bool(value) and not getattr(value, "ndim", 0) else None
     except (TypeError, RuntimeError):  # RuntimeError: a tensor without memory
         return None
+
+
+def never_copied(name: str, why: str, way_out: str) -> Callable[[Any], NoReturn]:
+    """Return a ``__reduce__`` that refuses pickle and copy with a TypeError, which says why and what to do instead."""
+
+    def reduce(self: Any) -> NoReturn:
+        raise TypeError(f"{name}: it cannot be pickled or copied, because it holds {why}; {way_out}")
+
+    return reduce
 
 
 class DirectedLoopError(ValueError):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 import torch
 
+from ..errors import never_copied
 from .commands import LEVEL
 
 if TYPE_CHECKING:
@@ -85,9 +86,8 @@ def _tensors(env: Env) -> dict[str, torch.Tensor]:
     return env._store.changing() | {f"actuator state {i}": part for i, part in enumerate(delays)}
 
 
-def reduce(self: Env) -> NoReturn:
-    """Raise TypeError, which says how to store an environment."""
-    raise TypeError(
-        "Env: it cannot be pickled or copied, because it holds kernels, graphs and memory of a device; store "
-        "env.state_dict(), make an environment with the same arguments, and call its load_state_dict"
-    )
+reduce = never_copied(
+    "Env",
+    "kernels, graphs and memory of a device",
+    "store env.state_dict(), make an environment with the same arguments, and call its load_state_dict",
+)

@@ -16,6 +16,7 @@ import warp as wp
 
 from .. import launches
 from ..arrays import ArrayT, Call, kind_of, new, parse_device, parse_dtype
+from ..errors import never_copied
 from ..kernels import block_sparse, declare
 from ..memory import view
 
@@ -42,6 +43,8 @@ class Workspace:
 
 class LetterOwner(abc.ABC):
     """The owner of operators that are letters of the paper; it may apply an expression of them in one kernel."""
+
+    __reduce__ = never_copied("operators of a scene", "memory of a device", "store q, and call dyn.operators(q) anew")
 
     @abc.abstractmethod
     def fill(self) -> None:
@@ -73,6 +76,10 @@ class Operator(abc.ABC):
     form: tuple = ()
     operands: "tuple[Operator, ...]" = ()
     __array_ufunc__ = None  # NumPy hands array @ op and array + op to the operator
+
+    __reduce__ = never_copied(
+        "Operator", "memory of a device", "store op.dense(), or what the operator was made of: its weights, or q"
+    )
 
     def __init__(self, shape: tuple[int, int], worlds: int, device: wp.Device, dtype: type, kind: str | None):
         self.shape = shape

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from ..arrays import AnyArray, ArrayT, Call, parse_device, parse_dtype
-from ..errors import as_integer
+from ..errors import as_integer, never_copied
 from ..kernels import declare
 from ..kernels import mujoco as kernels
 from ..memory import broadcast_worlds
@@ -45,6 +45,8 @@ class Coordinates:
     All methods take and return arrays as :class:`Dynamics` does: torch, Warp or NumPy, ``[world, ...]``, with ``out=``;
     torch and Warp arrays are not copied, and a call with ``out=`` can be captured.
     """
+
+    __reduce__ = never_copied("Coordinates", "memory of a device", "store the scene and the MjModel, and make it anew")
 
     def __init__(self, scene: Scene, model: Any, worlds: int | None = None, device: Any = None, dtype: Any = "float32"):
         if not isinstance(model, mujoco.MjModel):

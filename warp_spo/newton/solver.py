@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar, NoReturn
+from typing import Any, ClassVar
 
 import newton
 import warp as wp
@@ -14,7 +14,7 @@ from newton.solvers import SolverBase
 from .. import launches
 from ..dynamics.dynamics import Dynamics
 from ..dynamics.steps import INTEGRATORS
-from ..errors import UnsupportedError, as_integer, as_names
+from ..errors import UnsupportedError, as_integer, as_names, never_copied
 from ..kernels import declare, exchange
 from ..scene.scene import Scene
 from ..scene.shapes import POINTS
@@ -257,11 +257,11 @@ class SolverSPO(Plugs, SolverBase):
             return f"integrator={self.integrator!r}"
         return "granularity='node'" if self._options["granularity"] == "node" else ""
 
-    def __reduce__(self) -> NoReturn:
-        raise TypeError(
-            "SolverSPO: it cannot be pickled or copied, because it reads the arrays of a newton.Model; build "
-            "SolverSPO(model) anew, or store solver.dynamics, which can be pickled"
-        )
+    __reduce__ = never_copied(
+        "SolverSPO",
+        "arrays of a newton.Model",
+        "build SolverSPO(model) anew, or store solver.dynamics, which can be pickled",
+    )
 
     @property
     def supported_observables(self) -> frozenset[str]:
