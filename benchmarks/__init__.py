@@ -15,10 +15,10 @@ Accuracy, mostly on a CPU:
     ``stress/``, ``stability`` (robots under gravity), ``frames`` (where frames lie), ``gradients`` (rollouts),
     ``robot_files`` and ``mjcf_files`` (readers), ``inverse_kinematics``, ``flexible_peers`` and ``boom`` (beams).
 Contact:
-    ``contacts`` (times and errors), ``contact_motions`` and ``contact_courses`` (every promised figure),
-    ``contact_throws`` (energy), ``contact_gradients``, ``contact_mujoco`` and ``contact_peers`` (other engines).
+    ``contacts`` (times and errors), ``contact_throws`` (energy); ``contact/``: every promised figure, other engines,
+    gradients, terrain.
 Learning:
     ``training`` (env-steps/s), ``learning_curves``.
 Documentation and refactoring:
-    ``blocks`` (code of pages), ``site``, ``site_pictures``, ``gallery``, ``terrain``; ``kernel_texts`` (generated).
+    ``blocks`` (code of pages), ``site``, ``site_pictures``, ``gallery``; ``kernel_texts`` (generated).
 """

@@ -45,7 +45,7 @@ SHOWN = (
         "films/panda_reach.webp",
         "python -m warp_spo.play panda-reach runs/panda-reach/model_119.pt --film webp",
     ),
-    ("One tile of each kind of terrain", "terrain.png", "python -m benchmarks.terrain terrain.png"),
+    ("One tile of each kind of terrain", "terrain.png", "python -m benchmarks.contact.terrain terrain.png"),
 )
 """Title, file in ``docs/_static`` and command of pictures that other commands draw."""
 OTHERS = """## Robots, policies, terrain

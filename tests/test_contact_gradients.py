@@ -350,7 +350,7 @@ def test_jax_differentiates_the_step(device):
 @pytest.mark.slow
 def test_jumps_are_not_seen_and_dissipation_has_none():
     """The picture of the documentation: without jumps the mean of the gradients is the slope."""
-    from benchmarks import contact_gradients as pictured
+    from benchmarks.contact import gradients as pictured
 
     mean, slope = pictured.slopes(**pictured.DAMPERS["damping=70"])
     assert abs(mean / slope - 0.69) <= 0.02

@@ -5,7 +5,7 @@ import pytest
 from contact_cases import STAND, ContactStep, quadruped
 
 import warp_spo as spo
-from benchmarks import contact_courses, contact_motions
+from benchmarks.contact import courses, motions
 
 REPORTS = {"contact_f": (12, 3), "contact_gap": (12,), "contact_slip": (12,), "contact_excess": (3,)}
 RISE = 1e-5  # of the first state's energy, above which a step counts as one that gains
@@ -133,9 +133,7 @@ def test_tumbling_drops_gain_next_to_nothing(device, passes, h, effort):
 @pytest.mark.slow
 def test_inclines_and_stairs():
     """Slide and creep on inclines; feet that swing into a riser, fly over its edge, stand across it."""
-    rows = [
-        contact_motions.Line(*row) for course in ("incline", "stairs") for row in contact_courses.courses()[course]()
-    ]
+    rows = [motions.Line(*row) for course in ("incline", "stairs") for row in courses.courses()[course]()]
     assert sum(row.asked is not None for row in rows) == 18
     for row in rows:
         assert row.holds is not False, str(row)

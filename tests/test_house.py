@@ -170,12 +170,13 @@ def test_the_reference_imports_numpy_alone():
         assert {room for _, room in rooms_imported(PACKAGE / name)} <= own_of.get(name, set())
 
 
-def test_the_map_of_the_benchmarks_names_every_file():
-    folder = REPOSITORY / "benchmarks"
+@pytest.mark.parametrize("name", ["benchmarks", "benchmarks/contact"])
+def test_the_map_of_the_benchmarks_names_every_file(name):
+    folder = REPOSITORY / name
     names = {path.stem for path in folder.glob("*.py")} - {"__init__", "__main__"}
     text = (folder / "__init__.py").read_text()
     missing = sorted(name for name in names if f"``{name}``" not in text)
-    assert not missing, f"benchmarks/__init__.py says nothing of {missing}"
+    assert not missing, f"{name}/__init__.py says nothing of {missing}"
 
 
 def test_import_is_light():

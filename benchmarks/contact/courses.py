@@ -1,4 +1,4 @@
-"""Courses for the table of :mod:`.contact_motions`: inclines, stairs, landings, and Newton's ant and humanoid.
+"""Courses for the table of :mod:`.motions`: inclines, stairs, landings, and Newton's ant and humanoid.
 
 Energy is kinetic, that of gravity, of the drives up to their effort limits, of position limits, and k p^2 / 2 of
 contacts. Each course yields (motion, figure, dt, measured, asked).
@@ -14,7 +14,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.reference_contact import ContactStep
 
-from . import contacts
+from .. import contacts
 
 STEPS = (2e-3, 5e-3, 1e-2)
 Row = tuple[str, str, float | None, float, float | None]

@@ -1,6 +1,6 @@
 """Draw one tile of each kind of terrain, as `warp_spo.scene.terrain` makes them.
 
-python -m benchmarks.terrain FILE.png
+python -m benchmarks.contact.terrain FILE.png
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LIGHT = (315.0, 45.0)  # azimuth and altitude of the light [deg]
 @drawing.style()
 def picture(path: Path) -> None:
     """Draw a panel for each kind into a PNG file."""
-    pyplot = drawing.load_pyplot("benchmarks.terrain")
+    pyplot = drawing.load_pyplot("benchmarks.contact.terrain")
     figure = pyplot.figure(figsize=(11.0, 5.2))
     figure.subplots_adjust(left=0.0, right=1.0, bottom=0.0, top=0.94, wspace=0.0, hspace=0.02)
     for number, (name, kind) in enumerate(terrain.KINDS.items()):
@@ -57,6 +57,6 @@ def draw(axes: Any, field: spo.HeightField) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(prog="benchmarks.terrain", description="Draw the kinds of terrain.")
+    parser = argparse.ArgumentParser(prog="benchmarks.contact.terrain", description="Draw the kinds of terrain.")
     parser.add_argument("file", type=Path, help="PNG file to write")
     picture(parser.parse_args().file)

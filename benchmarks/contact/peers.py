@@ -1,6 +1,6 @@
 """Steps on the ground beside mujoco_warp and Newton's solvers: time of a step, and error against own steps of 0.1 ms.
 
-    python -m benchmarks.contact_peers [--device cuda:0] [--worlds 4096 16384] [--json FILE]
+    python -m benchmarks.contact.peers [--device cuda:0] [--worlds 4096 16384] [--json FILE]
 
 Two groups. "file": the robots of the environments, one MJCF file for both sides, drives that hold the standing pose.
 "model": a Newton model of robots that come with Newton, stepped by Newton's solvers with the settings of Newton's own

@@ -1,8 +1,8 @@
 """Gradients of steps with contacts: their time beside the step's, their errors in float32, and the price of switches.
 
-    python -m benchmarks.contact_gradients [ROBOT ...] [--device cuda:0] [--worlds 4096] [--ground rough] [--json FILE]
+    python -m benchmarks.contact.gradients [ROBOT ...] [--device cuda:0] [--worlds 4096] [--ground rough] [--json FILE]
                                            [--passes 3 4] [--heights]
-    python -m benchmarks.contact_gradients --picture FILE.svg
+    python -m benchmarks.contact.gradients --picture FILE.svg
 
 Robots stand on the ground as in `benchmarks.contacts`, and gradients are by q, qd and tau. The picture: a point is
 thrown along the ground, and how far it has slid is drawn over the height from which it fell, with the tangents that
@@ -26,8 +26,8 @@ from warp_spo.dynamics.steps import STEP
 from warp_spo.scene.contacts import HEIGHTS
 from warp_spo.trials.drawing import OTHER, OURS
 
-from . import contacts
-from .capabilities import SETS, measure_time
+from .. import contacts
+from ..capabilities import SETS, measure_time
 
 DT = contacts.DT
 WRT = ("q", "qd", "tau")
@@ -136,7 +136,7 @@ def draw(path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="benchmarks.contact_gradients", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="benchmarks.contact.gradients", description=__doc__.split("\n")[0])
     parser.add_argument("robots", nargs="*", default=["go2"])
     parser.add_argument("--device", default=None)
     parser.add_argument("--worlds", type=int, nargs="+", default=[4096])

@@ -1,6 +1,6 @@
 """G1 on the ground beside MuJoCo: standing with the same stiffness, and error against run time when it is pushed.
 
-    python -m benchmarks.contact_mujoco [--json FILE] [--picture FILE.svg]
+    python -m benchmarks.contact.mujoco [--json FILE] [--picture FILE.svg]
 
 Both have the same bodies, drives and four spheres of 1 cm at each sole. MuJoCo takes elliptic cones, impratio 10,
 position servos and the integrator "implicitfast". "Mapped": solref = -(k, d) (1 - imp) A for a contact's stiffness k
@@ -23,9 +23,9 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.trials import drawing
 
-from . import robots
-from .contact_motions import BENT
-from .contacts import SOLE
+from .. import robots
+from ..contacts import SOLE
+from .motions import BENT
 
 KP, KD, RADIUS, IMP = 500.0, 15.0, 0.01, 0.9
 FEET = ("left_ankle_roll_link", "right_ankle_roll_link")

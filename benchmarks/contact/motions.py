@@ -1,6 +1,6 @@
 """What robots on the ground do: every figure that contacts promise, as asked and as measured, in float64 on the CPU.
 
-    python -m benchmarks.contact_motions [NAME ...] [--json FILE]
+    python -m benchmarks.contact.motions [NAME ...] [--json FILE]
 
 Errors are root mean squares over the run against the same motion in steps of 0.2 ms. Targets of the drives and pushes
 change every 10 ms, whatever the step is. G1 has four points at each sole and drives of 500 N m/rad, 15 N m s/rad with
@@ -22,8 +22,8 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.reference_contact import ContactStep
 
-from . import contacts
-from .contact_courses import courses
+from .. import contacts
+from .courses import courses
 
 FINE, CONTROL = 2e-4, 1e-2  # the step of the reference, and the time between changes of targets and pushes [s]
 STEPS = (2e-3, 5e-3, 1e-2)
