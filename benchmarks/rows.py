@@ -5,34 +5,32 @@
 The cases are those of the parts of ``python -m benchmarks --everything`` that measure this library. ``--compile``
 compiles their kernels into Warp's cache, on all cores, and times nothing. Cases of one scene, number of worlds and
 precision form a group, which one process computes, the largest group first. It makes inputs and references beside the
-others, and waits for its turn to time a case. ``FILE`` is written after each group; one that is there already is
-continued, if it has the same commit and device. ``PATTERN`` is a regular expression on names of groups, such as
+others; while it times a case, the others stand still. ``FILE`` is written after each group; one that is there already
+is continued, if it has the same commit and device. ``PATTERN`` is a regular expression on names of groups, such as
 "go2.w4096.float32". After ``--seconds`` what is left is named; the exit code is 1 then, or if an error is too large.
 """
 
 from __future__ import annotations
 
 import argparse
-import concurrent.futures
 import contextlib
-import multiprocessing
+import gc
 import re
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import warp as wp
 
 from . import evidence, parts, roofline, runner
 from .__main__ import choose, parser
 from .cases import FACTORIES, case_name
+from .turns import Turn, take_turns
 
 OURS = ("headline", "operations", "others", "throughput", "granularities", "randomised", "refined", "sweep")
 """Kinds of parts."""
-JOBS = 12  # processes that prepare; each imports Warp and torch
-_turn: Any = contextlib.nullcontext()  # of this process, to time
+JOBS = 14  # processes that prepare; each imports Warp and torch
 
 
 def cases(compiling: bool = False) -> list[dict]:
@@ -53,6 +51,11 @@ def group_of(row: dict) -> str:
     return f"{row['scene']}.w{row['worlds']}.{row['dtype']}" + (".sweep" if row.get("sweep") else "")
 
 
+def kernel_of(row: dict) -> str:
+    """Return the name of the group of cases that have the same kernels."""
+    return f"{row['scene']}.{row['dtype']}.{row['op']}.{row['granularity']}"
+
+
 def grouped(chosen: Sequence[dict], name_of: Callable[[dict], str] = group_of) -> dict[str, list[dict]]:
     """Return the cases by the names of their groups."""
     groups: dict[str, list[dict]] = {}
@@ -61,18 +64,19 @@ def grouped(chosen: Sequence[dict], name_of: Callable[[dict], str] = group_of) -
     return groups
 
 
-def _start(turn: Any) -> None:
-    global _turn
-    _turn, wp.config.log_level = turn, wp.LOG_WARNING
+def _measure(task: tuple, turn: Turn) -> Iterator[dict]:
+    group, device, roof = task
+    wp.config.log_level = wp.LOG_WARNING
+    yield from runner.run(group, wp.get_device(device), roof=roof, turn=turn)
+    gc.collect()
 
 
-def _measure(group: Sequence[dict], device: str, roof: roofline.Roof) -> list[dict]:
-    return list(runner.run(group, wp.get_device(device), roof=roof, turn=_turn))
-
-
-def _compile(group: Sequence[dict], device: str) -> list[dict]:
+def _compile(task: tuple, turn: Turn) -> Iterator[dict]:
+    group, device, _ = task
+    wp.config.log_level = wp.LOG_WARNING
     runner.compile_only(group, wp.get_device(device))
-    return []
+    gc.collect()
+    yield from ()
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -87,48 +91,45 @@ def main(arguments: list[str] | None = None) -> int:
     begin, device = time.perf_counter(), wp.get_device(options.device)
     with contextlib.suppress(ImportError):
         import torch  # noqa: F401  # a run names its version
-    if options.compile:
-        name_of = lambda case: f"{case['scene']}.{case['dtype']}.{case['op']}.{case['granularity']}"  # noqa: E731
-        groups, work, more = grouped(cases(compiling=True), name_of), _compile, (str(device),)
-        rows: list[dict] = []
-        whole: dict[str, Any] = {}
-    else:
+    roof, rows = None, list[dict]()
+    if not options.compile:
         roof = roofline.measure(device)
-        groups, work, more = grouped(cases()), _measure, (str(device), roof)  # type: ignore[assignment]
         whole = _continued(options.file, runner.record([], device, roof))
         rows = whole["rows"]
     there = set(map(group_of, rows))
+    groups = grouped(cases(options.compile), kernel_of if options.compile else group_of)
     groups = {name: group for name, group in groups.items() if re.search(options.pattern, name) and name not in there}
-    groups = dict(sorted(groups.items(), key=lambda item: (-len(item[1]), -FACTORIES[item[1][0]["scene"]]().dof_count)))
     print(f"{len(groups)} groups; {len(there)} are there", flush=True)
-    context = multiprocessing.get_context("spawn")
-    pool = concurrent.futures.ProcessPoolExecutor(options.jobs, context, _start, (context.Lock(),))
-    tasks = {pool.submit(work, group, *more): name for name, group in groups.items()}
-    left, failed = dict.fromkeys(groups), 0
-    try:
-        for task in concurrent.futures.as_completed(tasks, options.seconds - (time.perf_counter() - begin)):
-            name = tasks[task]
-            del left[name]
-            if task.exception() is not None:
+    left, found, failed = dict.fromkeys(groups), dict[str, list[dict]](), 0
+    names = {id(group): name for name, group in groups.items()}
+    tasks = [(group, str(device), roof) for group in sorted(groups.values(), key=_effort, reverse=True)]
+    work = _compile if options.compile else _measure
+    for (group, *_), row in take_turns(tasks, work, options.seconds - (time.perf_counter() - begin), options.jobs):
+        name = names[id(group)]
+        if isinstance(row, Exception):
+            failed += 1
+            print(f"{name}: {row}", flush=True)
+            found.pop(name, None)
+        elif row is not None:
+            found.setdefault(name, []).append(row)
+            if not row["error"] <= runner.tolerance(row):
                 failed += 1
-                print(f"{name}: {task.exception()!r:.300}", flush=True)
-                continue
-            new = task.result()
-            rows += new
-            wrong = [row for row in new if not row["error"] <= runner.tolerance(row)]
-            failed += len(wrong)
-            for row in wrong:
                 print(f"{case_name(row)}: error {row['error']:.1e} exceeds its tolerance", flush=True)
+        else:
+            del left[name]
+            rows += found.get(name, [])
             if not options.compile:
                 runner.save(whole, options.file)
-                print(f"{time.perf_counter() - begin:.0f} s, {name}: {len(new)} rows", flush=True)
-    except TimeoutError:
+                print(f"{time.perf_counter() - begin:.0f} s, {name}: {len(found.get(name, []))} rows", flush=True)
+    if left:
         print(f"left out: {', '.join(left)}; the same command continues with them", flush=True)
-        for process in multiprocessing.active_children():
-            process.terminate()
-    pool.shutdown(cancel_futures=True)
     print(f"{time.perf_counter() - begin:.0f} s, {len(rows)} rows", flush=True)
     return 1 if left or failed else 0
+
+
+def _effort(group: Sequence[dict]) -> tuple[int, int]:
+    """Return what orders groups by the time that they take."""
+    return len(group), FACTORIES[group[0]["scene"]]().dof_count
 
 
 def _continued(file: Path, run: dict) -> dict:

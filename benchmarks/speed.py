@@ -6,29 +6,23 @@ A line gives the time of one call of all worlds [us], the largest error of the r
 reference, the figure that has a limit, and the limit. A figure is the time itself, a rate [1e9 worlds/s], or the time
 over that of another call in the same run. ``PATTERN`` is a regular expression on the lines' names. ``--compile``
 compiles the kernels into Warp's cache, several at a time and those that take longest first, and times nothing.
-Lines are prepared by processes side by side, then timed one at a time; ``--seconds`` is the time for either run. A line
-is printed and saved as soon as it is known, and one that fails is named. The exit code is 1 if an error exceeds its
-tolerance or a line failed; a limit that is missed is printed, and is no error.
+Lines are prepared by processes side by side and timed one at a time, while all other processes stand still; one call is
+timed at the beginning, in the middle and at the end. ``--seconds`` is the time for either run. A line is printed and
+saved as soon as it is known, and those that are not are named. The exit code is 1 if an error exceeds its tolerance or
+a line is missing; a limit that is missed is printed, and is no error.
 """
 
 from __future__ import annotations
 
 import argparse
-import concurrent.futures
-import contextlib
 import dataclasses
 import functools
 import gc
-import multiprocessing
-import os
-import queue
 import re
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import warp as wp
 
@@ -38,6 +32,7 @@ from warp_spo.trials.trial import Subject, Trial
 
 from . import contacts, robots, runner, step_parts, substeps
 from .resources import record_launches, resources
+from .turns import Turn, take_turns
 
 SOLVER_STEP = "SolverSPO.step"  # with drives and limits, of benchmarks.step_parts
 LEAN_STEP = "SolverSPO.step of joints alone"  # without the bodies' poses, and without forces on bodies
@@ -49,6 +44,7 @@ SUBSTEPS = 4
 FUSED = {f"step of {SUBSTEPS} substeps": "", f"contact_step of {SUBSTEPS} substeps": substeps.ON_PLANE}
 CONTACT_TOLERANCE = 1e-4  # of velocities after a step with contacts, in float32
 SETS, SAMPLE, REPEATS, WARM_UP, BUDGET = 3, 2, 15, 0.1, 0.3  # of MOST worlds one set is larger than every cache
+STEADY = 0.03  # largest relative difference of the times of the reference
 WORK = {SOLVER_STEP: 8.0, "forward_dynamics_derivatives": 6.0}  # of compiling, for a dof; the others 2
 
 
@@ -181,88 +177,65 @@ def calls_of(lines: list[Line]) -> list[Call]:
     return list(dict.fromkeys(call for line in lines for call in (line.call, line.beside) if call is not None))
 
 
-def _compile(calls: list[Call], device: str) -> None:
+def _compile(task: tuple[str, list[Call]], turn: Turn) -> Iterator[str]:
     """Compile the kernels of calls that differ in the number of worlds alone, most of which share them."""
     wp.config.log_level = wp.LOG_WARNING
-    for call in calls:
-        prepare(call, wp.get_device(device))
+    for call in task[1]:
+        prepare(call, wp.get_device(task[0]))
+        gc.collect()
+    yield "compiled"
 
 
 def _compile_all(calls: list[Call], device: str, seconds: float) -> int:
-    """Compile in processes side by side; return how many tasks failed, or were not done in so many seconds."""
+    """Compile in processes side by side; return how many groups failed, or were not done in so many seconds."""
     begin, groups = time.perf_counter(), dict[Call, list[Call]]()
     for call in calls:
         same = dataclasses.replace(call, operation=SOLVER_STEP if call.operation in STEPS else call.operation, worlds=0)
         groups.setdefault(same, []).append(call)
-
-    def work(group: Call) -> float:
-        return WORK.get(group.operation, 2.0) * robots.scene(group.robot).dof_count * (1 + (group.dtype == "float64"))
-
-    failed, context = 0, multiprocessing.get_context("spawn")
-    pool = concurrent.futures.ProcessPoolExecutor(os.cpu_count(), context)
-    tasks = {pool.submit(_compile, groups[one], device): groups[one] for one in sorted(groups, key=work, reverse=True)}
-    try:
-        for task in concurrent.futures.as_completed(tasks, seconds):
-            failed += task.exception() is not None
-            word = "compiled" if task.exception() is None else repr(task.exception())[:300]
-            print(f"{time.perf_counter() - begin:.0f} s, {'; '.join(map(str, tasks[task]))}: {word}", flush=True)
-    except TimeoutError:
-        left = [str(call) for task, group in tasks.items() if not task.done() for call in group]
-        print(f"not compiled in {seconds:.0f} s: {'; '.join(left)}", flush=True)
-        for process in multiprocessing.active_children():
-            process.terminate()
-        failed += len(left)
-    pool.shutdown(cancel_futures=True)
-    return failed
+    left = {"; ".join(map(str, groups[one])): groups[one] for one in sorted(groups, key=_work, reverse=True)}
+    for (_, group), found in take_turns([(device, group) for group in left.values()], _compile, seconds):
+        if found is not None:
+            name = "; ".join(map(str, group))
+            print(f"{time.perf_counter() - begin:.0f} s, {name}: {found}", flush=True)
+            if found == "compiled":
+                del left[name]
+    print(f"not compiled in {seconds:.0f} s: {'; '.join(left) or 'none'}", flush=True)
+    return len(left)
 
 
-def _serve(calls: list[Call], device: str, patience: float, gate: Any, turn: Any, rows: Any) -> None:
-    """Prepare calls, wait at the gate for other processes, and time the calls when it is this process's turn."""
-    wp.config.log_level, ready = wp.LOG_WARNING, {}
-    for call in calls:
-        try:
-            ready[call] = prepare(call, wp.get_device(device))
-        except Exception as error:  # the other calls go on
-            rows.put((call, f"{type(error).__name__}: {str(error)[:200]}"))
-    with contextlib.suppress(threading.BrokenBarrierError):
-        gate.wait(patience)
-    for call, run in ready.items():
-        with turn:
-            gc.collect()
-            try:
-                rows.put((call, run()))
-            except Exception as error:
-                rows.put((call, f"{type(error).__name__}: {str(error)[:200]}"))
-
-
-def _measured(calls: list[Call], device: str, seconds: float) -> Iterator[tuple[Call, dict | str]]:
-    """Yield each call with its row, or why it has none: prepared by processes side by side, timed by one at a time.
-
-    Processes that are not ready after half of the time do not hold the others up.
-    """
-    end, shares = time.monotonic() + seconds, dict[tuple, list[Call]]()
+def _shares(calls: list[Call]) -> list[list[Call]]:
+    """Return calls in groups that share models and inputs; those that take longest to prepare first."""
+    shares: dict[tuple, list[Call]] = {}
     for call in calls:
         kind = "solver" if call.operation in STEPS else call.operation in (ON_PLANE, ON_FIELD, *FUSED)
         shares.setdefault((call.robot, call.worlds, kind), []).append(call)
-    context = multiprocessing.get_context("spawn")
-    rows: Any = context.Queue()
-    gate, turn = context.Barrier(len(shares)), context.Lock()
-    given = device, seconds / 2, gate, turn, rows
-    processes = [context.Process(target=_serve, args=(share, *given), daemon=True) for share in shares.values()]
-    for process in processes:
-        process.start()
-    left = dict.fromkeys(calls)
-    while (
-        left and time.monotonic() < end and (any(map(multiprocessing.Process.is_alive, processes)) or not rows.empty())
-    ):
-        with contextlib.suppress(queue.Empty):
-            call, row = rows.get(timeout=0.5)
-            del left[call]
-            yield call, row
-    for process in processes:
-        process.terminate()
-    for call in left:
-        yield call, f"not measured in {seconds:.0f} s"
+    return sorted(shares.values(), key=lambda share: sum(map(_work, share)), reverse=True)
+
+
+def _work(call: Call) -> float:
+    """Return about how long a call takes to prepare, in no unit."""
+    return WORK.get(call.operation, 2.0) * robots.scene(call.robot).dof_count * (1 + (call.dtype == "float64"))
+
+
+def _time(task: tuple[str, tuple[int, ...], list[Call]], turn: Turn) -> Iterator[tuple[Call, dict | str]]:
+    """Prepare calls, and yield their rows, each as often as turns are given, after which the calls are timed."""
+    device, turns, calls = task
+    wp.config.log_level, ready = wp.LOG_WARNING, {}
+    for call in calls:
+        begin = time.perf_counter()
+        try:
+            ready[call] = prepare(call, wp.get_device(device)), time.perf_counter() - begin
+        except Exception as error:  # the other calls go on
+            yield call, f"{type(error).__name__}: {str(error)[:200]}"
+    for turn.after in turns:
+        for call, (run, seconds) in ready.items():
+            gc.collect()
+            try:
+                with turn:
+                    row = run()
+                yield call, row | {"prepare_s": seconds}
+            except Exception as error:
+                yield call, f"{type(error).__name__}: {str(error)[:200]}"
 
 
 def describe(line: Line, rows: dict[Call, dict]) -> str:
@@ -290,23 +263,50 @@ def main(arguments: list[str] | None = None) -> int:
     lines = [line for line in LINES if re.search(options.pattern, str(line.call))]
     if options.compile:
         return 1 if _compile_all(calls_of(lines), str(device), options.seconds) else 0
-    rows: dict[Call, dict] = {}
-    failed, waiting = 0, list(lines)
-    for call, row in _measured(calls_of(lines), str(device), options.seconds):
+    return _run(lines, str(device), options.seconds, options.json)
+
+
+def _run(lines: list[Line], device: str, seconds: float, file: Path | None) -> int:
+    """Time lines, print and save them; return the exit code."""
+    calls, rows = calls_of(lines), dict[Call, dict]()
+    reference = next((call for call in calls if call.worlds in (MANY, MOST)), calls[0])
+    often = 0, len(calls) // 2, len(calls)  # turns after which the reference is timed
+    tasks = [(device, often, [reference]), *((device, (0,), share) for share in _shares(calls))]
+    whole = runner.record([], device)
+    begin, failed, waiting, repeated = time.perf_counter(), dict[Call, str](), list(lines), list[float]()
+    for (_, turns, _), found in take_turns(tasks, _time, seconds):
+        if found is None:
+            continue
+        if isinstance(found, Exception):
+            print(f"a process failed: {found}", flush=True)
+            continue
+        call, row = found
         if isinstance(row, str):
             print(f"{call!s}: {row}", flush=True)
-            failed += 1
-            continue
-        rows[call] = row
-        for line in [line for line in waiting if {line.call, line.beside or line.call} <= rows.keys()]:
-            waiting.remove(line)
-            print(describe(line, rows), flush=True)
-        if options.json:
-            runner.save(runner.record(list(rows.values()), device), options.json)
+            failed[call] = row
+        elif turns is often:
+            repeated.append(row["us"])
+            print(f"reference, {call!s}, at {time.perf_counter() - begin:.0f} s: {row['us']:.4g} us", flush=True)
+        else:
+            rows[call] = row
+            for line in [line for line in waiting if {line.call, line.beside or line.call} <= rows.keys()]:
+                waiting.remove(line)
+                print(describe(line, rows), flush=True)
+        if file:
+            runner.save(whole | {"rows": list(rows.values()), "reference_us": repeated}, file)
+    if len(repeated) > 1:
+        spread = (max(repeated) - min(repeated)) / min(repeated)
+        word = "as it should be" if spread <= STEADY else "the machine was not steady"
+        print(f"{reference!s}, {len(repeated)} times in the run: they differ by {spread:.1%}, {word}")
+    for line in waiting:
+        left = [call for call in (line.call, line.beside) if call is not None and call not in rows]
+        why = "; ".join(f"{call!s}: {failed.get(call, f'not ready in {seconds:.0f} s')}" for call in left)
+        print(f"not measured: {line.call!s}: {why}")
+    print(f"{len(lines) - len(waiting)} of {len(lines)} lines in {time.perf_counter() - begin:.0f} s", flush=True)
     wrong = [row for row in rows.values() if not row["error"] <= row.get("tolerance", TOLERANCE[row["dtype"]])]
     for row in wrong:
         print(f"error {row['error']:.1e} exceeds its tolerance in {row}", file=sys.stderr)
-    return 1 if wrong or failed else 0
+    return 1 if wrong or waiting else 0
 
 
 if __name__ == "__main__":
