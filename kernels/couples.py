@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from . import coupling_points, pass_loops, touches
+from . import coupling_points, hulls, pass_loops, touches
 from .coupling import FEW, VALUES, entries, table
 from .elementary import C_TYPE
 from .touches import AWAY, HEADER, POINT
@@ -59,8 +59,8 @@ def declare(couples: Couples, T: type, shared: bool = False) -> str:
     balls = [sum(x * x for x in half[3 * i : 3 * i + 3]) ** 0.5 + radius[i] for i in range(2 * pairs)]
     lists = {
         "first_pair": first_pair, "pair": [pair for each in couples.pairs for pair in each], "points": couples.points,
-        "first_point": first_point[:-1], "entry": entries(couples.points)[:-1], "box": couples.solids.lists["box"],
-    }  # fmt: skip
+        "first_point": first_point[:-1], "entry": entries(couples.points)[:-1],
+    } | couples.solids.kinds  # fmt: skip
     reals = {"eps": couples.eps, "weight": couples.weight, "sign": couples.signs, "half": half, "radius": radius}
     reals["ball"] = balls
     few = pairs <= FEW
@@ -73,6 +73,7 @@ def declare(couples: Couples, T: type, shared: bool = False) -> str:
     shapes = coupling_points.NATIVE[: coupling_points.NATIVE.index("    // Finds the points of a pair")]
     laws = coupling_points.NATIVE[coupling_points.NATIVE.index("    // Begins the damper of a point") :]
     text = NATIVE.replace("SHAPES", shapes.strip()).replace("LAWS", laws.strip())
+    text = hulls.lines(text, bool(couples.solids.hulls))
     text = text.replace("REAL", c).replace("FUSED", f"FUSED_{c}").replace("TABLES", "\n    ".join(tables))
     text = text.replace("NOTHING", f"1e-24{number}").replace("AWAY", f"{AWAY!r}{number}")
     for word, pragma in (("UNROLL", "#pragma unroll"), ("LOOP", "#pragma unroll 1")):
@@ -82,7 +83,8 @@ def declare(couples: Couples, T: type, shared: bool = False) -> str:
     arrays = [f"{c} couple_{name}_row[{count}] = {{}};" for name, count in own.items()]
     arrays += [f"int couple_{name}_row[{pairs}] = {{}};" for name in ("count", "closed", "candidate")]
     column = SHARED if shared else "typedef REAL* Column;"
-    return "\n".join([column.replace("REAL", c), touches.native(T), text.replace("CONSTANTS", constants), *arrays])
+    solids = touches.native(T, couples.solids.hulls)
+    return "\n".join([column.replace("REAL", c), solids, text.replace("CONSTANTS", constants), *arrays])
 
 
 def arrays(couples: Couples) -> dict[str, int]:
@@ -169,6 +171,7 @@ struct couples
             for (int c = 0; c < 9; ++c) both[side].turn[c] = from[3 + c];
             both[side].radius = radius_of(which);
             both[side].box = box_of(which);
+            HULLS both[side].hull = hull_of(which);
         }
         return solids::touch(both[0], both[1], touches + entry_of(pair) + HEADER, 1, points_of(pair));
     }

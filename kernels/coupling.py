@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from . import coupling_matrices, coupling_passes, coupling_points, touches
+from . import coupling_matrices, coupling_passes, coupling_points, hulls, touches
 from .elementary import C_TYPE
 from .touches import AWAY, HEADER, POINT
 
@@ -76,7 +76,8 @@ def declare(couples: Couples, T: type) -> str:
         "PAIRS": pairs, "BODIES": bodies, "ROWS": 6 * together, "LARGEST": EXACT, "SWEEPS": SWEEPS,
         "HEADER": HEADER, "POINT": POINT, "ALONE": pairs if apart else 1, "FEW": int(pairs <= FEW),
     }  # fmt: skip
-    text = NATIVE.replace("REAL", c).replace("FUSED", f"FUSED_{c}").replace("TABLES", "\n    ".join(tables))
+    text = hulls.lines(NATIVE, bool(couples.solids.hulls))
+    text = text.replace("REAL", c).replace("FUSED", f"FUSED_{c}").replace("TABLES", "\n    ".join(tables))
     text = (
         text.replace("NOTHING", f"1e-24{number}")
         .replace("TINY", "1e-6f" if T is wp.float32 else "1e-13")
@@ -88,7 +89,7 @@ def declare(couples: Couples, T: type) -> str:
     constants = ", ".join(f"{name} = {value}" for name, value in sizes.items())
     own = {"across": first[-1], "closed": first[-1], "candidate": first[-1], "force": 6 * pairs, "arm": 7 * pairs}
     arrays = [f"{c} pair_{name}_row[{count}] = {{}};" for name, count in own.items()]
-    return "\n".join([COLUMN, touches.native(T), text.replace("CONSTANTS", constants), *arrays])
+    return "\n".join([COLUMN, touches.native(T, couples.solids.hulls), text.replace("CONSTANTS", constants), *arrays])
 
 
 def shared_arrays(couples: Couples) -> dict[str, int]:

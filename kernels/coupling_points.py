@@ -120,6 +120,7 @@ NATIVE = r"""typedef REAL Triangle[21];  // the lower triangle of a matrix, row 
             for (int c = 0; c < 9; ++c) both[side].turn[c] = places[(from + 3 + c) * near];
             both[side].radius = radius_of(which);
             both[side].box = box_of(which);
+            HULLS both[side].hull = hull_of(which);
         }
         solids::touch(both[0], both[1], to + HEADER * worlds, worlds, points_of(pair));
     }

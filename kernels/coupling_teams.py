@@ -17,7 +17,7 @@ from typing import Any
 
 import warp as wp
 
-from . import coupling_blocks, coupling_matrices, coupling_points, coupling_shared, touches
+from . import coupling_blocks, coupling_matrices, coupling_points, coupling_shared, hulls, touches
 from .coupling import COLUMN, FEW, entries, table
 from .elementary import C_TYPE
 from .touches import AWAY, HEADER, POINT
@@ -57,6 +57,7 @@ def declare(team: Any, T: type, local: bool = False) -> str:
     }  # fmt: skip
     text = coupling_shared.NATIVE.replace("MATRICES", coupling_matrices.NATIVE.strip())
     text = text.replace("BLOCKS", coupling_blocks.NATIVE).replace("SHAPES", coupling_points.NATIVE)
+    text = hulls.lines(text, bool(team.solids.hulls))
     text = text.replace("REAL", c).replace("FUSED", f"FUSED_{c}").replace("TABLES", "\n    ".join(tables))
     text = (
         text.replace("NOTHING", f"1e-24{number}")
@@ -69,4 +70,4 @@ def declare(team: Any, T: type, local: bool = False) -> str:
     if local:
         text = text.replace("__noinline__", "inline").replace("STRIDE = 32", "STRIDE = 1")
     constants = ", ".join(f"{name} = {value}" for name, value in sizes.items())
-    return COLUMN + touches.native(T) + text.replace("CONSTANTS", constants)
+    return COLUMN + touches.native(T, team.solids.hulls) + text.replace("CONSTANTS", constants)

@@ -1,12 +1,15 @@
-"""Points that two convex shapes share: segments with radii, spheres and boxes, boxes and boxes by clipped faces.
+"""Points that two convex shapes share: segments with radii, spheres and boxes or hulls, and boxes by clipped faces.
 
 The array of touches is [entry, world]. A pair has a header, the origin of the
 second body from that of the first, and then POINT entries for each of its points: place from the first body's origin,
 normal towards the first body, depth; all in inertial axes. Points that are not there are AWAY deep, and come last.
 """
 
+from typing import Any
+
 import warp as wp
 
+from . import hulls
 from .elementary import C_TYPE
 
 HEADER, POINT, AWAY = 3, 7, -1e3
@@ -14,27 +17,30 @@ MOST = 8  # points of two boxes
 LEAD = 0.05  # share of the smallest half size by which the second box must be farther away to give the common face
 
 
-def native(T: type) -> str:
-    """Return the definition of ``solids`` for scalars of type ``T``."""
+def native(T: type, of: Any = ()) -> str:
+    """Return the definition of ``solids`` for scalars of type ``T``, of shapes among which are the hulls ``of``."""
     number = "f" if T is wp.float32 else ""
     text = (
-        NATIVE.replace("REAL", C_TYPE[T])
+        hulls.lines(NATIVE, bool(of))
+        .replace("REAL", C_TYPE[T])
         .replace("UNROLL\n", "#pragma unroll\n")
         .replace("LOOP\n", "#pragma unroll 1\n")
     )
     for name, value in {"AWAY": AWAY, "LEAD": LEAD, "PARALLEL": 1e-6}.items():
         text = text.replace(name, f"{value!r}{number}")
-    return text.replace("POINT", str(POINT)).replace("MOST", str(MOST))
+    return hulls.native(of, T) + text.replace("POINT", str(POINT)).replace("MOST", str(MOST))
 
 
 NATIVE = r"""
 struct solids
 {
     // A shape at its pose, a box if ``box``, else all points within ``radius`` of a segment along its z axis.
+    HULLS // Where ``hull`` is a hull's number, it is that in place of the box around it.
     struct Solid
     {
         REAL at[3], turn[9], size[3], radius;
         bool box;
+        HULLS int hull;
     };
 
     static CUDA_CALLABLE inline REAL dot(const REAL* a, const REAL* b)
@@ -131,6 +137,7 @@ struct solids
             apart[i] = local[i] - within(local[i], -box.size[i], box.size[i]);
         }
         distance = sqrt(dot(apart, apart));
+        HULLS if (box.hull >= 0) distance = hulls::distance(box.hull, local, apart); else
         if (distance > 0) {
             UNROLL
             for (int i = 0; i < 3; ++i) apart[i] /= distance;

@@ -8,6 +8,7 @@ from warp_spo.reference_pairs import faces
 from warp_spo.reference_rotations import homogeneous
 
 H = 5e-3
+WEDGE = np.array([[x, y, z] for y in (-0.1, 0.1) for x, z in ((-0.15, 0.0), (0.12, 0.0), (0.12, 0.1))])  # 20 degrees
 STRAIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -59,6 +60,7 @@ def mixed():
         spo.Contact(5, box=(0.3, 0.3, 0.05), other=spo.Contact(3, sphere=0.05), stiffness=2e4),
         box(2, 0.06, other=spo.Contact(5, box=(0.3, 0.3, 0.05)), eps=2e-3),
         spo.Contact(4, point=(0.1, 0.0, 0.0), other=box(2, 0.06), **half),
+        spo.Contact(1, hull=0.5 * WEDGE - [0.0, 0.0, 0.27], other=spo.Contact(3, sphere=0.05), friction=0.5, **half),
     ]
     return spo.Scene(bodies, hinges, contacts=contacts, ground=spo.Plane(height=-0.04))
 

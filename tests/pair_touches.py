@@ -4,8 +4,11 @@ import functools
 
 import warp as wp
 
-from warp_spo.kernels import native, touches
+import warp_spo as spo
+from warp_spo.kernels import hulls, native, touches
 from warp_spo.kernels.elementary import C_TYPE, NATIVE
+from warp_spo.recursions.contact.couples import Polyhedron
+from warp_spo.scene.pairs import shape_of
 
 ENTRIES = 11  # of a shape: its pose in the body, half its sizes, its radius
 
@@ -23,7 +26,7 @@ struct placing
         for (int i = 0; i < 9; ++i) R[i] = turn[i];
     }
 
-    static CUDA_CALLABLE inline solids::Solid place(const REAL* origin, const REAL* body, const REAL* shape, bool box)
+    static CUDA_CALLABLE inline solids::Solid place(const REAL* origin, const REAL* body, const REAL* shape, int kind)
     {
         solids::Solid found;
         REAL R[9], own[9];
@@ -38,7 +41,8 @@ struct placing
                 found.turn[3 * r + c] = R[3 * r] * own[c] + R[3 * r + 1] * own[3 + c] + R[3 * r + 2] * own[6 + c];
         }
         found.radius = shape[10];
-        found.box = box;
+        found.box = kind > 0;
+        HULLS found.hull = kind - 2;
         return found;
     }
 };
@@ -55,22 +59,35 @@ solids::touch(a, b, out + HEADER * worlds, worlds, row[2] && row[3] ? MOST : 1);
 """
 
 
+def hull_of(points):
+    """Return the hull of points about its middle, and that."""
+    solid = shape_of("test", spo.Contact(0, hull=points))
+    return solid.hull, solid.pose[:3]
+
+
+def polyhedron(points):
+    """Return the hull of points as native code reads it."""
+    hull, _ = hull_of(points)
+    return Polyhedron(hull.planes, hull.edges)
+
+
 @functools.cache
-def find_touches(T) -> wp.Kernel:
+def find_touches(T, of=()) -> wp.Kernel:
     """Write the touches of all pairs.
 
     Inputs are the poses of frames [world, frame, 7]; for each pair (frame, frame, kind, kind, first entry of its
-    touches), with 0 for shapes with a radius and 1 for boxes; and the shapes [2 pair, ENTRIES].
+    touches), with 0 for shapes with a radius, 1 for boxes and 2 + i for the hull i of ``of``; and the shapes
+    [2 pair, ENTRIES].
     """
-    text = FIND.replace("REAL", C_TYPE[T]).replace("UNROLL\n", "#pragma unroll\n")
+    text = hulls.lines(FIND, bool(of)).replace("REAL", C_TYPE[T]).replace("UNROLL\n", "#pragma unroll\n")
     for name, value in {"ENTRIES": ENTRIES, "HEADER": touches.HEADER, "MOST": touches.MOST}.items():
         text = text.replace(name, str(value))
     arrays = {"poses": wp.array3d[T], "pairs": wp.array2d[int], "shapes": wp.array2d[T], "touches_out": wp.array2d[T]}
     find = native.function(
-        "find_touch", NATIVE[C_TYPE[T]] + touches.native(T) + text, {"pair": int, "world": int, **arrays}
+        "find_touch", NATIVE[C_TYPE[T]] + touches.native(T, of) + text, {"pair": int, "world": int, **arrays}
     )
 
-    @wp.kernel(module=f"warp_spo_touches_{T.__name__}", enable_backward=False)
+    @wp.kernel(module=f"warp_spo_touches_{len(of)}_{T.__name__}", enable_backward=False)
     def kernel(poses: wp.array3d[T], pairs: wp.array2d[int], shapes: wp.array2d[T], touches_out: wp.array2d[T]):
         pair, world = wp.tid()
         find(pair, world, poses, pairs, shapes, touches_out)

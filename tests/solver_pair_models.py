@@ -1,8 +1,11 @@
 """Newton models whose bodies touch each other."""
 
+from itertools import pairwise
+
 import newton
 import numpy as np
 import warp as wp
+from pair_touches import hull_of
 
 SIDE = 0.1
 GRAVITY = 9.81
@@ -14,6 +17,13 @@ def config(**values):
     for name, value in values.items():
         setattr(found, name, value)
     return found
+
+
+def mesh_of(points):
+    """The hull of points as a mesh of triangles."""
+    hull, middle = hull_of(points)
+    fans = [(face[0], *two) for face in hull.faces for two in pairwise(face[1:])]
+    return newton.Mesh(hull.corners + middle, np.ravel(fans))
 
 
 def many(one, worlds=2, ground=True):

@@ -177,14 +177,14 @@ def legs(contacts=True):
     return spo.Scene(bodies, hinges, contacts=pairs if contacts else away, gravity=(0, 0, 0))
 
 
-def largest_rise(scene, q, qd, device):
+def largest_rise(scene, q, qd, device, h=H):
     """Return the largest rise of energy in a step, over that at first, and in how many worlds bodies have met."""
     worlds, k = len(q), scene.values["contact_stiffness"][0, len(scene.contact_points) :]
     dyn, found, met = spo.Dynamics(scene, worlds, device=device, dtype="float64"), [], np.zeros(worlds, bool)
     gap, energy = np.zeros((worlds, scene.contact_count)), dyn.kinetic_energy(q, qd)
     force = np.zeros((*gap.shape, 3))
-    for _ in range(120):
-        q, qd = dyn.step(q, qd, None, H, contact_gap=gap, contact_f=force)
+    for _ in range(round(0.6 / h)):
+        q, qd = dyn.step(q, qd, None, h, contact_gap=gap, contact_f=force)
         depth = np.maximum(-gap[:, len(scene.contact_points) :], 0.0)  # before the step
         found.append(energy + 0.5 * depth**2 @ k)
         energy, met = dyn.kinetic_energy(q, qd), met | force.any(axis=(1, 2))

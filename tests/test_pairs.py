@@ -10,6 +10,7 @@ import pytest
 import warp as wp
 import warp_machine
 from pair_scenes import (
+    WEDGE,
     H,
     box,
     cube,
@@ -28,7 +29,7 @@ from pair_scenes import (
     stepped,
     thrown,
 )
-from pair_touches import find_touches
+from pair_touches import find_touches, hull_of, polyhedron
 
 import warp_spo as spo
 from warp_spo import reference_pairs
@@ -53,10 +54,10 @@ def placed(rng, kind):
     return np.concatenate([0.05 * rng.normal(size=3), turn / np.linalg.norm(turn), size, [0.0 if kind else 0.08]])
 
 
-@pytest.mark.parametrize("kinds", [(0, 0), (0, 1), (1, 0), (1, 1)])
+@pytest.mark.parametrize("kinds", [(0, 0), (0, 1), (1, 0), (1, 1), (0, 2), (2, 0)])
 def test_points_are_those_of_the_reference(device, kinds):
-    """Segments, spheres, boxes; half of the boxes nearly aligned."""
-    worlds, rng = 100, np.random.default_rng(sum(kinds))
+    """Segments, spheres, boxes, a hull; half of the boxes nearly aligned."""
+    worlds, rng, (hull, _) = 100, np.random.default_rng(sum(kinds)), hull_of(WEDGE)
     shapes = np.array([placed(rng, kind) for kind in kinds])
     for row, kind in enumerate(kinds):
         shapes[row, 9] = shapes[row, 9] if kind or kinds == (0, 0) else 0.0
@@ -69,13 +70,13 @@ def test_points_are_those_of_the_reference(device, kinds):
     out = wp.full((size, worlds), np.nan, dtype=wp.float64, device=device)
     given = [wp.array(poses, dtype=wp.float64, device=device), wp.array([[0, 1, *kinds, 0]], dtype=int, device=device)]
     given.append(wp.array(shapes, dtype=wp.float64, device=device))
-    wp.launch(find_touches(wp.float64), (1, worlds), given, [out], device=device)
+    wp.launch(find_touches(wp.float64, (polyhedron(WEDGE),)), (1, worlds), given, [out], device=device)
     found, counts = out.numpy(), set()
     for w in range(worlds):
-        both = [(kind, homogeneous(pose) @ homogeneous(row[:7]), row[7:10], row[10])
+        both = [(kind, homogeneous(pose) @ homogeneous(row[:7]), hull.corners if kind == 2 else row[7:10], row[10])
                 for kind, pose, row in zip(kinds, poses[w], shapes, strict=True)]  # fmt: skip
         wanted = reference_pairs.touches(*both)
-        rows = found[touches.HEADER :, w].reshape(-1, touches.POINT)[: 8 if sum(kinds) == 2 else 1]
+        rows = found[touches.HEADER :, w].reshape(-1, touches.POINT)[: 8 if kinds == (1, 1) else 1]
         rows = rows[rows[:, 6] > touches.AWAY]
         assert len(rows) == len(wanted)
         counts.add(len(wanted))
@@ -84,7 +85,7 @@ def test_points_are_those_of_the_reference(device, kinds):
             nearest = np.abs(found_rows - row).max(axis=1).argmin()
             np.testing.assert_allclose(found_rows[nearest], row, atol=1e-12)
             found_rows = np.delete(found_rows, nearest, axis=0)
-    assert counts >= ({4, 5, 6, 7} if sum(kinds) == 2 else {1})
+    assert counts >= ({4, 5, 6, 7} if kinds == (1, 1) else {1})
 
 
 def assert_is_dense(dyn, q, qd, passes=None, least=1, **values):
@@ -279,7 +280,7 @@ MISTAKES = {
     "nested": (lambda: [box(0, 0.1, other=box(1, 0.1, other=0))], ValueError, "an other= itself"),
     "kind": (lambda: [box(0, 0.1, other="cube")], TypeError, "other is 'cube'; expected a Contact"),
     "capsule": (lambda: [box(0, 0.1, other=spo.Contact(1, **STICK))], spo.UnsupportedError, "a capsule with a box"),
-    "hull": (lambda: [spo.Contact(0, hull=np.eye(3), other=box(1, 0.1))], spo.UnsupportedError, "a hull in contact"),
+    "flat hull": (lambda: [spo.Contact(0, hull=np.eye(3), other=box(1, 0.1))], ValueError, "3 points in one plane"),
     "dissipation": (lambda: [box(0, 0.1, other=box(1, 0.1), dissipation=1.0)], spo.UnsupportedError, "dissipation="),
 }
 

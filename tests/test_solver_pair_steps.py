@@ -6,8 +6,9 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from pair_scenes import WEDGE
 from solver_models import H
-from solver_pair_models import GRAVITY, SIDE, WALL, arm, config, free_cube, many, tower, with_table
+from solver_pair_models import GRAVITY, SIDE, WALL, arm, config, free_cube, many, mesh_of, tower, with_table
 
 import warp_spo as spo
 from warp_spo import Status
@@ -164,6 +165,25 @@ def test_a_cube_stands_on_a_table():
     pipeline.collide(state, contacts := pipeline.contacts())
     solver.step(state, state, control, contacts, H)
     assert contacts.rigid_contact_count.numpy()[0] >= 16 and not solver.status.numpy().any()
+
+
+@pytest.mark.slow
+def test_a_ball_rests_between_two_meshes():
+    """Wedges that stand still, of which each carries half of it.."""
+    one = newton.ModelBuilder()
+    for side, angle in ((1.0, 0.0), (-1.0, np.pi)):
+        where = wp.transform(wp.vec3(0.15 * side, 0.0, 0.0), wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle))
+        one.add_shape_mesh(-1, mesh=mesh_of(WEDGE), xform=where, label=f"wedge {side:g}", cfg=WALL)
+    ball = one.add_body(label="ball", xform=wp.transform(wp.vec3(0.01, 0.0, 0.08), wp.quat_identity()))
+    one.add_shape_sphere(ball, radius=0.05, cfg=config(ke=1e4, kd=100.0))
+    model = many(one, ground=False)
+    solver, state = SolverSPO(model, pairs=[("ball", "wedge*")]), model.state()
+    seen = solver.observables({"contact_f", "status"})
+    run(solver, state, 600, observables=seen)
+    weight, force = WALL.density * 4.0 / 3.0 * np.pi * 0.05**3 * GRAVITY, seen.contact_f.numpy()
+    np.testing.assert_allclose(force[..., 2], weight / 2.0, rtol=1e-3)
+    np.testing.assert_allclose(np.abs(force[..., 0]), weight / 2.0 * 0.1 / 0.27, rtol=1e-2)
+    assert not seen.status.numpy().any()
 
 
 @pytest.mark.slow

@@ -4,7 +4,8 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from solver_pair_models import arm, free_cube, many, with_table
+from pair_scenes import WEDGE
+from solver_pair_models import arm, config, free_cube, many, mesh_of, with_table
 
 import warp_spo as spo
 from warp_spo.errors import UnsupportedError
@@ -111,3 +112,48 @@ def test_pairs_name_all_that_stands_still_or_nothing():
         SolverSPO(model, pairs=pairs, contacts="ground")
     with pytest.raises(UnsupportedError, match=r"beside contacts='pipeline', such as box '.*table' of the world"):
         SolverSPO(model, pairs=pairs, contacts="pipeline")
+
+
+def meshes():
+    """A ball, a wedge as a mesh and as its hull, a gutter, and a fine globe as its hull."""
+    one = newton.ModelBuilder()
+    ball = one.add_body(label="ball", xform=wp.transform(wp.vec3(0.0, 0.0, 1.0), wp.quat_identity()))
+    one.add_shape_sphere(ball, radius=0.05, label="ball", cfg=config(margin=0.001))
+    turned = wp.transform(wp.vec3(0.0, 0.0, 0.3), wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), 0.5))
+    one.add_shape_mesh(
+        -1, mesh=mesh_of(WEDGE), label="wedge", cfg=config(margin=0.002), xform=turned, scale=(2.0, 1.0, 1.0)
+    )
+    body = one.add_body(label="rock")
+    one.add_shape_convex_hull(body, mesh=mesh_of(WEDGE), label="rock", cfg=config())
+    outline = [(0, 0), (0.3, 0), (0.3, 0.2), (0.2, 0.2), (0.2, 0.1), (0.1, 0.1), (0.1, 0.2), (0, 0.2)]
+    corners = np.array([(x, y, z) for y in (0.0, 0.5) for x, z in outline])
+    sides = [t for i in range(8) for t in ((i, (i + 1) % 8, i + 8), ((i + 1) % 8, (i + 1) % 8 + 8, i + 8))]
+    one.add_shape_mesh(-1, mesh=newton.Mesh(corners, np.ravel(sides)), label="gutter", cfg=config())
+    way = np.random.default_rng(0).normal(size=(100, 3))
+    globe = newton.Mesh(way / np.linalg.norm(way, axis=1)[:, None], np.arange(99))
+    one.add_shape_convex_hull(-1, mesh=globe, label="globe", cfg=config())
+    return many(one)
+
+
+def test_convex_meshes_are_hulls():
+    """Placed and scaled; the margins of both make the ball larger. Others have a name, and are left out of "all"."""
+    labels, pairs = chosen(meshes(), [("ball", "wedge"), ("rock", "ball")])
+    assert labels == ["ball with wedge", "rock with ball"]
+    (first, other), (rock, second) = ((one, one.other) for one in pairs._contacts)
+    np.testing.assert_allclose(first.radius, 0.053, atol=1e-8)
+    np.testing.assert_allclose(second.radius, 0.051, atol=1e-8)
+    c, s = np.cos(0.5), np.sin(0.5)
+    wanted = WEDGE * [2.0, 1.0, 1.0] @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [0.0, 0.0, 0.3]
+    np.testing.assert_allclose(other.hull, wanted, atol=1e-6)
+    np.testing.assert_allclose(rock.hull, WEDGE, atol=1e-7)
+    scene = pairs.added_to(spo.from_newton(meshes()))
+    assert [len(solid.hull.faces) for pair in scene.contact_pairs for solid in pair.shapes if solid.hull] == [5, 5]
+    cases = {
+        "gutter": "hull 'gutter' of the world, a mesh that is not convex, is not supported; make it convex",
+        "globe": "hull 'globe' of the world, a hull of more than 64 corners in contact with a body, is not",
+    }
+    for name, message in cases.items():
+        with pytest.raises(UnsupportedError, match=message):
+            chosen(meshes(), [("ball", name)])
+    with pytest.raises(UnsupportedError, match="hull 'rock' of body 'rock' with hull 'wedge' of the world is not"):
+        chosen(meshes(), [("rock", "wedge")])

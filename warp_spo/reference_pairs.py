@@ -5,6 +5,8 @@ ground is, whose velocity is that of the first body at the point less that of th
 step solves the system of :mod:`.reference_contact` with more rows, exactly, and forces come in pairs.
 """
 
+from itertools import combinations
+
 import numpy as np
 
 from .reference_contact import SLIP, ContactStep, Points
@@ -66,8 +68,12 @@ def pair_weight(dense, pair):
 
 
 def place(shape, body):
-    """Return the kind of a shape, its 4 x 4 matrix in the inertial frame, its half sizes and its radius."""
-    return shape.kind, body @ homogeneous(shape.pose), shape.size, shape.radius
+    """Return the kind of a shape, its 4 x 4 matrix in the inertial frame, its half sizes and its radius.
+
+    In place of half its sizes, a hull has its corners [corner, 3].
+    """
+    size = shape.size if shape.hull is None else shape.hull.corners
+    return shape.kind, body @ homogeneous(shape.pose), size, shape.radius
 
 
 def touches(first, second):
@@ -77,8 +83,8 @@ def touches(first, second):
     if first[0] == second[0] == 1:
         return faces(first, second)
     if first[0] == 0:
-        return [ball_in_box(first, second)]
-    point, normal, depth = ball_in_box(second, first)
+        return [ball_in(first, second)]
+    point, normal, depth = ball_in(second, first)
     return [(point, -normal, depth)]
 
 
@@ -113,10 +119,18 @@ def nearest(a, b, c, d):
     return a + s * u, c + t * v
 
 
-def ball_in_box(ball, box):
-    """Return the point of a sphere and a box; the normal leads out of the box."""
-    (_, at, _, radius), (_, place, half, _) = ball, box
+def ball_in(ball, solid):
+    """Return the point of a sphere and a box or a hull; the normal leads out of that."""
+    (_, at, _, radius), (kind, place, size, _) = ball, solid
     local = place[:3, :3].T @ (at[:3, 3] - place[:3, 3])
+    distance, normal = (out_of_box if kind == 1 else out_of_hull)(local, size)
+    depth = radius - distance
+    surface = local - distance * normal  # of the solid
+    return place[:3, :3] @ (surface - 0.5 * depth * normal) + place[:3, 3], place[:3, :3] @ normal, depth
+
+
+def out_of_box(local, half):
+    """Return how far a point is from a box, less than zero inside, and the unit vector along which that grows."""
     inside = np.clip(local, -half, half)
     apart = local - inside
     distance = np.linalg.norm(apart)
@@ -126,9 +140,35 @@ def ball_in_box(ball, box):
         axis = np.argmin(half - np.abs(local))
         normal, distance = np.zeros(3), -(half - np.abs(local))[axis]
         normal[axis] = 1.0 if local[axis] >= 0.0 else -1.0
-    depth = radius - distance
-    surface = local - distance * normal  # of the box
-    return place[:3, :3] @ (surface - 0.5 * depth * normal) + place[:3, 3], place[:3, :3] @ normal, depth
+    return distance, normal
+
+
+def out_of_hull(local, corners):
+    """Return the same of a hull: from its corners alone.
+
+    Inside, the nearest plane through three corners with none beyond it. Outside, the nearest of all points in the hulls
+    of three corners, two, or one; that of three counts where the point over it lies between them.
+    """
+    size, best = np.ptp(corners, axis=0).max(), None
+    for a, b, c in combinations(corners, 3):
+        across = np.cross(b - a, c - a)
+        if np.linalg.norm(across) < 1e-9 * size**2:
+            continue
+        normal = across / np.linalg.norm(across)
+        heights = (corners - a) @ normal
+        for way in (1.0, -1.0):
+            if (way * heights).max() <= 1e-9 * size and (best is None or way * normal @ (local - a) > best[0]):
+                best = way * normal @ (local - a), way * normal
+    if best[0] <= 0.0:
+        return best
+    points = list(corners)
+    for some in [*combinations(corners, 2), *combinations(corners, 3)]:
+        sides = np.array(some[1:]) - some[0]
+        weights = np.linalg.lstsq(sides.T, local - some[0], rcond=None)[0]
+        if min(*weights, 1.0 - weights.sum()) >= 0.0:
+            points.append(some[0] + weights @ sides)
+    apart = local - min(points, key=lambda point: np.linalg.norm(local - point))
+    return np.linalg.norm(apart), apart / np.linalg.norm(apart)
 
 
 def faces(first, second):

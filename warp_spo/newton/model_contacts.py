@@ -115,6 +115,7 @@ class ModelShapes:
             stiffness=ke if self.materials else None,
             damping=kd if self.materials else None,
             index=i,
+            triangles=_triangles(model.shape_source[i]) if kind == GeoType.MESH else None,
         )
 
     @functools.cached_property
@@ -264,6 +265,10 @@ def with_model_contacts(model: newton.Model, worlds: Worlds, scene: Scene, choic
     if made.found.left_out:
         warnings.warn(f"from_newton: left out: {', '.join(made.found.left_out)}", UserWarning, stacklevel=3)
     return made.scene
+
+
+def _triangles(mesh: Any) -> np.ndarray:
+    return np.reshape(mesh.indices, (-1, 3))
 
 
 def _model_sizes(source: Any, kind: str, scale: np.ndarray) -> Any:

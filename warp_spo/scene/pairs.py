@@ -9,13 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import UnsupportedError, as_integer
-from .checks import read_only
+from .checks import read_only, real
+from .hulls import Hull, convex_hull
 from .storage import StoredPart
 
 SINK = 1e-4  # how far the lighter body sinks in [m] that rests on the other one, where the stiffness is chosen
 DAMPING = 2.0  # of sqrt(k m): critical, so that stacks come to rest
 FACE = 8  # corners at most of the common part of two rectangles
-ROUND, BOX = 0, 1
+ROUND, BOX, HULL = 0, 1, 2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -23,16 +24,18 @@ class Solid(StoredPart):
     """A convex shape of a body.
 
     Attributes:
-        kind: BOX, or ROUND: all points within ``radius`` of a segment, which is a point for spheres.
-        pose: of the box, or of the segment's middle with the segment along z, in the body [7].
-        size: half the sizes of the box [m]; (0, 0, half the length) of the segment.
-        radius: [m]; 0 of boxes and points.
+        kind: BOX, HULL, or ROUND: all points within ``radius`` of a segment, which is a point for spheres.
+        pose: of the box, of the hull's middle, or of the segment's middle with the segment along z, in the body [7].
+        size: half the sizes of the box, or of the one around the hull [m]; (0, 0, half the length) of the segment.
+        radius: [m]; 0 of boxes, hulls and points.
+        hull: the corners and faces of a hull, about its pose.
     """
 
     kind: int
     pose: np.ndarray
     size: np.ndarray
     radius: float
+    hull: Hull | None = None
 
     @property
     def samples(self) -> np.ndarray:
@@ -77,12 +80,24 @@ def contact_pairs(contacts: Sequence[Any], body_count: int) -> tuple[ContactPair
         if partner.body == contact.body:
             raise ValueError(f"{call} is of body {contact.body} with itself; expected two bodies")
         first, second = shape_of(call, contact), shape_of(call, partner)
-        kinds = {first.kind, second.kind}
-        if kinds == {ROUND, BOX} and max(shape.size[2] for shape in (first, second) if shape.kind == ROUND) > 0.0:
-            raise UnsupportedError(call, "a capsule with a box", "use spheres along the capsule, or a box in its place")
-        points = FACE if kinds == {BOX} else 1
+        _check_kinds(call, first, second)
+        points = FACE if {first.kind, second.kind} == {BOX} else 1
         found.append(ContactPair(index, contact.body, partner.body, (first, second), points, contact.eps))
     return tuple(found)
+
+
+def _check_kinds(call: str, first: Solid, second: Solid) -> None:
+    """Raise UnsupportedError where two shapes have no points in common that a pair could find."""
+    shapes = {one.kind: one for one in (first, second)}
+    flat = "a hull" if HULL in shapes else "a box"
+    if ROUND in shapes and len(shapes) > 1 and shapes[ROUND].size[2] > 0.0:
+        raise UnsupportedError(call, f"a capsule with {flat}", "use spheres along the capsule, or a box in its place")
+    if HULL in shapes and ROUND not in shapes:
+        raise UnsupportedError(
+            call, f"a hull with {'a box' if BOX in shapes else 'a hull'}",
+            "put points or spheres on one of the two, such as at corners that touch, a contact each; or boxes in place "
+            "of both",
+        )  # fmt: skip
 
 
 def _partner(call: str, contact: Any, contacts: Sequence[Any]) -> Any:
@@ -105,9 +120,11 @@ def _partner(call: str, contact: Any, contacts: Sequence[Any]) -> Any:
 
 def shape_of(call: str, contact: Any) -> Solid:
     """Return the shape of a contact."""
-    if contact.hull is not None:
-        raise UnsupportedError(call, "a hull in contact with a body", "use spheres, capsules, boxes, or single points")
     places, radius = contact.positions, contact.radius
+    if contact.hull is not None:
+        hull, middle = convex_hull(call, real(contact.hull), places)
+        pose = np.array([*middle, 0.0, 0.0, 0.0, 1.0])
+        return Solid(HULL, read_only(pose), read_only(np.ptp(hull.corners, axis=0) / 2.0), 0.0, hull)
     if contact.box is not None:
         pose, size = contact.frame
         return Solid(BOX, pose, size, 0.0)

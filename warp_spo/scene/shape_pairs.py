@@ -11,6 +11,8 @@ import numpy as np
 
 from ..errors import UnsupportedError, as_integer
 from .contacts import Contact, pose_matrix
+from .hulls import is_convex
+from .pairs import shape_of
 from .shapes import Shape
 
 if TYPE_CHECKING:
@@ -19,8 +21,18 @@ if TYPE_CHECKING:
 ALL = "all"
 MOST = 32
 """Pairs at most that "all" stands for: what compiles in seconds. Nine boxes, 36 pairs, took 11 s on a CPU."""
-KINDS = ("sphere", "capsule", "box")
-"""Kinds of shapes that pairs may have; a capsule with a box is none of them."""
+KINDS = ("sphere", "capsule", "box", "hull")
+WITH = {"sphere": set(KINDS), "capsule": {"sphere", "capsule"}, "box": {"sphere", "box"}, "hull": {"sphere"}}
+"""Kinds of shapes that pairs may have, and with which others."""
+WAYS = (
+    "pairs are of spheres and capsules, of boxes, or of a sphere with a box or a hull: put such shapes in place of "
+    "others, a row of spheres in place of a capsule that meets a box, or use another solver; contacts='ground' is for "
+    "planes and height fields"
+)
+HULL_WAYS = (
+    "make it convex or coarser first, such as by builder.approximate_meshes('convex_hull') of a mesh with few vertices "
+    "or 'coacd' into several hulls, or put spheres and boxes in its place"
+)
 
 
 class ShapePair(NamedTuple):
@@ -31,29 +43,34 @@ class ShapePair(NamedTuple):
 
     @property
     def fits(self) -> bool:
-        """Whether a contact can stand for the pair."""
-        kinds = {self.first.kind, self.second.kind}
-        return kinds <= set(KINDS) and kinds != {"capsule", "box"}
+        """Whether a contact can stand for shapes of these kinds."""
+        return self.second.kind in WITH.get(self.first.kind, ())
 
     def contact(self) -> Contact:
         """Return the contact that stands for the pair, with the means of the shapes' materials."""
         a, b = self.first.on(self.second), self.second
+        solids = [_solid(one, other.rounding if other.kind == "hull" else 0.0) for one, other in ((a, b), (b, a))]
         material = {name: getattr(a, name) for name in ("stiffness", "damping")}
         if a.friction is not None:
             material["friction"] = a.friction
         label = f"{a.label} with {b.label}" if a.label and b.label else ""
-        return Contact(a.body, **_solid(a), other=Contact(b.body, **_solid(b)), **material, label=label)
+        return Contact(a.body, **solids[0], other=Contact(b.body, **solids[1]), **material, label=label)
 
     def words(self, bodies: Sequence[str]) -> str:
         """Return the pair for a message."""
         return " with ".join(shape.words(bodies) for shape in self)
 
 
-def _solid(shape: Shape) -> dict[str, Any]:
-    """Return a shape as arguments of a Contact; a margin makes a box larger on all sides."""
+def _solid(shape: Shape, more: float) -> dict[str, Any]:
+    """Return a shape as arguments of a Contact; a margin makes a box larger on all sides.
+
+    That of a hull makes the sphere larger which it meets, by ``more``.
+    """
     place = pose_matrix(shape.pose)
     if shape.kind == "sphere":
-        return {"sphere": (place[:3, 3], shape.sizes[0] + shape.rounding)}
+        return {"sphere": (place[:3, 3], shape.sizes[0] + shape.rounding + more)}
+    if shape.kind == "hull":
+        return {"hull": np.asarray(shape.sizes) @ place[:3, :3].T + place[:3, 3]}
     if shape.kind == "capsule":
         radius, half = shape.sizes
         ends = (place[:3, 3] + side * half * place[:3, 2] for side in (1.0, -1.0))
@@ -78,6 +95,7 @@ class PairChoice:
     shapes: Sequence[Shape]
     allowed: Callable[[Shape, Shape], bool]
     numbers: dict[int, Shape]
+    _lacking: dict[int, str] = dataclasses.field(default_factory=dict, init=False)
 
     def moves(self, shape: Shape) -> bool:
         """Whether a shape moves; that of a body that is fixed to the inertial frame does not."""
@@ -121,7 +139,7 @@ class PairChoice:
     def _all(self, solid: Sequence[Shape]) -> tuple[list[ShapePair], list[str]]:
         """Return every pair that may touch, and in words those that no contact represents."""
         pairs = [ShapePair(*pair) for pair in combinations(solid, 2) if self._may_touch(*pair)]
-        found = [pair for pair in pairs if pair.fits]
+        found = [pair for pair in pairs if self._stands(pair)]
         if not found:
             left_out = f"; {pairs[0].words(self.scene.body_labels)} is none that it can take" if pairs else ""
             raise ValueError(
@@ -134,7 +152,7 @@ class PairChoice:
                 f"pairs='all' of {len(found)} pairs of shapes, more than {MOST}",
                 "list those that matter, such as pairs=[('cube', '*finger*')], or filter others in the model",
             )
-        return found, [pair.words(self.scene.body_labels) for pair in pairs if not pair.fits]
+        return found, [pair.words(self.scene.body_labels) for pair in pairs if not self._stands(pair)]
 
     def _listed(self, names: Sequence[Any]) -> list[ShapePair]:
         """Return the pairs that two names stand for."""
@@ -148,14 +166,21 @@ class PairChoice:
             raise ValueError(f"{self.call}: {what} stands for {which}; expected shapes of two bodies that may touch")
         for pair in pairs:
             if not pair.fits:
-                raise UnsupportedError(
-                    self.call,
-                    f"{what}, which is {pair.words(bodies)}",
-                    "pairs are of spheres and capsules, of boxes, or of a sphere and a box: put such shapes in place "
-                    "of others, a row of spheres in place of a capsule that meets a box, or use another solver; "
-                    "contacts='ground' is for planes and height fields",
-                )
+                raise UnsupportedError(self.call, f"{what}, which is {pair.words(bodies)}", WAYS)
+            for shape in pair:
+                if lacks := self._lacks(shape):
+                    raise UnsupportedError(self.call, f"{what}: {shape.words(bodies)}, {lacks},", HULL_WAYS)
         return pairs
+
+    def _stands(self, pair: ShapePair) -> bool:
+        """Whether a contact can stand for a pair."""
+        return pair.fits and not any(map(self._lacks, pair))
+
+    def _lacks(self, shape: Shape) -> str:
+        """Return why no contact can have a shape of its kind; "" if one can."""
+        if shape.index not in self._lacking:
+            self._lacking[shape.index] = _hollow(shape)
+        return self._lacking[shape.index]
 
     def _named(self, name: Any) -> list[Shape]:
         """Return the shapes of a name or a number."""
@@ -182,6 +207,23 @@ class PairChoice:
         while body >= 0 and scene.hinges[scene.hinge_of[body]].dof_count == 0:
             body = scene.tree.parent[body]
         return body
+
+
+def _hollow(shape: Shape) -> str:
+    """Return why a contact cannot have a shape whose kind it may have; "" if it can."""
+    if shape.kind != "hull":
+        return ""
+    points = np.asarray(shape.sizes, dtype=np.float64)
+    try:
+        solid = shape_of("", Contact(0, hull=points))
+    except UnsupportedError as error:
+        return error.what
+    except ValueError as error:
+        return str(error).removeprefix(": ").partition(";")[0]
+    assert solid.hull is not None
+    if shape.triangles is None or is_convex(solid.hull, points - solid.pose[:3], shape.triangles):
+        return ""
+    return "a mesh that is not convex"
 
 
 def _is_pair(names: Any) -> bool:

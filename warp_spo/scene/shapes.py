@@ -47,6 +47,7 @@ class Shape:
         rounding: by how much the surface lies outside of these sizes [m].
         friction, stiffness, damping: of its material; None where the source has none.
         names: other names that patterns match, such as that of its mesh. index: its number in the source.
+        triangles: of a hull that stands for a mesh with hollows, maybe: its points by number [n, 3]; None: it has none.
     """
 
     label: str
@@ -60,6 +61,7 @@ class Shape:
     damping: float | None = None
     names: tuple[str, ...] = ()
     index: int = -1
+    triangles: Any = None
 
     def on(self, soil: Shape | None) -> Shape:
         """Return the shape with the means of its material and that of the ground, where both have one."""

@@ -13,13 +13,23 @@ EXCESS, BASE, RIGHT = 3, 27, 7
 right-hand sides: one, and six more where there is a base."""
 
 
+class Polyhedron(NamedTuple):
+    """A hull as native code reads it: ``planes`` and ``edges`` as of :class:`warp_spo.scene.hulls.Hull`."""
+
+    planes: tuple[float, ...]
+    edges: tuple[tuple[float, ...], ...]
+
+
 class Solids(NamedTuple):
     """The shapes of a scene's pairs, each shape of a body once.
 
     Attributes:
         bodies: how many bodies have shapes; shapes: how many there are.
         sides: of each pair, number of the body and of the shape of its first side, and of its second one.
-        boxes, half, radius: of each pair's first and second shape: whether it is a box, half its sizes, its radius.
+        boxes, half, radius: of each pair's first and second shape: whether it is a box or a hull, half its sizes, its
+            radius.
+        hull: of each pair's first and second shape: number of its hull; -1: it is none.
+        hulls: each hull once.
     """
 
     bodies: int
@@ -28,6 +38,8 @@ class Solids(NamedTuple):
     boxes: tuple[tuple[bool, bool], ...]
     half: tuple[tuple[float, ...], ...]
     radius: tuple[tuple[float, float], ...]
+    hull: tuple[tuple[int, int], ...] = ()
+    hulls: tuple[Polyhedron, ...] = ()
 
     @property
     def size(self) -> int:
@@ -36,12 +48,17 @@ class Solids(NamedTuple):
 
     @property
     def lists(self) -> dict[str, list[int]]:
-        """Where a pair's bodies and shapes begin among these values, and which are boxes."""
+        """Where a pair's bodies and shapes begin among these values, and their kinds."""
         flat = [side for row in self.sides for side in (row[:2], row[2:])]
         return {
             "origin": [3 * body for body, _ in flat], "solid": [3 * self.bodies + 12 * shape for _, shape in flat],
-            "box": [int(box) for row in self.boxes for box in row],
-        }  # fmt: skip
+        } | self.kinds  # fmt: skip
+
+    @property
+    def kinds(self) -> dict[str, list[int]]:
+        """Which sides are boxes, and the number of each one's hull, where there are hulls."""
+        kinds = {"box": [int(box) for row in self.boxes for box in row]}
+        return kinds | ({"hull": [hull for row in self.hull for hull in row]} if self.hulls else {})
 
     @property
     def reals(self) -> dict[str, list[float]]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ...scene.pairs import BOX
+from ...scene.pairs import ROUND
 from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Value, sqrt
@@ -25,7 +25,7 @@ from ..motion import hinge_motion
 from ..operational import respond, unit_wrenches
 from ..remembered import remembered
 from . import step as ground
-from .couples import Solids
+from .couples import Polyhedron, Solids
 from .points import SLIP, with_ancestors
 
 if TYPE_CHECKING:
@@ -114,9 +114,13 @@ def solids_of(links: Links) -> tuple[Solids, tuple[int, ...], tuple[tuple[int, t
             row += [number[body], shapes.setdefault((body, tuple(shape.pose.tolist())), len(shapes))]
         sides.append(tuple(row))
     kinds = [pair.shapes for pair in pairs]
+    hulls: dict[Polyhedron | None, int] = {None: -1}
+    of = [[None if one.hull is None else Polyhedron(one.hull.planes, one.hull.edges) for one in both] for both in kinds]
+    hull = tuple((hulls.setdefault(a, len(hulls) - 1), hulls.setdefault(b, len(hulls) - 1)) for a, b in of)
     solids = Solids(
-        len(bodies), len(shapes), tuple(sides), tuple((a.kind == BOX, b.kind == BOX) for a, b in kinds),
+        len(bodies), len(shapes), tuple(sides), tuple((a.kind != ROUND, b.kind != ROUND) for a, b in kinds),
         tuple((*a.size.tolist(), *b.size.tolist()) for a, b in kinds), tuple((a.radius, b.radius) for a, b in kinds),
+        hull, tuple(one for one in hulls if one is not None),
     )  # fmt: skip
     return solids, bodies, tuple(shapes)
 
