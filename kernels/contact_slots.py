@@ -4,7 +4,7 @@ import functools
 
 import warp as wp
 
-from .contacts import MOVING
+from .contacts import MOVING, in_world
 
 EMPTY = wp.constant(2**31 - 1)  # a slot that no contact fills
 AWAY = wp.constant(-1e3)  # depth of a point without contact [m], as warp_spo.scene.contacts.AWAY; a test compares
@@ -95,9 +95,7 @@ def place_points(_=None) -> wp.Kernel:
             n = wp.where(first, -normal[i], normal[i])
             here, there = wp.where(first, point0[i], point1[i]), wp.where(first, point1[i], point0[i])
             inside, outside = wp.where(first, margin0[i], margin1[i]), wp.where(first, margin1[i], margin0[i])
-            pose, at = body_q[shape_body[own]], wp.vec3(there)
-            if shape_body[other] >= 0:
-                at = wp.transform_point(body_q[shape_body[other]], there)
+            pose, at = body_q[shape_body[own]], in_world(body_q, shape_body, other, there)
             touching = wp.transform_point(pose, here) - inside * n
             depth = wp.dot(n, at + outside * n - touching)
             place = wp.transform_point(wp.transform_inverse(pose), touching)

@@ -9,6 +9,14 @@ STILL, GROUND, TOUCHING, MOVING = range(4)
 """Roles of shapes: stands still; is the ground; moves, and its contacts with the ground are computed; moves."""
 
 
+@wp.func
+def in_world(body_q: wp.array[wp.transform], shape_body: wp.array[wp.int32], shape: int, point: wp.vec3):
+    """Return a point of a shape's body in the world's axes; that of a shape without a body, or of none, as it is."""
+    if shape >= 0 and shape_body[shape] >= 0:
+        return wp.transform_point(body_q[shape_body[shape]], point)
+    return point
+
+
 @functools.cache
 def mark_contacts(_=None) -> wp.Kernel:
     """Set the word of every world that has a contact which is left out to UNSUPPORTED, but for a more severe one.
@@ -64,13 +72,9 @@ def mark_contacts(_=None) -> wp.Kernel:
         if most >= touching and surface_velocity:
             moves = moves or wp.length_sq(surface_velocity[i]) > 0.0
         if moves and body_q:
-            a, b, n = shape0[i], shape1[i], normal[i]
-            at, there = wp.vec3(point0[i]), wp.vec3(point1[i])
-            if a >= 0 and shape_body[a] >= 0:
-                at = wp.transform_point(body_q[shape_body[a]], at)
-            if b >= 0 and shape_body[b] >= 0:
-                there = wp.transform_point(body_q[shape_body[b]], there)
-            moves = wp.dot(n, there - at) <= margin0[i] + margin1[i]
+            at = in_world(body_q, shape_body, shape0[i], point0[i])
+            there = in_world(body_q, shape_body, shape1[i], point1[i])
+            moves = wp.dot(normal[i], there - at) <= margin0[i] + margin1[i]
         if beyond * count[0] > shape0.shape[0] or (moves and world < 0):
             for every in range(status_out.shape[0]):
                 mark(every, severity, status_out)

@@ -10,6 +10,85 @@ SCREWS, BALL, FREE = wp.constant(0), wp.constant(1), wp.constant(2)
 
 
 @functools.cache
+def hinge_motions(s) -> tuple[wp.Function, wp.Function]:
+    """Return functions of a chain of screws, and of a ball or free hinge.
+
+    Both write the columns of H* and return the pose of the node behind its anchor frame, ``velocity`` and ``bias``.
+    """
+    T, vec3, vec6, vec12 = s.T, s.vec3, s.vec6, s.vec12
+
+    @wp.func
+    def screws(
+        topology: Topology,
+        node: int,
+        world: int,
+        pose: vec12,
+        screw: wp.array2d[T],
+        q: wp.array2d[T],
+        qd: wp.array2d[T],
+        moves: bool,
+        axis_out: wp.array3d[T],
+    ):
+        first, coord = topology.qd_start[node], topology.q_start[node]
+        velocity, bias = vec6(), vec6()
+        for i in range(topology.dof_count[node]):
+            axis = vec3(screw[first + i, 0], screw[first + i, 1], screw[first + i, 2])
+            turn, slide = screw[first + i, 3], screw[first + i, 4]
+            x = q[world, coord + i]
+            inner = s.pose(s.rotation(axis, x * turn), axis * slide * x)
+            for j in range(i):
+                carried = s.motion_to_child(inner, s.load_motion(axis_out, first + j, world))
+                s.store_motion(axis_out, first + j, world, carried)
+            h = s.motion(axis * turn, axis * slide)
+            s.store_motion(axis_out, first + i, world, h)
+            pose = s.compose(pose, inner)
+            if moves:
+                own = h * qd[world, first + i]
+                bias = s.node_acceleration(inner, velocity, bias, own, vec6())
+                velocity = s.node_velocity(inner, velocity, own)
+        return pose, velocity, bias
+
+    @wp.func
+    def ball_or_free(
+        topology: Topology,
+        node: int,
+        world: int,
+        pose: vec12,
+        com: wp.array3d[T],
+        q: wp.array2d[T],
+        qd: wp.array2d[T],
+        moves: bool,
+        axis_out: wp.array3d[T],
+    ):
+        free = topology.motion[node] == FREE
+        first, coord = topology.qd_start[node], topology.q_start[node]
+        angular, at = int(first), int(coord)
+        p = vec3()
+        r = vec3()  # the node's reference point: a free hinge moves the CoM
+        if free:
+            p = vec3(q[world, coord], q[world, coord + 1], q[world, coord + 2])
+            r = s.load3(com, node, world)
+            at += 3
+            angular += 3
+        R = s.quaternion_rotation(q[world, at], q[world, at + 1], q[world, at + 2], q[world, at + 3])
+        velocity, w = vec6(), vec3()
+        for i in range(3):
+            column = vec3(R[i, 0], R[i, 1], R[i, 2])
+            s.store_motion(axis_out, angular + i, world, s.motion(column, wp.cross(r, column)))
+            if free:
+                s.store_motion(axis_out, first + i, world, s.motion(vec3(), column))
+            if moves:
+                w += column * qd[world, angular + i]
+                if free:
+                    velocity += s.motion(vec3(), column * qd[world, first + i])
+        velocity += s.motion(w, wp.cross(r, w))
+        bias = s.motion(vec3(), wp.cross(w, wp.cross(r, w)))  # about the CoM, which moves straight
+        return s.compose(pose, s.pose(R, p)), velocity, bias
+
+    return screws, ball_or_free
+
+
+@functools.cache
 def hinge(s) -> wp.Kernel:
     """Pose of node k in its parent's node frame, columns of H*(k), and with ``qd`` the hinge's velocity and bias.
 
@@ -17,7 +96,7 @@ def hinge(s) -> wp.Kernel:
     acceleration of the node and the acceleration of its origin as seen from the hinge's parent, qd being constant. A
     chain of screws is built inboard to outboard: each new screw carries what came before into its own frame.
     """
-    T, vec3, vec6 = s.T, s.vec3, s.vec6
+    T, vec6, (screws, ball_or_free) = s.T, s.vec6, hinge_motions(s)
 
     @wp.kernel(module=f"warp_spo_kinematics_{T.__name__}", enable_backward=False)
     def kernel(
@@ -33,53 +112,16 @@ def hinge(s) -> wp.Kernel:
         bias_out: wp.array3d[T],
     ):
         node, world = wp.tid()
-        motion = topology.motion[node]
-        first = topology.qd_start[node]
-        coord = topology.q_start[node]
-        pose = s.load_pose(tree, node, world)
-        velocity, bias = vec6(), vec6()
-        if motion == SCREWS:
-            for i in range(topology.dof_count[node]):
-                axis = vec3(screw[first + i, 0], screw[first + i, 1], screw[first + i, 2])
-                turn, slide = screw[first + i, 3], screw[first + i, 4]
-                x = q[world, coord + i]
-                inner = s.pose(s.rotation(axis, x * turn), axis * slide * x)
-                for j in range(i):
-                    carried = s.motion_to_child(inner, s.load_motion(axis_out, first + j, world))
-                    s.store_motion(axis_out, first + j, world, carried)
-                h = s.motion(axis * turn, axis * slide)
-                s.store_motion(axis_out, first + i, world, h)
-                pose = s.compose(pose, inner)
-                if velocity_out:
-                    own = h * qd[world, first + i]
-                    bias = s.node_acceleration(inner, velocity, bias, own, vec6())
-                    velocity = s.node_velocity(inner, velocity, own)
-        else:
-            angular = first
-            at = coord
-            p = vec3()
-            r = vec3()  # the node's reference point: a free hinge moves the CoM
-            if motion == FREE:
-                p = vec3(q[world, coord], q[world, coord + 1], q[world, coord + 2])
-                r = s.load3(com, node, world)
-                at += 3
-                angular += 3
-            R = s.quaternion_rotation(q[world, at], q[world, at + 1], q[world, at + 2], q[world, at + 3])
-            w = vec3()
-            for i in range(3):
-                column = vec3(R[i, 0], R[i, 1], R[i, 2])
-                s.store_motion(axis_out, angular + i, world, s.motion(column, wp.cross(r, column)))
-                if motion == FREE:
-                    s.store_motion(axis_out, first + i, world, s.motion(vec3(), column))
-                if velocity_out:
-                    w += column * qd[world, angular + i]
-                    if motion == FREE:
-                        velocity += s.motion(vec3(), column * qd[world, first + i])
-            velocity += s.motion(w, wp.cross(r, w))
-            bias = s.motion(vec3(), wp.cross(w, wp.cross(r, w)))  # about the CoM, which moves straight
-            pose = s.compose(pose, s.pose(R, p))
-        s.store_pose(pose_out, node, world, pose)
+        pose, velocity, bias = s.load_pose(tree, node, world), vec6(), vec6()
+        moves = bool(False)
         if velocity_out:
+            moves = True
+        if topology.motion[node] == SCREWS:
+            pose, velocity, bias = screws(topology, node, world, pose, screw, q, qd, moves, axis_out)
+        else:
+            pose, velocity, bias = ball_or_free(topology, node, world, pose, com, q, qd, moves, axis_out)
+        s.store_pose(pose_out, node, world, pose)
+        if moves:
             s.store_motion(velocity_out, node, world, velocity)
             s.store_motion(bias_out, node, world, bias)
 

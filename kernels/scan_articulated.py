@@ -30,7 +30,10 @@ EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
 
 @functools.cache
 def matrices(s) -> types.SimpleNamespace:
-    """Return functions of 6 x 6 matrices; A is kept as its transpose, one row for each column of A."""
+    """Return functions of 6 x 6 matrices, and one that adds up what branches hand on.
+
+    A is kept as its transpose, one row for each column of A.
+    """
     T, vec6, vec21 = s.T, s.vec6, s.vec21
     mat66 = wp.types.matrix((6, 6), T)
 
@@ -87,6 +90,17 @@ def matrices(s) -> types.SimpleNamespace:
             s.force_to_parent(place, rows[5]),
         )
 
+    @wp.func
+    def add_branches(
+        P: vec21, topology: Topology, stretches: Stretches, stretch: int, articulated: wp.array3d[T], world: int
+    ):
+        """Return P plus phi P+ phi* of the nodes that hang on the outermost node of a stretch beside its path."""
+        outermost, feed = stretches.nodes[stretches.first[stretch]], stretches.feed[stretch]
+        for c in range(topology.child_start[outermost], topology.child_start[outermost + 1]):
+            if topology.children[c] != feed:
+                P += s.load_articulated(articulated, topology.children[c], world)
+        return P
+
     return types.SimpleNamespace(**locals())
 
 
@@ -117,11 +131,7 @@ def element(s) -> wp.Kernel:
         stretch = level + i
         first, end = stretches.first[stretch], stretches.first[stretch + 1]
         A = wp.identity(n=6, dtype=T)
-        C, J = vec21(), vec21()
-        outermost, feed = stretches.nodes[first], stretches.feed[stretch]
-        for c in range(topology.child_start[outermost], topology.child_start[outermost + 1]):
-            if topology.children[c] != feed:
-                C += s.load_articulated(articulated, topology.children[c], world)
+        C, J = m.add_branches(vec21(), topology, stretches, stretch, articulated, world), vec21()
         for n in range(first, end):
             node = stretches.nodes[n]
             C += s.articulated(s.load_rigid(rigid, node, world))
@@ -145,13 +155,9 @@ def element(s) -> wp.Kernel:
 
 
 @functools.cache
-def combine(s) -> wp.Kernel:
-    """One round: put the element ``shift`` stretches further out before each element of a path level.
-
-    One thread for each (stretch, world).
-    """
-    T, vec6, vec21 = s.T, s.vec6, s.vec21
-    m = matrices(s)
+def pivots(s) -> tuple[wp.Function, wp.Function]:
+    """Return functions that choose the largest pivot of a mobility J, and read its column."""
+    T, vec6, vec21, m = s.T, s.vec6, s.vec21, matrices(s)
     rounding = T(4.0 * EPSILON[T])
 
     @wp.func
@@ -176,6 +182,17 @@ def combine(s) -> wp.Kernel:
             if c == pivot:
                 h, delta = columns[c], d[c]
         return h, delta
+
+    return largest_pivot, column_of
+
+
+@functools.cache
+def combine(s) -> wp.Kernel:
+    """One round: put the element ``shift`` stretches further out before each element of a path level.
+
+    One thread for each (stretch, world).
+    """
+    T, m, largest_pivot, column_of = s.T, matrices(s), *pivots(s)
 
     @wp.kernel(module=f"warp_spo_scan_articulated_{T.__name__}", enable_backward=False)
     def kernel(
@@ -255,10 +272,7 @@ def factor(s) -> wp.Kernel:
         P = vec21()
         if stretches.position[stretch] > 0:
             P = s.load_articulated(C, stretch - 1, world)
-        outermost, feed = stretches.nodes[first], stretches.feed[stretch]
-        for c in range(topology.child_start[outermost], topology.child_start[outermost + 1]):
-            if topology.children[c] != feed:
-                P += s.load_articulated(articulated_out, topology.children[c], world)
+        P = m.add_branches(P, topology, stretches, stretch, articulated_out, world)
         for n in range(first, end):
             node = stretches.nodes[n]
             P += s.articulated(s.load_rigid(rigid, node, world))

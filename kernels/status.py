@@ -11,6 +11,8 @@ up to constant factors of the order of one.
 """
 
 import functools
+import types
+from typing import Any
 
 import warp as wp
 
@@ -26,17 +28,8 @@ NORMAL = {
 
 
 @functools.cache
-def lost_digits(s) -> wp.Kernel:
-    """Inward, one level, after ``factor``: lost = (H S H* + |H| |P| |H*| + |Delta|) / D, the error of D in eps.
-
-    Instead of the error, ``lost`` is -PIVOT where D is NaN because its pivot is not positive, -RANGE where D or one of
-    its terms leaves the normal range of T, and NaN where D is NaN because of another node.
-
-    The entries of L are the squares of ``d = diag(P)^1/2``, since |P(i, j)| <= d(i) d(j), so that small entries have
-    small errors as long as nothing mixes them with large ones. A hinge along one axis of the node frame reads its entry
-    of P without rounding and cancels its own row to exactly zero; an oblique hinge multiplies the error by the ratio of
-    |H| |P| |H*| to D. A rotation about a frame axis keeps small entries small, any other rotation does not.
-    """
+def roundings(s) -> types.SimpleNamespace:
+    """Return functions of the sizes of numbers: what rounds in a pivot, in its elimination, and on the way outward."""
     T, vec3, mat33 = s.T, s.vec3, s.mat33
     smallest = T(NORMAL[T][0] / EPSILON[T])  # below, products that carry the last digit of D are subnormal
     largest = T(NORMAL[T][1])
@@ -51,12 +44,57 @@ def lost_digits(s) -> wp.Kernel:
         return vec3(wp.sqrt(wp.max(a[0, 0], zero)), wp.sqrt(wp.max(a[1, 1], zero)), wp.sqrt(wp.max(a[2, 2], zero)))
 
     @wp.func
-    def error_rotation(R: mat33, R_tree: mat33, screws: int):
-        """Return |R| where an entry is exact, and |2 R|^1/2 where it has an absolute error of eps.
+    def terms_of_pivot(J: mat33, C: mat33, m: mat33, w: vec3, v: vec3, alone: bool):
+        """Return |H| |P| |H*|, and whether H is along one axis of the node frame.
 
-        Exact entries are zeros, and the sines of a rotation about one axis of a frame whose anchor is rotated by right
-        angles.
+        An oblique axis among several of a hinge, which is not ``alone``, has absolute errors.
         """
+        w_a, v_a = wp.abs(w), wp.abs(v)
+        n_a = absolute(J) * w_a + absolute(C) * v_a
+        f_a = wp.transpose(absolute(C)) * w_a + absolute(m) * v_a
+        entries = int(0)
+        for c in range(3):
+            entries += wp.where(w[c] == T(0.0), 0, 1) + wp.where(v[c] == T(0.0), 0, 1)
+            if not alone and w[c] != T(0.0):
+                w_a[c] = T(1.0)
+        return wp.dot(w_a, n_a) + wp.dot(v_a, f_a), entries == 1
+
+    @wp.func
+    def lost_of(error: T, delta: T, size: T, along: bool, D: T):
+        """Return the error of D in eps, or the word that says why there is none."""
+        lost = (error + delta + wp.where(along, T(0.0), size)) / D
+        whole = size + delta
+        if whole > largest or (whole > T(0.0) and whole < smallest) or (D > T(0.0) and D < smallest):
+            lost = T(-float(RANGE))
+        elif wp.isnan(D) and not wp.isnan(whole):
+            lost = T(-float(PIVOT))
+        return lost
+
+    @wp.func
+    def rounding_of_rows(h: vec3, u: vec3, d: vec3, after: mat33, D: T, own: T):
+        """Return the diagonal of L after the elimination of a hinge along a frame axis.
+
+        It is ``own`` d^2 in the row of the hinge, and |P+| plus twice the subtracted term elsewhere.
+        """
+        rows = vec3()
+        for i in range(3):
+            rows[i] = wp.where(h[i] == T(0.0), wp.abs(after[i, i]) + T(2.0) * u[i] * u[i] / D, own * d[i] * d[i])
+        return rows
+
+    return types.SimpleNamespace(**locals())
+
+
+@functools.cache
+def error_rotation(s) -> wp.Function:
+    """Return a function of R: |R| where an entry is exact, and |2 R|^1/2 where it has an absolute error of eps.
+
+    Exact entries are zeros, and the sines of a rotation about one axis of a frame whose anchor is rotated by right
+    angles.
+    """
+    T, mat33 = s.T, s.mat33
+
+    @wp.func
+    def bound(R: mat33, R_tree: mat33, screws: int):
         one_axis, right_angles = bool(False), bool(True)
         for i in range(3):
             for j in range(3):
@@ -70,16 +108,23 @@ def lost_digits(s) -> wp.Kernel:
                 a[i, j] = wp.where(exact, r, wp.sqrt(wp.min(T(2.0) * r, T(1.0))))
         return a
 
-    @wp.func
-    def rounding_of_rows(h: vec3, u: vec3, d: vec3, after: mat33, D: T, own: T):
-        """Return the diagonal of L after the elimination of a hinge along a frame axis.
+    return bound
 
-        It is ``own`` d^2 in the row of the hinge, and |P+| plus twice the subtracted term elsewhere.
-        """
-        rows = vec3()
-        for i in range(3):
-            rows[i] = wp.where(h[i] == T(0.0), wp.abs(after[i, i]) + T(2.0) * u[i] * u[i] / D, own * d[i] * d[i])
-        return rows
+
+@functools.cache
+def lost_digits(s) -> wp.Kernel:
+    """Inward, one level, after ``factor``: lost = (H S H* + |H| |P| |H*| + |Delta|) / D, the error of D in eps.
+
+    Instead of the error, ``lost`` is -PIVOT where D is NaN because its pivot is not positive, -RANGE where D or one of
+    its terms leaves the normal range of T, and NaN where D is NaN because of another node.
+
+    The entries of L are the squares of ``d = diag(P)^1/2``, since |P(i, j)| <= d(i) d(j), so that small entries have
+    small errors as long as nothing mixes them with large ones. A hinge along one axis of the node frame reads its entry
+    of P without rounding and cancels its own row to exactly zero; an oblique hinge multiplies the error by the ratio of
+    |H| |P| |H*| to D. A rotation about a frame axis keeps small entries small, any other rotation does not.
+    """
+    T, vec3, mat33 = s.T, s.vec3, s.mat33
+    r, rotation = roundings(s), error_rotation(s)
 
     @wp.kernel(module=f"warp_spo_status_{T.__name__}", enable_backward=False)
     def kernel(
@@ -106,7 +151,7 @@ def lost_digits(s) -> wp.Kernel:
         J, C, m = s.J_of(P), s.C_of(P), s.m_of(P)
         S_J, S_C, S_m = s.J_of(S), s.C_of(S), s.m_of(S)
         terms = wp.sqrt(T(1 + topology.child_start[node + 1] - topology.child_start[node]))
-        d_n, d_f = root_of_diagonal(J), root_of_diagonal(m)
+        d_n, d_f = r.root_of_diagonal(J), r.root_of_diagonal(m)
         S_J += terms * wp.diag(wp.cw_mul(d_n, d_n))
         S_m += terms * wp.diag(wp.cw_mul(d_f, d_f))
 
@@ -118,29 +163,14 @@ def lost_digits(s) -> wp.Kernel:
             w, v = h[0:3], h[3:6]
             n, f = U[0:3], U[3:6]
             D, delta = pivot[dof, world], wp.abs(armature[dof, world])
-            w_a, v_a = wp.abs(w), wp.abs(v)
-            n_a = absolute(J) * w_a + absolute(C) * v_a
-            f_a = wp.transpose(absolute(C)) * w_a + absolute(m) * v_a
-            entries = int(0)
-            for c in range(3):
-                entries += wp.where(w[c] == T(0.0), 0, 1) + wp.where(v[c] == T(0.0), 0, 1)
-                if count > 1 and w[c] != T(0.0):
-                    w_a[c] = T(1.0)  # an oblique axis has absolute errors
-            along = entries == 1
-            size = wp.dot(w_a, n_a) + wp.dot(v_a, f_a)
+            size, along = r.terms_of_pivot(J, C, m, w, v, count == 1)
 
             n_S, f_S = S_J * w + S_C * v, wp.transpose(S_C) * w + S_m * v
             error = wp.dot(w, n_S) + wp.dot(v, f_S)
-            lost = (error + delta + wp.where(along, T(0.0), size)) / D
-            whole = size + delta
-            if whole > largest or (whole > T(0.0) and whole < smallest) or (D > T(0.0) and D < smallest):
-                lost = T(-float(RANGE))
-            elif wp.isnan(D) and not wp.isnan(whole):
-                lost = T(-float(PIVOT))
-            lost_out[dof, world] = lost
+            lost_out[dof, world] = r.lost_of(error, delta, size, along, D)
 
             n_D, f_D = n / D, f / D
-            d_n, d_f = root_of_diagonal(J), root_of_diagonal(m)
+            d_n, d_f = r.root_of_diagonal(J), r.root_of_diagonal(m)
             S_J += wp.outer(n_D, error * n_D - n_S) - wp.outer(n_S, n_D)
             S_C += wp.outer(n_D, error * f_D - f_S) - wp.outer(n_S, f_D)
             S_m += wp.outer(f_D, error * f_D - f_S) - wp.outer(f_S, f_D)
@@ -150,8 +180,8 @@ def lost_digits(s) -> wp.Kernel:
                 own = T(0.0)
                 if delta > T(0.0):  # the row keeps P Delta / D, the difference of two larger numbers
                     own = T(2.0)
-                S_J += wp.diag(rounding_of_rows(w, n, d_n, J, D, own))
-                S_m += wp.diag(rounding_of_rows(v, f, d_f, m, D, own))
+                S_J += wp.diag(r.rounding_of_rows(w, n, d_n, J, D, own))
+                S_m += wp.diag(r.rounding_of_rows(v, f, d_f, m, D, own))
             else:
                 scale = T(1.0) + wp.sqrt(size / D)
                 S_J += scale * scale * wp.diag(wp.cw_mul(d_n, d_n))
@@ -160,14 +190,58 @@ def lost_digits(s) -> wp.Kernel:
             place = s.load_pose(pose, node, world)
             l = vec3(place[9], place[10], place[11])
             R_tree = s.rotation_of(s.load_pose(tree, node, world))
-            R_a = error_rotation(s.rotation_of(place), R_tree, wp.where(topology.motion[node] == SCREWS, 1, 0))
-            f_d = R_a * root_of_diagonal(m)
-            n_d = R_a * root_of_diagonal(J) + absolute(s.skew(l)) * f_d
+            R_a = rotation(s.rotation_of(place), R_tree, wp.where(topology.motion[node] == SCREWS, 1, 0))
+            f_d = R_a * r.root_of_diagonal(m)
+            n_d = R_a * r.root_of_diagonal(J) + r.absolute(s.skew(l)) * f_d
             S = s.articulated_to_parent(place, s.pack(S_J, S_C, S_m))
             S += s.pack(wp.diag(wp.cw_mul(n_d, n_d)), mat33(), wp.diag(wp.cw_mul(f_d, f_d)))
             s.store_articulated(rounding_out, node, world, S)
 
     return kernel
+
+
+@wp.func
+def node_values_finite(a: wp.array3d[Any], world: int):
+    """Return whether all numbers [node, number, world] of a world are finite."""
+    for i in range(a.shape[0]):
+        for c in range(a.shape[1]):
+            if not wp.isfinite(a[i, c, world]):
+                return False
+    return True
+
+
+@wp.func
+def inputs_finite(
+    q: wp.array2d[Any],
+    qd: wp.array2d[Any],
+    tau: wp.array2d[Any],
+    body_f: wp.array3d[Any],
+    tree: wp.array3d[Any],
+    com: wp.array3d[Any],
+    rigid: wp.array3d[Any],
+    armature: wp.array2d[Any],
+    gravity: wp.array2d[Any],
+    dofs: int,
+    world: int,
+):
+    """Return whether all inputs of forward dynamics in a world are finite, values of bodies and hinges included."""
+    fine = node_values_finite(tree, world) and node_values_finite(com, world) and node_values_finite(rigid, world)
+    if gravity:
+        for c in range(3):
+            fine = fine and wp.isfinite(gravity[c, world])
+    for i in range(q.shape[1]):
+        fine = fine and wp.isfinite(q[world, i])
+    for dof in range(dofs):
+        fine = fine and wp.isfinite(armature[dof, world])
+        if qd:
+            fine = fine and wp.isfinite(qd[world, dof])
+        if tau:
+            fine = fine and wp.isfinite(tau[world, dof])
+    if body_f:
+        for body in range(body_f.shape[1]):
+            for c in range(6):
+                fine = fine and wp.isfinite(body_f[world, body, c])
+    return fine
 
 
 @functools.cache
@@ -183,14 +257,6 @@ def status_word(s) -> wp.Kernel:
     most = T(2.0 * EPSILON[T] ** -0.5)
     none = T(0.1 / EPSILON[T])
     tiny = T(NORMAL[T][0])
-
-    @wp.func
-    def finite(a: wp.array3d[T], world: int):
-        for i in range(a.shape[0]):
-            for c in range(a.shape[1]):
-                if not wp.isfinite(a[i, c, world]):
-                    return False
-        return True
 
     @wp.kernel(module=f"warp_spo_status_{T.__name__}", enable_backward=False)
     def kernel(
@@ -208,25 +274,11 @@ def status_word(s) -> wp.Kernel:
         status_out: wp.array[wp.int32],
     ):
         world = wp.tid()
-        inputs_finite = finite(tree, world) and finite(com, world) and finite(rigid, world)
-        if gravity:
-            for c in range(3):
-                inputs_finite = inputs_finite and wp.isfinite(gravity[c, world])
-        for i in range(q.shape[1]):
-            inputs_finite = inputs_finite and wp.isfinite(q[world, i])
-        if body_f:
-            for body in range(body_f.shape[1]):
-                for c in range(6):
-                    inputs_finite = inputs_finite and wp.isfinite(body_f[world, body, c])
+        n = qdd.shape[1]
         positive, in_range, resolved = bool(True), bool(True), bool(True)
         overflow, hopeless = bool(False), bool(False)
         largest = T(0.0)
-        for dof in range(qdd.shape[1]):
-            inputs_finite = inputs_finite and wp.isfinite(armature[dof, world])
-            if qd:
-                inputs_finite = inputs_finite and wp.isfinite(qd[world, dof])
-            if tau:
-                inputs_finite = inputs_finite and wp.isfinite(tau[world, dof])
+        for dof in range(n):
             positive = positive and lost[dof, world] != T(-float(PIVOT))
             hopeless = hopeless or lost[dof, world] > none
             in_range = in_range and lost[dof, world] != T(-float(RANGE))
@@ -234,7 +286,7 @@ def status_word(s) -> wp.Kernel:
             overflow = overflow or not wp.isfinite(qdd[world, dof])
             largest = wp.max(largest, wp.abs(qdd[world, dof]))
         word = int(OK)
-        if not inputs_finite:
+        if not inputs_finite(q, qd, tau, body_f, tree, com, rigid, armature, gravity, n, world):
             word = int(NOT_FINITE)
         elif not positive or (overflow and hopeless):
             word = int(PIVOT)
