@@ -10,15 +10,17 @@
 * inverse: the whole of M^-1;
 * loops: forward dynamics of a biped with closed ankles, with its loops embedded, and with its loops cut.
 
-Several calls in a row are captured into a CUDA graph, which is replayed; on a CPU calls are timed one by one. A printed
-line has the time of one call, or the reason why it cannot run. Derivatives and inverses are compared with their
-references; the other results are checked to be finite.
+Several calls in a row are captured into a CUDA graph, which is replayed; processes prepare cases side by side, and one
+at a time is timed while the others stand still. On a CPU one process times calls one by one. A line has the time
+of one call, or the reason why it cannot run. Derivatives and inverses are compared with their references; the other
+results are checked to be finite.
 """
 
 from __future__ import annotations
 
 import argparse
 import functools
+import gc
 import re
 import sys
 import time
@@ -33,7 +35,7 @@ import warp_spo as spo
 from warp_spo.trials.operations import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, Trial, all_finite
 
-from . import robots, runner
+from . import robots, runner, turns
 
 DT = 2e-3  # [s]
 SETS = 4
@@ -54,16 +56,17 @@ def measure_time(run: Callable[[int], Any], device: wp.Device) -> float:
     with wp.ScopedCapture(device) as capture:
         for index in range(CALLS):
             run(index % SETS)
-    begin = time.perf_counter()
-    while time.perf_counter() - begin < WARM_UP:
-        wp.capture_launch(capture.graph)
-        wp.synchronize_device(device)
     events = [[wp.Event(device, enable_timing=True) for _ in range(2)] for _ in range(REPEATS)]
-    for start, end in events:
-        device.stream.record_event(start)
-        wp.capture_launch(capture.graph)
-        device.stream.record_event(end)
-    wp.synchronize_device(device)
+    with turns.mine:
+        begin = time.perf_counter()
+        while time.perf_counter() - begin < WARM_UP:
+            wp.capture_launch(capture.graph)
+            wp.synchronize_device(device)
+        for start, end in events:
+            device.stream.record_event(start)
+            wp.capture_launch(capture.graph)
+            device.stream.record_event(end)
+        wp.synchronize_device(device)
     return 1e3 * float(np.median([wp.get_event_elapsed_time(start, end) for start, end in events])) / CALLS
 
 
@@ -143,7 +146,8 @@ def measure_operation(subject: Subject, name: str) -> dict:
     """Return ``us`` and ``error`` of an operation; an error beyond the tolerance raises AssertionError."""
     trial = Trial(subject, (OPERATIONS | APPLICATIONS)[name], SAMPLE)
     checked = trial.check()
-    timing, left = trial.measure(REPEATS)
+    with turns.mine:
+        timing, left = trial.measure(REPEATS)
     error, tolerance = float(np.max([checked, left])), TOLERANCE["float32"]
     assert error <= tolerance, f"error {error:.1e} exceeds the tolerance {tolerance:.0e}"
     return dict(us=1e6 * timing.median, error=error)
@@ -245,33 +249,55 @@ GROUPS = dict(
 )
 
 
+def _measure(task: tuple[str, str, int, str], turn: turns.Turn | None = None) -> Iterator[dict]:
+    """Yield the row of a case."""
+    group, name, worlds, device = task
+    wp.config.log_level = wp.LOG_WARNING
+    row: dict[str, Any] = dict(group=group, name=name, worlds=worlds)
+    try:
+        row |= dict(GROUPS[group](worlds, wp.get_device(device)))[name]()
+    except Exception as error:  # the other cases go on
+        row["skipped"] = f"{type(error).__name__}: {error}"
+    yield row
+    gc.collect()
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="benchmarks.capabilities", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("pattern", nargs="?", default="", help="regular expression on 'group name'")
     parser.add_argument("--device", help="Warp device, default: the current one")
     parser.add_argument("--worlds", nargs="+", type=int, default=[4096, 65536])
     parser.add_argument("--json", type=Path, help="write the rows there")
+    parser.add_argument("--jobs", type=int, help="processes that prepare; default: the number of cores")
+    parser.add_argument("--seconds", type=float, default=3600.0, help="time for all of it, default: 3600")
     options = parser.parse_args(arguments)
-    rows: list[dict] = []
-    device, failed = wp.get_device(options.device), 0
-    run = runner.record(rows, options.device)
-    for group, cases in GROUPS.items():
-        for worlds in options.worlds:
-            for name, measure in cases(worlds, device):
-                if not re.search(options.pattern, f"{group} {name}"):
-                    continue
-                row: dict[str, Any] = dict(group=group, name=name, worlds=worlds)
-                try:
-                    row |= measure()
-                    text = f"{row['us']:.4g} us, {worlds / row['us']:.4g} 10^6/s"
-                except Exception as error:  # the other cases go on
-                    row["skipped"] = f"{type(error).__name__}: {error}"
-                    text, failed = f"skipped: {row['skipped'][:300]}", failed + 1
-                print(f"{group} {name}, {worlds} worlds: {text}", flush=True)
-                rows.append(row)
-                if options.json:
-                    runner.save(run, options.json)
-    return 0 if failed < len(rows) else 1
+    device = wp.get_device(options.device)
+    run = runner.record([], options.device)
+    rows: dict[tuple, dict | None] = {
+        (group, name, worlds, str(device)): None
+        for group, cases in GROUPS.items()
+        for worlds in options.worlds
+        for name, _ in cases(worlds, device)
+        if re.search(options.pattern, f"{group} {name}")
+    }
+    found = turns.take_turns(list(rows), _measure, options.seconds, options.jobs)
+    if device.is_cpu:
+        found = ((case, row) for case in rows for row in _measure(case))
+    for case, row in found:
+        if row is None:
+            continue
+        group, name, worlds, _ = case
+        row = row if isinstance(row, dict) else dict(group=group, name=name, worlds=worlds, skipped=str(row))
+        us = row.get("us")
+        text = f"{us:.4g} us, {worlds / us:.4g} 10^6/s" if us else f"skipped: {row['skipped'][:300]}"
+        print(f"{group} {name}, {worlds} worlds: {text}", flush=True)
+        rows[case] = row
+        if options.json:
+            runner.save(run | {"rows": [one for one in rows.values() if one is not None]}, options.json)
+    left = [f"{name}, {worlds} worlds" for (_, name, worlds, _), row in rows.items() if row is None]
+    if left:
+        print(f"not done in {options.seconds:.0f} s: {'; '.join(left)}")
+    return 0 if any(row is not None and "us" in row for row in rows.values()) else 1
 
 
 if __name__ == "__main__":

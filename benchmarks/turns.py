@@ -29,15 +29,23 @@ class Turn:
     """
 
     def __init__(self, pipe: Connection):
-        self._pipe, self.after = pipe, 0
+        self._pipe, self._depth, self.after = pipe, 0, 0
 
     def __enter__(self) -> Turn:
-        self._pipe.send(("wants", self.after))
-        self._pipe.recv()
+        if self._depth == 0:
+            self._pipe.send(("wants", self.after))
+            self._pipe.recv()
+        self._depth += 1
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._pipe.send(("had", None))
+        self._depth -= 1
+        if self._depth == 0:
+            self._pipe.send(("had", None))
+
+
+mine: contextlib.AbstractContextManager = contextlib.nullcontext()
+"""The turn of this process; one that takes no turns always has its own."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -165,9 +173,11 @@ def _turn(
 
 def _serve(work: Work, pipe: Connection) -> None:
     """Do tasks in a process of its own."""
+    global mine
     with contextlib.suppress(EOFError):  # no more tasks
         while True:
-            task, turn = pipe.recv(), Turn(pipe)
+            task = pipe.recv()
+            mine = turn = Turn(pipe)
             try:
                 for result in work(task, turn):
                     pipe.send(("result", result))
