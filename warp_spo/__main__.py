@@ -121,12 +121,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     print(meaning)
     if options.report:
-        figure = report.picture(pyplot, title, rows, TOLERANCE)
-        table = report.table(report.HEADS, [report.cells(row) for row in rows])
-        path = options.report / REPORT
-        path.write_text(report.page(title, [report.image(figure), table, *map(report.paragraph, [meaning, *notes])]))
-        pyplot.close(figure)
-        print(f"wrote {path}")
+        print(f"wrote {write_page(options.report / REPORT, pyplot, title, rows, [meaning, *notes])}")
     failed = [row for row in rows if not row["error"] <= TOLERANCE[row["dtype"]]]
     for row in failed:
         lost = row["error"] != row["error"]
@@ -134,6 +129,15 @@ def main(argv: list[str] | None = None) -> int:
         expected = f"expected at most {TOLERANCE[row['dtype']]:.0e}"
         print(f"FAILED: {row['op']} in {row['dtype']} {what}; {expected}", file=sys.stderr)
     return 1 if failed else 0
+
+
+def write_page(path: Path, pyplot: Any, title: str, rows: list[dict], words: list[str]) -> Path:
+    """Write a page with a picture of the operations, their table and what it means; return its path."""
+    figure = report.picture(pyplot, title, rows, TOLERANCE)
+    table = report.table(report.HEADS, [report.cells(row) for row in rows])
+    path.write_text(report.page(title, [report.image(figure), table, *map(report.paragraph, words)]))
+    pyplot.close(figure)
+    return path
 
 
 def run_on_ground(options: argparse.Namespace, pyplot: Any) -> int:

@@ -12,16 +12,14 @@ import warp as wp
 
 from ..arrays import parse_device
 from ..dynamics.dynamics import Dynamics
-from ..errors import UnsupportedError
 from ..execution.device_facts import read_facts
 from ..launches import compile_side_by_side
 from ..recursions.contact.ground import GROUND, SINGLE
 from ..scene.scene import Scene
 from ..torch import stream
-from . import saving
-from .checks import check_number, check_whole
+from . import given, saving
+from .checks import check_whole
 from .events import Delays, Values, changed_values
-from .given import RESULTS, checked_actions, checked_lengths, checked_mask, checked_terms
 from .graphs import Part, Replay, run_all
 from .layout import Layout
 from .logs import Log, explain
@@ -108,61 +106,36 @@ class Env(VecEnv):
         final_observations: bool = False,
         cfg: Any = None,
     ):
-        if not isinstance(scene, Scene):
-            raise TypeError(f"Env: scene is {type(scene).__name__}; expected spo.Scene")
-        if scene.ties:
-            way_out = "leave them out of the scene; spo.Dynamics(scene, loops=...) steps it outside of environments"
-            raise UnsupportedError("Env", f"a scene with {scene.ties}", way_out)
-        self.scene, self.num_envs = scene, worlds
+        self.scene, self.num_envs = given.checked_scene(scene), worlds
         self.warp_device = parse_device(str(device) if device is not None else None, "Env")
         self.device = torch.device(wp.device_to_torch(self.warp_device))
-        steps = check_whole("Env", "decimation", decimation, 1)
-        for name, value in (("dt", dt), ("episode_length_s", episode_length_s)):
-            if check_number("Env", name, value) <= 0.0:
-                raise ValueError(f"Env: {name} is {value!r} s; expected more than zero")
-        self.dt, self.decimation, self.step_dt = float(dt), steps, float(dt) * steps
-        self.max_episode_length = max(1, round(episode_length_s / self.step_dt))
+        self.dt, self.decimation, self.max_episode_length = given.checked_times(dt, decimation, episode_length_s)
+        self.step_dt = self.dt * self.decimation
         self.first_world = check_whole("Env", "first_world", first_world, 0, 2**32 - 1)
         self.seed, self.cfg = check_whole("Env", "seed", seed, 0, 2**64 - 1), {} if cfg is None else cfg
-        self._passes, self.has_commands = passes, commands is not None
         self.log_interval = check_whole("Env", "log_interval", log_interval, 1)
+        self._passes, self.has_commands, self.final = passes, commands is not None, final_observations
         self._steps = 0
 
-        default = np.asarray(scene.neutral_q if default_q is None else default_q, dtype=np.float64)
-        if default.shape != (scene.coord_count,):
-            raise ValueError(f"Env: default_q has shape {default.shape}; expected ({scene.coord_count},) [coordinate]")
-        if not np.isfinite(default).all():
-            raise ValueError(f"Env: default_q is {default.tolist()}; expected finite numbers")
-        groups, rewards, terminations = checked_terms(observations, rewards, terminations or {}, events)
+        default = given.checked_default(scene, default_q)
+        groups, rewards, terminations = given.checked_terms(observations, rewards, terminations or {}, events)
         self._levels = saving.level_names(events, commands)
         layout = self._layout = Layout(scene, default, self.step_dt, commands, changed_values(scene, events))
-        parts = list(actions) if isinstance(actions, list | tuple) else [actions]
-        for part in parts:
-            if not hasattr(part, "labels"):
-                raise TypeError(f"Env: actions holds {part!r}; expected those of warp_spo.env.actions")
+        parts = given.checked_parts(actions)
         self.action_labels = [label for part in parts for label in part.labels(scene)]
         self.num_actions = layout.action_count = len(self.action_labels)
         layout.action_arrays = {part.array for part in parts}
         tracing = Tracing(layout, parts, groups, rewards, terminations, commands, list(events))
         tracing.run(self.max_episode_length, final_observations)
-        self.final = final_observations
         self.reward_names, self.termination_names = list(rewards), tracing.ends
         self.num_obs = tracing.group_sizes
+
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=layout.values, granularity=granularity)
-        finals = [(f"final {name}", size) for name, size in self.num_obs.items()] if self.final else []
-        results = [*((name, 1) for name in RESULTS), *self.num_obs.items(), *finals]
-        of_ground = {GROUND: "ground_cells", SINGLE: "ground_heights"}  # the same memory that the dynamics read
-        held = self.dyn.recursions.parameters
-        tables = {name: wp.to_torch(getattr(held, of_ground[name])) for name in of_ground.keys() & tracing.tables}
-        store = self._store = Storage(layout, worlds, self.device, tracing.arrays, results, tracing.apart, tables)
+        store = self._store = self._allocate(tracing)
         self.q, self.qd, self.actions, self.chosen = (store.tensors[n] for n in ("q", "qd", "actions", "chosen"))
         self._tensors, self._controls, self._step_arrays = store.tensors, store.controls, store.written
         self.values = store.values
-        delays = [int(each.delay) for each in scene.actuators]
-        delays += [event.longest for event in events if isinstance(event, Delays)]
-        self._actuator_state: Any = None
-        if "ctrl" in store.controls and max(delays) > 0:
-            self._actuator_state = self.dyn.actuator_state(like=self.q, longest=max(delays))
+        self._actuator_state = self._delay_buffers(events)
         self._log = Log(layout, self.reward_names, self.termination_names, self.device)
         self.set_seed(self.seed)
         self._kernels = self._build(tracing)
@@ -174,6 +147,23 @@ class Env(VecEnv):
         self._launch("start")
         self._set_values()
         self.reset()
+
+    def _allocate(self, tracing: Tracing) -> Storage:
+        """Return the arrays that the traced stages and the dynamics read and write."""
+        finals = [(f"final {name}", size) for name, size in self.num_obs.items()] if self.final else []
+        results = [*((name, 1) for name in given.RESULTS), *self.num_obs.items(), *finals]
+        of_ground = {GROUND: "ground_cells", SINGLE: "ground_heights"}  # the same memory that the dynamics read
+        held = self.dyn.recursions.parameters
+        tables = {name: wp.to_torch(getattr(held, of_ground[name])) for name in of_ground.keys() & tracing.tables}
+        return Storage(self._layout, self.num_envs, self.device, tracing.arrays, results, tracing.apart, tables)
+
+    def _delay_buffers(self, events: Sequence[Any]) -> Any:
+        """Return the buffers of actuators with delays, None where there are none."""
+        delays = [int(each.delay) for each in self.scene.actuators]
+        delays += [event.longest for event in events if isinstance(event, Delays)]
+        if "ctrl" not in self._controls or max(delays, default=0) == 0:
+            return None
+        return self.dyn.actuator_state(like=self.q, longest=max(delays))
 
     # -- numbers that may be written --------------------------------------------------------------------------------
     def set_seed(self, seed: int) -> None:
@@ -190,7 +180,7 @@ class Env(VecEnv):
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
-        self._tensors["episode_length"].copy_(checked_lengths("Env.episode_length_buf", value, self.num_envs))
+        self._tensors["episode_length"].copy_(given.checked_lengths("Env.episode_length_buf", value, self.num_envs))
 
     @property
     def default_q(self) -> np.ndarray:
@@ -224,7 +214,7 @@ class Env(VecEnv):
         if mask is None:
             self.chosen.fill_(True)
         else:
-            mask = checked_mask("Env.reset", mask, self.num_envs, self.device)
+            mask = given.checked_mask("Env.reset", mask, self.num_envs, self.device)
             self.chosen.copy_(mask)
         before = self._store.out.clone()
         self._launch("reset")
@@ -251,7 +241,7 @@ class Env(VecEnv):
             Observations by group; rewards [world]; whether the episode ended, int [world]; a dictionary with
             ``time_outs`` [world], 1 where it ended for its length alone, and now and then ``log``.
         """
-        self.actions.copy_(checked_actions("Env.step", actions, self.num_envs, self.action_labels))
+        self.actions.copy_(given.checked_actions("Env.step", actions, self.num_envs, self.action_labels))
         self.replay()
         self._steps += 1
         out = self._store.out.clone()
@@ -265,7 +255,7 @@ class Env(VecEnv):
 
     def controls(self, actions: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return what actions set, "ctrl", "target_q" or "tau" [world, ...]; worlds remember them as their actions."""
-        self.actions.copy_(checked_actions("Env.controls", actions, self.num_envs, self.action_labels))
+        self.actions.copy_(given.checked_actions("Env.controls", actions, self.num_envs, self.action_labels))
         self._launch("act")
         return {name: controls.clone() for name, controls in self._controls.items()}
 
@@ -401,9 +391,5 @@ class Env(VecEnv):
         ]
 
     def _fill_in(self, term: TorchTerm, start: int) -> None:
-        found = term.function(self)
-        expected = (self.num_envs,) if term.size == 1 else (self.num_envs, term.size)
-        if not isinstance(found, torch.Tensor) or tuple(found.shape) not in (expected, (self.num_envs, term.size)):
-            came = tuple(found.shape) if isinstance(found, torch.Tensor) else type(found).__name__
-            raise ValueError(f"Env: the term {term.name} returned {came}; expected a tensor {expected}")
-        self._tensors["user"][:, start : start + term.size].copy_(found.reshape(self.num_envs, term.size))
+        found = given.checked_numbers(term, term.function(self), self.num_envs)
+        self._tensors["user"][:, start : start + term.size].copy_(found)

@@ -1,13 +1,16 @@
-"""What an environment is given, checked: groups of observations, rewards, terminations, events, actions."""
+"""What an environment is given, checked: its scene, actions, terms, events, and where episodes start."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 
-from .checks import check_function, check_mapping, check_number
-from .observations import Observation
+from ..errors import UnsupportedError
+from ..scene.scene import Scene
+from .checks import check_function, check_mapping, check_number, check_whole
+from .observations import Observation, TorchTerm
 from .tracing import NOT_FINITE
 
 RESULTS = ("reward", "done", "time_out")
@@ -43,6 +46,44 @@ def checked_terms(
     return groups, rewards, terminations
 
 
+def checked_scene(scene: Any) -> Scene:
+    """Return a scene; TypeError for anything else, UnsupportedError for one with closed loops or couplings."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"Env: scene is {type(scene).__name__}; expected spo.Scene")
+    if scene.ties:
+        way_out = "leave them out of the scene; spo.Dynamics(scene, loops=...) steps it outside of environments"
+        raise UnsupportedError("Env", f"a scene with {scene.ties}", way_out)
+    return scene
+
+
+def checked_times(dt: Any, decimation: Any, episode_length_s: Any) -> tuple[float, int, int]:
+    """Return the length of a step of the dynamics [s], their number in a step, and the steps of an episode."""
+    steps = check_whole("Env", "decimation", decimation, 1)
+    for name, value in (("dt", dt), ("episode_length_s", episode_length_s)):
+        if check_number("Env", name, value) <= 0.0:
+            raise ValueError(f"Env: {name} is {value!r} s; expected more than zero")
+    return float(dt), steps, max(1, round(episode_length_s / (float(dt) * steps)))
+
+
+def checked_default(scene: Scene, default_q: Any) -> np.ndarray:
+    """Return the coordinates that episodes start from [coordinate]; the scene's neutral ones for None."""
+    default = np.asarray(scene.neutral_q if default_q is None else default_q, dtype=np.float64)
+    if default.shape != (scene.coord_count,):
+        raise ValueError(f"Env: default_q has shape {default.shape}; expected ({scene.coord_count},) [coordinate]")
+    if not np.isfinite(default).all():
+        raise ValueError(f"Env: default_q is {default.tolist()}; expected finite numbers")
+    return default
+
+
+def checked_parts(actions: Any) -> list[Any]:
+    """Return one of ``warp_spo.env.actions``, or several, as a list; TypeError for anything else."""
+    parts = list(actions) if isinstance(actions, list | tuple) else [actions]
+    for part in parts:
+        if not hasattr(part, "labels"):
+            raise TypeError(f"Env: actions holds {part!r}; expected those of warp_spo.env.actions")
+    return parts
+
+
 def checked_actions(call: str, actions: Any, worlds: int, labels: list[str]) -> torch.Tensor:
     """Return actions [world, action] as a tensor; TypeError and ValueError for what is none."""
     try:
@@ -75,3 +116,12 @@ def checked_lengths(call: str, value: Any, worlds: int) -> torch.Tensor:
     if found.shape not in ((), (worlds,)):
         raise ValueError(f"{call}: got shape {tuple(found.shape)}; expected ({worlds},) [world]")
     return found
+
+
+def checked_numbers(term: TorchTerm, found: Any, worlds: int) -> torch.Tensor:
+    """Return what a user's term in torch returned as [world, number]; ValueError for another shape."""
+    expected = (worlds,) if term.size == 1 else (worlds, term.size)
+    if not isinstance(found, torch.Tensor) or tuple(found.shape) not in (expected, (worlds, term.size)):
+        came = tuple(found.shape) if isinstance(found, torch.Tensor) else type(found).__name__
+        raise ValueError(f"Env: the term {term.name} returned {came}; expected a tensor {expected}")
+    return found.reshape(worlds, term.size)

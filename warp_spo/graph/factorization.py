@@ -70,49 +70,54 @@ class Factorization:
             )
         r = [H.places[k][2] for k in nodes]
         row = [H.places[k][0] for k in nodes]
-        _check_places("H", H, [(row[k], E_phi.starts[k], r[k], m[k]) for k in nodes])
-        _check_places("M", M, [(E_phi.starts[k], E_phi.starts[k], m[k], m[k]) for k in nodes])
-        pivot_places = [(row[k], row[k], r[k], r[k]) for k in nodes]
-        pivot_offsets = list(accumulate((size * size for size in r), initial=0))
         self._prepare = prepare
         self.worlds = max(operator.worlds for operator in (E_phi, H, M, *([Delta] if Delta else [])))
         self.device, self.dtype = E_phi.device, E_phi.dtype
-
-        weights_for = store or (lambda scalars: new_weights(self.worlds, scalars, self.dtype, self.device))
-
         N, dofs, kind = E_phi.shape[0], H.shape[0], E_phi.kind
+        pivot_places = [(row[k], row[k], r[k], r[k]) for k in nodes]
         if Delta is None:
+            pivot_offsets = list(accumulate((size * size for size in r), initial=0))
             zero = new_weights(1, pivot_offsets[-1], self.dtype, self.device)
             Delta = Blocks((dofs, dofs), pivot_places, zero, pivot_offsets[:-1], kind)
+        _check_places("H", H, [(row[k], E_phi.starts[k], r[k], m[k]) for k in nodes])
+        _check_places("M", M, [(E_phi.starts[k], E_phi.starts[k], m[k], m[k]) for k in nodes])
         _check_places("Delta", Delta, pivot_places)
         _check_apart("E_phi", E_phi.offsets, [m[parent] * m[child] for parent, child in tree.edges])
         for name, blocks in (("H", H), ("M", M), ("Delta", Delta)):
             _check_apart(name, blocks.offsets, [rows * columns for _, _, rows, columns in blocks.places])
+
+        weights_for = store or (lambda scalars: new_weights(self.worlds, scalars, self.dtype, self.device))
+        weights_like = lambda operator: weights_for(operator.stored.shape[1])  # noqa: E731
         self.E_phi, self.H, self.M, self.Delta = E_phi, H, M, Delta
         self.phi = E_phi.resolvent()
-        self.P = Blocks((N, N), M.places, weights_for(M.stored.shape[1]), M.offsets, kind)
-        self.D = Blocks((dofs, dofs), pivot_places, weights_for(Delta.stored.shape[1]), Delta.offsets, kind)
-        self.D_inverse = Blocks((dofs, dofs), pivot_places, weights_for(Delta.stored.shape[1]), Delta.offsets, kind)
+        self.P = Blocks((N, N), M.places, weights_like(M), M.offsets, kind)
+        self.D = Blocks((dofs, dofs), pivot_places, weights_like(Delta), Delta.offsets, kind)
+        self.D_inverse = Blocks((dofs, dofs), pivot_places, weights_like(Delta), Delta.offsets, kind)
         gain_places = [(E_phi.starts[k], row[k], m[k], r[k]) for k in nodes]
-        self.G = Blocks((N, dofs), gain_places, weights_for(H.stored.shape[1]), H.offsets, kind)
+        self.G = Blocks((N, dofs), gain_places, weights_like(H), H.offsets, kind)
         self.K = E_phi @ self.G
-        self.E_psi = BWA.packed(tree, m, weights_for(E_phi.stored.shape[1]), E_phi.offsets, kind)
+        self.E_psi = BWA.packed(tree, m, weights_like(E_phi), E_phi.offsets, kind)
         self.psi = self.E_psi.resolvent()
-
-        offset_of = dict(zip((child for _, child in tree.edges), E_phi.offsets, strict=True))
-        self.tables = block_tables(
-            tree,
-            size=m,
-            dofs=r,
-            weight=[offset_of.get(k, 0) for k in nodes],
-            square=M.offsets,
-            hinge=H.offsets,
-            pivot=Delta.offsets,
-            device=self.device,
-        )
-        self._scratch = [weights_for(op.stored.shape[1]) for op in (H, Delta, E_phi)]
+        self.tables = self._tables(r)
+        self._scratch = [weights_like(operator) for operator in (H, Delta, E_phi)]
         if store is None:
             self.update()
+
+    def _tables(self, dofs: list[int]) -> Any:
+        """Return sizes and places of the blocks of every node, as kernels read them."""
+        tree, nodes = self.E_phi.graph, range(self.E_phi.graph.node_count)
+        assert isinstance(tree, Tree)
+        offset_of = dict(zip((child for _, child in tree.edges), self.E_phi.offsets, strict=True))
+        return block_tables(
+            tree,
+            size=self.E_phi.dims,
+            dofs=dofs,
+            weight=[offset_of.get(k, 0) for k in nodes],
+            square=self.M.offsets,
+            hinge=self.H.offsets,
+            pivot=self.Delta.offsets,
+            device=self.device,
+        )
 
     def update(self) -> None:
         """Compute P, D, G and E_psi again, by launches alone, and R if it has been asked for."""

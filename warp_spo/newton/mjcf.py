@@ -144,9 +144,27 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool, choice: Choice = 
         features = [f"{feature} ({_holder(feature)} {quote_labels(where)})" for feature, where in misread.items()]
         ways_out = dict.fromkeys(MISREAD[feature] for feature in misread)
         raise UnsupportedError("load", f"{str(file)!r} with {', '.join(features)}", "; ".join(ways_out))
+    builder = _import(file, root, floating, choice.contacts is not None)
+    if gravity is not None:
+        builder.gravity = gravity
+    lost = [what for what in left_out(root) if choice.contacts is None or "ground plane" not in what]
+    choice, disabled = choice.unless(mjcf_disables_contacts(root))
+    if disabled:
+        warnings.warn(f"load: {str(file)!r}: left out: {disabled[0]}", UserWarning, stacklevel=3)
+    if lost:
+        warnings.warn(
+            f"load: {str(file)!r}: {', '.join(lost)} left out; install the package mujoco, with which load reads "
+            "actuators, keyframes and sites",
+            UserWarning,
+            stacklevel=3,
+        )
+    return scene_of(file, builder, repair, choice, contact_rule(root, builder))
 
+
+def _import(file: Path, root: ET.Element, floating: bool | None, contacts: bool) -> newton.ModelBuilder:
+    """Return the builder into which Newton's importer read a file; meshes are read for masses and for contacts."""
     source = mjcf_source(file, root)
-    needs_meshes = mjcf_needs_meshes(root) or (choice.contacts is not None and root.find(".//geom[@mesh]") is not None)
+    needs_meshes = mjcf_needs_meshes(root) or (contacts and root.find(".//geom[@mesh]") is not None)
     if needs_meshes and source != str(file):
         raise UnsupportedError(
             "load",
@@ -173,31 +191,17 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool, choice: Choice = 
         return builder
 
     try:
-        builder = import_with(parse_mujoco_options=True)
+        return import_with(parse_mujoco_options=True)
     except ValueError as error:
         # Newton 1.8 cannot read some of MuJoCo's options, such as gymnasium's solver="pgs"; a scene needs none of them.
         try:
-            builder = import_with(parse_mujoco_options=False)
+            return import_with(parse_mujoco_options=False)
         except ValueError:
             raise unreadable(file, error) from error
     except (ImportError, ET.ParseError):
         raise
     except Exception as error:
         raise unreadable(file, error) from error
-    if gravity is not None:
-        builder.gravity = gravity
-    lost = [what for what in left_out(root) if choice.contacts is None or "ground plane" not in what]
-    choice, disabled = choice.unless(mjcf_disables_contacts(root))
-    if disabled:
-        warnings.warn(f"load: {str(file)!r}: left out: {disabled[0]}", UserWarning, stacklevel=3)
-    if lost:
-        warnings.warn(
-            f"load: {str(file)!r}: {', '.join(lost)} left out; install the package mujoco, with which load reads "
-            "actuators, keyframes and sites",
-            UserWarning,
-            stacklevel=3,
-        )
-    return scene_of(file, builder, repair, choice, contact_rule(root, builder))
 
 
 def _holder(feature: str) -> str:

@@ -64,8 +64,25 @@ def from_newton(model: newton.Model, contacts: Any = None, ground: Any = None, p
 
     # Entries of the model's joint_q and joint_qd that belong to each world's hinges.
     q_index, dof_index = flat_entries(worlds.q_start, worlds.hinges), flat_entries(worlds.qd_start, worlds.hinges)
+    values = _values(worlds, q_index, dof_index)
+    bodies, hinges = _bodies(worlds, values), _hinges(worlds, values)
+    loop_labels = worlds.labels(model.joint_label, worlds.loops)
+    loops = [Loop(**worlds.edge(joint), label=label) for joint, label in zip(worlds.loops[0], loop_labels, strict=True)]
+    couplings = [Coupling(int(h), int(r), ratio=float(c[1]), offset=float(c[0])) for h, r, c in worlds.couplings()]
+    try:
+        scene = Scene(bodies, hinges, values["gravity"][0], loops, couplings)
+    except DirectedLoopError as error:
+        names = quote_labels([bodies[body].label for body in error.cycle])
+        raise DirectedLoopError(f"from_newton, the joints of bodies {names}", error.cycle) from None
+    differing = {name: array for name, array in values.items() if (array != array[:1]).any()}
+    scene = scene.with_values(**differing)
+    scene.q_index, scene.dof_index = q_index, dof_index
+    return with_model_contacts(model, worlds, scene, Choice(contacts, ground, points))
 
-    read = lambda name, rows: to_numpy(model, name)[rows].astype(np.float64)  # noqa: E731
+
+def _values(worlds: Worlds, q_index: np.ndarray, dof_index: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the values of bodies and hinges, by Newton's names [world, ...], in float64."""
+    read = lambda name, rows: to_numpy(worlds.model, name)[rows].astype(np.float64)  # noqa: E731
     values = {name: read(name, worlds.bodies) for name in ("body_mass", "body_com", "body_inertia")}
     # finalize() has checked the inertias, with a tolerance of its own, unless the caller did without.
     values["body_inertia"] = checked_inertia("from_newton", _symmetric(values["body_inertia"]))
@@ -74,24 +91,23 @@ def from_newton(model: newton.Model, contacts: Any = None, ground: Any = None, p
     for name in ("joint_limit_lower", "joint_limit_upper", "joint_effort_limit", "joint_velocity_limit"):
         values[name] = values[name].clip(-UNLIMITED, UNLIMITED)  # USD files may hold infinities
     values["joint_rest_q"] = read("joint_rest_q", q_index)
-    gravity = to_numpy(model, "gravity").astype(np.float64) + 0.0  # turns -0.0 into 0.0
-    values["gravity"] = (
-        gravity[: worlds.count] if worlds.declared else gravity[-1:]
-    )  # the last row is for bodies outside worlds
+    gravity = to_numpy(worlds.model, "gravity").astype(np.float64) + 0.0  # turns -0.0 into 0.0
+    values["gravity"] = gravity[: worlds.count] if worlds.declared else gravity[-1:]  # the last: bodies of no world
+    return values
 
-    body_labels = worlds.labels(model.body_label, worlds.bodies)
-    bodies = [
-        Body(
-            values["body_mass"][0, k],
-            values["body_com"][0, k],
-            values["body_inertia"][0, k],
-            label,
-            any_inertia=True,
-        )
-        for k, label in enumerate(body_labels)
-    ]
+
+def _bodies(worlds: Worlds, values: dict[str, np.ndarray]) -> list[Body]:
+    """Return the bodies of world 0."""
+    masses, coms, inertias = (values[name][0] for name in ("body_mass", "body_com", "body_inertia"))
+    labels = worlds.labels(worlds.model.body_label, worlds.bodies)
+    numbers = zip(masses, coms, inertias, labels, strict=True)
+    return [Body(mass, com, inertia, label, any_inertia=True) for mass, com, inertia, label in numbers]
+
+
+def _hinges(worlds: Worlds, values: dict[str, np.ndarray]) -> list[Hinge]:
+    """Return the hinges of world 0; where a scene has other values than the model, write them into ``values``."""
     hinges, q, dof = [], slice(0, 0), slice(0, 0)
-    for joint, label in zip(worlds.hinges[0], worlds.labels(model.joint_label, worlds.hinges), strict=True):
+    for joint, label in zip(worlds.hinges[0], worlds.labels(worlds.model.joint_label, worlds.hinges), strict=True):
         q = slice(q.stop, q.stop + np.diff(worlds.q_start)[joint])
         dof = slice(dof.stop, dof.stop + np.diff(worlds.qd_start)[joint])
         kind = worlds.type[joint]
@@ -102,19 +118,7 @@ def from_newton(model: newton.Model, contacts: Any = None, ground: Any = None, p
             values["joint_rest_q"][:, turn] = _unit_or_identity(values["joint_rest_q"][:, turn])
         per_dof: dict[str, Any] = {name.removeprefix("joint_"): values[name][0, dof] for name in DOF_VALUES}
         hinges.append(Hinge(**worlds.edge(joint), rest=values["joint_rest_q"][0, q], label=label, **per_dof))
-    loop_labels = worlds.labels(model.joint_label, worlds.loops)
-    loops = [Loop(**worlds.edge(joint), label=label) for joint, label in zip(worlds.loops[0], loop_labels, strict=True)]
-    couplings = [Coupling(int(h), int(r), ratio=float(c[1]), offset=float(c[0])) for h, r, c in worlds.couplings()]
-
-    try:
-        scene = Scene(bodies, hinges, values["gravity"][0], loops, couplings)
-    except DirectedLoopError as error:
-        names = quote_labels([body_labels[body] for body in error.cycle])
-        raise DirectedLoopError(f"from_newton, the joints of bodies {names}", error.cycle) from None
-    differing = {name: array for name, array in values.items() if (array != array[:1]).any()}
-    scene = scene.with_values(**differing)
-    scene.q_index, scene.dof_index = q_index, dof_index
-    return with_model_contacts(model, worlds, scene, Choice(contacts, ground, points))
+    return hinges
 
 
 def _refuse_tendons_and_constraints(model: newton.Model) -> None:
@@ -173,6 +177,6 @@ def _drop_distance_limits(label: str, values: dict[str, np.ndarray], dofs: slice
             f"from_newton: DISTANCE joint {label!r} becomes a free hinge; its distance limit "
             f"[{low[0]:g}, {high[0]:g}] m is left out",
             UserWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     values["joint_limit_lower"][:, dofs], values["joint_limit_upper"][:, dofs] = -UNLIMITED, UNLIMITED

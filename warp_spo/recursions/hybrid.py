@@ -110,86 +110,129 @@ def expand_link(
     return qdd, tau, (Vector(alpha[:3]), Vector(alpha[3:]))
 
 
+class Sweeps:
+    """Both sweeps of hybrid dynamics over a trace, link by link, and what the inward one leaves to the outward one.
+
+    Args:
+        trace: what the sweeps write into.
+        mask: constant mask by dof; None: the array "prescribed" is the mask.
+
+    Attributes:
+        given: of each link, by its id, as all that follows. done: factors. rates: D^-1 (tau - H z), or qdd. heads: H z.
+        inner, forces: P+ and z+ in the parent's frame.
+        waiting: z of the links of groups. shared: qdd of groups, by dof.
+    """
+
+    def __init__(self, trace: Trace, mask: tuple[bool, ...] | None):
+        self.trace = trace
+        prescribed = trace.vector("prescribed") if mask is None else lambda dof: float(mask[dof])
+        self.entries = prescribed, trace.vector("tau"), trace.vector("qdd")
+        self.given: dict[int, Given] = {}
+        self.done: Factors = {}
+        self.rates: dict[int, list[Value]] = {}
+        self.heads: dict[int, list[Value]] = {}
+        self.inner: dict[int, Articulated] = {}
+        self.forces: dict[int, Vector] = {}
+        self.waiting: dict[int, Vector] = {}
+        self.shared: dict[int, Value] = {}
+
+    def reduce(self, link: Link) -> None:
+        """Eliminate a link whose children are eliminated: P, D and z."""
+        trace, key = self.trace, id(link)
+        trace.label(link, "P")
+        place, move = trace.places[key], trace.motions[key]
+        carried = [self.inner[id(child)] for child in link.children]
+        through = [inside(trace, child, self.done) for child in link.children]
+        self.given[key] = known = Given(*([entry(dof) for dof in link.dofs] for entry in self.entries))
+        if link.group is not None:
+            self._wait(link, total_inertia(link, carried))
+            return
+        if known.free:
+            done = articulated.factor(link, place, carried, through, trace.epsilon)
+        else:
+            done = factor(link, place, known.mask, carried, through, trace.epsilon)
+        self.done[key], self.inner[key] = done, done.in_parent
+        z = self._force(link)
+        if known.free:
+            self.rates[key], self.forces[key] = articulated.reduce_link(link, place, done, move, z, known.tau)
+        else:
+            self.rates[key], self.heads[key], self.forces[key] = reduce_link(link, place, done, move, z, known)
+
+    def _force(self, link: Link) -> Vector:
+        """Return z: velocity terms less outer wrenches, and what the children hand on."""
+        self.trace.label(link, "z")
+        z = articulated.gyroscopic(link.inertia, self.trace.motions[id(link)]) - self.trace.external_wrench(link)
+        for child in link.children:
+            z = z + self.forces[id(child)]
+        return z
+
+    def _wait(self, link: Link, P: Articulated) -> None:
+        """Keep what a link of a group brings; the one that closes the group eliminates it."""
+        trace, key = self.trace, id(link)
+        self.inner[key], self.forces[key] = NO_INERTIA, NO_FORCE
+        self.done[key] = articulated.Factor([], P, NO_INERTIA, False, False, 0.0)
+        self.waiting[key] = self._force(link)
+        if not link.closes:
+            return
+        assert link.group is not None
+        leader, known = link.group.links[0], self.given[key]
+        own = {id(one): self.done[id(one)].P for one in link.group.links}
+        together = groups.factor(leader, trace.places, own, trace.epsilon, known.mask)
+        self.done[id(leader)], self.inner[key] = together, together.in_parent
+        found = groups.reduce(together, trace.places, trace.motions, self.waiting, known.tau, (known.mask, known.qdd))
+        self.rates[id(leader)], self.heads[id(leader)], self.forces[key] = found
+
+    def expand(self, link: Link, above: tuple[Vector, Vector]) -> tuple[tuple[Vector, Vector], list[Store]]:
+        """Return the acceleration of a link for that of its parent, and the stores of its qdd and tau."""
+        trace, key = self.trace, id(link)
+        known, place, move = self.given[key], trace.places[key], trace.motions[key]
+        if link.group is not None:
+            stores = self._expand_group(link, above) if link.leads else []
+            return newton_euler.link_acceleration(link, place, move, above, self.shared.__getitem__), stores
+        if known.free:
+            qdd, alpha = articulated.expand_link(link, place, self.done[key], self.rates[key], move, above)
+            tau = known.tau
+        else:
+            qdd, tau, alpha = expand_link(
+                link, place, self.done[key], self.rates[key], self.heads[key], move, above, known
+            )
+        return alpha, _stores(link, qdd, tau)
+
+    def _expand_group(self, leader: Link, above: tuple[Vector, Vector]) -> list[Store]:
+        """Return the stores of a group's qdd and tau."""
+        key, known = id(leader), self.given[id(leader)]
+        qdd, felt = groups.expand(self.done[key], self.rates[key], above)
+        self.shared |= zip(leader.dofs, qdd, strict=True)
+        needed = (a + b for a, b in zip(felt, self.heads[key][::-1], strict=True))
+        tau = [select(held, x, b) for held, x, b in zip(known.mask, needed, known.tau, strict=True)]
+        return _stores(leader, qdd, tau)
+
+
+def _stores(link: Link, qdd: list[Value], tau: list[Value]) -> list[Store]:
+    return [
+        store
+        for dof, a, force in zip(link.dofs, qdd, tau, strict=True)
+        for store in (Store("out", (dof,), a), Store("tau_out", (dof,), force))
+    ]
+
+
 def hybrid_dynamics(trace: Trace, mask: tuple[bool, ...] | None = None) -> list[Store]:
     """out = qdd, tau_out = tau: dofs under the mask follow qdd, the others tau.
 
     Args:
         mask: constant mask by dof; None: the array "prescribed" is the mask.
     """
-    prescribed = trace.vector("prescribed") if mask is None else lambda dof: float(mask[dof])
-    tau, qdd, moves = trace.vector("tau"), trace.vector("qdd"), "qd" in trace.inputs
-    given: dict[int, Given] = {}
-    done: Factors = {}
-    rates: dict[int, list[Value]] = {}
-    heads: dict[int, list[Value]] = {}
-    inner: dict[int, Articulated] = {}
-    forces: dict[int, Vector] = {}
-    waiting: dict[int, Vector] = {}  # z of the links of groups
-    shared: dict[int, Value] = {}  # qdd of groups
+    sweeps, moves = Sweeps(trace, mask), "qd" in trace.inputs
     for link, outward in trace.traversal():
-        key = id(link)
         if outward:
             trace.place(link, moves)
-            continue
-        trace.label(link, "P")
-        place, move = trace.places[key], trace.motions[key]
-        carried = [inner[id(child)] for child in link.children]
-        through = [inside(trace, child, done) for child in link.children]
-        given[key] = known = Given(*([entry(dof) for dof in link.dofs] for entry in (prescribed, tau, qdd)))
-        if link.group is not None:
-            P, inner[key], forces[key] = total_inertia(link, carried), NO_INERTIA, NO_FORCE
-            done[key] = articulated.Factor([], P, NO_INERTIA, False, False, 0.0)
-            trace.label(link, "z")
-            waiting[key] = articulated.gyroscopic(link.inertia, move) - trace.external_wrench(link)
-            for child in link.children:
-                waiting[key] = waiting[key] + forces[id(child)]
-            if link.closes:
-                leader = link.group.links[0]
-                own = {id(one): done[id(one)].P for one in link.group.links}
-                together = groups.factor(leader, trace.places, own, trace.epsilon, known.mask)
-                done[id(leader)], inner[key] = together, together.in_parent
-                found = groups.reduce(
-                    together, trace.places, trace.motions, waiting, known.tau, (known.mask, known.qdd)
-                )
-                rates[id(leader)], heads[id(leader)], forces[key] = found
-            continue
-        if known.free:
-            done[key] = articulated.factor(link, place, carried, through, trace.epsilon)
         else:
-            done[key] = factor(link, place, known.mask, carried, through, trace.epsilon)
-        inner[key] = done[key].in_parent
-        trace.label(link, "z")
-        z = articulated.gyroscopic(link.inertia, move) - trace.external_wrench(link)
-        for child in link.children:
-            z = z + forces[id(child)]
-        if known.free:
-            rates[key], forces[key] = articulated.reduce_link(link, place, done[key], move, z, known.tau)
-        else:
-            rates[key], heads[key], forces[key] = reduce_link(link, place, done[key], move, z, known)
+            sweeps.reduce(link)
     alpha: dict[int, tuple[Vector, Vector]] = {}
     stores: list[Store] = []
     for link in trace.links.links:
         trace.label(link, "a")
-        key = id(link)
         above = trace.base_acceleration if link.parent is None else alpha[id(link.parent)]
-        known, place, move = given[key], trace.places[key], trace.motions[key]
-        if link.group is not None:
-            if link.leads:
-                forward, felt = groups.expand(done[key], rates[key], above)
-                shared |= zip(link.dofs, forward, strict=True)
-                needed = (a + b for a, b in zip(felt, heads[key][::-1], strict=True))
-                inverse = [select(held, x, b) for held, x, b in zip(known.mask, needed, known.tau, strict=True)]
-                for dof, a, force in zip(link.dofs, forward, inverse, strict=True):
-                    stores += [Store("out", (dof,), a), Store("tau_out", (dof,), force)]
-            alpha[key] = newton_euler.link_acceleration(link, place, move, above, shared.__getitem__)
-            continue
-        if known.free:
-            forward, alpha[key] = articulated.expand_link(link, place, done[key], rates[key], move, above)
-            inverse = known.tau
-        else:
-            forward, inverse, alpha[key] = expand_link(
-                link, place, done[key], rates[key], heads[key], move, above, known
-            )
-        for dof, a, force in zip(link.dofs, forward, inverse, strict=True):
-            stores += [Store("out", (dof,), a), Store("tau_out", (dof,), force)]
+        alpha[id(link)], more = sweeps.expand(link, above)
+        stores += more
     return stores

@@ -210,21 +210,7 @@ def beam_modes(
         ValueError: a value is out of range; the message names it.
         TypeError: ``section``, ``material`` or ``children`` is something else.
     """
-    (length,) = positive("beam_modes", length=length)
-    for name, value, kind in (("section", section, Section), ("material", material, Material)):
-        if not isinstance(value, kind):
-            raise TypeError(f"beam_modes: {name} is {value!r}; expected a spo.{kind.__name__}")
-    if ends not in ENDS:
-        raise ValueError(f"beam_modes: ends is {ends!r}; expected one of {', '.join(map(repr, ENDS))}")
-    zeta = float(checked_array("beam_modes", "damping_ratio", damping_ratio, ()))
-    if zeta < 0.0:
-        raise ValueError(f"beam_modes: damping_ratio is {zeta}; expected zero or more")
-    counts = _counts(count, ends)
-    if children is not None and not isinstance(children, Mapping):
-        raise TypeError(f"beam_modes: children is {children!r}; expected places by label or index of the child")
-    number = as_integer(points)
-    if points is not None and (number is None or number < 2):
-        raise ValueError(f"beam_modes: points is {points!r}; expected an integer of two or more, or None")
+    length, zeta, counts, number = _checked(length, section, material, ends, count, children, damping_ratio, points)
     total = material.density * section.area * length
     y, z = (_bending(length, counts[name], ends) for name in ("y", "z"))
     torsion, axial = (_rod(length, counts[name], ends) for name in ("torsion", "axial"))
@@ -232,12 +218,7 @@ def beam_modes(
     particles = _points(length, total, shapes, number)
 
     x, weights = length * shapes.nodes, length * shapes.weights
-    curvatures = [curves.values(x, 2 if i < 2 else 1) for i, curves in enumerate(shapes.curves)]
-    E, G = material.E, float(material.G)  # type: ignore[arg-type]
-    rigidities = (E * section.Iz, E * section.Iy, G * section.torsion, E * section.area)  # type: ignore[operator]
-    stiffness = np.concatenate(
-        [rigidity * weights @ curvature**2 for rigidity, curvature in zip(rigidities, curvatures, strict=True)]
-    )
+    stiffness = _stiffness(section, material, shapes, x, weights)
     mass, coupling = _moments(particles)
     turning = material.density * np.array([section.Iy + section.Iz, section.Iy, section.Iz]) * (1.0, rotary, rotary)
     turns = shapes.section(x)[:, :3]
@@ -261,6 +242,40 @@ def beam_modes(
         points=particles,
         rigid=(total, (0.5 * length, 0.0, 0.0), np.diag(inertia)),
         shape=shapes,
+    )
+
+
+def _checked(
+    length: float, section: Any, material: Any, ends: str, count: Any, children: Any, damping_ratio: Any, points: Any
+) -> tuple[float, float, dict[str, int], int | None]:
+    """Return the length, the damping ratio, the numbers of modes by direction and of points; errors by name."""
+    (length,) = positive("beam_modes", length=length)
+    for name, value, kind in (("section", section, Section), ("material", material, Material)):
+        if not isinstance(value, kind):
+            raise TypeError(f"beam_modes: {name} is {value!r}; expected a spo.{kind.__name__}")
+    if ends not in ENDS:
+        raise ValueError(f"beam_modes: ends is {ends!r}; expected one of {', '.join(map(repr, ENDS))}")
+    zeta = float(checked_array("beam_modes", "damping_ratio", damping_ratio, ()))
+    if zeta < 0.0:
+        raise ValueError(f"beam_modes: damping_ratio is {zeta}; expected zero or more")
+    counts = _counts(count, ends)
+    if children is not None and not isinstance(children, Mapping):
+        raise TypeError(f"beam_modes: children is {children!r}; expected places by label or index of the child")
+    number = as_integer(points)
+    if points is not None and (number is None or number < 2):
+        raise ValueError(f"beam_modes: points is {points!r}; expected an integer of two or more, or None")
+    return length, zeta, counts, number
+
+
+def _stiffness(
+    section: Section, material: Material, shapes: BeamShapes, x: np.ndarray, weights: np.ndarray
+) -> np.ndarray:
+    """Return the stiffness of each mode: bending along y and z, torsion, stretch, from curvatures at places x."""
+    curvatures = [curves.values(x, 2 if i < 2 else 1) for i, curves in enumerate(shapes.curves)]
+    E, G = material.E, float(material.G)  # type: ignore[arg-type]
+    rigidities = (E * section.Iz, E * section.Iy, G * section.torsion, E * section.area)  # type: ignore[operator]
+    return np.concatenate(
+        [rigidity * weights @ curvature**2 for rigidity, curvature in zip(rigidities, curvatures, strict=True)]
     )
 
 
