@@ -8,7 +8,7 @@ import textwrap
 import numpy as np
 
 import warp_spo
-from warp_spo.dynamics.rounds import EARLY
+from warp_spo.dynamics.rounds import ROUNDS
 from warp_spo.execution.routine import Routine
 from warp_spo.recursions import (
     composite,
@@ -142,18 +142,26 @@ def contact_step(scene, arrays, h, passes=3, dtype="float64"):
 
 def contact_step_in_rounds(scene, arrays, h, passes, dtype="float64"):
     """The same for a step that begins with rounds, whose velocity terms are kicks."""
-    found, worlds, n = {"out": arrays["qd"]}, len(arrays["q"]), scene.dof_count
-    left = {"out": np.zeros((worlds, n)), "q_out": np.zeros_like(arrays["q"])}
-    for count in (*EARLY, passes):
-        known = {"q": arrays["q"], "qd": arrays["qd"], middle.FOUND: found["out"], middle.KICKED: left["out"].copy()}
-        known["dt"] = np.full((worlds, 1), h)
-        stores = middle.middle_kick(Trace(Links(scene), dtype, tuple(known)))
-        read = lambda name, at, known=known: known[name][(slice(None), *at)]  # noqa: E731
+    start = {"q": arrays["q"], "qd": arrays["qd"], "dt": np.full((len(arrays["q"]), 1), h)}
+    found, kick = {"out": arrays["qd"]}, np.zeros_like(arrays["qd"])
+
+    def computed(trace, **options):
+        known = start | {middle.FOUND: found["out"], middle.KICKED: kick, middle.GAINED: found.get("qdd_out")}
+        stores = trace(Trace(Links(scene), dtype, tuple(known)), **options)
+        left = {name: np.full_like(arrays["qd"], np.nan) for name in ("out", "path_out", "qdd_out")}
+        left["q_out"] = np.full_like(arrays["q"], np.nan)
+        read = lambda name, at: known[name][(slice(None), *at)]  # noqa: E731
         for item, value in zip(stores, evaluate([item.value for item in stores], read, dtype), strict=True):
             left[item.array][(slice(None), *item.index)] = value
-        more = {"q": left["q_out"], middle.START: arrays["q"], middle.KICK: left["out"]}
-        found = contact_step(scene, arrays | more, h, count, dtype)
-    return found
+        return left
+
+    for _ in range(ROUNDS):
+        left = computed(middle.middle_kick)
+        kick = left["out"]
+        more = {"q": left["q_out"], middle.START: arrays["q"], middle.KICK: kick, middle.PATH: left["path_out"]}
+        found = contact_step(scene, arrays | more, h, passes, dtype)
+    last = computed(middle.last_kick, qdd=True)
+    return found | {name: last[name] for name in ("out", "qdd_out")}
 
 
 def plant(monkeypatch, owner, name, old, new):

@@ -15,7 +15,7 @@ import warp_spo as spo
 from warp_spo.dynamics import contact_gradients as kernels
 from warp_spo.dynamics.operation import derivative_of
 from warp_spo.dynamics.steps import STEP
-from warp_spo.recursions.contact.middle import KICK, START
+from warp_spo.recursions.contact.middle import KICK, PATH, START
 from warp_spo.recursions.derivatives.contact import INERTIA, PassGradient, PassSolve, divides
 from warp_spo.recursions.derivatives.contact_pass import weighed_pieces
 from warp_spo.reference import Dense
@@ -35,7 +35,7 @@ def launches(scene, wrt, kicked):
     a = dict(zip(("q", "qd", "tau"), touching(scene, 3, WORLDS), strict=True))
     if kicked:
         starts = np.array([Dense(scene, q).integrate(-qd, 0.5 * H) for q, qd in zip(a["q"], a["qd"], strict=True)])
-        a |= {START: starts, KICK: 0.05 * rng.normal(size=a["qd"].shape)}
+        a |= {START: starts, KICK: 0.05 * rng.normal(size=a["qd"].shape), PATH: a["qd"]}
     a = contact_gradients.furnish(scene, a)
     cotangents = [rng.normal(size=a[name].shape) for name in ("q", "qd")]
     contact_gradients.gradient(scene, a, H, PASSES, cotangents, wrt, ran)
@@ -46,7 +46,7 @@ def assert_right(monkeypatch, scene, wrt=WRT, only=tuple(ROUTINES), kicked=False
     ran = launches(scene, wrt, kicked)
     texts = warp_machine.recorded(monkeypatch)
     dyn = spo.Dynamics(scene, WORLDS, "cpu", "float64", granularity="segment", variable=contact_gradients.VALUES)
-    terms = (START, KICK) if kicked else ()
+    terms = (START, KICK, PATH) if kicked else ()
     laws, weighed = kernels._laws(dyn, ("q", "qd", "tau", "dt", "passes", *terms))
     for kernel in only:
         known, wanted = ran[kernel]
@@ -82,9 +82,9 @@ def test_limbs_share_gradients(monkeypatch):
 @pytest.mark.parametrize("scene", [quadruped(contact_cases.EFFORT), waisted()], ids=["quadruped", "waisted"])
 def test_limbs_share_gradients_where_velocity_terms_are_kicks(monkeypatch, scene):
     """The waist and the arm of the second scene carry limbs, and feel their inertia."""
-    trace = contact_gradients.trace_of(scene, ("q", "qd", "tau", "dt", "passes", START, KICK))
+    trace = contact_gradients.trace_of(scene, ("q", "qd", "tau", "dt", "passes", START, KICK, PATH))
     assert len(weighed_pieces(trace)) == (0 if scene.body_count == 13 else 2)
-    assert_right(monkeypatch, scene, (*WRT, START, KICK, "joint_target_ke"), kicked=True)
+    assert_right(monkeypatch, scene, (*WRT, START, KICK, PATH, "joint_target_ke"), kicked=True)
 
 
 @pytest.mark.slow

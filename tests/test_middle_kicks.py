@@ -10,7 +10,7 @@ from contact_cases import quadruped, waisted
 import warp_spo as spo
 from warp_spo.dynamics import rounds
 from warp_spo.recursions.contact import middle, step
-from warp_spo.recursions.contact.middle import FOUND, KICKED, middle_kick
+from warp_spo.recursions.contact.middle import FOUND, GAINED, KICKED, PATH
 from warp_spo.recursions.links import Links
 from warp_spo.recursions.tracing import Trace
 from warp_spo.reference import Dense
@@ -75,9 +75,9 @@ def test_rates_are_of_second_order():
 
 
 BUGS = {
-    "rounds that forget": (middle, "middle_kick", "0.5 * (qd(i) + found(i))", "found(i)"),
+    "rounds that forget": (middle, "_kick", "0.5 * (qd(dof) + found(dof))", "found(dof)"),
     "one kick": (step.ContactStep, "_after", "rates[dof] + self.kick(dof)", "rates[dof]"),
-    "velocity terms at the start": (middle, "middle_kick", '"q": half.__getitem__, ', ""),
+    "velocity terms at the start": (middle, "_kick", '"q": there.__getitem__, ', ""),
 }
 
 
@@ -103,28 +103,42 @@ def test_rounds_that_do_not_settle_have_a_word(device):
 
 
 @pytest.mark.slow
+def test_the_state_may_be_overwritten(device):
+    """By a step and by substeps, with the same bits; and qdd is what the whole step does."""
+    scene, worlds = quadruped(contact_cases.EFFORT), 70
+    q, qd, tau = contact_cases.touching(scene, 3, worlds)
+    dyn = spo.Dynamics(scene, worlds, device=device, dtype="float64")
+    qdd = np.full_like(qd, np.nan)
+    after = dyn.step(q, qd, tau, H, passes=4, qdd=qdd)
+    np.testing.assert_allclose(qd + H * qdd, after[1], atol=ROUNDING * abs(after[1]).max())
+    again = dyn.step(*after, tau, H, passes=4)
+    for substeps, wanted in ((1, after), (2, again)):
+        mine = q.copy(), qd.copy()
+        dyn.step(*mine, tau, H, passes=4, out=mine, substeps=substeps)
+        assert all((x == y).all() for x, y in zip(mine, wanted, strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("routine", [rounds.MIDDLE_KICK, rounds.LAST_KICK], ids=["middle", "last"])
 @pytest.mark.parametrize("scene", [quadruped(contact_cases.EFFORT), waisted()], ids=["quadruped", "waisted"])
-def test_limbs_share_kicks(scene, monkeypatch):
+def test_limbs_share_kicks(scene, routine, monkeypatch):
     """Code of a GPU, run by threads in both orders, finds what the whole tree finds."""
     rng, n, texts = np.random.default_rng(0), scene.dof_count, warp_machine.recorded(monkeypatch)
-    given = flying(scene) | {FOUND: 20.0 * rng.normal(size=(WORLDS, n)), KICKED: rng.normal(size=(WORLDS, n))}
+    given = flying(scene) | {name: 20.0 * rng.normal(size=(WORLDS, n)) for name in (FOUND, KICKED)}
+    options, shapes = {}, {"out": (n,), "q_out": (scene.coord_count,), f"{PATH}_out": (n,)}
+    if routine is rounds.LAST_KICK:
+        given, options = given | {GAINED: rng.normal(size=(WORLDS, n))}, {"qdd": True}
+        shapes = {"out": (n,), "qdd_out": (n,)}
     known = given | {"dt": np.full((WORLDS, 1), H)}
-    shapes = {
-        "out": (n,),
-        "q_out": (scene.coord_count,),
-        "half_out": (scene.coord_count,),
-        "a_out": (n,),
-        "b_out": (n,),
-    }
     wanted = {name: np.full((WORLDS, *shape), np.nan) for name, shape in shapes.items()}
-    stores = middle_kick(Trace(Links(scene), "float64", tuple(known)), states=True)
+    stores = routine.trace(Trace(Links(scene), "float64", tuple(known)), **options)
     values = evaluate([item.value for item in stores], lambda name, at: known[name][(slice(None), *at)], "float64")
     for item, value in zip(stores, values, strict=True):
         wanted[item.array][(slice(None), *item.index)] = value
     dyn = spo.Dynamics(scene, WORLDS, "cpu", "float64", granularity="segment")
     more = {name: array.shape for name, array in wanted.items() if name != "out"}
     shapes = {name: np.shape(array) for name, array in given.items()} | {"dt": ()}
-    program = dyn.programs.find(rounds.MIDDLE_KICK, shapes, wanted["out"].shape, more, states=True)
+    program = dyn.programs.find(routine, shapes, wanted["out"].shape, more, **options)
     assert program.warps > 1
     for backwards in (False, True):
         got = {"out": warp_machine.run(texts[-1], given | {"dt": H}, backwards, further := {})} | further

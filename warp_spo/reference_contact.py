@@ -10,11 +10,12 @@ where S and l are resistances and loads of the hinges' laws. G, S and l depend o
 the pass before. Friction, effort limits and dry friction are secants: dampers that give the bound at the v before. The
 first pass closes all candidates, later passes open those that pull, the last of three or more only closes.
 
-A step of four passes or more is made in rounds. Each finds the kick k = -h Mass^-1 c(u, v) / 2 half way along the mean
-v of qd and of the rates after the step, where c(u, v) = c((u + v) / 2) - c((u - v) / 2) are velocity terms of rates v
-along a path u, as the round before found both. Passes without velocity terms, half way along qd + k, then take qd + k
-to u, along which q moves, and the rates after the step are u + k. How much faster a dof gets that a saturated drive
-lets go follows from each pass's own sweep.
+A step of four passes or more is made in two rounds of as many passes. Each finds the kick k = -h Mass^-1 c(u, v) / 2
+half way along u, where c(u, v) = c((u + v) / 2) - c((u - v) / 2) are velocity terms of the mean v of qd and of the
+rates after the step, along a path u, as the round before found both. Passes without velocity terms, at the same place,
+then take qd + k to u, along which q moves, and the rates after the step are u + k. At the end both k become that of the
+u and v which the last round found. How much faster a dof gets that a saturated drive lets go follows from each pass's
+own sweep.
 """
 
 from typing import NamedTuple
@@ -28,7 +29,7 @@ CREEP = 1e-4  # rate below which dry friction is a damper [rad/s, m/s]
 UNBOUNDED, UNLIMITED = 1e6, 1e10  # effort and velocity limits, position limits, of this size and more are none
 HOLD = 300.0  # resistance of a velocity limit, in inertias over the step
 MANY = 4  # passes from which on a step begins with rounds
-EARLY = (3, 3)  # passes of each round
+ROUNDS = 2  # of as many passes each
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
 
 
@@ -224,15 +225,15 @@ class ContactStep:
         scene: a Scene with contact_points and a ground.
         q, qd: the state [coordinate], [dof]. h: length of the step [s].
         target_q, target_qd: of the drives; None: the neutral q, zero.
-        start: q before the step, if ``q`` is half way; None: ``q`` is before the step.
+        start: q before the step, if ``q`` is half way along the rates ``path``; None: ``q`` is before the step.
     """
 
-    def __init__(self, scene, q, qd, h, target_q=None, target_qd=None, world=0, start=None):
+    def __init__(self, scene, q, qd, h, target_q=None, target_qd=None, world=0, start=None, path=None):
         self.scene, self.h, self.world, self.half_way = scene, h, world, start is not None
         self.start = Dense(scene, q if start is None else start, world=world)
         self.dense, self.qd = Dense(scene, q, qd, world), np.asarray(qd, dtype=np.float64)
         self.neutral = Dense(scene, scene.neutral_q)
-        self.points, self.limits = self._points(), self._limits()
+        self.points, self.limits = self._points(self.qd if path is None else path), self._limits()
         self._targets = target_q, target_qd
         target_q = scene.neutral_q if target_q is None else target_q
         self.laws = self._laws(target_q, np.zeros(scene.dof_count) if target_qd is None else target_qd)
@@ -244,17 +245,26 @@ class ContactStep:
             found = self._passes(tau - dense.bias_force(self.qd, body_f), passes)
             return dense.integrate(found.v, self.h), found
         u = rates = self.qd
-        for count in (*EARLY, passes):
-            v = 0.5 * (self.qd + rates)
-            middle = Dense(self.scene.with_values(gravity=np.zeros(3)), dense.integrate(v, 0.5 * self.h), v, self.world)
-            terms = middle.bias_force(0.5 * (u + v)) - middle.bias_force(0.5 * (u - v))
-            kick = -0.5 * self.h * np.linalg.solve(middle.mass_matrix, terms)
-            half = dense.integrate(self.qd + kick, 0.5 * self.h)
-            there = ContactStep(self.scene, half, self.qd + kick, self.h, *self._targets, self.world, start=dense.q)
-            load = tau - there.dense.bias_force(np.zeros(len(v)), body_f) + there._lift(there.dense) - self._lift(dense)
-            found = there._passes(load, count, self._outward)
+        for _ in range(ROUNDS):
+            half, kick = self._kick(u, rates)
+            there = ContactStep(
+                self.scene, half, self.qd + kick, self.h, *self._targets, self.world, start=dense.q, path=u
+            )
+            load = tau - there.dense.bias_force(np.zeros(len(u)), body_f) + there._lift(there.dense) - self._lift(dense)
+            found = there._passes(load, passes, self._outward)
             u, rates = found.v, found.v + kick
+        rates = rates + 2.0 * (self._kick(u, rates)[1] - kick)
         return dense.integrate(u, self.h), found._replace(v=rates)
+
+    def _kick(self, u, rates):
+        """Return the coordinates half way along ``u``, and half of what velocity terms add to the rates.
+
+        ``rates``: after the step.
+        """
+        v, half = 0.5 * (self.qd + rates), self.dense.integrate(u, 0.5 * self.h)
+        middle = Dense(self.scene.with_values(gravity=np.zeros(3)), half, v, self.world)
+        terms = middle.bias_force(0.5 * (u + v)) - middle.bias_force(0.5 * (u - v))
+        return half, -0.5 * self.h * np.linalg.solve(middle.mass_matrix, terms)
 
     @staticmethod
     def _lift(dense):
@@ -282,17 +292,20 @@ class ContactStep:
             found[int(dofs[i][0])] = beyond
         return found
 
-    def _points(self):
-        """Return the points; one that may touch a wall and a floor is two, and ``numbers`` says of which point."""
+    def _points(self, path):
+        """Return the points, which move along ``path``.
+
+        One that may touch a wall and a floor is two, and ``numbers`` says of which point.
+        """
         dense, ground, rows, self.numbers = self.dense, self.scene.ground, [], []
         plane, moved = not hasattr(ground, "heights"), dense.value("ground_origin")
         field = dense.value("ground_field")
         inverse = np.linalg.pinv(self.neutral.mass_matrix)
         for number, point in enumerate(self.scene.contact_points):
             at = (dense.body_matrix[point.body] @ homogeneous([*point.position, 0, 0, 0, 1]))[:3, 3]
-            turning = dense.jacobian_bias(self.qd, [(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
+            turning = dense.jacobian_bias(path, [(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
             share = 0.5 if self.half_way else 1.0
-            moves = share * self.h * dense.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3] @ self.qd
+            moves = share * self.h * dense.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3] @ path
             at = at - point.radius * np.array(ground.normal if plane else (0.0, 0.0, 1.0))
             there = self.neutral.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
             weight = SLIP * np.trace(there @ inverse @ there.T) / 3.0
@@ -304,7 +317,7 @@ class ContactStep:
             for normal, depth in touched:
                 J, bend = dense._jacobian_at(point.body, at)[:3], normal @ turning
                 if self.half_way:  # half a step back
-                    depth = depth + 0.5 * self.h * normal @ J @ self.qd - 0.125 * self.h**2 * bend
+                    depth = depth + 0.5 * self.h * normal @ J @ path - 0.125 * self.h**2 * bend
                     bend = 0.0
                 damping = d * k * max(depth, 0.0) if point.dissipates else d
                 rows.append((J, normal, depth, k, damping, mu, point.eps, weight, bend))

@@ -30,8 +30,8 @@ class Status(enum.IntEnum):
     RANGE = 4
     """A pivot, a product that forms it, or the result is too small or too large for the dtype's normal numbers."""
     NOT_SETTLED = 5
-    """The last pass of a step ended with a limit or a friction law on another branch than the pass had assumed; or the
-    last round of a step with contacts still changed what velocity terms do."""
+    """The last pass of a step ended with a limit or a friction law on another branch than the pass had assumed; or
+    velocity terms of what the last round of a step with contacts found changed a rate by a tenth."""
     LOOPS = 6
     """The closures of the loops lose rank, or half of the dtype's digits. The mechanism is at a change point."""
     OPEN = 7

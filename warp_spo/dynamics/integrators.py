@@ -101,12 +101,11 @@ def semi_implicit(
     given |= {SUBSTEPS: float(substeps)} if substeps > 1 else {}
     if dyn.scene.contacts:
         count = float(pairs.default_passes(dyn.scene) if passes is None else passes)
-        taken = rounds.run(dyn, dt, q, qd, **given) if rounds.taken(dyn.scene, count) else []
-        state = taken[-1].step(q) if taken else {"q": q}
         given |= {"passes": count, "reports": tuple(reports or ()), **option}
-        launch(contact_routine(dyn), qd_out, more | (reports or {}), qd=qd, dt=dt, **state, **given)
-        if taken and status is not None:
-            rounds.mark_unsettled(dyn, taken, status)
+        if rounds.taken(dyn.scene, count):
+            rounds.step(dyn, dt, (q_out, qd_out), more | (reports or {}), q, qd, **given)
+        else:
+            launch(contact_routine(dyn), qd_out, more | (reports or {}), qd=qd, dt=dt, q=q, **given)
     elif not dyn.closed:
         if bodies is not None and substeps == 1:
             further = more | {"poses_out": bodies[0], "velocities_out": bodies[1]}

@@ -1,8 +1,8 @@
 """Steps with contacts whose velocity terms are kicks from half way: their rounds, and the way back.
 
-From MANY passes on a step is made in rounds. Each finds what velocity terms do to the rates half way through the step
-that the round before has found, and makes the whole step with that, see :mod:`warp_spo.recursions.contact.middle`.
-Those before the last one take EARLY passes.
+From MANY passes on a step is made in ROUNDS of as many passes each. A round finds what velocity terms do to the rates
+half way through the step that the round before has found, and makes the whole step with that. At the end the rates
+receive what velocity terms do half way through that step itself, see :mod:`warp_spo.recursions.contact.middle`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from .. import launches
 from ..execution.routine import Routine
 from ..kernels import combination, unsettled
 from ..recursions.contact import step as contact
-from ..recursions.contact.middle import FOUND, HALF, KICK, KICKED, START, middle_kick
+from ..recursions.contact.middle import FOUND, GAINED, KICK, KICKED, PATH, START, last_kick, middle_kick
 from ..recursions.derivatives import adjoints
 from ..scene.scene import Scene
 from .inertia import SOLVE_MASS_MATRIX
@@ -27,10 +27,11 @@ if TYPE_CHECKING:
     from .dynamics import Dynamics
 
 MANY = 4  # passes from which on a step is made in rounds
-EARLY = (3, 3)  # passes of each round before the last one
-UNSETTLED = 0.1  # share of the largest rate by which the last round may change a rate without a word
+ROUNDS = 2
+UNSETTLED = 0.1  # share of the largest rate by which the end may change a rate without a word
 CONTACT_STEP = Routine("contact_step", contact.step, letters="PzafSE", passes=True, counted=True, wide=True)
 MIDDLE_KICK = Routine("middle_kick", middle_kick, letters="fPza")
+LAST_KICK = Routine("last_kick", last_kick, letters="fPza")
 INTEGRATE_VJP = Routine("integrate_vjp", adjoints.integrate_vjp)
 
 
@@ -38,23 +39,24 @@ class Round(NamedTuple):
     """What a round of a step reads and finds.
 
     Attributes:
-        found: rates after the step that the round before found; of the first round, those before the step [world, dof].
-        kicked, kick: what velocity terms add to the rates in half a step, of the round before and of this one.
-        q: coordinates half way, at which its passes are.
-        half, a, b: where asked for, coordinates and rates at which the kick was found.
+        before, kicked: rates after the step and kick that the round before found; of the first round, those before the
+            step and zero [world, dof].
+        kick: what velocity terms add to the rates in half a step. path: the rates along which q moves.
+        q: coordinates half way along the path, at which the kick was found and the passes are.
+        found, gained: rates after the step, and what its passes add to them over its length.
     """
 
-    found: wp.array
+    before: wp.array
     kicked: wp.array
     kick: wp.array
+    path: wp.array
     q: wp.array
-    half: wp.array | None = None
-    a: wp.array | None = None
-    b: wp.array | None = None
+    found: wp.array
+    gained: wp.array
 
     def step(self, q: wp.array) -> dict[str, wp.array]:
-        """Return what the step of the round reads for the coordinates ``q`` before it, by name."""
-        return {"q": self.q, START: q, KICK: self.kick}
+        """Return what the passes of the round read for the coordinates ``q`` before the step, by name."""
+        return {"q": self.q, START: q, KICK: self.kick, PATH: self.path}
 
 
 def taken(scene: Scene, passes: float) -> bool:
@@ -62,40 +64,87 @@ def taken(scene: Scene, passes: float) -> bool:
     return passes >= MANY and not scene.contact_pairs
 
 
-def run(dyn: Dynamics, dt: float, q: wp.array, qd: wp.array, states: bool = False, **given: Any) -> list[Round]:
-    """Launch the rounds of a step but for the passes of the last one, and return them.
+def step(
+    dyn: Dynamics,
+    dt: float,
+    ends: tuple[wp.array, wp.array],
+    more: dict[str, wp.array],
+    q: wp.array,
+    qd: wp.array,
+    **given: Any,
+) -> None:
+    """Launch a step in rounds.
 
     Args:
-        states: fill in :attr:`Round.half`, ``a`` and ``b``. given: forces and targets by name.
+        ends: arrays for q and qd after it. more: further arrays to fill, by name. given: arguments of the step, with
+            its "passes", "reports" and options.
     """
-    launch, rounds = dyn._engine.launch_routine, list[Round]()
+    (q_out, qd_out), status = ends, more.get("status")
+    q, qd = (  # the last kick reads both after q is stored
+        _copied(dyn, name, array) if any(array.ptr == end.ptr for end in ends) else array
+        for name, array in (("q", q), ("qd", qd))
+    )
+    options: dict[str, Any] = {name: given.pop(name) for name in ("qdd", "status") if name in given}
+    further = {"qdd_out": more["qdd_out"]} if "qdd" in options else {}
+    last = _run(dyn, dt, q, qd, given, more | {"q_out": q_out}, options)[-1]
+    state: dict[str, Any] = {"q": q, "qd": qd, "dt": dt, FOUND: last.found, KICKED: last.kick}
+    state |= {GAINED: last.gained, "qdd": True} if further else {}
+    dyn._engine.launch_routine(LAST_KICK, qd_out, further, **state)
+    if status is not None:
+        read = [last.found, last.kick, qd_out, UNSETTLED]
+        dyn.recursions.launch(unsettled.mark_unsettled, dyn.worlds, read, [status])
+
+
+def _copied(dyn: Dynamics, name: str, array: wp.array) -> wp.array:
+    launches.copy(copy := dyn.recursions.array(f"{name} before", *array.shape), array)
+    return copy
+
+
+def _run(
+    dyn: Dynamics,
+    dt: float,
+    q: wp.array,
+    qd: wp.array,
+    given: dict[str, Any],
+    more: dict[str, wp.array],
+    options: dict[str, Any],
+    gains: bool = False,
+) -> list[Round]:
+    """Launch the rounds of a step but for the last kick, and return them.
+
+    Args:
+        given: arguments of the step. more: arrays that the last round fills, by name, for these ``options``.
+        gains: fill in :attr:`Round.gained` of all rounds.
+    """
+    made, launch = list[Round](), dyn._engine.launch_routine
+    given, reports = given | {"reports": ()}, given["reports"]
+    while len(made) < ROUNDS:
+        one = _begin(dyn, dt, q, qd, made)
+        made.append(one)
+        asked = {"q_out": dyn.recursions.array("q of a round", *q.shape)}
+        chosen = {"qdd": True} if gains else {}
+        if len(made) == ROUNDS:
+            asked, given, chosen = asked | more, given | {"reports": reports}, chosen | options
+        asked |= {"qdd_out": one.gained} if "qdd" in chosen else {}
+        launch(CONTACT_STEP, one.found, asked, qd=qd, dt=dt, **one.step(q), **given, **chosen)
+    return made
+
+
+def _begin(dyn: Dynamics, dt: float, q: wp.array, qd: wp.array, made: list[Round]) -> Round:
+    """Launch the kick of the round after those that were ``made``, and return the round."""
 
     def array(name: str, like: wp.array) -> wp.array:
-        return dyn.recursions.array((name, len(rounds)), *like.shape)
+        return dyn.recursions.array((name, len(made)), *like.shape)
 
-    found, kicked, ends = qd, array(KICKED, qd), array(FOUND + " q", q)
-    launches.fill(kicked, 0)
-    while True:
-        one = Round(found, kicked, array(KICK, qd), array("q half way", q))
-        one = one._replace(half=array(HALF, q), a=array("a", qd), b=array("b", qd)) if states else one
-        more = {f"{name}_out": array for name, array in one._asdict().items() if name in ("q", HALF, "a", "b")}
-        more = {name: array for name, array in more.items() if array is not None}
-        asked = {"states": True} if states else {}
-        launch(MIDDLE_KICK, one.kick, more, q=q, qd=qd, dt=dt, **{FOUND: found, KICKED: kicked}, **asked)
-        rounds.append(one)
-        if len(rounds) > len(EARLY):
-            return rounds
-        found, kicked = array(FOUND, qd), one.kick
-        count = {"passes": float(EARLY[len(rounds) - 1])}
-        options = {**one.step(q), **given, **count, "reports": ()}  # in the order of the step's own call
-        launch(CONTACT_STEP, found, {"q_out": ends}, qd=qd, dt=dt, **options)
-
-
-def mark_unsettled(dyn: Dynamics, rounds: list[Round], status: wp.array) -> None:
-    """Launch the word NOT_SETTLED where the last round changed a rate by UNSETTLED of the largest one."""
-    last = rounds[-1]
-    read = [last.kicked, last.kick, last.found, UNSETTLED]
-    dyn.recursions.launch(unsettled.mark_unsettled, dyn.worlds, read, [status])
+    before, kicked = (made[-1].found, made[-1].kick) if made else (qd, array(KICKED, qd))
+    if not made:
+        launches.fill(kicked, 0)
+    one = Round(
+        before, kicked, array(KICK, qd), array(PATH, qd), array("q half way", q), array(FOUND, qd), array(GAINED, qd)
+    )
+    more = {"q_out": one.q, f"{PATH}_out": one.path}
+    dyn._engine.launch_routine(MIDDLE_KICK, one.kick, more, q=q, qd=qd, dt=dt, **{FOUND: before, KICKED: kicked})
+    return one
 
 
 def pull_back(
@@ -105,18 +154,18 @@ def pull_back(
     passes: int,
     q_cotangent: wp.array,
     qd_cotangent: wp.array,
-    qdd: wp.array,
     **given: Any,
 ) -> None:
     """Launch the gradients of a step that is made in rounds.
 
     Args:
         back: ``back(results, passes, **given)`` launches those of passes between kicks.
-        results: arrays to fill, by name of what they are gradients by. passes: of the last round.
-        qdd: that the step found. given: arguments of the step.
+        results: arrays to fill, by name of what they are gradients by. passes: of a round. given: arguments of the
+            step, and "qdd" that it found, which is found anew.
     """
-    q, qd, dt = given.pop("q"), given.pop("qd"), given.pop("dt")
-    rounds, h, launch = run(dyn, dt, q, qd, states=True, **given), 0.5 * dt, dyn._engine.launch_routine
+    q, qd, dt, _ = (given.pop(name) for name in ("q", "qd", "dt", "qdd"))
+    rounds = _run(dyn, dt, q, qd, given | {"passes": float(passes), "reports": ()}, {}, {}, gains=True)
+    end, h, launch = _begin(dyn, dt, q, qd, rounds), 0.5 * dt, dyn._engine.launch_routine
 
     def like(array: wp.array, *key: Any) -> wp.array:
         return dyn.recursions.array(("way back", *key), *array.shape)
@@ -141,52 +190,59 @@ def pull_back(
             add(name, ways[name])
         return ways["qd"]
 
-    for array in results.values():
-        launches.fill(array, 0)
-    extra = {"q": q, "qd": qd, START: q, KICK: qd}
-    parts = {name: like(array, "step", name) for name, array in (results | extra).items()}
-    kinds = [name for name in ("q", "qd", "value") if name == "q" or name in parts]
-    by_kicked, rates, gains, still = like(qd, "kicked"), like(qd, "rates"), like(qd, "gains"), like(q, "still")
-    launches.fill(by_kicked, 0)
-    launches.fill(still, 0)
-    after, cotangents = combine(dt, qdd, 1.0, qd, like(qd, "after")), (q_cotangent, qd_cotangent)
-    for number, one in reversed([*enumerate(rounds)]):
-        combine(1.0, qd, 1.0, one.kick, rates)  # before the passes
-        combine(1.0, after, -1.0, one.kick, gains)
-        combine(1.0 / dt, gains, -1.0 / dt, rates, gains)
-        ends = {"q_cotangent": cotangents[0], "qd_cotangent": cotangents[1], "qdd": gains}
-        count = passes if number == len(EARLY) else EARLY[number]
-        back(parts, count, qd=qd, dt=dt, **one.step(q), **given, **ends)
-        for name in results.keys() - {"q"}:
-            add(name, parts[name])
-        add("q", parts[START])
-        by_rates = moved_back(rates, parts["q"])
-        add("qd", by_rates)
-        by_kick = combine(1.0, parts[KICK], 1.0, by_rates, parts[KICK])
-        combine(1.0, by_kick, 1.0, by_kicked, by_kick)
+    def kicked_back(
+        one: Round, by_kick: wp.array, by_half: wp.array | None = None, by_path: wp.array | None = None
+    ) -> None:
+        """Add the gradient by q and qd of a kick, from those by what it leaves; leave those by what it reads.
 
+        They are in ``by_found`` and ``by_kicked``.
+        """
         # k = h acc / 2 with Mass acc + c(a) - c(b) = 0; of c(a) and c(b) gravity counts twice, and cancels
+        v = combine(0.5, qd, 0.5, one.before, like(qd, "v"))
+        a, b = (combine(0.5, one.path, sign, v, like(qd, "rates", sign)) for sign in (0.5, -0.5))
         solved, acc = like(qd, "solved"), combine(1.0 / h, one.kick, 0.0, one.kick, like(qd, "acc"))
-        dyn._engine.launch(SOLVE_MASS_MATRIX, solved, q=one.half, b=by_kick)
+        dyn._engine.launch(SOLVE_MASS_MATRIX, solved, q=one.q, b=by_kick)
         found: list[dict[str, wp.array]] = []
-        for sign, at, accelerates in ((-h, one.a, {"qdd": acc}), (h, one.b, {})):
+        for sign, at, accelerates in ((-h, a, {"qdd": acc}), (h, b, {})):
             weighed = combine(sign, solved, 0.0, solved, like(qd, "weighed"))
             ways = {name: like(parts[name], "terms", name, sign) for name in kinds}
             more = {f"{name}_bar": way for name, way in ways.items() if name != "q"}
-            state = {"q": one.half, "qd": at, **accelerates, "cotangent": weighed}
+            state = {"q": one.q, "qd": at, **accelerates, "cotangent": weighed}
             launch(WAY_BACK, ways["q"], more, **state, wrt=tuple(ways))
             found.append(ways)
-        (along, across), by_half, by_u, by_v = found, like(q, "half"), like(qd, "u"), like(qd, "v")
+        along, across = found
         if "value" in results:
             add("value", along["value"])
             add("value", across["value"])
-        combine(1.0, along["q"], 1.0, across["q"], by_half)
-        combine(1.0, one.a, -1.0, one.b, rates)  # v
-        combine(0.5, along["qd"], -0.5, across["qd"], by_v)
-        combine(1.0, by_v, 1.0, moved_back(rates, by_half), by_v)
-        combine(0.5, along["qd"], 0.5, across["qd"], by_u)
-        by_found = combine(1.0, by_u, 0.5, by_v, like(qd, "found"))
+        half = combine(1.0, along["q"], 1.0, across["q"], like(q, "half"))
+        by_u = combine(0.5, along["qd"], 0.5, across["qd"], like(qd, "u"))
+        by_v = combine(0.5, along["qd"], -0.5, across["qd"], like(qd, "by v"))
+        if by_half is not None and by_path is not None:
+            combine(1.0, half, 1.0, by_half, half)
+            combine(1.0, by_u, 1.0, by_path, by_u)
+        combine(1.0, by_u, 1.0, moved_back(one.path, half), by_u)
+        combine(1.0, by_u, 0.5, by_v, by_found)
         combine(-1.0, by_u, 0.0, by_u, by_kicked)
         add("qd", by_v, 0.5)
-        after, cotangents = one.found, (still, by_found)
+
+    for array in results.values():
+        launches.fill(array, 0)
+    extra = {"q": q, "qd": qd, START: q, KICK: qd, PATH: qd}
+    parts = {name: like(array, "step", name) for name, array in (results | extra).items()}
+    kinds = [name for name in ("q", "qd", "value") if name == "q" or name in parts]
+    by_found, by_kicked, still = like(qd, "found"), like(qd, "kicked"), like(q, "still")
+    launches.fill(still, 0)
+    kicked_back(end, combine(2.0, qd_cotangent, 0.0, qd_cotangent, like(qd, "last")))  # qd' = found + 2 (end - kick)
+    combine(1.0, by_found, 1.0, qd_cotangent, by_found)
+    combine(1.0, by_kicked, -2.0, qd_cotangent, by_kicked)
+    by_q = q_cotangent
+    for one in reversed(rounds):
+        ends = {"q_cotangent": by_q, "qd_cotangent": by_found, "qdd": one.gained}
+        back(parts, passes, qd=qd, dt=dt, **one.step(q), **given, **ends)
+        for name in results.keys() - {"q"}:
+            add(name, parts[name])
+        add("q", parts[START])
+        by_kick = combine(1.0, parts[KICK], 1.0, by_kicked, like(qd, "by kick"))
+        kicked_back(one, by_kick, parts["q"], parts[PATH])
+        by_q = still
     add("qd", by_found)  # the first round found the rates before the step

@@ -215,10 +215,10 @@ def step(
     beyond. Contacts need integrator="semi_implicit", no closed loops, and another granularity than "node".
 
     With four passes and more, half of what velocity terms add to the rates comes before the passes and half after them,
-    and inertias and contacts are half way through the step. In flight rates are then of second order, and the kinetic
-    energy changes by the work of the forces, which are implicit and lose energy. Two rounds of three passes find the
-    rates half way. How much faster a joint gets when its drive saturates is then found by each pass's own sweep, not
-    from the mass at the neutral pose.
+    and inertias and contacts are half way along its path. In flight rates are then of second order, and the kinetic
+    energy changes by the work of the forces, which are implicit and lose energy. A round of as many passes finds the
+    path. How much faster a joint gets when its drive saturates is then found by each pass's own sweep, not from the
+    mass at the neutral pose.
 
     Where Dynamics closes loops, accelerations obey the closures, with all of the above on every dof, those that a loop
     moves included. Two Newton steps then move q', and qd' there, onto the closures; they leave O((h rate)^6), 1e-10 at
@@ -258,8 +258,8 @@ def step(
               contact, or without the push of a point that it carried below ground, by more than 0.1 of the weight of
               all bodies, or outside of an effort limit by more than 0.1 of the least such limit.
             * 5, NOT_SETTLED: the last pass still found a law in another part than it had assumed; or, with four passes
-              and more, the last round still changed a rate by a tenth of the largest one, because links turn by much of
-              a radian in the step. The step stands, with a force that a shorter dt would correct.
+              and more, velocity terms of what it found changed a rate by a tenth of the largest one, because links turn
+              by much of a radian in the step. The step stands, with a force that a shorter dt would correct.
             * 0, OK: none of these.
 
         ctrl: controls of the scene's actuators [world, actuator]. None: the actuators do not act, servos neither.
@@ -272,7 +272,7 @@ def step(
             launches for each substep, see :meth:`explain`. Delays count substeps. With a tensor that requires grad,
             every substep is recorded.
         passes: of a scene with contacts; None: 3, or 4 where bodies touch each other. One is stable and coarse. From 4
-            on, where no bodies touch each other, energy hardly ever rises; that is four times the work of three.
+            on, where no bodies touch each other, energy hardly ever rises; that is three times the work of three.
         contact_f: written with the force of the ground on each contact point [world, contact, 3] [N], inertial axes,
             the mean over substeps. The points are ``scene.contact_points``; after them, for each of
             ``scene.contact_pairs``, comes the force of the other body on the first one.

@@ -11,18 +11,20 @@ h^2 F* Mass^-1 F / 2 is lost; without forces nothing is. With the kick k = -h Ma
 
     u = (qd + k) + h Mass^-1 F,    qd' = u + k,
 
-a step without velocity terms between two kicks. Mass of kicks and of forces lie half way, not before the step: a
-difference in Mass counts as often as a light base is lighter than what it carries. c is quadratic: c(u, v) = c(a) -
-c(b) with a, b = (u +- v) / 2, but for spins of balls and of a free base that are not parallel. u and qd' are those that
-the round before found.
+a step without velocity terms between two kicks. Mass of kicks and of forces is that half way along u: the identity
+holds there alone, and a difference in Mass counts as often as a light base is lighter than what it carries. c is
+quadratic: c(u, v) = c(a) - c(b) with a, b = (u +- v) / 2, but for spins of balls and of a free base that are not
+parallel. u and qd' are those that the round before found. After the last round both kicks become that of what it found
+itself, as the work of velocity terms must be that of its own u and v: qd' changes by twice the difference, u stays.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ...trace.emission import Store
-from ...trace.scalars import Value
+from ...trace.scalars import Value, reciprocal
 from ...trace.spatial import ZERO
 from ..articulated_sweeps import expand, reduce
 from ..integration import integrate_link
@@ -35,40 +37,58 @@ if TYPE_CHECKING:
 
 KICK, FOUND, KICKED = "kick", "found", "kick_before"
 """Arrays [world, dof]: k; of the round before qd' and k. The first round takes qd and zero for them."""
-START = "q_before"
-"""Array [world, coordinate]: q before the step, where "q" is half way."""
-HALF = "half"
-"""Coordinates half way along v, at which the kick was found [world, coordinate]; where asked for, as are a and b."""
+START, PATH = "q_before", "path"
+"""Arrays: q before the step, where "q" is half way [world, coordinate]; u, along which it is half way [world, dof]."""
+
+GAINED = "gained"
+"""Array [world, dof]: M^-1 F of the last round, what its passes add to the rates over h."""
 
 
-def middle_kick(trace: Trace, states: bool = False) -> list[Store]:
-    """out = k, q_out = the coordinates half way along qd + k; with ``states`` half_out, a_out, b_out"""
-    qd, found, kicked, h = *map(trace.vector, ("qd", FOUND, KICKED)), trace.graph.input("dt", 0)
+def middle_kick(trace: Trace) -> list[Store]:
+    """out = k, q_out = the coordinates half way along u, path_out = u"""
+    kick, u, half, stores = _kick(trace)
+    for link in trace.own_links:
+        if link.leads:
+            stores += [Store("q_out", (at,), value) for at, value in half(link).items()]
+            stores += [Store(name, (i,), of[i]) for name, of in (("out", kick), (f"{PATH}_out", u)) for i in link.dofs]
+    return stores
+
+
+def last_kick(trace: Trace, qdd: bool = False) -> list[Store]:
+    """out = qd' with the kick of what the last round found; with ``qdd`` qdd_out = (qd' - qd) / h"""
+    kick, _, _, stores = _kick(trace)
+    (_, found, kicked), gained, h = _given(trace), trace.vector(GAINED), trace.graph.input("dt", 0)
+    for link in trace.own_links:
+        for dof in link.dofs if link.leads else ():
+            stores.append(Store("out", (dof,), found(dof) + 2.0 * (kick[dof] - kicked(dof))))
+            if qdd:
+                stores.append(Store("qdd_out", (dof,), gained(dof) + 2.0 * kick[dof] * reciprocal(h)))
+    return stores
+
+
+def _given(trace: Trace) -> tuple[Callable[[int], Value], ...]:
+    """Return entries of qd, and of qd' and k of the round before."""
+    return tuple(map(trace.vector, ("qd", FOUND, KICKED)))
+
+
+def _kick(trace: Trace) -> tuple[dict[int, Value], dict[int, Value], Callable[[Link], dict[int, Value]], list[Store]]:
+    """Return by dof k of the trace's links and u, the coordinates half way by link, and stores of messages."""
+    (qd, found, kicked), h = _given(trace), trace.graph.input("dt", 0)
     start, dofs = trace.vector("q"), [dof for link in trace.links.leaders for dof in link.dofs]
-    u, v = (
-        {dof: of(dof) for dof in dofs} for of in (lambda i: found(i) - kicked(i), lambda i: 0.5 * (qd(i) + found(i)))
-    )
+    u = {dof: found(dof) - kicked(dof) for dof in dofs}
+    v = {dof: 0.5 * (qd(dof) + found(dof)) for dof in dofs}
     a, b = ({dof: 0.5 * (u[dof] + sign * v[dof]) for dof in dofs} for sign in (1.0, -1.0))
 
-    def moved(link: Link, rates: dict[int, Value]) -> dict[int, Value]:
+    def half(link: Link) -> dict[int, Value]:
         trace.label(link, "q")
-        return dict(enumerate(integrate_link(link, start, rates.__getitem__, 0.5 * h), link.coordinate))
+        return dict(enumerate(integrate_link(link, start, u.__getitem__, 0.5 * h), link.coordinate))
 
-    half = {at: x for link in trace.links.leaders for at, x in moved(link, v).items()}
-    trace.instead = {"q": half.__getitem__, "qd": b.__getitem__}
+    there = {at: x for link in trace.links.leaders for at, x in half(link).items()}
+    trace.instead = {"q": there.__getitem__, "qd": b.__getitem__}
     across = inverse_dynamics(trace, gravity=False, qdd=zero, letter="f")
     forces = {item.index[0]: item.value for item in across if item.array == "out"}
     trace.instead["qd"] = a.__getitem__
     done, rates, sent = reduce(trace, forces.__getitem__, moves=True, loads=False)
     along = expand(trace, done, rates, (ZERO, ZERO))
     kick = {item.index[0]: 0.5 * h * item.value for item in along if item.array == "out"}
-    stores = [item for item in (*across, *sent, *along) if item.array != "out"]
-    stores += [Store("out", (dof,), value) for dof, value in kick.items()]
-    for link in trace.own_links:
-        if link.leads:
-            ends = moved(link, {dof: qd(dof) + kick[dof] for dof in link.dofs})
-            stores += [Store("q_out", (at,), value) for at, value in ends.items()]
-            if states:
-                stores += [Store(f"{HALF}_out", (at,), half[at]) for at in ends]
-                stores += [Store(f"{name}_out", (i,), of[i]) for name, of in (("a", a), ("b", b)) for i in link.dofs]
-    return stores
+    return kick, u, half, [item for item in (*across, *sent, *along) if item.array != "out"]

@@ -11,7 +11,7 @@ A point's path within the step is a parabola: at rates that stay as they are it 
 the normal, so that after the step it is h n* v + h^2 bend / 2 further out, and leaves the ground by h bend faster. The
 spring and the damper see that. Without it a point of a limb that turns fast ends up to h^2 bend / 2 deeper than the
 spring has worked for, and energy rises. Where velocity terms are kicks, all is half way, where J* is the mean along the
-path: the point was half a step back before the step, and n* J v is its mean speed.
+path: the point was half a step back before the step, along that path, and n* J v is its mean speed.
 
 A piece works on the points of its links. Those of the link on which other pieces begin are shared among these in equal
 numbers, and only the rest stays: they know that link's motion, and their messages to it carry what the points add.
@@ -38,7 +38,7 @@ from ..pieces import Piece, Pieces
 from ..remembered import remembered
 from ..tracing import Trace
 from .ground import Corners, Place, Surface, directions, lowest, surface_count, surfaces
-from .middle import KICK
+from .middle import KICK, PATH
 
 if TYPE_CHECKING:
     from ..impedance import Impedance
@@ -121,6 +121,7 @@ class Carried(NamedTuple):
     Attributes:
         axes: the directions of the ground. origins: where the link's origin is along them. twist: (omega; v).
         motion: velocity terms. bend: acceleration (omega'; v').
+        travel: the twist along the path of the step, where that is another one.
     """
 
     axes: list[Vector]
@@ -128,6 +129,7 @@ class Carried(NamedTuple):
     twist: tuple[Vector, Vector]
     motion: Motion | None
     bend: tuple[Vector, Vector]
+    travel: tuple[Vector, Vector]
 
 
 def place_points(
@@ -147,14 +149,15 @@ def place_points(
     scene = trace.links.scene
     ground, weights = scene.ground, inverse_weights(scene)
     assert ground is not None
-    half_way = KICK in trace.inputs
+    half_way, still = KICK in trace.inputs, (ZERO, ZERO)
+    path = trace.vector(PATH) if half_way else qd
     place_of_ground = ground_place(impedance)
     seats = {number: _seat(trace, number, body, place) for number, body, place in _places(trace, impedance)}
     needed = with_ancestors([link for link, _ in seats.values()] if carry is None else point_links(trace.links))
     asked = directions(ground)
     count = len(asked)
     asked = [*asked, *IDENTITY] if oriented and count < len(IDENTITY) else asked
-    carried: dict[int | None, Carried] = {None: Carried(asked, [0.0] * count, (ZERO, ZERO), None, (ZERO, ZERO))}
+    carried: dict[int | None, Carried] = {None: Carried(asked, [0.0] * count, still, None, still, still)}
     for link in trace.active_links:
         if id(link) not in needed:
             continue
@@ -163,8 +166,9 @@ def place_points(
         axes = [place.pose.to_child(axis) for axis in over.axes]
         origins = [at + dot(axis, place.pose.l) for at, axis in zip(over.origins, over.axes, strict=False)]
         twist = carried_velocity(place, over.twist, hinge_motion(link, place, qd))
-        move = link_motion(link, place, over.motion, qd)
-        own = Carried(axes, origins, twist, move, link_acceleration(link, place, move, over.bend, zero))
+        travel = carried_velocity(place, over.travel, hinge_motion(link, place, path)) if half_way else twist
+        move = link_motion(link, place, over.motion, path)
+        own = Carried(axes, origins, twist, move, link_acceleration(link, place, move, over.bend, zero), travel)
         carried[id(link)] = own if carry is None else carry(link, own)
     found = []
     for number, (on, centre) in seats.items():
@@ -183,7 +187,7 @@ def place_points(
         h, moving = impedance.h, mine.motion
         bend = mine.bend[1] + cross(mine.bend[0], centre)
         bend = bend if moving is None else bend + moving.whirl @ centre
-        w, v = mine.twist
+        w, v = mine.travel
         ahead = 0.5 * h if half_way else h
         moves = [ahead * dot(axis, v + cross(w, centre)) for axis in toward]
         touched = [_listed(impedance, number)] if isinstance(ground, Listed) else None

@@ -51,7 +51,7 @@ class ContactStep(Step):
 
     Attributes:
         kicked: velocity terms are kicks before and after the step, see :mod:`.middle`; ``qd`` is after the first one,
-            and all but the hinges' laws is half way.
+            and all but the hinges' laws is half way; qdd is what the passes find, without kicks.
         looks: whether many points of a link cost a look where they are far from the ground, see :mod:`.crowds`.
     """
 
@@ -312,8 +312,7 @@ class ContactStep(Step):
             coordinates = integrate_link(link, self.q, rates.__getitem__, self.h)
             stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
             if qdd:
-                changes = ((dof, gains[dof] + 2.0 * self.kick(dof)) for dof in link.dofs)
-                stores += [Store("qdd_out", (dof,), change * reciprocal(self.h)) for dof, change in changes]
+                stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
         results = [item.value for item in stores]
         for name in self.reports:
             stores += self.finished[name]

@@ -37,7 +37,7 @@ from ...trace.scalars import Scalar, Value, cut, is_constant, less, ordered, sel
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from ..articulated_sweeps import Factors, eliminate, expand, reduce
 from ..contact.ground import CORNERS
-from ..contact.middle import KICK, START
+from ..contact.middle import KICK, PATH, START
 from ..contact.points import Carried, Point, own_points, place_points, point_links, with_ancestors
 from ..integration import integrate_link
 from ..kinematics import carried_velocity
@@ -61,7 +61,7 @@ HEIGHTS_AT = "heights_at"
 """Columns of the heights of a cell in the table of gradients by surface [world, surface]."""
 ORIGIN = "ground_origin"
 OF_DOFS = ("q", "qd", "tau", "target_q", "target_qd", "joint_rest_q", *DOF_VALUES)
-BY_PIECES = (*OF_DOFS, "ctrl", *CONTACT_VALUES, HEIGHTS, ORIGIN, START, KICK)
+BY_PIECES = (*OF_DOFS, "ctrl", *CONTACT_VALUES, HEIGHTS, ORIGIN, START, KICK, PATH)
 """Arguments and values whose gradient a limb computes by itself, or by messages between limbs."""
 Twists = dict[int, tuple[Vector, Vector]]
 
@@ -260,7 +260,8 @@ class PassGradient(PassAdjoint):
 
     def _carry(self, link: Link, own: Carried) -> Carried:
         """Return what further links know of a link."""
-        known = [x for row in (*own.axes, own.origins, *own.twist, *own.bend) for x in row]
+        travels = own.travel if self.kicked else ()
+        known = [x for row in (*own.axes, own.origins, *own.twist, *own.bend, *travels) for x in row]
         if link is self._end:
             self.passed_on += known
         if link is not self._under:
@@ -270,11 +271,11 @@ class PassGradient(PassAdjoint):
         vector = lambda: Vector(itertools.islice(take, 3))  # noqa: E731
         axes, origins = [vector() for _ in own.axes], [*itertools.islice(take, len(own.origins))]
         twist, bend = (vector(), vector()), (vector(), vector())
-        move = own.motion
+        move, travel = own.motion, (vector(), vector()) if self.kicked else twist
         if move is not None:
-            assert list(move.spin) == list(own.twist[0])
-            move = move._replace(spin=twist[0], whirl=whirl(twist[0]))
-        return Carried(axes, origins, twist, move, bend)
+            assert list(move.spin) == list(own.travel[0])
+            move = move._replace(spin=travel[0], whirl=whirl(travel[0]))
+        return Carried(axes, origins, twist, move, bend, travel)
 
     def _known(self, link: Link, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
         if id(link) not in self._reached:
