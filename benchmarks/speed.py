@@ -3,9 +3,10 @@
     python -m benchmarks.speed [PATTERN] [--device cuda:0] [--json FILE] [--compile]
 
 A line gives the time of one call of all worlds [us], the largest error of the results against the dense float64
-reference, the figure that has a limit, and the limit. A figure is the time itself, a rate [1e9 worlds/s], or the time
-over that of another call in the same run. ``PATTERN`` is a regular expression on the lines' names. ``--compile``
-compiles the kernels into Warp's cache, several at a time and those that take longest first, and times nothing.
+reference, the figure that has a limit, and the limit. A figure is the time itself [us, s], a rate [1e9 worlds/s], or
+the time over that of another call in the same run. ``PATTERN`` is a regular expression on the lines' names.
+``--compile`` compiles the kernels into Warp's cache, several at a time and those that take longest first, and times
+nothing.
 Lines are prepared by processes side by side and timed one at a time, while all other processes stand still; one call is
 timed at the beginning, in the middle and at the end. ``--seconds`` is the time for either run. A line is printed and
 saved as soon as it is known, and those that are not are named. The exit code is 1 if an error exceeds its tolerance or
@@ -20,10 +21,12 @@ import functools
 import gc
 import re
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import warp as wp
 
 import warp_spo as spo
@@ -42,10 +45,11 @@ INERTIAS = ("body_mass", "body_com", "body_inertia")
 ON_PLANE, ON_FIELD = "contact_step", "contact_step on a height field"
 SUBSTEPS = 4
 FUSED = {f"step of {SUBSTEPS} substeps": "", f"contact_step of {SUBSTEPS} substeps": substeps.ON_PLANE}
+FIRST_STEP = "first call of a step"  # with drives and limits; kernels are traced and compiled
 CONTACT_TOLERANCE = 1e-4  # of velocities after a step with contacts, in float32
 SETS, SAMPLE, REPEATS, WARM_UP, BUDGET = 3, 2, 15, 0.1, 0.3  # of MOST worlds one set is larger than every cache
 STEADY = 0.03  # largest relative difference of the times of the reference
-WORK = {SOLVER_STEP: 8.0, "forward_dynamics_derivatives": 6.0}  # of compiling, for a dof; the others 2
+WORK = {SOLVER_STEP: 8.0, FIRST_STEP: 3.0, "forward_dynamics_derivatives": 6.0}  # of compiling, for a dof; the others 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +69,7 @@ class Call:
 
 @dataclasses.dataclass(frozen=True)
 class Line:
-    """A call, and the limit of a figure: of "us", "ratio" (its time over that of ``beside``), or "rate" (at least).
+    """A call, and the limit of a figure: "us", "s", "ratio" (its time over that of ``beside``), or "rate" (at least).
 
     The ratio of a call of several substeps is its time over that of as many calls.
     """
@@ -80,7 +84,7 @@ class Line:
         us = time(self.call)["us"]
         if self.kind == "ratio":
             return us / (time(self.call)["calls_us"] if self.beside is None else time(self.beside)["us"])
-        return 1e-3 * self.call.worlds / us if self.kind == "rate" else us
+        return {"rate": 1e-3 * self.call.worlds / us, "s": 1e-6 * us, "us": us}[self.kind]
 
     def keeps(self, figure: float) -> bool:
         """Return whether the figure keeps the limit."""
@@ -107,6 +111,7 @@ def _over_folded(robot: str, limit: float) -> Line:
 LINES = (
     *(_step_over_forward_dynamics(robot, step, FEW, 2.5) for robot in step_parts.NAMES for step in STEPS),
     *(_step_over_forward_dynamics(robot, SOLVER_STEP, SOME, 2.0) for robot in ("go2", "b1_z1", "centauro")),
+    Line(Call("centauro", FIRST_STEP, FEW), "s", 10.0),
     *(_over_float32("centauro", "forward_dynamics", worlds, 3.0) for worlds in (FEW, MANY)),
     Line(Call("centauro", "forward_dynamics", MOST), "rate", 0.8),
     Line(Call("g1", "forward_dynamics", MOST), "rate", 1.6),
@@ -159,6 +164,8 @@ def prepare(call: Call, device: wp.Device) -> Callable[[], dict]:
     if call.operation in FUSED:
         run = substeps.prepare(call.robot + FUSED[call.operation], call.worlds, device, SUBSTEPS)
         return lambda: dataclasses.asdict(call) | run() | {"tolerance": 0.0}
+    if call.operation == FIRST_STEP:
+        return _first_step(call, device)
     with record_launches() as launched:
         trial = trial_of(call, device)
         del launched[:]
@@ -171,6 +178,26 @@ def prepare(call: Call, device: wp.Device) -> Callable[[], dict]:
         timing, left = trial.measure(REPEATS, WARM_UP, BUDGET)
         row = dataclasses.asdict(call) | dict(us=1e6 * timing.median, p10_us=1e6 * timing.low, p90_us=1e6 * timing.high)
         return row | dict(error=max(checked, left)) | used
+
+    return timed
+
+
+def _first_step(call: Call, device: wp.Device) -> Callable[[], dict]:
+    """Return what takes a first step, with kernels that no cache has."""
+    scene = step_parts.driven_scene(call.robot)
+    few = [Inputs(scene, SAMPLE).array(name) for name in ("q", "qd")]
+    expected = spo.Dynamics(scene, SAMPLE, "cpu", "float64").step(few[0], few[1], None, contacts.DT)[1]
+
+    def timed() -> dict:
+        q, qd = (np.resize(array, (call.worlds, array.shape[1])) for array in few)
+        cache = wp.config.kernel_cache_dir
+        with tempfile.TemporaryDirectory() as wp.config.kernel_cache_dir:
+            begin = time.perf_counter()
+            after = spo.Dynamics(scene, call.worlds, device, call.dtype).step(q, qd, None, contacts.DT)[1]
+            seconds = time.perf_counter() - begin
+        wp.config.kernel_cache_dir = cache
+        error = np.abs(after[:SAMPLE] - expected).max() / np.abs(expected - few[1]).max()
+        return dataclasses.asdict(call) | dict(us=1e6 * seconds, error=float(error))
 
     return timed
 
@@ -195,7 +222,7 @@ def _compile(task: tuple[str, list[Call]], turn: Turn) -> Iterator[str]:
 def _compile_all(calls: list[Call], device: str, seconds: float) -> int:
     """Compile in processes side by side; return how many groups failed, or were not done in so many seconds."""
     begin, groups = time.perf_counter(), dict[Call, list[Call]]()
-    for call in calls:
+    for call in (call for call in calls if call.operation != FIRST_STEP):
         same = dataclasses.replace(call, operation=SOLVER_STEP if call.operation in STEPS else call.operation, worlds=0)
         groups.setdefault(same, []).append(call)
     left = {"; ".join(map(str, groups[one])): groups[one] for one in sorted(groups, key=_work, reverse=True)}
@@ -213,7 +240,7 @@ def _shares(calls: list[Call]) -> list[list[Call]]:
     """Return calls in groups that share models and inputs; those that take longest to prepare first."""
     shares: dict[tuple, list[Call]] = {}
     for call in calls:
-        kind = "solver" if call.operation in STEPS else call.operation in (ON_PLANE, ON_FIELD, *FUSED)
+        kind = "solver" if call.operation in STEPS else call.operation in (ON_PLANE, ON_FIELD, FIRST_STEP, *FUSED)
         shares.setdefault((call.robot, call.worlds, kind), []).append(call)
     return sorted(shares.values(), key=lambda share: sum(map(_work, share)), reverse=True)
 
@@ -248,7 +275,7 @@ def describe(line: Line, rows: dict[Call, dict]) -> str:
     """Return the line in words, with its figure."""
     timed = rows.__getitem__
     figure, row = line.figure(timed), rows[line.call]
-    unit = {"us": "us", "rate": "1e9/s", "ratio": "times"}[line.kind]
+    unit = {"us": "us", "s": "s", "rate": "1e9/s", "ratio": "times"}[line.kind]
     limit = f"{'at least' if line.kind == 'rate' else 'at most'} {line.limit:g}"
     beside = f" of {line.beside}, {timed(line.beside)['us']:.4g} us" if line.beside else ""
     if line.call.operation in FUSED:
@@ -275,9 +302,9 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(lines: list[Line], device: str, seconds: float, file: Path | None) -> int:
     """Time lines, print and save them; return the exit code."""
     calls, rows = calls_of(lines), dict[Call, dict]()
-    reference = REFERENCE if REFERENCE in calls else calls[0]
     often = 0, len(calls) // 2, len(calls)  # turns after which the reference is timed
-    tasks = [(device, often, [reference]), *((device, (0,), share) for share in _shares(calls))]
+    tasks: list[tuple[str, tuple[int, ...], list[Call]]] = [(device, often, [REFERENCE])] if REFERENCE in calls else []
+    tasks += [(device, (0,), share) for share in _shares(calls)]
     whole = runner.record([], device)
     begin, failed, waiting, repeated = time.perf_counter(), dict[Call, str](), list(lines), list[float]()
     for (_, turns, _), found in take_turns(tasks, _time, seconds):
@@ -303,7 +330,7 @@ def _run(lines: list[Line], device: str, seconds: float, file: Path | None) -> i
     if len(repeated) > 1:
         spread = (max(repeated) - min(repeated)) / min(repeated)
         word = "as it should be" if spread <= STEADY else "the machine was not steady"
-        print(f"{reference!s}, {len(repeated)} times in the run: they differ by {spread:.1%}, {word}")
+        print(f"{REFERENCE!s}, {len(repeated)} times in the run: they differ by {spread:.1%}, {word}")
     for line in waiting:
         left = [call for call in (line.call, line.beside) if call is not None and call not in rows]
         why = "; ".join(f"{call!s}: {failed.get(call, f'not ready in {seconds:.0f} s')}" for call in left)
