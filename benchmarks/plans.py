@@ -11,11 +11,9 @@ that has no more. The exit code is 1 if a choice takes more than ``ALLOWED`` tim
 from __future__ import annotations
 
 import argparse
-import concurrent.futures
 import contextlib
 import dataclasses
 import gc
-import multiprocessing
 import os
 import sys
 import time
@@ -34,7 +32,7 @@ from warp_spo.execution.device_facts import DeviceFacts, read_facts
 from warp_spo.trials.operations import OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, Trial
 
-from . import robots, runner
+from . import robots, runner, turns
 from .capabilities import DT, KD, KE
 from .crowding import crowd
 
@@ -170,7 +168,7 @@ def compare(name: str, operation: str, worlds: int, device: str | None, leave: i
         if twin == granularity:
             timed[granularity] = found
     chosen = planned.plan.of(planned._operations[operation].routine)
-    with crowd(planned.device, leave):
+    with turns.mine, crowd(planned.device, leave):
         for _ in range(REPEATS):
             for each in timed.values():
                 each.measure()
@@ -180,7 +178,19 @@ def compare(name: str, operation: str, worlds: int, device: str | None, leave: i
     return row | dict(us=times, chosen=chosen, ratio=ratio, error=max(errors))
 
 
-def _compile(name: str, operation: str, counts: list[int], device: str | None, facts: DeviceFacts) -> None:
+def _measure(task: tuple, turn: turns.Turn | None = None) -> Iterator[dict[str, Any]]:
+    """Yield the row of a case."""
+    name, operation, [worlds], device, leave, facts = task
+    wp.config.log_level = wp.LOG_WARNING
+    with as_on(facts):
+        yield compare(name, operation, worlds, device, leave)
+    gc.collect()
+
+
+def _compile(task: tuple, turn: turns.Turn | None = None) -> Iterator[dict[str, Any]]:
+    """Compile the kernels of a case; yield nothing."""
+    name, operation, counts, device, _, facts = task
+    wp.config.log_level = wp.LOG_WARNING
     with as_on(facts):
         for worlds in counts:
             scene = scene_of(name)
@@ -190,6 +200,7 @@ def _compile(name: str, operation: str, counts: list[int], device: str | None, f
                 dyn.prepare(operation)
                 if operation == "step":
                     dyn.prepare("integrate")
+    yield from ()
 
 
 @contextlib.contextmanager
@@ -206,36 +217,38 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--operations", nargs="+", choices=NAMES, default=NAMES, metavar="O", help=", ".join(NAMES))
     parser.add_argument("--worlds", nargs="+", type=int, default=WORLDS)
     parser.add_argument("--leave", type=int, metavar="N", help="multiprocessors that others do not occupy")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes that compile; default: all cores")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes that prepare; default: all cores")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
-    parser.add_argument("--seconds", type=float, default=3600.0, help="time after which no further case begins")
+    parser.add_argument("--seconds", type=float, default=3600.0, help="time for all of it, default: 3600")
     parser.add_argument("--compile", action="store_true", help="compile the kernels, and time nothing")
     options = parser.parse_args(arguments)
     device, begin = wp.get_device(options.device), time.perf_counter()
     facts = read_facts(device)
     facts = facts if options.leave is None else dataclasses.replace(facts, multiprocessors=options.leave)
     cases = [(name, operation) for name in options.scenes for operation in options.operations]
+    work, counts = _measure, [[worlds] for worlds in options.worlds]
     if options.compile:
-        context = multiprocessing.get_context("spawn")
-        with concurrent.futures.ProcessPoolExecutor(options.jobs, context) as pool:
-            for task in [pool.submit(_compile, *case, options.worlds, str(device), facts) for case in cases]:
-                task.result()
+        work, counts = _compile, [options.worlds]
+    tasks = [(*case, worlds, str(device), options.leave, facts) for case in cases for worlds in counts]
+    if device.is_cuda:
+        found = turns.take_turns(tasks, work, options.seconds, options.jobs)
+    else:
+        found = ((task, row) for task in tasks for row in work(task))
+    rows: list[dict] = []
+    for (name, operation, *_), row in found:
+        if isinstance(row, Exception):
+            print(f"{name} {operation}: {row}", flush=True)
+        elif row is not None:
+            rows.append(row)
+            shown = ", ".join(f"{key} {us:.4g}" for key, us in row["us"].items())
+            print(
+                f"{name} {operation}, {row['dofs']} dofs, {row['limbs']} limbs, {row['worlds']} worlds: {shown} us; "
+                f"plan {row['chosen']}, {row['ratio']:.3f} of the best, error {row['error']:.1e}",
+                flush=True,
+            )
+    if options.compile:
         print(f"compiled in {time.perf_counter() - begin:.0f} s")
         return 0
-    rows: list[dict] = []
-    with as_on(facts):
-        for name, operation in cases:
-            for worlds in options.worlds:
-                if time.perf_counter() - begin > options.seconds:
-                    continue
-                gc.collect()
-                rows.append(row := compare(name, operation, worlds, options.device, options.leave))
-                shown = ", ".join(f"{key} {us:.4g}" for key, us in row["us"].items())
-                print(
-                    f"{name} {operation}, {row['dofs']} dofs, {row['limbs']} limbs, {worlds} worlds: {shown} us; "
-                    f"plan {row['chosen']}, {row['ratio']:.3f} of the best, error {row['error']:.1e}",
-                    flush=True,
-                )
     if options.json:
         runner.save(runner.record(rows, device), options.json)
     beyond = [row for row in rows if row["ratio"] > ALLOWED]
