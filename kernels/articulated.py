@@ -14,6 +14,50 @@ from .topology import Topology
 
 
 @functools.cache
+def dof_elimination(s) -> tuple[wp.Function, wp.Function]:
+    """Return functions that eliminate the dofs of a node, one after the other, and say where digits of D are lost.
+
+    The size of the terms that cancel in D waits in the place of D: the first function writes it for all dofs of the
+    node, and the second one adds, for the dofs that follow, what the elimination of a dof cancels in them.
+    """
+    T, vec6, vec21, least = s.T, s.vec6, s.vec21, s.T(s.least)
+
+    @wp.func
+    def keep_sizes(
+        P: vec21, first: int, count: int, world: int, axis: wp.array3d[T], armature: wp.array2d[T], pivot: wp.array2d[T]
+    ):
+        for dof in range(first, first + count):
+            h = s.load_motion(axis, dof, world)
+            pivot[dof, world] = s.magnitude(P, h, h) + wp.abs(armature[dof, world])
+
+    @wp.func
+    def eliminate_dof(
+        P: vec21,
+        P_0: vec21,
+        h: vec6,
+        armature: T,
+        first: int,
+        dof: int,
+        world: int,
+        axis: wp.array3d[T],
+        gain: wp.array3d[T],
+        pivot: wp.array2d[T],
+    ):
+        size = pivot[dof, world]
+        result = s.eliminate(P, h, armature, least * size)
+        P, U, D = result[0:21], result[21:27], result[27]
+        s.store_motion(gain, dof, world, U)
+        pivot[dof, world] = D
+        for other in range(first, dof):
+            g = s.load_motion(axis, other, world)
+            share = wp.abs(wp.dot(g, U)) / D
+            pivot[other, world] += s.cancellation(s.magnitude(P_0, g, h), share, size)
+        return P, U, D
+
+    return keep_sizes, eliminate_dof
+
+
+@functools.cache
 def factor(s) -> wp.Kernel:
     """Inward, one level: P(k) = M(k) + sum over children phi P+ phi*, U = P H*, D = H U + Delta, P+ = P - U D^-1 U*.
 
@@ -22,8 +66,7 @@ def factor(s) -> wp.Kernel:
     of the same hinge cause which were eliminated before it. Along an axis of the node frame nothing cancels: any D > 0
     is kept.
     """
-    T = s.T
-    least = T(s.least)
+    T, (keep_sizes, eliminate_dof) = s.T, dof_elimination(s)
 
     @wp.kernel(module=f"warp_spo_articulated_{T.__name__}", enable_backward=False)
     def kernel(
@@ -43,24 +86,12 @@ def factor(s) -> wp.Kernel:
         for c in range(topology.child_start[node], topology.child_start[node + 1]):
             P += s.load_articulated(articulated_out, topology.children[c], world)
 
-        first = topology.qd_start[node]
-        count = topology.dof_count[node]
-        P_0 = P
-        for dof in range(first, first + count):  # the size of the terms that cancel in D waits in the place of D
-            h = s.load_motion(axis, dof, world)
-            pivot_out[dof, world] = s.magnitude(P, h, h) + wp.abs(armature[dof, world])
+        first, count, P_0 = topology.qd_start[node], topology.dof_count[node], P
+        keep_sizes(P, first, count, world, axis, armature, pivot_out)
         for e in range(count):
             dof = first + count - 1 - e
-            h = s.load_motion(axis, dof, world)
-            size = pivot_out[dof, world]
-            result = s.eliminate(P, h, armature[dof, world], least * size)
-            P, U, D = result[0:21], result[21:27], result[27]
-            s.store_motion(gain_out, dof, world, U)
-            pivot_out[dof, world] = D
-            for other in range(first, dof):
-                g = s.load_motion(axis, other, world)
-                share = wp.abs(wp.dot(g, U)) / D
-                pivot_out[other, world] += s.cancellation(s.magnitude(P_0, g, h), share, size)
+            h, armed = s.load_motion(axis, dof, world), armature[dof, world]
+            P, _U, _D = eliminate_dof(P, P_0, h, armed, first, dof, world, axis, gain_out, pivot_out)
         if topology.parent[node] >= 0:
             s.store_articulated(
                 articulated_out, node, world, s.articulated_to_parent(s.load_pose(pose, node, world), P)

@@ -86,6 +86,46 @@ def change_axes(T) -> wp.Function:
 
 
 @functools.cache
+def turn_joint(T) -> wp.Function:
+    """Return the function that writes the entries of a joint that is not free, and returns a joint's rotation."""
+    Matrix, rotate, entries, store, change = (
+        wp.types.matrix((3, 3), T),
+        rotation(T),
+        three(T),
+        store_three(T),
+        change_axes(T),
+    )
+
+    @wp.func
+    def function(
+        to_scene: bool,
+        kind: int,
+        coordinates: wp.array2d[T],
+        world: int,
+        vector: int,
+        real: int,
+        first: int,
+        x: wp.array2d[T],
+        out: wp.array2d[T],
+    ) -> Matrix:
+        R = Matrix()
+        if kind == 0:
+            out[world, first] = x[world, first]
+        else:
+            R = rotate(coordinates, world, vector, real)
+            if kind == 1:
+                store(change(to_scene, R, entries(x, world, first)), world, first, out)
+        return R
+
+    return function
+
+
+def vectors(T) -> tuple:
+    """Return the type of a vector, and the functions that turn, read and write vectors of a joint."""
+    return wp.types.vector(3, T), turn_joint(T), three(T), store_three(T)
+
+
+@functools.cache
 def rates(T) -> wp.Kernel:
     """Compute qd from qpos and qvel if ``to_scene``, else qvel from q and qd; a thread for each (world, joint).
 
@@ -95,13 +135,8 @@ def rates(T) -> wp.Kernel:
         vector, real: entries of its quaternion in ``coordinates``: the first of x, y, z, and w.
         com: centre of mass of the body that the joint carries, in the body frame [m].
     """
-    Vector, rotate, entries, store, change = (
-        wp.types.vector(3, T),
-        rotation(T),
-        three(T),
-        store_three(T),
-        change_axes(T),
-    )
+    Vector, turn, entries, store = vectors(T)
+    change = change_axes(T)
 
     @wp.kernel(module=f"warp_spo_mujoco_{T.__name__}", enable_backward=False)
     def kernel(
@@ -117,12 +152,8 @@ def rates(T) -> wp.Kernel:
     ):
         world, joint = wp.tid()
         first = dof[joint]
-        if kind[joint] == 0:
-            out[world, first] = x[world, first]
-            return
-        R = rotate(coordinates, world, vector[joint], real[joint])
-        if kind[joint] == 1:
-            store(change(to_scene, R, entries(x, world, first)), world, first, out)
+        R = turn(to_scene, kind[joint], coordinates, world, vector[joint], real[joint], first, x, out)
+        if kind[joint] < 2:
             return
         given = entries(x, world, first + 3)
         result = change(to_scene, R, given)
@@ -141,13 +172,8 @@ def rates(T) -> wp.Kernel:
 @functools.cache
 def accelerations(T) -> wp.Kernel:
     """Compute qdd from qpos, qvel and qacc if ``to_scene``, else qacc from q, qd and qdd; arguments as of `rates`."""
-    Vector, rotate, entries, store, change = (
-        wp.types.vector(3, T),
-        rotation(T),
-        three(T),
-        store_three(T),
-        change_axes(T),
-    )
+    Vector, turn, entries, store = vectors(T)
+    change = change_axes(T)
 
     @wp.kernel(module=f"warp_spo_mujoco_{T.__name__}", enable_backward=False)
     def kernel(
@@ -164,12 +190,8 @@ def accelerations(T) -> wp.Kernel:
     ):
         world, joint = wp.tid()
         first = dof[joint]
-        if kind[joint] == 0:
-            out[world, first] = x[world, first]
-            return
-        R = rotate(coordinates, world, vector[joint], real[joint])
-        if kind[joint] == 1:
-            store(change(to_scene, R, entries(x, world, first)), world, first, out)
+        R = turn(to_scene, kind[joint], coordinates, world, vector[joint], real[joint], first, x, out)
+        if kind[joint] < 2:
             return
         given, w = entries(x, world, first + 3), entries(velocity, world, first + 3)
         result = change(to_scene, R, given)
@@ -189,13 +211,7 @@ def accelerations(T) -> wp.Kernel:
 @functools.cache
 def forces(T) -> wp.Kernel:
     """Compute tau from qpos and qfrc if ``to_scene``, else qfrc from q and tau; arguments as of `rates`."""
-    Vector, rotate, entries, store, change = (
-        wp.types.vector(3, T),
-        rotation(T),
-        three(T),
-        store_three(T),
-        change_axes(T),
-    )
+    Vector, turn, entries, store = vectors(T)
 
     @wp.kernel(module=f"warp_spo_mujoco_{T.__name__}", enable_backward=False)
     def kernel(
@@ -211,12 +227,8 @@ def forces(T) -> wp.Kernel:
     ):
         world, joint = wp.tid()
         first = dof[joint]
-        if kind[joint] == 0:
-            out[world, first] = x[world, first]
-            return
-        R = rotate(coordinates, world, vector[joint], real[joint])
-        if kind[joint] == 1:
-            store(change(to_scene, R, entries(x, world, first)), world, first, out)
+        R = turn(to_scene, kind[joint], coordinates, world, vector[joint], real[joint], first, x, out)
+        if kind[joint] < 2:
             return
         f, n = entries(x, world, first), entries(x, world, first + 3)
         store(f, world, first, out)

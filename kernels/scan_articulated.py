@@ -22,6 +22,7 @@ import types
 
 import warp as wp
 
+from .articulated import dof_elimination
 from .stretches import Stretches
 from .topology import Topology
 
@@ -246,9 +247,7 @@ def factor(s) -> wp.Kernel:
     One thread for each (stretch, world). ``C`` holds P+ of the innermost node of each stretch, in its parent's frame.
     ``psi_out`` receives psi through the stretch, row-major, as the weight of every stretch that hangs on it.
     """
-    T, vec21 = s.T, s.vec21
-    m = matrices(s)
-    least = T(s.least)
+    T, vec21, m, (keep_sizes, eliminate_dof) = s.T, s.vec21, matrices(s), dof_elimination(s)
 
     @wp.kernel(module=f"warp_spo_scan_articulated_{T.__name__}", enable_backward=False)
     def kernel(
@@ -276,23 +275,12 @@ def factor(s) -> wp.Kernel:
         for n in range(first, end):
             node = stretches.nodes[n]
             P += s.articulated(s.load_rigid(rigid, node, world))
-            start, count = topology.qd_start[node], topology.dof_count[node]
-            P_0 = P
-            for dof in range(start, start + count):  # the size of the terms that cancel in D waits in the place of D
-                h = s.load_motion(axis, dof, world)
-                pivot_out[dof, world] = s.magnitude(P, h, h) + wp.abs(armature[dof, world])
+            start, count, P_0 = topology.qd_start[node], topology.dof_count[node], P
+            keep_sizes(P, start, count, world, axis, armature, pivot_out)
             for e in range(count):
                 dof = start + count - 1 - e
-                h = s.load_motion(axis, dof, world)
-                size = pivot_out[dof, world]
-                result = s.eliminate(P, h, armature[dof, world], least * size)
-                P, U, D = result[0:21], result[21:27], result[27]
-                s.store_motion(gain_out, dof, world, U)
-                pivot_out[dof, world] = D
-                for other in range(start, dof):
-                    g = s.load_motion(axis, other, world)
-                    share = wp.abs(wp.dot(g, U)) / D
-                    pivot_out[other, world] += s.cancellation(s.magnitude(P_0, g, h), share, size)
+                h, armed = s.load_motion(axis, dof, world), armature[dof, world]
+                P, U, D = eliminate_dof(P, P_0, h, armed, start, dof, world, axis, gain_out, pivot_out)
                 psi -= wp.outer(psi * h / D, U)
             place = s.load_pose(pose, node, world)
             psi = m.rows_to_parent(place, psi)  # of a root, too: gravity comes from there
