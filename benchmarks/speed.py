@@ -335,6 +335,8 @@ def _run(lines: list[Line], device: str, seconds: float, file: Path | None) -> i
         left = [call for call in (line.call, line.beside) if call is not None and call not in rows]
         why = "; ".join(f"{call!s}: {failed.get(call, f'not ready in {seconds:.0f} s')}" for call in left)
         print(f"not measured: {line.call!s}: {why}")
+    for call in sorted(rows, key=lambda call: -rows[call]["prepare_s"])[:3]:
+        print(f"longest to prepare: {call!s}, {rows[call]['prepare_s']:.0f} s")
     print(f"{len(lines) - len(waiting)} of {len(lines)} lines in {time.perf_counter() - begin:.0f} s", flush=True)
     wrong = [row for row in rows.values() if not row["error"] <= row.get("tolerance", TOLERANCE[row["dtype"]])]
     for row in wrong:

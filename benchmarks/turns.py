@@ -19,6 +19,11 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 LATEST = 30.0  # [s] after which a turn ends, whatever it does
+THREADS = (
+    "OPENBLAS_NUM_THREADS",
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+)  # of NumPy: those of many processes wait in turns
 
 
 class Turn:
@@ -84,6 +89,8 @@ def take_turns(tasks: Sequence[Any], work: Work, seconds: float, jobs: int | Non
         workers[mine] = _Worker(process, rest.popleft())
         mine.send(workers[mine].task)
 
+    for name in THREADS:
+        os.environ.setdefault(name, "1")  # of the processes that start now
     before = signal.signal(signal.SIGTERM, _leave)
     try:
         while (rest or workers) and time.monotonic() < end:
