@@ -50,22 +50,7 @@ def set_values(self: Dynamics, *, worlds: AnyArray | None = None, **values: Any)
         variable: dict[str, Any] = {}
         chosen = None if worlds is None else read_mask(call, "worlds", worlds, self.worlds)
         for name, value in values.items():
-            if name not in VARIABLE:
-                raise ValueError(f"Dynamics.set: unknown value {name!r}; expected one of {', '.join(VARIABLE)}")
-            if not hasattr(value, "shape"):
-                try:
-                    value = real(value)
-                except (TypeError, ValueError):
-                    raise TypeError(f"Dynamics.set: {name} is {value!r}; expected an array of numbers") from None
-            shape = self.scene.values[name].shape[1:]
-            if len(shape_of(value)) > len(shape) and name not in SHARED:
-                shape = (self.worlds, *shape)
-            followed = name in self._gradients.values and records_gradient((value,))
-            plain = value.detach() if followed else value
-            meaning = (
-                "[...], because all worlds share it" if name in SHARED else "[world, ...] or [...] as Newton has it"
-            )
-            array = call.read(name, plain, shape, meaning)
+            value, array = _read(self, call, name, value)
             if name in self.variable:
                 _inspect(name, value, worlds, self.scene.values[name].ndim)
                 variable[name] = array
@@ -89,6 +74,23 @@ def set_values(self: Dynamics, *, worlds: AnyArray | None = None, **values: Any)
             for name in folded:
                 self.values.set(name, None)
             _rebuild(self, checked)
+
+
+def _read(dyn: Dynamics, call: Call, name: str, value: Any) -> tuple[Any, Any]:
+    """Return what was given for a value, an array, and the Warp array that has its numbers; errors by name."""
+    if name not in VARIABLE:
+        raise ValueError(f"Dynamics.set: unknown value {name!r}; expected one of {', '.join(VARIABLE)}")
+    if not hasattr(value, "shape"):
+        try:
+            value = real(value)
+        except (TypeError, ValueError):
+            raise TypeError(f"Dynamics.set: {name} is {value!r}; expected an array of numbers") from None
+    shape = dyn.scene.values[name].shape[1:]
+    if len(shape_of(value)) > len(shape) and name not in SHARED:
+        shape = (dyn.worlds, *shape)
+    followed = name in dyn._gradients.values and records_gradient((value,))
+    meaning = "[...], because all worlds share it" if name in SHARED else "[world, ...] or [...] as Newton has it"
+    return value, call.read(name, value.detach() if followed else value, shape, meaning)
 
 
 def reset(

@@ -127,28 +127,14 @@ class ClosedLoops:
             apart = [id(child) for child in link.children if id(child) not in self.cluster_of]
             bundles = list(map(id, self.hanging.get(key, ())))
             carried = [inner[other] for other in apart + bundles]
-            force = articulated.gyroscopic(link.inertia, self.trace.motions[key])
-            if loads:
-                force = force - self.trace.external_wrench(link)
-            if wrenches and key in wrenches:
-                force = force - wrenches[key]
+            force = self._force(link, loads, (wrenches or {}).get(key))
             for other in apart + bundles:
                 force = force + forces[other]
             cluster = self.cluster_of.get(key)
             if cluster is None:
-                through = [
-                    (self.trace.places[id(c)].pose, swept.links[id(c)].P) for c in link.children if id(c) in apart
-                ]
+                through = [(self.trace.places[child].pose, swept.links[child].P) for child in apart]
                 through += [(HERE, inner[other]) for other in bundles]
-                place = self.trace.places[key]
-                stiff = self.trace.stiffened(link)
-                swept.links[key] = done = articulated.factor(stiff, place, carried, through, self.trace.epsilon)
-                self.trace.label(link, "z")
-                right = [tau(dof) for dof in link.dofs]
-                inner[key] = done.in_parent
-                swept.link_rates[key], forces[key] = articulated.reduce_link(
-                    link, place, done, self.trace.motions[key], force, right
-                )
+                inner[key], forces[key] = self._reduce(link, carried, through, force, swept, tau)
                 continue
             own[key], z[key] = NO_INERTIA if link.inertia is None else link.inertia.articulated, force
             for inertia in carried:
@@ -159,6 +145,25 @@ class ClosedLoops:
                 found = self._eliminate(cluster, space, k, swept, own, z, tau)
                 inner[id(cluster)], forces[id(cluster)] = found
         return swept
+
+    def _force(self, link: Link, loads: bool, wrench: Vector | None) -> Vector:
+        """Return velocity terms less the wrenches on a link: body_f with ``loads``, and a further one."""
+        force = articulated.gyroscopic(link.inertia, self.trace.motions[id(link)])
+        if loads:
+            force = force - self.trace.external_wrench(link)
+        return force if wrench is None else force - wrench
+
+    def _reduce(
+        self, link: Link, carried: list[Articulated], through: list, force: Vector, swept: Swept, tau: Callable
+    ) -> tuple[Articulated, Vector]:
+        """Eliminate a link that is in no cluster; return P+ and z+ in its parent's frame."""
+        key, place, move = id(link), self.trace.places[id(link)], self.trace.motions[id(link)]
+        stiff = self.trace.stiffened(link)
+        swept.links[key] = done = articulated.factor(stiff, place, carried, through, self.trace.epsilon)
+        self.trace.label(link, "z")
+        right = [tau(dof) for dof in link.dofs]
+        swept.link_rates[key], on_parent = articulated.reduce_link(link, place, done, move, force, right)
+        return done.in_parent, on_parent
 
     def _shortest(self, cluster: Cluster, swept: Swept, moves: bool) -> tuple[NullSpace, Columns]:
         tied = self.tie(cluster)
