@@ -73,8 +73,12 @@ def declare(couples: Couples, T: type, shared: bool = False) -> str:
     shapes = coupling_points.NATIVE[: coupling_points.NATIVE.index("    // Finds the points of a pair")]
     laws = coupling_points.NATIVE[coupling_points.NATIVE.index("    // Begins the damper of a point") :]
     text = NATIVE.replace("SHAPES", shapes.strip()).replace("LAWS", laws.strip())
-    text = hulls.lines(text, bool(couples.solids.hulls))
-    text = text.replace("REAL", c).replace("FUSED", f"FUSED_{c}").replace("TABLES", "\n    ".join(tables))
+    text = (
+        hulls.lines(text, bool(couples.solids.hulls))
+        .replace("REAL", c)
+        .replace("FUSED", f"FUSED_{c}")
+        .replace("TABLES", "\n    ".join(tables))
+    )
     text = text.replace("NOTHING", f"1e-24{number}").replace("AWAY", f"{AWAY!r}{number}")
     for word, pragma in (("UNROLL", "#pragma unroll"), ("LOOP", "#pragma unroll 1")):
         text = text.replace(f"{word}\n", f"{pragma}\n")
@@ -83,7 +87,7 @@ def declare(couples: Couples, T: type, shared: bool = False) -> str:
     arrays = [f"{c} couple_{name}_row[{count}] = {{}};" for name, count in own.items()]
     arrays += [f"int couple_{name}_row[{pairs}] = {{}};" for name in ("count", "closed", "candidate")]
     column = SHARED if shared else "typedef REAL* Column;"
-    solids = touches.native(T, couples.solids.hulls)
+    solids = touches.native(T, *couples.solids.met)
     return "\n".join([column.replace("REAL", c), solids, text.replace("CONSTANTS", constants), *arrays])
 
 

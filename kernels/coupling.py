@@ -89,7 +89,7 @@ def declare(couples: Couples, T: type) -> str:
     constants = ", ".join(f"{name} = {value}" for name, value in sizes.items())
     own = {"across": first[-1], "closed": first[-1], "candidate": first[-1], "force": 6 * pairs, "arm": 7 * pairs}
     arrays = [f"{c} pair_{name}_row[{count}] = {{}};" for name, count in own.items()]
-    return "\n".join([COLUMN, touches.native(T, couples.solids.hulls), text.replace("CONSTANTS", constants), *arrays])
+    return "\n".join([COLUMN, touches.native(T, *couples.solids.met), text.replace("CONSTANTS", constants), *arrays])
 
 
 def shared_arrays(couples: Couples) -> dict[str, int]:

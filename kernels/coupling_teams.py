@@ -70,4 +70,4 @@ def declare(team: Any, T: type, local: bool = False) -> str:
     if local:
         text = text.replace("__noinline__", "inline").replace("STRIDE = 32", "STRIDE = 1")
     constants = ", ".join(f"{name} = {value}" for name, value in sizes.items())
-    return COLUMN + touches.native(T, team.solids.hulls) + text.replace("CONSTANTS", constants)
+    return COLUMN + touches.native(T, *team.solids.met) + text.replace("CONSTANTS", constants)

@@ -5,7 +5,7 @@ face is the one whose plane is nearest. Outside, the nearest point lies on a fac
 the point is over the face, or on one of its edges. All faces are looked at, in one order, so that a world does the same
 among others as alone; of two that are as near, the first counts.
 
-Lines of native text that begin with HULLS are there only in scenes with hulls.
+Lines of native text that begin with HULLS are there only in scenes with hulls, and so with other such words.
 """
 
 import re
@@ -13,20 +13,22 @@ from typing import Any
 
 import warp as wp
 
+from . import sticks
 from .elementary import C_TYPE
 
 EDGE = 7  # numbers of an edge: where it begins, what leads to its end, 1 / length^2
 
 
-def lines(text: str, there: bool) -> str:
-    """Return native text with its lines for hulls, or without."""
-    return text.replace("HULLS ", "") if there else re.sub(r"^ *HULLS .*\n", "", text, flags=re.MULTILINE)
+def lines(text: str, there: bool, word: str = "HULLS") -> str:
+    """Return native text with its lines for hulls, or for what else they begin with, or without these lines."""
+    return text.replace(f"{word} ", "") if there else re.sub(rf"^ *{word} .*\n", "", text, flags=re.MULTILINE)
 
 
-def native(hulls: Any, T: type) -> str:
+def native(hulls: Any, T: type, long: bool) -> str:
     """Return the definition of ``hulls`` for scalars of type ``T``; nothing where there are none.
 
-    Each has ``planes``, four numbers a face, and ``edges``, EDGE numbers for each edge of each face.
+    Each has ``planes``, four numbers a face, and ``edges``, EDGE numbers for each edge of each face. ``long``: some
+    pair is of a segment and a box or a hull.
     """
     if not hulls:
         return ""
@@ -43,7 +45,8 @@ def native(hulls: Any, T: type) -> str:
     integers = {"first_face": first_face, "first_edge": first_edge}
     tables = [_table("int", name, [str(x) for x in row]) for name, row in integers.items()]
     tables += [_table(C_TYPE[T], name, [f"{x!r}{number}" for x in row]) for name, row in reals.items()]
-    text = NATIVE.replace("TABLES", "\n    ".join(tables)).replace("REAL", C_TYPE[T]).replace("EDGE", str(EDGE))
+    text = lines(NATIVE, long, "STICKS").replace("OVER_FACE\n", sticks.OVER_FACE)
+    text = text.replace("TABLES", "\n    ".join(tables)).replace("REAL", C_TYPE[T]).replace("EDGE", str(EDGE))
     return text.replace("UNROLL\n", "#pragma unroll\n").replace("LOOP\n", "#pragma unroll 1\n")
 
 
@@ -115,5 +118,7 @@ struct hulls
         for (int c = 0; c < 3; ++c) away[c] = rest[c] / least;
         return least;
     }
+
+    STICKS OVER_FACE
 };
 """

@@ -1,4 +1,4 @@
-"""Points that two convex shapes share: segments with radii, spheres and boxes or hulls, and boxes by clipped faces.
+"""Points that two convex shapes share: segments with radii, these with boxes or hulls, and boxes by clipped faces.
 
 The array of touches is [entry, world]. A pair has a header, the origin of the
 second body from that of the first, and then POINT entries for each of its points: place from the first body's origin,
@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from . import hulls
+from . import hulls, sticks
 from .elementary import C_TYPE
 
 HEADER, POINT, AWAY = 3, 7, -1e3
@@ -17,18 +17,23 @@ MOST = 8  # points of two boxes
 LEAD = 0.05  # share of the smallest half size by which the second box must be farther away to give the common face
 
 
-def native(T: type, of: Any = ()) -> str:
-    """Return the definition of ``solids`` for scalars of type ``T``, of shapes among which are the hulls ``of``."""
+def native(T: type, of: Any = (), long: bool = False) -> str:
+    """Return the definition of ``solids`` for scalars of type ``T``, of shapes among which are the hulls ``of``.
+
+    ``long``: some pair is of a segment and a box or a hull.
+    """
     number = "f" if T is wp.float32 else ""
     text = (
-        hulls.lines(NATIVE, bool(of))
+        hulls.lines(hulls.lines(NATIVE, long, "STICKS").replace("STICK_IN_BOX\n", sticks.IN_BOX), bool(of))
         .replace("REAL", C_TYPE[T])
         .replace("UNROLL\n", "#pragma unroll\n")
         .replace("LOOP\n", "#pragma unroll 1\n")
     )
-    for name, value in {"AWAY": AWAY, "LEAD": LEAD, "PARALLEL": 1e-6}.items():
+    for name, value in {"AWAY": AWAY, "LEAD": LEAD, "FLAT": sticks.FLAT, "PARALLEL": 1e-6}.items():
         text = text.replace(name, f"{value!r}{number}")
-    return hulls.native(of, T) + text.replace("POINT", str(POINT)).replace("MOST", str(MOST))
+    return hulls.native(of, T, long) + text.replace("POINT", str(POINT)).replace("MOST", str(MOST)).replace(
+        "HALVINGS", str(sticks.HALVINGS[T])
+    )
 
 
 NATIVE = r"""
@@ -166,6 +171,7 @@ struct solids
         out.put(at, normal, depth);
     }
 
+    STICKS STICK_IN_BOX
     // A corner or a crossing of the polygon, in the common face: across it, and how deep.
     struct Corner
     {
@@ -364,6 +370,8 @@ struct solids
     {
         Out out = {to, apart, 0};
         if (a.box && b.box) faces(a, b, out);
+        STICKS else if (a.box && b.size[2] > 0) stick_in_box(b, a, true, out);
+        STICKS else if (b.box && a.size[2] > 0) stick_in_box(a, b, false, out);
         else if (a.box) ball_in_box(b, a, true, out);
         else if (b.box) ball_in_box(a, b, false, out);
         else rounds(a, b, out);

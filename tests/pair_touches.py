@@ -55,7 +55,7 @@ REAL *out = touches_out.data + row[4] * worlds + world, zero[3] = {0, 0, 0}, bet
 for (int c = 0; c < 3; ++c) out[c * worlds] = between[c] = two[c] - one[c];
 const solids::Solid a = placing::place(zero, one + 3, shape, row[2]);
 const solids::Solid b = placing::place(between, two + 3, shape + ENTRIES, row[3]);
-solids::touch(a, b, out + HEADER * worlds, worlds, row[2] && row[3] ? MOST : 1);
+solids::touch(a, b, out + HEADER * worlds, worlds, row[2] && row[3] ? MOST : row[2] || row[3] ? 4 : 1);
 """
 
 
@@ -84,7 +84,9 @@ def find_touches(T, of=()) -> wp.Kernel:
         text = text.replace(name, str(value))
     arrays = {"poses": wp.array3d[T], "pairs": wp.array2d[int], "shapes": wp.array2d[T], "touches_out": wp.array2d[T]}
     find = native.function(
-        "find_touch", NATIVE[C_TYPE[T]] + touches.native(T, of) + text, {"pair": int, "world": int, **arrays}
+        "find_touch",
+        NATIVE[C_TYPE[T]] + touches.native(T, of, long=True) + text,
+        {"pair": int, "world": int, **arrays},
     )
 
     @wp.kernel(module=f"warp_spo_touches_{len(of)}_{T.__name__}", enable_backward=False)

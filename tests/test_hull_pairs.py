@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 from pair_scenes import WEDGE, cube, free, stepped
 from pair_touches import find_touches, hull_of, polyhedron
-from scipy.optimize import nnls
+from scipy.optimize import minimize_scalar, nnls
 from scipy.spatial import ConvexHull
 from test_pairs import assert_is_dense, plant
 
@@ -62,7 +62,6 @@ def test_a_hull_that_is_none_has_a_name():
         (dict(hull=ball[:36]), dict(sphere=0.1), spo.UnsupportedError, f"68 faces, more than {MOST}"),
         (solid, dict(box=(1, 1, 1)), spo.UnsupportedError, "a hull with a box .* points or spheres on one of the two"),
         (solid, dict(hull=CUBE), spo.UnsupportedError, "a hull with a hull"),
-        (solid, dict(capsule=((0, 0, 0), (0, 0, 1), 0.1)), spo.UnsupportedError, "a capsule with a hull .* spheres"),
     ]
     for one, other, kind, message in cases:
         for a, b in ((one, other), (other, one)):
@@ -89,28 +88,38 @@ def truth(local, corners):
 BODIES = (TETRAHEDRON, WEDGE, CUBE, CAN)
 
 
-def touched(device, corners, order, places, radius, dtype=wp.float64):
-    """Points of a ball at ``places`` in the frame of a hull, as native code finds them: place, normal, depth."""
+def touched(device, corners, order, places, radius, dtype=wp.float64, half=0.0, turns=(0, 0, 0, 1)):
+    """Points of a ball or a capsule at ``places`` in the frame of a hull, as native code finds them.
+
+    Return place, normal, depth; of the four points of a capsule [world, point, ...]. Its ``turns`` are in that frame.
+    """
     hull, middle = hull_of(corners)
     turn = np.array([0.1, -0.3, 0.2, 0.9])
     turn /= np.linalg.norm(turn)
     frame = homogeneous([0.3, -0.2, 0.5, *turn])
     poses = np.zeros((len(places), 2, 7))
-    poses[:, 1], poses[:, 0, 6] = [0.3, -0.2, 0.5, *turn], 1.0
+    poses[:, 1], poses[:, 0, 3:] = [0.3, -0.2, 0.5, *turn], product(turn, np.broadcast_to(turns, (len(places), 4)))
     poses[:, 0, :3] = places @ frame[:3, :3].T + frame[:3, 3]
-    half = np.ptp(hull.corners, axis=0) / 2.0
-    rows = np.array([[0, 0, 0, 0, 0, 0, 1, 0, 0, 0, radius], [*middle, 0, 0, 0, 1, *half, 0.0]])
+    sizes = np.ptp(hull.corners, axis=0) / 2.0
+    rows = np.array([[0, 0, 0, 0, 0, 0, 1, 0, 0, half, radius], [*middle, 0, 0, 0, 1, *sizes, 0.0]])
     kinds = [0, 2]
     if order:
         poses, rows, kinds = poses[:, ::-1].copy(), rows[::-1].copy(), [2, 0]
-    out = wp.full((touches.HEADER + touches.POINT, len(places)), np.nan, dtype=dtype, device=device)
+    out = wp.full((touches.HEADER + 4 * touches.POINT, len(places)), np.nan, dtype=dtype, device=device)
     given = [wp.array(poses, dtype=dtype, device=device), wp.array([[0, 1, *kinds, 0]], dtype=int, device=device),
              wp.array(rows, dtype=dtype, device=device)]  # fmt: skip
     find = find_touches(dtype, (polyhedron(corners),))
     wp.launch(find, (1, len(places)), given, [out], device=device)
     found, sign = np.float64(out.numpy())[touches.HEADER :].T, -1.0 if order else 1.0
-    at = found[:, :3] + poses[:, 0, :3] - frame[:3, 3]
-    return at @ frame[:3, :3], sign * found[:, 3:6] @ frame[:3, :3], found[:, 6]
+    found = found.reshape(len(places), 4, touches.POINT) if half else found[:, : touches.POINT]
+    at = found[..., :3] + (poses[:, None] if half else poses)[..., 0, :3] - frame[:3, 3]
+    return at @ frame[:3, :3], sign * found[..., 3:6] @ frame[:3, :3], found[..., 6]
+
+
+def product(a, b):
+    """The product of a quaternion with others."""
+    v = a[3] * b[:, :3] + b[:, 3:] * a[:3] + np.cross(a[:3], b[:, :3])
+    return np.column_stack([v, a[3] * b[:, 3] - b[:, :3] @ a[:3]])
 
 
 def around(corners, rng, count=60):
@@ -173,6 +182,39 @@ def test_a_planted_bug_of_hulls_is_seen(monkeypatch, device, bug):
 
 
 @pytest.mark.slow
+def test_capsules_on_a_hull_are_nearest_where_they_touch(device):
+    """The deepest point is as deep as the axis is near, which a search along it finds; two are about as near."""
+    rng, half, radius = np.random.default_rng(0), 0.12, 0.03
+    for corners in (WEDGE, TETRAHEDRON):
+        places = around(corners, rng, 40)
+        turns = rng.normal(size=(len(places), 4))
+        turns /= np.linalg.norm(turns, axis=1)[:, None]
+        for order in (0, 1):
+            at, normal, depth = touched(device, corners, order, places, radius, half=half, turns=turns)
+            outside = 0
+            for i, (place, turn) in enumerate(zip(places, turns, strict=True)):
+                axis = homogeneous([0, 0, 0, *turn])[:3, 2]
+                found = minimize_scalar(lambda s: truth(place + s * axis, corners)[0], bounds=(-half, half),  # noqa: B023
+                                        method="bounded", options=dict(xatol=1e-9))  # fmt: skip
+                near = min(found.fun, *(truth(place + s * axis, corners)[0] for s in (-half, half)))
+                np.testing.assert_allclose(radius - depth[i].max(), near, atol=1e-7)
+                if near < 1e-3:  # inside, depths are along the normal of the nearest face
+                    continue
+                outside += 1
+                for end in range(4):
+                    on_axis = at[i, end] + (radius - 0.5 * depth[i, end]) * normal[i, end]
+                    along = (on_axis - place) @ axis
+                    np.testing.assert_allclose(on_axis, place + along * axis, atol=1e-9)
+                    distance, _ = truth(on_axis, corners)
+                    assert abs(along) <= half + 1e-9
+                    if end in (1, 2):
+                        assert near - 1e-9 < distance < near + 1.001e-3 * half
+                    else:
+                        np.testing.assert_allclose(radius - depth[i, end], distance, atol=1e-9)
+            assert outside > 20
+
+
+@pytest.mark.slow
 def test_points_of_a_hull_in_float32(device):
     """As exact near edges and corners as elsewhere: the normal of a ball comes from far enough."""
     places = around(WEDGE, np.random.default_rng(0))
@@ -228,6 +270,10 @@ def rocks():
         spo.Contact(1, **rock, other=spo.Contact(0, **ball), **LAW),
         spo.Contact(2, **tip, other=spo.Contact(1, **rock), friction=0.6, **LAW),
         spo.Contact(1, **rock, other=spo.Contact(-1, sphere=((0.09, 0.12, 0.33), 0.05)), **LAW),
+        spo.Contact(2, capsule=((0.04, 0.0, 0.1), (0.04, 0.0, -0.18), 0.03), other=spo.Contact(1, **rock), **LAW),
+        spo.Contact(
+            0, box=(0.03, 0.03, 0.03), other=spo.Contact(2, capsule=((0, 0, 0), (-0.045, 0.0, -0.41), 0.02)), **LAW
+        ),
     ]
     return spo.Scene(bodies, hinges, contacts=contacts)
 

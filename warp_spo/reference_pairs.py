@@ -12,6 +12,7 @@ import numpy as np
 from .reference_contact import SLIP, ContactStep, Points
 from .reference_rotations import homogeneous
 
+FLAT = 1e-3  # share of a capsule's half length by which it may come away from a face that it lies on
 LEAD = 0.05  # share of the smallest half size by which the second box must be farther away to give the common face
 
 
@@ -22,9 +23,9 @@ class PairStep(ContactStep):
         pair_of: by point after those with the ground, the number of its pair.
     """
 
-    def _points(self):
+    def _points(self, path):
         dense, scene, rows, self.numbers, self.pair_of = self.dense, self.scene, [], [], []
-        ground = super()._points() if scene.contact_points else None
+        ground = super()._points(path) if scene.contact_points else None
         for number, pair in enumerate(scene.contact_pairs):
             at = len(scene.contact_points) + number
             k, d, mu = (dense.value(f"contact_{name}")[at] for name in ("stiffness", "damping", "friction"))
@@ -83,9 +84,8 @@ def touches(first, second):
     if first[0] == second[0] == 1:
         return faces(first, second)
     if first[0] == 0:
-        return [ball_in(first, second)]
-    point, normal, depth = ball_in(second, first)
-    return [(point, -normal, depth)]
+        return round_in(first, second)
+    return [(point, -normal, depth) for point, normal, depth in round_in(second, first)]
 
 
 def rounds(first, second):
@@ -119,14 +119,61 @@ def nearest(a, b, c, d):
     return a + s * u, c + t * v
 
 
-def ball_in(ball, solid):
-    """Return the point of a sphere and a box or a hull; the normal leads out of that."""
-    (_, at, _, radius), (kind, place, size, _) = ball, solid
-    local = place[:3, :3].T @ (at[:3, 3] - place[:3, 3])
-    distance, normal = (out_of_box if kind == 1 else out_of_hull)(local, size)
-    depth = radius - distance
-    surface = local - distance * normal  # of the solid
-    return place[:3, :3] @ (surface - 0.5 * depth * normal) + place[:3, 3], place[:3, :3] @ normal, depth
+def round_in(stick, solid):
+    """Return the points of a sphere or a capsule and a box or a hull; the normal leads out of that.
+
+    Those of a capsule are the ends of the part of its axis that is nearest, but for FLAT of its half length, and the
+    ends of the part over the face that is there. All have the normal of the nearest place on the axis, along which the
+    depth of the first two is measured.
+    """
+    (_, axis, (_, _, half), radius), (kind, place, size, _) = stick, solid
+    middle, along = place[:3, :3].T @ (axis[:3, 3] - place[:3, 3]), half * place[:3, :3].T @ axis[:3, 2]
+    out_of = lambda share: (out_of_box if kind == 1 else out_of_hull)(middle + share * along, size)  # noqa: E731
+    nearest = first_where(lambda share: out_of(share)[1] @ along > 0.0, -1.0, 1.0) if half > 0.0 else 0.0
+    least, normal = out_of(nearest)
+    ends = [(nearest, least)]
+    if half > 0.0:
+        far = lambda share: out_of(share)[0] > least + FLAT * half  # noqa: E731
+        ends = [first_where(lambda share: not far(share), -1.0, nearest), first_where(far, nearest, 1.0)]
+        slope = 0.0 if -1.0 + 1e-12 < nearest < 1.0 else along @ normal
+        ends = [(share, max(least, least + (share - nearest) * slope)) for share in ends]
+        corners = size if kind == 2 else np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size
+        part = over_face(corners, middle, along, normal)
+        low, high = ((share, out_of(share)[0]) for share in (part if part[0] < part[1] else (nearest, nearest)))
+        ends = [low, *ends, high]
+    found = []
+    for share, distance in ends:
+        depth = radius - distance
+        surface = middle + share * along - distance * normal  # of the solid
+        point = place[:3, :3] @ (surface - 0.5 * depth * normal) + place[:3, 3]
+        found.append((point, place[:3, :3] @ normal, depth))
+    return found
+
+
+def over_face(corners, middle, along, normal):
+    """Return between which shares of a segment it lies over the face of a hull that ``normal`` points out of most."""
+    size, begin, end = np.ptp(corners, axis=0).max(), -1.0, 1.0
+    up, offset = max(planes(corners), key=lambda plane: round(plane[0] @ normal, 9))
+    on = corners[np.abs(corners @ up - offset) < 1e-9 * size]
+    for a in on:
+        for b in on:
+            outward = np.cross(b - a, up)
+            if ((on - a) @ outward).max() > 1e-9 * size**2 or not outward.any():
+                continue
+            apart, rate = (middle - a) @ outward, along @ outward
+            if rate > 0.0:
+                end = min(end, -apart / rate)
+            elif rate < 0.0:
+                begin = max(begin, -apart / rate)
+    return begin, end
+
+
+def first_where(true, low, high):
+    """Return the least number between two from which on something is true, by halving; ``high`` if it never is."""
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if true(middle) else (middle, high)
+    return high
 
 
 def out_of_box(local, half):
@@ -143,24 +190,27 @@ def out_of_box(local, half):
     return distance, normal
 
 
+def planes(corners):
+    """Return normals and offsets of the planes through three corners that have none beyond them; some several times."""
+    size, found = np.ptp(corners, axis=0).max(), []
+    for a, b, c in combinations(corners, 3):
+        across = np.cross(b - a, c - a)
+        if np.linalg.norm(across) > 1e-9 * size**2:
+            normal = across / np.linalg.norm(across)
+            sides = [way * normal for way in (1.0, -1.0) if (way * (corners - a) @ normal).max() <= 1e-9 * size]
+            found += [(side, side @ a) for side in sides]
+    return found
+
+
 def out_of_hull(local, corners):
     """Return the same of a hull: from its corners alone.
 
     Inside, the nearest plane through three corners with none beyond it. Outside, the nearest of all points in the hulls
     of three corners, two, or one; that of three counts where the point over it lies between them.
     """
-    size, best = np.ptp(corners, axis=0).max(), None
-    for a, b, c in combinations(corners, 3):
-        across = np.cross(b - a, c - a)
-        if np.linalg.norm(across) < 1e-9 * size**2:
-            continue
-        normal = across / np.linalg.norm(across)
-        heights = (corners - a) @ normal
-        for way in (1.0, -1.0):
-            if (way * heights).max() <= 1e-9 * size and (best is None or way * normal @ (local - a) > best[0]):
-                best = way * normal @ (local - a), way * normal
-    if best[0] <= 0.0:
-        return best
+    up, offset = max(planes(corners), key=lambda plane: plane[0] @ local - plane[1])
+    if up @ local - offset <= 0.0:
+        return up @ local - offset, up
     points = list(corners)
     for some in [*combinations(corners, 2), *combinations(corners, 3)]:
         sides = np.array(some[1:]) - some[0]

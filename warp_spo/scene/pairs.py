@@ -16,6 +16,7 @@ from .storage import StoredPart
 SINK = 1e-4  # how far the lighter body sinks in [m] that rests on the other one, where the stiffness is chosen
 DAMPING = 2.0  # of sqrt(k m): critical, so that stacks come to rest
 FACE = 8  # corners at most of the common part of two rectangles
+PART = 4  # ends of the part of a segment that is near a box or a hull
 ROUND, BOX, HULL = 0, 1, 2
 
 
@@ -81,20 +82,25 @@ def contact_pairs(contacts: Sequence[Any], body_count: int) -> tuple[ContactPair
             raise ValueError(f"{call} is of body {contact.body} with itself; expected two bodies")
         first, second = shape_of(call, contact), shape_of(call, partner)
         _check_kinds(call, first, second)
-        points = FACE if {first.kind, second.kind} == {BOX} else 1
-        found.append(ContactPair(index, contact.body, partner.body, (first, second), points, contact.eps))
+        both = (first, second)
+        found.append(ContactPair(index, contact.body, partner.body, both, most_points(*both), contact.eps))
     return tuple(found)
+
+
+def most_points(first: Solid, second: Solid) -> int:
+    """Return how many points two shapes share at most."""
+    if ROUND not in (first.kind, second.kind):
+        return FACE
+    stick = max(one.size[2] for one in (first, second) if one.kind == ROUND) > 0.0
+    return PART if stick and {first.kind, second.kind} != {ROUND} else 1
 
 
 def _check_kinds(call: str, first: Solid, second: Solid) -> None:
     """Raise UnsupportedError where two shapes have no points in common that a pair could find."""
-    shapes = {one.kind: one for one in (first, second)}
-    flat = "a hull" if HULL in shapes else "a box"
-    if ROUND in shapes and len(shapes) > 1 and shapes[ROUND].size[2] > 0.0:
-        raise UnsupportedError(call, f"a capsule with {flat}", "use spheres along the capsule, or a box in its place")
-    if HULL in shapes and ROUND not in shapes:
+    kinds = {first.kind, second.kind}
+    if HULL in kinds and ROUND not in kinds:
         raise UnsupportedError(
-            call, f"a hull with {'a box' if BOX in shapes else 'a hull'}",
+            call, f"a hull with {'a box' if BOX in kinds else 'a hull'}",
             "put points or spheres on one of the two, such as at corners that touch, a contact each; or boxes in place "
             "of both",
         )  # fmt: skip

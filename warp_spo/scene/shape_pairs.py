@@ -22,12 +22,12 @@ ALL = "all"
 MOST = 32
 """Pairs at most that "all" stands for: what compiles in seconds. Nine boxes, 36 pairs, took 11 s on a CPU."""
 KINDS = ("sphere", "capsule", "box", "hull")
-WITH = {"sphere": set(KINDS), "capsule": {"sphere", "capsule"}, "box": {"sphere", "box"}, "hull": {"sphere"}}
+ROUND = {"sphere", "capsule"}
+WITH = {"sphere": set(KINDS), "capsule": set(KINDS), "box": ROUND | {"box"}, "hull": ROUND}
 """Kinds of shapes that pairs may have, and with which others."""
 WAYS = (
-    "pairs are of spheres and capsules, of boxes, or of a sphere with a box or a hull: put such shapes in place of "
-    "others, a row of spheres in place of a capsule that meets a box, or use another solver; contacts='ground' is for "
-    "planes and height fields"
+    "pairs are of boxes, or of a sphere or a capsule with these, a box or a hull: put such shapes in place of others, "
+    "or use another solver; contacts='ground' is for planes and height fields"
 )
 HULL_WAYS = (
     "make it convex or coarser first, such as by builder.approximate_meshes('convex_hull') of a mesh with few vertices "
@@ -64,7 +64,7 @@ class ShapePair(NamedTuple):
 def _solid(shape: Shape, more: float) -> dict[str, Any]:
     """Return a shape as arguments of a Contact; a margin makes a box larger on all sides.
 
-    That of a hull makes the sphere larger which it meets, by ``more``.
+    That of a hull makes the sphere or capsule larger which it meets, by ``more``.
     """
     place = pose_matrix(shape.pose)
     if shape.kind == "sphere":
@@ -74,7 +74,7 @@ def _solid(shape: Shape, more: float) -> dict[str, Any]:
     if shape.kind == "capsule":
         radius, half = shape.sizes
         ends = (place[:3, 3] + side * half * place[:3, 2] for side in (1.0, -1.0))
-        return {"capsule": (*ends, radius + shape.rounding)}
+        return {"capsule": (*ends, radius + shape.rounding + more)}
     return {"box": (np.asarray(shape.sizes) + shape.rounding, shape.pose)}
 
 

@@ -47,6 +47,13 @@ class Solids(NamedTuple):
         return 3 * self.bodies + 12 * self.shapes
 
     @property
+    def met(self) -> tuple[tuple[Polyhedron, ...], bool]:
+        """The hulls, and whether some pair is of a segment and a box or a hull."""
+        long = [(row[2] > 0.0, row[5] > 0.0) for row in self.half]
+        sticks = (boxes[0] != boxes[1] and long[i][boxes[0]] for i, boxes in enumerate(self.boxes))
+        return self.hulls, any(sticks)
+
+    @property
     def lists(self) -> dict[str, list[int]]:
         """Where a pair's bodies and shapes begin among these values, and their kinds."""
         flat = [side for row in self.sides for side in (row[:2], row[2:])]
