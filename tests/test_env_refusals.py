@@ -16,6 +16,8 @@ ENVIRONMENTS = [
     (dict(seed=1.5), "seed is 1.5"),
     (dict(first_world=2**33), "first_world is 8589934592"),
     (dict(dt="x"), "dt is 'x'; expected a finite number"),
+    (dict(passes=3), "Env: passes is 3, and the scene has no contacts; expected None"),
+    (dict(final_observations="maybe"), "Env: final_observations is 'maybe'; expected True or False"),
     (dict(log_interval=0), "log_interval is 0; expected an integer, 1 or more"),
     (dict(default_q=[0.0, NAN]), "default_q is .*nan.*; expected finite numbers"),
     (dict(rewards=[Q]), r"rewards is \[.*expected pairs \(weight, term\) by name"),
@@ -88,6 +90,11 @@ def test_calls_name_what_is_wrong():
         env.controls(torch.zeros(1, 1))
     with pytest.raises(ValueError, match=r"episode_length_buf: got shape \(3,\); expected \(8,\)"):
         env.episode_length_buf = torch.zeros(3)
+    with pytest.raises(ValueError, match=r"Env.command: this environment gives no commands"):
+        _ = env.command
+    for call in (env.start_at, env.load_state_dict):
+        with pytest.raises(TypeError, match=rf"Env.{call.__name__}: .* is int; expected a dictionary of tensors"):
+            call(3)
     with pytest.raises(ValueError, match=r"Env.set_seed: seed is 'x'"):
         env.set_seed("x")
     with pytest.raises(TypeError, match=r"Env: scene is NoneType; expected spo.Scene"):

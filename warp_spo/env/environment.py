@@ -114,7 +114,8 @@ class Env(VecEnv):
         self.first_world = check_whole("Env", "first_world", first_world, 0, 2**32 - 1)
         self.seed, self.cfg = check_whole("Env", "seed", seed, 0, 2**64 - 1), {} if cfg is None else cfg
         self.log_interval = check_whole("Env", "log_interval", log_interval, 1)
-        self._passes, self.has_commands, self.final = passes, commands is not None, final_observations
+        self._passes, self.has_commands = given.checked_passes(scene, passes), commands is not None
+        self.final = given.checked_bool("final_observations", final_observations)
         self._steps = 0
 
         default = given.checked_default(scene, default_q)
@@ -202,6 +203,10 @@ class Env(VecEnv):
     @property
     def command(self) -> torch.Tensor:
         """The commands [world, command]; they may be written."""
+        if not self.has_commands:
+            raise ValueError(
+                "Env.command: this environment gives no commands; expected one that was made with commands="
+            )
         return self.memory("command")
 
     # -- stepping --------------------------------------------------------------------------------------------------

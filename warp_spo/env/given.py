@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..errors import UnsupportedError
+from ..errors import UnsupportedError, is_bool
 from ..scene.scene import Scene
 from .checks import check_function, check_mapping, check_number, check_whole
 from .observations import Observation, TorchTerm
@@ -73,6 +73,20 @@ def checked_default(scene: Scene, default_q: Any) -> np.ndarray:
     if not np.isfinite(default).all():
         raise ValueError(f"Env: default_q is {default.tolist()}; expected finite numbers")
     return default
+
+
+def checked_passes(scene: Scene, passes: Any) -> int | None:
+    """Return the passes of a step, None as given; ValueError for no whole number, or for a scene without contacts."""
+    if passes is not None and not scene.contacts:
+        raise ValueError(f"Env: passes is {passes!r}, and the scene has no contacts; expected None")
+    return None if passes is None else check_whole("Env", "passes", passes, 1)
+
+
+def checked_bool(name: str, value: Any) -> bool:
+    """Return True or False; ValueError for anything else."""
+    if not is_bool(value):
+        raise ValueError(f"Env: {name} is {value!r}; expected True or False")
+    return bool(value)
 
 
 def checked_parts(actions: Any) -> list[Any]:

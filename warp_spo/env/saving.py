@@ -38,8 +38,9 @@ def start_at(self: Env, levels: Mapping[str, torch.Tensor]) -> None:
     again from the first.
 
     Raises:
-        ValueError: names or numbers per world are not those of this environment.
+        ValueError: names or numbers per world are not those of this environment. TypeError: it is no dictionary.
     """
+    _check_tensors("Env.start_at: levels", levels)
     held = self.levels()
     if levels.keys() != held.keys() or any(levels[name].shape[1:] != held[name].shape[1:] for name in held):
         came, expected = ({name: tuple(x.shape) for name, x in each.items()} for each in (levels, held))
@@ -64,7 +65,9 @@ def load_state_dict(self: Env, state: Mapping[str, torch.Tensor]) -> None:
 
     Raises:
         ValueError: a tensor is missing, too many, or has another shape or dtype than here; nothing is changed then.
+        TypeError: it is no dictionary of tensors.
     """
+    _check_tensors("Env.load_state_dict: state", state)
     held = _tensors(self)
     kinds = {name: (tuple(x.shape), x.dtype) for name, x in held.items()} | {STEPS: ((), torch.int64)}
     came = {name: (tuple(x.shape), x.dtype) for name, x in state.items()}
@@ -78,6 +81,12 @@ def load_state_dict(self: Env, state: Mapping[str, torch.Tensor]) -> None:
         tensor.copy_(state[name])
     self._steps = int(state[STEPS])
     self._set_values()
+
+
+def _check_tensors(what: str, given: Any) -> None:
+    """Raise TypeError unless something is a dictionary of tensors."""
+    if not isinstance(given, Mapping) or not all(isinstance(each, torch.Tensor) for each in given.values()):
+        raise TypeError(f"{what} is {type(given).__name__}; expected a dictionary of tensors")
 
 
 def _tensors(env: Env) -> dict[str, torch.Tensor]:
