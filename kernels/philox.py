@@ -3,9 +3,6 @@
 Salmon, Moraes, Dror and Shaw 2011, "Parallel random numbers: as easy as 1, 2, 3", algorithm Philox4x32 with 10 rounds.
 """
 
-KEY = 2  # 32-bit words
-COUNTER = 4
-
 NATIVE = r"""
 struct philox
 {

@@ -107,6 +107,25 @@ def test_ready_rewards():
 
 
 @pytest.mark.slow
+def test_ready_observations():
+    """Places of frames, and of feet over the ground, beside those of the dynamics."""
+    terms = [observations.frame_position("shank1"), observations.feet_height(FEET), observations.feet_force(FEET)]
+    terms.append(observations.feet_contact(FEET, 20.0))
+    env, touches = walker_env(4, observations={"a": terms}, events=[], rewards={}, terminations={}), []
+    for step in range(20):
+        observed, _, _, _ = env.step(torch.sin(torch.arange(32.0).view(4, 8) + step))
+        found = observed["a"].numpy()
+        place = env.dyn.frame_poses(env.q, [env.scene.body_labels.index("shank1")])[:, 0, :3].numpy()
+        assert np.allclose(found[:, :3], place, atol=1e-5)
+        assert np.allclose(found[:, 3:7], env._tensors["contact_gap"][:, :4].numpy(), atol=1e-6)
+        force = env._tensors["contact_f"][:, :4].numpy()
+        assert np.allclose(found[:, 7:19], force.reshape(4, 12), atol=1e-4)
+        touches.append(found[:, 19:] == 1.0)
+        assert np.array_equal(touches[-1], np.linalg.norm(force, axis=-1) > 20.0)
+    assert np.ptp(found[:, 3:7]) > 1e-3 and place.std() > 1e-2 and 10 < np.sum(touches) < 310
+
+
+@pytest.mark.slow
 def test_ready_terminations():
     ends = {
         "tilted": terminations.tilted(0.5),

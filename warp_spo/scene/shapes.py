@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 POINTS = 8
 """Points of a shape that is the hull of points, if the caller does not say."""
 SPREAD = 256  # points on a round surface, of which those of a hull are chosen
-RIM = 64  # points on the rim of a cylinder, of which those of a hull are chosen
 ROUNDING = 1e-15  # share of a shape's size by which an entry of a point that should be zero may differ
 UPRIGHT = 0.5  # least cosine between the normal of a ground and the upward direction
 TURNED = 1e-6  # by which axes of a height field may differ from the inertial ones
