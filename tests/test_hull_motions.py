@@ -36,7 +36,7 @@ def thrown_rock(dtype, device, steps):
 def test_a_collision_with_a_hull_keeps_momentum(device, dtype, bound):
     before, after, met = thrown_rock(dtype, device, 60)
     assert (met > 10.0).sum() >= 10
-    np.testing.assert_allclose(after[:, :3], before[:, :3], atol=bound * np.abs(before).max())
+    np.testing.assert_allclose(after[:, :3], before[:, :3], atol=bound * 0.5 * 1.5)  # that of the ball
     if dtype == "float64":  # angular momentum drifts with the order of the step where bodies spin
         np.testing.assert_allclose(after[:, 3:], before[:, 3:], atol=1e-12)
 

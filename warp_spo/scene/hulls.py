@@ -66,10 +66,11 @@ def convex_hull(call: str, points: np.ndarray, known: np.ndarray) -> tuple[Hull,
         if len(corners) > MOST:
             raise _too_many(call, f"more than {MOST} corners")
         normals, offsets = _planes(call, corners, size)
-        beyond = (centred @ normals.T - offsets).max(axis=1)
-        if beyond.max() <= SAME * size:
+        beyond = centred @ normals.T - offsets
+        far = beyond.max(axis=0) > SAME * size
+        if not far.any():
             break
-        corners = np.vstack([corners, centred[beyond.argmax()]])
+        corners = np.vstack([corners, centred[np.unique(beyond[:, far].argmax(axis=0))]])
     on = np.abs(corners @ normals.T - offsets) <= SAME * size
     faces = [_around(corners, np.flatnonzero(row), normal) for row, normal in zip(on.T, normals, strict=True)]
     if len(faces) > MOST:

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..errors import UnsupportedError, as_integer
-from .contacts import Contact, pose_matrix
-from .hulls import is_convex
-from .pairs import shape_of
+from .contacts import Contact, pose_matrix, spread_directions
+from .hulls import Hull, convex_hull, is_convex
 from .shapes import Shape
 
 if TYPE_CHECKING:
     from .scene import Scene
 
 ALL = "all"
+SOME = 64  # directions in which corners of a mesh are looked for at first
 MOST = 32
 """Pairs at most that "all" stands for: what compiles in seconds. Nine boxes, 36 pairs, took 11 s on a CPU."""
 KINDS = ("sphere", "capsule", "box", "hull")
@@ -70,7 +70,8 @@ def _solid(shape: Shape, more: float) -> dict[str, Any]:
     if shape.kind == "sphere":
         return {"sphere": (place[:3, 3], shape.sizes[0] + shape.rounding + more)}
     if shape.kind == "hull":
-        return {"hull": np.asarray(shape.sizes) @ place[:3, :3].T + place[:3, 3]}
+        hull, middle = _hull_of(shape)
+        return {"hull": (hull.corners + middle) @ place[:3, :3].T + place[:3, 3]}
     if shape.kind == "capsule":
         radius, half = shape.sizes
         ends = (place[:3, 3] + side * half * place[:3, 2] for side in (1.0, -1.0))
@@ -213,17 +214,22 @@ def _hollow(shape: Shape) -> str:
     """Return why a contact cannot have a shape whose kind it may have; "" if it can."""
     if shape.kind != "hull":
         return ""
-    points = np.asarray(shape.sizes, dtype=np.float64)
     try:
-        solid = shape_of("", Contact(0, hull=points))
+        hull, middle = _hull_of(shape)
     except UnsupportedError as error:
         return error.what
     except ValueError as error:
         return str(error).removeprefix(": ").partition(";")[0]
-    assert solid.hull is not None
-    if shape.triangles is None or is_convex(solid.hull, points - solid.pose[:3], shape.triangles):
+    if shape.triangles is None or is_convex(hull, np.asarray(shape.sizes) - middle, shape.triangles):
         return ""
     return "a mesh that is not convex"
+
+
+def _hull_of(shape: Shape) -> tuple[Hull, np.ndarray]:
+    """Return the hull of a shape's points about its middle, and that, in the axes of its pose."""
+    points = np.asarray(shape.sizes, dtype=np.float64)
+    outward = np.concatenate([spread_directions(SOME), np.eye(3), -np.eye(3)])
+    return convex_hull("", points, points[np.unique((points @ outward.T).argmax(axis=0))])
 
 
 def _is_pair(names: Any) -> bool:
