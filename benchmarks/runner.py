@@ -31,7 +31,8 @@ from .resources import record_launches, resources
 from .shapes import Recursive
 
 SETS = 4  # sets of inputs that evaluations in a row take in turn
-WARM_UP, BUDGET = 0.05, 0.5  # [s] for each case, so that a run takes minutes
+REPEATS = 12  # timed rows of calls
+WARM_UP, BUDGET, EAGER = 0.05, 0.5, 0.1  # [s] for each case, so that a run takes minutes
 SWEEP_TOLERANCE = 1e-2  # errors grow with the length of a chain, but a wrong result differs by more than this
 METRICS = (  # those that a row has are printed
     *("us", "eager_us", "torch_us", "evals_per_s", "GBps", "GFLOPs", "roof", "spread", "error", "error_median"),
@@ -137,10 +138,10 @@ def _measure(
     trial.check()
     if not check:
         with turn:
-            timing, _ = trial.measure(warm_up=WARM_UP, budget=BUDGET)
-            row["eager_us"] = 1e6 * trial.eager().median
+            timing, _ = trial.measure(REPEATS, WARM_UP, BUDGET)
+            row["eager_us"] = 1e6 * trial.eager(budget=EAGER).median
             if precision.scalar and _torch_serves(dyn.device):
-                row["torch_us"] = 1e6 * trial.eager(wp.to_torch).median
+                row["torch_us"] = 1e6 * trial.eager(wp.to_torch, budget=EAGER).median
         row |= dict(us=1e6 * timing.median, p10_us=1e6 * timing.low, p90_us=1e6 * timing.high)
         row |= dict(spread=(timing.high - timing.low) / timing.median, evals_per_s=case["worlds"] / timing.median)
         row |= _rates(case, trial, precision.scalar, timing.median, roof)
