@@ -48,6 +48,7 @@ def urdf_file(name: str) -> Path:
     """Return the path of a robot's URDF file.
 
     Raises:
+        ValueError: there is no robot of this name.
         ImportError: the environment variable FOLDER is not set, and the package is not installed.
         FileNotFoundError: FOLDER is set, and the folder does not have the robot.
     """
@@ -59,6 +60,8 @@ def urdf_file(name: str) -> Path:
                 f"robots: there is no file {str(file)!r}; expected {name}.urdf in the folder that {FOLDER} names"
             )
         return file
+    if name not in ALL:
+        raise ValueError(f"robots: there is no robot {name!r}; expected one of {', '.join(ALL)}")
     try:
         return Path(str(metadata.distribution(PACKAGE).locate_file(f"{INSTALLED}/{ALL[name].path}")))
     except metadata.PackageNotFoundError:

@@ -137,7 +137,7 @@ def draw(path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="benchmarks.contact.gradients", description=__doc__.split("\n")[0])
-    parser.add_argument("robots", nargs="*", default=["go2"])
+    parser.add_argument("robots", nargs="*", default=["go2"], help="go2, g1, ant")
     parser.add_argument("--device", default=None)
     parser.add_argument("--worlds", type=int, nargs="+", default=[4096])
     parser.add_argument("--ground", choices=["plane", "rough"], nargs="+", default=["plane", "rough"])

@@ -311,11 +311,16 @@ LINES: dict[str, Callable[[], Iterator[Line]]] = {"g1": g1_lines, "field": field
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="benchmarks.contact.motions", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     every = LINES | {name: (lambda f=f: (Line(*row) for row in f())) for name, f in courses().items()}
     parser.add_argument("names", nargs="*", help=f"among {', '.join(every)}; all if there are none")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
+    unknown = [name for name in options.names if name not in every]
+    if unknown:
+        parser.error(f"there is no motion {', '.join(unknown)}; expected some of {', '.join(every)}")
     rows = []
     for name in options.names or every:
         began = time.perf_counter()

@@ -259,11 +259,13 @@ def measure(make: Callable[..., Stepper], each: int, name: str, worlds: int, dev
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="benchmarks.contact.peers", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default=None)
     parser.add_argument("--worlds", type=int, nargs="+", default=[4096, 16384])
     parser.add_argument("--groups", nargs="+", choices=GROUPS, default=list(GROUPS))
-    parser.add_argument("--robots", nargs="+", help="some of the robots")
+    parser.add_argument("--robots", nargs="+", choices=sorted({*FILES, *MODELS}), help="left out: all of a group")
     parser.add_argument("--solvers", nargs="+", help="some of the solvers")
     parser.add_argument("--no-errors", action="store_true", help="times only")
     parser.add_argument("--json", type=Path)
