@@ -53,9 +53,9 @@ def goes_on(make, tmp_path):
     return all(map(torch.equal, found, wanted)) and all(torch.equal(log[name], other.log()[name]) for name in log)
 
 
-def test_an_environment_goes_on_from_a_file(tmp_path):
-    """Episodes end and random numbers are drawn meanwhile."""
-    assert goes_on(lambda seed: cart_env(seed=seed), tmp_path)
+def test_an_environment_goes_on_from_a_file(tmp_path, device):
+    """Episodes end and random numbers are drawn meanwhile; on CUDA the step is a graph."""
+    assert goes_on(lambda seed: cart_env(device=str(device), seed=seed), tmp_path)
 
 
 @pytest.mark.slow
