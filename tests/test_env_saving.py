@@ -124,6 +124,12 @@ def test_terrain_and_commands_have_levels():
     np.testing.assert_allclose(env.command[:, 0].numpy(), np.array([0.7, 0.3])[order], atol=1e-6)
 
 
+def test_objects_say_what_they_are():
+    assert repr(cart_env()) == "Env(8 worlds on cpu, 1 actions, observations: actor 4)"
+    dyn = spo.Dynamics(spo.Scene([spo.Body(1.0)], [spo.Hinge("free", -1, 0)]), 3, "cpu", "float64")
+    assert repr(dyn) == "Dynamics(1 bodies, 6 dof, 3 worlds on cpu, float64)"
+
+
 def test_an_argument_that_a_task_sets_is_refused():
     words = r"make: 'cartpole' takes no dt, hop; expected some of seed, first_world, .*copy its file, .*cartpole.py"
     with pytest.raises(TypeError, match=words):

@@ -294,6 +294,10 @@ class Dynamics:
         return self._closures.rows
 
     # -- what runs -------------------------------------------------------------------------------------------------
+    def __repr__(self) -> str:
+        size = f"{self.scene.body_count} bodies, {self.scene.dof_count} dof, {self.worlds} worlds on {self.device}"
+        return f"{type(self).__name__}({size}, {self.dtype.__name__})"
+
     def explain(self) -> str:
         """Return what runs where, and why."""
         scene, tree = self.scene, self.scene.tree

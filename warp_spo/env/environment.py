@@ -22,7 +22,7 @@ from .checks import check_whole
 from .events import Delays, Values, changed_values
 from .graphs import Part, Replay, run_all
 from .layout import Layout
-from .logs import Log, explain
+from .logs import Log, describe, explain
 from .observations import TorchTerm
 from .stage import Launch
 from .storage import Storage
@@ -288,7 +288,7 @@ class Env(VecEnv):
     start_at = saving.start_at
     state_dict = saving.state_dict
     load_state_dict = saving.load_state_dict
-    __reduce__ = saving.reduce
+    __reduce__, __repr__ = saving.reduce, describe
 
     # -- inside ----------------------------------------------------------------------------------------------------
     def _observations(self, out: torch.Tensor, kind: str = "") -> Any:

@@ -39,6 +39,12 @@ class Log:
         return dict(zip(self._names, [*means.unbind(), *memory[self._counts].sum(dim=1).unbind()], strict=True))
 
 
+def describe(env: Env) -> str:
+    """Return the size of an environment in a line."""
+    groups = ", ".join(f"{name} {size}" for name, size in env.num_obs.items())
+    return f"Env({env.num_envs} worlds on {env.warp_device}, {env.num_actions} actions, observations: {groups})"
+
+
 def explain(env: Env, stages: dict[str, list[Launch]], users: dict[Any, tuple[str, int]]) -> str:
     """Return what a step consists of, and what it takes in memory.
 
