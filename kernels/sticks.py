@@ -1,9 +1,9 @@
 """Points of a segment with a radius on a box or a hull, for :mod:`.touches` and :mod:`.hulls`.
 
-The distance from a convex shape is convex along a segment: halving finds where it is least, and the part of the segment
-around it that is hardly farther away. Both ends of that part are points, with the normal of the nearest place, along
-which they are less deep or as deep. The ends of what lies over the face there are points, too, as deep as they are:
-they may come near as the segment turns, and are seen before they do.
+The distance from a convex shape is convex along a segment: halving finds where it is least. Both ends of what lies over
+the face there are points, as deep as they are: they may come near as the segment turns, and are seen before they do.
+Between each of them and the nearest place, where the line of distances has risen by FLAT, is a point, too, which is
+hardly farther away than that place: less deep by the slope there, or as deep. All have the normal of the nearest place.
 """
 
 import warp as wp
@@ -64,33 +64,28 @@ IN_BOX = r"""
         }
     }
 
-    // The distance from a box or a hull is convex along a segment: halving finds where it is least, and the part of the
-    // segment around it that is hardly farther away. Both ends of that part are points, with the normal of the nearest
-    // place, along which they are less deep or as deep; and so are both ends of what lies over the face, which may come
-    // near as the segment turns, as deep as they are.
+    // Puts the four points of a segment and a box or a hull.
     static CUDA_CALLABLE inline void stick_in_box(const Solid& stick, const Solid& box, bool inward, Out& out)
     {
         REAL probe[POINT], normal[3] = {0, 0, 0}, low = -1, high = 1, nearest = 0, least = 0, slope = 0;
-        REAL along[3], ends[4] = {-1, -1, 1, 1}, away[4] = {0, 0, 0, 0};
+        REAL along[3], ends[4] = {-1, 0, 0, 1}, away[4] = {0, 0, 0, 0};
         Solid ball = stick;
         ball.radius = 0;
         UNROLL
         for (int r = 0; r < 3; ++r) along[r] = stick.size[2] * stick.turn[3 * r + 2];
         LOOP
-        for (int i = 0; i <= 3 * HALVINGS + 2; ++i) {
-            const REAL share = i == HALVINGS ? high : i > 3 * HALVINGS ? ends[i & 1 ? 0 : 3] : (REAL)0.5 * (low + high);
+        for (int i = 0; i < HALVINGS + 3; ++i) {
+            const int end = i == HALVINGS + 1 ? 0 : 3;
+            const REAL share = i < HALVINGS ? (REAL)0.5 * (low + high) : i == HALVINGS ? high : ends[end];
             UNROLL
             for (int r = 0; r < 3; ++r) ball.at[r] = stick.at[r] + share * along[r];
             Out here = {probe, 1, 0};
             ball_in_box(ball, box, false, here);
             const REAL distance = -probe[6], rise = dot(probe + 3, along);
-            const bool near = distance <= least + FLAT * stick.size[2];
-            const bool less = i < HALVINGS ? rise > 0 : i <= 2 * HALVINGS ? near : !near;
-            if (i != HALVINGS) {
-                high = less ? share : high;
-                low = less ? low : share;
-            }
-            if (i == HALVINGS) {
+            if (i < HALVINGS) {
+                high = rise > 0 ? share : high;
+                low = rise > 0 ? low : share;
+            } else if (i == HALVINGS) {
                 REAL middle[3], way[3], outward[3];
                 UNROLL
                 for (int c = 0; c < 3; ++c) {
@@ -107,19 +102,16 @@ IN_BOX = r"""
                     }
                 over_face(box, middle, way, outward, ends[0], ends[3]);
                 nearest = share;
-                if (!(ends[0] < ends[3])) ends[0] = ends[3] = nearest;
+                const bool none = !(ends[0] < ends[3]);
+                ends[0] = none || nearest < ends[0] ? nearest : ends[0];
+                ends[3] = none || nearest > ends[3] ? nearest : ends[3];
                 least = distance;
                 slope = low > -1 && high < 1 ? 0 : rise;
-                low = -1;
-                high = nearest;
+            } else {
+                const REAL more = distance - least, flat = FLAT * stick.size[2];
+                away[end] = more;
+                ends[end == 0 ? 1 : 2] = nearest + (ends[end] - nearest) * (more > flat ? flat / more : 1);
             }
-            if (i == 2 * HALVINGS) {
-                ends[1] = high;
-                low = nearest;
-                high = 1;
-            }
-            if (i == 3 * HALVINGS) ends[2] = high;
-            if (i > 3 * HALVINGS) away[i & 1 ? 0 : 3] = distance - least;
         }
         UNROLL
         for (int end = 0; end < 4; ++end) {

@@ -122,9 +122,9 @@ def nearest(a, b, c, d):
 def round_in(stick, solid):
     """Return the points of a sphere or a capsule and a box or a hull; the normal leads out of that.
 
-    Those of a capsule are the ends of the part of its axis that is nearest, but for FLAT of its half length, and the
-    ends of the part over the face that is there. All have the normal of the nearest place on the axis, along which the
-    depth of the first two is measured.
+    Those of a capsule are the ends of the part of its axis over the face where it is nearest, and, between each of them
+    and the nearest place, where a line from there to there has risen by FLAT of its half length. All have the normal of
+    the nearest place, and the depths of the last two fall with the slope there.
     """
     (_, axis, (_, _, half), radius), (kind, place, size, _) = stick, solid
     middle, along = place[:3, :3].T @ (axis[:3, 3] - place[:3, 3]), half * place[:3, :3].T @ axis[:3, 2]
@@ -133,14 +133,16 @@ def round_in(stick, solid):
     least, normal = out_of(nearest)
     ends = [(nearest, least)]
     if half > 0.0:
-        far = lambda share: out_of(share)[0] > least + FLAT * half  # noqa: E731
-        ends = [first_where(lambda share: not far(share), -1.0, nearest), first_where(far, nearest, 1.0)]
-        slope = 0.0 if -1.0 + 1e-12 < nearest < 1.0 else along @ normal
-        ends = [(share, max(least, least + (share - nearest) * slope)) for share in ends]
         corners = size if kind == 2 else np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size
-        part = over_face(corners, middle, along, normal)
-        low, high = ((share, out_of(share)[0]) for share in (part if part[0] < part[1] else (nearest, nearest)))
-        ends = [low, *ends, high]
+        low, high = over_face(corners, middle, along, normal)
+        low, high = (min(low, nearest), max(high, nearest)) if low < high else (nearest, nearest)
+        slope, ends, inner = 0.0 if -1.0 + 1e-12 < nearest < 1.0 else along @ normal, [], []
+        for end in (low, high):
+            distance = out_of(end)[0]
+            share = nearest + (end - nearest) * min(1.0, FLAT * half / max(distance - least, 1e-300))
+            ends.append((end, distance))
+            inner.append((share, max(least, least + (share - nearest) * slope)))
+        ends = [ends[0], *inner, ends[1]]
     found = []
     for share, distance in ends:
         depth = radius - distance
