@@ -95,6 +95,27 @@ def test_a_tripod_on_a_ramp(device):
 
 
 @pytest.mark.slow
+def test_a_ball_rolls_over_the_top_of_a_wedge(device):
+    """Up the slope, over the edge and down behind it: on the slope slower by 5 / 7 g sin, and no energy is gained."""
+    mass, radius, h = 2.0, 0.05, 2e-3
+    ball = spo.Body(mass, inertia=0.4 * mass * radius**2 * np.eye(3))
+    contact = spo.Contact(0, sphere=radius, other=spo.Contact(-1, hull=RAMP), stiffness=1e5, damping=500.0)
+    scene = free([ball], [contact], (0.0, 0.0, -9.81))
+    up, normal = np.array([np.cos(SLOPE), 0.0, np.sin(SLOPE)]), np.array([-np.sin(SLOPE), 0.0, np.cos(SLOPE)])
+    q, qd = np.zeros((1, 7)), np.zeros((1, 6))
+    q[0, :3], q[0, 6] = np.array([0.5, 0.0, 0.6]) + (radius - 1.8e-4) * normal, 1.0
+    qd[0, :3], qd[0, 4] = 2.2 * up, 2.2 / radius
+    dyn, speeds, energy = spo.Dynamics(scene, 1, device=device, dtype="float64"), [], []
+    for _ in range(400):
+        q, qd = dyn.step(q, qd, None, h)
+        speeds.append(qd[0, :3] @ up)
+        energy.append(dyn.kinetic_energy(q, qd)[0] + mass * 9.81 * q[0, 2])
+    np.testing.assert_allclose((speeds[79] - speeds[19]) / (60 * h), -5.0 / 7.0 * 9.81 * np.sin(SLOPE), rtol=2e-3)
+    assert q[0, 0] > 1.0 + radius and q[0, 2] < 0.4  # behind the wedge
+    assert np.diff(energy).max() < 1e-4 * energy[0] and energy[-1] < energy[0]
+
+
+@pytest.mark.slow
 def test_what_comes_to_rest(device):
     """A tetrahedron falls on three balls that stand still, and a ball between two wedges: forces carry the weights."""
     posts = [(0.08, 0.0, 0.0), (-0.04, 0.07, 0.0), (-0.04, -0.07, 0.0)]
