@@ -32,7 +32,7 @@ from ..recursions.derivatives.contact_pass import (
 from ..recursions.messages import SIZES
 from ..recursions.tracing import Trace
 from ..scene.contacts import HEIGHTS, HeightField
-from . import rounds
+from . import rounds, rounds_back
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
@@ -70,7 +70,7 @@ def launch(
     given = {name: value for name, value in given.items() if value is not None}
     results = dict(zip(wrt, (out, *more.values()), strict=True))
     if rounds.taken(dyn.scene, count):
-        rounds.pull_back(dyn, functools.partial(_launch, dyn), results, count, **given)
+        rounds_back.pull_back(dyn, functools.partial(_launch, dyn), results, count, **given)
     else:
         _launch(dyn, results, count, **given)
 
