@@ -16,8 +16,7 @@ Accuracy, mostly on a CPU:
     ``stress/``, ``stability`` (robots under gravity), ``frames`` (where frames lie), ``gradients`` (rollouts),
     ``robot_files`` and ``mjcf_files`` (readers), ``inverse_kinematics``, ``flexible_peers`` and ``boom`` (beams).
 Contact:
-    ``contacts`` (times and errors), ``contact_throws`` (energy); ``contact/``: every promised figure, other engines,
-    gradients, terrain.
+    ``contact/``: times and errors, energy, every promised figure, other engines, gradients, terrain.
 Learning:
     ``training`` (env-steps/s), ``learning_curves``.
 Documentation and refactoring:

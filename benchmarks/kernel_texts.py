@@ -32,7 +32,8 @@ from warp_spo.examples import biped, fivebar, fourbar, slider_crank, stewart
 from warp_spo.execution.device_facts import MEASURED
 from warp_spo.kernels import native
 
-from . import contacts, robots, shapes
+from . import robots, shapes
+from .contact import scenes
 
 WORLDS = (1, 4096, 65536)
 MANY_WORLDS = 1 << 18  # beyond every world count at which a plan changes
@@ -79,7 +80,7 @@ SCENES: dict[str, Callable[[], spo.Scene]] = {
     "hinges": every_hinge,
     "tower": tower,
     **{
-        f"{name}_on_ground": (lambda name=name: contacts.scene(name))
+        f"{name}_on_ground": (lambda name=name: scenes.scene(name))
         for name in ("go2", "g1")
         if robots.is_available(name)
     },

@@ -33,7 +33,9 @@ import warp_spo as spo
 from warp_spo.trials.operations import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, Trial
 
-from . import contacts, robots, runner, step_parts, substeps
+from . import robots, runner, step_parts, substeps
+from .contact import scenes
+from .contact import steps as contact_steps
 from .resources import record_launches, resources
 from .turns import Turn, take_turns
 
@@ -159,7 +161,7 @@ def prepare(call: Call, device: wp.Device) -> Callable[[], dict]:
         A function that times it and returns its row: ``us``, percentiles, ``error``, and what the call's kernels take.
     """
     if call.operation in (ON_PLANE, ON_FIELD):
-        run = contacts.prepare(call.robot, call.worlds, device, call.operation == ON_FIELD)
+        run = contact_steps.prepare(call.robot, call.worlds, device, call.operation == ON_FIELD)
         return lambda: dataclasses.asdict(call) | run() | {"tolerance": CONTACT_TOLERANCE}
     if call.operation in FUSED:
         run = substeps.prepare(call.robot + FUSED[call.operation], call.worlds, device, SUBSTEPS)
@@ -186,14 +188,14 @@ def _first_step(call: Call, device: wp.Device) -> Callable[[], dict]:
     """Return what takes a first step, with kernels that no cache has."""
     scene = step_parts.driven_scene(call.robot)
     few = [Inputs(scene, SAMPLE).array(name) for name in ("q", "qd")]
-    expected = spo.Dynamics(scene, SAMPLE, "cpu", "float64").step(few[0], few[1], None, contacts.DT)[1]
+    expected = spo.Dynamics(scene, SAMPLE, "cpu", "float64").step(few[0], few[1], None, scenes.DT)[1]
 
     def timed() -> dict:
         q, qd = (np.resize(array, (call.worlds, array.shape[1])) for array in few)
         cache = wp.config.kernel_cache_dir
         with tempfile.TemporaryDirectory() as wp.config.kernel_cache_dir:
             begin = time.perf_counter()
-            after = spo.Dynamics(scene, call.worlds, device, call.dtype).step(q, qd, None, contacts.DT)[1]
+            after = spo.Dynamics(scene, call.worlds, device, call.dtype).step(q, qd, None, scenes.DT)[1]
             seconds = time.perf_counter() - begin
         wp.config.kernel_cache_dir = cache
         error = np.abs(after[:SAMPLE] - expected).max() / np.abs(expected - few[1]).max()

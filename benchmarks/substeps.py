@@ -3,7 +3,7 @@
     python -m benchmarks.substeps [ROBOT ...] [--device cuda:0] [--worlds 4096 16384] [--counts 4 10] [--json FILE]
 
 Robots have drives and the limits of their files, see :mod:`benchmarks.step_parts`; "go2 on a plane" and "g1 on a plane"
-have contacts, see :mod:`benchmarks.contacts`. Worlds start at random in and around their limits, dt is 5 ms.
+have contacts, see :mod:`benchmarks.contact.scenes`. Worlds start at random in and around their limits, dt is 5 ms.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.scene.scene import Scene
 
-from . import contacts, runner, step_parts
+from . import runner, step_parts
 from .capabilities import SETS, measure_time
+from .contact import scenes
 from .resources import record_launches, resources
 
 DT = 5e-3
@@ -47,7 +48,7 @@ def positions(scene: Scene, worlds: int, rng: np.random.Generator, beyond: float
 def subject(name: str, worlds: int, device: wp.Device) -> tuple[spo.Dynamics, list[dict[str, wp.array]]]:
     """Return a robot and its sets of arguments of a step."""
     if name.endswith(ON_PLANE):
-        dyn, states = contacts.subject(name.removesuffix(ON_PLANE), worlds, device)
+        dyn, states = scenes.subject(name.removesuffix(ON_PLANE), worlds, device)
         return dyn, [dict(zip(("q", "qd"), state, strict=True)) | {"tau": None} for state in states]
     scene, sets = step_parts.driven_scene(name), []
     rng = np.random.default_rng(0)

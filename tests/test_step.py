@@ -11,7 +11,8 @@ import zoo
 from step_scenes import FORCES, SETTLED, TOLERANCE, H, furnished, slider, states
 
 import warp_spo as spo
-from benchmarks import contact_throws, robots
+from benchmarks import robots
+from benchmarks.contact import throws
 from warp_spo.errors import UnsupportedError
 from warp_spo.hinges import ball, free
 from warp_spo.kernels import pass_loops
@@ -109,7 +110,7 @@ def test_guesses_that_would_repeat_for_ever_end(monkeypatch):
     bare, worlds = robots.scene("g1"), [28, 135, 190, 453, 789, 1431, 1518, 1563]
     drive = np.r_[np.zeros(6), np.ones(29)]
     scene = bare.with_values(joint_target_ke=200.0 * drive, joint_target_kd=20.0 * drive)
-    (q, qd), (target, _) = (contact_throws.states(bare, 2048, seed) for seed in (0, 1))
+    (q, qd), (target, _) = (throws.states(bare, 2048, seed) for seed in (0, 1))
     a = {name: array[worlds].astype(float) for name, array in (("q", q), ("qd", qd), ("target_q", target))}
     assert symbolic.advance(scene, a, 5e-3, most=pass_loops.MOST_PASSES)[2].max() <= pass_loops.MOST_PASSES
     monkeypatch.setattr(step, "PATIENCE", 2 * pass_loops.MOST_PASSES)

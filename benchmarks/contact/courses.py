@@ -14,7 +14,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.reference_contact import ContactStep
 
-from .. import contacts
+from . import scenes
 
 STEPS = (2e-3, 5e-3, 1e-2)
 Row = tuple[str, str, float | None, float, float | None]
@@ -152,7 +152,7 @@ def stairs() -> Iterator[Row]:
 
 def landings() -> Iterator[Row]:
     """Go2 at 1.5 m/s, stiffness 1e4 to 1e7, friction 0 to 1.5, the trunk's mass times 1 to 100."""
-    bare = contacts.scene("go2")
+    bare = scenes.scene("go2")
     base = next(i for i, label in enumerate(bare.body_labels) if label.endswith("base"))
     for trunk in (1.0, 10.0, 100.0):
         heavier = np.where(np.arange(len(bare.bodies)) == base, trunk, 1.0)
@@ -163,7 +163,7 @@ def landings() -> Iterator[Row]:
         mu = np.tile(np.linspace(0.0, 1.5, 11), 6)[:, None] * np.ones((1, points))
         damping = 0.5 * np.sqrt(k * scene.values["body_mass"].sum() / 4.0)
         q, qd = np.repeat(scene.neutral_q[None], 66, axis=0), np.zeros((66, 18))
-        q[:, 7:] = contacts.GO2_STAND
+        q[:, 7:] = scenes.GO2_STAND
         q[:, 2] += ContactStep(scene, q[0], np.zeros(18), 5e-3).points.depth.max()
         qd[:, 0], qd[:, 2] = 0.5, -1.5
         dyn = spo.Dynamics(

@@ -4,7 +4,7 @@
                                            [--passes 3 4] [--heights]
     python -m benchmarks.contact.gradients --picture FILE.svg
 
-Robots stand on the ground as in `benchmarks.contacts`, and gradients are by q, qd and tau. The picture: a point is
+Robots stand on the ground as in `benchmarks.contact.steps`, and gradients are by q, qd and tau. The picture: a point is
 thrown along the ground, and how far it has slid is drawn over the height from which it fell, with the tangents that
 gradients say. Every jump is where the first touch moves to another step.
 """
@@ -26,10 +26,10 @@ from warp_spo.dynamics.steps import STEP
 from warp_spo.scene.contacts import HEIGHTS
 from warp_spo.trials.drawing import OTHER, OURS
 
-from .. import contacts
 from ..capabilities import SETS, measure_time
+from . import scenes
 
-DT = contacts.DT
+DT = scenes.DT
 WRT = ("q", "qd", "tau")
 SAMPLE = 256  # worlds whose gradients are compared with those in float64
 THROWN = dict(dt=5e-3, steps=100, speed=1.0, friction=0.5, stiffness=2e4)
@@ -48,7 +48,7 @@ def measure(
         field: rough ground of 2 cm in place of a plane. heights: gradients by its heights, too, without their error.
     """
     variable, wrt = ((HEIGHTS,), (*WRT, HEIGHTS)) if heights else ((), WRT)
-    dyn, sets = contacts.subject(robot, worlds, device, field, variable=variable)
+    dyn, sets = scenes.subject(robot, worlds, device, field, variable=variable)
     rng = np.random.default_rng(9)
     given = [_given(dyn, q, qd, rng) for q, qd in sets]
     out = tuple(wp.empty_like(x) for x in sets[0])

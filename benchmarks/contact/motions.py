@@ -22,7 +22,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.reference_contact import ContactStep
 
-from .. import contacts
+from . import scenes
 from .courses import courses
 
 FINE, CONTROL = 2e-4, 1e-2  # the step of the reference, and the time between changes of targets and pushes [s]
@@ -95,7 +95,7 @@ def g1() -> spo.Scene:
     drive = np.r_[np.zeros(6), np.ones(29)]
     gains = dict(joint_target_ke=500.0 * drive, joint_target_kd=15.0 * drive, joint_armature=0.01 * drive,
                  joint_effort_limit=robots.scene("g1").values["joint_effort_limit"])  # fmt: skip
-    return contacts.scene("g1").with_values(**gains)
+    return scenes.scene("g1").with_values(**gains)
 
 
 def entry(scene: spo.Scene, name: str) -> int:
@@ -272,9 +272,9 @@ def trot_target(scene: spo.Scene, stand: np.ndarray, t: float) -> np.ndarray:
 
 def go2_lines() -> Iterator[Line]:
     """Yield Go2's figures: standing on flat and tilted ground, a trot in an open loop, a landing at 3 m/s."""
-    motions, scene = ("stand", "slope", "trot", "landing"), contacts.scene("go2")
+    motions, scene = ("stand", "slope", "trot", "landing"), scenes.scene("go2")
     stand = scene.neutral_q.copy()
-    stand[7:] = contacts.GO2_STAND
+    stand[7:] = scenes.GO2_STAND
     stand = np.repeat(touch_down(scene, stand, 4)[None], 4, axis=0)
     tilt, weight = np.radians(20.0), 9.81 * scene.values["body_mass"].sum()
     gravity = np.repeat(scene.values["gravity"][:1], 4, axis=0)

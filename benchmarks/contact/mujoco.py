@@ -24,8 +24,8 @@ import warp_spo as spo
 from warp_spo.trials import drawing
 
 from .. import robots
-from ..contacts import SOLE
 from .motions import BENT
+from .scenes import SOLE
 
 KP, KD, RADIUS, IMP = 500.0, 15.0, 0.01, 0.9
 FEET = ("left_ankle_roll_link", "right_ankle_roll_link")

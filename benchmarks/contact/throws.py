@@ -1,6 +1,6 @@
 """A million random states of G1 thrown on the ground at 10 ms for one second: what is lost, and what gains energy.
 
-    python -m benchmarks.contact_throws [--device cuda:0] [--worlds 1048576] [--passes 3 4] [--json FILE]
+    python -m benchmarks.contact.throws [--device cuda:0] [--worlds 1048576] [--passes 3 4] [--json FILE]
 
 Energy is kinetic, that of gravity, k p^2 / 2 of contacts and position limits, and that of drives up to their effort
 limits; once without drives, once with them. A world whose state is not finite must have a status that says so.
@@ -19,7 +19,7 @@ import warp as wp
 
 import warp_spo as spo
 
-from . import contacts
+from . import scenes
 
 DT, SECONDS, CHUNK = 1e-2, 1.0, 2**17
 BOUNDS = (1e-5, 1e-3, 1e-2)  # of the energy at the start
@@ -96,14 +96,16 @@ def throw(scene: spo.Scene, worlds: int, passes: int, device: str, seed: int) ->
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="benchmarks.contact.throws", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default=None)
     parser.add_argument("--worlds", type=int, default=2**20)
     parser.add_argument("--passes", type=int, nargs="+", default=[3, 4])
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     device, rows = str(wp.get_device(options.device)), {}
-    driven = contacts.scene("g1")
+    driven = scenes.scene("g1")
     n = driven.dof_count
     limp = driven.with_values(joint_target_ke=np.zeros(n), joint_target_kd=np.zeros(n))
     for passes in options.passes:
