@@ -9,6 +9,7 @@ from .native import MASKS
 from .slots import VECTORS, WARP_SIZE
 
 LONG_COPY = 64  # rows of this many entries or more are copied to shared memory without passing through registers
+MANY = 8  # turns that copy single entries, side by side; more take longer to fetch than to execute
 FEW = 4  # turns of a loop that is hardly ever run, side by side; the compiler would take 16, which is more code
 # defines ON_ITS_WAY(to, from), which starts the asynchronous copy of one scalar from global to shared memory
 DEFINE_ASYNC_COPY = """\
@@ -51,7 +52,8 @@ class Copy(NamedTuple):
         count, statement = WARP_SIZE * self.entries // (self.wide or 1), self.several if self.wide else self.one
         turns = -(-count // team)
         some = "" if turns * team == count else f"if (i < {count}) "
-        return f"""    #pragma unroll
+        unroll = "" if self.wide or turns <= MANY else f" {MANY}"
+        return f"""    #pragma unroll{unroll}
     for (int k = 0; k < {turns}; ++k) {{ const int i = member + {team} * k; {some}{statement} }}{self._end}"""
 
     def part(self, team: int) -> str:

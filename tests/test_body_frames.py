@@ -1,4 +1,4 @@
-"""Bodies that a step places by frames of links: poses and velocities against those by statements of their own."""
+"""Bodies that a walk along the tree finds after a step: poses and velocities against those by statements."""
 
 import numpy as np
 import pytest
@@ -8,6 +8,7 @@ from granularity_scenes import hand
 from step_scenes import FORCES, H, furnished, states
 
 import warp_spo as spo
+from warp_spo.execution import walks
 from warp_spo.recursions import body_frames
 from warp_spo.recursions.links import Links
 
@@ -58,7 +59,13 @@ def test_equal_those_of_statements(name, variable, device):
     after = dyn.step(a["q"], a["qd"], a["tau"], H, *(a[name] for name in FORCES[1:]), **bodies)
     for got, wanted in zip(bodies.values(), alone.body_states(*after), strict=True):
         np.testing.assert_allclose(got, wanted, rtol=0.0, atol=ROUNDING)
-    assert all("body_states" not in line for line in dyn.programs.described())
+    assert sum("body_states" in line for line in dyn.programs.described()) == 1
+
+
+def test_warps_take_several_walks(monkeypatch, device):
+    """Where there are more pieces than warps."""
+    monkeypatch.setattr(walks, "MOST_WARPS", 2)
+    test_equal_those_of_statements("walker", (), device)
 
 
 def test_a_scene_with_a_body_that_does_not_move():
@@ -75,14 +82,15 @@ def test_values_that_vary():
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_a_world_does_not_depend_on_their_number(dtype, device):
     """Lanes without a world write nowhere: the last world has the bits that it has among more."""
-    scene, found = scene_of("walker"), {}
-    for worlds in (33, 1, 31, 32):
+    scene, found, count = scene_of("walker"), {}, 33
+    a = states(scene, count, dtype)
+    for worlds in (count, 1, 31, 32, *((1000, 4096, 16384, 65536) if device.is_cuda else ())):
         dyn = spo.Dynamics(scene, worlds, device=device, dtype=dtype, granularity="segment")
-        a = states(scene, 33, dtype)
-        given = [wp.array(a[name][:worlds], dtype=dyn.dtype, device=device) for name in ("q", "qd", "tau", *FORCES[1:])]
+        rows = {name: np.resize(a[name], (worlds, *a[name].shape[1:])) for name in ("q", "qd", "tau", *FORCES[1:])}
+        given = [wp.array(each, dtype=dyn.dtype, device=device) for each in rows.values()]
         bodies = {n: wp.full((worlds, scene.body_count, k), np.nan, dyn.dtype, device) for n, k in SIZES.items()}
         after = dyn.step(*given[:3], H, *given[3:], **bodies)
         found[worlds] = [array.numpy() for array in (*after, *bodies.values())]
-        for one, more in zip(found[worlds], found[33], strict=True):
+        for one, more in zip(found[worlds], found[count], strict=True):
             assert np.isfinite(one).all()
-            np.testing.assert_array_equal(one, more[:worlds])
+            np.testing.assert_array_equal(one, np.resize(more, one.shape))

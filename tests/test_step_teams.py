@@ -19,7 +19,6 @@ import warp_spo as spo
 from warp_spo.execution import plan, teams
 from warp_spo.kernels import pass_loops, straight
 from warp_spo.kernels.substeps import repeat_on_cuda
-from warp_spo.recursions import body_frames
 from warp_spo.recursions import step as steps
 from warp_spo.recursions.step import SHORT, Step, by_pieces
 
@@ -188,14 +187,9 @@ def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("together", [True, False])
 @pytest.mark.parametrize("name", ["hand", "forest"])
-def test_the_step_writes_the_states_of_bodies(name, together, monkeypatch):
-    """They are those of the state after the step, whichever warp goes first, written over the state or not.
-
-    ``together``: bodies share a text; otherwise each has statements of its own.
-    """
-    monkeypatch.setattr(body_frames, "BY_STATEMENTS", 0 if together else 1 << 10)
+def test_the_step_writes_the_states_of_bodies(name, monkeypatch):
+    """They are those of the state after the step, whichever warp goes first, written over the state or not."""
     text, a, (q, qd, _) = texts_of(monkeypatch, name, True, status=True, bodies=True)
     dense = spo.Dynamics(scene_of(name), WORLDS, device="cpu", dtype="float64", granularity="tree")
     expected = dense.body_states(q, qd)

@@ -226,6 +226,18 @@ def test_mirrored_limbs_share_one_text(operation, monkeypatch):
     assert together.cuda.count(" = ") < 0.8 * apart.cuda.count(" = ")
 
 
+def test_mirrored_limbs_share_one_text_where_wrenches_act_on_what_they_carry(monkeypatch):
+    """The places of bodies on links do not fold either, and forces are those of the dense expression."""
+    texts = warp_machine.recorded(monkeypatch)
+    legs = mirrored()
+    feet = [spo.Body(0.2, (0.01, 0.0, 0.0), np.eye(3) * 1e-3) for _ in range(4)]
+    places = [(0.03 * side, 0.0, -0.2, 0.0, 0.0, 0.0, 1.0) for side in (1, -1, 0, 1)]
+    fixed = [spo.Hinge("fixed", 2 + 2 * k, 9 + k, parent_pose=place) for k, place in enumerate(places)]
+    text, arrays, wanted = built(texts, spo.Scene([*legs.bodies, *feet], [*legs.hinges, *fixed]), "forward_dynamics")
+    assert branches(text) == [[0, 1, 2, 3]]
+    assert laws.error(warp_machine.run(text, arrays), wanted) <= laws.TOLERANCE["float64"]
+
+
 def test_what_differs_between_limbs_is_in_the_table(monkeypatch):
     """One constant of one finger: one column of the table, a row for each finger, the others' all the same."""
     texts = warp_machine.recorded(monkeypatch)

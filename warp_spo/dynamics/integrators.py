@@ -13,7 +13,7 @@ from ..errors import UnsupportedError
 from ..execution.routine import Routine
 from ..kernels import combination, loops
 from ..kernels.substeps import SUBSTEPS
-from ..recursions import coordinates, hinge_forces
+from ..recursions import coordinates, hinge_forces, kinematics
 from ..recursions import step as recursion
 from ..recursions.contact import pair_pieces, pairs
 from ..recursions.impedance import DEFAULT_BOUND
@@ -42,7 +42,8 @@ def _limbs_couple(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
     return pair_pieces.by_limbs(scene)
 
 
-STEP = Routine("step", recursion.step, letters="PzaSXF", divides=_divides, passes=True, wide=True)
+STEP = Routine("step", recursion.step, letters="PzaSX", divides=_divides, passes=True, wide=True)
+BODIES_BY_WALKS = Routine("body_states", kinematics.body_states, alone=True, passes=True, wide=True, walks=True)
 PAIRED_STEP = Routine(
     "paired_step", pair_pieces.step, letters="PzafSE", divides=_limbs_couple, passes=True, counted=True, wide=True,
     couples=True,
@@ -107,7 +108,7 @@ def semi_implicit(
         else:
             launch(contact_routine(dyn), qd_out, more | (reports or {}), qd=qd, dt=dt, q=q, **given)
     elif not dyn.closed:
-        if bodies is not None and substeps == 1:
+        if bodies is not None and substeps == 1 and not _walks(dyn):
             further = more | {"poses_out": bodies[0], "velocities_out": bodies[1]}
             arguments = dict(q=q, qd=qd, dt=dt, **given, **option, bodies=True)
             if dyn._engine.has_program(STEP, qd_out, further, **arguments):
@@ -133,7 +134,16 @@ def arrays_of_bodies(dyn: Dynamics, states: dict[str, Any]) -> tuple[wp.array, w
 
 def write_bodies(dyn: Dynamics, q: wp.array, qd: wp.array, bodies: tuple[wp.array, wp.array]) -> None:
     """Launch the poses and velocities of the bodies at a state."""
-    dyn._engine.launch(BODY_STATES, bodies[0], {"velocities_out": bodies[1]}, q=q, qd=qd)
+    more = {"velocities_out": bodies[1]}
+    if _walks(dyn) and dyn._engine.has_program(BODIES_BY_WALKS, bodies[0], more, q=q, qd=qd):
+        dyn._engine.launch_routine(BODIES_BY_WALKS, bodies[0], more, q=q, qd=qd)
+    else:
+        dyn._engine.launch(BODY_STATES, bodies[0], more, q=q, qd=qd)
+
+
+def _walks(dyn: Dynamics) -> bool:
+    """Whether a kernel of its own walks to the bodies after a step: whatever the number of worlds, for equal bits."""
+    return dyn.plan.of(STEP) == "segment" and dyn.programs.builder.walks
 
 
 def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool, passes: int | None = None) -> str:

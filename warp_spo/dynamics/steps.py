@@ -286,7 +286,7 @@ def step(
         contact_residual: of a scene with pairs of bodies, written with the largest change of a pair's force in the last
             of 16 rounds, where pairs are solved in rounds [world] [N]; zero where they are solved exactly.
         poses, velocities: written with :meth:`body_poses` and :meth:`body_velocities` of the state after the last
-            substep. With a warp for each limb, see :meth:`explain`, the kernel of the step writes them.
+            substep. With a warp for each of a quadruped's limbs, see :meth:`explain`, one kernel does both.
         out: (q, qd) after the step, each an array or None. They may be the arrays of the state itself.
 
     Returns:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from ..kernels import straight
 from ..kernels.straight import DIRECT, RELAYED, TILED, KernelLayout
 from ..kernels.substeps import SUBSTEPS
-from ..recursions.body_frames import GEOMETRY
+from ..recursions.body_frames import FRAME, GEOMETRY
 from ..recursions.contact import coupled
 from ..recursions.contact.secants import SECANT
 from ..recursions.messages import INWARD, OUTWARD
@@ -58,7 +58,7 @@ def make_emitter(
             return f"SENT({entry}) = {value};"
         if array == "out" and result.way == RELAYED:
             return f"RELAY({entry}) = {value};"
-        if array in (HELD, SECANT, FORCE, RESISTANCE, *coupled.ARRAYS):
+        if array in (HELD, SECANT, FORCE, RESISTANCE, FRAME, *coupled.ARRAYS):
             return f"{load(array, entry)} = {value};"
         if array == MISSED and pieces:
             return f"missed_row[0] += {value};"

@@ -10,6 +10,7 @@ from ..kernels import coupling, native, straight
 from ..kernels.fields import axes
 from ..kernels.native import INTEGERS
 from ..kernels.straight import BY_TABLE, TILED, KernelLayout
+from ..recursions import body_frames
 from ..recursions.contact import coupled, pairs
 from ..recursions.contact.ground import GROUND
 from ..recursions.contact.secants import SECANT
@@ -87,10 +88,11 @@ class Builder:
         self.run, self.plan, self.dtype = run, plan, run.dtype.__name__
         self.relays = run.device.is_cuda
         self._links: Links | None = None
+        self._walks: bool | None = None
 
     def forget(self) -> None:
         """Drop the links: values that they folded have changed."""
-        self._links = None
+        self._links = self._walks = None
 
     @property
     def links(self) -> Links:
@@ -98,6 +100,13 @@ class Builder:
         if self._links is None:
             self._links = Links(self.run.scene, self.run.parameters.variable)
         return self._links
+
+    @property
+    def walks(self) -> bool:
+        """Whether kernels by limbs walk to the bodies of the scene, see :mod:`.walks`."""
+        if self._walks is None:
+            self._walks = body_frames.suits(self.links)
+        return self._walks
 
     def own_links(self, options: dict[str, Any], copies: bool = False) -> Links:
         """Return links of their own for one trace, with what the frames in its options sit on."""

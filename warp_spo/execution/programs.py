@@ -11,7 +11,7 @@ from ..kernels.substeps import SUBSTEPS
 from ..recursions.contact import coupled
 from ..recursions.links import TABLES, Links
 from ..recursions.pieces import Pieces
-from . import link_values, products, searches, segment_programs, tree_programs
+from . import link_values, products, searches, segment_programs, tree_programs, walks
 from .builder import Builder, Job, Program
 from .plan import MOST_WARPS, Plan
 from .routine import Routine
@@ -139,6 +139,8 @@ class Programs:
             return searches.build(self, routine, links, "given" in inputs, options)
         divides = routine.divides(self.run.scene, inputs, **options)
         shared = self.plan.of(routine) == "segment" and divides
+        if shared and routine.walks and self.builder.walks:
+            return walks.build(self.builder, job, links)
         if routine.bias_first is not None and self.plan.at(routine).apart and "qd" in inputs:
             job = job._replace(routine=routine.bias_first)
         ways = [dict(alone=False)] if shared else []

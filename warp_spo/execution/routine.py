@@ -51,6 +51,7 @@ class Routine:
         wide: its rows are long, so that a team asks for as much shared memory as they need.
         start: ``start(trace, **options)`` returns what a search starts from; None: the kernel is no search, see
             :mod:`.searches`.
+        walks: where bodies are walked to, by limbs, see :mod:`.walks`.
         title: ``title(inputs, **options)``, what a user calls this computation; None: the name.
     """
 
@@ -78,6 +79,7 @@ class Routine:
     variants: int = VARIANTS
     wide: bool = False
     start: Callable[..., list[Store]] | None = None
+    walks: bool = False
     title: Callable[..., str] | None = None
 
     @property

@@ -14,7 +14,7 @@ from ..kernels import coupling_teams
 from ..kernels.elementary import C_TYPE
 from ..kernels.slots import WARP_SIZE
 from ..kernels.straight import DIRECT, KernelLayout
-from ..recursions import alike, body_frames, messages
+from ..recursions import alike, messages
 from ..recursions.contact import pair_pieces
 from ..recursions.contact.couples import Team as Couplings
 from ..recursions.contact.points import own_points
@@ -42,7 +42,7 @@ class Traced(NamedTuple):
     Attributes:
         stores: what its trace returns.
         begin: what it stores and sends before the passes. held: what it computes once before them.
-        laws, checks, news, rounds, states, couples, carried: as of a :class:`~warp_spo.recursions.tracing.Trace`.
+        laws, checks, news, rounds, couples, carried: as of a :class:`~warp_spo.recursions.tracing.Trace`.
         numbers: its constants, where they may be kept from folding.
     """
 
@@ -53,7 +53,6 @@ class Traced(NamedTuple):
     checks: list[list[Store]]
     news: list[Store]
     rounds: list[list[Store]]
-    states: list[list[Store]]
     couples: list[tuple[int, list[Store]]]
     carried: list[Value]
     numbers: alike.Numbers | None
@@ -61,7 +60,7 @@ class Traced(NamedTuple):
     @property
     def everything(self) -> list[Store]:
         """All stores of a piece."""
-        turns = (*self.laws, *self.checks, *self.rounds, *self.states, *(items for _, items in self.couples))
+        turns = (*self.laws, *self.checks, *self.rounds, *(items for _, items in self.couples))
         return [*self.begin, *self.stores, *self.news, *(item for turn in turns for item in turn)]
 
 
@@ -100,9 +99,7 @@ class _Limbs:
     def __init__(self, builder: Builder, job: Job, pieces: Pieces, alone: bool, local: bool):
         self.builder, self.job, self.pieces, self.alone, self.local = builder, job, pieces, alone, local
         self.run, self.plan, self.dtype = builder.run, builder.plan, builder.dtype
-        letters = messages.needed(job.routine.letters, job.shapes)
-        by_frames = BODIES in job.options and body_frames.suits(builder.links)
-        self.letters = letters if by_frames else letters.replace("F", "")
+        self.letters = messages.needed(job.routine.letters, job.shapes)
         self.slots, self.sent = messages.slots(self.letters, pieces)
         self.couples = self._couples() if job.routine.couples else None
         self.sent = self.couples.layout["end"] if self.couples is not None else self.sent
@@ -149,7 +146,6 @@ class _Limbs:
             checks=trace.checks,
             news=flat(trace.news),
             rounds=[flat(turn) for turn in trace.rounds],
-            states=[flat(turn) for turn in trace.states],
             couples=trace.couples,
             carried=trace.carried,
             numbers=links.numbers if self.unfolds else None,
@@ -235,11 +231,9 @@ class _Limbs:
         ends = [item for item in one.news if item.array == "out"]
         news = later.branch([item for item in one.news if item.array != "out"] + by_slot(ends))
         rounds = [later.branch(by_slot(turn)) for turn in one.rounds]
-        of_states = [emitter() for _ in one.states]
-        states = [each.region(turn) for each, turn in zip(of_states, one.states, strict=True)]
         laws, checks = [ruling.branch(turn) for turn in one.laws], [checking.branch(turn) for turn in one.checks]
-        emitters = {first, sweeps, later, ruling, checking, *of_states}
-        work = Work(piece, sweep, back, laws, checks, news, rounds, ahead, couples, states)
+        emitters = {first, sweeps, later, ruling, checking}
+        work = Work(piece, sweep, back, laws, checks, news, rounds, ahead, couples)
         team.add(work, sum(each.operations for each in emitters))
         return any(each.counts["lookup"] for each in emitters)
 
@@ -259,11 +253,6 @@ class _Limbs:
             layout, registers = layout._replace(aside=places), routine.aside
             cuda = set_aside(cuda, C_TYPE[T], places)
         lists = {"place": table, "table": team.shared.table, "shifts": team.shared.shifts}
-        if team.shares_bodies:
-            lists[body_frames.GEOMETRY] = body_frames.geometry(self.run.scene)
-            name = body_frames.GEOMETRY.upper()
-            cuda = f"#define {name}(i) __ldg(geometry.data + i)\n{cuda}\n#undef {name}"
-            cpu = f"#define {name}(i) geometry.data[i]\n{cpu}\n#undef {name}"
         tables = {name: values for name, values in lists.items() if values} | self.builder.height_tables(looks_up)
         if couples is not None:
             tables |= self.builder.touch_tables(couples.points)

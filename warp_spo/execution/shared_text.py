@@ -9,7 +9,6 @@ from collections.abc import Iterable, Sequence
 from ..trace.emission import C_TYPE, Listing, fill_in, literal
 
 KEEP = 'asm("" : "+r"({}));'  # keeps the compiler from computing a number anew wherever it is used
-IN_A_ROW = 5  # most turns of a loop without a jump, which wait together for what they read
 CACHED = 8192  # largest number of operations of a world whose code fits into the instruction cache
 
 
@@ -74,26 +73,6 @@ class SharedText:
                     "}",
                 ]
             text.append("\n".join([f"{condition}{{", *inside, "}"]))
-        return "\n".join(text)
-
-    def share_out(self, warps: Sequence[int], listings: Sequence[Listing]) -> str:
-        """Return loops in which all ``warps`` execute ``listings``, each equally many; equal ones share a text.
-
-        Where they do not come out even, the last warp executes its last listing again.
-        """
-        kinds: dict[str, list[Listing]] = {}
-        for listing in listings:
-            kinds.setdefault(listing.text, []).append(listing)
-        text = []
-        for at, alike in enumerate(kinds.values()):
-            turns, name = -(-len(alike) // len(warps)), f"b{at}_"
-            in_a_row = max(range(3, IN_A_ROW + 1), key=lambda count: (-(-turns % count), count))
-            turns += -turns % in_a_row if turns > IN_A_ROW else 0
-            who = f"min({name}first + each, {len(alike) - 1})"
-            head, (body,) = self.merge([alike], "", name, who)
-            first = f"const int {name}first = {choose(warps, range(0, turns * len(warps), turns))};"
-            loop = f"for (int each = 0; each < {turns}; ++each) {{"
-            text += ["{", first, f"#pragma unroll {in_a_row}", loop, head, body, "}", "}"]
         return "\n".join(text)
 
     def merge(self, regions: list[list[Listing]], prefix: str, tables: str, who: str) -> tuple[str, list[str]]:

@@ -33,7 +33,6 @@ class Work(NamedTuple):
         ahead: in work with passes, what the piece computes once before them and keeps. Where a fixed number of passes
             is counted, pieces send each other messages inward ahead, too.
         couples: what the piece leaves for each couple of bodies that touches, after the inward sweep.
-        bodies: of the first piece, what limbs compute after the rounds of all pieces, each for some bodies.
     """
 
     piece: Piece
@@ -45,7 +44,6 @@ class Work(NamedTuple):
     rounds: list[Listing]
     ahead: Listing = Listing("", [], [], [])
     couples: Sequence[Listing] = ()
-    bodies: Sequence[Listing] = ()
 
     @property
     def text(self) -> tuple[str, ...]:
@@ -158,8 +156,6 @@ class Team:
                     (later if self.passes else text).append(self._branch(piece, self._work[piece.index].news))
         for work in self._work.values():
             later += [self._branch(work.piece, listing) for listing in work.rounds]
-        for work in self._work.values():
-            later += [self._branch(work.piece, listing) for listing in work.bodies]
         if self.passes:
             kept = {f"p{piece.index}_": [piece] for piece in self.pieces.pieces}
             order = reversed(self._work.values()) if self.passes.counted else self._work.values()  # children first
@@ -202,11 +198,6 @@ class Team:
             text.append("}")
         return self._in_passes("\n".join(text)) if self.passes else "\n".join(text)
 
-    @property
-    def shares_bodies(self) -> bool:
-        """Whether all warps share the states of bodies."""
-        return any(work.bodies for work in self._work.values())
-
     def _in_passes(self, a_pass: str) -> str:
         """Return ``a_pass`` in a loop, then the news of every piece, then the rounds."""
         assert self.passes is not None
@@ -246,8 +237,6 @@ class Team:
             if last and any(text_of_ranks):
                 text.append(BARRIER)
             text += text_of_ranks
-        bodies = [listing for work in self._work.values() for listing in work.bodies]
-        text += [BARRIER, self.shared.share_out(_warps(leaves), bodies)] if bodies else []
         return "\n".join(text)
 
     @property

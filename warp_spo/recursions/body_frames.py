@@ -1,29 +1,35 @@
-"""States of bodies from the frames of links: one text for all, in a loop, with the geometry as numbers in a table.
+"""States of bodies after a step, by walks along the tree: few texts for all links and bodies, geometry from a table.
 
-Pieces first place their links, in inertial axes, and send each other the frames. Then each limb takes as many bodies
-as the others. :func:`.kinematics.body_states` computes the same in statements of its own for each body; those of a
-humanoid, once a step, are fetched more slowly than they are executed.
+A walk goes from a root to the bodies of a piece. It holds the frame of one link, in inertial axes, moves it to the next
+link, and writes the states of its bodies. :func:`.kinematics.body_states` computes the same in statements of its own
+for each body; those of a humanoid, once a step, are fetched more slowly than they are executed.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 from ..hinges.quaternions import Quaternion, constant_quaternion, multiplied, turned
+from ..hinges.turn import Turn
 from ..scene.scene import Scene
 from ..trace.emission import Store
 from ..trace.scalars import Graph, Value, is_constant
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross
 from .kinematics import NEUTRAL, quaternions_in_links, relative_quaternion
 from .links import Link, Links, place_link
-from .messages import FRAME, INWARD
-from .pieces import Piece, Pieces
+from .pieces import Pieces
 from .remembered import remembered
-from .tracing import Trace
 
 GEOMETRY = "geometry"
-"""The table of RECORD numbers for each body: origin and quaternion in the frame that its link sends, and its com."""
+"""The table of RECORD numbers for each body: origin and quaternion in the frame that its link has in a walk, and its
+com; then of PLACE numbers for each link: origin and quaternion at rest in the frame that its parent has in a walk."""
 RECORD = 10
+PLACE = 7
+FRAME = "frame"
+"""The variables of a walk: origin, quaternion, omega, velocity."""
+SIZE = 13
 BY_STATEMENTS = (
     4  # dofs of unlike pieces up to which bodies have statements of their own, which are fetched fast enough
 )
@@ -39,7 +45,7 @@ class Frame(NamedTuple):
 
 
 def suits(links: Links) -> bool:
-    """Return whether bodies share a text: all of them move, are rigid, and sit at places that do not vary.
+    """Return whether bodies are walked to: all of them move, are rigid, and sit at places that do not vary.
 
     Where statements of their own are few, they wait less, for nothing that is read from a table.
     """
@@ -55,57 +61,115 @@ def suits(links: Links) -> bool:
     return anchored or all(is_constant(x) for node in links.nodes.values() for x in node.com)
 
 
+def walks(links: Links) -> list[list[tuple[bool, int]]]:
+    """Return the steps of a walk for each piece: (True, link) moves the frame, (False, body) stores a state."""
+    number = {id(link): at for at, link in enumerate(links.links)}
+    bodies: dict[int, list[int]] = {}
+    for body in sorted(links.seats):
+        bodies.setdefault(id(links.seats[body].link), []).append(body)
+    found = []
+    for piece in Pieces(links).pieces:
+        steps = [(True, number[id(link)]) for above in reversed(piece.ancestors) for link in above.links]
+        for link in piece.links:
+            steps += [(True, number[id(link)]), *((False, body) for body in bodies.get(id(link), ()))]
+        found.append(steps)
+    return found
+
+
+@remembered
+def _numeric(scene: Scene) -> Links:
+    """Return the links of the first world; what is read of them holds in every world of a scene that :func:`suits`."""
+    return Links(scene.with_values(**{name: array[:1] for name, array in scene.values.items()}))
+
+
+class Place(NamedTuple):
+    """Where a link is at rest in the frame that its parent has in a walk."""
+
+    matrix: Matrix | None
+    offset: Vector
+    rest: Quaternion
+
+
+@remembered
+def _places(scene: Scene) -> list[Place]:
+    """Return the places of all links, which are constants even if centres of mass vary."""
+    links, found = _numeric(scene), []
+    for link in links.links:
+        matrix, offset, rest = link.matrix, link.offset, link.hinge.quaternion_at_rest(link)
+        if link.parent is not None and _at_node(link.parent):
+            offset, rest = _in_frame(links, link.parent, offset, rest)
+            node = links.seats[link.parent.node].matrix.T
+            matrix = node if matrix is None else node @ matrix
+        found.append(Place(matrix, offset, rest))
+    return found
+
+
 @remembered
 def geometry(scene: Scene) -> list[float]:
-    """Return the numbers of all bodies of a scene that :func:`suits`."""
-    links = Links(scene.with_values(**{name: array[:1] for name, array in scene.values.items()}))
+    """Return the numbers of all bodies and of all links of a scene that :func:`suits`."""
+    links = _numeric(scene)
     within = quaternions_in_links(links)
     found: list[Value] = []
     for body in sorted(links.seats):
         seat, (R, p) = links.seats[body], links.nodes[body].anchor
-        offset, turn = seat.offset - seat.matrix @ (R.T @ p), within[body]
-        if seat.link is not None and _at_node(seat.link):
-            node = links.seats[seat.link.node]
-            x, y, z, w = constant_quaternion(node.matrix)
-            offset, turn = node.matrix.T @ (offset - node.offset), multiplied(Vector((-x, -y, -z, w)), turn)
+        assert seat.link is not None
+        offset, turn = _in_frame(links, seat.link, seat.offset - seat.matrix @ (R.T @ p), within[body])
         found += [*offset, *turn, *scene.values["body_com"][0, body].tolist()]
+    for place in _places(scene):
+        found += [*place.offset, *place.rest]
     return [float(x) for x in found]  # type: ignore[arg-type]
 
 
-def add_bodies(trace: Trace, state: Trace) -> None:
-    """Let a piece send the frames of its links at a ``state``, in a round of the ``trace``.
-
-    Afterwards limbs share the states of bodies, ``states`` of the first piece's trace.
-    """
-    own = trace.piece
-    assert own is not None
-    frames = _frames(state)
-    sent = [x for link in own.links for part in _sent(state, link, frames[id(link)]) for x in part]
-    trace.rounds = [*trace.rounds, trace.send("F", own, sent)]
-    if own.index == 0:
-        trace.states = [_body(trace, body) for body in sorted(trace.links.seats)]
-
-
 def _at_node(link: Link) -> bool:
-    """Whether a link sends the frame of its node, because its own is at a centre of mass, which may vary."""
+    """Whether a walk has the frame of a link's node, because its own is at a centre of mass, which may vary."""
     return link.hinge.at_com
 
 
-def _frames(state: Trace) -> dict[int | None, Frame]:
-    """Return the frames of the links that the state is traced for, by id; None is the inertial frame."""
-    q, qd = state.vector("q"), state.vector("qd")
-    frames: dict[int | None, Frame] = {None: Frame(ZERO, NEUTRAL, ZERO, ZERO)}
-    for link in state.active_links:
-        state.label(link, "F")
-        over = frames[None if link.parent is None else id(link.parent)]
-        place = place_link(link, q)
-        arm, Q = turned(over.Q, place.pose.l), multiplied(over.Q, relative_quaternion(link, q))
-        w, v = over.w, over.v + cross(over.w, arm)
-        columns = link.hinge.inertial_columns(link, place, _axes(over.Q), _axes(Q), ZERO)
-        for dof, (turn, shift) in zip(link.dofs, columns, strict=True):
-            w, v = w + turn * qd(dof), v + shift * qd(dof)
-        frames[id(link)] = Frame(over.p + arm, Q, w, v)
-    return frames
+def _in_frame(links: Links, link: Link, offset: Vector, turn: Quaternion) -> tuple[Vector, Quaternion]:
+    """Return a place in the frame that a link has in a walk, for that in the frame of the link."""
+    if not _at_node(link):
+        return offset, turn
+    node = links.seats[link.node]
+    x, y, z, w = constant_quaternion(node.matrix)
+    return node.matrix.T @ (offset - node.offset), multiplied(Vector((-x, -y, -z, w)), turn)
+
+
+def move_to_link(links: Links, number: int) -> list[Store]:
+    """Return the stores of a step of a walk to a link; equal for all links that turn about an axis on another one."""
+    link, over = links.links[number], Frame(ZERO, NEUTRAL, ZERO, ZERO)
+    if link.parent is not None and link.hinge.shape == Turn.name:
+        graph, first = Graph(), RECORD * len(links.seats) + PLACE * number
+        table = [graph.input(GEOMETRY, first + i) for i in range(PLACE)]
+        still = dataclasses.replace(link, matrix=None, offset=Vector(table[:3]), rest=Vector(table[3:]))
+    else:
+        graph, place = links.graph, _places(links.scene)[number]
+        still = dataclasses.replace(link, matrix=place.matrix, offset=place.offset, rest=place.rest)
+    graph.step = "links|F"
+    if link.parent is not None:
+        over = _read(graph)
+    frame = _moved(over, still, lambda c: graph.input("q", c), lambda dof: graph.input("qd", dof))
+    if _at_node(link):
+        seat = links.seats[link.node]
+        arm, Q = turned(frame.Q, seat.offset), multiplied(frame.Q, constant_quaternion(seat.matrix))
+        frame = Frame(frame.p + arm, Q, frame.w, frame.v + cross(frame.w, arm))
+    return [Store(FRAME, (i,), x) for i, x in enumerate(x for part in frame for x in part)]
+
+
+def _read(graph: Graph) -> Frame:
+    """Return the frame of a walk."""
+    values = [graph.input(FRAME, i) for i in range(SIZE)]
+    return Frame(Vector(values[:3]), Vector(values[3:7]), Vector(values[7:10]), Vector(values[10:]))
+
+
+def _moved(over: Frame, link: Link, q: Callable[[int], Value], qd: Callable[[int], Value]) -> Frame:
+    """Return the frame of a link for that of its parent, at q and qd."""
+    place = place_link(link, q)
+    arm, Q = turned(over.Q, place.pose.l), multiplied(over.Q, relative_quaternion(link, q))
+    w, v = over.w, over.v + cross(over.w, arm)
+    columns = link.hinge.inertial_columns(link, place, _axes(over.Q), _axes(Q), ZERO)
+    for dof, (turn, shift) in zip(link.dofs, columns, strict=True):
+        w, v = w + turn * qd(dof), v + shift * qd(dof)
+    return Frame(over.p + arm, Q, w, v)
 
 
 def _axes(Q: Quaternion) -> Matrix:
@@ -119,32 +183,17 @@ def _axes(Q: Quaternion) -> Matrix:
     ])  # fmt: skip
 
 
-def _sent(state: Trace, link: Link, frame: Frame) -> Frame:
-    """Return the frame that a link sends."""
-    if not _at_node(link):
-        return frame
-    seat = state.links.seats[link.node]
-    arm = turned(frame.Q, seat.offset)
-    Q = multiplied(frame.Q, constant_quaternion(seat.matrix))
-    return Frame(frame.p + arm, Q, frame.w, frame.v + cross(frame.w, arm))
-
-
-def _body(trace: Trace, body: int) -> list[Store]:
-    """Return the stores of a body's state; statements are equal for all bodies, so each has a graph of its own."""
-    graph, links = Graph(), trace.links
+def store_body(links: Links, body: int) -> list[Store]:
+    """Return the stores of a body's state, out [body, 7] and velocities_out [body, 6]; equal for all bodies."""
+    graph = Graph()
     graph.step = "bodies|b"
-    link = links.seats[body].link
-    assert link is not None and trace.slot is not None
-    piece: Piece = Pieces(links).of[id(link)]
-    at = trace.slot("F", piece) + FRAME * [id(other) for other in piece.links].index(id(link))
-    read = [graph.input(INWARD, at + i) for i in range(FRAME)]
-    p, Q, w, v = Vector(read[:3]), Vector(read[3:7]), Vector(read[7:10]), Vector(read[10:])
+    p, Q, w, v = _read(graph)
     number = [graph.input(GEOMETRY, RECORD * body + i) for i in range(RECORD)]
     com = [graph.input(*x.args) if not is_constant(x) else number[7 + i] for i, x in enumerate(links.nodes[body].com)]
     offset, turn = turned(Q, Vector(number[:3])), multiplied(Q, Vector(number[3:7]))
     arm = offset + turned(turn, Vector(com))
     pose, twist = (*(p + offset), *turn), (*(v + cross(w, arm)), *w)
     return [
-        *(Store("poses_out", (body, i), x) for i, x in enumerate(pose)),
+        *(Store("out", (body, i), x) for i, x in enumerate(pose)),
         *(Store("velocities_out", (body, i), x) for i, x in enumerate(twist)),
     ]

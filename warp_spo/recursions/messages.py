@@ -6,8 +6,7 @@ ground's origin, U = the flow and momentum of what a link carries, L = its load 
 how a sum changes with P, and for Mass^-1 N = the rates of all pivots further in for each unit force on the last link,
 D = the piece's own pivots, V = its columns of Y, Y = the part of them that lies further in. From all to the first
 piece, when all is done: S = a status word, E = by how much the last pass of a step with contacts exceeds its laws. From
-all to all then: X = the coordinates and the rates of a piece after a step, and F = the frames of its links then, see
-:mod:`.body_frames`.
+all to all then: X = the coordinates and the rates of a piece after a step.
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ INWARD, OUTWARD = "sent", "returned"
 OUTWARD_LETTERS = "abQNDVY"
 SIZES = {"P": 21, "z": 6, "f": 6, "y": 6, "R": 10, "B": 24, "G": 36, "O": 3, "U": 12, "L": 12, "a": 6, "b": 6, "Q": 21,
          "S": 1, "E": 4}  # fmt: skip
-FRAME = 13  # values of a frame: origin, quaternion, omega, velocity
-NEEDS = {"U": "qd", "L": "body_f", "O": "ground_origin_later", "X": "poses_out", "F": "poses_out"}
+NEEDS = {"U": "qd", "L": "body_f", "O": "ground_origin_later", "X": "poses_out"}
 """The array without which a message is zero, or nobody reads it, and is not sent, by letter."""
 
 
@@ -36,8 +34,6 @@ def size(letter: str, piece: Piece) -> int:
         return SIZES[letter]
     if letter == "X":
         return piece.coordinates + piece.weight
-    if letter == "F":
-        return FRAME * len(piece.links)
     further = sum(one.weight for one in piece.ancestors)
     whole = further + piece.weight
     return {"N": 6 * whole, "D": piece.weight, "V": whole * piece.weight, "Y": further * piece.weight}[letter]
@@ -51,15 +47,11 @@ def needed(letters: str, inputs: Collection[str]) -> str:
 def slots(letters: str, pieces: Pieces) -> tuple[dict[tuple[str, int], int], int]:
     """Return where each message begins, by letter and piece, and the values of all messages together.
 
-    Long messages outward take the place of what the same tree sent inward and has read by then. So does what
-    pieces send each other after the last pass, if there are frames among it.
+    Long messages outward take the place of what the same tree sent inward and has read by then.
     """
     places: dict[tuple[str, int], int] = {}
     end = 0
     groups = ("P", letters[1:]) if "N" in letters else (letters,)
-    if "F" in letters:
-        late = [letter for letter in letters if letter in "SXF"]
-        groups = "".join(letter for letter in letters if letter not in late), "".join(late)
     for root in (piece for piece in pieces.pieces if piece.parent is None):
         tree = [piece for piece in pieces.pieces if root in (piece, *piece.ancestors)]
         start = end
@@ -75,7 +67,7 @@ def slots(letters: str, pieces: Pieces) -> tuple[dict[tuple[str, int], int], int
 
 
 def _sends(letter: str, piece: Piece, tree: list[Piece]) -> bool:
-    if letter in "SEXF":
+    if letter in "SEX":
         return True
     if letter == "Y":
         return any(other.looks_at(piece) for other in tree)

@@ -19,7 +19,6 @@ from ..status import Status
 from ..trace.emission import Store
 from ..trace.scalars import Value, alone, floor, less, reciprocal, select
 from ..trace.spatial import total
-from . import body_frames
 from .actuation import hinge_laws
 from .articulated_sweeps import expand, reduce
 from .impedance import Law, add_laws, is_number
@@ -272,9 +271,6 @@ class Step:
         for piece in Pieces(trace.links).pieces:
             sent |= dict(zip(_entries(piece), trace.receive("X", piece), strict=True))
         moved = trace.at({"q": lambda c: sent["q_out", c], "qd": lambda dof: sent["out", dof]})
-        if body_frames.suits(trace.links):
-            body_frames.add_bodies(trace, moved)
-            return
         found = [item._replace(array="poses_out") if item.array == "out" else item for item in body_states(moved)]
         trace.rounds = [*trace.rounds, found]
 

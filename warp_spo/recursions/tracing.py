@@ -39,7 +39,6 @@ class Trace:
         stiffened: returns a link with what a time step adds to its armature.
         news: messages that a piece sends apart from the others, because pieces of equal structure do not all send them.
         rounds: what a piece stores after it has received all news, in turns of which many may be alike.
-        states: of the first piece, what limbs store after that, body by body.
         ahead: values that the passes of a loop share, formed once before the loop.
         begin: stores before the passes of a loop, of the variables that they read.
         dampers, pushes: by id of the link: what contacts add to its articulated inertia, and to the forces on it; of a
@@ -63,7 +62,6 @@ class Trace:
         self.piece, self.slot = piece, slot
         self.news: list[Store] = []
         self.rounds: list[list[Store]] = []
-        self.states: list[list[Store]] = []
         self.ahead: list[Value] = []
         self.begin: list[Store] = []
         self.dampers: dict[int, Articulated] = {}
@@ -140,10 +138,20 @@ class Trace:
         acting = []
         for body in self.bodies.get(id(link), ()):
             entries = [self.graph.input("body_f", body, c) for c in range(6)]
-            acting.append((self.links.center(body)[1], Vector(entries[:3]), Vector(entries[3:])))
+            acting.append((self._center(body), Vector(entries[:3]), Vector(entries[3:])))
         n_bodies, f_bodies = newton_euler.add_wrenches(self.axes[id(link)], acting)
         n, f = n + n_bodies, f + f_bodies
         return Vector((*n, *f))
+
+    def _center(self, body: int) -> Vector:
+        """Return the centre of mass of a body of this piece in its link, with numbers that may be kept from folding."""
+        numbers, seat = self.links.numbers, self.links.seats[body]
+        if numbers is None or body in self.links.flexible:
+            return self.links.center(body)[1]
+        at, com = self.own_bodies.index(body), self.links.nodes[body].com
+        rows = numbers.of_body(at, "seat", [x for row in seat.matrix for x in row])
+        turned = Matrix.of([rows[3 * i : 3 * i + 3] for i in range(3)]) @ Vector(numbers.of_body(at, "centre", com))
+        return Vector(numbers.of_body(at, "offset", seat.offset)) + turned
 
     @property
     def base_acceleration(self) -> tuple[Vector, Vector]:
