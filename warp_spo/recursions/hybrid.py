@@ -110,7 +110,7 @@ def expand_link(
     return qdd, tau, (Vector(alpha[:3]), Vector(alpha[3:]))
 
 
-class Sweeps:
+class HybridSweeps:
     """Both sweeps of hybrid dynamics over a trace, link by link, and what the inward one leaves to the outward one.
 
     Args:
@@ -222,7 +222,7 @@ def hybrid_dynamics(trace: Trace, mask: tuple[bool, ...] | None = None) -> list[
     Args:
         mask: constant mask by dof; None: the array "prescribed" is the mask.
     """
-    sweeps, moves = Sweeps(trace, mask), "qd" in trace.inputs
+    sweeps, moves = HybridSweeps(trace, mask), "qd" in trace.inputs
     for link, outward in trace.traversal():
         if outward:
             trace.place(link, moves)
