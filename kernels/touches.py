@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from . import hulls, sticks
+from . import hull_faces, hulls, sticks
 from .elementary import C_TYPE
 
 HEADER, POINT, AWAY = 3, 7, -1e3
@@ -17,23 +17,28 @@ MOST = 8  # points of two boxes
 LEAD = 0.05  # share of the smallest half size by which the second box must be farther away to give the common face
 
 
-def native(T: type, of: Any = (), long: bool = False) -> str:
+def native(T: type, of: Any = (), long: bool = False, faces: bool = False) -> str:
     """Return the definition of ``solids`` for scalars of type ``T``, of shapes among which are the hulls ``of``.
 
-    ``long``: some pair is of a segment and a box or a hull.
+    ``long``: some pair is of a segment and a box or a hull. ``faces``: some pair is of two hulls.
     """
     number = "f" if T is wp.float32 else ""
     text = (
-        hulls.lines(hulls.lines(NATIVE, long, "STICKS").replace("STICK_IN_BOX\n", sticks.IN_BOX), bool(of))
+        hulls.lines(
+            hulls.lines(hulls.lines(NATIVE, faces, "FACES"), long, "STICKS")
+            .replace("STICK_IN_BOX\n", sticks.IN_BOX)
+            .replace("HULL_FACES\n", hull_faces.NATIVE),
+            bool(of),
+        )
         .replace("REAL", C_TYPE[T])
         .replace("UNROLL\n", "#pragma unroll\n")
         .replace("LOOP\n", "#pragma unroll 1\n")
     )
     for name, value in {"AWAY": AWAY, "LEAD": LEAD, "FLAT": sticks.FLAT, "PARALLEL": 1e-6}.items():
         text = text.replace(name, f"{value!r}{number}")
-    return hulls.native(of, T, long) + text.replace("POINT", str(POINT)).replace("MOST", str(MOST)).replace(
-        "HALVINGS", str(sticks.HALVINGS[T])
-    )
+    return hulls.native(of, T, long) + text.replace("POINT", str(POINT)).replace(
+        "MOST", str(hull_faces.MOST if faces else MOST)
+    ).replace("HALVINGS", str(sticks.HALVINGS[T])).replace("EDGE", str(hulls.EDGE))
 
 
 NATIVE = r"""
@@ -72,10 +77,12 @@ struct solids
         REAL* to;
         long long apart;
         int count;
+        FACES int room;  // 0: MOST
 
         CUDA_CALLABLE inline void put(const REAL* at, const REAL* normal, REAL depth)
         {
             if (count >= MOST) return;
+            FACES if (room && count >= room) return;
             REAL* entry = to + POINT * count * apart;
             UNROLL
             for (int c = 0; c < 3; ++c) {
@@ -172,6 +179,7 @@ struct solids
     }
 
     STICKS STICK_IN_BOX
+    FACES HULL_FACES
     // A corner or a crossing of the polygon, in the common face: across it, and how deep.
     struct Corner
     {
@@ -369,6 +377,8 @@ struct solids
     static CUDA_CALLABLE inline int touch(const Solid& a, const Solid& b, REAL* to, long long apart, int most)
     {
         Out out = {to, apart, 0};
+        FACES out.room = most;
+        FACES if (a.hull >= 0 && b.hull >= 0) hull_faces(a, b, out); else
         if (a.box && b.box) faces(a, b, out);
         STICKS else if (a.box && b.size[2] > 0) stick_in_box(b, a, true, out);
         STICKS else if (b.box && a.size[2] > 0) stick_in_box(a, b, false, out);

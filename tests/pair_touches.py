@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.kernels import hulls, native, touches
+from warp_spo.kernels import hull_faces, hulls, native, touches
 from warp_spo.kernels.elementary import C_TYPE, NATIVE
 from warp_spo.recursions.contact.couples import Polyhedron
 from warp_spo.scene.pairs import shape_of
@@ -55,7 +55,7 @@ REAL *out = touches_out.data + row[4] * worlds + world, zero[3] = {0, 0, 0}, bet
 for (int c = 0; c < 3; ++c) out[c * worlds] = between[c] = two[c] - one[c];
 const solids::Solid a = placing::place(zero, one + 3, shape, row[2]);
 const solids::Solid b = placing::place(between, two + 3, shape + ENTRIES, row[3]);
-solids::touch(a, b, out + HEADER * worlds, worlds, row[2] && row[3] ? MOST : row[2] || row[3] ? 4 : 1);
+solids::touch(a, b, out + HEADER * worlds, worlds, row[2] && row[3] ? TOGETHER : row[2] || row[3] ? 4 : 1);
 """
 
 
@@ -80,12 +80,16 @@ def find_touches(T, of=()) -> wp.Kernel:
     [2 pair, ENTRIES].
     """
     text = hulls.lines(FIND, bool(of)).replace("REAL", C_TYPE[T]).replace("UNROLL\n", "#pragma unroll\n")
-    for name, value in {"ENTRIES": ENTRIES, "HEADER": touches.HEADER, "MOST": touches.MOST}.items():
+    for name, value in {
+        "ENTRIES": ENTRIES,
+        "HEADER": touches.HEADER,
+        "TOGETHER": hull_faces.MOST if len(of) > 1 else touches.MOST,
+    }.items():
         text = text.replace(name, str(value))
     arrays = {"poses": wp.array3d[T], "pairs": wp.array2d[int], "shapes": wp.array2d[T], "touches_out": wp.array2d[T]}
     find = native.function(
         "find_touch",
-        NATIVE[C_TYPE[T]] + touches.native(T, of, long=True) + text,
+        NATIVE[C_TYPE[T]] + touches.native(T, of, long=True, faces=len(of) > 1) + text,
         {"pair": int, "world": int, **arrays},
     )
 

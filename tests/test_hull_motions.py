@@ -145,9 +145,9 @@ def gripper(shape, friction=0.8):
     return spo.Scene(bodies, hinges, contacts=contacts)
 
 
-def lifted(shape, device, seconds=2.0, side=0.05):
+def lifted(shape, device, seconds=2.0, side=0.05, scene=None):
     """Return q after each step in which 40 N a finger hold something, half as wide as ``side``, and lift it."""
-    scene = gripper(shape)
+    scene = gripper(shape) if scene is None else scene
     dyn, found = spo.Dynamics(scene, 1, device=device, dtype="float64"), []
     q, qd, tau = scene.neutral_q[None].copy(), np.zeros((1, scene.dof_count)), np.zeros((1, scene.dof_count))
     q[:, 1:3], tau[:, 1:3], target = side + 1e-4, -40.0, np.zeros((1, scene.coord_count))

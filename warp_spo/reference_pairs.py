@@ -83,6 +83,8 @@ def touches(first, second):
         return [rounds(first, second)]
     if first[0] == second[0] == 1:
         return faces(first, second)
+    if first[0] == second[0] == 2:
+        return hull_faces(first, second)
     if first[0] == 0:
         return round_in(first, second)
     return [(point, -normal, depth) for point, normal, depth in round_in(second, first)]
@@ -250,6 +252,39 @@ def faces(first, second):
         depth = half[axis] - normal @ (corner - here[:3, 3])
         found.append((corner + 0.5 * depth * normal, normal if swap else -normal, depth))
     return found
+
+
+def hull_faces(first, second):
+    """Return the points of two hulls: as :func:`faces`, with the face that looks at the common one most."""
+    placed = [(place[:3, :3], place[:3, 3], corners @ place[:3, :3].T + place[:3, 3]) for _, place, corners, _ in
+              (first, second)]  # fmt: skip
+    best = []
+    for (turn, at, _), (_, _, others), (_, _, corners, _) in zip(placed, placed[::-1], (first, second), strict=True):
+        sides = [(turn @ up, offset + turn @ up @ at) for up, offset in planes(corners)]
+        best.append(max((((others @ up - offset).min(), up, offset) for up, offset in sides), key=lambda side: side[0]))
+    lead = LEAD * min(np.ptp(solid[2], axis=0).min() / 2.0 for solid in (first, second))
+    swap = best[1][0] > best[0][0] + lead
+    _, normal, offset = best[1] if swap else best[0]
+    here, there = placed[::-1] if swap else placed
+    facing = min((there[0] @ up for up, _ in planes((first if swap else second)[2])), key=lambda up: up @ normal)
+    polygon = around(there[2], facing)
+    common = around(here[2], normal)
+    for a, b in zip(common, common[1:] + common[:1], strict=True):
+        outward = np.cross(b - a, normal)
+        polygon = clipped(polygon, outward, outward @ a)
+    found = []
+    for corner in polygon:
+        depth = offset - normal @ corner
+        found.append((corner + 0.5 * depth * normal, normal if swap else -normal, depth))
+    return found
+
+
+def around(corners, up):
+    """Return the corners of the face of a hull that is highest along ``up``, as they go round it counterclockwise."""
+    heights = corners @ up
+    on = corners[heights > heights.max() - 1e-9 * np.ptp(corners, axis=0).max()]
+    apart = on - on.mean(axis=0)
+    return list(on[np.argsort(np.arctan2(apart @ np.cross(up, apart[0]), apart @ apart[0]))])
 
 
 def farthest(one, other):

@@ -123,9 +123,9 @@ class SolverSPO(Plugs, SolverBase):
             for every two shapes that they match and that the model lets collide; forces are those on the first. A
             table or a wall may be the other one: pairs then name all shapes that stand still, but for the ground.
             "all": every two shapes of bodies that move which the model lets collide, 32 pairs at most, with a warning
-            of those that no contact represents: cylinders, meshes with hollows or more than 64 faces, a mesh with a box
-            or another mesh. An empty list: none. None: none, with a warning if bodies of separate trees may collide by
-            the model's filters and the ground is the solver's own.
+            of those that no contact represents: cylinders, meshes with hollows or more than 64 faces. An empty list:
+            none. None: none, with a warning if bodies of separate trees may collide by the model's filters and the
+            ground is the solver's own.
         passes: Of a step with contacts, see :meth:`warp_spo.Dynamics.step`.
         substeps: A step takes so many of dt / substeps, see there, and writes the bodies' states once. Joint forces of
             free joints on bodies keep the axes of the first. The observables are then status, contact_f (the mean),

@@ -135,11 +135,11 @@ class Contact(StoredPart):
     which never pull, and friction in the ground's plane, at most ``friction`` times the normal force.
 
     With ``other``, the two bodies touch each other instead, as the shapes that they are: points, spheres and capsules
-    among themselves and with boxes and hulls, and boxes with boxes at the common part of two faces, up to eight points.
-    Where edges of two boxes cross, the faces still push, in a direction that is not the edges' own. A hull, at most 64
-    faces and 64 corners, pushes away from its nearest point, on a face, an edge or a corner; what is inside, out of the
-    nearest face. A capsule on a box or a hull has four points along its axis. The pair is a spring and a damper that
-    its points share equally, with friction at each.
+    among themselves and with boxes and hulls, and boxes and hulls among themselves at the common part of two faces, up
+    to eight points of boxes and 16 of hulls. Where edges cross, the faces still push, in a direction that is not the
+    edges' own. A hull, at most 64 faces and 64 corners, pushes a point away from its nearest one, on a face, an edge or
+    a corner, and what is inside out of the nearest face. A capsule on a box or a hull has four points along its axis.
+    The pair is a spring and a damper that its points share equally, with friction at each.
 
     Args:
         body: index of the body.

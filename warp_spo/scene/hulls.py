@@ -90,6 +90,15 @@ def convex_hull(call: str, points: np.ndarray, known: np.ndarray) -> tuple[Hull,
     return hull, middle
 
 
+def grown(hull: Hull, by: float) -> np.ndarray:
+    """Return the corners of a hull whose faces lie farther out [corner, 3]; nearly where more than three meet."""
+    found = []
+    for number, corner in enumerate(hull.corners):
+        normals = hull.normals[[number in face for face in hull.faces]]
+        found.append(corner + np.linalg.lstsq(normals, np.full(len(normals), by), rcond=None)[0])
+    return np.array(found)
+
+
 def is_convex(hull: Hull, points: np.ndarray, triangles: np.ndarray) -> bool:
     """Return whether all triangles of a mesh lie on faces of its hull, for its points about the hull's middle.
 

@@ -16,6 +16,7 @@ from .storage import StoredPart
 SINK = 1e-4  # how far the lighter body sinks in [m] that rests on the other one, where the stiffness is chosen
 DAMPING = 2.0  # of sqrt(k m): critical, so that stacks come to rest
 FACE = 8  # corners at most of the common part of two rectangles
+FACES = 16  # corners at most of a face of one hull and one of another together
 PART = 4  # ends of the part of a segment that is near a box or a hull
 ROUND, BOX, HULL = 0, 1, 2
 
@@ -80,30 +81,35 @@ def contact_pairs(contacts: Sequence[Any], body_count: int) -> tuple[ContactPair
             )
         if partner.body == contact.body:
             raise ValueError(f"{call} is of body {contact.body} with itself; expected two bodies")
-        first, second = shape_of(call, contact), shape_of(call, partner)
-        _check_kinds(call, first, second)
-        both = (first, second)
-        found.append(ContactPair(index, contact.body, partner.body, both, most_points(*both), contact.eps))
+        both = shape_of(call, contact), shape_of(call, partner)
+        if ROUND not in (kinds := {one.kind for one in both}) and HULL in kinds:
+            both = as_hull(call, both[0]), as_hull(call, both[1])
+        found.append(ContactPair(index, contact.body, partner.body, both, most_points(call, *both), contact.eps))
     return tuple(found)
 
 
-def most_points(first: Solid, second: Solid) -> int:
-    """Return how many points two shapes share at most."""
+def most_points(call: str, first: Solid, second: Solid) -> int:
+    """Return how many points two shapes share at most; UnsupportedError if these are more than native code takes."""
+    if first.hull is not None and second.hull is not None:
+        corners = sum(max(map(len, one.hull.faces)) for one in (first, second) if one.hull is not None)
+        if corners > FACES:
+            raise UnsupportedError(
+                call, f"two hulls whose largest faces have {corners} corners together, more than {FACES},",
+                "give fewer points around the largest faces, or spheres in place of one of the two",
+            )  # fmt: skip
+        return corners
     if ROUND not in (first.kind, second.kind):
         return FACE
     stick = max(one.size[2] for one in (first, second) if one.kind == ROUND) > 0.0
     return PART if stick and {first.kind, second.kind} != {ROUND} else 1
 
 
-def _check_kinds(call: str, first: Solid, second: Solid) -> None:
-    """Raise UnsupportedError where two shapes have no points in common that a pair could find."""
-    kinds = {first.kind, second.kind}
-    if HULL in kinds and ROUND not in kinds:
-        raise UnsupportedError(
-            call, f"a hull with {'a box' if BOX in kinds else 'a hull'}",
-            "put points or spheres on one of the two, such as at corners that touch, a contact each; or boxes in place "
-            "of both",
-        )  # fmt: skip
+def as_hull(call: str, solid: Solid) -> Solid:
+    """Return a box as the hull of its corners, and a hull as it is."""
+    if solid.hull is not None:
+        return solid
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * solid.size
+    return dataclasses.replace(solid, kind=HULL, hull=convex_hull(call, corners, corners)[0])
 
 
 def _partner(call: str, contact: Any, contacts: Sequence[Any]) -> Any:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import UnsupportedError, as_integer
 from .contacts import Contact, pose_matrix, spread_directions
-from .hulls import Hull, convex_hull, is_convex
+from .hulls import Hull, convex_hull, grown, is_convex
 from .shapes import Shape
 
 if TYPE_CHECKING:
@@ -22,12 +22,10 @@ SOME = 64  # directions in which corners of a mesh are looked for at first
 MOST = 32
 """Pairs at most that "all" stands for: what compiles in seconds. Nine boxes, 36 pairs, took 11 s on a CPU."""
 KINDS = ("sphere", "capsule", "box", "hull")
-ROUND = {"sphere", "capsule"}
-WITH = {"sphere": set(KINDS), "capsule": set(KINDS), "box": ROUND | {"box"}, "hull": ROUND}
-"""Kinds of shapes that pairs may have, and with which others."""
+"""Kinds of shapes that pairs may have."""
 WAYS = (
-    "pairs are of boxes, or of a sphere or a capsule with these, a box or a hull: put such shapes in place of others, "
-    "or use another solver; contacts='ground' is for planes and height fields"
+    "pairs are of spheres, capsules, boxes and convex meshes: put such shapes in place of others, or use another "
+    "solver; contacts='ground' is for planes and height fields"
 )
 HULL_WAYS = (
     "make it convex or coarser first, such as by builder.approximate_meshes('convex_hull') of a mesh with few vertices "
@@ -44,12 +42,12 @@ class ShapePair(NamedTuple):
     @property
     def fits(self) -> bool:
         """Whether a contact can stand for shapes of these kinds."""
-        return self.second.kind in WITH.get(self.first.kind, ())
+        return self.first.kind in KINDS and self.second.kind in KINDS
 
     def contact(self) -> Contact:
         """Return the contact that stands for the pair, with the means of the shapes' materials."""
         a, b = self.first.on(self.second), self.second
-        solids = [_solid(one, other.rounding if other.kind == "hull" else 0.0) for one, other in ((a, b), (b, a))]
+        solids = [_solid(one, other) for one, other in ((a, b), (b, a))]
         material = {name: getattr(a, name) for name in ("stiffness", "damping")}
         if a.friction is not None:
             material["friction"] = a.friction
@@ -61,17 +59,18 @@ class ShapePair(NamedTuple):
         return " with ".join(shape.words(bodies) for shape in self)
 
 
-def _solid(shape: Shape, more: float) -> dict[str, Any]:
-    """Return a shape as arguments of a Contact; a margin makes a box larger on all sides.
+def _solid(shape: Shape, other: Shape) -> dict[str, Any]:
+    """Return a shape as arguments of a Contact with another one.
 
-    That of a hull makes the sphere or capsule larger which it meets, by ``more``.
+    A margin makes a box or a hull larger on all sides; that of a hull the sphere or capsule which it meets.
     """
-    place = pose_matrix(shape.pose)
+    place, more = pose_matrix(shape.pose), other.rounding if other.kind == "hull" else 0.0
     if shape.kind == "sphere":
         return {"sphere": (place[:3, 3], shape.sizes[0] + shape.rounding + more)}
     if shape.kind == "hull":
         hull, middle = _hull_of(shape)
-        return {"hull": (hull.corners + middle) @ place[:3, :3].T + place[:3, 3]}
+        corners = grown(hull, shape.rounding) if other.kind in ("box", "hull") and shape.rounding else hull.corners
+        return {"hull": (corners + middle) @ place[:3, :3].T + place[:3, 3]}
     if shape.kind == "capsule":
         radius, half = shape.sizes
         ends = (place[:3, 3] + side * half * place[:3, 2] for side in (1.0, -1.0))

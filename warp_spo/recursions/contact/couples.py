@@ -47,11 +47,11 @@ class Solids(NamedTuple):
         return 3 * self.bodies + 12 * self.shapes
 
     @property
-    def met(self) -> tuple[tuple[Polyhedron, ...], bool]:
-        """The hulls, and whether some pair is of a segment and a box or a hull."""
+    def met(self) -> tuple[tuple[Polyhedron, ...], bool, bool]:
+        """The hulls, whether some pair is of a segment and a box or a hull, and whether one is of two hulls."""
         long = [(row[2] > 0.0, row[5] > 0.0) for row in self.half]
         sticks = (boxes[0] != boxes[1] and long[i][boxes[0]] for i, boxes in enumerate(self.boxes))
-        return self.hulls, any(sticks)
+        return self.hulls, any(sticks), any(min(hulls) >= 0 for hulls in self.hull)
 
     @property
     def lists(self) -> dict[str, list[int]]:
