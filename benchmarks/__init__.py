@@ -9,9 +9,9 @@ The table of results:
     ``table``, ``pictures``, ``report`` and ``evidence`` make pages of the rows; ``commits``, ``probe`` and ``history``
     compare commits.
 One question each, on a GPU:
-    ``speed`` (times beside limits), ``breakdown`` (launches of a call), ``plans`` and ``crowding`` (the plan's choice),
-    ``depth`` (scans), ``variable`` (values that are read), ``substeps``, ``step_parts`` (SolverSPO's step),
-    ``actuators``, ``flexible``, ``capabilities`` (other solvers), ``host_time``, ``jax_check``, ``many_gpus``.
+    ``speed`` and ``limits`` (times beside limits), ``breakdown`` (launches of a call), ``plans`` and ``crowding`` (the
+    plan's choice), ``depth`` (scans), ``variable`` (values that are read), ``substeps``, ``step_parts`` (SolverSPO's
+    step), ``actuators``, ``flexible``, ``capabilities`` (other solvers), ``host_time``, ``jax_check``, ``many_gpus``.
 Accuracy, mostly on a CPU:
     ``stress/``, ``stability`` (robots under gravity), ``frames`` (where frames lie), ``gradients`` (rollouts),
     ``robot_files`` and ``mjcf_files`` (readers), ``inverse_kinematics``, ``flexible_peers`` and ``boom`` (beams).

@@ -1,6 +1,7 @@
 """Times of chosen operations beside a limit that each should keep: a table of what is fast enough and what is not.
 
     python -m benchmarks.speed [PATTERN] [--device cuda:0] [--json FILE] [--compile]
+    python -m benchmarks.speed --table FILE     # prints a saved run as a page
 
 A line gives the time of one call of all worlds [us], the largest error of the results against the dense float64
 reference, the figure that has a limit, and the limit. A figure is the time itself [us, s], a rate [1e9 worlds/s], or
@@ -33,102 +34,33 @@ import warp_spo as spo
 from warp_spo.trials.operations import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, Trial
 
-from . import robots, runner, step_parts, substeps
+from . import limits, robots, runner, step_parts, substeps
 from .contact import scenes
 from .contact import steps as contact_steps
+from .limits import (
+    FIRST_STEP,
+    FUSED,
+    LEAN_STEP,
+    LINES,
+    MANY,
+    MOST,
+    ON_FIELD,
+    ON_PLANE,
+    SOLVER_STEP,
+    STEPS,
+    SUBSTEPS,
+    Call,
+    Line,
+    describe,
+)
 from .resources import record_launches, resources
 from .turns import Turn, take_turns
 
-SOLVER_STEP = "SolverSPO.step"  # with drives and limits, of benchmarks.step_parts
-LEAN_STEP = "SolverSPO.step of joints alone"  # without the bodies' poses, and without forces on bodies
-STEPS = (SOLVER_STEP, LEAN_STEP)
-FEW, SOME, MANY, MOST = 4096, 16384, 65536, 1 << 20
-INERTIAS = ("body_mass", "body_com", "body_inertia")
-ON_PLANE, ON_FIELD = "contact_step", "contact_step on a height field"
-SUBSTEPS = 4
-FUSED = {f"step of {SUBSTEPS} substeps": "", f"contact_step of {SUBSTEPS} substeps": substeps.ON_PLANE}
-FIRST_STEP = "first call of a step"  # with drives and limits; kernels are traced and compiled
 CONTACT_TOLERANCE = 1e-4  # of velocities after a step with contacts, in float32
 SETS, SAMPLE, REPEATS, WARM_UP, BUDGET = 3, 2, 15, 0.1, 0.3  # of MOST worlds one set is larger than every cache
 STEADY = 0.03  # largest relative difference of the times of the reference
 WORK = {SOLVER_STEP: 8.0, FIRST_STEP: 3.0, "forward_dynamics_derivatives": 6.0}  # of compiling, for a dof; the others 2
-
-
-@dataclasses.dataclass(frozen=True)
-class Call:
-    """A call that is timed: an operation of a robot, how many worlds, and options of Dynamics."""
-
-    robot: str
-    operation: str
-    worlds: int
-    dtype: str = "float32"
-    variable: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        more = [self.dtype] * (self.dtype != "float32") + ["variable inertias"] * bool(self.variable)
-        return ", ".join([f"{self.robot} {self.operation}", f"{self.worlds} worlds", *more])
-
-
-@dataclasses.dataclass(frozen=True)
-class Line:
-    """A call, and the limit of a figure: "us", "s", "ratio" (its time over that of ``beside``), or "rate" (at least).
-
-    The ratio of a call of several substeps is its time over that of as many calls.
-    """
-
-    call: Call
-    kind: str
-    limit: float
-    beside: Call | None = None
-
-    def figure(self, time: Callable[[Call], dict]) -> float:
-        """Return the figure; ``time`` gives the times of a call [us]."""
-        us = time(self.call)["us"]
-        if self.kind == "ratio":
-            return us / (time(self.call)["calls_us"] if self.beside is None else time(self.beside)["us"])
-        return {"rate": 1e-3 * self.call.worlds / us, "s": 1e-6 * us, "us": us}[self.kind]
-
-    def keeps(self, figure: float) -> bool:
-        """Return whether the figure keeps the limit."""
-        return figure >= self.limit if self.kind == "rate" else figure <= self.limit
-
-
 REFERENCE = Call("go2", "forward_dynamics", MANY)  # is timed three times in a run of all lines
-
-
-def _over_float32(robot: str, operation: str, worlds: int, limit: float) -> Line:
-    call = Call(robot, operation, worlds, "float64")
-    return Line(call, "ratio", limit, dataclasses.replace(call, dtype="float32"))
-
-
-def _step_over_forward_dynamics(robot: str, step: str, worlds: int, limit: float) -> Line:
-    return Line(Call(robot, step, worlds), "ratio", limit, Call(robot, "forward_dynamics", worlds))
-
-
-def _over_folded(robot: str, limit: float) -> Line:
-    call = Call(robot, "forward_dynamics", MOST, variable=INERTIAS)
-    return Line(call, "ratio", limit, dataclasses.replace(call, variable=()))
-
-
-LINES = (
-    *(_step_over_forward_dynamics(robot, step, FEW, 2.5) for robot in step_parts.NAMES for step in STEPS),
-    *(_step_over_forward_dynamics(robot, SOLVER_STEP, SOME, 2.0) for robot in ("go2", "b1_z1", "centauro")),
-    Line(Call("centauro", FIRST_STEP, FEW), "s", 10.0),
-    *(_over_float32("centauro", "forward_dynamics", worlds, 3.0) for worlds in (FEW, MANY)),
-    Line(Call("centauro", "forward_dynamics", MOST), "rate", 0.8),
-    Line(Call("g1", "forward_dynamics", MOST), "rate", 1.6),
-    Line(Call("go2", "forward_dynamics", MANY), "us", 12.5),
-    Line(Call("go2", "inverse_dynamics", MANY), "us", 7.0),
-    Line(Call("g1", "forward_dynamics_derivatives", FEW), "us", 150.0),
-    Line(Call("g1", "forward_dynamics_derivatives", MANY), "us", 1500.0),
-    Line(Call("g1", "mass_matrix_inverse", FEW, "float64"), "us", 60.0),
-    *(_over_float32(robot, name, FEW, 2.5) for robot in ("go2", "g1") for name in ("phi", "phi.T", "psi")),
-    *(_over_folded(robot, 1.4) for robot in ("panda", "go2", "g1")),
-    *(Line(Call("go2", ON_PLANE, worlds), "us", limit) for worlds, limit in ((FEW, 25.0), (MANY, 150.0))),
-    *(Line(Call("g1", ON_PLANE, worlds), "us", limit) for worlds, limit in ((FEW, 70.0), (MANY, 500.0))),
-    Line(Call("go2", ON_FIELD, MANY), "ratio", 1.15, Call("go2", ON_PLANE, MANY)),
-    *(Line(Call(robot, name, FEW), "ratio", limit) for name in FUSED for robot, limit in (("go2", 0.85), ("g1", 1.05))),
-)
 
 
 def trial_of(call: Call, device: wp.Device, sets: int = SETS) -> Trial | step_parts.SolverTrial:
@@ -273,19 +205,6 @@ def _time(task: tuple[str, tuple[int, ...], list[Call]], turn: Turn) -> Iterator
                 yield call, f"{type(error).__name__}: {str(error)[:200]}"
 
 
-def describe(line: Line, rows: dict[Call, dict]) -> str:
-    """Return the line in words, with its figure."""
-    timed = rows.__getitem__
-    figure, row = line.figure(timed), rows[line.call]
-    unit = {"us": "us", "s": "s", "rate": "1e9/s", "ratio": "times"}[line.kind]
-    limit = f"{'at least' if line.kind == 'rate' else 'at most'} {line.limit:g}"
-    beside = f" of {line.beside}, {timed(line.beside)['us']:.4g} us" if line.beside else ""
-    if line.call.operation in FUSED:
-        beside = f" of {SUBSTEPS} calls, {row['calls_us']:.4g} us"
-    word, own = "kept" if line.keeps(figure) else "MISSED", f"{row['us']:.4g} us, error {row['error']:.1e}"
-    return f"{line.call!s}: {own}; {figure:.4g} {unit}{beside}; {limit}: {word}"
-
-
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="benchmarks.speed", description="Times beside limits.")
     parser.add_argument("pattern", nargs="?", default="", help="regular expression on the names of lines")
@@ -293,7 +212,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="file for the rows, written after each line")
     parser.add_argument("--compile", action="store_true", help="compile all kernels, and time nothing")
     parser.add_argument("--seconds", type=float, default=3600.0, help="time for all of it, default: 3600")
+    parser.add_argument("--table", type=Path, metavar="FILE", help="print a saved run as a page, and run nothing")
     options = parser.parse_args(arguments)
+    if options.table:
+        print(limits.page(options.table), end="")
+        return 0
     device = wp.get_device(options.device)
     lines = [line for line in LINES if re.search(options.pattern, str(line.call))]
     if options.compile:
