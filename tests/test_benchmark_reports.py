@@ -10,6 +10,7 @@ from benchmark_results import RUN, _data, _gathered, _row
 
 from benchmarks import (
     evidence,
+    limits,
     pictures,
     runner,
     table,
@@ -95,6 +96,19 @@ def test_committed_tables_are_those_of_the_committed_runs():
     found = evidence.gather(evidence.read(file) for file in evidence.files([evidence.RESULTS]))
     for file, text in table.filled(evidence.ROOT, evidence.RESULTS, found).items():
         assert file.read_text() == text, f"{file.name}: python -m benchmarks --readme writes it anew"
+
+
+def test_committed_page_of_limits_is_that_of_its_newest_run():
+    folder = evidence.RESULTS / "speed"
+    file = max(
+        (file for file in folder.glob("*.json") if "reference_us" in file.read_text()), key=lambda file: file.name
+    )
+    page = limits.page(file)
+    assert (folder / "README.md").read_text() == page, f"python -m benchmarks.speed --table {file.name} prints it anew"
+    run, lines = json.loads(file.read_text()), {str(line.call): line for line in limits.LINES}
+    assert page.count("\n| ") == 1 + len(limits.LINES) == 1 + len(lines) and str(run["commit"])[:12] in page
+    row = next(row for row in run["rows"] if row["operation"] == "inverse_dynamics")
+    assert f"| go2 inverse_dynamics | 65,536 | {row['us']:.4g} |" in page
 
 
 def test_report_is_one_page_with_tables_pictures_and_the_stress_suite(tmp_path, capsys):
