@@ -67,6 +67,10 @@ def grouped(chosen: Sequence[dict], name_of: Callable[[dict], str] = group_of) -
 def _measure(task: tuple, turn: Turn) -> Iterator[dict]:
     group, device, roof = task
     wp.config.log_level = wp.LOG_WARNING
+    with contextlib.suppress(ImportError):  # what torch does once is no part of a turn
+        import torch
+
+        torch.zeros(1, device=device if torch.cuda.is_available() else "cpu")
     yield from runner.run(group, wp.get_device(device), roof=roof, turn=turn)
     gc.collect()
 
