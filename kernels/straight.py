@@ -84,6 +84,7 @@ class KernelLayout(NamedTuple):
         late: the statements of a warp without a team wait for such rows where they first use them.
         repeats: the statements are those of a substep, see :mod:`.substeps`.
         aside: the number of values that a thread sets aside in shared memory, as ``ASIDE(i)``.
+        near: names and entries of tables that a team copies to shared memory, as ``near_NAME[i]``: loops wait for them.
     """
 
     rows: list[Row]
@@ -102,6 +103,7 @@ class KernelLayout(NamedTuple):
     late: bool = False
     repeats: bool = False
     aside: int = 0
+    near: tuple[tuple[str, int], ...] = ()
 
     @property
     def state(self) -> list[Row]:
@@ -159,7 +161,12 @@ class KernelLayout(NamedTuple):
 
     def shared_bytes(self, T: type) -> int:
         """Return the bytes of shared memory of a block, for scalars of type ``T``."""
-        return self.shared_scalars * self.groups * wp.types.type_size_in_bytes(T)
+        return (self.shared_scalars * self.groups + self.near_scalars) * wp.types.type_size_in_bytes(T)
+
+    @property
+    def near_scalars(self) -> int:
+        """The scalars of shared memory that tables take; an integer takes no more than a scalar."""
+        return sum(entries for _, entries in self.near)
 
 
 class _Places:
@@ -212,7 +219,9 @@ def _cuda_text(layout: KernelLayout, statements: str, T: type) -> list[str]:
         )
     if layout.repeats:
         statements = repeat_on_cuda(statements, layout.warps > 1)
-    text = [*_find_worlds(layout), *_declare_stage(layout, T), *_declare_rows(layout, places, c), *copied]
+    text = [*_find_worlds(layout), *_declare_stage(layout, T), *_fetch_tables(layout, c)]
+    text += [*_declare_rows(layout, places, c), *copied]
+    text += [WAIT_FOR_COPIES, _barrier(layout)] if layout.near else []
     text += _declare_result(layout, places, T)
     if layout.messages:
         text += [f"{c}* sent = stage + {places.messages} + lane;", "#define SENT(i) sent[(i) * 32]"]
@@ -243,10 +252,23 @@ def _declare_stage(layout: KernelLayout, T: type) -> list[str]:
     if not layout.shared_scalars:
         return []
     c = C_TYPE[T]
-    declared = [f"__shared__ __align__(16) {c} shared[{layout.groups * layout.shared_scalars}];"]
+    scalars = layout.groups * layout.shared_scalars + layout.near_scalars
+    declared = [f"__shared__ __align__(16) {c} shared[{scalars}];"]
     if layout.asks_for_shared_memory(T):
         declared = ["extern __shared__ __align__(16) char asked_for[];", f"{c}* shared = ({c}*)asked_for;"]
     return [*declared, f"{c}* stage = shared + (threadIdx.x / {WARP_SIZE * layout.warps}) * {layout.shared_scalars};"]
+
+
+def _fetch_tables(layout: KernelLayout, c: str) -> list[str]:
+    """Return code that starts to copy tables to shared memory, behind all else there."""
+    text, at, team = [], layout.groups * layout.shared_scalars, WARP_SIZE * layout.warps
+    for name, entries in layout.near:
+        kind = "int" if name in INTEGERS else c
+        text.append(f"{kind}* near_{name} = ({kind}*)(shared + {at});")
+        copied = f"{{ ON_ITS_WAY(near_{name} + i, {name}.data + i); }}"
+        text.append(f"for (int i = member; i < {entries}; i += {team}) {copied}")
+        at += entries
+    return [DEFINE_ASYNC_COPY, *text, "#undef ON_ITS_WAY"] if text else []
 
 
 def _declare_rows(layout: KernelLayout, places: _Places, c: str) -> list[str]:

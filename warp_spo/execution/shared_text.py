@@ -17,6 +17,7 @@ class SharedText:
 
     Args:
         dtype: the scalar type, "float32" or "float64".
+        near: integers are read from shared memory.
 
     Attributes:
         table: the constants in which equal pieces differ, as the kernel's array holds them.
@@ -24,8 +25,8 @@ class SharedText:
         operations: the number of floating-point operations of one world.
     """
 
-    def __init__(self, dtype: str):
-        self.dtype, self.c = dtype, C_TYPE[dtype]
+    def __init__(self, dtype: str, near: bool = False):
+        self.dtype, self.c, self.near = dtype, C_TYPE[dtype], near
         self.table: list[float] = []
         self.shifts: list[int] = []
         self.operations = 0
@@ -116,6 +117,10 @@ class SharedText:
             head += self._distances(shifts.columns, tables)
         return "\n".join(head), texts
 
+    def integer(self, entry: str) -> str:
+        """Return C++ that reads an entry of the table of integers."""
+        return f"near_shifts[{entry}]" if self.near else f"__ldg(shifts.data + {entry})"
+
     def _distances(self, columns: list[tuple], tables: str) -> list[str]:
         """Return statements that find how far the entries of a warp's piece lie from those of the first.
 
@@ -130,7 +135,7 @@ class SharedText:
             if step is not None:
                 found += [f"{name} = {tables}who * {step};", KEEP.format(name)]
             else:
-                found.append(f"{name} = __ldg(shifts.data + {first} + {tables}who * {len(uneven)});")
+                found.append(f"{name} = {self.integer(f'{first} + {tables}who * {len(uneven)}')};")
                 first += 1
         self.shifts += [value for row in zip(*uneven, strict=True) for value in row]
         return found

@@ -28,16 +28,19 @@ def build(builder: Builder, job: Job, links: Links) -> Program | None:
     for step, some in stores.items():
         emitters.append(make_emitter(dtype, job.shapes, layout, True))
         listings[step] = emitters[-1].region(some)
-    shared = SharedText(dtype)
+    shared = SharedText(dtype, near=True)
     cuda = _cuda(shared, walks, listings)
     declared = f"{C_TYPE[dtype]} {body_frames.FRAME}_row[{body_frames.SIZE}];"
     steps = [listings[step] for walk in walks for step in walk]
     cpu = "\n".join([declared, *(f"{{\n{render(listing, dtype)}\n}}" for listing in steps)])
     lists = {"table": shared.table, "shifts": shared.shifts, body_frames.GEOMETRY: body_frames.geometry(links.scene)}
+    tables = {name: values for name, values in lists.items() if values}
+    layout = layout._replace(near=(("shifts", len(shared.shifts)),))
+    if not layout.fits(builder.run.dtype, builder.room(job.routine.wide)):
+        return None
     name = body_frames.GEOMETRY.upper()
     cuda = f"#define {name}(i) __ldg(geometry.data + i)\n{declared}\n{cuda}\n#undef {name}"
     cpu = f"#define {name}(i) geometry.data[i]\n{cpu}\n#undef {name}"
-    tables = {name: values for name, values in lists.items() if values}
     return builder.finish(job.routine, layout, cuda, cpu, tables, sum(each.operations for each in emitters))
 
 
@@ -78,11 +81,11 @@ def _cuda(shared: SharedText, walks: list[list], listings: dict[tuple[bool, int]
     shared.shifts += [x for walk in walks for step in walk for x in known[step]]
     return "\n".join(
         [
-            f"const int last = __ldg(shifts.data + {first + 1} + warp);",
+            f"const int last = {shared.integer(f'{first + 1} + warp')};",
             "#pragma unroll 1",
-            f"for (int at = __ldg(shifts.data + {first} + warp); at < last; ++at) {{",
-            f"const int kind = __ldg(shifts.data + {table} + 2 * at);",
-            f"const int who = __ldg(shifts.data + {table + 1} + 2 * at);",
+            f"for (int at = {shared.integer(f'{first} + warp')}; at < last; ++at) {{",
+            f"const int kind = {shared.integer(f'{table} + 2 * at')};",
+            f"const int who = {shared.integer(f'{table + 1} + 2 * at')};",
             *branches,
             "}",
         ]
