@@ -131,9 +131,10 @@ def main(arguments: list[str] | None = None) -> int:
     return 1 if left or failed else 0
 
 
-def _effort(group: Sequence[dict]) -> tuple[int, int]:
-    """Return what orders groups by the time that they take."""
-    return len(group), FACTORIES[group[0]["scene"]]().dof_count
+def _effort(group: Sequence[dict]) -> float:
+    """Return what orders groups by the time that they take to prepare, in no unit."""
+    case = group[0]
+    return len(group) * (10 + FACTORIES[case["scene"]]().dof_count) * (1.0 + case["worlds"] / 2**17)
 
 
 def _continued(file: Path, run: dict) -> dict:
