@@ -152,14 +152,19 @@ def _around(corners: np.ndarray, on: np.ndarray, normal: np.ndarray) -> list[int
     one /= np.linalg.norm(one)
     flat = corners[on] @ np.column_stack([one, np.cross(normal, one)])
     order = np.lexsort((flat[:, 1], flat[:, 0]))
-    straight, sides = SAME * np.ptp(flat, axis=0).max(), []
+    straight, sides = SAME * np.ptp(corners, axis=0).max(), list[int]()
     for way in (order, order[::-1]):  # Andrew's chains
         chain: list[int] = []
         for i in way:
-            while len(chain) > 1 and _beside(flat[chain[-2]], flat[chain[-1]], flat[i]) <= straight:
+            while len(chain) > 1 and _beside(flat[chain[-2]], flat[chain[-1]], flat[i]) <= 0.0:
                 chain.pop()
             chain.append(int(i))
         sides += chain[:-1]
+    while len(sides) > 3:  # rounded points of an edge lie along it in order only once they go round
+        off = [_beside(*flat[[sides[i - 1], sides[i], sides[i + 1 - len(sides)]]]) for i in range(len(sides))]
+        if min(off) > straight:
+            break
+        del sides[int(np.argmin(off))]
     return [int(on[i]) for i in sides]
 
 
