@@ -101,9 +101,11 @@ def main(arguments: list[str] | None = None) -> int:
         whole = _continued(options.file, runner.record([], device, roof))
         rows = whole["rows"]
     there = set(map(group_of, rows))
-    groups = grouped(cases(options.compile), kernel_of if options.compile else group_of)
+    every = cases(options.compile)
+    groups = grouped(every, kernel_of if options.compile else group_of)
     groups = {name: group for name, group in groups.items() if re.search(options.pattern, name) and name not in there}
     print(f"{len(groups)} groups; {len(there)} are there", flush=True)
+    places = {name: place for place, name in enumerate(grouped(every))}  # in which rows are written
     left, found, failed = dict.fromkeys(groups), dict[str, list[dict]](), 0
     names = {id(group): name for name, group in groups.items()}
     tasks = [(group, str(device), roof) for group in sorted(groups.values(), key=_effort, reverse=True)]
@@ -123,6 +125,7 @@ def main(arguments: list[str] | None = None) -> int:
             del left[name]
             rows += found.get(name, [])
             if not options.compile:
+                rows.sort(key=lambda row: places[group_of(row)])
                 runner.save(whole, options.file)
                 print(f"{time.perf_counter() - begin:.0f} s, {name}: {len(found.get(name, []))} rows", flush=True)
     if left:
