@@ -118,7 +118,7 @@ def page(file: Path) -> str:
         f"{run['date'][:16].replace('T', ' ')} UTC. A time is that of one call of all worlds, replayed in a CUDA",
         "graph while all other processes stand still; the error is that of the same run, against float64, of a step of",
         "several substeps against as many calls. One call was timed at the beginning, in the middle and at the end:",
-        f"{', '.join(f'{us:.2f}' for us in run['reference_us'])} µs.",
+        f"{', '.join(f'{us:.2f}' for us in run['reference_us'])} µs. Calls took {run['sets']} sets of inputs in turn.",
         "",
         "| call | worlds | µs | error | figure | limit | |",
         "|---|---:|---:|---:|---:|---:|---|",

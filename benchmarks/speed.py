@@ -230,7 +230,7 @@ def _run(lines: list[Line], device: str, seconds: float, file: Path | None) -> i
     often = 0, len(calls) // 2, len(calls)  # turns after which the reference is timed
     tasks: list[tuple[str, tuple[int, ...], list[Call]]] = [(device, often, [REFERENCE])] if REFERENCE in calls else []
     tasks += [(device, (0,), share) for share in _shares(calls)]
-    whole = runner.record([], device)
+    whole = runner.record([], device) | {"sets": SETS}
     begin, failed, waiting, repeated = time.perf_counter(), dict[Call, str](), list(lines), list[float]()
     for (_, turns, _), found in take_turns(tasks, _time, seconds):
         if found is None:
