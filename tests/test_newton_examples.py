@@ -77,8 +77,8 @@ REFUSED = {
 """Examples that cannot run, and how they end."""
 
 
-@pytest.mark.parametrize("name", ["robot_cartpole", *(pytest.param(name, marks=pytest.mark.slow) for name in RUN
-                                                      if name != "robot_cartpole")])  # fmt: skip
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RUN)
 def test_passes_its_own_test(name):
     solver, frames, options = RUN[name]
     assert set(run(name, solver, frames, **options).solver.status.numpy()) == {Status.OK}

@@ -193,6 +193,7 @@ def test_harnesses_read_states_and_give_results(tmp_path):
         list(exchange.rows([sys.executable, "-c", "raise SystemExit(3)"], tmp_path / "results", states, timeout=60))
 
 
+@pytest.mark.slow
 def test_command_writes_rows_and_skips_what_is_absent(tmp_path, capsys, monkeypatch):
     installed("newton")
     monkeypatch.delenv("WARP_SPO_PEERS", raising=False)

@@ -29,6 +29,7 @@ def values_restored(tree):
     restore_values(tree[0])
 
 
+@pytest.mark.slow
 def test_prepared_ahead_nothing_is_compiled(device, monkeypatch):
     """``prepare`` compiles every kernel that products and torch's backward pass use."""
     scene = zoo.from_parents([-1, 0, 1], ["ball", "revolute", "revolute"], 3)
