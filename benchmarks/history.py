@@ -81,14 +81,10 @@ def harvest(folder: Path = FOLDER) -> list[Path]:
     Entries that exist are left alone, because they come from several processes.
     """
     runs: dict[tuple[str, str], list[dict]] = {}
-    for commit in commits.git("log", "--format=%H", "--", str(evidence.RESULTS)).split():
-        names = commits.git("ls-tree", "--full-tree", "--name-only", "-r", commit, str(RESULTS_IN_GIT)).split("\n")
-        for name in names:
-            file = Path(name)
-            if file.suffix == ".json" and file.parent == RESULTS_IN_GIT:  # subfolders have results of other forms
-                data = json.loads(commits.git("show", f"{commit}:{name}"))
-                if isinstance(data, dict) and "rows" in data and "commit" in data:
-                    runs.setdefault((data["commit"], data["machine"]["device"]), []).append(data)
+    for blob in _committed_results():
+        data = json.loads(commits.git("cat-file", "blob", blob))
+        if isinstance(data, dict) and "rows" in data and "commit" in data:
+            runs.setdefault((data["commit"], data["machine"]["device"]), []).append(data)
     found = []
     for (commit, _), mine in runs.items():
         rows = {}
@@ -108,6 +104,19 @@ def harvest(folder: Path = FOLDER) -> list[Path]:
             if not file.exists():
                 found.append(runner.save(data | dict(rows=list(rows.values())), file))
     return found
+
+
+def _committed_results() -> list[str]:
+    """Return the git objects of all files of results that a commit added or changed, newest first, each once."""
+    changes = commits.git("log", "--raw", "--no-abbrev", "--no-renames", "--format=", "--", str(RESULTS_IN_GIT))
+    found = {}
+    for change in filter(None, changes.split("\n")):  # ":100644 100644 old new M<tab>path"
+        fields, name = change.split("\t")
+        *_, blob, state = fields.split()
+        file = Path(name)
+        if state != "D" and file.suffix == ".json" and file.parent == RESULTS_IN_GIT:  # subfolders have other forms
+            found[blob] = None
+    return list(found)
 
 
 def file_of(data: dict, folder: Path) -> Path:
