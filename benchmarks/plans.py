@@ -37,7 +37,7 @@ from .capabilities import DT, KD, KE
 from .crowding import crowd
 
 sys.path.append(str(Path(__file__).parent.parent / "tests"))  # the random trees come from the tests
-import zoo
+from support import zoo
 
 NAMES = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "step")
 ARMS = ("hand", "hand_cube", "panda_cube")  # a Panda with fingers, the same beside a cube, without fingers beside one

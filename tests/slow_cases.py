@@ -1,6 +1,6 @@
 """Cases that take seconds among tests that are otherwise quick: they run with the slow suite.
 
-A name is a test, or one case of a parametrized test, as pytest writes it behind the folder.
+A name is a test, or one case of a parametrized test, as pytest writes it behind the folders.
 """
 
 SLOW_CASES = (

@@ -1,0 +1,142 @@
+"""Ready rewards and terminations beside NumPy, on states in which feet land, slip and lift."""
+
+import numpy as np
+import pytest
+import torch
+
+from support.env_scenes import FEET, walker_env, walker_q, walker_scene
+from warp_spo.env import commands, observations, rewards, terminations
+
+TERMS = {
+    "track velocity": rewards.track_velocity(0.4),
+    "track turning": rewards.track_turning(0.4),
+    "vertical velocity": rewards.vertical_velocity,
+    "tilting": rewards.tilting,
+    "tilt": rewards.tilt,
+    "base height": rewards.base_height(0.3),
+    "action rate": rewards.action_rate,
+    "action size": rewards.action_size,
+    "joint deviation": rewards.joint_deviation(),
+    "posture": rewards.posture({"joint_[1357]": 0.2, "joint_[2468]": 0.4}),
+    "joint velocity": rewards.joint_velocity(),
+    "torque": rewards.torque,
+    "power": rewards.power,
+    "air time": rewards.air_time(FEET, 0.04),
+    "foot slip": rewards.foot_slip(FEET),
+    "foot clearance": rewards.foot_clearance(FEET, 0.05),
+    "landing force": rewards.landing_force(FEET),
+    "touching": rewards.touching(FEET),
+    "joint limits": rewards.joint_limits(0.5),
+    "last air time": lambda w: w.feet(FEET).last_air_time.sum(),
+}
+LOW, HIGH = -1.4, 1.0  # limits of all joints
+
+
+def matrices(quaternions):
+    """Return rotation matrices of quaternions, xyzw."""
+    x, y, z, w = np.moveaxis(quaternions, -1, 0)
+    zero = np.zeros_like(x)
+    across = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
+    return np.eye(3) + 2.0 * w[..., None, None] * across + 2.0 * across @ across
+
+
+@pytest.mark.slow
+def test_ready_rewards():
+    limits = {"joint_limit_lower": np.r_[[-1e10] * 6, [LOW] * 8], "joint_limit_upper": np.r_[[1e10] * 6, [HIGH] * 8]}
+    env = walker_env(
+        8,
+        scene=walker_scene(delay=0).with_values(**limits),
+        observations={"a": list(TERMS.values()), "frame": [lambda w: w.frame("trunk").velocity]},
+        rewards={},
+        events=[],
+        terminations={},
+        commands=commands.Velocity(),
+    )
+    limited = walker_q()[7:]
+    actions = [torch.zeros(8, 8), torch.zeros(8, 8)]
+    air, contact, last = np.zeros((8, 4)), np.zeros((8, 4)), np.zeros((8, 4))
+    landed = slipped = beyond = 0
+    for step in range(60):
+        given = 1.5 * torch.sin(torch.arange(64.0).view(8, 8) + 0.35 * step)
+        observed, _, _, _ = env.step(given)
+        actions = [actions[1], given]
+        q, qd = env.q.double().numpy(), env.qd.double().numpy()
+        turn = matrices(q[:, 3:7])
+        back = lambda v: np.einsum("wji,wj->wi", turn, v)  # noqa: B023, E731
+        v, omega, command = back(observed["frame"].double().numpy()), back(qd[:, 3:6]), env.command.double().numpy()
+        gravity = back(np.tile([0.0, 0.0, -1.0], (8, 1)))
+        force, gap, slip = (env._tensors[f"contact_{name}"].double().numpy()[:, :4] for name in ("f", "gap", "slip"))
+        size = np.linalg.norm(force, axis=-1)
+        touches = size > 1.0
+        lands = touches & (contact == 0.0)
+        last = np.where(lands, air, last)
+        air, contact = np.where(touches, 0.0, air + 0.02), np.where(touches, contact + 0.02, 0.0)
+        moves = np.hypot(command[:, 0], command[:, 1]) + abs(command[:, 2])
+        torques = env.dyn.actuator_force(env.q, env.qd, env._controls["ctrl"]).double().numpy()
+        away = q[:, 7:] - limited
+        wide = np.array([0.2, 0.4] * 4)
+        new, old = (each.double().numpy() for each in actions[::-1])
+        expected = {
+            "track velocity": np.exp(-((command[:, :2] - v[:, :2]) ** 2).sum(1) / 0.16),
+            "track turning": np.exp(-((command[:, 2] - omega[:, 2]) ** 2) / 0.16),
+            "vertical velocity": v[:, 2] ** 2,
+            "tilting": (omega[:, :2] ** 2).sum(1),
+            "tilt": (gravity[:, :2] ** 2).sum(1),
+            "base height": (q[:, 2] - 0.3) ** 2,
+            "action rate": ((new - old) ** 2).sum(1),
+            "action size": (new**2).sum(1),
+            "joint deviation": (away**2).sum(1),
+            "posture": np.exp(-((away / wide) ** 2).mean(1)),
+            "joint velocity": (qd[:, 6:] ** 2).sum(1),
+            "torque": (torques**2).sum(1),
+            "power": abs(torques * qd).sum(1),
+            "air time": np.where(moves > 0.1, (lands * (last - 0.04)).sum(1), 0.0),
+            "foot slip": (touches * slip**2).sum(1),
+            "foot clearance": np.where(moves > 0.05, (abs(gap - 0.05) * slip).sum(1), 0.0),
+            "landing force": (lands * size).sum(1),
+            "touching": touches.sum(1),
+            "joint limits": np.maximum(abs(q[:, 7:] - 0.5 * (LOW + HIGH)) - 0.25 * (HIGH - LOW), 0.0).sum(1),
+            "last air time": last.sum(1),
+        }
+        for i, (name, values) in enumerate(expected.items()):
+            found = observed["a"][:, i].double().numpy()
+            assert np.allclose(found, values, rtol=1e-4, atol=1e-4 * (1 + abs(values).max())), f"step {step}: {name}"
+        landed, slipped = landed + lands.sum(), slipped + (touches & (slip > 0.05)).sum()
+        beyond += (expected["joint limits"] > 0).sum()
+    assert list(expected) == list(TERMS) and landed > 20 and slipped > 20 and beyond > 20
+
+
+@pytest.mark.slow
+def test_ready_observations():
+    """Places of frames, and of feet over the ground, beside those of the dynamics."""
+    terms = [observations.frame_position("shank1"), observations.feet_height(FEET), observations.feet_force(FEET)]
+    terms.append(observations.feet_contact(FEET, 20.0))
+    env, touches = walker_env(4, observations={"a": terms}, events=[], rewards={}, terminations={}), []
+    for step in range(20):
+        observed, _, _, _ = env.step(torch.sin(torch.arange(32.0).view(4, 8) + step))
+        found = observed["a"].numpy()
+        place = env.dyn.frame_poses(env.q, [env.scene.body_labels.index("shank1")])[:, 0, :3].numpy()
+        assert np.allclose(found[:, :3], place, atol=1e-5)
+        assert np.allclose(found[:, 3:7], env._tensors["contact_gap"][:, :4].numpy(), atol=1e-6)
+        force = env._tensors["contact_f"][:, :4].numpy()
+        assert np.allclose(found[:, 7:19], force.reshape(4, 12), atol=1e-4)
+        touches.append(found[:, 19:] == 1.0)
+        assert np.array_equal(touches[-1], np.linalg.norm(force, axis=-1) > 20.0)
+    assert np.ptp(found[:, 3:7]) > 1e-3 and place.std() > 1e-2 and 10 < np.sum(touches) < 310
+
+
+@pytest.mark.slow
+def test_ready_terminations():
+    ends = {
+        "tilted": terminations.tilted(0.5),
+        "below": terminations.below(0.2),
+        "touching": terminations.touching("trunk", 1.0),
+    }
+    env = walker_env(4, terminations=ends, events=[], rewards={}, observations={"a": [observations.projected_gravity]})
+    env.q[1, 3:7] = torch.tensor([np.sin(0.3), 0.0, 0.0, np.cos(0.3)])
+    env.q[2:, 7:] = torch.tensor([-1.5, 0.0] * 4)  # legs forward: one is in the air, one lies on its belly
+    env.q[2:, 2] = torch.tensor([0.15, 0.045])
+    _, _, done, extras = env.step(torch.zeros(4, 8))
+    assert done.tolist() == [0, 1, 1, 1] and not extras["time_outs"].any()
+    told = torch.stack([env.memory(f"last end {name}")[:, 0] for name in ends], dim=1)
+    assert told[1:].tolist() == [[1, 0, 0], [0, 1, 0], [0, 1, 1]]

@@ -1,0 +1,30 @@
+"""What several test files share: scenes, truths to compare with, and checks. No test file imports another one.
+
+Scenes:
+    ``zoo`` (trees of every kind of hinge), ``robots``, ``mechanisms`` (closed loops), ``granularity_scenes`` and
+    ``pieces_of_trees`` (limbs side by side), ``value_scenes``, ``operator_scenes`` (weighted graphs, no robots),
+    ``operators_of_robots``, ``border`` (one scene, arrays of all kinds), ``env_scenes``.
+Joints and what drives them:
+    ``custom_hinges``, ``hinge_twins`` (one mechanism written in two ways), ``geared``, ``actuated``.
+Steps:
+    ``step_scenes``, ``implicit`` (the dense nonlinear equation), ``rollouts``.
+Contact with the ground:
+    ``contact_cases``, ``contact_steps`` (the comparison with the dense step), ``contact_gradients``, ``hopping_leg``.
+Contact between bodies:
+    ``pair_scenes``, ``hull_scenes``, ``pair_touches`` (their points), ``pair_steps`` (the comparison with the dense
+    step), ``pair_motions``.
+Flexible bodies:
+    ``flexible_scenes``, ``flexible_trees``, ``flexible_twin`` (a second implementation).
+Newton's models and SolverSPO:
+    ``newton_models``, ``solver_models``, ``solver_grounds``, ``solver_pair_models``.
+Files:
+    ``random_mjcf``, ``mjcf_texts``, ``mjcf_damage``, ``damage`` (of URDF).
+Truths and laws:
+    ``laws`` (of every operation), ``oracles`` (Pinocchio, MuJoCo), ``reference_cases``, ``closed_loops`` (Lagrange's
+    equations), ``gradients`` (the operations that torch differentiates).
+Traces and kernels without a compiler or a GPU:
+    ``symbolic`` (traces evaluated by NumPy), ``warp_machine`` (the CUDA text of teams, run in Python), ``routines``,
+    ``granularities``, ``mutants`` (kernel files with a planted bug), ``allocations``.
+Others:
+    ``benchmark_results``, ``rendering`` (pictures), ``wrapped`` (arrays by DLPack), ``typing_user``.
+"""
