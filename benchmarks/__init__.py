@@ -20,5 +20,6 @@ Contact:
 Learning:
     ``training`` (env-steps/s), ``learning_curves``.
 Documentation and refactoring:
-    ``blocks`` (code of pages), ``site``, ``site_pictures``, ``gallery``; ``kernel_texts`` (generated).
+    ``blocks`` (code of pages), ``site``, ``site_pictures``, ``gallery``; ``kernel_texts`` (generated),
+    ``env_digests`` (bits of the tasks' environments).
 """

@@ -12,6 +12,7 @@ from benchmarks import (
     breakdown,
     capabilities,
     cases,
+    env_digests,
     kernel_texts,
     operation_counts,
     robots,
@@ -227,3 +228,15 @@ def test_texts_of_kernels_are_recorded_and_compared(tmp_path, capsys):
     assert kernel_texts.main(["--compare", *folders]) == 0 and capsys.readouterr().out == "all texts are equal\n"
     next((tmp_path / "after").glob("index.json")).write_text("{}")
     assert kernel_texts.main(["--compare", *folders]) == 1
+
+
+@pytest.mark.slow
+def test_bits_of_environments_are_recorded_and_compared(tmp_path, capsys):
+    file = tmp_path / "before.json"
+    assert env_digests.main(["cartpole", "--json", str(file)]) == 0
+    assert env_digests.main(["--compare", str(file)]) == 0
+    assert capsys.readouterr().out.endswith("the same bits: cartpole\n")
+    bits = json.loads(file.read_text())["cartpole"]
+    file.write_text(json.dumps({"cartpole": [*bits[:2], *["0"] * (len(bits) - 2)]}))
+    assert env_digests.main(["--compare", str(file)]) == 1
+    assert capsys.readouterr().out.endswith("cartpole differs within its first 20 steps\n")
