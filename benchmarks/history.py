@@ -31,8 +31,8 @@ committed results of earlier commits say. Times are those of one call of all wor
 a GPU in a CUDA graph, on a CPU by wall time. A point is the median of {processes} processes and its bar the range of
 their medians; of committed results, the median of one process, and 10 % to 90 % of its times. Machines of one kind
 differ by up to 3 %; to compare two commits, run `python -m benchmarks --compare A B`, whose processes take turns on one
-machine. Shared machines differ by more: on the AMD EPYC forward dynamics of Panda took 211 to 228 µs on 21 November and
-291 to 305 µs on the 22nd, at other commits and other times of day; which of them made the difference was not measured.
+machine. Shared machines differ by more. On the AMD EPYC forward dynamics of Panda took 211 to 228 µs on 21 November and
+291 to 305 µs on the 22nd, at other commits and other times of day. The cause of the difference was not measured.
 """
 
 

@@ -116,8 +116,9 @@ def page(file: Path) -> str:
         "",
         f"One run of `python -m benchmarks.speed` on one {run['machine']['device']}, commit {run['commit'][:12]}, "
         f"{run['date'][:16].replace('T', ' ')} UTC. A time is that of one call of all worlds, replayed in a CUDA",
-        "graph while all other processes stand still; the error is that of the same run, against float64, of a step of",
-        "several substeps against as many calls. One call was timed at the beginning, in the middle and at the end:",
+        "graph while all other processes stand still. The error is of the same run, against float64; that of a step of",
+        "several substeps is against as many calls. The figure is the time, a rate, or a ratio to the time of another",
+        "call, and has a limit. One call was timed at the beginning, in the middle and at the end:",
         f"{', '.join(f'{us:.2f}' for us in run['reference_us'])} µs. Calls took {run['sets']} sets of inputs in turn.",
         "",
         "| call | worlds | µs | error | figure | limit | |",

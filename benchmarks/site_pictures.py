@@ -13,6 +13,7 @@ import numpy as np
 from warp_spo.trials import drawing
 
 from .blocks import ROOT, STATIC
+from .evidence import RESULTS, files, gather, read
 from .stress.cases import ALLOWED
 
 FILES = ROOT / "docs" / "robot_files.md"
@@ -42,6 +43,7 @@ FAMILIES = {
     "S34.long_logdet": "log det of long chains",
 }
 """Case -> what it is, in the order of the picture."""
+HOST, JAX = "called from Python", "called from JAX"  # groups of rows
 CALLS = {
     "torch: forward_dynamics, forward and backward": "forward_dynamics with gradient, torch",
     "torch: an empty autograd.Function, forward and backward": "an empty autograd.Function with gradient",
@@ -200,19 +202,15 @@ def draw_jax(rows: list[dict]) -> Any:
 
 def main() -> None:
     """Write the pictures."""
-    folder = ROOT / "benchmarks" / "results"
-    names = ("h200", "h200-host", "h200-jax")
-    newest, host, jax = ([*sorted(folder.glob(f"*-{name}.json"))][-1] for name in names)
-    everything = json.loads(newest.read_text())
-    runs = [json.loads(file.read_text())["row"] for file in sorted(folder.glob("contact/*-environments.json"))]
+    found = gather(read(file) for file in files([RESULTS]))[0]  # the newest rows of each kind on a GPU
+    groups = {group: [row for row in found.capabilities if row["group"].startswith(group)] for group in (HOST, JAX)}
+    runs = [json.loads(file.read_text())["row"] for file in sorted(RESULTS.glob("contact/*-environments.json"))]
     with drawing.style():
-        (STATIC / "jax.svg").write_text(drawing.svg(draw_jax(json.loads(jax.read_text())["rows"])))
+        (STATIC / "jax.svg").write_text(drawing.svg(draw_jax(groups[JAX])))
         (STATIC / "many_gpus.svg").write_text(drawing.svg(draw_gpus(runs)))
         (STATIC / "robot_files.svg").write_text(drawing.svg(draw_files()))
-        (STATIC / "stress.svg").write_text(drawing.svg(draw_stress(everything["stress"])))
-        (STATIC / "host.svg").write_text(
-            drawing.svg(draw_host(json.loads(host.read_text())["rows"], everything["rows"]))
-        )
+        (STATIC / "stress.svg").write_text(drawing.svg(draw_stress(found.stress)))
+        (STATIC / "host.svg").write_text(drawing.svg(draw_host(groups[HOST], found.rows)))
 
 
 if __name__ == "__main__":

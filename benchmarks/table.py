@@ -67,7 +67,8 @@ CLAIMS = (
 )
 GROUPS = {"steps": "steps of a Panda"}  # what groups of rows are called, where their names say too little
 COST = _dynamics("go2", "forward_dynamics", dtype="float32")  # of one call, replayed
-CALLED = "torch: forward_dynamics, out="  # the same from Python, in rows of the host's time
+HOST = "called from Python, go2"  # the group of rows of the host's time
+CALLED = "torch: forward_dynamics, out="  # the same from Python, of that group
 BESIDE = "torch: add, out="
 HEADLINE_WORLDS = 4096
 NOTABLE = 0.1  # relative difference of two times
@@ -248,12 +249,21 @@ def headline(evidence: Evidence) -> str:
     if cost and called and beside:
         text += [
             "",
-            "Times are of one call, replayed in a CUDA graph. Without a graph Python sets the pace: forward dynamics",
-            f"of {HEADLINE_WORLDS:,} Go2 quadrupeds takes **{time(cost)} µs replayed, {time(called)} µs called with "
-            f"torch tensors**, where torch's own",
-            f"`add` takes {time(beside)} µs. So capture your loop in a graph.",
+            "Times are of one call, replayed in a CUDA graph. A call from Python takes longer than its kernel: forward",
+            f"dynamics of {HEADLINE_WORLDS:,} Go2 quadrupeds takes **{time(cost)} µs replayed, {time(called)} µs "
+            "called with torch tensors**, where torch's own",
+            f"`add` takes {time(beside)} µs (replayed {day(evidence)}, called {day(evidence, HOST)}). So capture your "
+            "loop in a graph.",
         ]
     return "\n".join(text).lstrip("\n") + "\n" if text else ""
+
+
+def day(evidence: Evidence, group: str | None = None) -> str:
+    """Return the date of the file that our rows come from, or those of a group, such as 2026-11-23."""
+    heads = {line.partition(", commit ")[0]: line for line in reversed(evidence.sources)}
+    ours = heads[evidence.machine["device"]]
+    line = next((line for head, line in heads.items() if group and group in head), ours)
+    return line.partition(", commit ")[2].split(", ")[1]
 
 
 def _fastest(rows: Sequence[dict], keys: dict) -> dict | None:
