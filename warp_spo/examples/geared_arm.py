@@ -1,4 +1,4 @@
-"""A geared arm: what a rotor behind a gear does to an arm, and what is wrong with its reflected inertia alone.
+"""An arm with geared motors, and the error that reflected inertia alone makes in its accelerations.
 
 Two rods swing in the horizontal plane. The elbow's motor sits on the upper rod; a spring pulls the elbow straight, and
 the shoulder is free. The rotor pushes the upper rod back by ratio J q'', which reflected inertia leaves out, so that

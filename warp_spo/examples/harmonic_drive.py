@@ -1,4 +1,4 @@
-"""A harmonic drive: an arm behind a gear that gives way rings at a frequency that the gear's stiffness sets.
+"""A harmonic drive: an arm behind a flexible gear oscillates at a frequency that the gear's stiffness sets.
 
 Every world has another stiffness. The motor's inertia Jm and the arm's Ja swing against each other, at omega^2 =
 k (1 / Jm + 1 / Ja) without friction. The measured omega is that of the cosine that fits three points of the deflection,

@@ -1,4 +1,4 @@
-"""A beam on a spinning hub becomes stiffer as it spins; a model without that stiffening bends away and is lost.
+"""A beam on a spinning hub becomes stiffer as it spins; a model without that stiffening diverges.
 
 A bent beam does not grow longer, so that its points come nearer to the hub, against the centrifugal force. The rates at
 which it swings are those of Wright et al. (J. Appl. Mech. 49, 1982), in units of sqrt(EI / rho A) / L^2. The manoeuvre
