@@ -22,6 +22,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.reference_contact import ContactStep
 
+from .. import robots
 from . import scenes
 from .courses import courses
 
@@ -90,8 +91,6 @@ def rms(found: dict, fine: dict, world: int, columns: Any = slice(0, 3)) -> floa
 # -- G1 ----------------------------------------------------------------------------------------------------------------
 def g1() -> spo.Scene:
     """Return G1 with 18 points, stiffer drives than for timing, and its file's effort limits."""
-    from . import robots
-
     drive = np.r_[np.zeros(6), np.ones(29)]
     gains = dict(joint_target_ke=500.0 * drive, joint_target_kd=15.0 * drive, joint_armature=0.01 * drive,
                  joint_effort_limit=robots.scene("g1").values["joint_effort_limit"])  # fmt: skip

@@ -87,6 +87,32 @@ def named(path):
     return str(path.relative_to(PACKAGE)) if path in HOST else path.name
 
 
+def names_bound_in(path):
+    """Return the names that a file binds anywhere, and what it imports."""
+    found = {"__doc__"}
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            found.add(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            found.add(node.id)
+        elif isinstance(node, ast.alias):
+            found.add(node.asname or node.name)
+    return found
+
+
+def test_benchmarks_import_from_each_other_what_is_there():
+    """Imports inside of functions, too, which fail only after minutes of measuring."""
+    missing = []
+    for path in sorted((REPOSITORY / "benchmarks").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.level:
+                place = path.parents[node.level - 1].joinpath(*(node.module or "").split("."))
+                file = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+                there = names_bound_in(file) | {each.stem for each in place.glob("*")}
+                missing += [f"{path.name}:{node.lineno} {each.name}" for each in node.names if each.name not in there]
+    assert not missing
+
+
 @pytest.mark.parametrize("path", DEVICE, ids=named)
 def test_device_code_computes(path):
     assert "wp.launch" not in path.read_text()
