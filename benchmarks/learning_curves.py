@@ -1,10 +1,13 @@
-"""Rewards against seconds of trainings: ``python -m benchmarks.learning_curves PICTURE FOLDER...``.
+"""Rewards against seconds of trainings.
+
+    python -m benchmarks.learning_curves PICTURE.svg FOLDER [FOLDER ...]
 
 Folders are those of ``python -m warp_spo.train TASK --seed N --out TASK_N``; those of a task share a panel.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -20,6 +23,9 @@ def draw(picture: Path, folders: list[Path]) -> None:
     pyplot = load_pyplot("learning_curves")
     found = {name: sorted(each for each in folders if each.name.rsplit("_", 1)[0] == name) for name in TASKS}
     found = {name: those for name, those in found.items() if those}
+    if not found:
+        names = ", ".join(folder.name for folder in folders)
+        raise ValueError(f"learning_curves: none of {names} is named as a task, _ and a seed, such as go2-flat_1")
     rows = -(-len(found) // COLUMNS)
     with style():
         figure, panels = pyplot.subplots(rows, COLUMNS, figsize=(9, 2.2 * rows), layout="constrained", squeeze=False)
@@ -38,5 +44,19 @@ def draw(picture: Path, folders: list[Path]) -> None:
         pyplot.close(figure)
 
 
+def main(argv: list[str] | None = None) -> int:
+    p = argparse.ArgumentParser(prog="python -m benchmarks.learning_curves", description=__doc__,
+                                formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
+    p.add_argument("picture", type=Path, metavar="PICTURE")
+    p.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
+    options = p.parse_args(argv)
+    try:
+        draw(options.picture, options.folders)
+    except (OSError, ValueError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
 if __name__ == "__main__":
-    draw(Path(sys.argv[1]), [Path(folder) for folder in sys.argv[2:]])
+    sys.exit(main())
