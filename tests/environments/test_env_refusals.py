@@ -88,8 +88,18 @@ def test_calls_name_what_is_wrong():
             env.step(actions_)
     with pytest.raises(ValueError, match=r"Env.controls: actions has shape \(1, 1\); expected \(8, 1\)"):
         env.controls(torch.zeros(1, 1))
-    with pytest.raises(ValueError, match=r"episode_length_buf: got shape \(3,\); expected \(8,\)"):
-        env.episode_length_buf = torch.zeros(3)
+    asks = torch.zeros(8, 1, requires_grad=True)
+    with pytest.raises(ValueError, match=r"Env.step: actions requires grad; .*actions.detach\(\)"):
+        env.step(2.0 * asks)
+    with torch.no_grad():
+        env.step(asks)
+    for wrong, words in (
+        (torch.zeros(3, dtype=torch.int64), r"int64 \(3,\)"),
+        (torch.full((8,), NAN), "float32"),
+        (None, ""),
+    ):
+        with pytest.raises((ValueError, TypeError), match=rf"episode_length_buf: got .*{words}.*integers \(8,\)"):
+            env.episode_length_buf = wrong
     with pytest.raises(ValueError, match=r"Env.command: this environment gives no commands"):
         _ = env.command
     for call in (env.start_at, env.load_state_dict):

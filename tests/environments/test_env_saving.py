@@ -75,6 +75,10 @@ def test_a_state_that_does_not_fit_changes_nothing():
         with pytest.raises(ValueError, match=f"Env.load_state_dict: {words}"):
             env.load_state_dict({name: x + 1 if x.is_floating_point() else x for name, x in wrong.items()})
         assert all(torch.equal(x, before[name]) for name, x in env.state_dict().items())
+    env.set_seed(5 << 40 | 0xFFFFFFFF)
+    other = cart_env(seed=3)
+    other.load_state_dict(env.state_dict())
+    assert other.seed == env.seed
 
 
 @pytest.mark.parametrize("way", [pickle.dumps, copy.copy, copy.deepcopy])
@@ -121,6 +125,13 @@ def test_terrain_and_commands_have_levels():
     starts = tiles.origins[[3, 1, 3, 1, 3], [2, 0, 2, 0, 2]]
     np.testing.assert_allclose(env.q[:, :2].numpy(), starts[:, :2], atol=1e-5)
     np.testing.assert_allclose(env.command[:, 0].numpy(), np.array([0.7, 0.3])[order], atol=1e-6)
+    with pytest.raises(ValueError, match=r"Env.start_at: levels 'terrain' holds NaN"):
+        env.start_at(wanted | {"terrain": torch.tensor([[0.0, torch.nan]])})
+    given = torch.tensor([[9.0, 1.0], [-2.0, 1.0], [1.0, 1e9], [torch.nan, 0.0], [0.0, torch.nan]])
+    env.levels()["terrain"].copy_(given)  # beyond the tiles: of a training on more of them, or not finite
+    env.reset()
+    starts = tiles.origins[[3, 0, 1, 0, 0], [1, 1, 2, 0, 0]]
+    np.testing.assert_allclose(env.q[:, :2].numpy(), starts[:, :2], atol=1e-5)
 
 
 def test_objects_say_what_they_are():

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+import warp_spo as spo
 from support.env_scenes import FEET, walker_env, walker_q, walker_scene
-from warp_spo.env import commands, observations, rewards, terminations
+from warp_spo.env import Env, actions, commands, events, observations, rewards, terminations
 
 TERMS = {
     "track velocity": rewards.track_velocity(0.4),
@@ -140,3 +141,49 @@ def test_ready_terminations():
     assert done.tolist() == [0, 1, 1, 1] and not extras["time_outs"].any()
     told = torch.stack([env.memory(f"last end {name}")[:, 0] for name in ends], dim=1)
     assert told[1:].tolist() == [[1, 0, 0], [0, 1, 0], [0, 1, 1]]
+
+
+def cubes():
+    """A slider that pushes a cube over the ground."""
+    solid = dict(inertia=0.01 * np.eye(3))
+    box = lambda body, **more: spo.Contact(body, box=(0.1, 0.1, 0.1), **more)  # noqa: E731
+    return spo.Scene(
+        [spo.Body(1.0, label="pusher", **solid), spo.Body(2.0, label="cube", **solid)],
+        [spo.Hinge("prismatic", -1, 0, axis=(1, 0, 0), parent_pose=(-0.199, 0, 0.1, 0, 0, 0, 1), label="slide"),
+         spo.Hinge("free", -1, 1)],
+        contacts=[box(1), box(0, other=box(1), stiffness=1e4, damping=50.0)],
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_bodies_that_touch_each_other_are_seen_and_changed():
+    """Contact arrays have a row for each pair after those of points, and events change their friction, too."""
+    options = dict(
+        decimation=1, default_q=[0.0, 0.0, 0.0, 0.0995, 0.0, 0.0, 0.0, 1.0],
+        actions=actions.Effort("slide", scale=10.0), rewards={"none": (1.0, lambda w: 0.0)},
+        observations={"force": [lambda w: w.contact_force.ravel()], "gap": [lambda w: w.contact_gap],
+                      "slip": [lambda w: w.contact_slip]},
+    )  # fmt: skip
+    scene = cubes()
+    drawn = events.randomise("contact_friction", (0.1, 0.2), "set")
+    env = Env(scene, 3, "cpu", events=[drawn], **options)
+    friction = env.values["contact_friction"]
+    assert friction.shape == (3, 9) and (friction >= 0.1).all() and (friction <= 0.2).all()
+    dyn = spo.Dynamics(scene, 3, "cpu", "float32", variable=("contact_friction",))
+    dyn.set(contact_friction=friction.clone())
+    q, qd = env.q.clone(), env.qd.clone()
+    observed, *_ = env.step(torch.tensor([[-1.0], [0.5], [1.0]]))
+    found = {"contact_f": torch.zeros(3, 9, 3), "contact_gap": torch.zeros(3, 9), "contact_slip": torch.zeros(3, 9)}
+    tau = torch.zeros(3, 7)
+    tau[:, 0] = torch.tensor([-10.0, 5.0, 10.0])
+    dyn.step(q, qd, tau, env.dt, **found)
+    for name, array in zip(("force", "gap", "slip"), found.values(), strict=True):
+        np.testing.assert_allclose(observed[name].numpy(), array.flatten(1).numpy(), rtol=1e-4, atol=1e-3)
+    assert (observed["force"][1:, 24] < -0.1).all()  # on the pusher
+    alone = Env(scene, 3, "cpu", events=[events.randomise("contact_friction", (0.1, 0.2), "set", "pusher")], **options)
+    assert (alone.values["contact_friction"][:, :8] == 0.8).all() and (
+        alone.values["contact_friction"][:, 8] < 0.3
+    ).all()
+    with pytest.raises(ValueError, match=r"events.randomise: no contact is of a body 'pusher'"):
+        bare = scene.with_contacts(scene.contacts[:1])
+        Env(bare, 3, "cpu", events=[events.randomise("contact_friction", (0.1, 0.2), "set", "pusher")], **options)

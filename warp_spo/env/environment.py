@@ -75,6 +75,7 @@ class Env(VecEnv):
         values: what events have made of the scene's values, torch tensors [world, ...] by name.
         dyn: the :class:`Dynamics`.
         has_commands: whether it gives commands.
+        action_labels, action_clips: of each action, what it sets, and None or the (lowest, highest) that counts.
         num_envs, num_actions, num_obs, max_episode_length, episode_length_buf, device, cfg: as rsl_rl names them.
 
     Raises:
@@ -124,6 +125,7 @@ class Env(VecEnv):
         layout = self._layout = Layout(scene, default, self.step_dt, commands, changed_values(scene, events))
         parts = given.checked_parts(actions)
         self.action_labels = [label for part in parts for label in part.labels(scene)]
+        self.action_clips = [part.clip for part in parts for _ in part.labels(scene)]
         self.num_actions = layout.action_count = len(self.action_labels)
         layout.action_arrays = {part.array for part in parts}
         tracing = Tracing(layout, parts, groups, rewards, terminations, commands, list(events))

@@ -171,7 +171,8 @@ def terrain(tiles: Tiles, rows: int | None = None, level: bool = True) -> Reset:
         w.keep("terrain", [w.integer(0, first_rows - 1), w.integer(0, columns - 1)])
 
     def change(w: World) -> None:
-        row, column = w.memory("terrain", 2, reset=None)
+        held = w.memory("terrain", 2, reset=None)
+        row, column = (_between(x, most - 1.0) for x, most in zip(held, (count, columns), strict=True))
         origins = w.table("terrain", tiles.origins.reshape(-1, 3))
         if not level:
             row = w.integer(0, first_rows - 1)
@@ -191,6 +192,11 @@ def terrain(tiles: Tiles, rows: int | None = None, level: bool = True) -> Reset:
             w.q[start + i] = w.q[start + i] + x
 
     return Reset(change, first, ("terrain",))
+
+
+def _between(x: Any, most: float) -> Any:
+    """Return a number between zero and ``most``, so that no table is read beyond its end; NaN becomes zero."""
+    return where(x > 0.0, where(x < most, x, most), 0.0)
 
 
 def push(
@@ -229,8 +235,8 @@ def randomise(
         span: (lowest, highest) of the uniform draw; one pair for each number along the value's last axis, if it has
             one, such as three of "body_com" [m].
         how: "scale", "add" or "set".
-        names: regular expressions of bodies for values of bodies and contacts (those of their points), of joints for
-            values of joints, of actuators for values of actuators; None: all.
+        names: regular expressions of bodies for values of bodies and contacts (those of their points, and of the pairs
+            that they are in), of joints for values of joints, of actuators for values of actuators; None: all.
         when: see :class:`Values`.
         alike: all entries get the same draw.
     """
@@ -364,11 +370,15 @@ def entries_of(scene: Any, name: str, names: Any) -> list[int]:
     """Return the entries of a value that regular expressions name; None: all."""
     family = name.split("_")[0]
     if family == "contact":
-        every = list(range(len(scene.contact_points)))
+        members = [{point.body} for point in scene.contact_points]
+        members += [{pair.body, pair.other} for pair in scene.contact_pairs]
         if names is None:
-            return every
-        bodies = find("events.randomise", "body", scene.body_labels, names)
-        return [i for i in every if scene.contact_points[i].body in bodies]
+            return list(range(len(members)))
+        bodies = set(find("events.randomise", "body", scene.body_labels, names))
+        entries = [i for i, own in enumerate(members) if own & bodies]
+        if not entries:
+            raise ValueError(f"events.randomise: no contact is of a body {names!r}; expected bodies with contacts")
+        return entries
     if family == "joint":
         start, count = (
             (scene.q_start, scene.coord_count) if name == "joint_rest_q" else (scene.qd_start, scene.dof_count)

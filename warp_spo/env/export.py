@@ -17,7 +17,9 @@ def describe(env: Env, name: str) -> dict[str, Any]:
     """Return what turns the network into a controller, as plain numbers and names.
 
     Action k sets ``offset[k] + scale[k] action``, a control of the actuator or the target or force of the joint
-    ``actuators[k]``, whose gains are ``stiffness[k]`` and ``damping[k]``. Observations are the terms ``observations``
+    ``actuators[k]``, whose gains are ``stiffness[k]`` and ``damping[k]``, after it is clipped to ``action_clip[k]``,
+    (lowest, highest), None without one. No bias of an encoder is in the offset. Observations are the terms
+    ``observations``
     [name, size, scale], one after the other; ``None`` where no task lists them. Joint positions are relative
     to ``default_position``. ``stride`` is the period [s] of the observation "step phase", None without one: sine and
     cosine of 2 pi time / stride, zeros while the command is zero. ``delay_steps`` count steps of ``dt``; the policy
@@ -38,6 +40,7 @@ def describe(env: Env, name: str) -> dict[str, Any]:
         "default_position": default.tolist(),
         "action_offset": offset.tolist(),
         "action_scale": scale.tolist(),
+        "action_clip": env.action_clips,
         **gains,
         "dt": env.dt,
         "decimation": env.decimation,
@@ -53,26 +56,35 @@ def controls_of(env: Env) -> tuple[np.ndarray, np.ndarray, dict[str, list]]:
     The last are lists by name, a number for each action; None where there is no limit. Worlds start anew.
     """
     scene, rows = env.scene, []
-    given = torch.zeros(1 + env.num_actions, env.num_actions, device=env.device)
-    given[1:].fill_diagonal_(0.5)
+    clips = [(-np.inf, np.inf) if clip is None else clip for clip in env.action_clips]
+    start = np.array([min(max(0.0, low), high) for low, high in clips])
+    step = np.array([min(0.5, high - at) or low - at for at, (low, high) in zip(start, clips, strict=True)])
+    given = torch.tensor(start + np.vstack([np.zeros(len(step)), np.diag(step)]), dtype=torch.float32)
+    biases = [env.memory("encoder bias")] if env._layout.biased else []
+    drawn = [bias.clone() for bias in biases]
+    for bias in biases:
+        bias.zero_()  # it is of world 0, not of the robot
     for actions in given:
         controls = env.controls(actions.expand(env.num_envs, -1))
         rows.append({array: values[0].double().cpu().numpy() for array, values in controls.items()})
+    for bias, own in zip(biases, drawn, strict=True):
+        bias.copy_(own)
     env.reset()
     scale, offset = [], []
     gains: dict[str, list] = {"stiffness": [], "damping": [], "force_limit": [], "delay_steps": []}
-    for label, row in zip(env.action_labels, rows[1:], strict=True):
+    for label, row, at, by in zip(env.action_labels, rows[1:], start, step, strict=True):
         moved = [(array, i) for array in row for i in np.flatnonzero(row[array] != rows[0][array])]
         if len(moved) != 1:
             raise ValueError(
-                f"export: action {label!r} sets {len(moved)} controls; expected one: a scale that is not 0"
+                f"export: action {label!r} sets {len(moved)} controls; expected one: a scale that is not 0, and a "
+                "range of actions, if clip= gives one"
             )
         ((array, i),) = moved
-        scale.append(2.0 * (row[array][i] - rows[0][array][i]))
-        offset.append(rows[0][array][i])
+        scale.append((row[array][i] - rows[0][array][i]) / by)
+        offset.append(rows[0][array][i] - scale[-1] * at)
         if array == "ctrl":
-            bias, delay = scene.values["actuator_bias"][0, i], scene.values["actuator_delay"][0, i]
-            stiffness, damping, limit = -bias[1], -bias[2], scene.values["actuator_force_range"][0, i, 1]
+            law, delay = scene.values["actuator_bias"][0, i], scene.values["actuator_delay"][0, i]
+            stiffness, damping, limit = -law[1], -law[2], scene.values["actuator_force_range"][0, i, 1]
         else:
             dof = i if array == "tau" else int(scene.qd_start[list(scene.q_start).index(i)])
             stiffness, damping = (scene.values[f"joint_target_{k}"][0, dof] for k in ("ke", "kd"))

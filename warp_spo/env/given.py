@@ -13,6 +13,7 @@ from .checks import check_function, check_mapping, check_number, check_whole
 from .observations import Observation, TorchTerm
 from .tracing import NOT_FINITE
 
+INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 RESULTS = ("reward", "done", "time_out")
 
 
@@ -99,7 +100,7 @@ def checked_parts(actions: Any) -> list[Any]:
 
 
 def checked_actions(call: str, actions: Any, worlds: int, labels: list[str]) -> torch.Tensor:
-    """Return actions [world, action] as a tensor; TypeError and ValueError for what is none."""
+    """Return actions [world, action] as a tensor; TypeError and ValueError for what is none, or requires grad."""
     try:
         given = torch.as_tensor(actions)
     except (TypeError, ValueError, RuntimeError):
@@ -109,6 +110,11 @@ def checked_actions(call: str, actions: Any, worlds: int, labels: list[str]) -> 
         raise ValueError(
             f"{call}: actions has {kind}shape {tuple(given.shape)}; expected ({worlds}, {len(labels)}) "
             f"[world, action]: {', '.join(labels)}"
+        )
+    if given.requires_grad and torch.is_grad_enabled():
+        raise ValueError(
+            f"{call}: actions requires grad; expected a tensor without, because a step of an environment has no "
+            "gradient; call it inside torch.no_grad(), or pass actions.detach(); Dynamics.step has gradients"
         )
     return given
 
@@ -126,9 +132,12 @@ def checked_mask(call: str, mask: Any, worlds: int, device: torch.device) -> tor
 
 def checked_lengths(call: str, value: Any, worlds: int) -> torch.Tensor:
     """Return steps since the starts of episodes, one for all worlds or one each; ValueError for what is none."""
-    found = torch.as_tensor(value)
-    if found.shape not in ((), (worlds,)):
-        raise ValueError(f"{call}: got shape {tuple(found.shape)}; expected ({worlds},) [world]")
+    try:
+        found = torch.as_tensor(value)
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"{call}: got {value!r}; expected integers ({worlds},) [world]") from None
+    if found.shape not in ((), (worlds,)) or found.dtype not in INTEGERS:
+        raise ValueError(f"{call}: got {found.dtype} {tuple(found.shape)}; expected integers ({worlds},) [world]")
     return found
 
 

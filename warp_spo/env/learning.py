@@ -22,6 +22,7 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.runners import OnPolicyRunner
 
 from ..arrays import parse_device
+from ..errors import as_integer
 from .checks import check_folder
 from .course import Course, OutOfTime
 from .environment import Env
@@ -199,6 +200,12 @@ def load_checkpoint(runner: OnPolicyRunner, file: str | Path, learns: bool = Tru
             f"checkpoint {str(file)!r}: has no {', '.join(sorted(missing))}; expected a model_N.pt of a training"
         )
     parts = {"actor": True, "critic": True, "optimizer": learns, "iteration": True, "rnd": False}
+    iteration, levels = found["iter"], (found.get("infos") or {}).get("levels", {})
+    if as_integer(iteration) is None or not isinstance(levels, Mapping):
+        raise ValueError(
+            f"checkpoint {str(file)!r}: iter is {iteration!r}, its levels are {type(levels).__name__}; expected an "
+            "integer, and a dictionary: a model_N.pt of a training"
+        )
     try:
         runner.alg.load(found, parts, strict=True)
     except RuntimeError as error:
@@ -207,9 +214,9 @@ def load_checkpoint(runner: OnPolicyRunner, file: str | Path, learns: bool = Tru
             f"checkpoint {str(file)!r}: does not fit the task's networks ({first}); expected one of the same task"
         ) from None
     if learns:
-        runner.current_learning_iteration = found["iter"] + 1
-        resume_levels(runner.env, file, (found.get("infos") or {}).get("levels", {}))
-    return int(found["iter"])
+        runner.current_learning_iteration = iteration + 1
+        resume_levels(runner.env, file, levels)
+    return int(iteration)
 
 
 def resume_levels(env: Env, file: str | Path, levels: Mapping[str, torch.Tensor]) -> None:

@@ -38,13 +38,18 @@ def start_at(self: Env, levels: Mapping[str, torch.Tensor]) -> None:
     again from the first.
 
     Raises:
-        ValueError: names or numbers per world are not those of this environment. TypeError: it is no dictionary.
+        ValueError: names or numbers per world are not those of this environment, or a number is not finite.
+        TypeError: it is no dictionary.
     """
     _check_tensors("Env.start_at: levels", levels)
     held = self.levels()
     if levels.keys() != held.keys() or any(levels[name].shape[1:] != held[name].shape[1:] for name in held):
         came, expected = ({name: tuple(x.shape) for name, x in each.items()} for each in (levels, held))
         raise ValueError(f"Env.start_at: levels have the shapes {came}; expected {expected}, with any number of worlds")
+    for name, given in levels.items():
+        if not len(given) or not given.isfinite().all():
+            what = f"{name!r} has {len(given)} worlds" if not len(given) else f"{name!r} holds NaN or infinity"
+            raise ValueError(f"Env.start_at: levels {what}; expected finite numbers of one world or more")
     for name, own in held.items():
         rows = (self.first_world + torch.arange(self.num_envs)) % len(levels[name])
         own.copy_(levels[name].to(self.device)[rows.to(self.device)])
@@ -80,6 +85,8 @@ def load_state_dict(self: Env, state: Mapping[str, torch.Tensor]) -> None:
     for name, tensor in held.items():
         tensor.copy_(state[name])
     self._steps = int(state[STEPS])
+    low, high = (int(word) & 0xFFFFFFFF for word in state["key"][:2])
+    self.seed = low | high << 32
     self._set_values()
 
 

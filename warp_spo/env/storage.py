@@ -10,7 +10,7 @@ import torch
 from .layout import Layout
 from .stage import CHOSEN, COLUMN, INT, LONG, ROW, SHARED, Buffer, output_name
 
-CONTACT_ARRAYS = {"contact_f": 3, "contact_gap": 1, "contact_slip": 1}  # entries of each point
+CONTACT_ARRAYS = {"contact_f": 3, "contact_gap": 1, "contact_slip": 1}  # entries of each point, and of each pair
 LINE = 32  # scalars of a line of the caches
 
 
@@ -107,7 +107,7 @@ class Storage:
 
     def _add_measured(self, layout: Layout, read: set[str]) -> None:
         """Add what the dynamics write: contacts, frames."""
-        worlds, points, frames = self.worlds, len(layout.scene.contact_points), len(layout.frames)
+        worlds, points, frames = self.worlds, layout.scene.contact_count, len(layout.frames)
         for name, each in CONTACT_ARRAYS.items():
             if name in read:
                 shape = (worlds, points, 3) if each == 3 else (worlds, points)

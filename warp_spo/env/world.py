@@ -55,7 +55,9 @@ class World:
         q, qd: coordinates [coordinate] and velocities [dof]; events assign to their entries.
         action, last_action, action_before: actions of this step, of the step before, and of the one before that.
         contact_force: [point, 3], inertial axes, mean over substeps [N]. contact_gap: [point] distance from the ground
-            [m]. contact_slip: [point], speed along the ground [m/s]. Points are those of ``scene.contact_points``.
+            [m]. contact_slip: [point], speed along the ground [m/s]. Points are those of ``scene.contact_points``, and
+            after them ``scene.contact_pairs``, each as one: the force is on the first body, the gap infinite where the
+            two share no point.
         time: since the last reset [s].
         dt: of a step of the environment [s].
         values: in events that change values: arrays by name, of abstract scalars or numbers, whose entries they assign.
@@ -123,16 +125,16 @@ class World:
     # -- contacts --------------------------------------------------------------------------------------------------
     @functools.cached_property
     def contact_force(self) -> np.ndarray:
-        count = self._point_count()
+        count = self._contact_count()
         return self._quiet(self.read("contact_f", 3 * count)).reshape(count, 3)
 
     @functools.cached_property
     def contact_gap(self) -> Vector:
-        return self.read("contact_gap", self._point_count())
+        return self.read("contact_gap", self._contact_count())
 
     @functools.cached_property
     def contact_slip(self) -> Vector:
-        return self._quiet(self.read("contact_slip", self._point_count()))
+        return self._quiet(self.read("contact_slip", self._contact_count()))
 
     def points(self, bodies: Any) -> list[list[int]]:
         """Return, for each body whose label matches, the indices of its contact points; numbers."""
@@ -391,8 +393,8 @@ class World:
             return values
         return vector(where(self.fresh, 0.0, value) for value in values)
 
-    def _point_count(self) -> int:
-        count = len(self.scene.contact_points)
+    def _contact_count(self) -> int:
+        count = self.scene.contact_count
         if not count:
             raise ValueError("Env: a term reads contacts, and the scene has none; expected scene.with_contacts(...)")
         return count

@@ -54,6 +54,10 @@ class Deployment:
             key: np.array(found[key]) for key in ("default_position", "action_offset", "action_scale", "delay_steps")
         }
         self.last = np.zeros((worlds, len(self.actuators)), np.float32)
+        clips = found.get("action_clip") or [None] * len(self.actuators)  # None in files that are older than it
+        self.low, self.high = np.array([(-np.inf, np.inf) if clip is None else clip for clip in clips]).T
+        older = -(-int(self.numbers["delay_steps"].max()) // found["decimation"])  # actions that are still on their way
+        self.set = [self._controls(self.last)] * (1 + older)  # what actions ask for, the newest first
         self.commands = np.zeros((worlds, 3))
         self.fallen, self.time = np.zeros(worlds, bool), 0.0
         for data in self.data:
@@ -88,16 +92,21 @@ class Deployment:
 
     def step(self) -> None:
         """Let the policy act once in each world: ``decimation`` steps of MuJoCo, controls delayed as the file says."""
-        before = self.last
-        self.last = np.asarray(self.network(self.observe()))
-        old, new = (self.numbers["action_offset"] + self.numbers["action_scale"] * x for x in (before, self.last))
-        self.time += self.metadata["dt"] * self.metadata["decimation"]
+        self.last, decimation = np.asarray(self.network(self.observe())), self.metadata["decimation"]
+        self.set = [self._controls(self.last), *self.set[:-1]]
+        self.time += self.metadata["dt"] * decimation
+        held, every = np.array(self.set), np.arange(len(self.actuators))
         for world, data in enumerate(self.data):
-            for substep in range(self.metadata["decimation"]):
-                late = substep < self.numbers["delay_steps"]
-                data.ctrl[self.actuators] = np.where(late, old[world], new[world])
+            for substep in range(decimation):
+                age = -((substep - self.numbers["delay_steps"]) // decimation)  # in actions
+                data.ctrl[self.actuators] = held[np.maximum(age, 0), world, every]
                 mujoco.mj_step(self.model, data)
             self.fallen[world] |= data.xmat[1][8] < np.cos(np.radians(70.0))
+
+    def _controls(self, actions: np.ndarray) -> np.ndarray:
+        """Return the controls that actions ask for [world, actuator]."""
+        clipped = np.clip(actions, self.low, self.high)
+        return self.numbers["action_offset"] + self.numbers["action_scale"] * clipped
 
     def velocities(self) -> np.ndarray:
         """Return velocity forward and to the left [m/s] and rate of turning [rad/s] of each base, in its axes."""
