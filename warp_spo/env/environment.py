@@ -57,8 +57,7 @@ class Env(VecEnv):
         commands: None, or one of :mod:`warp_spo.env.commands`.
         events: of :mod:`warp_spo.env.events`.
         episode_length_s: after this time an episode ends with a time-out [s].
-        default_q: coordinates that episodes start from, and that joints and actions are relative to [coordinate];
-            None: the scene's neutral q.
+        default_q: coordinates [coordinate] of starts, to which joints and actions are relative; None: the scene's.
         seed: of all random numbers, 64 bits.
         first_world: number of world 0 in a run on several devices; a world's numbers depend on its own number alone.
         passes: of steps with contacts, see :meth:`Dynamics.step`.
@@ -73,8 +72,7 @@ class Env(VecEnv):
         final: the argument ``final_observations``.
         replay: runs a step without its inputs and results; ``replay.captured`` says of how many graphs it is made.
         values: what events have made of the scene's values, torch tensors [world, ...] by name.
-        dyn: the :class:`Dynamics`.
-        has_commands: whether it gives commands.
+        dyn: the :class:`Dynamics`. has_commands: whether it gives commands.
         action_labels, action_clips: of each action, what it sets, and None or the (lowest, highest) that counts.
         num_envs, num_actions, num_obs, max_episode_length, episode_length_buf, device, cfg: as rsl_rl names them.
 

@@ -12,7 +12,7 @@ from ..hinges.functions import where
 from ..scene.terrain import Tiles
 from .actions import actuator_labels
 from .checks import Range, check_interval, check_number, check_span, check_steps
-from .vectors import find, multiply, vector
+from .vectors import between, find, multiply, vector
 from .world import World
 
 
@@ -171,8 +171,7 @@ def terrain(tiles: Tiles, rows: int | None = None, level: bool = True) -> Reset:
         w.keep("terrain", [w.integer(0, first_rows - 1), w.integer(0, columns - 1)])
 
     def change(w: World) -> None:
-        held = w.memory("terrain", 2, reset=None)
-        row, column = (_between(x, most - 1.0) for x, most in zip(held, (count, columns), strict=True))
+        row, column = map(between, w.memory("terrain", 2, reset=None), (count - 1.0, columns - 1.0))
         origins = w.table("terrain", tiles.origins.reshape(-1, 3))
         if not level:
             row = w.integer(0, first_rows - 1)
@@ -192,11 +191,6 @@ def terrain(tiles: Tiles, rows: int | None = None, level: bool = True) -> Reset:
             w.q[start + i] = w.q[start + i] + x
 
     return Reset(change, first, ("terrain",))
-
-
-def _between(x: Any, most: float) -> Any:
-    """Return a number between zero and ``most``, so that no table is read beyond its end; NaN becomes zero."""
-    return where(x > 0.0, where(x < most, x, most), 0.0)
 
 
 def push(
@@ -370,8 +364,8 @@ def entries_of(scene: Any, name: str, names: Any) -> list[int]:
     """Return the entries of a value that regular expressions name; None: all."""
     family = name.split("_")[0]
     if family == "contact":
-        members = [{point.body} for point in scene.contact_points]
-        members += [{pair.body, pair.other} for pair in scene.contact_pairs]
+        pairs = [{pair.body, pair.other} for pair in scene.contact_pairs]
+        members = [{point.body} for point in scene.contact_points] + pairs
         if names is None:
             return list(range(len(members)))
         bodies = set(find("events.randomise", "body", scene.body_labels, names))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..hinges.functions import AbstractScalar, Condition
+from ..hinges.functions import AbstractScalar, Condition, where
 from ..trace.scalars import Value, is_constant
 
 Vector = np.ndarray  # of abstract scalars
@@ -44,6 +44,11 @@ def rotate(quaternion: Any, v: Any) -> Vector:
 def rotate_back(quaternion: Any, v: Any) -> Vector:
     """Return ``v`` turned by the inverse of a unit quaternion, xyzw."""
     return rotate(vector([-quaternion[0], -quaternion[1], -quaternion[2], quaternion[3]]), v)
+
+
+def between(x: Any, most: float) -> Any:
+    """Return a number between zero and ``most``, so that no table is read beyond its end; NaN becomes zero."""
+    return where(x > 0.0, where(x < most, x, most), 0.0)
 
 
 def find(call: str, what: str, labels: Sequence[str], names: Any) -> list[int]:
