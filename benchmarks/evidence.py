@@ -34,6 +34,7 @@ class Evidence(NamedTuple):
         stress: rows of the stress suite, with "case" and "verdict".
         sources: a line for each file that rows come from: machine, kinds of rows, commit, date, versions.
         capabilities: rows with "group", of :mod:`.capabilities` and of the benchmarks of one topic.
+        dates: kind of rows, "ours" or the name of a peer or a group -> date and time of the newest file that has some.
     """
 
     machine: dict
@@ -41,7 +42,8 @@ class Evidence(NamedTuple):
     peers: list[dict]
     stress: list[dict]
     sources: list[str]
-    capabilities: Sequence[dict] = ()
+    capabilities: Sequence[dict]
+    dates: dict[str, str]
 
     @property
     def is_gpu(self) -> bool:
@@ -125,7 +127,8 @@ def _gather_machine(runs: list[dict]) -> Evidence:
     machine = {key: value for data in runs[::-1] for key, value in data["machine"].items()}
     lines = [_source_line(data, list(used[index])) for index, data in enumerate(runs) if index in used]
     sources = list(dict.fromkeys(lines))
-    return Evidence(machine, rows["ours"], rows["peers"], rows["stress"], sources, rows["capabilities"])
+    dates = {kind: runs[index]["date"] for index in sorted(used, reverse=True) for kind in used[index]}
+    return Evidence(machine, rows["ours"], rows["peers"], rows["stress"], sources, rows["capabilities"], dates)
 
 
 def _kind(row: dict) -> str:

@@ -247,23 +247,15 @@ def headline(evidence: Evidence) -> str:
         text = [f"| {of} | `warp_spo` | the same work elsewhere, and how many times as long |", "|---|---:|---|", *text]
     cost, called, beside = (_fastest(rows, keys) for keys in (COST, dict(name=CALLED), dict(name=BESIDE)))
     if cost and called and beside:
+        replayed, day = (evidence.dates[kind][:10] for kind in ("ours", HOST))
         text += [
             "",
             "Times are of one call, replayed in a CUDA graph. A call from Python takes longer than its kernel: forward",
             f"dynamics of {HEADLINE_WORLDS:,} Go2 quadrupeds takes **{time(cost)} µs replayed, {time(called)} µs "
             "called with torch tensors**, where torch's own",
-            f"`add` takes {time(beside)} µs (replayed {day(evidence)}, called {day(evidence, HOST)}). So capture your "
-            "loop in a graph.",
+            f"`add` takes {time(beside)} µs (replayed {replayed}, called {day}). So capture your loop in a graph.",
         ]
     return "\n".join(text).lstrip("\n") + "\n" if text else ""
-
-
-def day(evidence: Evidence, group: str | None = None) -> str:
-    """Return the date of the file that our rows come from, or those of a group, such as 2026-11-23."""
-    heads = {line.partition(", commit ")[0]: line for line in reversed(evidence.sources)}
-    ours = heads[evidence.machine["device"]]
-    line = next((line for head, line in heads.items() if group and group in head), ours)
-    return line.partition(", commit ")[2].split(", ")[1]
 
 
 def _fastest(rows: Sequence[dict], keys: dict) -> dict | None:
@@ -295,11 +287,11 @@ def page(everything: Sequence[Evidence], speed: Sequence[dict] = ()) -> str:
         worlds = usual_worlds(plain(evidence))
         shown = evidence._replace(rows=[row for row in evidence.rows if row["worlds"] == worlds])
         operations = None if evidence is everything[0] else HEADLINE
-        text += [f"## {evidence.machine['device']}", "", *evidence.sources, ""]
+        text += [f"## {evidence.machine['device']}", "", *(f"* {line}" for line in evidence.sources), ""]
         text += [rates(evidence) + markdown(shown, operations)]
         if evidence is everything[0]:
             text += [others(evidence) + (beyond(evidence) if evidence.capabilities else "")]
-            text += [later(run, evidence, seen) for run in speed]
+            text += [later(run, evidence, seen) for run in speed if run["date"] > evidence.dates.get("ours", "")]
             text += [line for name, what in PICTURES.items() for line in (f"![{what}]({name})", "")]
     return "\n".join(text).rstrip("\n") + "\n"
 

@@ -92,6 +92,14 @@ def test_tables_and_headline_are_rewritten_between_the_markers(tmp_path, monkeyp
         file.write_text(kept)
 
 
+def test_a_run_of_lines_is_shown_beside_tables_that_are_older_than_it():
+    line = dict(robot="ant", operation="phi", dtype="float32", worlds=4096, variable=[], us=512.0, error=1e-7)
+    run = dict(commit="fedcba9876543210", date="2026-01-02T03:04:06+00:00", rows=[line])
+    assert "| ant, `phi` | float32 | 4,096 | 1024 | 512 | 1.0e-07 |" in table.page(_gathered(_data()), [run])
+    earlier = run | dict(date="2026-01-02T03:04:04+00:00")
+    assert "Measured after" not in table.page(_gathered(_data()), [earlier])
+
+
 def test_committed_tables_are_those_of_the_committed_runs():
     found = evidence.gather(evidence.read(file) for file in evidence.files([evidence.RESULTS]))
     for file, text in table.filled(evidence.ROOT, evidence.RESULTS, found).items():
