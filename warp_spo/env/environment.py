@@ -116,31 +116,19 @@ class Env(VecEnv):
         self._passes, self.has_commands = given.checked_passes(scene, passes), commands is not None
         self.final = given.checked_bool("final_observations", final_observations)
         self._steps = 0
-
         default = given.checked_default(scene, default_q)
-        groups, rewards, terminations = given.checked_terms(observations, rewards, terminations or {}, events)
-        self._levels = saving.level_names(events, commands)
-        layout = self._layout = Layout(scene, default, self.step_dt, commands, changed_values(scene, events))
-        parts = given.checked_parts(actions)
-        self.action_labels = [label for part in parts for label in part.labels(scene)]
-        self.action_clips = [part.clip for part in parts for _ in part.labels(scene)]
-        self.num_actions = layout.action_count = len(self.action_labels)
-        layout.action_arrays = {part.array for part in parts}
-        tracing = Tracing(layout, parts, groups, rewards, terminations, commands, list(events))
-        tracing.run(self.max_episode_length, final_observations)
-        self.reward_names, self.termination_names = list(rewards), tracing.ends
-        self.num_obs = tracing.group_sizes
-
-        self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=layout.values, granularity=granularity)
+        terms = given.checked_terms(observations, rewards, terminations or {}, events)
+        self._layout = Layout(scene, default, self.step_dt, commands, changed_values(scene, events))
+        tracing = self._trace(given.checked_parts(actions), *terms, commands, events)
+        variable = self._layout.values
+        self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=variable, granularity=granularity)
         store = self._store = self._allocate(tracing)
         self.q, self.qd, self.actions, self.chosen = (store.tensors[n] for n in ("q", "qd", "actions", "chosen"))
         self._tensors, self._controls, self._step_arrays = store.tensors, store.controls, store.written
-        self.values = store.values
-        self._actuator_state = self._delay_buffers(events)
-        self._log = Log(layout, self.reward_names, self.termination_names, self.device)
+        self.values, self._actuator_state = store.values, self._delay_buffers(events)
+        self._log = Log(self._layout, self.reward_names, self.termination_names, self.device)
         self.set_seed(self.seed)
         self._kernels = self._build(tracing)
-        self._values_later = any(isinstance(event, Values) and event.when != "start" for event in events)
         wanted = self.warp_device.is_cuda if graph is None else bool(graph) and self.warp_device.is_cuda
         self.replay = Replay(self._parts(), wanted)
         if self.warp_device.is_cuda:
@@ -148,6 +136,20 @@ class Env(VecEnv):
         self._launch("start")
         self._set_values()
         self.reset()
+
+    def _trace(self, actions: Any, groups: Any, rewards: Any, terminations: Any, commands: Any, events: Any) -> Tracing:
+        """Return the traced stages of the checked terms; keep the names and counts of their numbers."""
+        layout = self._layout
+        self.action_labels = [label for part in actions for label in part.labels(self.scene)]
+        self.action_clips = [part.clip for part in actions for _ in part.labels(self.scene)]
+        self.num_actions = layout.action_count = len(self.action_labels)
+        layout.action_arrays = {part.array for part in actions}
+        tracing = Tracing(layout, actions, groups, rewards, terminations, commands, list(events))
+        tracing.run(self.max_episode_length, self.final)
+        self.reward_names, self.termination_names = list(rewards), tracing.ends
+        self.num_obs, self._levels = tracing.group_sizes, saving.level_names(events, commands)
+        self._values_later = any(isinstance(event, Values) and event.when != "start" for event in events)
+        return tracing
 
     def _allocate(self, tracing: Tracing) -> Storage:
         """Return the arrays that the traced stages and the dynamics read and write."""
@@ -389,11 +391,8 @@ class Env(VecEnv):
 
     def _user_parts(self, stage: str) -> list[Part]:
         """Return the parts that fill in the numbers of the user's terms in torch that a stage reads."""
-        return [
-            Part(functools.partial(self._fill_in, term, start), term.name)
-            for term, (place, start) in self._layout.users.items()
-            if place == stage
-        ]
+        users = [(term, start) for term, (place, start) in self._layout.users.items() if place == stage]
+        return [Part(functools.partial(self._fill_in, term, start), term.name) for term, start in users]
 
     def _fill_in(self, term: TorchTerm, start: int) -> None:
         found = given.checked_numbers(term, term.function(self), self.num_envs)
