@@ -112,6 +112,7 @@ MISTAKES = {
     "ground": (lambda: spo.Scene([spo.Body(1.0)], [spo.Hinge("free", -1, 0)], ground=0.0), TypeError, "ground is of"),
     "field": (lambda: spo.HeightField([[0.0, 1.0], [np.nan, 0.0]], 0.1), ValueError, r"heights\[1, 0\] is nan"),
     "cells": (lambda: spo.HeightField([0.0, 1.0], 0.1), ValueError, r"heights has shape \(2,\)"),
+    "rows": (lambda: spo.HeightField([[0.0, 1.0], [2.0]], 0.1), ValueError, "heights has rows of different lengths"),
     "cell": (lambda: spo.HeightField(np.zeros((2, 2)), 0.0), ValueError, "cell is 0.0 m"),
     "normal": (lambda: spo.Plane(normal=(0, 0, 2)), ValueError, "normal is .*expected unit length"),
 }

@@ -199,6 +199,8 @@ STICK = dict(capsule=((0, 0, 0), (0, 0, 1), 0.1))
 MISTAKES = {
     "itself": (lambda: [box(0, 0.1, other=box(0, 0.1))], ValueError, "of body 0 with itself"),
     "nobody": (lambda: [box(0, 0.1, other=box(3, 0.1))], ValueError, "with body 3; expected one of 2"),
+    "a name": (lambda: [box(0, 0.1, other=box("cube", 0.1))], TypeError, "with body 'cube'; expected an integer"),
+    "a fraction": (lambda: [box(0, 0.1, other=box(1.0, 0.1))], TypeError, "with body 1.0; expected an integer"),
     "no shape": (lambda: [box(0, 0.1, other=1)], ValueError, "has 0 contacts with the ground"),
     "nested": (lambda: [box(0, 0.1, other=box(1, 0.1, other=0))], ValueError, "an other= itself"),
     "kind": (lambda: [box(0, 0.1, other="cube")], TypeError, "other is 'cube'; expected a Contact"),
@@ -212,6 +214,14 @@ def test_mistakes_have_names(mistake):
     make, kind, message = MISTAKES[mistake]
     with pytest.raises(kind, match=message):
         free([cube(1.0, 0.1)] * 2, make())
+
+
+def test_a_body_with_modes_is_refused_on_either_side():
+    modes = spo.Modes(np.eye(1), 100.0 * np.eye(1), 0.1 * np.eye(1), np.zeros((6, 1)))
+    bodies = [cube(1.0, 0.1), spo.Body(1.0, inertia=0.01 * np.eye(3), modes=modes)]
+    for body in (0, 1):
+        with pytest.raises(spo.UnsupportedError, match=r"contact 0: a contact (of|with) a body with modes"):
+            free(bodies, [box(body, 0.1, other=box(1 - body, 0.1))])
 
 
 def test_the_plan_takes_the_form_that_was_faster():

@@ -1,5 +1,7 @@
 """Margins of MJCF shapes against MuJoCo's constraints, shapes that MuJoCo cannot read, and files without contacts."""
 
+import warnings
+
 import mujoco
 import numpy as np
 import pytest
@@ -112,3 +114,21 @@ def test_masks_pairs_and_excludes_hold_without_mujoco(floor, contact, exclude, t
     wanted = [c.label for c in spo.load(file, contacts=True).contacts]
     scene = mjcf.read_mjcf(file, None, True, Choice(True, None, 8))
     assert [c.label.split("/")[-1] for c in scene.contacts] == wanted and 0 < len(wanted) + len(exclude)
+
+
+def test_friction_that_differs_across_is_said_to_be_left_out(tmp_path):
+    """A contact has one friction; MuJoCo's pairs have two."""
+    file = tmp_path / "pair.xml"
+    for friction, left_out in (("0.3 0.9", True), ("0.3 0.3", False)):
+        file.write_text(
+            "<mujoco><worldbody><geom name='floor' type='plane' size='1 1 1'/><body><freejoint/>"
+            "<geom name='ball' size='.1'/></body></worldbody>"
+            f"<contact><pair geom1='floor' geom2='ball' friction='{friction}'/></contact></mujoco>"
+        )
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            (contact,) = spo.load(file, contacts=True).contacts
+        assert contact.friction == 0.3
+        assert [str(each.message).partition("left out: ")[2] for each in said] == left_out * [
+            "the friction 0.9 across of a contact pair of geom 'ball', which has 0.3 in all directions"
+        ]

@@ -269,3 +269,41 @@ def test_inertias_are_replaced_by_newtons_rule(rng):
     assert sum(not np.array_equal(new, old) for (_, new), old in zip(ours, inertias, strict=True)) > 100
     for (_, mine), theirs in zip(ours, model.body_inertia.numpy(), strict=True):
         np.testing.assert_allclose(mine, theirs, atol=2e-6 * np.abs(theirs).max(initial=1e-3))
+
+
+COLLADA = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset>{unit}<up_axis>Z_UP</up_axis></asset><library_geometries><geometry id="g"><mesh><source id="p">
+<float_array id="a" count="12">0 0 0 1000 0 0 0 2000 0 0 0 3000</float_array><technique_common>
+<accessor source="#a" count="4" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source><vertices id="v">
+<input semantic="POSITION" source="#p"/></vertices><triangles count="4">
+<input semantic="VERTEX" source="#v" offset="0"/><p>0 2 1 0 1 3 0 3 2 1 2 3</p></triangles></mesh>
+</geometry></library_geometries><library_visual_scenes><visual_scene id="s">
+<node><instance_geometry url="#g"/></node></visual_scene></library_visual_scenes><scene>
+<instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+
+@pytest.mark.parametrize(("unit", "length"), [('<unit meter="0.001"/>', 1e-3), ("<unit/>", 1.0), ("", 1.0)])
+def test_a_mesh_has_the_unit_of_its_file(unit, length, tmp_path):
+    """Millimetres in a COLLADA file are no metres: in contacts, and in masses from shapes."""
+    pytest.importorskip("collada")
+    (tmp_path / "mesh.dae").write_text(COLLADA.format(unit=unit))
+    file = tmp_path / "robot.urdf"
+    shape = '<collision><geometry><mesh filename="mesh.dae" scale="1 2 -1"/></geometry></collision>'
+    file.write_text(f'<robot name="r"><link name="a">{shape}</link></robot>')
+    with pytest.warns(UserWarning, match="a"):
+        scene = spo.load(file, floating=True, contacts=True)
+    wanted = length * np.array([[0, 0, 0], [1000, 0, 0], [0, 4000, 0], [0, 0, -3000]])
+    np.testing.assert_allclose(sorted(scene.contacts[0].positions.tolist()), sorted(wanted.tolist()), rtol=1e-6)
+    assert np.isclose(scene.bodies[0].mass, 1000.0 * 1e3 * 4e3 * 3e3 * length**3 / 6.0, rtol=1e-4)
+
+
+def test_a_unit_that_is_none_is_named(tmp_path):
+    pytest.importorskip("collada")
+    (tmp_path / "mesh.dae").write_text(COLLADA.format(unit='<unit meter="inch"/>'))
+    file = tmp_path / "robot.urdf"
+    shape = '<collision><geometry><mesh filename="mesh.dae"/></geometry></collision>'
+    mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    file.write_text(f'<robot name="r"><link name="a">{mass}{shape}</link></robot>')
+    with pytest.raises(ValueError, match=r"line 1, <mesh>: its file 'mesh.dae' .* has no unit of length"):
+        spo.load(file, floating=True, contacts=True)

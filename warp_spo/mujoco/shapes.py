@@ -74,7 +74,10 @@ def _friction(source: Source, geom: int, ground: int | None, pairs: Pairs) -> fl
     m = source.model
     pair = None if ground is None else pairs.get(frozenset((geom, ground)))
     if pair is not None:
-        value, dimensions = m.pair_friction[pair, 0], m.pair_dim[pair]
+        (value, across), dimensions = m.pair_friction[pair, :2], m.pair_dim[pair]
+        if dimensions > 1 and across != value:
+            words = f"the friction {across:g} across of a contact pair of {source.words('geom', geom)}"
+            source.left_out.append(f"{words}, which has {value:g} in all directions")
     else:
         both = [geom] if ground is None else [geom, ground]
         priority = max(m.geom_priority[g] for g in both)

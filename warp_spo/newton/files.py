@@ -57,9 +57,10 @@ def load(
 
     MJCF is compiled by MuJoCo if the package is installed (extra ``mujoco``), and becomes a scene as by
     :func:`from_mujoco`, in float64. A URDF is read in float64, and the scene has its numbers; order, labels and
-    coordinates are those of Newton's model of the file. USD, and MJCF without the package mujoco, are read by Newton's
-    importers, in float32. Visual shapes are skipped. Collision shapes are read if ``contacts`` asks for them. A mesh
-    file is needed only if a body that can move takes its mass from it, or a contact its points.
+    coordinates are those of Newton's model of the file. The unit of a COLLADA mesh counts, its up axis does not. USD,
+    and MJCF without the package mujoco, are read by Newton's importers, in float32. Visual shapes are skipped.
+    Collision shapes are read if ``contacts`` asks for them. A mesh file is needed only if a body that can move takes
+    its mass from it, or a contact its points.
 
     Args:
         path: The robot file.

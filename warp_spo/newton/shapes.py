@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any
 
 import newton
 import numpy as np
@@ -25,8 +26,12 @@ def mass_of_shapes(link: Element) -> tuple[float, np.ndarray, np.ndarray]:
     alone = ET.SubElement(robot, "link", {"name": "link"})
     for shape in link.findall("collision"):
         alone.append(copy.deepcopy(shape))
+        old: Any
         for old, new in zip(shape.iter("mesh"), alone[-1].iter("mesh"), strict=True):
-            new.set("filename", str(mesh_file(old, "because its link has no mass; write <inertial>")))  # type: ignore[arg-type]
+            file = mesh_file(old, "because its link has no mass; write <inertial>")
+            scale = unit_of(old, file) * old.numbers("scale", 3, (1.0, 1.0, 1.0))
+            new.set("filename", str(file))
+            new.set("scale", " ".join(map(repr, scale.tolist())))
     builder = newton.ModelBuilder()
     try:
         builder.add_urdf(ET.tostring(robot, encoding="unicode"))
@@ -54,3 +59,21 @@ def mesh_file(mesh: Element, why: str) -> Path:
         if candidate.is_file():
             return candidate
     raise mesh.error(f"there is no file {name!r}; expected a mesh, {why}")
+
+
+def unit_of(mesh: Element, file: Path) -> float:
+    """Return the length of the unit of a mesh's file [m]: that of a COLLADA file, 1 of others. Its up axis is no one's.
+
+    Raises:
+        ValueError: it is no length; the message names the line of the <mesh>.
+    """
+    if file.suffix.lower() != ".dae":
+        return 1.0
+    try:
+        unit = ET.parse(file).find("{*}asset/{*}unit")
+        found = 1.0 if unit is None else float(unit.get("meter", 1.0))
+    except (ET.ParseError, ValueError):
+        found = 0.0
+    if not 0.0 < found < float("inf"):
+        raise mesh.error(f"its file {file.name!r} cannot be read, or has no unit of length; correct it")
+    return found

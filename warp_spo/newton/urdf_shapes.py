@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..scene.shapes import Shape
-from .shapes import mesh_file
+from .shapes import mesh_file, unit_of
 from .xml_source import Element
 
 PRIMITIVES = ("sphere", "capsule", "cylinder", "box")
@@ -58,13 +58,14 @@ def _urdf_sizes(shape: Any) -> tuple[str, Any, tuple[str, ...]]:
         return "box", 0.5 * lengths, ()
     if shape.tag == "mesh":
         file = mesh_file(shape, "because contacts= asks for its shape; choose other shapes")
-        return "hull", _vertices(shape, file) * shape.numbers("scale", 3, (1.0, 1.0, 1.0)), (file.stem,)
+        scale = unit_of(shape, file) * shape.numbers("scale", 3, (1.0, 1.0, 1.0))
+        return "hull", _vertices(shape, file) * scale, (file.stem,)
     length = "height" if shape.tag == "capsule" and shape.get("height") is not None else "length"
     return shape.tag, (size("radius"), 0.5 * size(length)), ()
 
 
 def _vertices(shape: Any, file: Any) -> np.ndarray:
-    """Return the vertices of all parts of a mesh file [m, n x 3]."""
+    """Return the vertices of all parts of a mesh file, in its unit [n, 3]."""
     import trimesh  # an ImportError names the extra
 
     try:

@@ -71,7 +71,10 @@ class HeightField(StoredPart):
     origin: Any = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        shape = np.shape(self.heights)
+        try:
+            shape = np.shape(self.heights)
+        except ValueError:
+            raise ValueError("HeightField: heights has rows of different lengths; expected one length") from None
         if len(shape) not in (2, 3) or min(shape[-2:]) < 2 or shape[0] == 0:
             raise ValueError(
                 f"HeightField: heights has shape {shape}; expected (points along x, points along y), two or more each, "

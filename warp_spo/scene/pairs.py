@@ -64,7 +64,7 @@ class ContactPair(NamedTuple):
     eps: float
 
 
-def contact_pairs(contacts: Sequence[Any], body_count: int) -> tuple[ContactPair, ...]:
+def contact_pairs(contacts: Sequence[Any], bodies: Sequence[Any]) -> tuple[ContactPair, ...]:
     """Return the pairs of bodies among the contacts of a scene; raise an error for those that no solver takes."""
     found = []
     for index, contact in enumerate(contacts):
@@ -74,17 +74,22 @@ def contact_pairs(contacts: Sequence[Any], body_count: int) -> tuple[ContactPair
         if contact.dissipation is not None:
             raise UnsupportedError(call, "dissipation= of a contact between bodies", "give damping=")
         partner = _partner(call, contact, contacts)
-        if not -1 <= partner.body < body_count:
+        body, other = as_integer(contact.body), as_integer(partner.body)
+        if body is None or other is None:
+            raise TypeError(f"{call} is with body {partner.body!r}; expected an integer")
+        if not -1 <= other < len(bodies):
             raise ValueError(
-                f"{call} is with body {partner.body}; expected one of {body_count} bodies, 0 and up, "
+                f"{call} is with body {other}; expected one of {len(bodies)} bodies, 0 and up, "
                 "or -1, the inertial frame"
             )
-        if partner.body == contact.body:
-            raise ValueError(f"{call} is of body {contact.body} with itself; expected two bodies")
+        if other == body:
+            raise ValueError(f"{call} is of body {body} with itself; expected two bodies")
+        if other >= 0 and bodies[other].modes is not None:
+            raise UnsupportedError(call, "a contact with a body with modes", "let it touch a rigid body")
         both = shape_of(call, contact), shape_of(call, partner)
         if ROUND not in (kinds := {one.kind for one in both}) and HULL in kinds:
             both = as_hull(call, both[0]), as_hull(call, both[1])
-        found.append(ContactPair(index, contact.body, partner.body, both, most_points(call, *both), contact.eps))
+        found.append(ContactPair(index, body, other, both, most_points(call, *both), contact.eps))
     return tuple(found)
 
 

@@ -383,7 +383,7 @@ class Scene(Stored):
         check_contacts(self.contacts, ground, self.bodies)
         self.ground = Plane() if ground is None and self.contacts else ground
         self.contact_points: tuple[ContactPoint, ...] = contact_points(self.contacts)
-        self.contact_pairs: tuple[ContactPair, ...] = contact_pairs(self.contacts, len(self.bodies))
+        self.contact_pairs: tuple[ContactPair, ...] = contact_pairs(self.contacts, self.bodies)
 
     @property
     def contact_count(self) -> int:
