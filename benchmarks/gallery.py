@@ -64,7 +64,7 @@ def run(name: str, line: str) -> str:
     return (
         f"## {name}\n\n{line}\n\n<!-- not run: benchmarks.gallery ran it -->\n"
         f"```console\npython -m warp_spo.examples.{name}\n```\n\n"
-        f"![what the example {name} draws](_static/gallery/{picture.name})\n\n```text\n{printed.strip()}\n```\n"
+        f"![picture of the example {name}](_static/gallery/{picture.name})\n\n```text\n{printed.strip()}\n```\n"
     )
 
 
