@@ -46,6 +46,16 @@ def test_faces_are_those_of_qhull():
         np.testing.assert_allclose(volume, ConvexHull(points).volume, rtol=1e-6)
 
 
+def test_flat_and_long_hulls_keep_all_corners_on_the_ground(monkeypatch):
+    """Also those that reach farthest in few directions, none of which is looked in; in parts, where points are many."""
+    for seed, scale in enumerate(([1, 1, 0.2], [1, 1, 0.2], [1, 0.4, 0.05], [1, 0.05, 0.05], [1, 0.02, 0.01])):
+        cloud = np.random.default_rng(seed + 1).normal(size=(40, 3)) * scale
+        wanted = cloud[np.sort(ConvexHull(cloud).vertices)]
+        np.testing.assert_array_equal(spo.Contact(0, hull=cloud).positions, wanted)
+    monkeypatch.setattr("warp_spo.scene.contacts.AT_ONCE", 1000)
+    np.testing.assert_array_equal(spo.Contact(0, hull=cloud).positions, wanted)
+
+
 def test_a_hull_that_is_none_has_a_name():
     """Flat ones, and those of too many faces or corners."""
     rng = np.random.default_rng(0)

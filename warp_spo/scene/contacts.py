@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import UnsupportedError, as_integer
 from .checks import checked_array, checked_unit, read_only
+from .hulls import with_corners
 from .pairs import pair_values
 from .storage import Stored, StoredPart
 
@@ -24,6 +25,7 @@ STANCE = 2  # bodies at most whose points, up to RESTS each, carry a robot
 MARGIN = 1.6  # of the moment that holds up one leg, over what tips it: 360 N m/rad of 226 for a humanoid of 33 kg
 DAMPING = 0.5  # of sqrt(k m), the share of mass over one point; standing is quiet from 0.1 to 2
 DIRECTIONS = 2048  # in which the extreme points of a hull are looked for
+AT_ONCE = 1 << 26  # numbers in memory while these points are looked for
 STEEP = 1.0  # slope beyond which a cell of a height field is a wall and a floor
 STANDARD_GRAVITY = 9.81  # [m/s^2], in scenes without gravity
 
@@ -307,7 +309,7 @@ def _hull(call: str, value: Any) -> Points:
     if len(shape) != 2 or shape[1] != 3 or shape[0] == 0:
         raise ValueError(f"{call}: hull has shape {shape}; expected (points, 3)")
     points = checked_array(call, "hull [m]", value, shape)
-    return points[extreme_points(points)], 0.0
+    return points[with_corners(points, extreme_points(points))], 0.0
 
 
 SHAPES = {"point": _point, "sphere": _sphere, "capsule": _capsule, "box": _box, "hull": _hull}
@@ -317,7 +319,8 @@ def extreme_points(points: np.ndarray) -> np.ndarray:
     """Return the indices, ascending, of the points that lie farthest in some of many directions."""
     centred = points - points.mean(axis=0)
     outward = np.concatenate([spread_directions(), np.eye(3), -np.eye(3), centred])
-    return np.unique((centred @ outward.T).argmax(axis=0))
+    parts = np.array_split(outward, max(1, outward.size * len(points) // AT_ONCE))
+    return np.unique(np.concatenate([(centred @ part.T).argmax(axis=0) for part in parts]))
 
 
 def spread_directions(count: int = DIRECTIONS) -> np.ndarray:

@@ -56,21 +56,8 @@ def convex_hull(call: str, points: np.ndarray, known: np.ndarray) -> tuple[Hull,
         ValueError: the points lie in a plane, or some are too near to each other to tell faces apart.
         UnsupportedError: there are more than MOST corners or faces.
     """
-    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    centred, size = points - middle, float(np.ptp(points, axis=0).max())
-    corners = np.zeros((0, 3))
-    for corner in known - middle:
-        if len(corners) <= MOST and not (np.abs(corners - corner).max(axis=1) <= SAME * size).any():
-            corners = np.vstack([corners, corner])
-    while True:
-        if len(corners) > MOST:
-            raise _too_many(call, f"more than {MOST} corners")
-        normals, offsets = _planes(call, corners, size)
-        beyond = centred @ normals.T - offsets
-        far = beyond.max(axis=0) > SAME * size
-        if not far.any():
-            break
-        corners = np.vstack([corners, centred[np.unique(beyond[:, far].argmax(axis=0))]])
+    middle, corners, normals, offsets = _found(call, points, known)
+    size = float(np.ptp(points, axis=0).max())
     on = np.abs(corners @ normals.T - offsets) <= SAME * size
     faces = [_around(corners, np.flatnonzero(row), normal) for row, normal in zip(on.T, normals, strict=True)]
     if len(faces) > MOST:
@@ -88,6 +75,39 @@ def convex_hull(call: str, points: np.ndarray, known: np.ndarray) -> tuple[Hull,
         read_only(normals), read_only(offsets),
     )  # fmt: skip
     return hull, middle
+
+
+def _found(call: str, points: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the middle of points, the corners of their hull about it, and normals and offsets of its faces."""
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    centred, size = points - middle, float(np.ptp(points, axis=0).max())
+    corners = np.zeros((0, 3))
+    for corner in known - middle:
+        if len(corners) <= MOST and not (np.abs(corners - corner).max(axis=1) <= SAME * size).any():
+            corners = np.vstack([corners, corner])
+    while True:
+        if len(corners) > MOST:
+            raise _too_many(call, f"more than {MOST} corners")
+        normals, offsets = _planes(call, corners, size)
+        beyond = centred @ normals.T - offsets
+        far = beyond.max(axis=0) > SAME * size
+        if not far.any():
+            break
+        corners = np.vstack([corners, centred[np.unique(beyond[:, far].argmax(axis=0))]])
+    return middle, corners, normals, offsets
+
+
+def with_corners(points: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """Return the indices, ascending, of ``some`` points that lie on their hull and of all its corners.
+
+    Of hulls with more than MOST corners, and of points in a plane, ``some`` alone.
+    """
+    try:
+        middle, corners, _, _ = _found("", points, points[some])
+    except ValueError:
+        return some
+    at = [int(np.abs(points - middle - corner).max(axis=1).argmin()) for corner in corners]
+    return np.union1d(some, at)
 
 
 def grown(hull: Hull, by: float) -> np.ndarray:
