@@ -118,6 +118,19 @@ def test_calls_name_what_is_wrong():
 
 
 @pytest.mark.slow
+def test_terms_in_torch_leave_no_graph_behind():
+    """A network in a term keeps nothing of a step for a backward pass."""
+    net = torch.nn.Linear(2, 1)
+    scored = TorchTerm(lambda env: net(env.q)[:, 0], name="scored")
+    env = cart_env(observations={"actor": [scored]})
+    observed, *_ = env.step(torch.zeros(8, 1))
+    assert not observed["actor"].requires_grad and not any(x.requires_grad for x in env._tensors.values())
+    assert torch.allclose(observed["actor"], net(env.q).detach(), atol=1e-6)
+    with pytest.raises(ValueError, match=r"the term turning returned torch.complex64; expected real numbers"):
+        cart_env(observations={"actor": [TorchTerm(lambda env: 1j * env.q[:, 0], name="turning")]})
+
+
+@pytest.mark.slow
 def test_groups_share_the_history_of_an_observation():
     """An observation in two groups is one measurement, with its noise, of each step; resets of others change none."""
     seen = Observation(lambda w: w.q[1], noise=0.1, history=3)

@@ -1,5 +1,6 @@
 """Exported policies: what their files say, and how they act in MuJoCo."""
 
+import inspect
 import json
 
 import numpy as np
@@ -11,7 +12,7 @@ pytest.importorskip("rsl_rl")
 import warp_spo as spo  # noqa: E402
 from warp_spo import env as envs  # noqa: E402
 from warp_spo.env import export, learning, recording, robots  # noqa: E402
-from warp_spo.env.tasks import task  # noqa: E402
+from warp_spo.env.tasks import task, velocity  # noqa: E402
 
 
 def test_exports_act_as_the_policy(tmp_path):
@@ -100,3 +101,17 @@ def test_controls_in_mujoco_are_as_late_as_the_file_says(monkeypatch, tmp_path):
         acts = np.array([max(0, 1 + (substep - late) // env.decimation) for late in delays])  # the step's number
         acts = np.where(np.arange(12) % 4 == 0, np.minimum(acts, 2.5), acts)
         assert np.allclose(found, offset + scale * acts), substep
+
+
+@pytest.mark.slow
+def test_the_clock_of_steps_stands_in_mujoco_while_the_command_does(tmp_path):
+    """From the same command on as in the tasks."""
+    from warp_spo.mujoco import deployment
+
+    env = envs.make("go2-flat", 2, "cpu")
+    file, _ = export.save(learning.make_runner(env, task("go2-flat").LEARNER), env, "go2-flat", tmp_path / "go2")
+    there = deployment.Deployment(file, robots.FILES / "go2.xml", 3)
+    there.metadata |= {"observations": [["step phase", 2, 1.0]], "stride": 0.8}
+    there.time, there.commands = 0.2, np.array([[0.02, 0.0, -0.02], [0.0, 0.04, 0.02], [0.0, 0.0, 0.0]])
+    least = inspect.signature(velocity.step_phase).parameters["least_command"].default
+    assert deployment.LEAST_COMMAND == least and np.allclose(there.observe(), [[0, 0], [1, 0], [0, 0]], atol=1e-6)

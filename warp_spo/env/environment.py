@@ -395,5 +395,4 @@ class Env(VecEnv):
         return [Part(functools.partial(self._fill_in, term, start), term.name) for term, start in users]
 
     def _fill_in(self, term: TorchTerm, start: int) -> None:
-        found = given.checked_numbers(term, term.function(self), self.num_envs)
-        self._tensors["user"][:, start : start + term.size].copy_(found)
+        self._tensors["user"][:, start : start + term.size].copy_(given.numbers_of(term, self))

@@ -19,11 +19,10 @@ def describe(env: Env, name: str) -> dict[str, Any]:
     Action k sets ``offset[k] + scale[k] action``, a control of the actuator or the target or force of the joint
     ``actuators[k]``, whose gains are ``stiffness[k]`` and ``damping[k]``, after it is clipped to ``action_clip[k]``,
     (lowest, highest), None without one. No bias of an encoder is in the offset. Observations are the terms
-    ``observations``
-    [name, size, scale], one after the other; ``None`` where no task lists them. Joint positions are relative
-    to ``default_position``. ``stride`` is the period [s] of the observation "step phase", None without one: sine and
-    cosine of 2 pi time / stride, zeros while the command is zero. ``delay_steps`` count steps of ``dt``; the policy
-    runs every ``decimation`` of them.
+    ``observations`` [name, size, scale], one after the other; ``None`` where no task lists them. Joint positions are
+    relative to ``default_position``. ``stride`` is the period [s] of the observation "step phase", None without one:
+    sine and cosine of 2 pi time / stride, zeros while speed and turning asked for add up to 0.05 m/s and rad/s at most.
+    ``delay_steps`` count steps of ``dt``; the policy runs every ``decimation`` of them.
     """
     chosen, scene = task(name) if name in TASKS else None, env.scene
     scale, offset, gains = controls_of(env)

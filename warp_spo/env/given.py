@@ -141,10 +141,14 @@ def checked_lengths(call: str, value: Any, worlds: int) -> torch.Tensor:
     return found
 
 
-def checked_numbers(term: TorchTerm, found: Any, worlds: int) -> torch.Tensor:
-    """Return what a user's term in torch returned as [world, number]; ValueError for another shape."""
+@torch.no_grad()
+def numbers_of(term: TorchTerm, env: Any) -> torch.Tensor:
+    """Return what a user's term in torch returns as [world, number]; ValueError for another shape, or complex ones."""
+    found, worlds = term.function(env), env.num_envs
     expected = (worlds,) if term.size == 1 else (worlds, term.size)
     if not isinstance(found, torch.Tensor) or tuple(found.shape) not in (expected, (worlds, term.size)):
         came = tuple(found.shape) if isinstance(found, torch.Tensor) else type(found).__name__
         raise ValueError(f"Env: the term {term.name} returned {came}; expected a tensor {expected}")
+    if found.is_complex():
+        raise ValueError(f"Env: the term {term.name} returned {found.dtype}; expected real numbers")
     return found.reshape(worlds, term.size)

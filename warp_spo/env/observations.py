@@ -150,8 +150,8 @@ class TorchTerm:
     it. In a graph, Python runs once: what the function does beside tensors is not repeated.
 
     Args:
-        function: of the ``Env``, which returns a tensor [world] or [world, size], of any dtype. It must not change
-            the environment.
+        function: of the ``Env``, which returns a tensor [world] or [world, size] of real numbers, of any dtype. It must
+            not change the environment. It is called under ``torch.no_grad``.
         size: how many numbers it returns for each world.
         name: in errors and warnings; None: the function's.
     """

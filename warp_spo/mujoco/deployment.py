@@ -9,6 +9,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+LEAST_COMMAND = 0.05  # [m/s and rad/s, added up] below which the clock of steps stands, as that of the tasks
+
 
 class Deployment:
     """A velocity-tracking policy of an ONNX file on several robots in MuJoCo, each with its own command.
@@ -77,6 +79,7 @@ class Deployment:
         rows, angle = [], 2.0 * np.pi * self.time / (self.metadata["stride"] or 1.0)
         for data, command, last in zip(self.data, self.commands, self.last, strict=True):
             base = data.xmat[1].reshape(3, 3)
+            moves = np.hypot(command[0], command[1]) + abs(command[2]) > LEAST_COMMAND
             terms = {
                 "base velocity": base.T @ data.qvel[:3],
                 "base angular velocity": data.qvel[3:6],
@@ -85,7 +88,7 @@ class Deployment:
                 "joint velocity": data.qvel[self.joint_qd],
                 "last action": last,
                 "command": command,
-                "step phase": (np.abs(command).sum() > 0.0) * np.array([np.sin(angle), np.cos(angle)]),
+                "step phase": moves * np.array([np.sin(angle), np.cos(angle)]),
             }
             rows.append(np.concatenate([scale * terms[name] for name, _, scale in self.metadata["observations"]]))
         return np.array(rows, np.float32)
