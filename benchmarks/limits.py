@@ -68,7 +68,7 @@ def _step_over_forward_dynamics(robot: str, step: str, worlds: int, limit: float
     return Line(Call(robot, step, worlds), "ratio", limit, Call(robot, "forward_dynamics", worlds))
 
 
-def _over_folded(robot: str, limit: float) -> Line:
+def _ratio_to_folded(robot: str, limit: float) -> Line:
     call = Call(robot, "forward_dynamics", MOST, variable=INERTIAS)
     return Line(call, "ratio", limit, dataclasses.replace(call, variable=()))
 
@@ -86,7 +86,7 @@ LINES = (
     Line(Call("g1", "forward_dynamics_derivatives", MANY), "us", 1500.0),
     Line(Call("g1", "mass_matrix_inverse", FEW, "float64"), "us", 60.0),
     *(_over_float32(robot, name, FEW, 2.5) for robot in ("go2", "g1") for name in ("phi", "phi.T", "psi")),
-    *(_over_folded(robot, 1.4) for robot in ("panda", "go2", "g1")),
+    *(_ratio_to_folded(robot, 1.4) for robot in ("panda", "go2", "g1")),
     *(Line(Call("go2", ON_PLANE, worlds), "us", limit) for worlds, limit in ((FEW, 25.0), (MANY, 150.0))),
     *(Line(Call("g1", ON_PLANE, worlds), "us", limit) for worlds, limit in ((FEW, 70.0), (MANY, 500.0))),
     Line(Call("go2", ON_FIELD, MANY), "ratio", 1.15, Call("go2", ON_PLANE, MANY)),

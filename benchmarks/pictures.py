@@ -64,7 +64,7 @@ def headline(pyplot: Any, evidence: Evidence) -> Any:
     Returns:
         The figure; None without rows.
     """
-    rows = [row for row in _timed(evidence) if row["op"] == MAIN and row["dtype"] in ("float32", "float64")]
+    rows = [row for row in _timed_rows(evidence) if row["op"] == MAIN and row["dtype"] in ("float32", "float64")]
     scenes = {row["scene"] for row in rows}
     robots = next((names for names in ROBOTS if scenes >= set(names)), sorted(scenes)[:3])
     rows = [row for row in rows if row["scene"] in robots and row["error"] > 0.0]
@@ -100,7 +100,7 @@ def error_time(pyplot: Any, evidence: Evidence, operation: str, worlds: int) -> 
     Returns:
         The figure; None where nothing was timed.
     """
-    rows = [row for row in _timed(evidence) if row["op"] == operation and row["worlds"] == worlds]
+    rows = [row for row in _timed_rows(evidence) if row["op"] == operation and row["worlds"] == worlds]
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     if not scenes:
         return None
@@ -137,7 +137,7 @@ def error_time(pyplot: Any, evidence: Evidence, operation: str, worlds: int) -> 
 
 def world_counts(evidence: Evidence) -> list[int]:
     """Return the world counts at which error is drawn against run time: ours, or else the peers'."""
-    ours = {row["worlds"] for row in _timed(evidence) if not row.get("peer")}
+    ours = {row["worlds"] for row in _timed_rows(evidence) if not row.get("peer")}
     return sorted(ours or {row["worlds"] for row in evidence.peers if "us" in row})
 
 
@@ -145,7 +145,7 @@ def _title(row: dict) -> str:
     return f"{TITLES.get(row['scene'], row['scene'])}, {row['dof']} dof"
 
 
-def _timed(evidence: Evidence) -> list[dict]:
+def _timed_rows(evidence: Evidence) -> list[dict]:
     return [row for row in [*evidence.rows, *evidence.peers] if not row.get("sweep") and "us" in row and "error" in row]
 
 

@@ -141,7 +141,9 @@ def compare_urdf(file: Path, text: str | None = None) -> Row:
         except ValueError as refusal:
             return Row(short(file), note=f"refused: {str(refusal).replace(str(file), file.name)}")
         spo.load(file, floating=True)
-    row = Row(short(file), scene.dof_count, note=_counted(list(dict.fromkeys(str(one.message) for one in caught))))
+    row = Row(
+        short(file), scene.dof_count, note=_count_warnings(list(dict.fromkeys(str(one.message) for one in caught)))
+    )
     theirs = PinocchioFile(scene, text or file.read_text())
     errors = []
     for q, qd, tau in random_states(scene):
@@ -173,7 +175,7 @@ SAID = {
 """Meaning of a warning of ``spo.load``, by a pattern whose group holds the names in it."""
 
 
-def _counted(said: list[str]) -> str:
+def _count_warnings(said: list[str]) -> str:
     """Return the warnings of ``spo.load`` in a few words, with the number of names that they are about."""
     notes = []
     for pattern, meaning in SAID.items():

@@ -98,7 +98,7 @@ def main(arguments: list[str] | None = None) -> int:
     roof, rows = None, list[dict]()
     if not options.compile:
         roof = roofline.measure(device)
-        whole = _continued(options.file, runner.record([], device, roof))
+        whole = _continue_run(options.file, runner.record([], device, roof))
         rows = whole["rows"]
     there = set(map(group_of, rows))
     every = cases(options.compile)
@@ -140,7 +140,7 @@ def _effort(group: Sequence[dict]) -> float:
     return len(group) * (10 + FACTORIES[case["scene"]]().dof_count) * (1.0 + case["worlds"] / 2**17)
 
 
-def _continued(file: Path, run: dict) -> dict:
+def _continue_run(file: Path, run: dict) -> dict:
     """Return the run in the file, or the new run if there is no file.
 
     Raises:

@@ -102,7 +102,7 @@ def take_turns(tasks: Sequence[Any], work: Work, seconds: float, jobs: int | Non
             following = _next(workers, taken, rest)
             if following is None:
                 continue
-            with _alone(workers, following):
+            with _stop_others(workers, following):
                 yield from _turn(workers, following, rest, min(LATEST, end - time.monotonic()))
             taken += 1
     finally:
@@ -153,7 +153,7 @@ def _heard(
 
 
 @contextlib.contextmanager
-def _alone(workers: dict[Connection, _Worker], pipe: Connection) -> Iterator[None]:
+def _stop_others(workers: dict[Connection, _Worker], pipe: Connection) -> Iterator[None]:
     """Let all processes but one stand still."""
     others = [worker.process.pid for at, worker in workers.items() if at is not pipe and worker.process.is_alive()]
     for process in others:

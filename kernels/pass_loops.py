@@ -14,11 +14,11 @@ def repeat_passes(ahead: str, a_pass: str, last: str, names: tuple[str, str, str
     """
     c, missed = C_TYPE[T], names[-1]
     declared = [f"{c} {name}_row[{entries}] = {{}};" for name in names[:-1]] + [f"{c} {missed}_row[1] = {{}};"]
-    body = f"{_numbered(a_pass, c)}\nif (!({missed}_row[0] > 0)) break;"
+    body = f"{_number_pass(a_pass, c)}\nif (!({missed}_row[0] > 0)) break;"
     return "\n".join([ahead, *declared, f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{\n{body}\n}}", last])
 
 
-def _numbered(a_pass: str, c: str) -> str:
+def _number_pass(a_pass: str, c: str) -> str:
     """Return code of a pass with its number, if it reads that."""
     return f"const {c} {PASS}[1] = {{({c})turn}};\n{a_pass}" if PASS in a_pass else a_pass
 
@@ -49,7 +49,7 @@ def repeat_team_passes(a_pass: str, flags: int, warps: int, c: str) -> str:
             f"{c} missed_row[1] = {{}};",
             f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{",
             "missed_row[0] = 0;",
-            _numbered(a_pass, c),
+            _number_pass(a_pass, c),
             f"const int now = {flags} + (turn & 1) * {warps};",
             "SENT(now + warp) = missed_row[0];",
             "const int going = __syncthreads_or(missed_row[0] > 0);",
@@ -84,7 +84,7 @@ def repeat_thread_passes(a_pass: str, c: str) -> str:
             f"{c} missed_row[1] = {{}};",
             f"for (int turn = 0; turn < {MOST_PASSES}; ++turn) {{",
             "missed_row[0] = 0;",
-            _numbered(a_pass, c),
+            _number_pass(a_pass, c),
             "if (!(missed_row[0] > 0)) break;",
             "}",
         ]

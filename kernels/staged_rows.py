@@ -134,10 +134,10 @@ def copy_rows_out(out: Row, offset: int, width: int, c: str, team: int) -> str:
     several = f"(({vector}*)to)[i] = (({vector}*)from)[i];"
     if n != width:
         parts = ", ".join(f"at[{k}]" for k in range(len(names)))
-        at = _padded(f"({len(names)} * i)", n, width)
+        at = _padded_index(f"({len(names)} * i)", n, width)
         several = f"{{ const {c}* at = from + {at}; (({vector}*)to)[i] = make_{vector}({parts}); }}"
     declared = f"{c}* to = {out.name}.data + first * {n};\nconst {c}* from = stage + {offset};"
-    return _run([Copy(declared, n, len(names), "to", f"to[i] = from[{_padded('i', n, width)}];", several)], team)
+    return _run([Copy(declared, n, len(names), "to", f"to[i] = from[{_padded_index('i', n, width)}];", several)], team)
 
 
 def _run(copies: list[Copy], team: int) -> str:
@@ -160,12 +160,12 @@ def _run(copies: list[Copy], team: int) -> str:
 def _copy_in(row: Row, offset: int, c: str, asynchronous: bool) -> Copy:
     n, (kind, start), (vector, _, names) = row.entries, source(row, c), VECTORS[c]
     origin, to = f"from_{row.name}", f"to_{row.name}"  # q_from is the name of an array
-    padded, to_one = n != pitch(n), f"{to} + {_padded('i', n, pitch(n))}"
+    padded, to_one = n != pitch(n), f"{to} + {_padded_index('i', n, pitch(n))}"
     one = f"*({to_one}) = __ldg({origin} + i);"
     several = f"(({vector}*){to})[i] = __ldg((const {vector}*){origin} + i);"
     if padded:
         parts = " ".join(f"at[{k}] = v.{name};" for k, name in enumerate(names))
-        at = _padded(f"({len(names)} * i)", n, pitch(n))
+        at = _padded_index(f"({len(names)} * i)", n, pitch(n))
         several = f"{{ const {vector} v = __ldg((const {vector}*){origin} + i); {c}* at = {to} + {at}; {parts} }}"
     wide = len(names)
     if row.name in MASKS:
@@ -178,6 +178,6 @@ def _copy_in(row: Row, offset: int, c: str, asynchronous: bool) -> Copy:
     return Copy(declared, n, wide, origin, one, several)
 
 
-def _padded(i: str, entries: int, distance: int) -> str:
+def _padded_index(i: str, entries: int, distance: int) -> str:
     """Return C++ for the place of entry ``i`` of consecutive rows that lie ``distance`` scalars apart."""
     return i if entries == distance else f"({i} / {entries}) * {distance} + {i} % {entries}"

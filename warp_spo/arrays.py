@@ -434,10 +434,12 @@ class Call:
             wp.synchronize_stream(self.device.stream)  # copies made here are freed without regard to streams
         for array, warp_array in self._staged:
             array[...] = warp_array.numpy()
-        results = tuple(self._returned(warp_array) if out is None else out for out, warp_array in self._results)
+        results = tuple(
+            self._to_kind_of_result(warp_array) if out is None else out for out, warp_array in self._results
+        )
         self.result = results[0] if len(results) == 1 else results or None
 
-    def _returned(self, array: wp.array) -> Any:
+    def _to_kind_of_result(self, array: wp.array) -> Any:
         """Return a result that the call made, in its kind."""
         return dlpack.share(array, self.kind) if isinstance(self.kind, dlpack.Library) else array.numpy()
 

@@ -96,7 +96,7 @@ def risers(cell: float, corner: str = "") -> spo.HeightField:
     return spo.HeightField(0.1 * high, cell, (-1.0, -1.0))
 
 
-def thrown(field: spo.HeightField, q: np.ndarray, qd: np.ndarray, dt: float, seconds: float, **contact: object) -> dict:
+def throw(field: spo.HeightField, q: np.ndarray, qd: np.ndarray, dt: float, seconds: float, **contact: object) -> dict:
     ball = free_body([spo.Contact(0, sphere=0.03, stiffness=2e4, damping=100.0, friction=0.6, **contact)], field, 1.0)
     return run(spo.Dynamics(ball, len(q), dtype="float64"), q, qd, dt, seconds)
 
@@ -109,10 +109,10 @@ def stairs() -> Iterator[Row]:
         heights = np.linspace(0.035, 0.125, 10)
         q = np.array([[-0.1 - cell, 0.3, z, *upright] for z in heights])
         qd = np.array([[0.7, 0.05, -0.3, 0.0, 0.0, 0.0]] * len(q))
-        found = thrown(field, q, qd, dt, 1.0)
+        found = throw(field, q, qd, dt, 1.0)
         yield name, "feet swing in: rise [J]", dt, float(np.diff(found["energy"], axis=0).max()), 0.1
         q = np.array([[-0.1 - cell - x, 0.3, 0.0295, *upright] for x in np.linspace(0.0, 7.5e-3, 10)])
-        found = thrown(field, q, np.array([[1.5, 0.0, 0.0, 0.0, 0.0, 0.0]] * len(q)), dt, 0.5)
+        found = throw(field, q, np.array([[1.5, 0.0, 0.0, 0.0, 0.0, 0.0]] * len(q)), dt, 0.5)
         yield name, "feet slide in: rise [J]", dt, float(np.diff(found["energy"], axis=0).max()), 0.1
         stiff = spo.Contact(0, box=(0.1, 0.1, 0.1), friction=0.1, stiffness=1e5)  # 1.5 sqrt(m / k) in a wall of 2 cm
         corners = free_body([stiff], field)
@@ -128,7 +128,7 @@ def stairs() -> Iterator[Row]:
         yield name, "box slides in: rise [J]", dt, float(np.diff(found["energy"], axis=0).max()), 0.1
         yield name, "box slides in: depth, deepest [mm]", dt, -1e3 * float(found["gap"].min()), None
         q = np.array([[-0.3, 0.0, 0.1 + 0.03 + 0.012 + 9.81 * 0.02, *upright]])
-        flying = thrown(field, q, np.array([[1.5, 0.0, 0.0, 0.0, 0.0, 0.0]]), dt, 0.2)
+        flying = throw(field, q, np.array([[1.5, 0.0, 0.0, 0.0, 0.0, 0.0]]), dt, 0.2)
         yield name, "flight 12 mm over: loss of speed [m/s]", dt, 1.5 - float(flying["qd"][0, 0]), 1e-9
         legs = [spo.Contact(0, point=(x, y, -0.1 if x > 0 else -0.2)) for x in (-0.15, 0.15) for y in (-0.1, 0.1)]
         across = free_body(legs, field)
@@ -144,7 +144,7 @@ def stairs() -> Iterator[Row]:
         for corner in ("inner", "outer"):
             q = np.array([[-0.2, -0.2 + s, z, *upright] for s in (0.0, 0.01, 0.05, 0.1) for z in (0.029, 0.06, 0.1)])
             qd = np.array([[1.06, 1.06, 0.0, 0.0, 0.0, 0.0]] * len(q))
-            found = thrown(risers(cell, corner), q, qd, dt, 1.0)
+            found = throw(risers(cell, corner), q, qd, dt, 1.0)
             title = f"{corner} corner, cells of {100 * cell:g} cm"
             yield title, "feet slide in: rise [J]", dt, float(np.diff(found["energy"], axis=0).max()), None
             yield title, "depth, deepest [mm]", dt, -1e3 * float(found["gap"].min()), None

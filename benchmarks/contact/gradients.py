@@ -50,7 +50,7 @@ def measure(
     variable, wrt = ((HEIGHTS,), (*WRT, HEIGHTS)) if heights else ((), WRT)
     dyn, sets = scenes.subject(robot, worlds, device, field, variable=variable)
     rng = np.random.default_rng(9)
-    given = [_given(dyn, q, qd, rng) for q, qd in sets]
+    given = [_random_inputs(dyn, q, qd, rng) for q, qd in sets]
     out = tuple(wp.empty_like(x) for x in sets[0])
     outs = [wp.empty(dyn._gradients.shape_of(STEP, name), dtype=dyn.dtype, device=device) for name in wrt]
 
@@ -79,7 +79,7 @@ def measure(
     return found | {"error_median": float(np.median(errors)), "error_99": float(np.quantile(errors, 0.99))}
 
 
-def _given(dyn: spo.Dynamics, q: wp.array, qd: wp.array, rng: np.random.Generator) -> dict[str, Any]:
+def _random_inputs(dyn: spo.Dynamics, q: wp.array, qd: wp.array, rng: np.random.Generator) -> dict[str, Any]:
     """Return a state, forces and cotangents by name, and an array for qdd."""
 
     def random(like: wp.array) -> wp.array:
@@ -90,7 +90,7 @@ def _given(dyn: spo.Dynamics, q: wp.array, qd: wp.array, rng: np.random.Generato
 
 
 # -- the picture -------------------------------------------------------------------------------------------------------
-def thrown(heights: np.ndarray, **damper: float) -> tuple[np.ndarray, np.ndarray]:
+def slide_of_throw(heights: np.ndarray, **damper: float) -> tuple[np.ndarray, np.ndarray]:
     """Return how far points slide that fall from ``heights`` [m], and the gradient of that by the height."""
     import torch
 
@@ -111,7 +111,7 @@ def thrown(heights: np.ndarray, **damper: float) -> tuple[np.ndarray, np.ndarray
 def slopes(**damper: float) -> tuple[float, float]:
     """Return the mean gradient over FALLS, and the slope of the distance from one end of them to the other."""
     heights = np.linspace(*FALLS, 801)
-    x, slope = thrown(heights, **damper)
+    x, slope = slide_of_throw(heights, **damper)
     return float(slope.mean()), float((x[-1] - x[0]) / (heights[-1] - heights[0]))
 
 
@@ -122,7 +122,7 @@ def draw(path: Path) -> None:
     heights = np.linspace(*FALLS, 801)
     with drawing(path, *(f"A point that touches with {title}" for title in DAMPERS)) as panels:
         for axes, damper in zip(panels, DAMPERS.values(), strict=True):
-            x, slope = thrown(heights, **damper)
+            x, slope = slide_of_throw(heights, **damper)
             edges = np.flatnonzero(np.abs(np.diff(x)) > 4.0 * np.abs(slope[1:] * np.diff(heights)))
             parts = zip(np.split(1e2 * heights, edges + 1), np.split(1e2 * x, edges + 1), strict=True)
             for number, (z, part) in enumerate(parts):

@@ -60,7 +60,7 @@ class Case:
     @property
     def id(self) -> str:
         """Name and parameters, such as "S1.chain_rand.n16"."""
-        return ".".join([self.name, *(f"{key}{_short(value)}" for key, value in self.parameters.items())])
+        return ".".join([self.name, *(f"{key}{_short_text(value)}" for key, value in self.parameters.items())])
 
     @property
     def shown(self) -> tuple[str, ...]:
@@ -86,7 +86,7 @@ class Case:
         return self.build(**self.parameters)
 
 
-def _short(value: Any) -> str:
+def _short_text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float | int) else str(value)
 
 

@@ -211,7 +211,7 @@ BUGS = {
     "points along other rates": (points, "place_points", "w, v = mine.travel", "w, v = mine.twist"),
     "forces at the start": (step.ContactStep, "__init__", 'trace.instead.pop("q", None)', "None"),
     "points half way": (points, "place_points", "depth + (0.5 * h)", "depth + (0.4 * h)"),
-    "weights of the neutral pose": (step.ContactStep, "_felt", "not in single_dofs", "in single_dofs"),
+    "weights of the neutral pose": (step.ContactStep, "_step_over_inertia", "not in single_dofs", "in single_dofs"),
     "straight paths": (points, "place_points", "(0.5 * h) * faster", "0.0"),
     "damper of straight paths": (points, "place_points", "k * below - damping * faster", "k * below"),
     "damping that does not grow": (points, "place_points", "d * (k * select(less(0.0, depth), depth, 0.0))", "d"),

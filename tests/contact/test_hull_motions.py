@@ -11,7 +11,7 @@ from support.pair_scenes import H, cube, free
 FEET = [(0.1, 0.0), (-0.06, 0.09), (-0.06, -0.09)]
 
 
-def thrown_rock(dtype, device, steps):
+def throw_rock(dtype, device, steps):
     """A ball that meets a tetrahedron at a face, an edge, or a corner; momenta, and how many worlds have met."""
     rng, worlds = np.random.default_rng(0), 12
     scene = free([cube(1.0, 0.06), cube(0.5, 0.04)],
@@ -32,7 +32,7 @@ def thrown_rock(dtype, device, steps):
 @pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "bound"), [("float64", 1e-12), ("float32", 1e-6)])
 def test_a_collision_with_a_hull_keeps_momentum(device, dtype, bound):
-    before, after, met = thrown_rock(dtype, device, 60)
+    before, after, met = throw_rock(dtype, device, 60)
     assert (met > 10.0).sum() >= 10
     np.testing.assert_allclose(after[:, :3], before[:, :3], atol=bound * 0.5 * 1.5)  # that of the ball
     if dtype == "float64":  # angular momentum drifts with the order of the step where bodies spin

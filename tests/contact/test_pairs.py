@@ -13,6 +13,7 @@ from support.pair_scenes import (
     H,
     box,
     cube,
+    cube_thrown_at_cube,
     cubes_in_a_row,
     free,
     hand,
@@ -26,7 +27,6 @@ from support.pair_scenes import (
     shelf_states,
     stack,
     stepped,
-    thrown,
 )
 from support.pair_steps import assert_is_dense, plant, respond_by_whole_trees
 from support.pair_touches import assert_points_are_those_of_the_reference
@@ -172,7 +172,7 @@ TELLING = [0, 1, 20, 71, 112, 194]
 
 
 def test_a_cube_that_is_thrown_at_another(device, granularity=None):
-    scene, q, qd = thrown(TELLING)
+    scene, q, qd = cube_thrown_at_cube(TELLING)
     dyn = spo.Dynamics(scene, len(q), device=device, dtype="float64", granularity=granularity)
     assert_is_dense(dyn, q, qd, 3)
 

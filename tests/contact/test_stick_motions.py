@@ -78,7 +78,7 @@ def test_a_stick_rolls_down_a_ramp(device, friction):
     np.testing.assert_allclose((speeds[-1] - speeds[19]) / (100 * H), 9.81 * np.sin(SLOPE) / rolls, rtol=5e-3)
 
 
-def thrown(device, other, h=H, worlds=60):
+def stick_thrown_at(device, other, h=H, worlds=60):
     """A free stick that meets a free box or hull, without gravity: momenta, and the largest rise of energy."""
     rng = np.random.default_rng(0)
     contact = spo.Contact(0, **STICK, other=spo.Contact(1, **other), stiffness=1e5, friction=0.5)
@@ -100,7 +100,7 @@ def test_a_stick_that_is_thrown(device, other, bound):
 
     With the energy of springs a step may gain some: edges turn their normal by 20 degrees in it.
     """
-    scene, q, qd = thrown(device, other)
+    scene, q, qd = stick_thrown_at(device, other)
     (rise, met), (fine, _) = (largest_rise(scene, q, qd, device, h) for h in (H, 1e-3))
     assert met >= 40 and rise < bound and fine < 2e-3  # 0.003 and 1e-15 of the box, 0.09 and 6e-4 of the wedge
     before, dyn = momentum(scene, q, qd), spo.Dynamics(scene, len(q), device=device, dtype="float64")

@@ -151,11 +151,21 @@ def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
 
 # -- planted bugs ------------------------------------------------------------------------------------------------------
 BUGS = {
-    "what the children say": (Power, "_handed", "a + b for a, b in zip(bars, other", "a for a, b in zip(bars, other"),
-    "how fast points turn": (Power, "_handed", "a + b for a, b in zip(bars[:own]", "a for a, b in zip(bars[:own]"),
-    "the sense of a turn": (Power, "_handed", "x[1] * bars[3 * at] - x[0]", "x[1] * bars[3 * at] + x[0]"),
-    "lambda and the armature": (Power, "_handed", "armature_forces(link, self.qdd)", "[0.0] * len(dofs)"),
-    "the Coriolis acceleration": (Power, "_moved", "2.0 * cross(spin, v_d)", "cross(spin, v_d)"),
+    "what the children say": (
+        Power,
+        "_pull_to_parent",
+        "a + b for a, b in zip(bars, other",
+        "a for a, b in zip(bars, other",
+    ),
+    "how fast points turn": (
+        Power,
+        "_pull_to_parent",
+        "a + b for a, b in zip(bars[:own]",
+        "a for a, b in zip(bars[:own]",
+    ),
+    "the sense of a turn": (Power, "_pull_to_parent", "x[1] * bars[3 * at] - x[0]", "x[1] * bars[3 * at] + x[0]"),
+    "lambda and the armature": (Power, "_pull_to_parent", "armature_forces(link, self.qdd)", "[0.0] * len(dofs)"),
+    "the Coriolis acceleration": (Power, "_motion_of_link", "2.0 * cross(spin, v_d)", "cross(spin, v_d)"),
     "what is met by the arm": (FromParent, "of", "parent.turning @ pose.l", "parent.turning @ pose.l * 0.0"),
     "omega'": (power, "turning_of", "skew(moving.w) + ", ""),
 }

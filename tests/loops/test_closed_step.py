@@ -56,7 +56,7 @@ def test_equals_the_dense_nonlinear_equation(name):
 BUGS = [
     (clusters, "factor", "stiff.armature", "link.armature"),
     (clusters, "hinge_forces", "stiffened(link)", "link"),
-    (step.Step, "_stiffened", "self.h * piece.resistance", "0.5 * self.h * piece.resistance"),
+    (step.Step, "_with_resistance", "self.h * piece.resistance", "0.5 * self.h * piece.resistance"),
     (closed_step.ClosedStep, "_close", "[-rate for rate in rates]", "[-0.5 * rate for rate in rates]"),
     (closed_step.ClosedStep, "_close", "[-g for g", "[-0.9 * g for g"),
 ]

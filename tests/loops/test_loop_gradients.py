@@ -100,7 +100,7 @@ BUGS = [
     (embedded_adjoints.ClosedEquations, "gradient", "- tau(dof)", ""),
     (embedded_adjoints.ClosedEquations, "gradient", "[*mu, *(-x for x in nu)]", "[*mu, *nu]"),
     (NullSpace, "multipliers", "reversed(self._steps)", "self._steps"),
-    (power.Power, "_handed", "0.0) + bar + f", "0.0) + bar"),
+    (power.Power, "_pull_to_parent", "0.0) + bar + f", "0.0) + bar"),
 ]
 
 

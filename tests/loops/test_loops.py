@@ -154,7 +154,7 @@ BUGS = [
     (clusters, "expand_cluster", "k.get(dof, 0.0) + ", ""),
     (closures.Closure, "acceleration", "+ dot(row.w_rate, w)", ""),
     (closures.Closure, "acceleration", "+ 2.0 * v)", ")"),
-    (closures, "_moved", "2.0 * cross(spin, v)", "cross(spin, v)"),
+    (closures, "_state_of_link", "2.0 * cross(spin, v)", "cross(spin, v)"),
     (nullspace.Reflection, "apply", "self.scale * total", "1.01 * self.scale * total"),
     (embedded.ClosedLoops, "_eliminate", "force = force + column * rate", "force = force - column * rate"),
 ]

@@ -46,7 +46,7 @@ BUGS = [
     (impedance.Impedance, "_limits", "(0.0, None) if inward > 0.0 else (None, 0.0)", "None, None"),
     (impedance.Law, "piece", "select(over, 0.0, resistance)", "resistance"),
     (impedance.Law, "missed", "one.at(u) - piece.line(u)", "0.0 * u"),
-    (step.Step, "_stiffened", "self.h * piece.resistance", "piece.resistance"),
+    (step.Step, "_with_resistance", "self.h * piece.resistance", "piece.resistance"),
     (joint_space.JointSpace, "solve", "U.get((i, j), 0.0) - column[i]", "U.get((i, j), 0.0) + column[i]"),
     (free.Free, "moved", "+ shift[i]", ""),
     (ball, "rotated_by", "half = turn * 0.5", "half = turn"),

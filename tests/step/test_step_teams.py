@@ -294,7 +294,7 @@ BUGS = {
     "flags in one place": (pass_loops, "repeat_team_passes", "(turn & 1)", "(turn & 0)"),
     "no barrier in the vote": (
         pass_loops, "repeat_team_passes", "going = __syncthreads_or(missed_row[0] > 0)", "going = missed_row[0] > -1"),
-    "a guess that stays": (Step, "_looped", "after = gain\n", "after = 0.0 * gain\n"),
+    "a guess that stays": (Step, "_stores_of_pass", "after = gain\n", "after = 0.0 * gain\n"),
     "a limb that is not asked": (pass_loops, "repeat_team_passes", "for warp in range(warps)", "for warp in range(1)"),
     "a word before it is said": (teams.Team, "_in_passes", "if last and any(text_of_ranks)", "if False"),
     "a word unheard": (Step, "_words", "select(less(worst, word), word, worst)", "word"),

@@ -141,7 +141,7 @@ def shelf_states(seed, worlds):
     return np.float64(np.float32(q)), np.float64(np.float32(0.3 * rng.normal(size=(worlds, 12))))
 
 
-def thrown(chosen):
+def cube_thrown_at_cube(chosen):
     """A cube that meets another one in the air: the scene, and ``chosen`` ones of 1500 random states."""
     rng, worlds, half = np.random.default_rng(0), 1500, 0.1
     law = dict(stiffness=1e6, damping=300.0, friction=0.3)

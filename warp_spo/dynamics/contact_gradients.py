@@ -69,7 +69,7 @@ def launch(
     count = PASSES if passes is None else passes
     given = {name: value for name, value in given.items() if value is not None}
     results = dict(zip(wrt, (out, *more.values()), strict=True))
-    if rounds.taken(dyn.scene, count):
+    if rounds.in_rounds(dyn.scene, count):
         rounds_back.pull_back(dyn, functools.partial(_launch, dyn), results, count, **given)
     else:
         _launch(dyn, results, count, **given)

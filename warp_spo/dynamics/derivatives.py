@@ -110,7 +110,7 @@ def inverse_dynamics_derivatives(
         outs = engine.outs(call, INVERSE_DYNAMICS_DERIVATIVES, out)
         given = engine.read(call, INVERSE_DYNAMICS_DERIVATIVES, q=q, qd=qd, qdd=qdd, body_f=body_f)
         results: list[wp.array] = engine.write(call, INVERSE_DYNAMICS_DERIVATIVES, outs, given)
-        program, found = _tiled(self, INVERSE_DYNAMICS_DERIVATIVES, (3, *results[0].shape[1:]), {}, **given)
+        program, found = _run_into_tiles(self, INVERSE_DYNAMICS_DERIVATIVES, (3, *results[0].shape[1:]), {}, **given)
         for block, result in enumerate(results):
             _spread(self, program, found, block, result)
     return InverseDynamicsDerivatives(*call.result)
@@ -169,7 +169,7 @@ def forward_dynamics_derivatives(
                 engine.launch(MASS_MATRIX_INVERSE, inverse, q=given["q"])
             qdd = known_accelerations(self, None, **given)
             given = {"q": given["q"], "qd": given["qd"], "qdd": qdd, "body_f": given["body_f"]}
-            program, rates = _tiled(self, INVERSE_DYNAMICS_DERIVATIVES, (2, n, n), {"mass": False}, **given)
+            program, rates = _run_into_tiles(self, INVERSE_DYNAMICS_DERIVATIVES, (2, n, n), {"mass": False}, **given)
             assert program is not None and rates is not None
             if beside:
                 engine.branch.join()
@@ -202,7 +202,7 @@ def mass_matrix_derivative(self: Dynamics, q: ArrayT, out: ArrayT | None = None)
         self._gradients.check_size(call)
         given = engine.read(call, MASS_MATRIX_DERIVATIVE, q=q)
         (result,) = engine.write(call, MASS_MATRIX_DERIVATIVE, (out,), given)
-        program, found = _tiled(self, MASS_MATRIX_DERIVATIVE, result.shape[1:], {}, **given)
+        program, found = _run_into_tiles(self, MASS_MATRIX_DERIVATIVE, result.shape[1:], {}, **given)
         _spread(self, program, found, 0, result)
     return call.result
 
@@ -222,7 +222,7 @@ def _differentiate_by_rows(dyn: Dynamics, given: dict[str, Any], outs: Sequence[
             launches.copy(out[:, dof], row)
 
 
-def _tiled(
+def _run_into_tiles(
     dyn: Dynamics, operation: Operation, shape: tuple[int, ...], options: dict[str, Any], **given: Any
 ) -> tuple[Program | None, wp.array | None]:
     """Run a kernel whose result, of ``shape`` in a world, is left in tiles; return its program and the tiles."""

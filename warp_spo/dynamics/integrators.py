@@ -103,7 +103,7 @@ def semi_implicit(
     if dyn.scene.contacts:
         count = float(pairs.default_passes(dyn.scene) if passes is None else passes)
         given |= {"passes": count, "reports": tuple(reports or ()), **option}
-        if rounds.taken(dyn.scene, count):
+        if rounds.in_rounds(dyn.scene, count):
             rounds.step(dyn, dt, (q_out, qd_out), more | (reports or {}), q, qd, **given)
         else:
             launch(contact_routine(dyn), qd_out, more | (reports or {}), qd=qd, dt=dt, q=q, **given)
@@ -158,7 +158,7 @@ def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool, p
         return "loops='multipliers' takes several"
     if dyn.scene.contact_pairs:
         return "bodies that touch each other take one for each"
-    if passes is not None and rounds.taken(dyn.scene, passes):
+    if passes is not None and rounds.in_rounds(dyn.scene, passes):
         return f"{passes} passes are preceded by rounds"
     if delays:
         return "delays of actuators count substeps"

@@ -55,7 +55,7 @@ class Round(NamedTuple):
         return {"q": self.q, START: q, KICK: self.kick, PATH: self.path}
 
 
-def taken(scene: Scene, passes: float) -> bool:
+def in_rounds(scene: Scene, passes: float) -> bool:
     """Return whether a step of so many passes is made in rounds; one with pairs of bodies is not."""
     return passes >= MANY and not scene.contact_pairs
 
@@ -77,7 +77,7 @@ def step(
     """
     (q_out, qd_out), status = ends, more.get("status")
     q, qd = (  # the last kick reads both after q is stored
-        _copied(dyn, name, array) if any(array.ptr == end.ptr for end in ends) else array
+        _copy(dyn, name, array) if any(array.ptr == end.ptr for end in ends) else array
         for name, array in (("q", q), ("qd", qd))
     )
     options: dict[str, Any] = {name: given.pop(name) for name in ("qdd", "status") if name in given}
@@ -91,7 +91,7 @@ def step(
         dyn.recursions.launch(unsettled.mark_unsettled, dyn.worlds, read, [status])
 
 
-def _copied(dyn: Dynamics, name: str, array: wp.array) -> wp.array:
+def _copy(dyn: Dynamics, name: str, array: wp.array) -> wp.array:
     launches.copy(copy := dyn.recursions.array(f"{name} before", *array.shape), array)
     return copy
 

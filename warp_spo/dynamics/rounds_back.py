@@ -110,7 +110,7 @@ class Way:
         if by_half is not None and by_path is not None:
             self.combine(1.0, half, 1.0, by_half, half)
             self.combine(1.0, by_u, 1.0, by_path, by_u)
-        self.combine(1.0, by_u, 1.0, self._moved(one.path, half), by_u)
+        self.combine(1.0, by_u, 1.0, self._pull_half_step(one.path, half), by_u)
         self.combine(1.0, by_u, 0.5, by_v, self.by_found)
         self.combine(-1.0, by_u, 0.0, by_u, self.by_kicked)
         self.add("qd", by_v, 0.5)
@@ -136,7 +136,7 @@ class Way:
             found.append(ways)
         return found
 
-    def _moved(self, rates: wp.array, cotangent: wp.array) -> wp.array:
+    def _pull_half_step(self, rates: wp.array, cotangent: wp.array) -> wp.array:
         """Add the gradient by q of q moved along the rates for half a step; return that by the rates."""
         ways = {"q": self.like(self.q, "moved q"), "qd": self.like(self.qd, "moved")}
         if "value" in self.results:  # rates of a free base are those of its centre of mass

@@ -84,7 +84,7 @@ class Observation:
             values = values + w.drawn(
                 f"bias {w.number(self)}", len(values), lambda s: [s.uniform(-self.bias, self.bias) for _ in values]
             )
-        values = vector(self._measured(w, x) for x in values)
+        values = vector(self._measurement(w, x) for x in values)
         least, most = check_steps("Observation", "delay", self.delay)
         if self.history + most == 1:
             return values
@@ -115,12 +115,12 @@ class Observation:
 
     def trace_row(self, w: World, number: int) -> Any:
         """Return the number of a row of the thread."""
-        value = self._measured(w, self.term.of_own_row(w, number))  # type: ignore[attr-defined]
+        value = self._measurement(w, self.term.of_own_row(w, number))  # type: ignore[attr-defined]
         if w.kept:
             raise ValueError(f"observations.Each: {self.term.function} keeps {', '.join(w.kept)}; expected nothing")  # type: ignore[attr-defined]
         return value
 
-    def _measured(self, w: World, x: Any) -> Any:
+    def _measurement(self, w: World, x: Any) -> Any:
         """Return a number with noise, scaled and clipped."""
         x = x + w.uniform(-self.noise, self.noise) if self.noise > 0.0 else x
         x = self.scale * x

@@ -260,7 +260,7 @@ def choose(
     pieces = Pieces(Links(scene)) if side_by_side else None
     limbs, alike = (pieces.warps, pieces.alike >= ALIKE[dtype]) if pieces else (1, True)
     serial = pieces is not None and pieces.serial >= SERIAL
-    rule = _chosen(scene.dof_count, limbs, alike, serial, worlds, device, dtype, varies)
+    rule = _choose_by_rule(scene.dof_count, limbs, alike, serial, worlds, device, dtype, varies)
     chosen, reason = (asked, ASKED) if asked else rule
     if shared:
         reason = SHARED
@@ -337,7 +337,7 @@ def _depth(scene: Scene) -> int:
     return max(depth.values())
 
 
-def _chosen(
+def _choose_by_rule(
     dofs: int, limbs: int, alike: bool, serial: bool, worlds: int, device: DeviceFacts, dtype: str, varies: bool
 ) -> tuple[str, str]:
     held = min(HELD, SPILLS[dtype]) if varies else SPILLS[dtype]

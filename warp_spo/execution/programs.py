@@ -105,22 +105,22 @@ class Programs:
     @property
     def operation_counts(self) -> dict[str, int]:
         """Floating-point operations of one world, by operation."""
-        return {_title(key): program.operations for key, program in self._used}
+        return {_title(key): program.operations for key, program in self._programs_in_use}
 
     @property
-    def _used(self) -> list[tuple[tuple, Program]]:
+    def _programs_in_use(self) -> list[tuple[tuple, Program]]:
         """The programs at the granularity that the plan gives now; others stay for graphs that hold them."""
         found = self._programs.items()
         return [(key, program) for key, program in found if program is not None and key[3] == self.plan.of(key[0])]
 
     def warps(self, routine: Routine) -> int | None:
         """Return how many warps share worlds in a routine's kernels; None before one is built."""
-        return max((program.warps for key, program in self._used if key[0] is routine), default=None)
+        return max((program.warps for key, program in self._programs_in_use if key[0] is routine), default=None)
 
     def described(self) -> list[str]:
         """A line for each kernel: its granularity, its operations in one world, and on CUDA what it takes."""
         lines = []
-        for key, program in self._used:
+        for key, program in self._programs_in_use:
             granularity = f"{key[3]}, {program.warps} warps" if program.warps > 1 else "tree"
             line = f"{_title(key)}  {granularity}, {program.operations} operations a world"
             if self.run.device.is_cuda:

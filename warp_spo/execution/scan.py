@@ -52,10 +52,10 @@ class Scan:
         run = self._run
         self.cut = cut(run.scene.tree, solid_nodes(run.scene), self._length)
         self._stretches = _tables(self.cut, run.device)
-        self._through_psi = self._weighted()
+        self._through_psi = self._weights_and_resolvent()
         self.__dict__.pop("_through_phi", None)
 
-    def _weighted(self) -> tuple[Doubling, wp.array]:
+    def _weights_and_resolvent(self) -> tuple[Doubling, wp.array]:
         """Return new weights of the tree of stretches, a block for each that hangs on another, and their resolvent."""
         run, count = self._run, len(self.cut.nodes)
         offsets = [BLOCK * stretch for stretch in range(count)]
@@ -64,7 +64,7 @@ class Scan:
 
     @functools.cached_property
     def _through_phi(self) -> tuple[Doubling, wp.array]:
-        return self._weighted()
+        return self._weights_and_resolvent()
 
     @property
     def _rounds(self) -> list[Round]:

@@ -144,7 +144,7 @@ def _felt_by_screw(scene: Scene, node: int, hinge: int, dof: int) -> np.ndarray:
     """Return the inertia that the hinge feels of its own body alone, less the least share that counts [world]."""
     place, com = scene.values["joint_X_c"][:, hinge], scene.values["body_com"][:, node]
     mass, inertia = scene.values["body_mass"][:, node], scene.values["body_inertia"][:, node]
-    axis = _rotated(place[:, 3:], scene.dof_axis[dof])
+    axis = _rotate(place[:, 3:], scene.dof_axis[dof])
     arm = com - place[:, :3]
     turning = np.einsum("wi,wij,wj->w", axis, inertia, axis) + mass * (np.cross(axis, arm) ** 2).sum(-1)
     largest = np.linalg.eigvalsh(inertia)[:, -1] + mass * (arm**2).sum(-1)
@@ -152,7 +152,7 @@ def _felt_by_screw(scene: Scene, node: int, hinge: int, dof: int) -> np.ndarray:
     return angular**2 * np.where(turning > SOLID * largest, turning, 0.0) + linear**2 * mass
 
 
-def _rotated(quaternion: np.ndarray, axis: np.ndarray) -> np.ndarray:
+def _rotate(quaternion: np.ndarray, axis: np.ndarray) -> np.ndarray:
     """Return R axis for unit quaternions xyzw [world, 4]."""
     v, w = quaternion[:, :3], quaternion[:, 3:]
     axis = np.broadcast_to(axis, v.shape)

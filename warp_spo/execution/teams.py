@@ -122,7 +122,7 @@ class Team:
         return [self._work[piece.index].text for piece in self.pieces.pieces]
 
     @property
-    def _defined(self) -> list[str]:
+    def _definitions(self) -> list[str]:
         return [self.pairs] if self.pairs else []
 
     @property
@@ -168,7 +168,7 @@ class Team:
                 loop = pass_loops.count_team_passes(one, "", self.c)
             else:
                 loop = pass_loops.repeat_thread_passes(one, self.c)
-            text = [*self._defined, self.passes.declare(kept, self.c), *ahead, loop]
+            text = [*self._definitions, self.passes.declare(kept, self.c), *ahead, loop]
         return "\n".join(text + later)
 
     def _branch(self, piece: Piece, listing: Listing) -> str:
@@ -184,7 +184,7 @@ class Team:
         text: list[str] = []
         for alike in kinds.values():
             text.append(f"{'else ' if text else ''}if ({any_of(_warps(alike))}) {{")
-            inward, outward = self._shared(alike)
+            inward, outward = self._shared_sweeps(alike)
             warps = [work.piece.warp for work in alike]
             between = self._inner(warps)
             if self.pairs:
@@ -212,7 +212,7 @@ class Team:
             free[warp] = work
         names = ["", *(f"i{at}_" for at in range(len(ranks) - 1))]
         kept = {name: [work.piece for work in rank.values()] for name, rank in zip(names, ranks, strict=True)}
-        text = [*self._defined, self.passes.declare(kept, self.c)]
+        text = [*self._definitions, self.passes.declare(kept, self.c)]
         ranks_by_name = dict(zip(names, ranks, strict=True))
         text += self._ahead(leaves, ranks_by_name)
         if self.pairs:
@@ -220,7 +220,11 @@ class Team:
             a_pass = "\n".join([a_pass, BARRIER, judge_pairs("warp", self.pieces.warps)])
         if self._in_turns:
             a_pass = "\n".join(
-                [self._each(leaves, ranks_by_name, "laws"), a_pass, self._each(leaves, ranks_by_name, "checks")]
+                [
+                    self._turns_in_loops(leaves, ranks_by_name, "laws"),
+                    a_pass,
+                    self._turns_in_loops(leaves, ranks_by_name, "checks"),
+                ]
             )
         if self.passes.counted:
             text.append(pass_loops.count_team_passes(a_pass, BARRIER, self.c))
@@ -244,7 +248,7 @@ class Team:
         """Whether laws are found, and passes checked, in turns."""
         return any(work.laws for work in self._work.values())
 
-    def _each(self, leaves: list[Work], ranks: dict[str, dict[int, Work]], name: str) -> str:
+    def _turns_in_loops(self, leaves: list[Work], ranks: dict[str, dict[int, Work]], name: str) -> str:
         """Return the turns of pieces, the "laws" or the "checks", in loops; ``ranks`` as for :meth:`_ahead`."""
         text = []
         for at, (prefix, rank) in enumerate(ranks.items()):
@@ -283,7 +287,7 @@ class Team:
         text: list[str] = []
         for chains in owners.values():
             text.append(f"{'else ' if text else ''}if ({any_of([chain[0].piece.warp for chain in chains])}) {{")
-            shared = [self._shared(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
+            shared = [self._shared_sweeps(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
             for stage in range(1, self._last + 1):
                 text.append(BARRIER)
                 order = list(zip(chains[0], shared, strict=True))
@@ -318,7 +322,7 @@ class Team:
         """Return the statements that pieces execute in turns, see :meth:`.SharedText.take_turns`."""
         return self.shared.take_turns(_warps(works), turns, tables, prefix, loops)
 
-    def _shared(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str]:
+    def _shared_sweeps(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str]:
         """Return one text for the inward and one for the outward sweeps of pieces of equal structure."""
         checks = [] if self._in_turns else [list(each) for each in zip(*(work.checks for work in alike), strict=True)]
         regions = [[work.inward for work in alike], [work.outward for work in alike], *checks]

@@ -65,12 +65,12 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
     layout = layout._replace(retries=layout.retries and "farthest" in body, block=block, direct=direct, late=late)
     cuda = cpu = body
     if aggregates:
-        found = _aggregated(links, options, coupled.REPORT in body)
-        layout, cuda, cpu = _coupled(builder, layout, found, [*before, body], entries)
+        found = _couples_of_aggregates(links, options, coupled.REPORT in body)
+        layout, cuda, cpu = _coupled_step(builder, layout, found, [*before, body], entries)
     return builder.finish(routine, layout, cuda, cpu, tables, emitter.operations)
 
 
-def _coupled(
+def _coupled_step(
     builder: Builder, layout: KernelLayout, couples: couple_points.Couples, parts: list[str], entries: dict[str, int]
 ) -> tuple[KernelLayout, str, str]:
     """Return the layout and the code, for CUDA and for the CPU, of a step in which aggregates couple bodies.
@@ -98,7 +98,7 @@ def _couples(links: Links) -> coupling.Couples:
     )
 
 
-def _aggregated(links: Links, options: dict[str, Any], reports: bool) -> couple_points.Couples:
+def _couples_of_aggregates(links: Links, options: dict[str, Any], reports: bool) -> couple_points.Couples:
     """Return the pairs of bodies of a scene as aggregates couple them, as their native code needs them."""
     scene, couples = links.scene, couples_of(links)
     signs = dict(one for couple in couples for one in zip(couple.pairs, couple.signs, strict=True))

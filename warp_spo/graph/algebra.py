@@ -104,7 +104,7 @@ class Operator(abc.ABC):
         own = () if self.letter is None else (self.letter[0],)
         return tuple(dict.fromkeys([*own, *(owner for operand in self.operands for owner in operand.letters)]))
 
-    def _fused(self, x: wp.array, out: wp.array) -> bool:
+    def _launch_fused(self, x: wp.array, out: wp.array) -> bool:
         """Launch ``out = op x`` [world, row] as one kernel, or return False if there is no such kernel."""
         return len(self.letters) == 1 and self.expression is not None and self.letters[0].run(self.expression, x, out)
 
@@ -148,7 +148,7 @@ class Operator(abc.ABC):
             columns = read.shape[2] if many else 1
             shape = (worlds, self.shape[0], columns) if many else (worlds, self.shape[0])
             y = call.write(out, shape, "[world, row of the operator, any]" if many else "[world, row]")
-            if y.size and (many or not self._fused(read, y)):
+            if y.size and (many or not self._launch_fused(read, y)):
                 self._fill()
                 key = call.kind, worlds, columns
                 if key not in self._workspaces:

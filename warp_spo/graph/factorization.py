@@ -137,8 +137,8 @@ class Factorization:
                 outputs=[*outputs, *map(weights_array, self._scratch)],
                 device=self.device,
             )
-        if "_locked" in vars(self):
-            self._locked.update()
+        if "_without_hinges" in vars(self):
+            self._without_hinges.update()
 
     @property
     def R(self) -> Blocks:
@@ -146,10 +146,10 @@ class Factorization:
 
         phi M phi* = R + phi~ R + R phi~*, with phi~ = phi - I, ``phi.strict``.
         """
-        return self._locked.P
+        return self._without_hinges.P
 
     @functools.cached_property
-    def _locked(self) -> Factorization:
+    def _without_hinges(self) -> Factorization:
         """The factorisation without hinges."""
         places = [(0, row, 0, size) for row, _, size, _ in self.M.places]
         H = Blocks((0, self.M.shape[1]), places, new_weights(1, 0, self.dtype, self.device), [0] * len(places))

@@ -148,7 +148,7 @@ class AbstractScalar:
         rule = FUNCTIONS.get(ufunc.__name__)
         if rule is None or method != "__call__" or options:
             return refuse(f"np.{ufunc.__name__}" + ("" if method == "__call__" else f".{method}"))
-        return np.frompyfunc(rule, ufunc.nin, 1)(*(_boxed(x) for x in inputs))
+        return np.frompyfunc(rule, ufunc.nin, 1)(*(_as_objects(x) for x in inputs))
 
     # -- comparisons, conversions ----------------------------------------------------------------------------------
     def __lt__(self, other: Any) -> Condition:
@@ -199,7 +199,7 @@ def _apply(rule: Callable[[Value, Value], Value], a: Any, b: Any) -> Any:
     return AbstractScalar(rule(_value(a), _value(b)))
 
 
-def _boxed(x: Any) -> Any:
+def _as_objects(x: Any) -> Any:
     """An array of objects, so that NumPy goes through it entry by entry."""
     if isinstance(x, np.ndarray):
         return x.astype(object)
@@ -242,21 +242,21 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "fabs": _of_numbers(absolute),
     "sin": _of_numbers(sin),
     "cos": _of_numbers(cos),
-    "tan": lambda x: _lifted(x).tan(),
+    "tan": lambda x: _as_scalar(x).tan(),
     "exp": _of_numbers(exponential),
     "log": _of_numbers(logarithm),
     "sqrt": _of_numbers(sqrt),
     "arctan2": _of_numbers(arctangent),
     "hypot": _of_numbers(lambda a, b: sqrt(a * a + b * b)),
-    "less": lambda a, b: _lifted(a) < b,
-    "greater": lambda a, b: _lifted(a) > b,
-    "less_equal": lambda a, b: _lifted(a) <= b,
-    "greater_equal": lambda a, b: _lifted(a) >= b,
+    "less": lambda a, b: _as_scalar(a) < b,
+    "greater": lambda a, b: _as_scalar(a) > b,
+    "less_equal": lambda a, b: _as_scalar(a) <= b,
+    "greater_equal": lambda a, b: _as_scalar(a) >= b,
 }
 """NumPy's functions of one entry each, by name; the others are refused."""
 
 
-def _lifted(x: Any) -> AbstractScalar:
+def _as_scalar(x: Any) -> AbstractScalar:
     return x if isinstance(x, AbstractScalar) else AbstractScalar(_value(x))
 
 

@@ -51,7 +51,7 @@ class Program:
         if function.repeated[0] == 1:
             self.call.defvjp(self._result_and_residuals, self._pull_back, symbolic_zeros=True)
         else:
-            self.call.defvjp(self._repeated, lambda pull, cotangents: pull(cotangents))
+            self.call.defvjp(self._repeat, lambda pull, cotangents: pull(cotangents))
 
     def __call__(self, *arrays: Any) -> Any:
         return self.call(*arrays)
@@ -81,23 +81,23 @@ class Program:
         with self.dyn.recursions.turn.lock, self.dyn._gradients.at_values(values):
             yield {name: array for name, array in given.items() if name not in names}
 
-    def _written(self, names: tuple[str, ...]) -> dict[str, wp.array]:
+    def _arrays_to_write(self, names: tuple[str, ...]) -> dict[str, wp.array]:
         """Return arrays for arguments that the operation writes."""
         dyn, arguments = self.dyn, {one.name: one for one in self.operation.arrays}
         shapes = {name: dyn._engine.shape(arguments[name].axes)[0] for name in names}
         types = {name: arguments[name].dtype or dyn.dtype for name in names}
         return {name: wp.empty(shapes[name], dtype=types[name], device=dyn.device) for name in names}
 
-    def _computed(self, keep: bool) -> tuple[dict[str, wp.array], tuple[wp.array, ...], dict[str, wp.array]]:
+    def _run_once(self, keep: bool) -> tuple[dict[str, wp.array], tuple[wp.array, ...], dict[str, wp.array]]:
         """Return arguments of one call, its results, and what it writes: the status, and what the derivative keeps."""
         keeps = self.operation.derivative.keeps if keep and self.operation.derivative else ()
-        given, written = self._samples(), self._written((*self._status, *keeps))
+        given, written = self._samples(), self._arrays_to_write((*self._status, *keeps))
         results = self._compute(given, **written)
         return given, (results,) if self.count == 1 else tuple(results), written
 
     def _forward(self, keep: bool) -> Traced:
         """Return the operation as a JAX function; its results are followed by what else it writes."""
-        given, results, written = self._computed(keep)
+        given, results, written = self._run_once(keep)
 
         def run(inputs: Arrays, outputs: Arrays) -> None:
             for part in self._parts(inputs[0].shape[0]):
@@ -137,7 +137,7 @@ class Program:
 
     # -- backward --------------------------------------------------------------------------------------------------
     @property
-    def _refused(self) -> str:
+    def _refusal(self) -> str:
         """Return in words which argument has no gradient, and what is expected; "" if there is a gradient."""
         derivative = self.operation.derivative
         if derivative is None:
@@ -145,7 +145,7 @@ class Program:
             return f"it has no gradient; expected one of {known}"
         return derivative.refuses(self.dyn, dict(self.options))
 
-    def _repeated(self, *arrays: Any) -> tuple[Any, Any]:
+    def _repeat(self, *arrays: Any) -> tuple[Any, Any]:
         """Return the result of repetitions, and the way back through each of them."""
         times, single = self.function.repeated
         if self._once is None:
@@ -166,7 +166,7 @@ class Program:
         """Return the result, and what the way back reads. JAX keeps the keys of a dictionary while it traces."""
         arrays = tuple(one.value for one in primals)
         wanted: dict = {name: () for name, one in zip(self.columns, primals, strict=True) if one.perturbed}
-        keep = not self._refused
+        keep = not self._refusal
         if keep not in self._traced:
             self._traced[keep] = self._forward(keep)
         found = self._traced[keep](*arrays)
@@ -174,7 +174,7 @@ class Program:
 
     def _check_gradient(self, wanted: tuple[str, ...]) -> None:
         """Raise an error if a gradient is asked for that the operation does not have."""
-        refused = self._refused
+        refused = self._refusal
         if refused:
             raise ValueError(
                 f"{self.function.name}, backwards: {refused}; if no gradient should pass, put jax.lax.stop_gradient "
@@ -223,7 +223,7 @@ class Program:
 
     def _backward(self, wanted: tuple[str, ...]) -> Traced:
         """Return the gradients by some arguments as a JAX function of what the call read and wrote, and cotangents."""
-        given, results, written = self._computed(True)
+        given, results, written = self._run_once(True)
         sizes = len(given), len(results) + len(written)
 
         def pull(arrays: Arrays) -> list[wp.array]:

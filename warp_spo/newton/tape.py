@@ -149,7 +149,7 @@ class StepGradients:
             found["joint_target_qd"] = None
         return {name: array for name, array in found.items() if array is not None}
 
-    def given(self, read: Mapping[str, wp.array]) -> dict[str, Any]:
+    def step_arguments(self, read: Mapping[str, wp.array]) -> dict[str, Any]:
         """Return Newton's arrays as arguments of ``Dynamics.step``, without those that are not there."""
         layouts = self.layouts
         q = layouts.q.read(read["joint_q"], "joint_q")
@@ -217,7 +217,7 @@ class StepRecord:
         with paused_tape():
             solver.prepare()
             cotangents = self._cotangents()
-            given = solver.given(read)
+            given = solver.step_arguments(read)
             taus = forces.turns_with_bodies and "joint_f" in read
             names = {name for name in read if name in wanted} | ({"joint_f"} if taus else set())
             outs = {ARGUMENTS[name]: self._buffer(name) for name in ARGUMENTS if name in names}

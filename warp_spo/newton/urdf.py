@@ -52,7 +52,7 @@ def read_urdf(file: Path, floating: bool | None, repair: bool, choice: Choice = 
     robot = read_xml(file)
     _check_robot(robot)
     links, joints = _by_name(robot, "link"), _by_name(robot, "joint")
-    root, carried = _sorted(robot, links, joints)
+    root, carried = _sort_joints(robot, links, joints)
 
     name = robot.get("name")
     label = lambda part: f"{name}/{part}" if name else part  # noqa: E731
@@ -116,7 +116,7 @@ def _ends(joint: Element) -> tuple[str, str]:
     return ends[0].needed("link"), ends[1].needed("link")  # type: ignore[union-attr]
 
 
-def _sorted(robot: Element, links: dict[str, Element], joints: dict[str, Element]) -> tuple[str, list[Element]]:
+def _sort_joints(robot: Element, links: dict[str, Element], joints: dict[str, Element]) -> tuple[str, list[Element]]:
     """Return the root link and the joints depth first from it; raise ValueError unless all links form one tree."""
     carriers: dict[str, Element] = {}
     below: dict[str, list[Element]] = {link: [] for link in links}

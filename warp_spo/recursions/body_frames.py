@@ -147,7 +147,7 @@ def move_to_link(links: Links, number: int) -> list[Store]:
     graph.step = "links|F"
     if link.parent is not None:
         over = _read(graph)
-    frame = _moved(over, still, lambda c: graph.input("q", c), lambda dof: graph.input("qd", dof))
+    frame = _frame_of_child(over, still, lambda c: graph.input("q", c), lambda dof: graph.input("qd", dof))
     if _at_node(link):
         seat = links.seats[link.node]
         arm, Q = turned(frame.Q, seat.offset), multiplied(frame.Q, constant_quaternion(seat.matrix))
@@ -161,7 +161,7 @@ def _read(graph: Graph) -> Frame:
     return Frame(Vector(values[:3]), Vector(values[3:7]), Vector(values[7:10]), Vector(values[10:]))
 
 
-def _moved(over: Frame, link: Link, q: Callable[[int], Value], qd: Callable[[int], Value]) -> Frame:
+def _frame_of_child(over: Frame, link: Link, q: Callable[[int], Value], qd: Callable[[int], Value]) -> Frame:
     """Return the frame of a link for that of its parent, at q and qd."""
     place = place_link(link, q)
     arm, Q = turned(over.Q, place.pose.l), multiplied(over.Q, relative_quaternion(link, q))

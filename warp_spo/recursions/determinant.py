@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 def to_child(pose: Pose, S: Articulated) -> Articulated:
     """phi* S phi: phi* moves (v; omega) as phi moves (n; f), the way back."""
     still = Pose(None, None, -pose.l) if pose.matrix is None else Pose(None, pose.matrix.T, -(pose.matrix.T @ pose.l))
-    S = still.articulated_to_parent(_exchanged(S))
+    S = still.articulated_to_parent(_exchange(S))
     if pose.turn is not None:
         c, s = pose.turn
         S = Pose((c, -s), None, ZERO).articulated_to_parent(S)
-    return _exchanged(S)
+    return _exchange(S)
 
 
-def _exchanged(S: Articulated) -> Articulated:
+def _exchange(S: Articulated) -> Articulated:
     return Articulated(S.m, S.C.T, S.J)
 
 

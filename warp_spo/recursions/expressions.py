@@ -72,14 +72,14 @@ def format_expression(expression: Expression) -> str:
     if form == "resolvent":
         return RESOLVENTS.get(operands[0], f"resolvent({format_expression(operands[0])})")
     if form == "scaled":
-        return f"{operands[0]:g} {_bracketed(operands[1])}"
+        return f"{operands[0]:g} {_in_brackets(operands[1])}"
     if form == "transpose":
-        return f"{_bracketed(operands[0])}.T"
+        return f"{_in_brackets(operands[0])}.T"
     if form == "product":
-        return " @ ".join(map(_bracketed, operands))
+        return " @ ".join(map(_in_brackets, operands))
     return " + ".join(map(format_expression, operands))
 
 
-def _bracketed(expression: Expression) -> str:
+def _in_brackets(expression: Expression) -> str:
     text = format_expression(expression)
     return f"({text})" if " " in text else text

@@ -96,12 +96,12 @@ def bounds(trace: Trace, limits: Impedance, dof: int) -> tuple[Value | None, Val
         return 0.0, 0.0
     low, high = limits.range(dof)
     if trace.epsilon == EPSILON["float32"]:
-        low = _rounded(low, 1.0)
-        high = _rounded(high, -1.0)
+        low = _round_inward(low, 1.0)
+        high = _round_inward(high, -1.0)
     return low, high
 
 
-def _rounded(x: Value | None, inward: float) -> Value | None:
+def _round_inward(x: Value | None, inward: float) -> Value | None:
     """Return a number as the nearest one of float32 that does not lie outward; other values as they are."""
     if x is None or not is_constant(x):
         return x

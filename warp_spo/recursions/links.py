@@ -107,7 +107,7 @@ class Links:
         def table(name: str) -> Callable[[Any], Any]:
             slots = self.tables[name]
             read = lambda x: other.graph.input(name, slots.setdefault(x, len(slots)))  # noqa: E731
-            return lambda values: _changed(values, lambda x: x if is_constant(x) else read(x))
+            return lambda values: _map_scalars(values, lambda x: x if is_constant(x) else read(x))
 
         value, apart = table("value"), table("node_value")
         twin: dict[Link | None, Any] = {None: None}
@@ -368,11 +368,11 @@ def _lost_bound(x: Value) -> Value:
     return select(less(x, 0.0) + less(0.0, x), 0.0, lost(x))
 
 
-def _changed(values: Any, change: Callable[[Value], Value]) -> Any:
+def _map_scalars(values: Any, change: Callable[[Value], Value]) -> Any:
     """A nest of tuples and dicts with ``change`` made to each scalar; None stays."""
     if isinstance(values, dict):
-        return {key: _changed(value, change) for key, value in values.items()}
+        return {key: _map_scalars(value, change) for key, value in values.items()}
     if isinstance(values, tuple):
-        items = [_changed(value, change) for value in values]
+        items = [_map_scalars(value, change) for value in values]
         return type(values)(*items) if hasattr(values, "_fields") else type(values)(items)
     return values if values is None else change(values)

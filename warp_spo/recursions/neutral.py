@@ -23,7 +23,7 @@ def masses(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         ValueError: the matrix is not finite there; the message names the hinge.
     """
-    mass = _evaluated(scene, mass_matrix, (scene.dof_count, scene.dof_count))
+    mass = _evaluate(scene, mass_matrix, (scene.dof_count, scene.dof_count))
     lost = ~np.isfinite(mass)
     if lost.any():
         dof = int(np.argmax(np.where(np.diagonal(lost), 2, lost.any(axis=0))))
@@ -37,11 +37,11 @@ def masses(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 def inverse_weights(scene: Scene, frames: tuple[tuple[int, Any], ...]) -> np.ndarray:
     """Return the sum of J Mass^-1 J* over three directions, of each point given by its body and place [1/kg]."""
-    J = _evaluated(scene, lambda trace: jacobian(trace, frames), (len(frames), 6, scene.dof_count))[:, :3]
+    J = _evaluate(scene, lambda trace: jacobian(trace, frames), (len(frames), 6, scene.dof_count))[:, :3]
     return np.einsum("pai,ij,paj->p", J, masses(scene)[1], J)
 
 
-def _evaluated(scene: Scene, trace: Callable, shape: tuple[int, ...]) -> np.ndarray:
+def _evaluate(scene: Scene, trace: Callable, shape: tuple[int, ...]) -> np.ndarray:
     one = scene.with_values(**{name: array[:1] for name, array in scene.values.items()})
     stores, found = trace(Trace(Links(one), "float64", ("q",))), np.zeros(shape)
     with np.errstate(all="ignore"):

@@ -43,15 +43,15 @@ class Operators:
     def stores(self, expression: Expression) -> list[Store]:
         """out = expression x"""
         rows, columns = spaces(expression)
-        result = self.applied(expression, self.given(columns or rows or NODES))
+        result = self.applied(expression, self.input_vector(columns or rows or NODES))
         found = []
-        for node in self._finished():
+        for node in self._inward_order():
             values = result(node)
             first = self._first(rows or columns or NODES, node)
             found += [Store("out", (first + i,), value) for i, value in enumerate(values)]
         return found
 
-    def given(self, space: str) -> Field:
+    def input_vector(self, space: str) -> Field:
         """Return the input array x as a vector over a space."""
 
         def at(node: int) -> Vector:
@@ -70,7 +70,7 @@ class Operators:
     def _at(self, node: int, letter: str) -> None:
         self.graph.step = f"{self.scene.body_labels[node]}|{letter}"
 
-    def _finished(self) -> Iterator[int]:
+    def _inward_order(self) -> Iterator[int]:
         """Yield every node after all that it carries, limb by limb."""
         stack = [(node, False) for node in reversed(self.scene.tree.roots)]
         while stack:
@@ -122,11 +122,11 @@ class Operators:
             offset = self.applied("Delta", x)
             return _once(lambda node: lever(node) + offset(node))
         steps: dict[str, Callable[[int, Vector], Vector]] = {
-            "H": self._spread if transposed else self._collected,
+            "H": self._spread if transposed else self._collect,
             "M": self._momentum,
-            "P": self._carried,
+            "P": self._apply_inertia,
             "Delta": self._armature,
-            "D_inverse": self._solved,
+            "D_inverse": self._solve,
             "G": self._gain_transposed if transposed else self._gain,
         }
         return _once(lambda node: steps[letter](node, x(node)))
@@ -202,21 +202,21 @@ class Operators:
     def _force(self, node: int, z: Vector, less: bool) -> Vector:
         for link, pose in reversed(self.hops(node)):
             if link is not None and less:
-                _, z = self._eliminated(link, z, [0.0] * len(link.dofs))
+                _, z = self._eliminate(link, z, [0.0] * len(link.dofs))
             self._at(node, "z")
-            z = _joined(pose.force_to_parent(*_parts(z)))
+            z = _join(pose.force_to_parent(*_parts(z)))
         return z
 
     def _motion(self, node: int, v: Vector, less: bool) -> Vector:
         for link, pose in self.hops(node):
             self._at(node, "v")
-            v = _joined(pose.motion_to_child(*_parts(v)))
+            v = _join(pose.motion_to_child(*_parts(v)))
             if link is not None and less:
-                _, v = self._released(link, v)
+                _, v = self._release(link, v)
         return v
 
     # -- hinges ----------------------------------------------------------------------------------------------------
-    def _collected(self, node: int, z: Vector) -> Vector:
+    def _collect(self, node: int, z: Vector) -> Vector:
         """H z"""
         self._at(node, "h")
         tau: list[Value] = []
@@ -224,7 +224,7 @@ class Operators:
             if link is not None:
                 tau = [*hinge_entries(link, self.place(link), *_parts(z)), *tau]
             if not first:
-                z = _joined(pose.force_to_parent(*_parts(z)))
+                z = _join(pose.force_to_parent(*_parts(z)))
         return Vector(tau)
 
     def _spread(self, node: int, rates: Vector) -> Vector:
@@ -233,12 +233,12 @@ class Operators:
         v, at = Vector((*ZERO, *ZERO)), 0
         for link, pose, first in reversed(self._inner(node)):
             if not first:
-                v = _joined(pose.motion_to_child(*_parts(v)))
+                v = _join(pose.motion_to_child(*_parts(v)))
             if link is not None:
                 own = list(rates[at : at + len(link.dofs)])
                 at += len(own)
                 entries = dict(zip(link.dofs, own, strict=True))
-                v = v + _joined(hinge_motion(link, self.place(link), lambda dof, entries=entries: entries[dof]))
+                v = v + _join(hinge_motion(link, self.place(link), lambda dof, entries=entries: entries[dof]))
         return v
 
     def _armature(self, node: int, x: Vector) -> Vector:
@@ -253,14 +253,14 @@ class Operators:
         for link, pose, first in inner:
             if link is not None:
                 at -= len(link.dofs)
-                _, z = self._eliminated(link, z, list(right[at : at + len(link.dofs)]))
+                _, z = self._eliminate(link, z, list(right[at : at + len(link.dofs)]))
             if not first:
-                z = _joined(pose.force_to_parent(*_parts(z)))
+                z = _join(pose.force_to_parent(*_parts(z)))
         self._at(node, "g")
         for _, pose, first in reversed(inner):
             if not first:
                 n, f = _parts(z)
-                z = _joined((pose.to_child(n - cross(pose.l, f)), pose.to_child(f)))
+                z = _join((pose.to_child(n - cross(pose.l, f)), pose.to_child(f)))
         return z
 
     def _gain_transposed(self, node: int, v: Vector) -> Vector:
@@ -273,32 +273,32 @@ class Operators:
                 v = Vector((*w, *(v - cross(w, pose.l))))
         for link, pose, first in reversed(inner):
             if not first:
-                v = _joined(pose.motion_to_child(*_parts(v)))
+                v = _join(pose.motion_to_child(*_parts(v)))
             if link is not None:
-                own, v = self._released(link, v)
+                own, v = self._release(link, v)
                 rates += own
         return Vector(rates)
 
-    def _solved(self, node: int, right: Vector) -> Vector:
+    def _solve(self, node: int, right: Vector) -> Vector:
         """D^-1 right"""
         z, at, reduced = Vector((*ZERO, *ZERO)), len(right), {}
         inner = self._inner(node)
         for link, pose, first in inner:
             if link is not None:
                 at -= len(link.dofs)
-                reduced[id(link)], z = self._eliminated(link, z, list(right[at : at + len(link.dofs)]))
+                reduced[id(link)], z = self._eliminate(link, z, list(right[at : at + len(link.dofs)]))
             if not first:
-                z = _joined(pose.force_to_parent(*_parts(z)))
+                z = _join(pose.force_to_parent(*_parts(z)))
         v, found = Vector((*ZERO, *ZERO)), []
         for link, pose, first in reversed(inner):
             if not first:
-                v = _joined(pose.motion_to_child(*_parts(v)))
+                v = _join(pose.motion_to_child(*_parts(v)))
             if link is not None:
-                own, v = self._released(link, v, reduced[id(link)])
+                own, v = self._release(link, v, reduced[id(link)])
                 found += [-rate for rate in own]
         return Vector(found)
 
-    def _eliminated(self, link: Link, z: Vector, right: list[Value]) -> tuple[list[Value], Vector]:
+    def _eliminate(self, link: Link, z: Vector, right: list[Value]) -> tuple[list[Value], Vector]:
         """D^-1 (right - H z), pivot by pivot, and z + G (right - H z), of one link, in its frame."""
         done, place, rates = self.factor(link), self.place(link), []
         self._at(link.node, "z")
@@ -310,8 +310,8 @@ class Operators:
             rates.append(rate)
         return rates, z
 
-    def _released(self, link: Link, v: Vector, given: list[Value] | None = None) -> tuple[list[Value], Vector]:
-        """The adjoint of :meth:`_eliminated`: G* v less what is ``given``, by dof, and v - H* of that."""
+    def _release(self, link: Link, v: Vector, given: list[Value] | None = None) -> tuple[list[Value], Vector]:
+        """The adjoint of :meth:`_eliminate`: G* v less what is ``given``, by dof, and v - H* of that."""
         done, place, rates = self.factor(link), self.place(link), []
         self._at(link.node, "v")
         given = [0.0] * len(done.pivots) if given is None else given
@@ -325,12 +325,12 @@ class Operators:
     # -- bodies ----------------------------------------------------------------------------------------------------
     def _momentum(self, node: int, v: Vector) -> Vector:
         self._at(node, "m")
-        return _joined(self.links.nodes[node].rigid.apply(*_parts(v)))
+        return _join(self.links.nodes[node].rigid.apply(*_parts(v)))
 
-    def _carried(self, node: int, v: Vector) -> Vector:
+    def _apply_inertia(self, node: int, v: Vector) -> Vector:
         P = self.inertia(node)
         self._at(node, "p")
-        return _joined(P.apply(*_parts(v)))
+        return _join(P.apply(*_parts(v)))
 
     def inertia(self, top: int) -> Articulated:
         """P(k) in the node frame."""
@@ -418,7 +418,7 @@ def _parts(v: Vector) -> tuple[Vector, Vector]:
     return Vector(v[:3]), Vector(v[3:])
 
 
-def _joined(parts: tuple[Vector, Vector]) -> Vector:
+def _join(parts: tuple[Vector, Vector]) -> Vector:
     return Vector((*parts[0], *parts[1]))
 
 

@@ -113,7 +113,7 @@ class Pieces:
             self.of[id(link)] = piece
         leaves = [piece for piece in reversed(self.pieces) if not piece.children]
         self.warps = len(leaves)
-        for warp, piece in zip(_parted(leaves), leaves, strict=True):
+        for warp, piece in zip(_warps_of_leaves(leaves), leaves, strict=True):
             piece.warp = warp
         for piece in reversed(self.pieces):
             if piece.children:
@@ -167,7 +167,7 @@ class Pieces:
         return max(paths) / sum(len(piece.links) for piece in self.pieces)
 
 
-def _parted(leaves: list[Piece]) -> list[int]:
+def _warps_of_leaves(leaves: list[Piece]) -> list[int]:
     """Return the warp of each leaf: leaves of one kind share a part of the multiprocessor, which fetches its own code.
 
     Warp w runs on part w % PARTS. Up to PARTS leaves have a part each, in their order.

@@ -75,7 +75,7 @@ def _scale(trace: Trace, done: Factors, qd: Entry) -> dict[int, Value]:
         V = _carry(trace, link, velocity)
         if link.group is not None:
             for dof, pivot in zip(link.dofs, done[id(link)].pivots[::-1], strict=False):
-                nu[dof] = sqrt(pivot.D) * (qd(dof) + pivot.inverse * _felt(trace, link, pivot, velocity, qd))
+                nu[dof] = sqrt(pivot.D) * (qd(dof) + pivot.inverse * _apply_to_pivot(trace, link, pivot, velocity, qd))
             velocity[id(link)] = _add_group_rates(done, link, V, qd)
             continue
         for dof, pivot in zip(link.dofs, done[id(link)].pivots[::-1], strict=True):
@@ -86,7 +86,7 @@ def _scale(trace: Trace, done: Factors, qd: Entry) -> dict[int, Value]:
     return nu
 
 
-def _felt(trace: Trace, link: Link, pivot: groups.Pivot, velocity: dict[int, Vector], qd: Entry) -> Value:
+def _apply_to_pivot(trace: Trace, link: Link, pivot: groups.Pivot, velocity: dict[int, Vector], qd: Entry) -> Value:
     """Return U* V(p) of a group's pivot, and what the rates before it add."""
     above = Vector((*ZERO, *ZERO)) if link.parent is None else velocity[id(link.parent)]
     return dot(pivot.U, above) + total(x * qd(link.dofs[i]) for i, x in enumerate(pivot.row))
@@ -108,7 +108,7 @@ def _unscale(trace: Trace, done: Factors, nu: Entry) -> dict[int, Value]:
         V = _carry(trace, link, velocity)
         if link.group is not None:
             for dof, pivot in zip(link.dofs, done[id(link)].pivots[::-1], strict=False):
-                known = _felt(trace, link, pivot, velocity, qd.__getitem__)
+                known = _apply_to_pivot(trace, link, pivot, velocity, qd.__getitem__)
                 qd[dof] = pivot.inverse * (sqrt(pivot.D) * nu(dof) - known)
             velocity[id(link)] = _add_group_rates(done, link, V, qd.__getitem__)
             continue

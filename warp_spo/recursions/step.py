@@ -72,13 +72,13 @@ class Step:
         For a piece, the stores of one pass; stores after the last pass are the trace's ``news``.
         """
         trace = self.trace
-        trace.stiffened = self._stiffened
+        trace.stiffened = self._with_resistance
         tau = trace.vector("tau")
         found = self._accelerations(lambda dof: tau(dof) + self.forces[dof])
         gains = {dof: self.h * value for dof, value in found.items()}
-        looped = self._looped(gains)
+        looped = self._stores_of_pass(gains)
         if looped:
-            gains = self._solved({dof: self._kept_as(GAIN, dof) for dof in gains})
+            gains = self._solve({dof: self._kept_as(GAIN, dof) for dof in gains})
         rates_after = {dof: self.qd(dof) + gain for dof, gain in gains.items()}
         stores: list[Store] = []
         for link in self.links:
@@ -100,7 +100,7 @@ class Step:
 
     def _accelerations(self, tau: Callable[[int], Value]) -> dict[int, Value]:
         """Return qdd by dof for ``tau``, with the resistances of the active pieces added to Mass."""
-        if self._short:
+        if self._is_short:
             return self._in_joint_space(tau)
         done, rates, sent = reduce(self.trace, tau, moves=True, loads=True)
         stores = sent + expand(self.trace, done, rates, self.trace.base_acceleration)
@@ -108,7 +108,7 @@ class Step:
         return {item.index[0]: item.value for item in stores if item.array == "out"}
 
     @property
-    def _short(self) -> bool:
+    def _is_short(self) -> bool:
         """Whether one thread makes several passes over few dofs."""
         if self.trace.links.scene.dof_count > SHORT or self.trace.piece is not None:
             return False
@@ -128,15 +128,15 @@ class Step:
         """Return the stores with the state after the step projected onto its constraints."""
         return stores
 
-    def _unresolved(self) -> Value:
+    def _rank_loss(self) -> Value:
         """Return non-zero where constraints lose rank."""
         return 0.0
 
-    def _open(self) -> Value:
+    def _opening(self) -> Value:
         """Return non-zero where constraints do not hold after the step."""
         return 0.0
 
-    def _stiffened(self, link: Link) -> Link:
+    def _with_resistance(self, link: Link) -> Link:
         pieces = zip(link.armature, self._pieces(link), strict=True)
         return dataclasses.replace(link, armature=tuple(a + self.h * piece.resistance for a, piece in pieces))
 
@@ -166,7 +166,7 @@ class Step:
         bare = len(link.dofs) == 1 and link.group is None and is_number(link.armature[0], 0.0) and carries_nothing(link)
         return bare and any(law.bends for law in self.laws[link.dofs[0]])
 
-    def _solved(self, gains: dict[int, Value]) -> dict[int, Value]:
+    def _solve(self, gains: dict[int, Value]) -> dict[int, Value]:
         """Return u by dof; NaN of a massless dof that no law resists."""
         for link in self.links:
             if self._weightless(link):
@@ -187,7 +187,7 @@ class Step:
     def _kept_as(self, name: str, dof: int) -> Value:
         return self.trace.graph.input(name, self._kept.get(dof, dof))
 
-    def _looped(self, gains: dict[int, Value]) -> list[Store]:
+    def _stores_of_pass(self, gains: dict[int, Value]) -> list[Store]:
         """Return the stores at the end of a pass; none for a whole tree without bounded laws.
 
         A piece has few registers left in its pass, so it checks its guesses afterwards with inputs that it reads anew.
@@ -237,10 +237,10 @@ class Step:
     def _word(self, results: list[Value], looped: bool) -> Value:
         """Return the most severe status of the world."""
         settled = less(self.trace.graph.input(MISSED, 0), 0.5) if looped else 1.0
-        word = select(self._open(), Status.OPEN, select(settled, 0.0, Status.NOT_SETTLED))
+        word = select(self._opening(), Status.OPEN, select(settled, 0.0, Status.NOT_SETTLED))
         word = select(all_finite(results), word, Status.PIVOT)
         known = self._inputs() + self.trace.links.lost_values()
-        return select(all_finite(known), select(self._unresolved(), Status.LOOPS, word), Status.NOT_FINITE)
+        return select(all_finite(known), select(self._rank_loss(), Status.LOOPS, word), Status.NOT_FINITE)
 
     def _words(self, own: Piece, results: list[Value]) -> list[Store]:
         """Return the stores that send a piece's status to the first piece, which stores the most severe of all."""

@@ -210,7 +210,9 @@ def beam_modes(
         ValueError: a value is out of range; the message names it.
         TypeError: ``section``, ``material`` or ``children`` is something else.
     """
-    length, zeta, counts, number = _checked(length, section, material, ends, count, children, damping_ratio, points)
+    length, zeta, counts, number = _check_options(
+        length, section, material, ends, count, children, damping_ratio, points
+    )
     total = material.density * section.area * length
     y, z = (_bending(length, counts[name], ends) for name in ("y", "z"))
     torsion, axial = (_rod(length, counts[name], ends) for name in ("torsion", "axial"))
@@ -245,7 +247,7 @@ def beam_modes(
     )
 
 
-def _checked(
+def _check_options(
     length: float, section: Any, material: Any, ends: str, count: Any, children: Any, damping_ratio: Any, points: Any
 ) -> tuple[float, float, dict[str, int], int | None]:
     """Return the length, the damping ratio, the numbers of modes by direction and of points; errors by name."""

@@ -38,7 +38,7 @@ def _check_frame(scene: Scene, call: str, frame: Frame) -> tuple[int, tuple[floa
     base, pose = frame if isinstance(frame, tuple | list) and len(frame) == 2 else (frame, IDENTITY_POSE)
     at: tuple[float, ...] = IDENTITY_POSE
     if isinstance(base, str):
-        base, at = _named(scene, call, base)
+        base, at = _find_frame(scene, call, base)
     index = as_integer(base)
     if index is None:
         raise _wrong_frame(call, frame)
@@ -47,10 +47,10 @@ def _check_frame(scene: Scene, call: str, frame: Frame) -> tuple[int, tuple[floa
     if pose is IDENTITY_POSE:
         return index, at
     checked = _pose(call, frame, pose)
-    return index, checked if at is IDENTITY_POSE else _composed(at, checked)
+    return index, checked if at is IDENTITY_POSE else _compose(at, checked)
 
 
-def _named(scene: Scene, call: str, name: str) -> tuple[int, tuple[float, ...]]:
+def _find_frame(scene: Scene, call: str, name: str) -> tuple[int, tuple[float, ...]]:
     """Return the body of this label and the identity, or the body of the site of this name and the site's pose."""
     labels = scene.body_labels
     ends = [label.rpartition("/")[2] for label in labels]
@@ -79,7 +79,7 @@ def _named(scene: Scene, call: str, name: str) -> tuple[int, tuple[float, ...]]:
     return matches[0], IDENTITY_POSE
 
 
-def _composed(outer: tuple[float, ...], inner: tuple[float, ...]) -> tuple[float, ...]:
+def _compose(outer: tuple[float, ...], inner: tuple[float, ...]) -> tuple[float, ...]:
     """Return the pose ``inner``, given in the pose ``outer``."""
     place, turn = np.array(inner[:3]), np.array(inner[3:6])
     axis, w = np.array(outer[3:6]), outer[6]

@@ -48,7 +48,7 @@ def normal_modes(
         raise ValueError(f"{call}: mass is missing; expected (n, n), or points=MassPoints(...)")
     M = points.inertia[6:, 6:] if mass is None and points is not None else mass
     n = np.shape(M)[-1] if np.ndim(M) else 0
-    M, K = (_checked(call, name, value, n) for name, value in (("mass", M), ("stiffness", stiffness)))
+    M, K = (_check_matrix(call, name, value, n) for name, value in (("mass", M), ("stiffness", stiffness)))
     lowest = np.linalg.eigvalsh(M)[0]
     if not lowest > 0.0:
         raise ValueError(f"{call}: mass has the eigenvalue {lowest:.3g}; expected positive ones; leave out such modes")
@@ -61,7 +61,7 @@ def normal_modes(
         raise ValueError(f"{call}: damping and damping_ratio are given; expected one of them")
     D = np.diag(2.0 * (damping_ratio or 0.0) * omega)
     if damping is not None:
-        D = basis.T @ _checked(call, "damping", damping, n) @ basis
+        D = basis.T @ _check_matrix(call, "damping", damping, n) @ basis
         off = np.abs(D - np.diag(np.diag(D))).max()
         if off > SYMMETRY * np.abs(D).max():
             raise ValueError(
@@ -78,7 +78,7 @@ def normal_modes(
     return Modes(np.eye(n), omega**2, np.diag(D), change(coupling), at, bent, moved, rigid), basis
 
 
-def _checked(call: str, name: str, value: Any, n: int) -> np.ndarray:
+def _check_matrix(call: str, name: str, value: Any, n: int) -> np.ndarray:
     """Return a symmetric matrix, made exactly so."""
     array = checked_array(call, name, value, (n, n))
     skew = np.abs(array - array.T).max(initial=0.0)

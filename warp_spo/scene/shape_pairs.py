@@ -113,7 +113,7 @@ class PairChoice:
             UnsupportedError: No contact represents a listed pair, or "all" are too many.
         """
         if isinstance(asked, str) and asked == ALL:
-            return self._all([shape for shape in self.shapes if self.moves(shape)])
+            return self._all_pairs([shape for shape in self.shapes if self.moves(shape)])
         if isinstance(asked, str) or not isinstance(asked, Sequence) or not all(map(_is_pair, asked)):
             raise TypeError(
                 f"{self.call}: pairs is {asked!r}; expected 'all', or a list of pairs of names of shapes or bodies, "
@@ -121,7 +121,7 @@ class PairChoice:
             )
         found: dict[frozenset[int], ShapePair] = {}
         for names in asked:
-            for pair in self._listed(names):
+            for pair in self._named_pairs(names):
                 found.setdefault(frozenset(shape.index for shape in pair), pair)
         return list(found.values()), []
 
@@ -136,7 +136,7 @@ class PairChoice:
         sides = (pair for one, other in combinations(trees.values(), 2) for pair in product(one, other))
         return next((ShapePair(*pair) for pair in sides if self.allowed(*pair)), None)
 
-    def _all(self, solid: Sequence[Shape]) -> tuple[list[ShapePair], list[str]]:
+    def _all_pairs(self, solid: Sequence[Shape]) -> tuple[list[ShapePair], list[str]]:
         """Return every pair that may touch, and in words those that no contact represents."""
         pairs = [ShapePair(*pair) for pair in combinations(solid, 2) if self._may_touch(*pair)]
         found = [pair for pair in pairs if self._stands(pair)]
@@ -154,9 +154,9 @@ class PairChoice:
             )
         return found, [pair.words(self.scene.body_labels) for pair in pairs if not self._stands(pair)]
 
-    def _listed(self, names: Sequence[Any]) -> list[ShapePair]:
+    def _named_pairs(self, names: Sequence[Any]) -> list[ShapePair]:
         """Return the pairs that two names stand for."""
-        sides = [self._named(name) for name in names]
+        sides = [self._shapes_of_name(name) for name in names]
         both = [ShapePair(a, b) if self.moves(a) else ShapePair(b, a) for a, b in product(*sides) if a.index != b.index]
         pairs = [pair for pair in both if self._may_touch(*pair)]
         bodies, what = self.scene.body_labels, f"pairs={tuple(names)!r}"
@@ -182,7 +182,7 @@ class PairChoice:
             self._lacking[shape.index] = _hollow(shape)
         return self._lacking[shape.index]
 
-    def _named(self, name: Any) -> list[Shape]:
+    def _shapes_of_name(self, name: Any) -> list[Shape]:
         """Return the shapes of a name or a number."""
         number, bodies = as_integer(name), self.scene.body_labels
         if number is not None:

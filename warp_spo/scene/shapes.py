@@ -161,12 +161,12 @@ class Choice(NamedTuple):
         solid = [shape for shape in shapes if shape.body >= 0 and moving[shape.body]]
         if soil is not None and touches is not None:
             solid = [shape for shape in solid if touches(shape, soil)]
-        taken, left_out = self._chosen(call, scene.body_labels, solid)
+        taken, left_out = self._choose(call, scene.body_labels, solid)
         words = [shape.words(scene.body_labels) for shape in left_out]
         words += [shape.words(scene.body_labels) + (", not level" if shape.kind in GROUNDS else "") for shape in others]
         return Chosen([(shape, contacts_of(shape.on(soil), most)) for shape, most in taken], ground, soil, words)
 
-    def _chosen(
+    def _choose(
         self, call: str, names: list[str], solid: Sequence[Shape]
     ) -> tuple[list[tuple[Shape, int]], list[Shape]]:
         """Return the chosen shapes with the most points of each, and those that no contact represents."""
@@ -225,7 +225,7 @@ def moving_bodies(scene: Scene) -> np.ndarray:
 def contacts_of(shape: Shape, most: int = POINTS) -> list[Contact]:
     """Return the contacts that stand for a shape, none for one that has no points."""
     place = pose_matrix(shape.pose)
-    at = lambda points: _placed(np.asarray(points, dtype=np.float64), place)  # noqa: E731
+    at = lambda points: _place(np.asarray(points, dtype=np.float64), place)  # noqa: E731
     values: dict[str, Any] = {"stiffness": shape.stiffness, "damping": shape.damping, "label": shape.label}
     if shape.friction is not None:
         values["friction"] = shape.friction
@@ -243,7 +243,7 @@ def contacts_of(shape: Shape, most: int = POINTS) -> list[Contact]:
     return [Contact(shape.body, sphere=(point, shape.rounding), **values) for point in points]
 
 
-def _placed(points: np.ndarray, place: np.ndarray) -> np.ndarray:
+def _place(points: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Return points where a pose puts them, with zeros where entries are zero but for rounding: zeros cost nothing."""
     found = points @ place[:3, :3].T + place[:3, 3]
     size = max(np.abs(points).max(initial=0.0), np.abs(found).max(initial=0.0))

@@ -78,7 +78,7 @@ class Record:
         assert operation.derivative is not None
         self.dyn, self.operation, self.derivative = dyn, operation, operation.derivative
         names = {option.name for option in operation.options}
-        self.options = {name: _copied(value) if name in names else value for name, value in options.items()}
+        self.options = {name: _copy(value) if name in names else value for name, value in options.items()}
         self.inputs, self.values = inputs, values
         self.stamps = dict(dyn.values.stamps)
 
@@ -115,10 +115,10 @@ class Record:
             return gradients.pull_back(self.operation, arrays, self.options, results, cotangents, wanted)
 
 
-def _copied(option: Any) -> Any:
+def _copy(option: Any) -> Any:
     """Return an option that stays as it is if the caller changes his: a list of frames, or a tensor for dt."""
     if type(option) in (list, tuple):
-        return type(option)(map(_copied, option))
+        return type(option)(map(_copy, option))
     return option.clone() if is_tensor(option) else option
 
 

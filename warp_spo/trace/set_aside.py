@@ -53,8 +53,8 @@ def set_aside(text: str, dtype: str, places: int) -> str:
             found.append(f"const {dtype} {name} = ASIDE({place});")
             coming.setdefault(gap.end, []).append((gap.name, name))
         now.update(coming.get(at, ()))
-        if now and _defined(line, dtype)[1]:
-            now = {name: other for name, other in now.items() if name not in _defined(line, dtype)[1]}
+        if now and _definitions(line, dtype)[1]:
+            now = {name: other for name, other in now.items() if name not in _definitions(line, dtype)[1]}
         found.append(_rename(line, now) if now else line)
         found += [f"ASIDE({place}) = {now.get(name, name)};" for name, place in stores.get(at, ())]
     return "\n".join(found)
@@ -64,7 +64,7 @@ def _rename(line: str, names: dict[str, str]) -> str:
     return WORD.sub(lambda match: names.get(match[0], match[0]), line)
 
 
-def _defined(line: str, dtype: str) -> tuple[str, tuple[str, ...]]:
+def _definitions(line: str, dtype: str) -> tuple[str, tuple[str, ...]]:
     """Return the part of a statement that uses values, and the names of those that it defines."""
     pair = PAIR.match(line)
     if pair:
@@ -97,7 +97,7 @@ def _find_gaps(lines: list[str], scopes: list[int], dtype: str) -> Iterator[Gap]
     for at, line in enumerate(lines):
         if line.startswith(("//", "#")):
             continue
-        used, defined = _defined(line, dtype)
+        used, defined = _definitions(line, dtype)
         for name in set(WORD.findall(used)) & latest.keys():
             if at - latest[name] > LEAST and home[name] == scopes[at] == scopes[latest[name]]:
                 yield Gap(latest[name], at, name)

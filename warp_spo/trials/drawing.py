@@ -141,13 +141,13 @@ def log_axis(axis: Any, values: Sequence[float], text: Any, most: int = 6) -> No
     powers = range(-(-first // step) * step, last + 1, step)
     ticks = [part * 10.0**power for power in powers for part in parts if low <= part * 10.0**power <= high]
     axis.axes.set(**{f"{axis.axis_name}scale": "log", f"{axis.axis_name}lim": (low, high)})
-    axis.set_major_locator(FixedLocator(_apart(axis, ticks, text, math.log(high / low))))
+    axis.set_major_locator(FixedLocator(_legible_ticks(axis, ticks, text, math.log(high / low))))
     axis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))
     axis.set_minor_locator(NullLocator())
     axis.axes.grid(True)
 
 
-def _apart(axis: Any, ticks: Sequence[float], text: Any, span: float) -> list[float]:
+def _legible_ticks(axis: Any, ticks: Sequence[float], text: Any, span: float) -> list[float]:
     """Return the ticks of a logarithmic axis whose labels do not touch, round numbers first.
 
     Args:

@@ -48,15 +48,15 @@ class Progress:
 
 def duration(seconds: float) -> str:
     """Return a time with three digits and a unit, such as "41.2 us"."""
-    return _scaled(seconds, ((1.0, "s"), (1e-3, "ms"), (1e-6, "us"), (0.0, "ns")), 1e-9)
+    return _with_unit(seconds, ((1.0, "s"), (1e-3, "ms"), (1e-6, "us"), (0.0, "ns")), 1e-9)
 
 
 def rate(per_second: float) -> str:
     """Return a rate with three digits and a letter, such as "14.2 M"."""
-    return _scaled(per_second, ((1e9, "G"), (1e6, "M"), (1e3, "k"), (0.0, "")), 1.0).rstrip()
+    return _with_unit(per_second, ((1e9, "G"), (1e6, "M"), (1e3, "k"), (0.0, "")), 1.0).rstrip()
 
 
-def _scaled(value: float, units: Sequence[tuple[float, str]], last: float) -> str:
+def _with_unit(value: float, units: Sequence[tuple[float, str]], last: float) -> str:
     value = float(f"{value:.3g}")  # 999.6 us is 1.00 ms
     size, unit = next(u for u in units if value >= u[0])
     return f"{value / (size or last):#.3g}".rstrip(".") + f" {unit}"

@@ -55,7 +55,7 @@ class CoupledStep(ContactStep):
         self.twists: list[Store] = []
         found = super().stores(qdd, status)
         self.trace.begin = [*self.trace.begin, *self.first]
-        return found + self.twists + [item for name in self.reports for item in self._reported(name)]
+        return found + self.twists + [item for name in self.reports for item in self._report_stores(name)]
 
     def inward(self, tau: Callable[[int], Value]) -> tuple[Factors, dict, list[Store]]:
         """Return factors and D^-1 eps of a pass by link, for forces of the dofs; no stores that send."""
@@ -68,7 +68,7 @@ class CoupledStep(ContactStep):
     def _press(self, points: list[Point], touches: list[Touch]) -> None:
         super()._press(points, touches)
         trace = self.trace
-        self.plan = Plan(trace.links, couples_of(trace.links), lambda link: flies(self._stiffened(link)))
+        self.plan = Plan(trace.links, couples_of(trace.links), lambda link: flies(self._with_resistance(link)))
         self.couples = self.plan.couples
         passes = trace.graph.input("passes", 0)  # native code counts them, too
         self.first += [Store(VALUE, (i,), value) for i, value in enumerate([*values_of(self), passes])]
@@ -192,7 +192,7 @@ class CoupledStep(ContactStep):
         cone, pull, missed = (read(i) for i in range(EXCESS))
         return cone, pull, [], missed
 
-    def _reported(self, name: str) -> list[Store]:
+    def _report_stores(self, name: str) -> list[Store]:
         """Return the stores of what couples report, after the rows of the points."""
         first, offset = len(self.trace.links.scene.contact_points), {"contact_gap": 3, "contact_slip": 4}
         read = lambda i: self.trace.graph.input(REPORT, i)  # noqa: E731

@@ -119,7 +119,7 @@ class Corners(NamedTuple):
         rows, columns = ground.heights.shape[-2:]
         first = i * float(columns) + j
         if ground.count > 1:
-            first = floor(_between(place.field, ground.count - 1.0)) * float(rows * columns) + first
+            first = floor(_clamp(place.field, ground.count - 1.0)) * float(rows * columns) + first
         if together:
             h00, h01, h10, h11 = lookup(graph, GROUND, first, CORNERS)
         else:
@@ -205,13 +205,13 @@ def height(graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place:
 
 def _cell(x: Value, points: int) -> tuple[Value, Value]:
     """Return the cell of a place in cells, and how far in it the place is; the last cell beyond the edges."""
-    x = _between(x, points - 1.0)
+    x = _clamp(x, points - 1.0)
     cell = floor(x)
     cell = select(less(cell, points - 1.5), cell, points - 2.0)
     return cell, x - cell
 
 
-def _between(x: Value, most: float) -> Value:
+def _clamp(x: Value, most: float) -> Value:
     """Return a number between zero and ``most``, so that no table is read beyond its end; NaN becomes zero."""
     x = select(less(0.0, x), x, 0.0)
     return select(less(x, most), x, most)

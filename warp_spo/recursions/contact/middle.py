@@ -57,7 +57,7 @@ def middle_kick(trace: Trace) -> list[Store]:
 def last_kick(trace: Trace, qdd: bool = False) -> list[Store]:
     """out = qd' with the kick of what the last round found; with ``qdd`` qdd_out = (qd' - qd) / h"""
     kick, _, _, stores = _kick(trace)
-    (_, found, kicked), gained, h = _given(trace), trace.vector(GAINED), trace.graph.input("dt", 0)
+    (_, found, kicked), gained, h = _rates_and_kicks(trace), trace.vector(GAINED), trace.graph.input("dt", 0)
     for link in trace.own_links:
         for dof in link.dofs if link.leads else ():
             stores.append(Store("out", (dof,), found(dof) + 2.0 * (kick[dof] - kicked(dof))))
@@ -66,14 +66,14 @@ def last_kick(trace: Trace, qdd: bool = False) -> list[Store]:
     return stores
 
 
-def _given(trace: Trace) -> tuple[Callable[[int], Value], ...]:
+def _rates_and_kicks(trace: Trace) -> tuple[Callable[[int], Value], ...]:
     """Return entries of qd, and of qd' and k of the round before."""
     return tuple(map(trace.vector, ("qd", FOUND, KICKED)))
 
 
 def _kick(trace: Trace) -> tuple[dict[int, Value], dict[int, Value], Callable[[Link], dict[int, Value]], list[Store]]:
     """Return by dof k of the trace's links and u, the coordinates half way by link, and stores of messages."""
-    (qd, found, kicked), h = _given(trace), trace.graph.input("dt", 0)
+    (qd, found, kicked), h = _rates_and_kicks(trace), trace.graph.input("dt", 0)
     start, dofs = trace.vector("q"), [dof for link in trace.links.leaders for dof in link.dofs]
     u = {dof: found(dof) - kicked(dof) for dof in dofs}
     v = {dof: 0.5 * (qd(dof) + found(dof)) for dof in dofs}

@@ -181,7 +181,7 @@ class PairedStep(ground.ContactStep):
         self.response: list[Store] = []
         found = super().stores(qdd, status)
         self.trace.begin = [*self.trace.begin, *self.first]
-        return self.response + found + [item for name in self.reports for item in self._reported(name)]
+        return self.response + found + [item for name in self.reports for item in self._report_stores(name)]
 
     def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, tuple[Vector, Vector]]) -> dict[int, Value]:
         """Return qd' - qd by dof with the forces between bodies; ``alpha`` becomes that of the links."""
@@ -244,7 +244,7 @@ class PairedStep(ground.ContactStep):
                 stores += [Store(RESPONSE, (at[a][b] + place,), value) for place in sorted(places)]
         return stores
 
-    def _reported(self, name: str) -> list[Store]:
+    def _report_stores(self, name: str) -> list[Store]:
         """Return the stores of what the coupling found, after the rows of the points."""
         first, offset = len(self.trace.links.scene.contact_points), {"contact_gap": 3, "contact_slip": 4}
         stores, read = [], self.trace.graph.input

@@ -190,7 +190,7 @@ def place_points(
         w, v = mine.travel
         ahead = 0.5 * h if half_way else h
         moves = [ahead * dot(axis, v + cross(w, centre)) for axis in toward]
-        touched = [_listed(impedance, number)] if isinstance(ground, Listed) else None
+        touched = [_listed_surface(impedance, number)] if isinstance(ground, Listed) else None
         for normal, depth, cell, near in touched or surfaces(
             trace.graph, ground, at, place_of_ground, moves, point.walls
         ):
@@ -276,7 +276,7 @@ def _places(trace: Trace, impedance: Impedance) -> Iterator[tuple[int, int, tupl
         yield number, point.body, given or point.position
 
 
-def _listed(impedance: Impedance, number: int) -> Surface:
+def _listed_surface(impedance: Impedance, number: int) -> Surface:
     """Return the surface near a point that the scene's values describe."""
     *normal, depth = (impedance.value("contact_place", PLACE * number + i) for i in range(3, PLACE))
     return Surface(Vector(normal), depth)

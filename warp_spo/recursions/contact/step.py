@@ -89,7 +89,7 @@ class ContactStep(Step):
         trace.ahead += [value for point in points for value in point.state(arms)]
         trace.ahead += [value for crowd in self.crowds.values() for value in (crowd.highest, crowd.reach)]
         self._press(points, touches)
-        trace.stiffened = self._stiffened
+        trace.stiffened = self._with_resistance
         tau = trace.vector("tau")
         done, rates, sent = self.inward(lambda dof: tau(dof) + self.forces[dof] - bias[dof])
         rates = self.close(done, rates)
@@ -103,7 +103,9 @@ class ContactStep(Step):
         for link in self.links:
             trace.label(link, "u")
             efforts += [
-                law.finish(gains[dof], self._felt(law, link, done)) for dof in link.dofs for law in self.secants[dof]
+                law.finish(gains[dof], self._step_over_inertia(law, link, done))
+                for dof in link.dofs
+                for law in self.secants[dof]
             ]
         excess = self.coupled_excess()
         forces = self._forces(points, touches, alpha, excess)
@@ -195,7 +197,7 @@ class ContactStep(Step):
         self.forces |= {dof: piece.force for dof, piece in zip(link.dofs, found, strict=True)}
         return found
 
-    def _felt(self, law: Secant, link: Link, done: Factors) -> Value | None:
+    def _step_over_inertia(self, law: Secant, link: Link, done: Factors) -> Value | None:
         """Return h over the inertia that a law's dof feels in this pass without it; None: that of the neutral pose.
 
         The sweep knows it of hinges with one dof, and it is asked for where kicks are given.

@@ -81,7 +81,7 @@ class PassAdjoint(OnePass):
         self.last = less(trace.graph.input("passes", 0) - 1.5, trace.graph.input(NUMBER, 0))
         for link in trace.active_links:
             trace.place(link)
-        self.points = self._placed()
+        self.points = self._find_points()
         self.touches = [self._begin(point) for point in self.points]
         self.qdd = {dof: cut(trace.vector("qdd")(dof)) for dof in self.before}
         self.gains = {dof: self.h * rate for dof, rate in self.qdd.items()}
@@ -90,7 +90,7 @@ class PassAdjoint(OnePass):
         for link in self.links:
             for dof in link.dofs:
                 for law in self.secants[dof]:
-                    law.finish(self.gains[dof], self._felt(law, link, done) if id(link) in done else None)
+                    law.finish(self.gains[dof], self._step_over_inertia(law, link, done) if id(link) in done else None)
         self.moving = self._twists(self._or_input(self.qdd, "qdd"))
         touching = zip(self.points, self.touches, strict=True)
         self.loads = [self._finish(point, touch, self.moving)[0] for point, touch in touching]
@@ -101,7 +101,7 @@ class PassAdjoint(OnePass):
         if not (self._carrier or any(map(self._weighs, self.links))):
             return done
         self._press(self.points, self.touches)
-        trace.pushes, trace.stiffened = {}, self._stiffened
+        trace.pushes, trace.stiffened = {}, self._with_resistance
         for link, outward in trace.traversal():
             if outward:
                 trace.place(link)
@@ -117,7 +117,7 @@ class PassAdjoint(OnePass):
         return above if above is not None and above.index in self.weighed else None
 
     @property
-    def _packed(self) -> list[Value]:
+    def _inertia_message(self) -> list[Value]:
         """Message of the piece's articulated inertia, with the dampers of its points on the link that it moves on."""
         piece = self.trace.piece
         if self._carrier is None or piece is None:
@@ -125,7 +125,7 @@ class PassAdjoint(OnePass):
         P, link = self.inner[id(piece.links[0])], piece.links[0]
         return (P + self.trace.dampers[id(link.parent)] if id(link.parent) in self.trace.dampers else P).packed
 
-    def _placed(self) -> list[Point]:
+    def _find_points(self) -> list[Point]:
         """Return the contact points."""
         return place_points(self.trace, self.impedance, self.qd)
 
@@ -136,10 +136,10 @@ class PassAdjoint(OnePass):
             self.trace.label(link, "t")
             place = self.trace.places[id(link)]
             over = (ZERO, ZERO) if link.parent is None else found[id(link.parent)]
-            found[id(link)] = self._known(link, carried_velocity(place, over, hinge_motion(link, place, rate)))
+            found[id(link)] = self._read_twist(link, carried_velocity(place, over, hinge_motion(link, place, rate)))
         return found
 
-    def _known(self, link: Link, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    def _read_twist(self, link: Link, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
         """Return a twist of a link, as what follows from it reads it."""
         return twist
 
@@ -148,7 +148,7 @@ class PassAdjoint(OnePass):
         read = self.trace.vector(name)
         return lambda dof: known[dof] if dof in known else read(dof)
 
-    def _later(self, name: str, *index: int) -> Value:
+    def _of_later(self, name: str, *index: int) -> Value:
         """Return an entry of what the passes after this one have found; zero in the last pass."""
         return select(self.last, 0.0, self.trace.graph.input(name, *index))
 
@@ -164,7 +164,7 @@ class PassAdjoint(OnePass):
             seeds += [trace.vector("q_cotangent")(link.coordinate + c) for c in range(len(values))]
         seeds = [select(self.last, seed, 0.0) for seed in seeds]
         results += [item.value for item in self.kept.end]
-        return results, seeds + [self._later(COTANGENT, self._dofs + item.index[0]) for item in self.kept.end]
+        return results, seeds + [self._of_later(COTANGENT, self._dofs + item.index[0]) for item in self.kept.end]
 
     @property
     def _dofs(self) -> int:
@@ -182,7 +182,7 @@ class PassAdjoint(OnePass):
 class PassSolve(PassAdjoint):
     """The solve of a pass, and the cotangents of what the pass before left."""
 
-    def _known(self, link: Link, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    def _read_twist(self, link: Link, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
         return _cut(twist[0]), _cut(twist[1])
 
     def stores(self) -> list[Store]:  # type: ignore[override]
@@ -192,11 +192,11 @@ class PassSolve(PassAdjoint):
         results, seeds = self._results()
         stops = [*self.qdd.values(), *(x for key in on for part in self.moving[key] for x in part)]
         direct = _by_each(stops, reverse(results, _distinct(stops), seeds, True))
-        right = {dof: way + self._later(COTANGENT, dof) for dof, way in zip(self.qdd, direct, strict=False)}
+        right = {dof: way + self._of_later(COTANGENT, dof) for dof, way in zip(self.qdd, direct, strict=False)}
         self._press(self.points, self.touches)
         wrenches = direct[len(self.qdd) :]
         trace.pushes = {key: Vector(wrenches[6 * at : 6 * at + 6]) for at, key in enumerate(on)}
-        trace.stiffened = self._stiffened
+        trace.stiffened = self._with_resistance
         done, rates, sent = reduce(trace, right.__getitem__, moves=False, loads=False)
         pushed: Twists = {}
         found = expand(trace, done, rates, (ZERO, ZERO), alpha=pushed)
@@ -204,7 +204,7 @@ class PassSolve(PassAdjoint):
         sent += [item for item in found if item.array != "out"]
         pushed = {key: (_cut(pushed[key][0]), _cut(pushed[key][1])) for key in on}
         if self._carrier is not None:
-            results, seeds = results + self._packed, seeds + trace.receive("Q", self._carrier)
+            results, seeds = results + self._inertia_message, seeds + trace.receive("Q", self._carrier)
         sent += self._tell(results, seeds)
         power = self._power(solved, pushed)
         came = self.before | {self._dofs + at: value for at, value in self.kept.variables.items()}
@@ -255,7 +255,7 @@ class PassGradient(PassAdjoint):
             for corner, height in enumerate(point.cell.heights if point.cell and point.link else ()):
                 self.corners.setdefault(height.key, (height, surface, corner))
 
-    def _placed(self) -> list[Point]:
+    def _find_points(self) -> list[Point]:
         return place_points(self.trace, self.impedance, self.qd, carry=self._carry)
 
     def _carry(self, link: Link, own: Carried) -> Carried:
@@ -277,7 +277,7 @@ class PassGradient(PassAdjoint):
             move = move._replace(spin=travel[0], whirl=whirl(travel[0]))
         return Carried(axes, origins, twist, move, bend, travel)
 
-    def _known(self, link: Link, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    def _read_twist(self, link: Link, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
         if id(link) not in self._reached:
             return twist
         if link is self._end:
@@ -295,7 +295,7 @@ class PassGradient(PassAdjoint):
         results += [self._power(self.solved, self.pushed), *(item.value for item in kept.begin)]
         came = [trace.graph.input(CAME, self._dofs + item.index[0]) for item in kept.begin]
         seeds += [1.0, *(select(kept.first, way, 0.0) for way in came)]
-        packed = self._packed
+        packed = self._inertia_message
         if self._carrier is not None:
             first = len(packed) * self.weighed.index(self._carrier.index)
             results, seeds = (
@@ -332,7 +332,7 @@ class PassGradient(PassAdjoint):
                 if trace.piece.parent is not None:
                     continue
             for index, value in self._entries(name, ways):
-                found.append(Store(result_name(name, wrt), index, self._later(f"{name}_later", *index) + value))
+                found.append(Store(result_name(name, wrt), index, self._of_later(f"{name}_later", *index) + value))
         return [*sent, *power.stores, *found]
 
     def _add_origins(self, own: Piece, ways: Ways) -> list[Store]:

@@ -115,16 +115,16 @@ class Power:
                 trace.place(link)
                 trace.label(link, "m")
                 carried[key] = FromParent.of(trace.places[key], seen[over], trace.axes.get(key, Matrix()))
-                moved[key] = self._moved(link, carried[key].apart)
+                moved[key] = self._motion_of_link(link, carried[key].apart)
                 seen[key] = Seen.of(moved[key], carried[key].apart[5:])
                 trace.axes[key] = seen[key].axes
                 continue
             trace.label(link, "g")
             others = trace.from_children(link, "B", bars, list)
-            bars[key] = self._handed(link, seen[key], moved[key], carried[key], seen[over], others)
+            bars[key] = self._pull_to_parent(link, seen[key], moved[key], carried[key], seen[over], others)
             self.stores += trace.send_to_parent("B", link, bars[key])
 
-    def _moved(self, link: Link, carried: list[Vector]) -> Moving:
+    def _motion_of_link(self, link: Link, carried: list[Vector]) -> Moving:
         """Return the motion of a link with its own rates added."""
         place, (spin, w, v, mu_w, mu_v, *_) = self.trace.places[id(link)], carried
         rates = self.rate, self.qdd, self.multiplier
@@ -135,7 +135,7 @@ class Power:
         own = own_bias(link, place, rates[0])
         return moved if own is None else moved._replace(w=moved.w + own[0], v=moved.v + own[1])
 
-    def _handed(
+    def _pull_to_parent(
         self, link: Link, mine: Seen, moved: Moving, carried: FromParent, parent: Seen, others: list[list[Value]]
     ) -> list[Value]:
         """Return the gradient by what the link's parent exposes; ``others``: the same from the link's children."""

@@ -188,7 +188,7 @@ def of_coordinates(
         change = cross(spin, theta)
         v_d = cross(v, theta) + shifting @ d + cross(change, slide)
         found.append(Sensitivity(theta, d, change, turning @ theta, v_d))
-    changes = link.hinge.own_changes(place, [rates(dof) if rates else 0.0 for dof in link.dofs], _each(link, qdd))
+    changes = link.hinge.own_changes(place, [rates(dof) if rates else 0.0 for dof in link.dofs], _entries_of(link, qdd))
     if changes is None:
         return found
     return [
@@ -199,7 +199,7 @@ def of_coordinates(
     ]
 
 
-def _each(link: Link, entry: Any) -> list[Value]:
+def _entries_of(link: Link, entry: Any) -> list[Value]:
     return [entry(dof) for dof in link.dofs]
 
 
@@ -208,7 +208,7 @@ def of_rates(link: Link, place: Placed, motion: Motion, parent: Motion, rates: A
     spin_c = place.pose.to_child(parent.spin)
     both = spin_c + motion.spin
     found = [Sensitivity(ZERO, ZERO, w, cross(both, w), cross(spin_c, v) * 2.0) for w, v in columns(link, place)]
-    changes = None if rates is None else link.hinge.own_bias_changes(place, _each(link, rates))
+    changes = None if rates is None else link.hinge.own_bias_changes(place, _entries_of(link, rates))
     if changes is None:
         return found
     return [s._replace(w=s.w + w, v=s.v + v) for s, (w, v) in zip(found, changes, strict=True)]

@@ -90,14 +90,14 @@ class ClosedStep(Step):
         """Return whether no mass is on the link or further out; a link in a loop may carry what is beyond the loop."""
         return id(link) not in self.loops.cluster_of and super()._weightless(link)
 
-    def _unresolved(self) -> Value:
+    def _rank_loss(self) -> Value:
         least = RESOLVED * self.trace.epsilon
         before, after = (
             total(1.0 - less(least, margin) for margin in margins) for margins in (self.margins, self.margins_after)
         )
         return before + select(all_finite(self.rates), after, 0.0)
 
-    def _open(self) -> Value:
+    def _opening(self) -> Value:
         q, qd = self.after
         places = {
             id(link): place_link(link, q.__getitem__) for cluster in self.loops.clusters for link in cluster.links
@@ -110,12 +110,12 @@ class MultiplierStep(Step):
 
     def system(self) -> list[Store]:
         """out, right, size: what the multipliers solve."""
-        self.trace.stiffened = self._stiffened
+        self.trace.stiffened = self._with_resistance
         tau = self.trace.vector("tau")
         return loop_system(self.trace, lambda dof: tau(dof) + self.forces[dof])
 
-    def _stiffened(self, link: Link) -> Link:
-        stiff = super()._stiffened(link)
+    def _with_resistance(self, link: Link) -> Link:
+        stiff = super()._with_resistance(link)
         for dof in link.dofs:
             if any(law.bends for law in self.laws[dof]):
                 label = self.trace.links.scene.dof_labels[dof]
@@ -130,7 +130,7 @@ class MultiplierStep(Step):
         done, rates, _ = reduce(trace, lambda dof: tau(dof) + loads.get(dof, 0.0), moves=True, loads=True)
         return {item.index[0]: item.value for item in expand(trace, done, rates, trace.base_acceleration)}
 
-    def _unresolved(self) -> Value:
+    def _rank_loss(self) -> Value:
         return 1.0 - less(self.trace.epsilon**0.5, self.trace.graph.input("resolved", 0))
 
 

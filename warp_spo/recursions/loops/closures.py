@@ -174,7 +174,7 @@ class Closure:
 
     def _anchors(self, places: dict[int, Placed], qd: Any = None, qdd: Any = None) -> tuple[State, State]:
         inner, outer = (
-            _carried(self._states(path, places, qd, qdd)[-1] if path else REST, anchor)
+            _state_of_anchor(self._states(path, places, qd, qdd)[-1] if path else REST, anchor)
             for path, anchor in ((self.inner_path, self.inner), (self.outer_path, self.outer))
         )
         return inner, outer
@@ -183,12 +183,12 @@ class Closure:
         """Return the position and motion of each link of a path, relative to the common link."""
         found, state = [], REST
         for link in path:
-            state = _moved(link, places[id(link)], state, qd, qdd)
+            state = _state_of_link(link, places[id(link)], state, qd, qdd)
             found.append(state)
         return found
 
 
-def _moved(link: Link, place: Placed, over: State, qd: Any, qdd: Any) -> State:
+def _state_of_link(link: Link, place: Placed, over: State, qd: Any, qdd: Any) -> State:
     pose = place.pose
     axes, d = over.axes @ pose.rotation, over.axes @ pose.l
     spin, velocity, rate, acceleration = over.spin, over.velocity, over.spin_rate, over.acceleration
@@ -208,7 +208,7 @@ def _moved(link: Link, place: Placed, over: State, qd: Any, qdd: Any) -> State:
     return State(axes, over.origin + d, spin, velocity, rate, acceleration)
 
 
-def _carried(link: State, anchor: Seat) -> State:
+def _state_of_anchor(link: State, anchor: Seat) -> State:
     s = link.axes @ anchor.offset
     velocity = link.velocity + cross(link.spin, s)
     acceleration = link.acceleration + cross(link.spin_rate, s) + cross(link.spin, cross(link.spin, s))

@@ -41,7 +41,7 @@ def loop_system(trace: Trace, tau: Callable[[int], Value] | None = None) -> list
     columns = {}
     for i, row in enumerate(constraint_rows(trace)):
         trace.graph.step = f"loop row {i}|m"
-        columns[i] = _loaded(trace, done, row)
+        columns[i] = _rates_of_loads(trace, done, row)
     stores = mirror(weighted_products(trace, *pivots(done), columns))
     return stores + [Store("right", (i,), value) for i, value in enumerate(right)] + _sizes(trace)
 
@@ -52,7 +52,7 @@ def _sizes(trace: Trace) -> list[Store]:
     return [Store("size", (i,), value) for i, value in enumerate(sizes)]
 
 
-def _loaded(trace: Trace, done: dict[int, articulated.Factor], tau: Columns) -> dict[int, list[Value]]:
+def _rates_of_loads(trace: Trace, done: dict[int, articulated.Factor], tau: Columns) -> dict[int, list[Value]]:
     """Return D^-1 [I - H psi K] tau, by link."""
     rates: dict[int, list[Value]] = {}
     forces: dict[int, Vector] = {}

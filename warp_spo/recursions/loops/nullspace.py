@@ -65,7 +65,7 @@ class NullSpace:
             waiting.remove(row)
             left = {c: x for c, x in self._rows[row].items() if c in live}
             self._steps.append(self._reflect(row, left, sizes[row], waiting, live, epsilon))
-        self.basis = [self._turned({column: 1.0}) for column in live]
+        self.basis = [self._reflect_back({column: 1.0}) for column in live]
 
     def _reflect(self, row: int, left: dict, size: Value, waiting: list, live: list, epsilon: float) -> tuple:
         square = guarded(total(x * x for x in left.values()), (LEAST * epsilon) ** 2 * size)
@@ -88,7 +88,7 @@ class NullSpace:
         self._rows[row] = {**self._rows[row], pivot: -sign * norm}
         return row, pivot, -sign * reciprocal(norm), reflection
 
-    def _turned(self, x: dict[int, Value]) -> dict[int, Value]:
+    def _reflect_back(self, x: dict[int, Value]) -> dict[int, Value]:
         for _, _, _, reflection in reversed(self._steps):
             x = x if reflection is None else reflection.apply(x)
         return x
@@ -99,7 +99,7 @@ class NullSpace:
         for row, pivot, inverse, _ in self._steps:
             known = total(self._rows[row].get(column, 0.0) * x for column, x in found.items())
             found[pivot] = (right[row] - known) * inverse
-        return self._turned(found)
+        return self._reflect_back(found)
 
     def multipliers(self, force: Callable[[int], Value]) -> list[Value]:
         """Return mu, by row, with Y* mu = the part of a ``force``, by column, that X* maps to zero."""
