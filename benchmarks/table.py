@@ -153,7 +153,7 @@ def rates(evidence: Evidence) -> str:
 
 
 def beyond(evidence: Evidence) -> str:
-    """What the library does beyond one evaluation of the dynamics, beside those who do the same."""
+    """Return the table of what the library does beyond one evaluation of the dynamics, beside those who do the same."""
     rows = sorted((row for row in evidence.capabilities if "us" in row), key=lambda row: row["group"])
     counts = sorted({row["worlds"] for row in rows})
     if not rows:

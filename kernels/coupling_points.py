@@ -1,6 +1,6 @@
 """Native code of the points of pairs of bodies, for :mod:`.coupling_passes` and :mod:`.coupling_teams`.
 
-What is listed about a pair, such as ``eps_of(pair)``, and the words in capital letters come from those who use it.
+Functions of a pair's listed values, such as ``eps_of(pair)``, and the words in capital letters come from its users.
 """
 
 NATIVE = r"""typedef REAL Triangle[21];  // the lower triangle of a matrix, row after row

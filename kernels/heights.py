@@ -3,8 +3,8 @@
 A contribution is the gradient by the four corners of one cell. Contributions are sorted by cell, stably, so that those
 of a cell are neighbours in the order of worlds and points; contributions of zeros come after all others, and are left
 there. A thread adds up RUN of them, whichever cells they belong to, so that all threads have the same work even where
-all worlds stand on one cell. What it has found when its cell goes on in the next thread's part is that cell's carry. A
-cell's sum is that of its carries, in order, and of its last part.
+all worlds stand on one cell. The sum that it has when its cell goes on in the next thread's part is that cell's carry.
+A cell's sum is that of its carries, in order, and of its last part.
 """
 
 import functools

@@ -126,7 +126,7 @@ class Call:
         device: The device on which the kernels run.
         dtype: ``wp.float32`` or ``wp.float64``.
         kind: Kind of the result if the call reads no array.
-        turn: What the call has to wait for.
+        turn: The turn that the call has to wait for.
 
     Attributes:
         result: The array of :meth:`write` in the caller's kind, or a tuple of them if :meth:`write` was called more

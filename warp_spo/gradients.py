@@ -65,7 +65,7 @@ def is_exported() -> bool:
 
 
 def call_in_graph(*call: Any) -> Any:
-    """Return the result of :func:`warp_spo.torch.call_in_graph`. What torch traces must not meet a cached function."""
+    """Return the result of :func:`warp_spo.torch.call_in_graph`; code that torch traces may call no cached function."""
     from .torch import call_in_graph
 
     return call_in_graph(*call)

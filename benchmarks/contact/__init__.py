@@ -1,4 +1,4 @@
-"""What steps with contacts do and take: times, errors, energy, motions, other engines, gradients, pictures.
+"""Steps with contacts: times, errors, energy, motions, other engines, gradients, pictures.
 
 ``scenes``: robots on the ground. ``steps``: time and error of a step. ``throws``: energy of a million random states.
 ``motions`` and ``courses``: every figure that contacts promise, on a CPU. ``mujoco``: G1 beside MuJoCo, its error

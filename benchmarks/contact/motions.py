@@ -1,4 +1,4 @@
-"""What robots on the ground do: every figure that contacts promise, as asked and as measured, in float64 on the CPU.
+"""Motions of robots on the ground: every figure that contacts promise, as asked and as measured, in float64 on the CPU.
 
     python -m benchmarks.contact.motions [NAME ...] [--json FILE]
 

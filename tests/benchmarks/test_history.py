@@ -183,7 +183,7 @@ def test_a_process_measures_the_package_of_its_folder(tmp_path):
 
 @needs_git
 def test_past_results_become_entries(tmp_path):
-    """What commits say that have been replaced since is in the history, whose page shows it."""
+    """The history holds results of commits that later ones replaced, and its page shows them."""
     done = subprocess.run(["git", "rev-parse", "--is-shallow-repository"], capture_output=True, text=True)
     if done.stdout.strip() == "true":
         pytest.skip("a shallow clone has no past")

@@ -171,7 +171,7 @@ def test_legs_share_one_text_and_the_points_of_the_trunk():
 
 
 def test_passes_compute_no_velocity_terms():
-    """What comes before the passes leaves them, differences a - b that passes take as b - a, too."""
+    """Passes leave out all that comes before them, differences a - b that they take as b - a, too."""
     for name in ("quadruped", "crowded"):
         cuda = known(name, True)[0].cuda
         passes = cuda[cuda.index("turn < (int)passes_row[0]") :]

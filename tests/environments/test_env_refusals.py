@@ -1,4 +1,4 @@
-"""What environments refuse, by name, and what worlds see that are not reset."""
+"""Errors of environments, by name, and observations of worlds that are not reset."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What a custom hinge's pose may be written with: abstract scalars against plain numbers, and splines."""
+"""Functions that a custom hinge's pose may be written with: abstract scalars against plain numbers, and splines."""
 
 import numpy as np
 import pytest

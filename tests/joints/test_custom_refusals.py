@@ -1,4 +1,4 @@
-"""What a custom hinge refuses, and what its errors say."""
+"""Functions that a custom hinge refuses, and the words of its errors."""
 
 import numpy as np
 import pytest

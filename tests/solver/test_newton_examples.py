@@ -31,7 +31,7 @@ def made(model, stiffness=None, **options):
 def run(name, solver, frames, worlds=2, stiffness=None, folder=None, pairs=None, loops="raise", **options):
     """Run an example with SolverSPO where it makes the solver of that name; return the example.
 
-    What its own test finds wrong is raised.
+    Errors that its own test finds are raised.
     """
     module = importlib.import_module(f"newton.examples.{folder or name.split('_')[0]}.example_{name}")
     theirs = getattr(newton.solvers, solver)

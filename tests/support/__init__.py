@@ -1,4 +1,4 @@
-"""What several test files share: scenes, truths to compare with, and checks. No test file imports another one.
+"""Scenes, truths to compare with, and checks that several test files share. No test file imports another one.
 
 Scenes:
     ``zoo`` (trees of every kind of hinge), ``robots``, ``mechanisms`` (closed loops), ``granularity_scenes`` and

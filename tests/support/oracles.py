@@ -5,7 +5,7 @@ velocities ``T(q) qd``: T is the identity for hinges made of screws, and acceler
 knows loops, couplings, damping, stiffness or limits here; armature of ball and free hinges is added outside, since an
 oracle's own belongs to another basis of velocities.
 
-What they cannot represent:
+They cannot represent:
 
 * Pinocchio: nothing of the zoo. A body whose hinge is fixed is lumped into its parent, so it has a pose, not a joint.
 * MuJoCo: helical hinges, free hinges inside the tree (UnsupportedHinge), and moving bodies without mass or with a zero

@@ -24,7 +24,7 @@ class Race(AssertionError):
 
 
 class Text(NamedTuple):
-    """What surrounds and what is in one kernel."""
+    """One kernel: its operation, its layout, its texts and its tables."""
 
     operation: str
     frame: KernelLayout

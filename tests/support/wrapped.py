@@ -4,7 +4,7 @@ import numpy as np
 
 
 class Array:
-    """An array. What a caller may ask for is what the standard of DLPack says, a shape and a dtype."""
+    """An array. Callers may ask for what the standard of DLPack says, a shape and a dtype."""
 
     def __init__(self, inside, device=(1, 0)):
         self.inside, self.device_here = inside, device

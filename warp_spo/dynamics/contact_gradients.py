@@ -1,7 +1,7 @@
 """Gradients of a step with contacts: its passes once more, of which all is kept, and then back through each of them.
 
-A pass is a launch of its own here, so that any number of them needs the same three kernels. What a pass leaves for the
-next one stays in the workspace, [world, dof] and [world, variable] of each pass; steps share it.
+A pass is a launch of its own here, so that any number of them needs the same three kernels. The results of a pass that
+the next one reads stay in the workspace, [world, dof] and [world, variable] of each pass; steps share it.
 """
 
 from __future__ import annotations

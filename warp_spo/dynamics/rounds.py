@@ -32,7 +32,7 @@ INTEGRATE_VJP = Routine("integrate_vjp", adjoints.integrate_vjp)
 
 
 class Round(NamedTuple):
-    """What a round of a step reads and finds.
+    """Inputs and results of a round of a step.
 
     Attributes:
         before, kicked: rates after the step and kick that the round before found; of the first round, those before the

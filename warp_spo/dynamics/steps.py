@@ -294,12 +294,8 @@ def step(
     """
     engine = self._engine
     with engine.call(STEP) as call:
-        if integrator not in INTEGRATORS:
-            raise ValueError(f"{call.name}: integrator is {integrator!r}; expected one of {', '.join(INTEGRATORS)}")
+        _check_integrator(call, integrator, status=status, qdd=qdd)
         outs = engine.outs(call, STEP, out)
-        for name, array in (("status", status), ("qdd", qdd)):
-            if array is not None and integrator != "semi_implicit":
-                raise ValueError(f"{call.name}: {name} with integrator={integrator!r}; expected 'semi_implicit'")
         count = _take_substeps(call.name, {"substeps": substeps})
         reported = contact_f, contact_gap, contact_slip, contact_excess, contact_residual
         asked = dict(zip(contacts.REPORTS, reported, strict=True))
@@ -311,9 +307,8 @@ def step(
         if not given["dt"] > 0.0:
             raise ValueError(f"{call.name}: dt is {given['dt']} s; expected more than zero")
         buffers = actuators.read_state(self, call, actuator_state)
-        states = {name: x for name, x in (("poses", poses), ("velocities", velocities)) if x is not None}
-        states = engine.read(call, STEP, **states)
-        reports = engine.read(call, STEP, **{name: array for name, array in asked.items() if array is not None})
+        states = _read_if_given(self, call, {"poses": poses, "velocities": velocities})
+        reports = _read_if_given(self, call, asked)
         given |= {} if taken is None else {"passes": taken, "reports": reports}
         given["bodies"] = integrators.arrays_of_bodies(self, states) if states else None
         q_out, qd_out = engine.write(call, STEP, outs, given)
@@ -321,6 +316,20 @@ def step(
         given = {name: value for name, value in given.items() if name not in Interval._fields}
         _launch(self, call, integrator, count, interval, given, buffers)
     return call.result
+
+
+def _check_integrator(call: Call, integrator: str, **semi_implicit: Any) -> None:
+    """Raise ValueError if there is no such integrator, or if it cannot write arrays of the semi-implicit step."""
+    if integrator not in INTEGRATORS:
+        raise ValueError(f"{call.name}: integrator is {integrator!r}; expected one of {', '.join(INTEGRATORS)}")
+    for name, array in semi_implicit.items():
+        if array is not None and integrator != "semi_implicit":
+            raise ValueError(f"{call.name}: {name} with integrator={integrator!r}; expected 'semi_implicit'")
+
+
+def _read_if_given(dyn: Dynamics, call: Call, arrays: dict[str, Any]) -> dict[str, wp.array]:
+    """Return the checked arrays that a step fills, by name, of those that are not None."""
+    return dyn._engine.read(call, STEP, **{name: array for name, array in arrays.items() if array is not None})
 
 
 def _launch(

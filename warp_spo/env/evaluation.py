@@ -17,7 +17,7 @@ def roll(env: Env, policy: Policy, steps: int, read: dict[str, Read], command: A
     """Start all worlds anew, and return what ``read`` returns after each step, [step, world, ...] by name.
 
     ``valid`` [step, world]: whether the world's first episode still goes on; ``ended`` [world]: whether it has ended by
-    a termination, not by its length. What is read after the step that ends an episode belongs to the next one.
+    a termination, not by its length. Values read after the step that ends an episode belong to the next one.
     ``command``: held from the first step on; the observation before sees another one.
     """
     observed, _ = env.reset()

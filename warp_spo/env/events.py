@@ -22,7 +22,7 @@ class Reset:
 
     Args:
         change: function of a ``World``, which assigns to entries of ``w.q`` and ``w.qd``. ``w.before`` is the
-            world at the end of the episode. What it keeps with ``w.keep`` stays until the next reset.
+            world at the end of the episode. Values that it keeps with ``w.keep`` stay until the next reset.
         first: None, or a function that keeps what worlds remember for good, when the environment is made.
         levels: names of what worlds remember that say how far they have come; a training that resumes goes on there.
     """

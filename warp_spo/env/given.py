@@ -1,4 +1,4 @@
-"""What an environment is given, checked: its scene, actions, terms, events, and where episodes start."""
+"""Checks of an environment's arguments: its scene, actions, terms, events, and where episodes start."""
 
 from __future__ import annotations
 

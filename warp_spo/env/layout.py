@@ -1,4 +1,4 @@
-"""What the stages of an environment agree on while they are traced: memory, frames, values, counts."""
+"""The layout that the stages of an environment share while they are traced: memory, frames, values, counts."""
 
 from __future__ import annotations
 

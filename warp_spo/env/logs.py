@@ -1,4 +1,4 @@
-"""What an environment says of itself: means over finished episodes, counts of bad numbers, what a step consists of."""
+"""Logs of an environment: means over finished episodes, counts of bad numbers, and the parts of a step."""
 
 from __future__ import annotations
 

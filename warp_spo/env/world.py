@@ -34,7 +34,7 @@ class Frame(NamedTuple):
 
 
 class Imu(NamedTuple):
-    """What an inertial measurement unit in a frame measures, in the frame's axes.
+    """Measurements of an inertial measurement unit in a frame, in the frame's axes.
 
     Attributes:
         acceleration: of its origin less gravity (3,) [m/s^2]. rate: angular velocity (3,) [rad/s].
@@ -233,7 +233,7 @@ class World:
 
     @property
     def joint_force(self) -> Vector:
-        """What actuators, drives and efforts do, as actions command, in the state after the step [dof] [N m or N]."""
+        """Force of actuators, drives and efforts, as actions command, in the state after the step [dof] [N m or N]."""
         arrays, count = self._layout.action_arrays, self.scene.dof_count
         total = vector(0.0 for _ in range(count))
         if "ctrl" in arrays:

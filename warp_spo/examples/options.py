@@ -29,7 +29,7 @@ POINTS, LEAST = 50, 1e-18  # of a line of errors: how many points, and the small
 def command(main):
     """Run ``main`` of an example from the command line. Its arguments are options, its module's docstring the help.
 
-    What is wrong with an option is one line on stderr, and the exit code is 2.
+    An error of an option is one line on stderr, and the exit code is 2.
     """
     module = sys.modules[main.__module__]
     parser = Parser(

@@ -1,4 +1,4 @@
-"""What all programs of a scene are built from: links, the layout of a kernel's arrays, tables, and the last step."""
+"""Parts of which all programs of a scene are built: links, the layout of a kernel's arrays, tables, the last step."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Program(NamedTuple):
 
 
 class Job(NamedTuple):
-    """What a program is to compute.
+    """The task of a program.
 
     Attributes:
         routine: its routine.

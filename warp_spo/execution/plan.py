@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 from ..errors import UnsupportedError
 from ..kernels.slots import WARP_SIZE
@@ -242,19 +243,8 @@ def choose(
     Raises:
         ValueError: no such granularity or recursion, or a scan at another granularity than "node".
     """
-    for name, value, known in (("granularity", granularity, GRANULARITIES), ("recursion", recursion, RECURSIONS)):
-        if value is not None and value not in known:
-            raise ValueError(f"Dynamics: {name} is {value!r}; expected None or one of {', '.join(known)}")
-    if recursion == "scan" and granularity not in (None, "node"):
-        raise ValueError(
-            f"Dynamics: recursion is 'scan' and granularity is {granularity!r}; expected granularity 'node' or None, "
-            f"because kernels of other granularities sweep"
-        )
+    _check_options(scene, granularity, recursion)
     shared = scene.shares_dofs
-    if shared and (granularity in ("node", "segment") or recursion == "scan"):
-        option = f"granularity={granularity!r}" if granularity else "recursion='scan'"
-        what, way = f"{option} for a scene with flexible bodies or rotors", "use granularity=None or 'tree'"
-        raise UnsupportedError("Dynamics", what, way if granularity else "leave recursion out")
     asked = "tree" if shared else granularity or ("node" if recursion == "scan" else DEFAULT)
     side_by_side = device.cuda and not shared and asked != "node" and 0 < scene.dof_count <= MOST_DOFS
     pieces = Pieces(Links(scene)) if side_by_side else None
@@ -268,18 +258,15 @@ def choose(
     staged = scene.dof_count > rows and worlds > device.scaled(
         FEW_WORLDS if scene.dof_count <= LONG_ROWS else FEW_WORLDS // 16
     )
-    outward, first = [], 0
-    for level in scene.tree.levels:
-        outward.append((first, len(level)))
-        first += len(level)
     apart = side_by_side and not varies and _takes_velocities_first(scene, "tree" if limbs == 1 else chosen, dtype)
-    levels, dofs = tuple(outward), scene.dof_count
     if recursion is not None:
         stretch = STRETCH if recursion == "scan" else 0, ASKED
-    elif chosen != "node" or not dofs:
+    elif chosen != "node" or not scene.dof_count:
         stretch = 0, ""
     else:
         stretch = (0, "granularity is asked for") if asked else _stretch(scene, worlds, device, varies)
+    sizes = [len(level) for level in scene.tree.levels]
+    levels = tuple(zip(itertools.accumulate(sizes, initial=0), sizes, strict=False))
     return Plan(
         chosen,
         reason,
@@ -289,13 +276,29 @@ def choose(
         worlds,
         device,
         dtype,
-        dofs,
+        scene.dof_count,
         limbs,
         alike,
         apart,
         varies,
         *stretch,
     )
+
+
+def _check_options(scene: Scene, granularity: str | None, recursion: str | None) -> None:
+    """Raise an error if there is no such granularity or recursion, or none such of the scene."""
+    for name, value, known in (("granularity", granularity, GRANULARITIES), ("recursion", recursion, RECURSIONS)):
+        if value is not None and value not in known:
+            raise ValueError(f"Dynamics: {name} is {value!r}; expected None or one of {', '.join(known)}")
+    if recursion == "scan" and granularity not in (None, "node"):
+        raise ValueError(
+            f"Dynamics: recursion is 'scan' and granularity is {granularity!r}; expected granularity 'node' or None, "
+            f"because kernels of other granularities sweep"
+        )
+    if scene.shares_dofs and (granularity in ("node", "segment") or recursion == "scan"):
+        option = f"granularity={granularity!r}" if granularity else "recursion='scan'"
+        what, way = f"{option} for a scene with flexible bodies or rotors", "use granularity=None or 'tree'"
+        raise UnsupportedError("Dynamics", what, way if granularity else "leave recursion out")
 
 
 def _stretch(scene: Scene, worlds: int, device: DeviceFacts, varies: bool) -> tuple[int, str]:

@@ -18,7 +18,7 @@ def _always(*_: Any, **__: Any) -> bool:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Routine:
-    """What one kernel computes. Plan, programs and messages read these facts; they know no routine by its name.
+    """A computation of one kernel. Plan, programs and messages read these facts; they know no routine by its name.
 
     Attributes:
         name: name of the kernel.

@@ -37,7 +37,7 @@ BODIES = "bodies"  # option of a step by limbs whose kernel writes the states of
 
 
 class Traced(NamedTuple):
-    """What the work on one piece stores.
+    """The stores of the work on one piece.
 
     Attributes:
         stores: what its trace returns.

@@ -72,10 +72,7 @@ def choose_layout(
     numbers = tuple(name for name, shape in shapes.items() if (name in used or name == SUBSTEPS) and not shape)
     out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
     dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
-    read_by_others = ["q", "body_f", "ctrl"]  # entries that another piece than the one that writes them may read last
-    read_by_others += ["qd"] if warps > 1 and "ctrl" in used else []
-    over = [row.name for row in rows if row.entries == out.entries and row.name not in read_by_others]
-    over = [name for name in over if is_read_before_written(stores, everything, name)]
+    over = _rows_to_write_over(rows, out, stores, everything, ("qd",) if warps > 1 and "ctrl" in used else ())
     slots = count_slots(stores)
     fields = {name: tuple(sorted(used[name])) for name in FIELDS if name in used}
     cached = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
@@ -115,6 +112,18 @@ def choose_layout(
         for entries in cached[::-1]
     ]
     return next((layout for layout in layouts if layout.fits(T, room)), layouts[-1])
+
+
+def _rows_to_write_over(
+    rows: list[Row], out: Row, stores: list[Store], everything: list[Store], late: Sequence[str]
+) -> list[str]:
+    """Return the names of rows as long as the result's of which each entry is read before the result's is written.
+
+    ``late``: rows of which a piece may read an entry after another piece has written it; others are always such.
+    """
+    late = (*late, "q", "body_f", "ctrl")
+    long_enough = [row.name for row in rows if row.entries == out.entries and row.name not in late]
+    return [name for name in long_enough if is_read_before_written(stores, everything, name)]
 
 
 def _may_write_early(rows: list[Row], out: Row) -> bool:

@@ -118,7 +118,7 @@ class Team:
 
     @property
     def texts(self) -> list[tuple[str, ...]]:
-        """What is equal for pieces that share their code, by piece."""
+        """The texts that are equal for pieces that share their code, by piece."""
         return [self._work[piece.index].text for piece in self.pieces.pieces]
 
     @property

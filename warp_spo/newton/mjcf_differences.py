@@ -13,7 +13,7 @@ APART = "give each joint a body of its own, nested in the order of the joints"
 
 
 class File:
-    """What holds for a whole MJCF file.
+    """An MJCF file, and the settings that hold for all of it.
 
     Args:
         root: its tree.

@@ -42,8 +42,8 @@ class ModelArrays:
         worlds: The rows of its worlds.
         state: How its state is laid out.
         factors: 1 or 0 for each dof [dof], for the gains that count only in some modes of a drive.
-        sources: What turns arrays of the model into values of the contacts that the solver computes, by name; {} if
-            it computes none.
+        sources: Functions that turn arrays of the model into values of the contacts that the solver computes, by
+            name; {} if it computes none.
 
     Attributes:
         used: The copies by name.

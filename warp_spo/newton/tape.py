@@ -65,7 +65,7 @@ class StepGradients:
         model: The Newton model.
         dynamics: Its dynamics.
         layouts: How Newton's arrays are laid out.
-        forces, drives, arrays: What turns Newton's forces, targets and values into those of the dynamics.
+        forces, drives, arrays: Objects that turn Newton's forces, targets and values into those of the dynamics.
         passes: Of steps with contacts. prepare: Called before the backward pass of a step, by launches alone.
     """
 

@@ -58,8 +58,8 @@ def _rows(link: Link, places: dict[int, Placed], column: int, n: Vector, f: Vect
 def own_entries(link: Link, place: Placed, body: Rigid) -> dict[tuple[int, int], Value]:
     """H R H* + Delta of the link's own dofs, upper triangle.
 
-    What turns by a quaternion has R in the axes of its rates, where its mass is exact. R in the link's axes is the same
-    but for rounding: a float32 rotation is off by 1e-7 from its inverse.
+    A link that turns by a quaternion has R in the axes of its rates, where its mass is exact. R in the link's axes is
+    the same but for rounding: a float32 rotation is off by 1e-7 from its inverse.
     """
     if place.turned is not None:
         body = Pose(None, place.turned, ZERO).rigid_to_parent(body)

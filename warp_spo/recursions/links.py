@@ -1,8 +1,8 @@
 """Links: a scene as the recursions see it, one degree of freedom at a time, constants folded.
 
 A hinge that is a sequence of elementary ones becomes a chain of links without inertia, the last one with the body's;
-each has one elementary hinge, an object of :mod:`warp_spo.hinges`, and its axis along its own z axis. What a fixed
-hinge carries belongs to the link under it, so that a body that does not move costs nothing.
+each has one elementary hinge, an object of :mod:`warp_spo.hinges`, and its axis along its own z axis. A body
+on a fixed hinge belongs to the link under it, so that a body that does not move costs nothing.
 
 Variable values are symbols here. An operation works on a copy whose quantities are read from tables: what depends on
 the scene's values alone is computed once when they are set, not in every call.
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 MOTION_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c", "joint_armature", "gravity")
 LINK_VALUES = (*MOTION_VALUES, "body_gravcomp")
 TABLES = ("value", "node_value", "lost_value")
-"""What links are made of; what bodies are by themselves, for the operators; see :meth:`Links.lost_values`."""
+"""Tables: values of links; values of bodies by themselves, for the operators; see :meth:`Links.lost_values`."""
 BOUNDS = (*RANGES, "joint_limit_lower", "joint_limit_upper", "joint_effort_limit", "joint_velocity_limit")
 NOTHING = Rigid(0.0, ZERO, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 PRICES = (6, 10, 10, 10, 4, 4, 4, 8, 8, 8)  # of mass, first moment, moments and products of inertia

@@ -83,8 +83,8 @@ def root_force(
 ) -> list[Value]:
     """The same for a free link on the inertial frame that carries ``mass``, itself included, and accelerates with v.
 
-    What gives all of the mass one acceleration is most of f. It never enters the link's axes: a rotation in float32 is
-    off by 1e-7 from its inverse, and f would be so too.
+    The force that gives all of the mass one acceleration is most of f. It never enters the link's axes: a rotation in
+    float32 is off by 1e-7 from its inverse, and f would be so too.
     """
     forces = hinge_force(link, place, n, f - v * mass, qdd)
     return [*(Vector(forces[:3]) + root_acceleration(link, base, qdd)[1] * mass), *forces[3:]]

@@ -401,7 +401,7 @@ class Stand(Stored):
 def contact_values(scene: Any) -> dict[str, np.ndarray]:
     """Return the values of a scene that come from its contacts, [1, point] by name, and from its ground.
 
-    What is None is chosen.
+    Values that are None are chosen.
     """
     points = scene.contact_points
     values = {name: np.zeros((1, scene.contact_count)) for name in CONTACT_VALUES}

@@ -20,7 +20,7 @@ def branch_of(scalar: Scalar) -> tuple:
 def find_blocks(needed: list[Scalar], used: Container[tuple]) -> dict[tuple, Sides]:
     """Return, by branch, the scalars that only the values of this branch need, and only the others, in their order.
 
-    What a kernel reads stays outside, because statements before the branch may write over it.
+    Inputs of a kernel stay outside, because statements before the branch may write over them.
 
     Args:
         needed: the scalars of a region. used: the keys of those that are stored, used later, or known.

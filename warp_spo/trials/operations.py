@@ -25,7 +25,7 @@ __all__ = ["APPLICATIONS", "DT", "FRAME_POSE", "INPUTS", "OPERATIONS", "TOLERANC
 __all__ += ["every_other", "rotations", "two_frames"]
 TOLERANCE = {
     # Largest error of an operation that counts as correct. Rounding grows with depth and with the condition of the mass
-    # matrix; Newton's robots reach 3e-6 and 1e-14. What is wrong, and not rounded, is off by 1e-2 or more.
+    # matrix; Newton's robots reach 3e-6 and 1e-14. A wrong result, not a rounded one, is off by 1e-2 or more.
     "float32": 1e-4,
     "float64": 1e-10,
 }

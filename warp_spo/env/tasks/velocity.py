@@ -1,4 +1,4 @@
-"""What the tasks of velocity tracking share: observations, rewards and events as mjlab's velocity task has them."""
+"""Common parts of the tasks of velocity tracking: observations, rewards and events as in mjlab's velocity task."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ACTOR = (
     ("last action", obs.last_action, 1.0, 0.0),
     ("command", obs.command, 1.0, 0.0),
 )
-"""What the actor sees: name, term, scale, and the size of the noise before scaling."""
+"""Observations of the actor: name, term, scale, and the size of the noise before scaling."""
 
 
 def observed(feet: Any, *more: Any) -> dict[str, list]:

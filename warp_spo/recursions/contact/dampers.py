@@ -1,4 +1,4 @@
-"""What the contacts of one link add to it in a pass: dampers to its articulated inertia, and loads to the force on it.
+"""Dampers and loads that the contacts of one link add, in a pass, to its articulated inertia and to the force on it.
 
 The part across is that of point masses, as many as points, and adds up to one rigid inertia. The part along a normal
 that several points share, as all do on a plane, depends on sums of m, m r and m r r* only.

@@ -179,8 +179,8 @@ def corner_steps(ground: HeightField) -> tuple[int, ...]:
 def by_cell(heights: np.ndarray) -> np.ndarray:
     """Return the table of cells of heights [..., x, y]: the corners of each in :class:`Corners`' order [..., x, y, 4].
 
-    What a point needs of a field lies together so. A cell has the number of its first corner; the numbers of the last
-    points along x and y are no cells, and nothing reads their rows.
+    All that a point needs of a field lies together so. A cell has the number of its first corner; the numbers of the
+    last points along x and y are no cells, and nothing reads their rows.
     """
     far = np.concatenate([heights[..., 1:, :], heights[..., -1:, :]], axis=-2)
     beside = [np.concatenate([each[..., 1:], each[..., -1:]], axis=-1) for each in (heights, far)]

@@ -24,7 +24,7 @@ class Touch(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a pass finds of a point.
+    """Results of a pass for a point.
 
     Attributes:
         force, slip: force on it, and its speed along the ground.

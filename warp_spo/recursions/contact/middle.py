@@ -1,4 +1,4 @@
-"""What velocity terms add to the rates in a step with contacts: half before its passes, half after them.
+"""Kicks: what velocity terms add to the rates in a step with contacts, half before its passes, half after them.
 
 Velocity terms at the state before a step do not do the work by which the kinetic energy changes along its path: limbs
 that whirl gain energy. Of a step

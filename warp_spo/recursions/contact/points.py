@@ -116,7 +116,7 @@ class Point:
 
 
 class Carried(NamedTuple):
-    """What links that carry points know at qdd = 0, in their axes.
+    """Motion at qdd = 0 of a link that carries points, in its axes.
 
     Attributes:
         axes: the directions of the ground. origins: where the link's origin is along them. twist: (omega; v).
@@ -157,19 +157,8 @@ def place_points(
     asked = directions(ground)
     count = len(asked)
     asked = [*asked, *IDENTITY] if oriented and count < len(IDENTITY) else asked
-    carried: dict[int | None, Carried] = {None: Carried(asked, [0.0] * count, still, None, still, still)}
-    for link in trace.active_links:
-        if id(link) not in needed:
-            continue
-        trace.label(link, "n")
-        over, place = carried[None if link.parent is None else id(link.parent)], trace.places[id(link)]
-        axes = [place.pose.to_child(axis) for axis in over.axes]
-        origins = [at + dot(axis, place.pose.l) for at, axis in zip(over.origins, over.axes, strict=False)]
-        twist = carried_velocity(place, over.twist, hinge_motion(link, place, qd))
-        travel = carried_velocity(place, over.travel, hinge_motion(link, place, path)) if half_way else twist
-        move = link_motion(link, place, over.motion, path)
-        own = Carried(axes, origins, twist, move, link_acceleration(link, place, move, over.bend, zero), travel)
-        carried[id(link)] = own if carry is None else carry(link, own)
+    base = Carried(asked, [0.0] * count, still, None, still, still)
+    carried = _carry_outward(trace, base, needed, qd, path, carry)
     found = []
     for number, (on, centre) in seats.items():
         point, mine = scene.contact_points[number], carried[None if on is None else id(on)]
@@ -205,6 +194,34 @@ def place_points(
             state = turned, below, push, cell, near if branches else None, lever
             found.append(Point(number, on, arm, inward, -depth, mine.twist, *material, *state))
     return found
+
+
+def _carry_outward(
+    trace: Trace,
+    base: Carried,
+    needed: set[int],
+    qd: Callable[[int], Value],
+    path: Callable[[int], Value],
+    carry: Callable[[Link, Carried], Carried] | None,
+) -> dict[int | None, Carried]:
+    """Return what the ``needed`` links carry, by id, from the ``base`` outward; that is under None.
+
+    ``path``: the rates along which q moves in the step; qd itself where that is no other path.
+    """
+    carried: dict[int | None, Carried] = {None: base}
+    for link in trace.active_links:
+        if id(link) not in needed:
+            continue
+        trace.label(link, "n")
+        over, place = carried[None if link.parent is None else id(link.parent)], trace.places[id(link)]
+        axes = [place.pose.to_child(axis) for axis in over.axes]
+        origins = [at + dot(axis, place.pose.l) for at, axis in zip(over.origins, over.axes, strict=False)]
+        twist = carried_velocity(place, over.twist, hinge_motion(link, place, qd))
+        travel = carried_velocity(place, over.travel, hinge_motion(link, place, path)) if path is not qd else twist
+        move = link_motion(link, place, over.motion, path)
+        own = Carried(axes, origins, twist, move, link_acceleration(link, place, move, over.bend, zero), travel)
+        carried[id(link)] = own if carry is None else carry(link, own)
+    return carried
 
 
 def surface_numbers(scene: Scene, varies: bool) -> list[range]:

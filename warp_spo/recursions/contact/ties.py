@@ -68,7 +68,7 @@ def flies(link: Link) -> bool:
 
 
 class Plan:
-    """What carries each link, which are aggregated, and in which order they are eliminated.
+    """The carrier of each link, the links that are aggregated, and the order in which they are eliminated.
 
     Args:
         links: the scene's. couples: of :func:`couples_of`. flies: whether a link's own dofs may be replaced.
