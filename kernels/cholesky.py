@@ -4,6 +4,8 @@ import functools
 
 import warp as wp
 
+from .elementary import EPSILON
+
 
 @functools.cache
 def inverse(T) -> wp.Kernel:
@@ -12,7 +14,7 @@ def inverse(T) -> wp.Kernel:
     A pivot is D(k) = W(k) A W(k)* for row k of W, so the terms that cancel in it are at most
     (sum of |W(k, i)| sqrt(A(i, i)))^2. The world becomes NaN if a pivot is not above 16 roundings of that bound.
     """
-    least = T(16.0 * (2.0**-23 if T is wp.float32 else 2.0**-52))
+    least = T(16.0 * EPSILON[T])
 
     @wp.kernel(module=f"warp_spo_cholesky_{T.__name__}", enable_backward=False)
     def kernel(A: wp.array3d[T], size_out: wp.array2d[T], out: wp.array3d[T]):

@@ -9,6 +9,7 @@ inverse root are approximations of the hardware with one Newton step (two in flo
 import warp as wp
 
 C_TYPE: dict[type, str] = {wp.float32: "float", wp.float64: "double"}
+EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}  # of one unit in the last place
 FUSED = """
 #if defined(__CUDA_ARCH__)
 #define FUSED_float(a, b, c) __fmaf_rn(a, b, c)

@@ -5,10 +5,10 @@ from typing import Any
 
 import warp as wp
 
+from .elementary import EPSILON
 from .status import NOT_FINITE, OK, PIVOT, inputs_finite
 
 NOT_SETTLED, LOOPS, OPEN = 5, 6, 7  # as warp_spo.Status, which kernels cannot import; a test compares
-EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
 JACOBI_SWEEPS = 10  # their convergence is quadratic; 36 rows need 6 to 8
 NOISE = 32.0  # eigenvalues below NOISE * rows * eps times the largest one count as zero
 

@@ -23,10 +23,9 @@ import types
 import warp as wp
 
 from .articulated import dof_elimination
+from .elementary import EPSILON
 from .stretches import Stretches
 from .topology import Topology
-
-EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
 
 
 @functools.cache

@@ -16,11 +16,11 @@ from typing import Any
 
 import warp as wp
 
+from .elementary import EPSILON
 from .kinematics import SCREWS
 from .topology import Topology
 
 OK, PIVOT, NOT_FINITE, DIGITS, RANGE = range(5)  # as warp_spo.Status, which kernels cannot import; a test compares
-EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
 NORMAL = {
     wp.float32: (2.0**-126, 2.0**127),
     wp.float64: (2.0**-1022, 2.0**1023),
