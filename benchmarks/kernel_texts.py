@@ -37,6 +37,7 @@ from .contact import scenes
 
 WORLDS = (1, 4096, 65536)
 MANY_WORLDS = 1 << 18  # beyond every world count at which a plan changes
+MOST_ENTRIES = 1 << 30  # of a result, which takes memory though nothing is launched
 FRAMES = {"frames": [0, (0, (0.1, -0.05, 0.2, 0.0, 0.0, 0.0, 1.0))]}
 GIVEN = ("body_f", "status", "qdd", "target_q", "target_qd")
 
@@ -157,11 +158,12 @@ def subjects() -> Iterator[tuple[str, Callable[[], spo.Dynamics]]]:
 
 def calls(dyn: spo.Dynamics) -> Iterator[tuple[str, Callable[[], Any]]]:
     """Every call that generates kernels."""
-    size = dyn.worlds * dyn.scene.dof_count**2
+    dofs, bodies = dyn.scene.dof_count, dyn.scene.body_count
+    entries = {"mass_matrix_derivative": 4 * dofs**3, "inverse_dynamics_regressor": 10 * dofs * bodies}
     declared = {name: one for name, one in dynamics.OPERATIONS.items() if one.results}
     for operation in (name for name, one in declared.items() if not one.product):
         more = FRAMES if "frames" in (option.name for option in declared[operation].options) else {}
-        if operation == "mass_matrix_derivative" and size * dyn.scene.dof_count > 1 << 28:
+        if dyn.worlds * entries.get(operation, 0) > MOST_ENTRIES:
             continue
         yield operation, lambda operation=operation, more=more: dyn.prepare(operation, **more)
         optional = {
