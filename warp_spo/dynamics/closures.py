@@ -30,6 +30,11 @@ if TYPE_CHECKING:
     from .dynamics import Dynamics
 
 LOOPS = ("raise", "cut", "embed", "multipliers")
+AMID_CONTACTS = (
+    "use loops='cut', which leaves them open, and hold what follows by drives: target_q = ratio q + offset, see the "
+    "page on closed loops; or leave the contacts out, scene.with_contacts([]), and loops='embed' closes them"
+)
+"""What to do with the loops of a scene that has contacts."""
 FORWARD_DYNAMICS = Routine("embedded_forward_dynamics", embedded.forward_dynamics)
 PROJECT_POSITION = Routine("project_position", projection.project_position)
 PROJECT_VELOCITY = Routine("project_velocity", projection.project_velocity)
@@ -180,8 +185,14 @@ def check_loops(scene: Scene, loops: str) -> None:
     """Raise ValueError unless ``loops`` says what to do with the loops of the scene."""
     if loops not in LOOPS:
         raise ValueError(f"Dynamics: loops is {loops!r}; expected one of {', '.join(LOOPS)}")
-    if scene.ties and loops == "raise":
+    if not scene.ties or loops != "raise":
+        return
+    if scene.contacts:
         raise ValueError(
-            f"Dynamics: the scene has {scene.ties}; expected a tree; loops='cut' leaves them open, loops='embed' and "
-            f"loops='multipliers' close them"
+            f"Dynamics: the scene has {scene.ties}, and contacts, with which no step closes them; expected a tree; "
+            f"{AMID_CONTACTS}"
         )
+    raise ValueError(
+        f"Dynamics: the scene has {scene.ties}; expected a tree; loops='cut' leaves them open, loops='embed' and "
+        f"loops='multipliers' close them"
+    )

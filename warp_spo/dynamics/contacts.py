@@ -14,6 +14,7 @@ from ..recursions.contact.pair_pieces import by_limbs
 from ..recursions.contact.pairs import RESIDUAL, default_passes
 from ..scene.contacts import HeightField, contact_figures
 from . import integrators
+from .closures import AMID_CONTACTS
 from .operation import Argument
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def refuse(dyn: Dynamics, call: Call, integrator: str) -> None:
     if integrator != "semi_implicit":
         raise UnsupportedError(call.name, f"integrator={integrator!r} with contacts", "use 'semi_implicit'")
     if dyn.closed:
-        raise UnsupportedError(call.name, "closing loops in a scene with contacts", "use loops='cut'")
+        raise UnsupportedError(call.name, "closing loops in a scene with contacts", AMID_CONTACTS)
     if forced == "node":
         raise UnsupportedError(call.name, f"granularity={forced!r} with contacts", "use another one, or leave it out")
     if forced == "segment" and dyn.scene.contact_pairs and not by_limbs(dyn.scene):

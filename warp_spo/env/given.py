@@ -52,7 +52,10 @@ def checked_scene(scene: Any) -> Scene:
     if not isinstance(scene, Scene):
         raise TypeError(f"Env: scene is {type(scene).__name__}; expected spo.Scene")
     if scene.ties:
-        way_out = "leave them out of the scene; spo.Dynamics(scene, loops=...) steps it outside of environments"
+        way_out = (
+            "pass scene.without_loops(), and hold followers by drives, as the page on closed loops says; "
+            "spo.Dynamics(scene, loops=...) closes them outside of environments"
+        )
         raise UnsupportedError("Env", f"a scene with {scene.ties}", way_out)
     return scene
 

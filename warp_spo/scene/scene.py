@@ -378,6 +378,12 @@ class Scene(Stored):
         scene.values = MappingProxyType({**self.values, **contact_values(scene)})
         return scene
 
+    def without_loops(self) -> Scene:
+        """Return a copy of the scene without its loop joints and couplings: an open tree with all its joints."""
+        scene = object.__new__(Scene)
+        scene.__dict__.update(self.__dict__, loops=(), couplings=())
+        return scene
+
     def _set_contacts(self, contacts: Sequence[Contact], ground: Plane | HeightField | None) -> None:
         self.contacts: tuple[Contact, ...] = _parts("contacts", contacts, Contact)
         check_contacts(self.contacts, ground, self.bodies)
