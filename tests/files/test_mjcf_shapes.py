@@ -132,3 +132,42 @@ def test_friction_that_differs_across_is_said_to_be_left_out(tmp_path):
         assert [str(each.message).partition("left out: ")[2] for each in said] == left_out * [
             "the friction 0.9 across of a contact pair of geom 'ball', which has 0.3 in all directions"
         ]
+
+
+RUBBED = """<mujoco><default><geom friction="0.6"/><pair friction="0.35 0.35"/><default class="smooth">
+ <geom friction="0.1"/><pair condim="1"/></default></default><worldbody>
+ <geom name="floor" type="plane" size="1 1 1" {floor}/><body><freejoint/><geom name="plain" size="0.1"/>
+ <geom name="one" size="0.1" condim="1"/><geom name="rough" size="0.1" friction="0.9" margin="0.02"/>
+ <geom name="first" size="0.1" friction="0.3" priority="2"/><geom name="slick" size="0.1" class="smooth"/>
+ <geom name="listed" size="0.1" margin="0.5" contype="0" conaffinity="0"/>
+ <geom name="wet" size="0.1"/></body></worldbody><contact>
+ <pair geom1="floor" geom2="listed" margin="0.07" friction="0.45 0.45" condim="3"/>
+ <pair geom1="wet" geom2="floor" class="smooth"/></contact></mujoco>"""
+FLOORS = ["", 'friction="0.8" condim="1"', 'friction="0.2" priority="1" condim="4" margin="0.05"', 'priority="2"']
+"""Under a margin of the floor, the pairs have less than it or more."""
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+def test_friction_and_margins_are_mujocos_without_mujoco(floor, tmp_path):
+    """The larger of both, or that of higher priority, zero in contacts of one dimension; a pair has its own."""
+    file = tmp_path / "rubbed.xml"
+    file.write_text(RUBBED.format(floor=floor))
+    wanted, found = spo.load(file, contacts=True), mjcf.read_mjcf(file, None, True, Choice(True, None, 8))
+    assert len(wanted.contacts) == 7 and len({contact.friction for contact in wanted.contacts}) > 2
+    for one, other in zip(wanted.contacts, found.contacts, strict=True):
+        assert one.label == other.label.rpartition("/")[2]
+        assert other.friction == pytest.approx(one.friction, abs=1e-7)
+        assert other.radius + found.ground.height == pytest.approx(one.radius + wanted.ground.height, abs=1e-7)
+
+
+def test_a_height_field_is_refused_without_mujoco(tmp_path):
+    file = tmp_path / "field.xml"
+    file.write_text(
+        '<mujoco><asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1" elevation="0 0 0 1"/></asset><worldbody>'
+        '<geom type="hfield" hfield="h"/><body><freejoint/><geom size="0.1"/></body></worldbody></mujoco>'
+    )
+    with pytest.raises(spo.UnsupportedError, match=r"a height field that Newton's importer does not read"):
+        mjcf.read_mjcf(file, None, True, Choice(True, None, 8))
+    own = spo.HeightField(np.zeros((2, 2)), 1.0)
+    assert mjcf.read_mjcf(file, None, True, Choice(True, own, 8)).ground is own
+    assert spo.load(file, contacts=True).ground.heights.max() == 1.0

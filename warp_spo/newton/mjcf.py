@@ -8,8 +8,10 @@ does not read, and for features that it misreads. It is written anew where the i
 from __future__ import annotations
 
 import copy
+import dataclasses
 import warnings
 import xml.etree.ElementTree as ET
+from collections.abc import Callable
 from pathlib import Path
 
 import newton
@@ -17,12 +19,14 @@ import warp as wp
 
 from ..errors import UnsupportedError
 from ..scene.scene import Scene
-from ..scene.shapes import NONE, Choice, Shape, Touches
+from ..scene.shapes import NONE, Choice, On, Shape, Touches
 from .imported import scene_of, unreadable
-from .mjcf_differences import MISREAD, find_misread, left_out
+from .mjcf_differences import MISREAD, find_misread, left_out, mjcf_classes
 from .worlds import quote_labels
 
 MASKS = ("contype", "conaffinity")
+DEFAULTS = {"contype": 1, "conaffinity": 1, "condim": 3, "geom_priority": 0}
+"""What the importer reads of geoms, and what they have where a file says nothing."""
 
 
 def mjcf_tree(file: Path) -> ET.Element:
@@ -79,24 +83,74 @@ def contact_rule(root: ET.Element, builder: newton.ModelBuilder) -> Touches:
     A <pair> of their geoms counts first, then an <exclude> of the body and the world, which Newton 1.8 does not read,
     then the masks of both. Shapes of pairs get a group in the builder, so that they collide whatever their masks say.
     """
-    name = lambda label: label.rpartition("/")[2]  # noqa: E731
-    pairs = {frozenset((pair.get("geom1", ""), pair.get("geom2", ""))) for pair in root.iterfind("contact/pair")}
+    pairs = _pairs(root)
     for i, label in enumerate(builder.shape_label):
         if any(name(label) in pair for pair in pairs):
             builder.shape_collision_group[i] = 1
     excludes = [{exclude.get("body1"), exclude.get("body2")} for exclude in root.iterfind("contact/exclude")]
     parted = {body for bodies in excludes if "world" in bodies for body in bodies}
-    contype, conaffinity = (dict(builder.custom_attributes[f"mujoco:{mask}"].values or {}) for mask in MASKS)
+    own = _attributes(builder)
 
     def touches(shape: Shape, ground: Shape) -> bool:
         if frozenset((name(shape.label), name(ground.label))) in pairs:
             return True
         if name(shape.label.rpartition("/")[0]) in parted:
             return False
-        one, other = ((contype.get(each.index, 1), conaffinity.get(each.index, 1)) for each in (shape, ground))
+        one, other = ([own(each, mask) for mask in MASKS] for each in (shape, ground))
         return bool(one[0] & other[1] | other[0] & one[1])
 
     return touches
+
+
+def material_rule(root: ET.Element, builder: newton.ModelBuilder) -> On:
+    """Return a function that gives a shape the friction and the margin that MuJoCo gives it on a ground.
+
+    The friction is that of the geom of higher priority, or the larger of both; zero where a contact has one dimension.
+    A <pair> has its own, whatever its geoms have.
+    """
+    pairs, own = _pairs(root), _attributes(builder)
+
+    def on(shape: Shape, ground: Shape | None) -> Shape:
+        both = [shape] if ground is None else [shape, ground]
+        pair = pairs.get(frozenset(name(each.label) for each in both))
+        if ground is not None and pair is not None:
+            value, dimensions = float((pair.get("friction") or "1").split()[0]), int(pair.get("condim", 3))
+            rounding = float(pair.get("margin", 0.0)) - ground.rounding  # that of the ground is in its height
+            if rounding < 0.0 and (shape.kind not in ("sphere", "capsule") or shape.sizes[0] + rounding < 0.0):
+                what = (
+                    f"the contact pair of geom {name(shape.label)!r}, whose margin is smaller than that of the ground,"
+                )
+                raise UnsupportedError("load", what, "install the package mujoco, or give it the ground's")
+            shape = dataclasses.replace(shape, rounding=rounding)
+        else:
+            first = max(own(each, "geom_priority") for each in both)
+            count = [each for each in both if own(each, "geom_priority") == first]
+            value, dimensions = max(each.friction or 0.0 for each in count), max(own(each, "condim") for each in count)
+        return dataclasses.replace(shape, friction=value if dimensions > 1 else 0.0)
+
+    return on
+
+
+def name(label: str) -> str:
+    """Return the name of an element by its label."""
+    return label.rpartition("/")[2]
+
+
+def _pairs(root: ET.Element) -> dict[frozenset[str], dict[str, str]]:
+    """Return the attributes of the explicit pairs of an MJCF tree, those of their classes included, by their geoms."""
+    classes = mjcf_classes(root)
+    found = {}
+    for pair in root.iterfind("contact/pair"):
+        defaults = classes.get(pair.get("class", "main"), {}).get("pair", {})
+        found[frozenset((pair.get("geom1", ""), pair.get("geom2", "")))] = defaults | pair.attrib
+    return found
+
+
+def _attributes(builder: newton.ModelBuilder) -> Callable[[Shape, str], int]:
+    """Return a function that returns one of the DEFAULTS of a shape."""
+    held = {each: builder.custom_attributes.get(f"mujoco:{each}") for each in DEFAULTS}
+    given = {each: {} if one is None else dict(one.values or {}) for each, one in held.items()}
+    return lambda shape, each: int(given[each].get(shape.index, DEFAULTS[each]))
 
 
 def mjcf_disables_contacts(root: ET.Element) -> bool:
@@ -144,6 +198,9 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool, choice: Choice = 
         features = [f"{feature} ({_holder(feature)} {quote_labels(where)})" for feature, where in misread.items()]
         ways_out = dict.fromkeys(MISREAD[feature] for feature in misread)
         raise UnsupportedError("load", f"{str(file)!r} with {', '.join(features)}", "; ".join(ways_out))
+    if choice.contacts is not None and choice.ground is None and root.find("worldbody//geom[@hfield]") is not None:
+        what = f"contacts= of {str(file)!r}, which has a height field that Newton's importer does not read,"
+        raise UnsupportedError("load", what, "install the package mujoco, or pass ground=spo.HeightField(...)")
     builder = _import(file, root, floating, choice.contacts is not None)
     if gravity is not None:
         builder.gravity = gravity
@@ -158,7 +215,7 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool, choice: Choice = 
             UserWarning,
             stacklevel=3,
         )
-    return scene_of(file, builder, repair, choice, contact_rule(root, builder))
+    return scene_of(file, builder, repair, choice, contact_rule(root, builder), material_rule(root, builder))
 
 
 def _import(file: Path, root: ET.Element, floating: bool | None, contacts: bool) -> newton.ModelBuilder:
@@ -178,7 +235,7 @@ def _import(file: Path, root: ET.Element, floating: bool | None, contacts: bool)
         for mask in MASKS:  # which the importer reads where the builder knows them
             builder.add_custom_attribute(
                 newton.ModelBuilder.CustomAttribute(
-                    mask, wp.int64, newton.Model.AttributeFrequency.SHAPE, namespace="mujoco", default=1
+                    mask, wp.int64, newton.Model.AttributeFrequency.SHAPE, namespace="mujoco", default=DEFAULTS[mask]
                 )
             )
         builder.add_mjcf(

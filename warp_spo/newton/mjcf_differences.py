@@ -21,7 +21,7 @@ class File:
     """
 
     def __init__(self, root: ET.Element, floating: bool | None):
-        self.root, self.floating, self.classes = root, floating, _mjcf_classes(root)
+        self.root, self.floating, self.classes = root, floating, mjcf_classes(root)
         compiler = {name: value for element in root.iter("compiler") for name, value in element.items()}
         self.by_geom = compiler.get("inertiafromgeom", "auto")
         self.groups = [int(group) for group in compiler.get("inertiagrouprange", "0 5").split()]
@@ -239,7 +239,7 @@ def _misread_servos(root: ET.Element, classes: dict[str, dict[str, dict[str, str
     return found
 
 
-def _mjcf_classes(root: ET.Element) -> dict[str, dict[str, dict[str, str]]]:
+def mjcf_classes(root: ET.Element) -> dict[str, dict[str, dict[str, str]]]:
     """Return the attributes by default class and tag; the outermost class is "main"."""
     classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
 

@@ -84,6 +84,7 @@ class Shape:
 
 
 Touches = Callable[[Shape, Shape], bool]
+On = Callable[[Shape, Shape | None], Shape]
 
 
 class Chosen(NamedTuple):
@@ -115,13 +116,19 @@ class Choice(NamedTuple):
     points: Any = POINTS
 
     def applied(
-        self, call: str, scene: Scene, shapes: Callable[[], Sequence[Shape]], touches: Touches | None = None
+        self,
+        call: str,
+        scene: Scene,
+        shapes: Callable[[], Sequence[Shape]],
+        touches: Touches | None = None,
+        on: On = Shape.on,
     ) -> tuple[Scene, list[str]]:
         """Return the scene with contacts for the chosen shapes, and in words what is left out, such as "box 'table'".
 
         Args:
             call: for errors. shapes: returns those of the source; called only if some are wanted.
             touches: says whether a shape collides with the ground of the source; None: each of ``shapes`` does.
+            on: returns a shape as it is on the ground of the source, None if that is another one.
 
         Raises:
             ValueError: a pattern matches no shape of a body that can move, a number of points is invalid, or there is a
@@ -130,7 +137,7 @@ class Choice(NamedTuple):
         """
         if not self.wants(call):
             return scene, []
-        found = self.resolve(call, scene, shapes(), touches)
+        found = self.resolve(call, scene, shapes(), touches, on)
         return scene.with_contacts([one for _, made in found.taken for one in made], found.ground), found.left_out
 
     def unless(self, disabled: bool) -> tuple[Choice, list[str]]:
@@ -148,11 +155,10 @@ class Choice(NamedTuple):
             )
         return self.contacts is not None
 
-    def resolve(self, call: str, scene: Scene, shapes: Sequence[Shape], touches: Touches | None = None) -> Chosen:
-        """Return the contacts of the chosen shapes, and what is left out; errors as :meth:`applied`.
-
-        ``touches`` says whether a shape collides with the ground of the source.
-        """
+    def resolve(
+        self, call: str, scene: Scene, shapes: Sequence[Shape], touches: Touches | None = None, on: On = Shape.on
+    ) -> Chosen:
+        """Return the contacts of the chosen shapes, and what is left out; arguments and errors as :meth:`applied`."""
         moving = moving_bodies(scene)
         still = [shape for shape in shapes if shape.body < 0 or not moving[shape.body]]
         ground, soil, others = self.ground, None, [shape for shape in still if shape.kind not in GROUNDS]
@@ -164,7 +170,7 @@ class Choice(NamedTuple):
         taken, left_out = self._choose(call, scene.body_labels, solid)
         words = [shape.words(scene.body_labels) for shape in left_out]
         words += [shape.words(scene.body_labels) + (", not level" if shape.kind in GROUNDS else "") for shape in others]
-        return Chosen([(shape, contacts_of(shape.on(soil), most)) for shape, most in taken], ground, soil, words)
+        return Chosen([(shape, contacts_of(on(shape, soil), most)) for shape, most in taken], ground, soil, words)
 
     def _choose(
         self, call: str, names: list[str], solid: Sequence[Shape]
