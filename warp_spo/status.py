@@ -75,9 +75,9 @@ _ADVICE = {
         "on a ball joint have no positive pivot. Use one ball joint in place of three hinges."
     ),
     Status.NOT_FINITE: (
-        "Look for the NaN or the infinity in this world's q, qd, tau, body_f and in the values passed to Dynamics.set, "
-        "or for an actuator_delay longer than its buffers, or not a whole number, or a ground_field that the set of "
-        "fields lacks; reset the world."
+        "Look for the NaN or the infinity in what the call was given for this world (q, qd, tau, body_f, target_q, "
+        "target_qd, ctrl and so on) and in the values passed to Dynamics.set, or for an actuator_delay longer than its "
+        "buffers, or not a whole number, or a ground_field that the set of fields lacks; reset the world."
     ),
     Status.DIGITS: (
         "Use float64 for such worlds, give light links armature, and lay joint axes along the axes of their anchors."

@@ -167,7 +167,11 @@ class TorchTerm:
 
 
 def base_velocity(w: World) -> Vector:
-    """Return the velocity of the base in its axes (3,) [m/s]."""
+    """Return the velocity of the origin of the base's frame, in its axes (3,) [m/s].
+
+    The first three entries of a floating base's ``qd``, and of what :class:`warp_spo.mujoco.Coordinates` returns, are
+    the velocity of its centre of mass, in inertial axes.
+    """
     return w.base_velocity
 
 

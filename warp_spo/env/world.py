@@ -184,7 +184,7 @@ class World:
 
     @property
     def base_velocity(self) -> Vector:
-        """Velocity of the base's origin in the base's axes (3,) [m/s]."""
+        """Velocity of the base frame's origin, not of its centre of mass as in ``qd``; base's axes (3,) [m/s]."""
         start = self.scene.qd_start[self.base]
         com = self.value("body_com")[self.scene.hinges[self.base].child]
         return rotate_back(self.base_quaternion, self.qd[start : start + 3]) - cross(self.base_angular_velocity, com)
