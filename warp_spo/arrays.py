@@ -459,6 +459,14 @@ def new(kind: str | None, shape: tuple, dtype: type, device: wp.Device) -> tuple
 def _way_to_shape(name: str, kind: str, came: Any, shape: tuple, meaning: str) -> str:
     """Return what the caller can do about an array of the shape that ``came`` in place of ``shape``, in words."""
     inner = shape[1:]
+    if meaning == "[world, actuator]" and shape[-1] == 0:
+        return f"the scene has no actuators: leave {name} out; drives follow target_q and target_qd"
+    repeats = len(came) <= len(shape) and all(
+        c in (1, e) for c, e in zip(reversed(came), reversed(shape), strict=False)
+    )
+    if meaning.startswith("[world, ...]") and shape and repeats and came[-1:] != shape[-1:]:
+        of = "contact points and pairs" if name.startswith("contact_") else "entries along the last axis"
+        return f"give one number for each of the {shape[-1]} {of}: repeat it"
     of_one_world = len(came) == len(inner) and all(e in (-1, c) for c, e in zip(came, inner, strict=True))
     if not of_one_world or not inner or not meaning.startswith("[world"):
         return f"reshape {name}, or build the object for this size"

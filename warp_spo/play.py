@@ -3,9 +3,10 @@
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt                  # FILE.gif and FILE.png beside it
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --measure        # and errors over 256 worlds
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --view           # in Newton's viewer, on a display
-    python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --export policy  # policy.onnx, policy.pt
-    python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --mujoco         # 64 robots walk in MuJoCo
+    python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --export policy  # policy.onnx, policy.pt, no film
+    python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --mujoco         # 64 robots walk in MuJoCo; no film
 
+With ``--export`` or ``--mujoco`` a film is drawn only where ``--film`` or ``--view`` asks for it.
 Films are drawn without a display: by MuJoCo's renderer and EGL where both are at hand, else in NumPy.
 """
 
@@ -39,7 +40,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--trial", help="of go2-rough: on the ground of one of its trials")
     parser.add_argument("--out", type=Path, help="name of the film; left out: that of the checkpoint")
-    parser.add_argument("--film", choices=("gif", "webp", "mp4"), default="gif", help="mp4 needs imageio-ffmpeg")
+    parser.add_argument("--film", choices=("gif", "webp", "mp4"), help="gif unless told; mp4 needs imageio-ffmpeg")
     parser.add_argument("--renderer", choices=("mujoco", "numpy"), help="left out: MuJoCo's where it works")
     parser.add_argument("--measure", action="store_true", help="print what the task asks for, over --worlds worlds")
     parser.add_argument("--worlds", type=count, default=256)
@@ -73,11 +74,13 @@ def main(arguments: list[str] | None = None) -> int:
             print(file)
     if options.mujoco:
         print(json.dumps(walk_in_mujoco(runner, env, options.task), indent=1))
+    if options.film is None and (options.export or options.mujoco) and not options.view:
+        return 0  # an export, or a run in MuJoCo, alone
     recorded = recording.record(env, policy, options.seconds, options.command)
     if options.view:
         recording.show(chosen.ROBOT, recorded, env.step_dt)
     frames = recording.film(chosen, recorded, STEPS_A_PICTURE, options.renderer)
-    print(film.save(frames, name.with_suffix(f".{options.film}"), STEPS_A_PICTURE * env.step_dt))
+    print(film.save(frames, name.with_suffix(f".{options.film or 'gif'}"), STEPS_A_PICTURE * env.step_dt))
     strip = recording.strip(chosen, recorded, renderer=options.renderer)
     print(film.save_strip(strip, name.with_suffix(".png")))
     return 0

@@ -126,6 +126,7 @@ REFUSED = {
     "short": (dict(body_mass=np.ones(3)), ValueError, r"Dynamics.set: body_mass is .*\(3,\); expected \(12,\)"),
     "worlds": (dict(body_mass=np.ones((4, 12))), ValueError, r"body_mass is .*\(4, 12\); expected \(3, 12\)"),
     "scalar": (dict(body_mass=1.0), ValueError, r"Dynamics.set: body_mass is .*\(\); expected \(12,\)"),
+    "repeated": (dict(body_mass=np.ones((3, 1))), ValueError, r"\(3, 1\).* for each of the 12 entries .*: repeat it"),
     "text": (dict(body_mass="heavy"), TypeError, "Dynamics.set: body_mass is 'heavy'; expected an array of numbers"),
     "dtype": (dict(gravity=torch.zeros(3).double()), ValueError, "gravity is a torch array float64.*expected float32"),
     "grad": (dict(gravity=torch.zeros(3).requires_grad_()), ValueError, r"gravity requires grad.*gravity.detach\(\)"),

@@ -123,3 +123,21 @@ def test_mistakes_have_names(mistake):
     make, kind, message = MISTAKES[mistake]
     with pytest.raises(kind, match=message):
         make()
+
+
+def test_too_few_numbers_for_contacts_and_controls_without_actuators_say_the_way_out():
+    """They are not broadcast; and where the scene has no actuators no shape is right."""
+    scene = spo.Scene(
+        [spo.Body(1.0, inertia=np.eye(3))], [spo.Hinge("free", -1, 0)],
+        contacts=[spo.Contact(0, sphere=((x, 0, 0), 0.1)) for x in (0.0, 0.5, 1.0)],
+    )  # fmt: skip
+    dyn = spo.Dynamics(scene, 4, "cpu", variable=("contact_friction",))
+    with pytest.raises(ValueError, match=r"\(4, 1\).*one number for each of the 3 contact points and pairs: repeat it"):
+        dyn.set(contact_friction=np.ones((4, 1)))
+    with pytest.raises(ValueError, match=r"contact_friction is .*\(4, 2\).*reshape"):
+        dyn.set(contact_friction=np.ones((4, 2)))
+    q, qd = np.tile(scene.neutral_q, (4, 1)), np.zeros((4, 6))
+    with pytest.raises(
+        ValueError, match=r"ctrl is .*\(4, 3\).*has no actuators: leave ctrl out; drives follow target_q"
+    ):
+        dyn.step(q, qd, None, 1e-3, ctrl=np.zeros((4, 3)))

@@ -1,6 +1,7 @@
 """Tasks, their training, films and exports, at small sizes."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -79,6 +80,23 @@ def test_a_training_leaves_checkpoints_and_a_course(trained):
     )
     assert torch.load(trained / "model_2.pt", weights_only=True)["iter"] == 2
     assert (trained / "curve.png").stat().st_size > 1000
+
+
+def test_a_course_prints_no_numbers_of_episodes_that_have_not_ended(tmp_path, capsys):
+    """Neither rewards before the first end, nor lengths before the first that counts."""
+    names = ("/reward/up", "/episode/seconds", "/episode/finished", "/episode/whole")
+    for row, words in (
+        ((0, 0, 0, 0), "reward        -  episode     - s"),
+        ((2, 0, 3, 0), "reward    2.000  episode     - s"),
+        ((2, 7, 3, 1), "reward    2.000  episode   7.0 s"),
+    ):
+        env = types.SimpleNamespace(
+            device="cpu", log=lambda row=row: {n: torch.tensor(float(x)) for n, x in zip(names, row, strict=True)}
+        )
+        one = course.Course(env, tmp_path, 1, 0.0, True)
+        one.init_logging_writer()
+        one.log(0, 1, 0.1, 0.1, {}, action_std=torch.ones(1), learning_rate=1e-3)
+        assert words in capsys.readouterr().out
 
 
 def test_a_training_resumes(trained, tmp_path):
@@ -177,6 +195,16 @@ def test_play_draws_a_film(trained, tmp_path):
         shown = np.asarray(strip).astype(int)
     orange = (shown[..., 0] > shown[..., 2] + 60).mean()
     assert 0.001 < orange < 0.1  # the pole
+
+
+def test_play_draws_no_film_beside_an_export(trained, tmp_path):
+    """Nor overwrites one that is there, unless it is asked for."""
+    pytest.importorskip("onnx")
+    given = ["cartpole", str(trained / "model_2.pt"), "--seconds", "0.1", "--renderer", "numpy"]
+    given += ["--out", str(tmp_path / "film"), "--export", str(tmp_path / "policy")]
+    assert play.main(given) == 0
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["policy.onnx", "policy.pt"]
+    assert play.main([*given, "--film", "webp"]) == 0 and (tmp_path / "film.webp").exists()
 
 
 @pytest.mark.parametrize("renderer", ["numpy", pytest.param("mujoco", marks=pytest.mark.slow)])

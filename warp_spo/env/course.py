@@ -72,8 +72,10 @@ class Course:
         with self.file.open("a") as file:
             file.write(json.dumps({name: float(f"{value:.6g}") for name, value in row.items()}) + "\n")
         if it % self.every == 0 or it + 1 == total_it:
-            print(f"iteration {it:4d} of {total_it}  {row['seconds']:6.1f} s  reward {row['reward']:8.3f}  "
-                  f"episode {row['/episode/seconds']:5.1f} s  collecting {1e3 * collect_time:4.0f} ms  "
+            reward = f"{row['reward']:8.3f}" if row["/episode/finished"] else f"{'-':>8}"
+            length = f"{row['/episode/seconds']:5.1f}" if row["/episode/whole"] else f"{'-':>5}"
+            print(f"iteration {it:4d} of {total_it}  {row['seconds']:6.1f} s  reward {reward}  "
+                  f"episode {length} s  collecting {1e3 * collect_time:4.0f} ms  "
                   f"learning {1e3 * learn_time:4.0f} ms", flush=True)  # fmt: skip
         if time.time() > self.ends:
             raise OutOfTime

@@ -126,7 +126,7 @@ class Env(VecEnv):
         self.q, self.qd, self.actions, self.chosen = (store.tensors[n] for n in ("q", "qd", "actions", "chosen"))
         self._tensors, self._controls, self._step_arrays = store.tensors, store.controls, store.written
         self.values, self._actuator_state = store.values, self._delay_buffers(events)
-        self._log = Log(self._layout, self.reward_names, self.termination_names, self.device)
+        self._log = Log(self._layout, self.reward_names, self.termination_names, self.device, worlds)
         self.set_seed(self.seed)
         self._kernels = self._build(tracing)
         wanted = self.warp_device.is_cuda if graph is None else bool(graph) and self.warp_device.is_cuda
@@ -178,12 +178,21 @@ class Env(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Steps since the start of the episode, int64 [world]; it may be written."""
+        """Steps since the start of the episode, int64 [world]; it may be written.
+
+        The log leaves out the length of an episode whose steps were written: it did not take so long.
+        """
         return self._tensors["episode_length"]
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
-        self._tensors["episode_length"].copy_(given.checked_lengths("Env.episode_length_buf", value, self.num_envs))
+        lengths, value = (
+            self._tensors["episode_length"],
+            given.checked_lengths("Env.episode_length_buf", value, self.num_envs),
+        )
+        before = lengths.clone()
+        lengths.copy_(value)
+        self._log.write_ages(self._tensors["memory"], lengths != before)
 
     @property
     def default_q(self) -> np.ndarray:
@@ -267,7 +276,11 @@ class Env(VecEnv):
         return {name: controls.clone() for name, controls in self._controls.items()}
 
     def log(self) -> dict[str, torch.Tensor]:
-        """Return means over the worlds' last finished episodes by name, and counts of what was not finite."""
+        """Return means over the worlds' last finished episodes by name, and counts of what was not finite.
+
+        "/episode/finished" is the number of worlds that have finished one, "/episode/whole" of those whose length
+        counts, see :attr:`episode_length_buf`. Means over no world are zero.
+        """
         return self._log(self._tensors["memory"])
 
     def explain(self) -> str:

@@ -18,25 +18,39 @@ class Log:
     """Reads the worlds' memory, without waiting for the device.
 
     Args:
-        layout: where the memory is. rewards, ends: names. device: of the memory.
+        layout: where the memory is. rewards, ends: names. device: of the memory. worlds: their number.
     """
 
-    def __init__(self, layout: Layout, rewards: list[str], ends: list[str], device: torch.device):
+    def __init__(self, layout: Layout, rewards: list[str], ends: list[str], device: torch.device, worlds: int):
         means = {f"/reward/{name}": f"last reward {name}" for name in rewards}
         means |= {f"/termination/{name}": f"last end {name}" for name in ends}
         means["/episode/seconds"] = "last seconds"
         counts = {f"/not finite/{cause}": f"bad {cause}" for cause in CAUSES}
-        self._names = [*means, *counts]
+        self._names = [*means, *counts, "/episode/finished", "/episode/whole"]
         self._means, self._counts, self._episodes = (
             torch.tensor([layout.memory[name][0] for name in names], device=device)
             for names in (means.values(), counts.values(), ["episodes"])
         )
+        self._cut = torch.zeros(worlds, device=device)  # number of a world's episode whose age was written; 0: none
+
+    def write_ages(self, memory: torch.Tensor, written: torch.Tensor) -> None:
+        """Leave the lengths of the episodes that now go on where ``written`` [world] holds out of the report."""
+        self._cut = torch.where(written, memory[self._episodes][0] + 1.0, self._cut)
 
     def __call__(self, memory: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the report for the memory [number, world]."""
-        finished = (memory[self._episodes][0] > 0).float()
-        means = memory[self._means] @ (finished / finished.sum().clamp(min=1.0))
-        return dict(zip(self._names, [*means.unbind(), *memory[self._counts].sum(dim=1).unbind()], strict=True))
+        episodes = memory[self._episodes][0]
+        finished = (episodes > 0).float()
+        whole = finished * (episodes != self._cut)
+        rows = memory[self._means]  # the last one is of lengths
+        means = [*(rows[:-1] @ share(finished)).unbind(), rows[-1] @ share(whole)]
+        found = [*means, *memory[self._counts].sum(dim=1).unbind(), finished.sum(), whole.sum()]
+        return dict(zip(self._names, found, strict=True))
+
+
+def share(counted: torch.Tensor) -> torch.Tensor:
+    """Return the weight of each world in a mean over those that count [world]; zeros where none does."""
+    return counted / counted.sum().clamp(min=1.0)
 
 
 def describe(env: Env) -> str:
