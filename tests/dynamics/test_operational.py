@@ -24,10 +24,7 @@ from warp_spo.trials.operations import APPLICATIONS, Inputs
 from warp_spo.trials.trial import Subject, Trial
 
 WORLDS = 3
-TOLERANCE = {
-    "float64": 1e-12,  # cond(M) of the worst scene is 1e4
-    "float32": 3e-5,
-}
+TOLERANCE = {"float64": 1e-12, "float32": 3e-5}  # cond(M) of the worst scene is 1e4
 DIFFERENCES = 1e-10  # the gradient of log det, and C of quasi-velocities: rounding over a step of 0.01 or less
 LARGE = ("tree20", "trees25", "screw_tree", "every_d6", "floating_tree", "star")  # seconds
 SCENES = [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in zoo.SCENES]

@@ -249,6 +249,15 @@ INTEGRATORS: dict[str, Callable[..., None]] = {"semi_implicit": semi_implicit, "
 """By name."""
 
 
+def check_integrator(call: Call, integrator: str, **semi_implicit: Any) -> None:
+    """Raise ValueError if there is no such integrator, or if it cannot write arrays of the semi-implicit step."""
+    if integrator not in INTEGRATORS:
+        raise ValueError(f"{call.name}: integrator is {integrator!r}; expected one of {', '.join(INTEGRATORS)}")
+    for name, array in semi_implicit.items():
+        if array is not None and integrator != "semi_implicit":
+            raise ValueError(f"{call.name}: {name} with integrator={integrator!r}; expected 'semi_implicit'")
+
+
 def _finish(dyn: Dynamics, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array) -> None:
     """Write q, qd as the state after the step, with its loops closed."""
     if dyn.closed:

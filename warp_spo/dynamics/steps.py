@@ -294,7 +294,7 @@ def step(
     """
     engine = self._engine
     with engine.call(STEP) as call:
-        _check_integrator(call, integrator, status=status, qdd=qdd)
+        integrators.check_integrator(call, integrator, status=status, qdd=qdd)
         outs = engine.outs(call, STEP, out)
         count = _take_substeps(call.name, {"substeps": substeps})
         reported = contact_f, contact_gap, contact_slip, contact_excess, contact_residual
@@ -316,15 +316,6 @@ def step(
         given = {name: value for name, value in given.items() if name not in Interval._fields}
         _launch(self, call, integrator, count, interval, given, buffers)
     return call.result
-
-
-def _check_integrator(call: Call, integrator: str, **semi_implicit: Any) -> None:
-    """Raise ValueError if there is no such integrator, or if it cannot write arrays of the semi-implicit step."""
-    if integrator not in INTEGRATORS:
-        raise ValueError(f"{call.name}: integrator is {integrator!r}; expected one of {', '.join(INTEGRATORS)}")
-    for name, array in semi_implicit.items():
-        if array is not None and integrator != "semi_implicit":
-            raise ValueError(f"{call.name}: {name} with integrator={integrator!r}; expected 'semi_implicit'")
 
 
 def _read_if_given(dyn: Dynamics, call: Call, arrays: dict[str, Any]) -> dict[str, wp.array]:
