@@ -18,6 +18,7 @@ from warp_spo import reference_pairs
 from warp_spo.kernels import hulls
 from warp_spo.reference_rotations import homogeneous
 from warp_spo.scene.hulls import MOST
+from warp_spo.scene.shapes import reduced
 
 
 def test_faces_are_those_of_qhull():
@@ -52,6 +53,8 @@ def test_flat_and_long_hulls_keep_all_corners_on_the_ground(monkeypatch):
         cloud = np.random.default_rng(seed + 1).normal(size=(40, 3)) * scale
         wanted = cloud[np.sort(ConvexHull(cloud).vertices)]
         np.testing.assert_array_equal(spo.Contact(0, hull=cloud).positions, wanted)
+        few = cloud[:10]
+        np.testing.assert_array_equal(reduced(few, 16), np.sort(ConvexHull(few).vertices))  # of a file's mesh
     monkeypatch.setattr("warp_spo.scene.contacts.AT_ONCE", 1000)
     np.testing.assert_array_equal(spo.Contact(0, hull=cloud).positions, wanted)
 

@@ -110,6 +110,22 @@ def with_corners(points: np.ndarray, some: np.ndarray) -> np.ndarray:
     return np.union1d(some, at)
 
 
+def farthest_beyond(points: np.ndarray, some: np.ndarray) -> int | None:
+    """Return the index of the point that is farthest beyond a face of the hull of ``some``; None: all lie within it.
+
+    Of MOST corners or more, and of points in a plane, None.
+    """
+    size = float(np.ptp(points, axis=0).max())
+    if len(some) >= MOST:
+        return None
+    try:
+        normals, offsets = _planes("", points[some], size)
+    except ValueError:
+        return None
+    beyond = (points @ normals.T - offsets).max(axis=1)
+    return int(beyond.argmax()) if beyond.max() > SAME * size else None
+
+
 def grown(hull: Hull, by: float) -> np.ndarray:
     """Return the corners of a hull whose faces lie farther out [corner, 3]; nearly where more than three meet."""
     found = []

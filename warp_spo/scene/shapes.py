@@ -16,6 +16,7 @@ import numpy as np
 
 from ..errors import UnsupportedError, as_integer
 from .contacts import Contact, HeightField, Plane, Stand, pose_matrix, spread_directions
+from .hulls import farthest_beyond
 
 if TYPE_CHECKING:
     from .scene import Scene
@@ -306,7 +307,7 @@ def reduced(points: np.ndarray, most: int) -> np.ndarray:
 
     Each further point is the one that the hull of those before misses most, in one of many directions: what a plane
     would sink into the body before it touches. Where several are as far, the first counts, so that the choice does not
-    depend on rounding.
+    depend on rounding. Last come corners that are farthest in none of these directions.
     """
     outward = np.concatenate([-np.eye(3), np.eye(3), spread_directions()])  # downward directions before others
     outward = outward[[2, 5, 0, 1, 3, 4, *range(6, len(outward))]]
@@ -322,6 +323,8 @@ def reduced(points: np.ndarray, most: int) -> np.ndarray:
             break
         chosen.append(int(far[worst]))
         covered = np.maximum(covered, heights[chosen[-1]])
+    while len(chosen) < most and (left := farthest_beyond(points, np.unique(chosen))) is not None:
+        chosen.append(left)
     return np.unique(chosen)
 
 
