@@ -36,6 +36,8 @@ def test_reports_every_operation_in_both_precisions(tmp_path, capsys, device):
     assert job.main(["cartpole", "--worlds", "3", "--device", str(device), "--report", str(tmp_path)]) == 0
     out, err = capsys.readouterr()
     assert err == ""  # not a terminal: no bar
+    said = f"PASSED: {len(OPERATIONS)} operations, {2 * len(OPERATIONS)} results, all within tolerance"
+    assert said in out.splitlines() and f"run {len(OPERATIONS)} operations" in job.__doc__
     lines = [line.split() for line in out.splitlines() if " float" in line and "tolerance" not in line]
     assert [tuple(line[:3:2]) for line in lines] == [(op, dtype) for op in OPERATIONS for dtype in TOLERANCE]
     for _, _, dtype, error, *_ in lines:
@@ -76,10 +78,23 @@ def test_a_wrong_result_fails_and_is_named(capsys, monkeypatch, device):
     chosen = {"phi": OPERATIONS["phi"], "gravity_force": wrong, "mass_matrix": nothing}
     monkeypatch.setattr(job, "OPERATIONS", chosen)
     assert job.main(["cartpole", "--worlds", "2", "--dtype", "float64", "--device", str(device)]) == 1
-    failed = [line for line in capsys.readouterr().err.splitlines() if line.startswith("FAILED")]
+    out, err = capsys.readouterr()
+    assert out.splitlines()[-1] == "FAILED: 3 operations, 3 results, 2 beyond tolerance"
+    failed = [line for line in err.splitlines() if line.startswith("FAILED")]
     assert len(failed) == 2
     assert "gravity_force in float64 has error 1.0e-03; expected at most 1e-10" in failed[0]
     assert "mass_matrix in float64 gives NaN" in failed[1]
+
+
+def test_notes_about_what_a_file_has_besides_say_that_it_is_no_fault(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    (tmp_path / "robot.xml").write_text(
+        '<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody>'
+        '<actuator><motor joint="j"/></actuator></mujoco>'
+    )
+    job.load(str(tmp_path / "robot.xml"))
+    (note,) = capsys.readouterr().err.splitlines()
+    assert "1 actuator left out" in note and note.endswith("(no fault: the comparison needs nothing of it)")
 
 
 def test_loops_are_cut_and_named(tmp_path, capsys, monkeypatch, device):

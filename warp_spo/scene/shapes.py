@@ -26,6 +26,7 @@ POINTS = 8
 SPREAD = 256  # points on a round surface, of which those of a hull are chosen
 ROUNDING = 1e-15  # share of a shape's size by which an entry of a point that should be zero may differ
 UPRIGHT = 0.5  # least cosine between the normal of a ground and the upward direction
+STEEP = ", steeper than 60 degrees"  # what a ground is that is not UPRIGHT
 TURNED = 1e-6  # by which axes of a height field may differ from the inertial ones
 GROUNDS = ("plane", "height field")
 MATERIAL = ("friction", "stiffness", "damping")
@@ -170,7 +171,8 @@ class Choice(NamedTuple):
             solid = [shape for shape in solid if touches(shape, soil)]
         taken, left_out = self._choose(call, scene.body_labels, solid)
         words = [shape.words(scene.body_labels) for shape in left_out]
-        words += [shape.words(scene.body_labels) + (", not level" if shape.kind in GROUNDS else "") for shape in others]
+        steep = STEEP if soil is not None else f"{STEEP}, so that the ground is the plane z = 0"
+        words += [shape.words(scene.body_labels) + (steep if shape.kind in GROUNDS else "") for shape in others]
         return Chosen([(shape, contacts_of(on(shape, soil), most)) for shape, most in taken], ground, soil, words)
 
     def _choose(
