@@ -20,8 +20,6 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-STEPS_A_PICTURE = 2
-
 
 def main(arguments: list[str] | None = None) -> int:
     """Play the checkpoint that the arguments name."""
@@ -79,8 +77,8 @@ def main(arguments: list[str] | None = None) -> int:
     recorded = recording.record(env, policy, options.seconds, options.command)
     if options.view:
         recording.show(chosen.ROBOT, recorded, env.step_dt)
-    frames = recording.film(chosen, recorded, STEPS_A_PICTURE, options.renderer)
-    print(film.save(frames, name.with_suffix(f".{options.film or 'gif'}"), STEPS_A_PICTURE * env.step_dt))
+    frames = recording.film(chosen, recorded, recording.STEPS_A_PICTURE, options.renderer)
+    print(film.save(frames, name.with_suffix(f".{options.film or 'gif'}"), recording.STEPS_A_PICTURE * env.step_dt))
     strip = recording.strip(chosen, recorded, renderer=options.renderer)
     print(film.save_strip(strip, name.with_suffix(".png")))
     return 0

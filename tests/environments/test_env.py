@@ -128,23 +128,6 @@ def test_what_is_not_finite_stays_in_its_world():
     assert float(log["/termination/not finite"]) == 1  # of the worlds with a finished episode
 
 
-def test_lengths_of_episodes_of_written_ages_do_not_count():
-    """Rewards of such an episode do; the length of the next one does."""
-    env = cart_env(4, terminations={})
-    most = env.max_episode_length
-    env.episode_length_buf = torch.tensor([most - 1, most - 2, 0, 0])
-    for step, (finished, whole) in enumerate([(1, 0), (2, 0), (2, 0)]):
-        env.step(torch.zeros(4, 1))
-        log = env.log()
-        assert (log["/episode/finished"], log["/episode/whole"]) == (finished, whole), step
-        assert log["/episode/seconds"] == 0.0
-    for _ in range(most - 2):
-        env.step(torch.zeros(4, 1))
-    log = env.log()
-    assert (log["/episode/finished"], log["/episode/whole"]) == (4, 3)  # worlds 0, 2 and 3
-    assert torch.isclose(log["/episode/seconds"], torch.tensor(most * env.step_dt))
-
-
 def test_a_reward_that_is_not_finite_is_counted_and_not_summed():
     env = cart_env(4, rewards={"root": (1.0, lambda w: np.sqrt(0.4 - w.q[0]))}, terminations={})
     env.q[2, 0] = 0.45

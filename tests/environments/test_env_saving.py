@@ -146,3 +146,20 @@ def test_an_argument_that_a_task_sets_is_refused():
         envs.make("cartpole", 2, "cpu", dt=0.01, hop=3)
     with pytest.raises(TypeError, match="takes no commands; expected some of seed, trial, first_world"):
         envs.make("go2-rough", 2, "cpu", commands=None)
+
+
+def test_lengths_of_episodes_of_written_ages_do_not_count():
+    """Rewards of such an episode do; the length of the next one does."""
+    env = cart_env(4, terminations={})
+    most = env.max_episode_length
+    env.episode_length_buf = torch.tensor([most - 1, most - 2, 0, 0])
+    for step, (finished, whole) in enumerate([(1, 0), (2, 0), (2, 0)]):
+        env.step(torch.zeros(4, 1))
+        log = env.log()
+        assert (log["/episode/finished"], log["/episode/whole"]) == (finished, whole), step
+        assert log["/episode/seconds"] == 0.0
+    for _ in range(most - 2):
+        env.step(torch.zeros(4, 1))
+    log = env.log()
+    assert (log["/episode/finished"], log["/episode/whole"]) == (4, 3)  # worlds 0, 2 and 3
+    assert torch.isclose(log["/episode/seconds"], torch.tensor(most * env.step_dt))

@@ -74,6 +74,7 @@ class Env(VecEnv):
         values: what events have made of the scene's values, torch tensors [world, ...] by name.
         dyn: the :class:`Dynamics`. has_commands: whether it gives commands.
         action_labels, action_clips: of each action, what it sets, and None or the (lowest, highest) that counts.
+        observation_terms: of each group (name, size, ``Observation``) of its terms, in their order.
         num_envs, num_actions, num_obs, max_episode_length, episode_length_buf, device, cfg: as rsl_rl names them.
 
     Raises:
@@ -147,6 +148,7 @@ class Env(VecEnv):
         tracing = Tracing(layout, actions, groups, rewards, terminations, commands, list(events))
         tracing.run(self.max_episode_length, self.final)
         self.reward_names, self.termination_names = list(rewards), tracing.ends
+        self.observation_terms = tracing.observation_terms
         self.num_obs, self._levels = tracing.group_sizes, saving.level_names(events, commands)
         self._values_later = any(isinstance(event, Values) and event.when != "start" for event in events)
         return tracing
@@ -178,21 +180,12 @@ class Env(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Steps since the start of the episode, int64 [world]; it may be written.
-
-        The log leaves out the length of an episode whose steps were written: it did not take so long.
-        """
+        """Steps since the start of the episode, int64 [world]; may be written: logs then leave that length out."""
         return self._tensors["episode_length"]
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
-        lengths, value = (
-            self._tensors["episode_length"],
-            given.checked_lengths("Env.episode_length_buf", value, self.num_envs),
-        )
-        before = lengths.clone()
-        lengths.copy_(value)
-        self._log.write_ages(self._tensors["memory"], lengths != before)
+        saving.write_lengths(self, value)
 
     @property
     def default_q(self) -> np.ndarray:
@@ -276,11 +269,7 @@ class Env(VecEnv):
         return {name: controls.clone() for name, controls in self._controls.items()}
 
     def log(self) -> dict[str, torch.Tensor]:
-        """Return means over the worlds' last finished episodes by name, and counts of what was not finite.
-
-        "/episode/finished" is the number of worlds that have finished one, "/episode/whole" of those whose length
-        counts, see :attr:`episode_length_buf`. Means over no world are zero.
-        """
+        """Return means over worlds' last finished episodes by name, and counts: ``warp_spo.env.logs.Log``."""
         return self._log(self._tensors["memory"])
 
     def explain(self) -> str:

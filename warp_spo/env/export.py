@@ -18,19 +18,23 @@ def describe(env: Env, name: str) -> dict[str, Any]:
 
     Action k sets ``offset[k] + scale[k] action``, a control of the actuator or the target or force of the joint
     ``actuators[k]``, whose gains are ``stiffness[k]`` and ``damping[k]``, after it is clipped to ``action_clip[k]``,
-    (lowest, highest), None without one. No bias of an encoder is in the offset. Observations are the terms
-    ``observations`` [name, size, scale], one after the other; ``None`` where no task lists them. Joint positions are
-    relative to ``default_position``. ``stride`` is the period [s] of the observation "step phase", None without one:
-    sine and cosine of 2 pi time / stride, zeros while speed and turning asked for add up to 0.05 m/s and rad/s at most.
-    ``delay_steps`` count steps of ``dt``; the policy runs every ``decimation`` of them.
+    (lowest, highest), None without one. ``action_kind[k]`` says what is set, "ctrl", "target_q" or "tau";
+    ``armature[k]`` is the rotor's inertia at that joint. No bias of an encoder is in the offset. ``delay_steps`` count
+    steps of ``dt``; the policy runs every ``decimation`` of them.
+
+    Observations are the terms ``observations`` [name, size, scale] of the group "actor", one after the other, each with
+    its ``observation_clip`` [lowest, highest], None without one, and ``observation_history``, the steps that it holds,
+    the newest first. A term's name is that of its function, "unnamed" of a lambda. Joint positions are relative to
+    ``default_position``; they are of all joints unless the term names some. ``stride`` is the period [s] of the
+    observation "step phase", None without one: sine and cosine of 2 pi time / stride, zeros while speed and turning
+    asked for add up to 0.05 m/s and rad/s at most. ``default_base`` is where a floating base starts, position and
+    quaternion (xyzw), None of a fixed one.
     """
     chosen, scene = task(name) if name in TASKS else None, env.scene
     scale, offset, gains = controls_of(env)
     joints = [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == hinge.dof_count == 1]
     default = env.default_q[[int(scene.q_start[i]) for i in joints]]
-    count = len(joints)
-    sizes = {"joint position": count, "joint velocity": count, "last action": env.num_actions, "step phase": 2}
-    listed = getattr(chosen, "ACTOR", None)
+    floats, seen = scene.hinges[0].coord_count == 7, env.observation_terms["actor"]
     return {
         "task": name,
         "robot": getattr(chosen, "ROBOT", None),
@@ -45,7 +49,10 @@ def describe(env: Env, name: str) -> dict[str, Any]:
         "decimation": env.decimation,
         "stride": getattr(chosen, "STRIDE", None),
         "observation_size": env.num_obs["actor"],
-        "observations": listed and [[each[0], sizes.get(each[0], 3), each[2]] for each in listed],
+        "observations": [[name, size, term.scale] for name, size, term in seen],
+        "observation_clip": [term.clip for _, _, term in seen],
+        "observation_history": [term.history for _, _, term in seen],
+        "default_base": env.default_q[:7].tolist() if floats else None,
     }
 
 
@@ -70,7 +77,8 @@ def controls_of(env: Env) -> tuple[np.ndarray, np.ndarray, dict[str, list]]:
         bias.copy_(own)
     env.reset()
     scale, offset = [], []
-    gains: dict[str, list] = {"stiffness": [], "damping": [], "force_limit": [], "delay_steps": []}
+    names = ("stiffness", "damping", "force_limit", "delay_steps", "action_kind", "armature")
+    gains: dict[str, list] = {name: [] for name in names}
     for label, row, at, by in zip(env.action_labels, rows[1:], start, step, strict=True):
         moved = [(array, i) for array in row for i in np.flatnonzero(row[array] != rows[0][array])]
         if len(moved) != 1:
@@ -84,11 +92,13 @@ def controls_of(env: Env) -> tuple[np.ndarray, np.ndarray, dict[str, list]]:
         if array == "ctrl":
             law, delay = scene.values["actuator_bias"][0, i], scene.values["actuator_delay"][0, i]
             stiffness, damping, limit = -law[1], -law[2], scene.values["actuator_force_range"][0, i, 1]
+            dof = int(scene.qd_start[scene.actuators[i].hinges[0]])
         else:
-            dof = i if array == "tau" else int(scene.qd_start[list(scene.q_start).index(i)])
+            dof = int(i) if array == "tau" else int(scene.qd_start[list(scene.q_start).index(i)])
             stiffness, damping = (scene.values[f"joint_target_{k}"][0, dof] for k in ("ke", "kd"))
             limit, delay = scene.values["joint_effort_limit"][0, dof], 0
-        found = (float(stiffness), float(damping), float(limit) if np.isfinite(limit) else None, int(delay))
+        bound, rotor = float(limit) if np.isfinite(limit) else None, float(scene.values["joint_armature"][0, dof])
+        found = (float(stiffness), float(damping), bound, int(delay), array, rotor)
         for key, value in zip(gains, found, strict=True):
             gains[key].append(value)
     return np.array(scale), np.array(offset), gains

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 class Log:
     """Reads the worlds' memory, without waiting for the device.
 
+    Means are over the worlds' last finished episodes, zero where there are none. "/episode/finished" is the number of
+    worlds that have finished one, "/episode/whole" of those whose length counts: not where ``episode_length_buf`` was
+    written. "/not finite/" counts actions, states and rewards that were not.
+
     Args:
         layout: where the memory is. rewards, ends: names. device: of the memory. worlds: their number.
     """

@@ -15,6 +15,7 @@ from .vectors import Vector, rotate, rotate_back, vector
 from .world import World
 
 Term = Callable[[World], Any]
+PACKAGE = __name__.rpartition(".")[0]
 MANY = 16  # rows from which they have threads of their own
 
 
@@ -164,6 +165,19 @@ class TorchTerm:
     def __call__(self, w: World) -> Any:
         """Return its numbers; of one number, as a termination, whether it is not zero."""
         return w.user(self)
+
+
+def name_of(observation: Observation) -> str:
+    """Return the name of a term in words: of its function, or of the one that made it; "unnamed" for a lambda."""
+    term: Any = observation.term
+    if isinstance(term, TorchTerm):
+        return str(term.name)
+    function = term.function if isinstance(term, Each) else term
+    path = getattr(function, "__qualname__", type(function).__name__).split(".<locals>.")
+    module, named = getattr(function, "__module__", ""), path[-1]
+    if module == __name__ or (module.startswith(PACKAGE) and named == "term"):
+        named = path[0]
+    return "unnamed" if named == "<lambda>" else named.split(".")[-1].replace("_", " ")
 
 
 def base_velocity(w: World) -> Vector:

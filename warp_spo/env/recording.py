@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from . import film as films
-from . import robots
+from . import robots, shapes
 from .environment import Env
 
 STRIP = 10  # pictures of a strip
+STEPS_A_PICTURE = 2  # of a film
 STRIP_SECONDS = 0.08  # between them, so that a strip shows about one stride of a walk
 
 
@@ -47,6 +50,46 @@ def record(env: Env, policy: Any, seconds: float, command: Any = None, world: in
     return Recording(q, qd, commands if commanded else None, env.step_dt, env.scene.ground)
 
 
+def play(
+    env: Env, policy: Any, path: str | Path, seconds: float = 8.0, command: Any = None,
+    camera: films.Camera | None = None, renderer: str | None = None, suffix: str = ".gif",
+) -> list[Path]:  # fmt: skip
+    """Let a policy act in any environment, and draw world 0: write a film and a strip of ten pictures as PNG.
+
+    Shapes come from the scene: what touches the ground, and a bone from each joint to the next. All worlds start anew.
+
+    Args:
+        env: the environment. policy: function from observations to actions.
+        path: of the film and the strip, without their endings.
+        seconds: of the film. command: held if it is given, one number for each of the environment's commands.
+        camera: None: one that sees all of the robot, from the side; it follows a floating base.
+        renderer: "mujoco", "numpy", or None: MuJoCo's if it works here.
+        suffix: of the film: ".gif", ".webp", or ".mp4", which needs imageio-ffmpeg.
+
+    Returns:
+        The files: the film, the strip.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    wanted = env.command.shape[1] if env.has_commands else 0
+    if command is not None and len(command) != wanted:
+        raise ValueError(f"recording.play: command has {len(command)} number(s); expected {wanted}")
+    recorded, start = record(env, policy, seconds, command), env.default_q
+    scene = env.scene.without_loops()
+    robot = robots.Robot("", path, scene, start, np.zeros(0), shapes.primitives(scene, start))
+    camera = shapes.camera_of(scene, start) if camera is None else camera
+    follow = scene.hinges[0].coord_count == 7
+    every = list(range(0, len(recorded.q), STEPS_A_PICTURE))
+    pictures, few = (
+        _draw(robot, camera, follow, recorded, rows, captions(recorded, rows), [], renderer)
+        for rows in (every, strip_rows(recorded, not follow))
+    )
+    return [
+        films.save(pictures, path.with_name(path.name + suffix), STEPS_A_PICTURE * recorded.step),
+        films.save_strip(few, path.with_name(path.name + ".png")),
+    ]
+
+
 def markers(task: Any, recorded: Recording, row: int) -> tuple:
     """Return what is drawn beside the robot: the place that a hand is asked to reach."""
     if recorded.commands is None or not hasattr(task, "PLACES"):
@@ -61,29 +104,45 @@ def film(task: Any, recorded: Recording, every: int = 2, renderer: str | None = 
 
 def strip(task: Any, recorded: Recording, start: float = 0.5, renderer: str | None = None) -> list:
     """Return the pictures of a film strip, from a share of the recording on; a stride if it walks."""
-    if recorded.q.shape[1] == 2 or hasattr(task, "PLACES"):
-        rows = np.linspace(0, len(recorded.q) - 1, STRIP).astype(int)
-    else:
-        rows = int(start * len(recorded.q)) + np.round(np.arange(STRIP) * STRIP_SECONDS / recorded.step).astype(int)
-    return _pictures(task, recorded, [int(row) for row in rows if row < len(recorded.q)], renderer)
+    whole = recorded.q.shape[1] == 2 or hasattr(task, "PLACES")
+    return _pictures(task, recorded, strip_rows(recorded, whole, start), renderer)
+
+
+def strip_rows(recorded: Recording, whole: bool, start: float = 0.5) -> list[int]:
+    """Return the rows of a film strip: over the whole recording, or about a stride from a share of it on."""
+    if whole:
+        return np.linspace(0, len(recorded.q) - 1, STRIP).astype(int).tolist()
+    rows = int(start * len(recorded.q)) + np.round(np.arange(STRIP) * STRIP_SECONDS / recorded.step).astype(int)
+    return [int(row) for row in rows if row < len(recorded.q)]
 
 
 def _pictures(task: Any, recorded: Recording, rows: Any, renderer: str | None) -> list:
     robot = robots.load(task.ROBOT, recorded.ground)
-    rows = list(rows)
-    texts = [f"{row * recorded.step:.2f} s" for row in rows]
-    if recorded.commands is not None and not hasattr(task, "PLACES"):
-        texts = [
-            text + "   asked " + ", ".join(f"{x:.1f}" for x in recorded.commands[row])
-            for text, row in zip(texts, rows, strict=True)
-        ]
-    shapes = [markers(task, recorded, row) for row in rows]
+    rows, places = list(rows), hasattr(task, "PLACES")
+    texts = captions(recorded._replace(commands=None) if places else recorded, rows)
+    beside = [markers(task, recorded, row) for row in rows]
     follow = task.ROBOT not in ("cartpole", "panda")
-    camera = task.CAMERA
-    if follow:  # from the side of where the robot faces at first
+    return _draw(robot, task.CAMERA, follow, recorded, rows, texts, beside, renderer)
+
+
+def captions(recorded: Recording, rows: Sequence[int]) -> list[str]:
+    """Return the time of each row, and what is asked for, if anything is."""
+    texts = [f"{row * recorded.step:.2f} s" for row in rows]
+    if recorded.commands is None:
+        return texts
+    asked = [", ".join(f"{x:.1f}" for x in recorded.commands[row]) for row in rows]
+    return [f"{text}   asked {each}" for text, each in zip(texts, asked, strict=True)]
+
+
+def _draw(
+    robot: robots.Robot, camera: films.Camera, follow: bool, recorded: Recording, rows: Sequence[int], texts: list[str],
+    beside: list, renderer: str | None,
+) -> list:  # fmt: skip
+    """Return a picture of each row; a camera that follows looks from the side of where the robot faces at first."""
+    if follow:
         _, _, z, w = recorded.q[rows[0], 3:7]
         camera = dataclasses.replace(camera, azimuth=camera.azimuth + 2.0 * float(np.arctan2(z, w)))
-    return films.pictures(robot, recorded.q[rows], camera, follow, shapes, texts, renderer)
+    return films.pictures(robot, recorded.q[rows], camera, follow, beside, texts, renderer)
 
 
 def show(name: str, recorded: Recording, step: float) -> None:

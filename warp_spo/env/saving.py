@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from ..errors import never_copied
+from . import given as checks
 from .commands import LEVEL
 
 if TYPE_CHECKING:
@@ -20,6 +21,14 @@ def level_names(events: Sequence[Any], commands: Any) -> list[str]:
     """Return the names under which worlds remember how far they have come in curricula of events and commands."""
     names = [name for event in events for name in getattr(event, "levels", ())]
     return names + ([] if getattr(commands, "level", None) is None else [LEVEL])
+
+
+def write_lengths(self: Env, value: torch.Tensor) -> None:
+    """Set steps since the starts of episodes; where they change, the log leaves the length of the episode out."""
+    lengths = self._tensors["episode_length"]
+    before = lengths.clone()
+    lengths.copy_(checks.checked_lengths("Env.episode_length_buf", value, self.num_envs))
+    self._log.write_ages(self._tensors["memory"], lengths != before)
 
 
 def levels(self: Env) -> dict[str, torch.Tensor]:

@@ -16,7 +16,7 @@ from ..hinges.functions import AbstractScalar, Condition, where
 from ..trace.scalars import Value, absolute, branch, less
 from .events import EncoderBias, Interval, Reset, Start, Values
 from .layout import Layout
-from .observations import Observation
+from .observations import Observation, name_of
 from .stage import Stage, output_name
 from .vectors import Vector, as_condition, as_value, vector
 from .world import World
@@ -70,12 +70,21 @@ class Tracing:
         names = ("act", "judge", "observe", "reset", "start", "final")
         self.stages = {name: Stage(name, stream) for stream, name in enumerate(names)}
         self.group_sizes: dict[str, int] = {}
+        self.term_sizes: dict[str, list[int]] = {}  # of each group's terms, in their order
         self.apart: set[str] = set()
 
     @property
     def arrays(self) -> set[str]:
         """Names of the arrays that the stages read."""
         return set().union(*(stage.read_arrays() for stage in self.stages.values()))
+
+    @property
+    def observation_terms(self) -> dict[str, list[tuple[str, int, Observation]]]:
+        """Name, size and Observation of each term of each group."""
+        return {
+            group: list(zip(map(name_of, terms), self.term_sizes[group], terms, strict=True))
+            for group, terms in self.groups.items()
+        }
 
     @property
     def tables(self) -> set[str]:
@@ -302,7 +311,7 @@ class Tracing:
         """Store the observations of all groups: of ``w``, or of the rows of a world that ``begin`` makes of a stage."""
         of_rows: dict[int, World] = {}
         for group, terms in self.groups.items():
-            name, at = output_name(kind + group), 0
+            name, at, starts = output_name(kind + group), 0, [0]
             for term in terms:
                 rows = term.rows
                 if rows:
@@ -319,7 +328,8 @@ class Tracing:
                     for value in term.trace(w):
                         w._stage.store(name, at, as_value(value))
                         at += 1
-            self.group_sizes[group] = at
+                starts.append(at)
+            self.group_sizes[group], self.term_sizes[group] = at, np.diff(starts).tolist()
 
     # -- memory ----------------------------------------------------------------------------------------------------
     def _close(self) -> None:

@@ -11,16 +11,25 @@ import numpy as np
 
 LEAST_COMMAND = 0.05  # [m/s and rad/s, added up] below which the clock of steps stands, as that of the tasks
 
+OBSERVED = (
+    "base velocity", "base angular velocity", "projected gravity", "joint position", "joint velocity", "last action",
+    "command", "step phase",
+)  # fmt: skip
+"""Names of the observations that are made here."""
+
 
 class Deployment:
-    """A velocity-tracking policy of an ONNX file on several robots in MuJoCo, each with its own command.
+    """A policy of an ONNX file on several robots in MuJoCo, each with its own command: of a task, or of your own.
 
     The network, the order of joints and actuators, offsets, scales, delays and the times come from the file; the robot
-    comes from its MJCF file, its servos included. The ground is a plane.
+    comes from its MJCF or URDF file, its servos included. Where it has none for an action, the file's gains make one,
+    and the file's armature that joint's; a base that floats gets a free joint. The ground is a plane. Joints and
+    actuators are found by their labels, or by what is behind the last "/".
 
     Args:
         policy: ONNX file with the metadata of ``warp_spo.env.export``.
-        robot: MJCF file of the robot, with a keyframe "stand".
+        robot: file of the robot, or a ``mujoco.MjSpec``, which is changed. Robots start from its keyframe "stand", or
+            from the pose of the policy's file without one.
         worlds: number of robots.
         friction: of the ground and the feet.
         seed: of the random starts and commands.
@@ -30,14 +39,22 @@ class Deployment:
         time: since the start [s]. fallen: robots whose trunk has leaned by more than 70 degrees since then [world].
     """
 
-    def __init__(self, policy: str | Path, robot: str | Path, worlds: int, friction: float = 0.8, seed: int = 0):
+    def __init__(
+        self, policy: str | Path, robot: str | Path | mujoco.MjSpec, worlds: int, friction: float = 0.8, seed: int = 0
+    ):
         self.network, found = load_policy(policy)
         self.metadata: dict[str, Any] = found
-        if found["observations"] is None or found["observations"][0][0] != "base velocity":
+        if found.get("default_base", "older") is None:
+            raise ValueError(f"Deployment: {str(policy)!r} is of a robot on a fixed base; expected one that floats")
+        unknown = [name for name, *_ in found["observations"] or [["none listed"]] if name not in OBSERVED]
+        if unknown or max(found.get("observation_history", [1])) > 1:
+            seen = ", ".join(unknown) or "past steps"
             raise ValueError(
-                f"Deployment: {str(policy)!r} is of task {found['task']!r}; expected one that tracks velocities"
+                f"Deployment: {str(policy)!r} is of task {found['task']!r}, which observes {seen}; expected one that "
+                f"tracks velocities, with observations among {', '.join(OBSERVED)}"
             )
-        spec = mujoco.MjSpec.from_file(str(robot))
+        spec = robot if isinstance(robot, mujoco.MjSpec) else mujoco.MjSpec.from_file(str(robot))
+        complete(spec, found)
         floor = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=0)
         floor.friction[0] = friction
         for geom in spec.geoms:
@@ -49,9 +66,11 @@ class Deployment:
         self.model = model = spec.compile()
         self.random = np.random.default_rng(seed)
         self.data = [mujoco.MjData(model) for _ in range(worlds)]
-        self.joint_q = [int(model.joint(name).qposadr[0]) for name in found["joints"]]
-        self.joint_qd = [int(model.joint(name).dofadr[0]) for name in found["joints"]]
-        self.actuators = [int(model.actuator(name).id) for name in found["actuators"]]
+        joints = [model.joint(own_name(name, [each.name for each in spec.joints])) for name in found["joints"]]
+        self.joint_q = [int(joint.qposadr[0]) for joint in joints]
+        self.joint_qd = [int(joint.dofadr[0]) for joint in joints]
+        labels = [each.name for each in spec.actuators]
+        self.actuators = [int(model.actuator(own_name(name, labels)).id) for name in found["actuators"]]
         self.numbers = {
             key: np.array(found[key]) for key in ("default_position", "action_offset", "action_scale", "delay_steps")
         }
@@ -64,10 +83,20 @@ class Deployment:
         self.fallen, self.time = np.zeros(worlds, bool), 0.0
         for data in self.data:
             self._start(data)
+        size, seen = found.get("observation_size"), self.observe().shape[1]
+        if size not in (None, seen):
+            raise ValueError(
+                f"Deployment: {str(policy)!r} takes {size} observations, and its terms give {seen} here; expected "
+                "terms of all joints, without names of some"
+            )
 
     def _start(self, data: mujoco.MjData) -> None:
-        """Stand a robot up in a random direction, its joints within 0.1 rad of the pose "stand"."""
-        mujoco.mj_resetDataKeyframe(self.model, data, self.model.key("stand").id)
+        """Stand a robot up in a random direction, its joints within 0.1 rad of where episodes start."""
+        if "stand" in (self.model.key(i).name for i in range(self.model.nkey)):
+            mujoco.mj_resetDataKeyframe(self.model, data, self.model.key("stand").id)
+        else:
+            mujoco.mj_resetData(self.model, data)
+            data.qpos[:3], data.qpos[self.joint_q] = self.metadata["default_base"][:3], self.numbers["default_position"]
         yaw = self.random.uniform(-np.pi, np.pi)
         data.qpos[3:7] = [np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw)]
         data.qpos[self.joint_q] += self.random.uniform(-0.1, 0.1, len(self.joint_q))
@@ -90,7 +119,10 @@ class Deployment:
                 "command": command,
                 "step phase": moves * np.array([np.sin(angle), np.cos(angle)]),
             }
-            rows.append(np.concatenate([scale * terms[name] for name, _, scale in self.metadata["observations"]]))
+            listed = self.metadata["observations"]
+            clips = self.metadata.get("observation_clip") or [None] * len(listed)
+            parts = [scale * terms[name] for name, _, scale in listed]
+            rows.append(np.concatenate([x if c is None else np.clip(x, *c) for x, c in zip(parts, clips, strict=True)]))
         return np.array(rows, np.float32)
 
     def step(self) -> None:
@@ -118,6 +150,33 @@ class Deployment:
             base = data.xmat[1].reshape(3, 3)
             found.append([*(base.T @ data.qvel[:3])[:2], data.qvel[5]])
         return np.array(found)
+
+
+def own_name(label: str, names: list[str]) -> str:
+    """Return the one of a model's names that a scene's label means: itself, or what is behind the last "/"."""
+    found = label if label in names else label.split("/")[-1]
+    if found not in names:
+        raise ValueError(f"Deployment: the robot has no {label!r}; it has {', '.join(names) or 'none'}")
+    return found
+
+
+def complete(spec: mujoco.MjSpec, found: dict[str, Any]) -> None:
+    """Add to a robot what the metadata of a policy have and it lacks: a free joint of the base, servos and motors."""
+    if found.get("default_base") and not any(each.type == mujoco.mjtJoint.mjJNT_FREE for each in spec.joints):
+        spec.worldbody.first_body().add_freejoint()
+    own, joints = [each.name for each in spec.actuators], [each.name for each in spec.joints]
+    for k, label in enumerate(found["actuators"]):
+        if label in own or label.split("/")[-1] in own:
+            continue
+        name = own_name(label, joints)
+        spec.joint(name).armature = found["armature"][k]
+        position, limit = found["action_kind"][k] != "tau", found["force_limit"][k]
+        stiffness, damping = (found[key][k] if position else 0.0 for key in ("stiffness", "damping"))
+        added = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        added.gaintype, added.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
+        added.gainprm[0], added.biasprm[:3] = stiffness if position else 1.0, [0.0, -stiffness, -damping]
+        if limit is not None:
+            added.forcelimited, added.forcerange = True, [-limit, limit]
 
 
 def load_policy(file: str | Path) -> tuple[Any, Any]:
