@@ -1,6 +1,7 @@
 """Steps as users call them: outputs, status, values that change, mistakes; accelerations and reactions of bodies."""
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -222,3 +223,23 @@ def test_accelerations_and_reactions_of_bodies(scene):
                 got = got - f - np.concatenate([np.zeros(3), np.cross(centre[child] - centre[k], f[:3])])
             wanted = [*(mass[k] * (linear - scene.values["gravity"][0])), *(I @ angular + np.cross(spin, I @ spin))]
             np.testing.assert_allclose(got, wanted, atol=1e-9)
+
+
+def test_targets_that_no_drive_follows_are_said_once(device):
+    """At the first step that is given some; not where a drive follows, or gains may be set."""
+    body, place = spo.Body(1.0, inertia=np.eye(3)), dict(axis=(0, 1, 0))
+    at = np.ones((1, 1))
+
+    def step(dyn, **given):
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            dyn.step(at, at, None, 1e-3, **given)
+        return [each for each in found if "target_q moves nothing" in str(each.message)]
+
+    bare = spo.Scene([body], [spo.Hinge("revolute", -1, 0, **place)])
+    dyn = spo.Dynamics(bare, 1, device)
+    said = [step(dyn), step(dyn, target_q=at), step(dyn, target_q=at)]
+    assert [len(each) for each in said] == [0, 1, 0] and said[1][0].filename == __file__
+    driven = spo.Scene([body], [spo.Hinge("revolute", -1, 0, target_ke=1.0, **place)])
+    for scene, variable in ((driven, ()), (bare, ("joint_target_ke",))):
+        assert not step(spo.Dynamics(scene, 1, device, variable=variable), target_q=at)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import warp as wp
@@ -125,8 +126,19 @@ def delays_controls(dyn: Dynamics) -> bool:
     return bool(dyn.scene.actuators) and ("actuator_delay" in dyn.variable or most_delay(dyn) > 0)
 
 
-def check_state(dyn: Dynamics, call: Call, ctrl: Any, state: Any) -> None:
-    """Raise ValueError unless a step has the buffers that its delays need, and no others."""
+def check_commands(dyn: Dynamics, call: Call, ctrl: Any, state: Any, target_q: Any) -> None:
+    """Raise ValueError unless a step has the buffers that its delays need, and no others.
+
+    At the first step with ``target_q`` warn if no drive follows it; later ones do not look again.
+    """
+    if target_q is not None and dyn._looks_at_targets:
+        dyn._looks_at_targets = False
+        if "joint_target_ke" not in dyn.variable and not dyn.scene.values["joint_target_ke"].any():
+            warnings.warn(
+                f"{call.name}: target_q moves nothing, because joint_target_ke of the scene is zero; set gains by "
+                "scene.with_values(joint_target_ke=..., joint_target_kd=...); files of robots rarely have them",
+                stacklevel=6,
+            )
     if ctrl is None and state is not None:
         raise ValueError(f"{call.name}: actuator_state is given and ctrl is None; expected both, or neither")
     if ctrl is not None and state is None and delays_controls(dyn):

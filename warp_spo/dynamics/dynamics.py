@@ -255,6 +255,7 @@ class Dynamics:
             raise UnsupportedError("Dynamics", f"refine={count} with loops={loops!r}", "dtype='float64'")
         self.refine = count
         self._refinement = Refinement(self, count) if count else None
+        self._looks_at_targets = True  # at the first step that is given some: whether a drive follows them
         self._options = {
             "worlds": self.worlds,
             "device": self.device.alias,

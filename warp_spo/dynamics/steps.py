@@ -300,7 +300,7 @@ def step(
         reported = contact_f, contact_gap, contact_slip, contact_excess, contact_residual
         asked = dict(zip(contacts.REPORTS, reported, strict=True))
         taken = contacts.check_step(self, call, integrator, passes, asked)
-        actuators.check_state(self, call, ctrl, actuator_state)
+        actuators.check_commands(self, call, ctrl, actuator_state, target_q)
         forces = {"tau": tau, "body_f": body_f, "target_q": target_q, "target_qd": target_qd, "ctrl": ctrl}
         written = {} if integrator != "semi_implicit" else {"qdd": qdd, "status": status}
         given = engine.read(call, STEP, q=q, qd=qd, dt=dt, **forces, **written)

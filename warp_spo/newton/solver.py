@@ -205,6 +205,7 @@ class SolverSPO(Plugs, SolverBase):
         self._values = {name: VALUES.get(name, name) for name in variable if name not in VALUES or name in sources}
         changing = tuple(self._values.values()) + (SLOT_VALUES if self._slots else ())
         self.dynamics = Dynamics(scene, scene.worlds, model.device, "float32", changing, **self._options)
+        self.dynamics._looks_at_targets = False  # a model has targets whether or not it has gains
         if self._tunes:
             self.dynamics.tune("forward_dynamics" if self.integrator == "rk4" else "step")
         if self.dynamics.closed:
