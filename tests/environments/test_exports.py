@@ -135,6 +135,26 @@ def test_a_film_of_a_robot_of_ones_own(tmp_path):
         recording.play(legged(), None, tmp_path / "walk", 1.0, (0,))
 
 
+@pytest.mark.slow
+def test_an_action_that_moves_a_follower_is_exported_as_its_own_joint():
+    """Offset, scale and gains are those of the joint that the action is named after."""
+
+    class Gripper(envs.actions.Position):
+        def trace(self, w, action):
+            ((entry, target),) = super().trace(w, action)
+            return [(0, -2.0 * target), (entry, target)]
+
+    body, axis = spo.Body(1.0, inertia=0.01 * np.eye(3)), (1, 0, 0)
+    names = enumerate(("right", "left"))
+    hinges = [spo.Hinge("prismatic", -1, k, axis=axis, label=name, target_ke=k + 1.0) for k, name in names]
+    env = envs.Env(
+        spo.Scene([body, body], hinges), 2, "cpu", actions=Gripper("left", scale=0.5, offset=0.1), rewards={},
+        observations={"actor": [lambda w: w.q]},
+    )  # fmt: skip
+    found = export.describe(env, "gripper")
+    assert np.allclose([found["action_scale"], found["action_offset"], found["stiffness"]], [[0.5], [0.1], [2.0]])
+
+
 def test_shapes_are_where_joints_and_contacts_are():
     """A capsule's ends are the joints, whichever way it points; a box is about the corners."""
     from warp_spo.env import shapes

@@ -19,8 +19,9 @@ def describe(env: Env, name: str) -> dict[str, Any]:
     Action k sets ``offset[k] + scale[k] action``, a control of the actuator or the target or force of the joint
     ``actuators[k]``, whose gains are ``stiffness[k]`` and ``damping[k]``, after it is clipped to ``action_clip[k]``,
     (lowest, highest), None without one. ``action_kind[k]`` says what is set, "ctrl", "target_q" or "tau";
-    ``armature[k]`` is the rotor's inertia at that joint. No bias of an encoder is in the offset. ``delay_steps`` count
-    steps of ``dt``; the policy runs every ``decimation`` of them.
+    ``armature[k]`` is the rotor's inertia at that joint. Targets of other joints that an action sets, too, such as
+    those of a mimic, are not listed. No bias of an encoder is in the offset. ``delay_steps`` count steps of ``dt``; the
+    policy runs every ``decimation`` of them.
 
     Observations are the terms ``observations`` [name, size, scale] of the group "actor", one after the other, each with
     its ``observation_clip`` [lowest, highest], None without one, and ``observation_history``, the steps that it holds,
@@ -81,6 +82,9 @@ def controls_of(env: Env) -> tuple[np.ndarray, np.ndarray, dict[str, list]]:
     gains: dict[str, list] = {name: [] for name in names}
     for label, row, at, by in zip(env.action_labels, rows[1:], start, step, strict=True):
         moved = [(array, i) for array in row for i in np.flatnonzero(row[array] != rows[0][array])]
+        if len(moved) > 1:  # targets of a joint and of what follows it
+            starts = {int(at): joint for at, joint in zip(scene.q_start, scene.joint_labels, strict=False)}
+            moved = [one for one in moved if one[0] == "target_q" and starts.get(int(one[1])) == label] or moved
         if len(moved) != 1:
             raise ValueError(
                 f"export: action {label!r} sets {len(moved)} controls; expected one: a scale that is not 0, and a "
