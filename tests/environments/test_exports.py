@@ -190,6 +190,11 @@ def test_go2_stands_in_mujoco(tmp_path):
     assert found["standing"] == 4
     for data in robots_there.data:
         assert data.qpos[2] > 0.25 and np.abs(data.qpos[robots_there.joint_q] - env.default_q[7:]).max() < 0.3
+    bare = deployment.mujoco.MjSpec.from_file(str(robots.FILES / "go2.xml"))
+    for each in list(bare.keys) + list(bare.actuators):  # a keyframe has controls
+        bare.delete(each)
+    with pytest.raises(ValueError, match="the robot has no actuator 'FL_hip', which the policy controls; it has none"):
+        deployment.Deployment(file, bare, 1)
     ours = recording.record(env, lambda observed: torch.zeros(2, 12), 2.0)
     assert np.allclose(ours.q[-1, 7:], robots_there.data[0].qpos[7:], atol=0.1)
 

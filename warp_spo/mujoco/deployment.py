@@ -168,9 +168,15 @@ def complete(spec: mujoco.MjSpec, found: dict[str, Any]) -> None:
     for k, label in enumerate(found["actuators"]):
         if label in own or label.split("/")[-1] in own:
             continue
+        kind = found.get("action_kind", ["ctrl"] * (k + 1))[k]
+        if kind == "ctrl":
+            raise ValueError(
+                f"Deployment: the robot has no actuator {label!r}, which the policy controls; it has "
+                f"{', '.join(own) or 'none'}; expected a file with the actuators of the environment's scene"
+            )
         name = own_name(label, joints)
         spec.joint(name).armature = found["armature"][k]
-        position, limit = found["action_kind"][k] != "tau", found["force_limit"][k]
+        position, limit = kind != "tau", found["force_limit"][k]
         stiffness, damping = (found[key][k] if position else 0.0 for key in ("stiffness", "damping"))
         added = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         added.gaintype, added.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
