@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+import wrapped
 
 import warp_spo as spo
-from support import laws, wrapped
+from support import laws
 from support.border import WORLDS, dynamics, explained, scene
 
 MAKE = {"JAX": jnp.asarray, "wrapped": wrapped.Array}

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+import wrapped
 
 import warp_spo as spo
-from support import laws, wrapped, zoo
+from support import laws, zoo
 from support.border import explained
 from warp_spo import jax as spo_jax
 

@@ -1,4 +1,7 @@
-"""A library of arrays that speaks DLPack and nothing else: its arrays are NumPy's inside."""
+"""A library of arrays that speaks DLPack and nothing else: its arrays are NumPy's inside.
+
+It lies beside ``support`` because messages name a library by the package of its arrays.
+"""
 
 import numpy as np
 
