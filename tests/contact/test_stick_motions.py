@@ -45,7 +45,7 @@ def test_a_stick_lies_still(device, case):
 
 
 BUGS = {
-    "what lies over a face is forgotten": ("none = !(ends[0] < ends[3])", "none = true"),
+    "the part over a face is forgotten": ("none = !(ends[0] < ends[3])", "none = true"),
     "one side alone": ("ends[end == 0 ? 1 : 2] =", "ends[1] ="),
     "the wrong side": ("high = rise > 0", "high = rise < 0"),
     "as deep as the nearest place": ("more > 0 ? more : 0", "0 * more"),

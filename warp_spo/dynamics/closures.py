@@ -34,7 +34,7 @@ AMID_CONTACTS = (
     "use loops='cut', which leaves them open, and hold what follows by drives: target_q = ratio q + offset, see the "
     "page on closed loops; or leave the contacts out, scene.with_contacts([]), and loops='embed' closes them"
 )
-"""What to do with the loops of a scene that has contacts."""
+"""Ways to treat the loops of a scene that has contacts, for errors."""
 FORWARD_DYNAMICS = Routine("embedded_forward_dynamics", embedded.forward_dynamics)
 PROJECT_POSITION = Routine("project_position", projection.project_position)
 PROJECT_VELOCITY = Routine("project_velocity", projection.project_velocity)

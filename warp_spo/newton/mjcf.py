@@ -26,7 +26,7 @@ from .worlds import quote_labels
 
 MASKS = ("contype", "conaffinity")
 DEFAULTS = {"contype": 1, "conaffinity": 1, "condim": 3, "geom_priority": 0}
-"""What the importer reads of geoms, and what they have where a file says nothing."""
+"""Attributes of geoms that the importer reads, and their values where a file gives none."""
 
 
 def mjcf_tree(file: Path) -> ET.Element:

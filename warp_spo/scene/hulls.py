@@ -56,7 +56,7 @@ def convex_hull(call: str, points: np.ndarray, known: np.ndarray) -> tuple[Hull,
         ValueError: the points lie in a plane, or some are too near to each other to tell faces apart.
         UnsupportedError: there are more than MOST corners or faces.
     """
-    middle, corners, normals, offsets = _found(call, points, known)
+    middle, corners, normals, offsets = _corners_and_faces(call, points, known)
     size = float(np.ptp(points, axis=0).max())
     on = np.abs(corners @ normals.T - offsets) <= SAME * size
     faces = [_around(corners, np.flatnonzero(row), normal) for row, normal in zip(on.T, normals, strict=True)]
@@ -77,7 +77,9 @@ def convex_hull(call: str, points: np.ndarray, known: np.ndarray) -> tuple[Hull,
     return hull, middle
 
 
-def _found(call: str, points: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _corners_and_faces(
+    call: str, points: np.ndarray, known: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the middle of points, the corners of their hull about it, and normals and offsets of its faces."""
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     centred, size = points - middle, float(np.ptp(points, axis=0).max())
@@ -103,7 +105,7 @@ def with_corners(points: np.ndarray, some: np.ndarray) -> np.ndarray:
     Of hulls with more than MOST corners, and of points in a plane, ``some`` alone.
     """
     try:
-        middle, corners, _, _ = _found("", points, points[some])
+        middle, corners, _, _ = _corners_and_faces("", points, points[some])
     except ValueError:
         return some
     at = [int(np.abs(points - middle - corner).max(axis=1).argmin()) for corner in corners]
