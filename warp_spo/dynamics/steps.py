@@ -319,7 +319,7 @@ def step(
 
 
 def _read_if_given(dyn: Dynamics, call: Call, arrays: dict[str, Any]) -> dict[str, wp.array]:
-    """Return the checked arrays that a step fills, by name, of those that are not None."""
+    """Check the arrays that a step fills, and return those that are given, by name."""
     return dyn._engine.read(call, STEP, **{name: array for name, array in arrays.items() if array is not None})
 
 

@@ -180,7 +180,7 @@ class Env(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Steps since the start of the episode, int64 [world]. Logs leave out lengths of episodes that were written."""
+        """Steps since the start of the episode, int64 [world]. Logs leave out episodes whose entry a caller wrote."""
         return self._tensors["episode_length"]
 
     @episode_length_buf.setter

@@ -103,7 +103,7 @@ def checked_parts(actions: Any) -> list[Any]:
 
 
 def checked_actions(call: str, actions: Any, worlds: int, labels: list[str]) -> torch.Tensor:
-    """Return actions [world, action] as a tensor; TypeError and ValueError for what is none, or requires grad."""
+    """Return actions [world, action] as a tensor; TypeError or ValueError if they are none, or require grad."""
     try:
         given = torch.as_tensor(actions)
     except (TypeError, ValueError, RuntimeError):

@@ -73,7 +73,9 @@ def play(
     path.parent.mkdir(parents=True, exist_ok=True)
     wanted = env.command.shape[1] if env.has_commands else 0
     if command is not None and len(command) != wanted:
-        raise ValueError(f"recording.play: command has {len(command)} number(s); expected {wanted}")
+        raise ValueError(
+            f"recording.play: command has {len(command)} number(s); expected {wanted}, one for each command of env"
+        )
     recorded, start = record(env, policy, seconds, command), env.default_q
     scene = env.scene.without_loops()
     robot = robots.Robot("", path, scene, start, np.zeros(0), shapes.primitives(scene, start))

@@ -62,7 +62,7 @@ def mesh_file(mesh: Element, why: str) -> Path:
 
 
 def unit_of(mesh: Element, file: Path) -> float:
-    """Return the length of the unit of a mesh's file [m]: that of a COLLADA file, 1 of others. Its up axis is no one's.
+    """Return the length of the unit of a mesh's file [m]: that of a COLLADA file, 1 of others. No up axis is applied.
 
     Raises:
         ValueError: it is no length; the message names the line of the <mesh>.

@@ -204,7 +204,7 @@ def _carry_outward(
     path: Callable[[int], Value],
     carry: Callable[[Link, Carried], Carried] | None,
 ) -> dict[int | None, Carried]:
-    """Return what the ``needed`` links carry, by id, from the ``base`` outward; that is under None.
+    """Return what the ``needed`` links carry, by id, from the ``base`` outward; what the base carries is under None.
 
     ``path``: the rates along which q moves in the step; qd itself where that is no other path.
     """
