@@ -1,11 +1,12 @@
 """Steps on the ground beside mujoco_warp and Newton's solvers: time of a step, and error against own steps of 0.1 ms.
 
-    python -m benchmarks.contact.peers [--device cuda:0] [--worlds 4096 16384] [--json FILE]
+    python -m benchmarks.contact.peers [--device cuda:0] [--worlds 4096 16384] [--json FILE] [--seconds 120]
 
 Two groups. "file": the robots of the environments, one MJCF file for both sides, drives that hold the standing pose.
 "model": a Newton model of robots that come with Newton, stepped by Newton's solvers with the settings of Newton's own
 examples, and by SolverSPO. All take the same dt and start standing or just above the ground, pushed differently in
 each world. A time is that of a step among steps that are replayed in a CUDA graph, from a state after 0.5 s.
+Processes prepare side by side; one at a time measures (:mod:`benchmarks.turns`).
 The error is the root mean square, over worlds, of how far the base is after 0.5 s from where the same solver puts it
 with steps of 0.1 ms.
 """
@@ -17,7 +18,7 @@ import json
 import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +27,8 @@ import warp as wp
 
 import warp_spo as spo
 from warp_spo.env import robots
+
+from .. import turns
 
 DT, FINE, SECONDS = 5e-3, 1e-4, 0.5
 SAMPLE = 64  # worlds of a run for the error
@@ -237,10 +240,11 @@ def measure(make: Callable[..., Stepper], each: int, name: str, worlds: int, dev
     advance(stepper, round(SECONDS / DT / each), device)
     said, finite = stepper.said(), float(np.isfinite(stepper.base()).all(1).mean())
     if not device.is_cuda:
-        begin = time.perf_counter()
-        for _ in range(4):
-            stepper.step()
-        return dict(us=1e6 * (time.perf_counter() - begin) / 4 / each, said=said, finite=finite)
+        with turns.mine:
+            begin = time.perf_counter()
+            for _ in range(4):
+                stepper.step()
+            return dict(us=1e6 * (time.perf_counter() - begin) / 4 / each, said=said, finite=finite)
     kept = [wp.clone(x) for x in stepper.state]
     with wp.ScopedCapture(device) as capture:
         for now, before in zip(stepper.state, kept, strict=True):
@@ -248,14 +252,51 @@ def measure(make: Callable[..., Stepper], each: int, name: str, worlds: int, dev
         for _ in range(STEPS // each):
             stepper.step()
     times = []
-    for k in range(13):
-        start, end = (wp.Event(device, enable_timing=True) for _ in range(2))
-        device.stream.record_event(start)
-        wp.capture_launch(capture.graph)
-        device.stream.record_event(end)
-        wp.synchronize_device(device)
-        times += [wp.get_event_elapsed_time(start, end)] if k > 2 else []
+    with turns.mine:
+        for k in range(13):
+            start, end = (wp.Event(device, enable_timing=True) for _ in range(2))
+            device.stream.record_event(start)
+            wp.capture_launch(capture.graph)
+            device.stream.record_event(end)
+            wp.synchronize_device(device)
+            times += [wp.get_event_elapsed_time(start, end)] if k > 2 else []
     return dict(us=1e3 * float(np.median(times)) / STEPS, said=said, finite=finite)
+
+
+class Task(NamedTuple):
+    """What one process measures: the error where ``worlds`` is None, else the time of a step of so many worlds."""
+
+    device: str
+    group: str
+    robot: str
+    solver: str
+    worlds: int | None
+
+
+def work(task: Task, turn: turns.Turn) -> Iterator[dict[str, Any]]:
+    """Yield a part of the row of a robot and a solver."""
+    warnings.simplefilter("ignore")
+    (make, each), device = GROUPS[task.group][1][task.solver], wp.get_device(task.device)
+    if task.worlds is None:
+        yield {"error m": error(make, each, task.robot, device)}
+        return
+    found = measure(make, each, task.robot, task.worlds, device)
+    yield {f"us {task.worlds}": found["us"], "finite": found["finite"], "settings": found["said"]}
+
+
+def tasks_of(options: argparse.Namespace) -> list[Task]:
+    """Return what the options ask for, the most worlds first."""
+    wanted: list[int | None] = [*sorted(options.worlds, reverse=True), *([] if options.no_errors else [None])]
+    device = wp.get_device(options.device).alias
+    return [
+        Task(device, group, robot, solver, worlds)
+        for worlds in wanted
+        for group in options.groups
+        for robot in GROUPS[group][0]
+        if not options.robots or robot in options.robots
+        for solver in GROUPS[group][1]
+        if not options.solvers or solver in options.solvers
+    ]
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -268,29 +309,24 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--robots", nargs="+", choices=sorted({*FILES, *MODELS}), help="left out: all of a group")
     parser.add_argument("--solvers", nargs="+", help="some of the solvers")
     parser.add_argument("--no-errors", action="store_true", help="times only")
+    parser.add_argument("--seconds", type=float, default=3600.0, help="after which rows that are left are not measured")
+    parser.add_argument("--jobs", type=int, help="processes side by side; left out: one for each core")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
-    warnings.simplefilter("ignore")
-    device, rows = wp.get_device(options.device), []
-    for group in options.groups:
-        names, makers = GROUPS[group]
-        for name in (n for n in names if not options.robots or n in options.robots):
-            for solver, (make, each) in makers.items():
-                if options.solvers and solver not in options.solvers:
-                    continue
-                row: dict[str, Any] = dict(group=group, robot=name, solver=solver)
-                try:
-                    if not options.no_errors:
-                        row["error m"] = error(make, each, name, device)
-                    for worlds in options.worlds:
-                        found = measure(make, each, name, worlds, device)
-                        row |= {f"us {worlds}": found["us"], "finite": found["finite"], "settings": found["said"]}
-                except Exception as failure:  # a peer that cannot run is a row that says why
-                    row["refused"] = f"{type(failure).__name__}: {failure}"[:300]
-                rows.append(row)
-                print(row, flush=True)
-                if options.json:
-                    options.json.write_text(json.dumps(rows, indent=1))
+    tasks = tasks_of(options)
+    rows: dict[tuple[str, str, str], dict[str, Any]] = {}
+    for task in tasks:
+        rows[task[1:4]] = dict(zip(("group", "robot", "solver"), task[1:4], strict=True))
+    for task, found in turns.take_turns(tasks, work, options.seconds, options.jobs):
+        row = rows[task[1:4]]
+        if isinstance(found, Exception):  # a peer that cannot run is a row that says why
+            row["refused"] = str(found)
+        elif found is None:
+            print(row, flush=True)
+        else:
+            row |= found
+        if options.json:
+            options.json.write_text(json.dumps(list(rows.values()), indent=1))
     return 0
 
 
