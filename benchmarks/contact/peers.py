@@ -29,6 +29,7 @@ import warp_spo as spo
 from warp_spo.env import robots
 
 from .. import turns
+from ..capabilities import median_replay
 
 DT, FINE, SECONDS = 5e-3, 1e-4, 0.5
 SAMPLE = 64  # worlds of a run for the error
@@ -189,7 +190,7 @@ def model_steps(solver: str) -> Callable[[str, int, float, wp.Device], Stepper]:
                 return f"iterations {option.iterations}, ls {option.ls_iterations}, {found:.1f} contacts a world"
             if contacts:
                 return f"{contacts.rigid_contact_count.numpy()[0] / worlds:.1f} contacts a world"
-            kernel = next((x for x in taken.dynamics.programs.described() if x.startswith("contact_step")), "")
+            kernel = [x for x in taken.dynamics.programs.described() if x.startswith("contact_step")][-1]
             return f"{len(taken.dynamics.scene.contact_points)} points, {kernel}"
 
         arrays = [x for x in (states[0].joint_q, states[0].joint_qd, states[0].body_q, states[0].body_qd)]
@@ -218,6 +219,7 @@ def advance(stepper: Stepper, count: int, device: wp.Device) -> None:
                 stepper.step()
         for _ in range(count // STEPS):
             wp.capture_launch(capture.graph)
+            wp.synchronize_device(device)  # a process that is stopped for another one's turn leaves little to do
         count %= STEPS
     for _ in range(count):
         stepper.step()
@@ -251,16 +253,7 @@ def measure(make: Callable[..., Stepper], each: int, name: str, worlds: int, dev
             wp.copy(now, before)
         for _ in range(STEPS // each):
             stepper.step()
-    times = []
-    with turns.mine:
-        for k in range(13):
-            start, end = (wp.Event(device, enable_timing=True) for _ in range(2))
-            device.stream.record_event(start)
-            wp.capture_launch(capture.graph)
-            device.stream.record_event(end)
-            wp.synchronize_device(device)
-            times += [wp.get_event_elapsed_time(start, end)] if k > 2 else []
-    return dict(us=1e3 * float(np.median(times)) / STEPS, said=said, finite=finite)
+    return dict(us=1e3 * median_replay(capture.graph, device) / STEPS, said=said, finite=finite)
 
 
 class Task(NamedTuple):
