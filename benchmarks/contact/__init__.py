@@ -1,6 +1,7 @@
 """Steps with contacts: times, errors, energy, motions, other engines, gradients, pictures.
 
-``scenes``: robots on the ground. ``steps``: time and error of a step. ``throws``: energy of a million random states.
+``scenes``: robots on the ground. ``steps``: time and error of a step; ``pairs``: of one in which bodies touch each other.
+``throws``: energy of a million random states.
 ``motions`` and ``courses``: every figure that contacts promise, on a CPU. ``mujoco``: G1 beside MuJoCo, its error
 against run time. ``peers``: steps beside mujoco_warp and Newton's solvers, on a GPU. ``gradients``: their time, errors
 and jumps. ``terrain``: a picture of the kinds of terrain. All but ``scenes`` and ``courses`` are commands.

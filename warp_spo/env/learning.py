@@ -6,7 +6,9 @@ The learner, its losses and its storage are rsl_rl's.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import io
 import math
 import os
 import pickle
@@ -173,7 +175,8 @@ def make_runner(
     began: float | None = None, seconds: float = math.inf,
 ) -> OnPolicyRunner:  # fmt: skip
     """Return rsl_rl's runner on an environment, with the course of the training in ``folder``."""
-    runner = Runner(env, learner.settings(env, save_interval), None, device=str(env.device))
+    with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints every layer of both networks
+        runner = Runner(env, learner.settings(env, save_interval), None, device=str(env.device))
     began = time.time() if began is None else began
     runner.logger = Course(env, folder, every, began, runner.gpu_global_rank == 0, seconds)  # type: ignore[assignment]
     return runner
