@@ -18,7 +18,7 @@ Accuracy, mostly on a CPU:
 Contact:
     ``contact/``: times and errors, energy, every promised figure, other engines, gradients, terrain.
 Learning:
-    ``env_times`` (a step of an environment and its parts), ``training`` (env-steps/s), ``learning_curves``.
+    ``env_times`` (parts of a step of an environment), ``training`` (env-steps/s), ``learning_curves``.
 Documentation and refactoring:
     ``blocks`` (code of pages), ``site``, ``site_pictures``, ``gallery``; ``kernel_texts`` (generated),
     ``env_digests`` (bits of the tasks' environments).
