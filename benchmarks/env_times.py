@@ -39,10 +39,19 @@ def actions_of(env: Any, count: int = 4) -> list[torch.Tensor]:
 
 def drive(env: Any, steps: int) -> bool:
     """Take steps with random actions; return whether the last observations are finite."""
-    sets = actions_of(env)
-    for index in range(steps):
-        observed = env.step(sets[index % len(sets)])[0]
+    for actions in itertools.islice(itertools.cycle(actions_of(env)), steps):
+        observed = env.step(actions)[0]
     return all(bool(torch.isfinite(each).all()) for each in observed.values())
+
+
+def stepper(env: Any) -> Callable[[], None]:
+    """Return a function that takes one step as a learner does, with the sets of random actions in turn."""
+    sets = itertools.cycle(actions_of(env))
+
+    def step() -> None:
+        env.step(next(sets))
+
+    return step
 
 
 def time_of(work: Callable[[], Any], device: Any, count: int = REPLAYS) -> float:
@@ -81,12 +90,7 @@ def measure(tasks: list[str], worlds: int, device: Any) -> dict[str, dict[str, A
         step = statistics.median(turn[task] for turn in turns)
         dynamics = as_graph(env._physics, device)
         alone = statistics.median(time_of(dynamics, device) for _ in range(TURNS))
-        sets, count = actions_of(env), itertools.count()
-
-        def call(env: Any = env, sets: list = sets, count: Any = count) -> None:
-            env.step(sets[next(count) % len(sets)])
-
-        called = statistics.median(time_of(call, device) for _ in range(TURNS))
+        called = statistics.median(time_of(stepper(env), device) for _ in range(TURNS))
         found[f"{task}, {worlds} worlds"] = {
             "step": step, "dynamics": alone, "with Python": called, "env-steps/s": 1e6 * worlds / step,
             "share that is not dynamics": 1.0 - alone / step, "bytes a world": env.bytes_per_world,

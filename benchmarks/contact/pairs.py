@@ -32,6 +32,7 @@ SAMPLE = 4  # worlds that are compared with the dense step
 DIFFERENT = 64  # states of a set of inputs; worlds beyond repeat them
 ARM = np.array([0.0, 0.55, 0.0, -2.13, 0.0, 2.69, 0.785])
 CUBE = 0.1  # half the size of a cube that stands on others [m]
+CALF = dict(capsule=((0, 0, 0), (0, 0, -0.2), 0.02), stiffness=2e4)
 
 
 class Case(NamedTuple):
@@ -86,10 +87,8 @@ def calves() -> Case:
     """Return a Go2 with a pair between each two calves; in half of the worlds the front ones cross."""
     bare = scenes.scene("go2")
     labels = [label.split("/")[-1] for label in bare.body_labels]
-    shapes = [spo.Contact(labels.index(f"{leg}_calf"), capsule=((0, 0, 0), (0, 0, -0.2), 0.02), stiffness=2e4)
-              for leg in ("FL", "FR", "RL", "RR")]  # fmt: skip
-    both = [spo.Contact(a.body, capsule=((0, 0, 0), (0, 0, -0.2), 0.02), other=b, stiffness=2e4)
-            for b, a in itertools.combinations(shapes, 2)]  # fmt: skip
+    legs = [labels.index(f"{leg}_calf") for leg in ("FL", "FR", "RL", "RR")]
+    both = [spo.Contact(a, other=spo.Contact(b, **CALF), **CALF) for b, a in itertools.combinations(legs, 2)]
 
     def states(scene: spo.Scene, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         q, qd = scenes.states(scene, DIFFERENT, int(rng.integers(2**31)))

@@ -257,7 +257,7 @@ def measure(make: Callable[..., Stepper], each: int, name: str, worlds: int, dev
 
 
 class Task(NamedTuple):
-    """What one process measures: the error where ``worlds`` is None, else the time of a step of so many worlds."""
+    """A measurement by one process: the error where ``worlds`` is None, else the time of a step of so many worlds."""
 
     device: str
     group: str
