@@ -35,6 +35,12 @@ def as_names(call: str, what: str, names: Any, such: tuple[str, ...]) -> tuple[s
     return tuple(map(str, listed))  # NumPy's strings are of a subclass
 
 
+def shown(name: str, most: int = 64) -> str:
+    """Return a name of a file or a user as messages show it: what does not print is escaped, a long middle left out."""
+    text = repr(name)[1:-1]
+    return text if len(text) <= most else f"{text[: most // 2]}...{text[-most // 4 :]}"
+
+
 def is_bool(value: Any) -> bool:
     """Return whether a value is a bool or an array of bools, of Python, NumPy or torch."""
     return isinstance(value, bool) or str(getattr(value, "dtype", "")).endswith("bool")

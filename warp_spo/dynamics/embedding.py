@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import UnsupportedError, as_integer
+from ..errors import UnsupportedError, as_integer, shown
 from ..recursions.links import Links
 from ..recursions.loops.closures import closures
 from ..recursions.loops.clusters import clusters
@@ -134,7 +134,7 @@ def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str 
     clusters = closing.clusters
     for cluster in clusters:
         if len(cluster.dofs) > MOST_DOFS:
-            names = list(dict.fromkeys(link.label for link in cluster.links))
+            names = [shown(scene.body_labels[node]) for node in dict.fromkeys(link.node for link in cluster.links)]
             tied = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
             raise UnsupportedError(
                 call,
@@ -182,7 +182,7 @@ def _numbers(scene: Scene, asked: Sequence[int | str], call: str) -> set[int]:
         if number is None or not 0 <= number < scene.dof_count:
             raise ValueError(
                 f"{call}: independent names {dof!r}; expected dofs, 0 to {scene.dof_count - 1}, or labels "
-                f"among {', '.join(labels)}"
+                f"among {', '.join(map(shown, labels))}"
             )
         found.add(number)
     return found

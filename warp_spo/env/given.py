@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..errors import UnsupportedError, is_bool
+from ..errors import UnsupportedError, is_bool, shown
 from ..scene.scene import Scene
 from .checks import check_function, check_mapping, check_number, check_whole
 from .observations import Observation, TorchTerm
@@ -112,7 +112,7 @@ def checked_actions(call: str, actions: Any, worlds: int, labels: list[str]) -> 
         kind = "complex numbers of " if given.is_complex() else ""
         raise ValueError(
             f"{call}: actions has {kind}shape {tuple(given.shape)}; expected ({worlds}, {len(labels)}) "
-            f"[world, action]: {', '.join(labels)}"
+            f"[world, action]: {', '.join(map(shown, labels))}"
         )
     if given.requires_grad and torch.is_grad_enabled():
         raise ValueError(

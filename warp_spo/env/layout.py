@@ -23,6 +23,7 @@ class Layout:
         tables: numbers that all worlds share, by their names in kernels. table_names: names that terms give them.
         weights: of rewards.
         values: names of the scene's values that differ between worlds.
+        outputs: names under which kernels write results ("reward", a group of observations, ...), by result.
     """
 
     def __init__(self, scene: Scene, default_q: np.ndarray, step_dt: float, commands: Any, values: tuple[str, ...]):
@@ -47,6 +48,7 @@ class Layout:
         self.users: dict[Any, tuple[str, int]] = {}
         self.user_size = 0
         self.sensors: dict[str, tuple[int, float | None, Any]] = {}
+        self.outputs: dict[str, str] = {}
 
     def remember(self, name: str, size: int, reset: float | None) -> int:
         """Return where ``size`` numbers of this name are in the memory."""
@@ -60,6 +62,10 @@ class Layout:
                 f"{size}, set to {reset}; expected the same in all terms"
             )
         return start
+
+    def output(self, result: str) -> str:
+        """Return the name under which kernels write a result: its number, so that no user's name reaches a compiler."""
+        return self.outputs.setdefault(result, f"out_{len(self.outputs)}")
 
     def table(self, name: str, numbers: np.ndarray) -> str:
         """Return the name under which kernels read a table."""

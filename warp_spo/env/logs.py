@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from ..errors import shown
 from .layout import Layout
 from .stage import Launch
 from .tracing import CAUSES
@@ -59,7 +60,7 @@ def share(counted: torch.Tensor) -> torch.Tensor:
 
 def describe(env: Env) -> str:
     """Return the size of an environment in a line."""
-    groups = ", ".join(f"{name} {size}" for name, size in env.num_obs.items())
+    groups = ", ".join(f"{shown(name)} {size}" for name, size in env.num_obs.items())
     return f"Env({env.num_envs} worlds on {env.warp_device}, {env.num_actions} actions, observations: {groups})"
 
 
@@ -72,15 +73,15 @@ def explain(env: Env, stages: dict[str, list[Launch]], users: dict[Any, tuple[st
     lines = [
         f"{env.num_envs} worlds on {env.warp_device}, {env.decimation} steps of {env.dt:g} s a step, "
         f"{env.max_episode_length} steps an episode",
-        f"actions      {env.num_actions}: {', '.join(env.action_labels)}",
-        f"observations {', '.join(f'{name} {size}' for name, size in env.num_obs.items())}",
-        f"rewards      {', '.join(env.reward_names)}",
-        f"ends         {', '.join(env.termination_names)}, after {env.max_episode_length} steps",
+        f"actions      {env.num_actions}: {', '.join(map(shown, env.action_labels))}",
+        f"observations {', '.join(f'{shown(name)} {size}' for name, size in env.num_obs.items())}",
+        f"rewards      {', '.join(map(shown, env.reward_names))}",
+        f"ends         {', '.join(map(shown, env.termination_names))}, after {env.max_episode_length} steps",
         f"variable     {', '.join(env.values) or 'nothing'}",
         f"memory       {env.bytes_per_world} bytes a world",
     ]
     kernels = [(name, kernel) for name, some in stages.items() for kernel in some]
     parts = [f"{each.threads} threads a world, each" if each.threads else "a world," for _, each in kernels]
     lines += [f"{name:12} {part} {one.operations} operations" for (name, one), part in zip(kernels, parts, strict=True)]
-    lines += [f"in torch     {term.name}, before {place}" for term, (place, _) in users.items()]
+    lines += [f"in torch     {shown(term.name)}, before {place}" for term, (place, _) in users.items()]
     return "\n".join(lines)

@@ -69,17 +69,10 @@ class Buffer(NamedTuple):
         """Return the flat Warp array over the same memory."""
         import torch
 
-        flat = self.tensor.reshape(-1)
+        flat = self.tensor.reshape(-1)[:MOST_ENTRIES]  # kernels take its address alone
         if self.way == CHOSEN:
             return wp.from_torch(flat, dtype=wp.bool)
         return wp.from_torch(flat.view(torch.float32), dtype=wp.float32)
-
-
-def output_name(result: str) -> str:
-    """Return the name under which kernels write a result: "reward", a group of observations, and so on."""
-    return "out_" + "".join(
-        letter if letter.isalnum() and letter.isascii() else f"_{ord(letter)}_" for letter in result
-    )
 
 
 class Stage:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from .layout import Layout
-from .stage import CHOSEN, COLUMN, INT, LONG, ROW, SHARED, Buffer, output_name
+from .stage import CHOSEN, COLUMN, INT, LONG, ROW, SHARED, Buffer
 
 CONTACT_ARRAYS = {"contact_f": 3, "contact_gap": 1, "contact_slip": 1}  # entries of each point, and of each pair
 LINE = 32  # scalars of a line of the caches
@@ -40,7 +40,7 @@ class Storage:
         apart: set[str],
         tables: Mapping[str, torch.Tensor],
     ):
-        self.worlds, self.device = worlds, device
+        self.worlds, self.device, self._output = worlds, device, layout.output
         self.tensors: dict[str, torch.Tensor] = {}
         self.buffers: dict[str, Buffer] = {}
         self.controls: dict[str, torch.Tensor] = {}
@@ -63,7 +63,7 @@ class Storage:
 
     def changing(self) -> dict[str, torch.Tensor]:
         """Return the tensors that steps change, by name; "out" holds all results."""
-        results = {output_name(name) for name in self.places}
+        results = {self._output(name) for name in self.places}
         own = {name for name, buffer in self.buffers.items() if buffer.way != SHARED} | {"key"}
         return {name: x for name, x in self.tensors.items() if name in own - results} | {"out": self.out}
 
@@ -141,7 +141,7 @@ class Storage:
             at += -(-self.worlds * pitch // LINE) * LINE
         self.out = self._zeros(at)
         for name in self.places:
-            rows, held = self._rows(self.out, name), output_name(name)
+            rows, held = self._rows(self.out, name), self._output(name)
             whole = name == "done"
             self._add(held, rows.view(-1).view(torch.int32) if whole else rows, INT if whole else ROW)
             self.buffers[held] = self.buffers[held]._replace(passes=name in apart)

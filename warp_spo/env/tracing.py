@@ -17,7 +17,7 @@ from ..trace.scalars import Value, absolute, branch, less
 from .events import EncoderBias, Interval, Reset, Start, Values
 from .layout import Layout
 from .observations import Observation, name_of
-from .stage import Stage, output_name
+from .stage import Stage
 from .vectors import Vector, as_condition, as_value, vector
 from .world import World
 
@@ -157,9 +157,9 @@ class Tracing:
             terminated = terminated | ends[name]
         late = length >= float(steps)
         self.done = done = terminated | late
-        stage.store(output_name("reward"), 0, as_value(where(bad, 0.0, total)))
-        stage.store(output_name("done"), 0, as_value(where(done, 1.0, 0.0)))
-        stage.store(output_name("time_out"), 0, as_value(where(late & ~terminated, 1.0, 0.0)))
+        stage.store(self.layout.output("reward"), 0, as_value(where(bad, 0.0, total)))
+        stage.store(self.layout.output("done"), 0, as_value(where(done, 1.0, 0.0)))
+        stage.store(self.layout.output("time_out"), 0, as_value(where(late & ~terminated, 1.0, 0.0)))
         stage.store("chosen", 0, as_value(where(done, 1.0, 0.0)))
         stage.store("episode_length", 0, as_value(where(done, 0.0, length)))
         found = {"seconds": w.time, **{f"reward {name}": w.kept[f"sum reward {name}"][0] for name in self.rewards}}
@@ -311,7 +311,7 @@ class Tracing:
         """Store the observations of all groups: of ``w``, or of the rows of a world that ``begin`` makes of a stage."""
         of_rows: dict[int, World] = {}
         for group, terms in self.groups.items():
-            name, at, starts = output_name(kind + group), 0, [0]
+            name, at, starts = self.layout.output(kind + group), 0, [0]
             for term in terms:
                 rows = term.rows
                 if rows:

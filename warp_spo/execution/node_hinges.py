@@ -34,8 +34,8 @@ def links(scene: Scene) -> list[Link]:
         if any(kind.node_code is None for kind, _ in elements):
             first, (kind, axis) = int(scene.qd_start[index]), elements[0]
             assert len(elements) == 1 and axis is None and not kind.at_com, "placed by itself, about its anchor"
-            dofs, label = tuple(range(first, first + kind.dofs)), scene.body_labels[node]
-            found.append(Link(None, kind, None, ZERO, None, dofs, int(scene.q_start[index]), (), node, label))
+            dofs = tuple(range(first, first + kind.dofs))
+            found.append(Link(None, kind, None, ZERO, None, dofs, int(scene.q_start[index]), (), node))
     return found
 
 
@@ -50,7 +50,7 @@ def kernel(scene: Scene, T: type, moves: bool) -> wp.Kernel | None:
         return None
     graph, stores = Graph(), []
     for link in some:
-        graph.step = f"{link.label}|x"
+        graph.step = f"{link.title}|x"
         stores += _stores(graph, link, moves)
     widths = WRITTEN | {"tree": POSE}
 

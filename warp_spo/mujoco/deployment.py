@@ -9,6 +9,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from ..errors import shown
+
 LEAST_COMMAND = 0.05  # [m/s and rad/s, added up] below which the clock of steps stands, as that of the tasks
 
 OBSERVED = (
@@ -48,7 +50,7 @@ class Deployment:
             raise ValueError(f"Deployment: {str(policy)!r} is of a robot on a fixed base; expected one that floats")
         unknown = [name for name, *_ in found["observations"] or [["none listed"]] if name not in OBSERVED]
         if unknown or max(found.get("observation_history", [1])) > 1:
-            seen = ", ".join(unknown) or "past steps"
+            seen = ", ".join(map(shown, unknown)) or "past steps"
             raise ValueError(
                 f"Deployment: {str(policy)!r} is of task {found['task']!r}, which observes {seen}; expected one that "
                 f"tracks velocities, with observations among {', '.join(OBSERVED)}"
@@ -156,7 +158,7 @@ def own_name(label: str, names: list[str]) -> str:
     """Return the one of a model's names that a scene's label means: itself, or what is behind the last "/"."""
     found = label if label in names else label.split("/")[-1]
     if found not in names:
-        raise ValueError(f"Deployment: the robot has no {label!r}; it has {', '.join(names) or 'none'}")
+        raise ValueError(f"Deployment: the robot has no {label!r}; it has {', '.join(map(shown, names)) or 'none'}")
     return found
 
 

@@ -14,7 +14,7 @@ from newton.solvers import SolverBase
 from .. import launches
 from ..dynamics.dynamics import Dynamics
 from ..dynamics.steps import INTEGRATORS
-from ..errors import UnsupportedError, as_integer, as_names, never_copied
+from ..errors import UnsupportedError, as_integer, as_names, never_copied, shown
 from ..kernels import declare, exchange
 from ..scene.scene import Scene
 from ..scene.shapes import POINTS
@@ -187,7 +187,7 @@ class SolverSPO(Plugs, SolverBase):
         model = self.model
         scene = from_newton(model)
         if scene.couplings and self._options["loops"] == "raise":
-            names = ", ".join(scene.joint_labels[c.hinge] for c in scene.couplings)
+            names = ", ".join(shown(scene.joint_labels[c.hinge]) for c in scene.couplings)
             raise UnsupportedError(
                 "SolverSPO", f"mimic joints: {names}", "loops='embed' closes them, loops='cut' leaves them open"
             )

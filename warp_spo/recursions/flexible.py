@@ -55,10 +55,10 @@ def deform(links: Links, node: int, dof: int, coordinate: int, armature: tuple) 
     origin = seat.offset - axes @ p
     values = (scene.values[name][0, node] for name in MASS_VALUES)
     mean = mean_motion(scene.body_labels[node], modes, *values)
-    dofs, label = tuple(range(dof, dof + modes.count)), f"{scene.body_labels[node]}/modes"
+    dofs = tuple(range(dof, dof + modes.count))
     kind = Deflection(mean.slopes)
     at = origin + axes @ Vector(mean.center.tolist())
-    leader = Link(seat.link, kind, still(axes), at, None, dofs, coordinate, armature, node, label)
+    leader = Link(seat.link, kind, still(axes), at, None, dofs, coordinate, armature, node)
     leader.armature = tuple(a + b for a, b in zip(armature, np.diag(mean.armature).tolist(), strict=True))
     pairs = zip(*np.nonzero(np.triu(mean.armature, 1)), strict=True)
     leader.group = Group([leader], {(int(i), int(j)): float(mean.armature[i, j]) for i, j in pairs})

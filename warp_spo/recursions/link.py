@@ -36,7 +36,7 @@ class Link:
         grouped: the same for sums of forces and composite inertias, where it may be counted elsewhere: what turns about
             its own axis, or does not turn, belongs to the parent as well as to the link. It need not be positive.
         lift: the part of its bodies whose weight is compensated, in its frame; None where nothing is.
-        node: the body whose hinge it belongs to; label: its name.
+        node: the body whose hinge it belongs to.
         com: the link's origin from the child anchor, in the link's axes: the body's centre of mass, if the hinge moves
             that.
         children: the links that move on it.
@@ -53,7 +53,6 @@ class Link:
     coordinate: int
     armature: tuple
     node: int
-    label: str
     com: Vector = ZERO
     inertia: Rigid | None = None
     grouped: Rigid | None = None
@@ -61,6 +60,11 @@ class Link:
     children: list = dataclasses.field(default_factory=list)
     group: Group | None = None
     rest: Vector | None = None
+
+    @property
+    def title(self) -> str:
+        """How comments of generated code name it: by number, so that no name of a file reaches a compiler."""
+        return f"body {self.node}"
 
     @property
     def leads(self) -> bool:

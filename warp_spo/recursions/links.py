@@ -282,7 +282,7 @@ class Links:
             seat, R, l = self.ports[node], folded(self.poses["joint_X_p"][index][0]), ZERO
         matrix, offset, link = seat.matrix @ R, seat.offset + seat.matrix @ l, seat.link
         dof, coordinate = int(scene.qd_start[index]), int(scene.q_start[index])
-        label, armatures = scene.body_labels[node], self.values["joint_armature"].tolist()
+        armatures = self.values["joint_armature"].tolist()
         rotor, anchor = scene.hinges[index].rotor, (matrix, offset)
         for kind, axis in scene.hinges[index].elements:
             if isinstance(kind, Amplitudes):
@@ -299,7 +299,6 @@ class Links:
                 coordinate,
                 tuple(armatures[i] for i in own),
                 node,
-                label,
                 body.com if kind.at_com else ZERO,
             )
             self.append(link)

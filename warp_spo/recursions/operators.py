@@ -68,7 +68,7 @@ class Operators:
         return 6 if space == NODES else self.scene.hinge_sizes[node]
 
     def _at(self, node: int, letter: str) -> None:
-        self.graph.step = f"{self.scene.body_labels[node]}|{letter}"
+        self.graph.step = f"body {node}|{letter}"
 
     def _inward_order(self) -> Iterator[int]:
         """Yield every node after all that it carries, limb by limb."""
@@ -353,7 +353,7 @@ class Operators:
     def place(self, link: Link) -> Placed:
         """Return the placement of a link."""
         if id(link) not in self._places:
-            self.graph.step = f"{link.label}|x"
+            self.graph.step = f"{link.title}|x"
             self._places[id(link)] = place_link(link, self.q)
         return self._places[id(link)]
 
@@ -363,7 +363,7 @@ class Operators:
             chain, seat = self.chains[node], self.links.seats[node]
             found: list[tuple[Link | None, Pose]] = []
             if chain:
-                self.graph.step = f"{chain[0].label}|x"
+                self.graph.step = f"{chain[0].title}|x"
                 found.append((chain[0], place_link(self.links.on_parent_node(chain[0]), self.q).pose))
                 found += [(link, self.place(link).pose) for link in chain[1:]]
                 if seat.matrix != IDENTITY or not seat.offset.vanishes:
@@ -391,7 +391,7 @@ class Operators:
                 continue
             place, children = self.place(link), [self._factors[id(child)] for child in link.children]
             poses = [self.place(child).pose for child in link.children]
-            self.graph.step = f"{link.label}|P"
+            self.graph.step = f"{link.title}|P"
             self._factors[id(link)] = articulated.factor(
                 link,
                 place,

@@ -32,7 +32,6 @@ def add(links: Links, driven: Link, rotor: Rotor, axes: Matrix, origin: Vector) 
         offset=origin + axes @ Vector(rotor.com.tolist()),
         align=None,
         armature=(0.0,),
-        label=f"{driven.label}/rotor",
         com=ZERO,
         inertia=None,
         grouped=None,

@@ -108,7 +108,7 @@ class Trace:
 
     def label(self, link: Link, letter: str) -> None:
         """Name the scalars that follow after a link and a letter."""
-        self.graph.step = f"{link.label}|{letter}"
+        self.graph.step = f"{link.title}|{letter}"
 
     def place(self, link: Link, moves: bool = False) -> None:
         """Place a link by its coordinates; with ``moves`` compute its velocity terms too."""

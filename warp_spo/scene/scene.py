@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import refuse_masked
+from ..errors import refuse_masked, shown
 from .actuators import RANGES, Actuator, Keyframe, actuator_values, check_actuator_value
 from .checks import SYMMETRY
 from .contacts import (
@@ -340,9 +340,9 @@ class Scene(Stored):
     @property
     def ties(self) -> str:
         """A list in words of the loop joints and couplings, for messages; empty if there are none."""
-        loops = [loop.label or f"body {loop.parent} to body {loop.child}" for loop in self.loops]
+        loops = [shown(loop.label) or f"body {loop.parent} to body {loop.child}" for loop in self.loops]
         labels = self.joint_labels
-        couplings = [f"{labels[c.hinge]} follows {labels[c.reference]}" for c in self.couplings]
+        couplings = [f"{shown(labels[c.hinge])} follows {shown(labels[c.reference])}" for c in self.couplings]
         kinds = ("loop joint(s)", loops), ("coupling(s)", couplings)
         return " and ".join(f"{len(names)} {kind}: {', '.join(names)}" for kind, names in kinds if names)
 

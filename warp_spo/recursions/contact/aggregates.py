@@ -71,7 +71,7 @@ class Node:
     def only(self, name: str, values: list[Value], otherwise: list[Value] | None = None) -> list[Value]:
         """Return the values where a couple acts, else others or zeros."""
         others = [0.0] * len(values) if otherwise is None else otherwise
-        name = f"{name} of {self.aggregate.links[0].label}"
+        name = f"{name} of {self.aggregate.links[0].title}"
         return [branch(self.mask, value, other, name, "either") for value, other in zip(values, others, strict=True)]
 
     # -- inward ----------------------------------------------------------------------------------------------------

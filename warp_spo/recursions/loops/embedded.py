@@ -88,7 +88,7 @@ class ClosedLoops:
 
     def label(self, cluster: Cluster, letter: str) -> None:
         """Name the scalars that follow after a cluster and a letter."""
-        self.trace.graph.step = f"loops of {cluster.links[0].label}|{letter}"
+        self.trace.graph.step = f"loops of {cluster.links[0].title}|{letter}"
 
     def tie(self, cluster: Cluster, fixed: tuple[int, ...] = ()) -> Tied:
         """Return the factored constraints of a cluster; ``fixed`` dofs do not move."""
