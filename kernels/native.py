@@ -7,6 +7,14 @@ import warp as wp
 
 MASKS = ("prescribed",)  # names of the arrays [world, dof] that hold booleans
 CHOICES = ("chosen",)  # names of the arrays [world] that hold booleans
+THREAD = """\
+#if defined(__CUDA_ARCH__)
+const long long thread = (long long)blockIdx.x * blockDim.x + threadIdx.x;
+#else
+const long long thread = index;
+#endif
+"""
+"""The number of the thread, in 64 bits. On CUDA it needs a grid of one axis, see :func:`warp_spo.launches.launch`."""
 INTEGERS = ("place", "shifts", "status")  # names of the arrays that hold integers; each has one axis
 
 
@@ -40,6 +48,8 @@ def kernel(
 ) -> wp.Kernel:
     """Return a kernel in which each thread runs the C++ text ``native``.
 
+    The text may use ``thread``, its number, and on CUDA ``blockIdx.x``, however many threads are launched.
+
     Args:
         name: the beginning of the kernel's name; a hash of ``native`` follows.
         native: the body.
@@ -54,12 +64,12 @@ def kernel(
     types |= {array: "mask" for array in types if array in MASKS}
     types |= {array: "choice" for array in types if array in CHOICES} | {array: "wide" for array in wide}
     declared = ", ".join(f"{array}: {kind}" for array, kind in types.items())
-    source = f"""def native(thread: int, worlds: int, {declared}): ...
+    source = f"""def native(index: int, worlds: int, {declared}): ...
 
 
 def {key}(worlds: int, {declared}):
-    thread = wp.tid()
-    native(thread, worlds, {", ".join(array for array, _ in arrays)})
+    index = wp.tid()
+    native(index, worlds, {", ".join(array for array, _ in arrays)})
 """
     file = f"<{key}>"
     linecache.cache[file] = len(source), None, source.splitlines(True), file  # Warp reads the source from this cache
@@ -73,11 +83,12 @@ def {key}(worlds: int, {declared}):
         "__name__": key,
     }
     exec(compile(source, file, "exec"), space)
-    space["native"] = wp.func_native(native)(space["native"])
+    space["native"] = wp.func_native(THREAD + native)(space["native"])
     options = {} if registers is None else {"cuda_max_registers": registers}
     decorate = wp.kernel(name=key, module=f"warp_spo_{key}", enable_backward=False, grid_stride=False, **options)
     made = decorate(space[key])
     made.module.options["fuse_fp"] = False  # the text says which products and sums are fused, see trace.emission
+    made.counts_blocks = True
     if shared:
         made.adj.get_total_required_shared = lambda: shared
     return made

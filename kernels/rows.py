@@ -10,6 +10,10 @@ HEAD = """\
 #if defined(__CUDA_ARCH__)
 #define COPY(source, target) \\
     if (thread < (long long)worlds * source.shape[1]) { \\
+        const unsigned int part = %s; \\
+        const bool is_short = thread < 1ll << 32; /* a division of 64 bits takes ten times as long */ \\
+        const int whole = (int)(is_short ? (unsigned int)thread / part : thread / part); \\
+        const int rest = (int)(thread - (long long)whole * part); \\
         const int world = %s, i = %s; \\
         if (!chosen.data || chosen.data[world]) target.data[thread] = source.data[FROM(source)]; \\
     }
@@ -21,8 +25,8 @@ const long long world = thread;
 #endif
 #define FROM(source) (source.shape[0] == 1 ? 0ll : (long long)world * source.shape[1]) + i
 """
-AS_THEY_ARE = HEAD % ("thread / source.shape[1]", "thread % source.shape[1]", "world * source.shape[1] + i")
-TRANSPOSED = HEAD % ("thread % worlds", "thread / worlds", "(long long)i * worlds + world")
+AS_THEY_ARE = HEAD % ("source.shape[1]", "whole", "rest", "world * source.shape[1] + i")
+TRANSPOSED = HEAD % ("worlds", "rest", "whole", "(long long)i * worlds + world")
 
 
 @functools.cache

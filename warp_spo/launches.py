@@ -21,6 +21,9 @@ import warp as wp
 
 from .memory import size_in_bytes, view
 
+MOST_IN_A_ROW = 1 << 24  # threads
+LARGEST = 2**31 - 1  # of an axis of a launch
+
 
 class _Thread(threading.local):
     recording: Recording | None = None
@@ -35,16 +38,32 @@ _thread = _Thread()
 def launch(
     kernel: wp.Kernel, dim: Any, inputs: Sequence[Any], outputs: Sequence[Any], *, device: Any, block_dim: int = 256
 ) -> None:
-    """Launch a kernel, as ``wp.launch``."""
+    """Launch a kernel, as ``wp.launch``.
+
+    Beyond MOST_IN_A_ROW threads Warp spreads blocks over several axes. Kernels of :mod:`.kernels.native` count blocks
+    along the first one, and get a grid of this axis alone.
+    """
     if _thread.waiting is not None and _thread.kernels is not None:
         _thread.kernels.add((kernel, wp.get_device(device).alias, block_dim))
         return _wait(functools.partial(launch, kernel, dim, inputs, outputs, device=device, block_dim=block_dim))
-    command = wp.launch(
-        kernel, dim, inputs, outputs, device=device, block_dim=block_dim, record_cmd=_thread.recording is not None
-    )
-    if _thread.recording is not None and command is not None:  # None: no thread has work
-        command.launch()
-        _thread.recording.keep_launch(command, [*inputs, *outputs])
+    in_a_row = counts_blocks(kernel, device) and dim > MOST_IN_A_ROW
+    if in_a_row and dim > LARGEST:  # an index of Warp's has 32 bits; that of these kernels has 64
+        dim = -(-dim // block_dim), block_dim
+    recording = _thread.recording
+    record = in_a_row or recording is not None
+    command = wp.launch(kernel, dim, inputs, outputs, device=device, block_dim=block_dim, record_cmd=record)
+    if not record or command is None:  # None: no thread has work
+        return
+    if in_a_row:
+        command.grid_stride = True  # the shape of the grid; it has as many blocks as there are
+    command.launch()
+    if recording is not None:
+        recording.keep_launch(command, [*inputs, *outputs])
+
+
+def counts_blocks(kernel: wp.Kernel, device: Any) -> bool:
+    """Return whether a kernel on a GPU tells its threads apart by the number of their block."""
+    return getattr(kernel, "counts_blocks", False) and wp.get_device(device).is_cuda
 
 
 def copy(out: wp.array, array: wp.array) -> None:

@@ -1,10 +1,13 @@
 """Where arrays lie: views of memory, and whether two arrays overlap."""
 
 import functools
+import math
 from typing import Any
 
 import numpy as np
 import warp as wp
+
+LONGEST_STRIDE = 2**31 - 1  # bytes
 
 
 @functools.lru_cache(maxsize=4096)
@@ -23,6 +26,21 @@ def broadcast_worlds(array: wp.array, axis: int, worlds: int) -> wp.array:
     found: Any = wp.array(**place, dtype=array.dtype, device=array.device)
     found._ref = array  # keeps the memory
     return found
+
+
+def empty(shape: tuple[int, ...], dtype: type, device: Any) -> wp.array:
+    """Return a new array.
+
+    Raises:
+        ValueError: a step along one of its axes takes 2^31 bytes or more, which Warp would round to 32 bits.
+    """
+    longest = wp.types.type_size_in_bytes(dtype) * math.prod(shape[1:])
+    if longest > LONGEST_STRIDE:
+        raise ValueError(
+            f"An array of shape {shape} has rows of {longest} bytes, and Warp's kernels count up to {LONGEST_STRIDE}; "
+            f"expected fewer worlds in one Dynamics; share them among several, or leave granularity='node' out"
+        )
+    return wp.empty(shape, dtype=dtype, device=device)
 
 
 def size_in_bytes(array: wp.array) -> int:

@@ -79,7 +79,7 @@ class Way:
 
     def combine(self, a: float, x: wp.array, b: float, y: wp.array, out: wp.array) -> wp.array:
         """Launch out = a x + b y."""
-        flat = [one.reshape((1, one.size)) for one in (x, y, out)]
+        flat = [one.reshape((self.dyn.worlds, one.size // self.dyn.worlds)) for one in (x, y, out)]
         self.dyn.recursions.launch(combination.combine, flat[2].shape, [a, flat[0], b, flat[1]], [flat[2]])
         return out
 

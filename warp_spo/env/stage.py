@@ -18,6 +18,7 @@ DRAW = "draw"  # random numbers of the thread's own
 ROW_NUMBER = "row_number"  # of the thread, where a world has many
 ROWS_AT_ONCE = 4  # of a thread, which share what is the same for all
 BLOCK, BLOCK_OF_ROWS = 64, 128  # threads
+MOST_ENTRIES = 2**31 - 1  # of an axis of a Warp array
 WIDE = 8  # entries of a row that the threads of a warp write together
 
 
@@ -191,8 +192,9 @@ class Stage:
             head += ["const long long world = mine ? thread : worlds - 1;"]
             tail = [f"if (mine) {{ {count} }}" if count else "", row_chunks.UNDEFINE]
         elif self.rows:
-            head = [f"if (thread >= worlds * {self.threads}) return;", f"const int row = thread % {self.threads};"]
-            head += [f"const long long world = thread / {self.threads};"]
+            head = [f"if (thread >= (long long)worlds * {self.threads}) return;"]
+            whole = f"thread < 1ll << 32 ? (unsigned int)thread / {self.threads}u : thread / {self.threads}"
+            head += [f"const long long world = {whole};", f"const int row = (int)(thread - world * {self.threads});"]
             tail = []
         else:
             head = ["if (thread >= worlds) return;", "const long long world = thread;"]

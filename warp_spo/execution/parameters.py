@@ -17,7 +17,7 @@ from ..kernels import parameters as kernels
 from ..kernels.heights import list_corners
 from ..kernels.spatial import POSE, RIGID
 from ..kernels.topology import Topology
-from ..memory import broadcast_worlds, size_in_bytes
+from ..memory import broadcast_worlds, empty, size_in_bytes
 from ..recursions.contact.ground import CORNERS
 from ..scene.actuators import ACTUATOR_VALUES
 from ..scene.contacts import CONTACT_VALUES, GROUND_VALUES, HEIGHTS
@@ -138,7 +138,7 @@ class Parameters:
             scene, worlds = self.scene, self.rows(RIGID_VALUES)
             values = [broadcast_worlds(self._values[name], 0, worlds) for name in RIGID_VALUES]
             own: list[wp.array] = [
-                wp.empty((scene.body_count, components, worlds), dtype=self.dtype, device=self.device)
+                empty((scene.body_count, components, worlds), self.dtype, self.device)
                 for components in (POSE, POSE, 3, RIGID)
             ]
             inputs, dim = [self._topology, self.hinge_of, *values], (scene.body_count, worlds)
@@ -177,7 +177,7 @@ class Parameters:
         def build() -> DerivedArrays:
             value = self._values[name]
             flat = value.reshape((value.shape[0], math.prod(value.shape[1:])))
-            own: Any = wp.empty(flat.shape[::-1], dtype=self.dtype, device=self.device)
+            own: Any = empty(flat.shape[::-1], self.dtype, self.device)
             kernel = kernels.transpose(node_functions(self.dtype))
             fill = lambda: launches.launch(kernel, own.shape, [flat], [own], device=self.device)  # noqa: E731
             return DerivedArrays([broadcast_worlds(own, 1, self.worlds)], (name,), fill)

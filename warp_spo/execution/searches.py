@@ -72,6 +72,11 @@ def launch(
         found, errors: [coordinate, seed, world] and [seed, world], to fill. q_out, error_out: the results.
     """
     run, threads = programs.run, errors.size
+    if threads >= 2**31:
+        raise ValueError(
+            f"Dynamics.inverse_kinematics: {errors.shape[0]} seeds in {errors.shape[1]} worlds; expected "
+            f"fewer than 2^31 searches; take fewer seeds or worlds"
+        )
     T = run.dtype
     inputs = [threads, T(weight), T(iterations), *(arrays[name] for name in program.rows)]
     inputs += [programs.field(name) for name in program.fields]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .. import launches
+from .. import launches, memory
 from ..kernels import articulated, composite, declare, kinematics, newton_euler, parameters, rigid_blocks, tiles
 from ..kernels.spatial import ARTICULATED, MOTION, POSE, RIGID
 from ..kernels.topology import Topology
@@ -84,7 +84,7 @@ class Sweeps:
         """Return the workspace array of this name; the first use gives its shape."""
         if name not in self._workspace:
             assert shape, f"Sweeps.array: the workspace array {name!r} is read before a sweep has written it"
-            self._workspace[name] = wp.empty(shape, dtype=self.dtype, device=self.device)
+            self._workspace[name] = memory.empty(shape, self.dtype, self.device)
         return self._workspace[name]
 
     def _per_node(self, name: Hashable, components: int) -> wp.array:
