@@ -4,10 +4,9 @@ Each file that is a command says so in its first lines; CONTRIBUTING.md has the 
 
 The table of results:
     ``cases``, ``precisions``, ``robots``, ``shapes`` and ``arms`` are the scenes and operations; ``runner`` checks and
-    times them, with ``resources``, ``roofline`` and ``operation_counts``; ``rows``, ``parts`` and ``everything`` run
-    all of it on one machine, ``turns`` gives it to one process at a time, ``peers/`` is what other libraries compute;
-    ``table``, ``pictures``, ``report`` and ``evidence`` make pages of the rows; ``commits``, ``probe`` and ``history``
-    compare commits.
+    times them, with ``resources``, ``roofline`` and ``operation_counts``; ``rows`` and ``parts`` run all of
+    it on one machine, ``turns`` gives it to one process at a time, ``peers/`` is what other libraries compute;
+    ``table``, ``pictures`` and ``evidence`` make pages of the rows; ``commits`` and ``probe`` compare commits.
 One question each, on a GPU:
     ``speed`` and ``limits`` (times beside limits), ``breakdown`` (launches of a call), ``plans`` and ``crowding`` (the
     plan's choice), ``depth`` (scans), ``variable`` (values that are read), ``substeps``, ``step_parts`` (SolverSPO's

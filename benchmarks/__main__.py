@@ -1,7 +1,7 @@
 """Run ``python -m benchmarks [FILTER]``: check cases with the dense reference, time them, print ``case.metric value``.
 
-``--everything --json benchmarks/results/ --readme`` measures all numbers of the README, also those of other libraries,
-and writes them into it. ``--report`` writes one HTML page.
+``--compare A B`` compares two runs or two commits. ``--readme`` writes tables, pictures and the
+README's main numbers from the committed results.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from warp_spo.__main__ import find_device
 from warp_spo.trials import drawing
 
 from . import cases as data
-from . import commits, everything, evidence, history, parts, pictures, report, roofline, runner, table
+from . import commits, evidence, pictures, roofline, runner, table
 from .cases import case_name
 from .precisions import PRECISIONS
 
@@ -37,27 +37,12 @@ def parser() -> argparse.ArgumentParser:
     names = [name or PLAN for name in data.GRANULARITIES]
     p.add_argument("--granularity", nargs="+", choices=names, metavar="G", help=f"{', '.join(names)}; default: {PLAN}")
     p.add_argument("--sweeps", action="store_true", help="growing world counts, chains and trees instead of robots")
-    p.add_argument(
-        "--everything", action="store_true", help="measure ours, all installed peers and the stress suite, in parts; "
-        "FILTER selects parts; continues an earlier run of this commit"
-    )  # fmt: skip
-    p.add_argument("--budget", type=float, default=3600.0, metavar="S", help="time for --everything [s]; default: 3600")
-    p.add_argument(
-        "--jobs", type=int, metavar="N", help="processes that compile at the same time; default: nearly all cores"
-    )
-    p.add_argument(
-        "--gpus", type=int, default=1, metavar="N", help="GPUs for --everything; of 3 or more the last one compiles"
-    )
     p.add_argument("--check", action="store_true", help="compare with the reference, and time nothing")
     p.add_argument(
         "--compile", action="store_true", help="compile the kernels into Warp's cache, and time nothing; also those of "
-        "--compare and --history"
+        "--compare"
     )  # fmt: skip
     p.add_argument("--json", type=Path, metavar="OUT", help="write the run to this file, or by date into this folder")
-    p.add_argument("--report", type=Path, metavar="DIR", help="write the run as one page, DIR/report.html")
-    p.add_argument(
-        "--from", type=Path, nargs="+", dest="source", metavar="JSON", help="report these files or folders, run nothing"
-    )
     p.add_argument("--table", type=Path, metavar="JSON", help="print the Markdown table of a run, and run nothing")
     p.add_argument(
         "--compare", nargs=2, metavar=("A", "B"), help="print the differences of two runs, JSON files; or measure two "
@@ -67,29 +52,13 @@ def parser() -> argparse.ArgumentParser:
         "--rounds", type=int, default=commits.ROUNDS, metavar="N", help="processes of each commit to compare"
     )
     p.add_argument(
-        "--history",
-        nargs="?",
-        type=Path,
-        const=history.FOLDER,
-        metavar="DIR",
-        help="measure this commit, keep its run times in a folder (default: benchmarks/results/history), and draw the "
-        "page of charts",
-    )
-    p.add_argument(
-        "--commits",
-        nargs="*",
-        metavar="C",
-        help="commits, or folders of them, for --history to measure; none: only draw the page",
-    )
-    p.add_argument("--past", action="store_true", help="for --history: take the committed results of earlier commits")
-    p.add_argument(
         "--readme",
         nargs="?",
         type=Path,
         const=evidence.RESULTS,
         metavar="JSON",
         help="write tables and pictures of a file or folder (default: benchmarks/results) into benchmarks/results, and "
-        "the main numbers into README.md; run nothing unless --everything is given",
+        "the main numbers into README.md, and run nothing",
     )
     return p
 
@@ -97,7 +66,7 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit code.
 
-    0: all is well; 1: an error exceeds its tolerance, two runs differ, or time ran out; 2: a mistake in the call.
+    0: all is well; 1: an error exceeds its tolerance, or two runs differ; 2: a mistake in the call.
     """
     options = parser().parse_args(argv)
     wp.config.log_level = wp.LOG_WARNING
@@ -110,35 +79,17 @@ def main(argv: list[str] | None = None) -> int:
             if any(name.endswith(".json") for name in options.compare):
                 return compare(*map(Path, options.compare))
             return compare_commits(options)
-        if options.history:
-            return keep_history(options, drawing.load_pyplot("--history"))
-        for option, out in (("--json", options.json), ("--report", options.report and options.report / report.FILE)):
-            if out:
-                runner.check_place(option, out)
-        pyplot = drawing.load_pyplot() if options.report or options.readme else None
-        if options.everything:
-            device = find_device(options.device)
-            chosen = parts.choose(options.filter, device.is_cuda, str(device))
-            out = options.json or evidence.RESULTS
-            _, left_out = everything.run(chosen, device, options.budget, options.jobs, out, options.gpus)
-            if left_out:
-                return 1
         if options.readme:
-            write_readme(pyplot, options.readme)
-        if options.readme or options.everything:
+            write_readme(drawing.load_pyplot("--readme"), options.readme)
             return 0
-        if options.source:
-            if not options.report:
-                raise ValueError("benchmarks: --from needs --report DIR, the folder in which to write the report")
-            runs = [evidence.read(file) for file in evidence.files(options.source)]
-            print(f"wrote {report.write(pyplot, evidence.gather(runs), options.report)}", file=sys.stderr)
-            return 0
+        if options.json:
+            runner.check_place("--json", options.json)
         device = find_device(options.device)
         chosen = choose(options, device.is_cuda)
     except (ValueError, RuntimeError, ImportError) as error:
         print(error, file=sys.stderr)
         return 2
-    return measure(chosen, options, device, pyplot)
+    return measure(chosen, options, device)
 
 
 def choose(options: Any, cuda: bool) -> list[dict]:
@@ -152,7 +103,7 @@ def choose(options: Any, cuda: bool) -> list[dict]:
     return data.cases(options.filter, worlds, options.dtype or data.DTYPES, granularities, options.sweeps, cuda)
 
 
-def measure(chosen: list[dict], options: Any, device: wp.Device, pyplot: Any) -> int:
+def measure(chosen: list[dict], options: Any, device: wp.Device) -> int:
     """Measure the cases, print and write their rows, and return the exit code."""
     if options.compile:
         runner.compile_only(chosen, device)
@@ -167,8 +118,6 @@ def measure(chosen: list[dict], options: Any, device: wp.Device, pyplot: Any) ->
             file = runner.save(whole, options.json)
     if file:
         print(f"wrote {file}", file=sys.stderr)
-    if options.report:
-        print(f"wrote {report.write(pyplot, evidence.gather([whole]), options.report)}", file=sys.stderr)
     failed = [case_name(row) for row in rows if not row["error"] <= runner.tolerance(row)]
     if failed:
         print(f"benchmarks: the error is NaN or exceeds its tolerance in {', '.join(failed)}", file=sys.stderr)
@@ -203,17 +152,12 @@ def compare(a: Path, b: Path) -> int:
     return 1 if beyond else 0
 
 
-def _cases_of_commits(options: Any, device: wp.Device) -> list[dict]:
-    """Return the cases for commits that the options select."""
-    return commits.cases(options.filter, options.worlds or (commits.WORLDS if device.is_cuda else commits.CPU_WORLDS))
-
-
 def compare_commits(options: Any) -> int:
     """Measure two commits in turns and print a verdict on each case; return 1 if one is slower, else 0."""
     if options.rounds < 2:
         raise ValueError(f"benchmarks: --rounds is {options.rounds}; expected 2 or more")
     device = find_device(options.device)
-    chosen = _cases_of_commits(options, device)
+    chosen = commits.cases(options.filter, options.worlds or (commits.WORLDS if device.is_cuda else commits.CPU_WORLDS))
     if options.compile:
         commits.compile_kernels(options.compare, chosen, device.alias)
         return 0
@@ -223,23 +167,6 @@ def compare_commits(options: Any) -> int:
     counts = ", ".join(f"{words.count(word)} {word}" for word in ("slower", "faster", "same", "skipped"))
     print(f"{counts}; {noise}")
     return 1 if "slower" in words else 0
-
-
-def keep_history(options: Any, pyplot: Any) -> int:
-    """Measure commits, keep their run times and draw the page; return 0."""
-    runner.check_place("--history", options.history)
-    device = find_device(options.device)
-    if options.compile:
-        names = options.commits or [str(evidence.ROOT)]
-        commits.compile_kernels(names, _cases_of_commits(options, device), device.alias)
-        return 0
-    if options.past:
-        print(f"wrote {len(history.harvest(options.history))} files", file=sys.stderr)
-    for commit in [None] if options.commits is None and not options.past else options.commits or []:
-        file = history.measure(commit, _cases_of_commits(options, device), device, options.history)
-        print(f"wrote {file}", file=sys.stderr)
-    print(f"wrote {history.write_page(pyplot, options.history)}", file=sys.stderr)
-    return 0
 
 
 if __name__ == "__main__":

@@ -56,7 +56,7 @@ def pages() -> list[Path]:
     """Return all pages of the documentation, and those outside of docs/ that they include."""
     results = ROOT / "benchmarks" / "results"
     included = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
-    included += [results / "README.md", results / "history" / "README.md"]
+    included += [results / "README.md"]
     return included + sorted(page for page in (ROOT / "docs").glob("**/*.md") if "_build" not in page.parts)
 
 

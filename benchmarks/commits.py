@@ -1,7 +1,6 @@
 """Commits of this repository, measured by one text: in worktrees, by processes that take turns.
 
-A commit may also be a folder that ``git archive`` has filled, for a machine that has no git or no history; a file in it
-tells which commit it is.
+A commit may also be a folder that ``git archive`` has filled, for a machine that has no git.
 
 Two commits that are measured one after the other differ by the temperature of the machine, by what else it does, and by
 the process, whose kernels lie elsewhere in memory. So processes of both take turns, each measures all cases, and the
@@ -34,7 +33,6 @@ OPERATIONS = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "step")
 SCENES = ("panda", "go2", "g1")
 WORLDS, CPU_WORLDS = (4096, 65536), (64, 1024)
 ROUNDS = 5  # processes of each commit that count
-ARCHIVED = ".git_archival.txt"  # git archive writes hash, date and subject into it
 LIMIT = 1800.0  # [s] for one process, which may have to compile all kernels
 
 
@@ -79,22 +77,6 @@ def checkout(commit: str) -> Iterator[Path]:
             yield place
         finally:
             git("worktree", "remove", "--force", str(place))
-
-
-def resolve(commit: str) -> tuple[str, str, str]:
-    """Return the whole hash of a commit, its date and its subject.
-
-    Raises:
-        ValueError: git knows no such commit, or a folder does not tell its own.
-    """
-    if is_folder(commit):
-        told = Path(commit, ARCHIVED)
-        lines = told.read_text().strip().split("\n") if told.is_file() else []
-        if len(lines) != 3:
-            raise ValueError(f"benchmarks: {told} tells no commit; expected a folder that git archive has filled")
-        return lines[0], lines[1], lines[2]
-    found = git("show", "--no-patch", "--format=%H%n%cI%n%s", f"{commit}^{{commit}}").split("\n")
-    return found[0], found[1], found[2]
 
 
 def is_folder(commit: str) -> bool:
@@ -212,7 +194,7 @@ def compare(
     """
     for commit in (first, second):
         if not is_folder(commit):
-            resolve(commit)
+            git("cat-file", "-e", f"{commit}^{{commit}}")  # fails, by name, where git knows no such commit
     times: list[dict[str, list[float]]] = [{}, {}]
     with checkout(first) as a, checkout(second) as b:
         for turn in range(rounds + 1):

@@ -33,19 +33,6 @@ PANELS = {
 """Sweep -> key of what grows, the axis' label, the panel's title."""
 
 
-def series_name(row: dict) -> str:
-    """Return a peer's name and variant, or our granularity."""
-    return f"{row['peer']} {row.get('variant', '')}".strip() if row.get("peer") else row["granularity"]
-
-
-def point_name(row: dict) -> str:
-    """Return the name that stands at a row's point: library and variant without versions, or our granularity."""
-    if not row.get("peer"):
-        return row["granularity"]
-    variant = row.get("variant") or ("dense resolvent" if "resolvent" in row["peer"] else "")
-    return f"{drawing.library(row['peer'])} {variant.removeprefix('Solver')}".strip()
-
-
 def pareto(points: Sequence[tuple[float, float]]) -> list[int]:
     """Return the indices of the points (run time, error) that no other point beats in both, fastest first."""
     front, best = [], float("inf")
@@ -91,70 +78,12 @@ def headline(pyplot: Any, evidence: Evidence) -> Any:
     return figure
 
 
-@drawing.style()
-def error_time(pyplot: Any, evidence: Evidence, operation: str, worlds: int) -> Any:
-    """Draw error against run time of one operation, a panel a robot: ours, every peer and variant, the Pareto front.
-
-    An error of zero is drawn at the bottom. One that is NaN is left out, and the panel says how many are.
-
-    Returns:
-        The figure; None where nothing was timed.
-    """
-    rows = [row for row in _timed_rows(evidence) if row["op"] == operation and row["worlds"] == worlds]
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
-    if not scenes:
-        return None
-    wide = min(2, len(scenes))
-    tall = -(-len(scenes) // wide)
-    size = (max(5.4 * wide, 7.0), 3.9 * tall + 1.0)
-    figure, grid = pyplot.subplots(tall, wide, figsize=size, layout="constrained", squeeze=False)
-    panels = []
-    for axes, scene in zip(grid.flat, scenes, strict=False):
-        mine = _newest([row for row in rows if row["scene"] == scene])
-        shown = [row for row in mine if row["error"] == row["error"]]
-        bottom = min([row["error"] for row in shown if row["error"] > 0.0], default=1e-16) / 3.0
-        panels.append((axes, [row | dict(error=max(row["error"], bottom)) for row in shown]))
-        drawing.log_axis(axes.xaxis, [row["us"] for row in mine], drawing.time_text)
-        drawing.log_axis(axes.yaxis, [max(row["error"], bottom) for row in shown] or [bottom], drawing.power_text)
-        axes.set(title=_title(mine[0]), xlabel="run time of all worlds", ylabel="largest relative error")
-        if len(shown) < len(mine):
-            note = f"{len(mine) - len(shown)} without a result"
-            axes.set_title(note, loc="right", fontsize=9, fontweight="normal", color=drawing.FAINT)
-    for axes in list(grid.flat)[len(scenes) :]:
-        axes.axis("off")
-    drawing.title(
-        figure, f"{operation}, {worlds:,} world{'s' * (worlds > 1)}, {evidence.machine['device']}: lower left is better"
-    )
-    _legend(figure, rows, pareto_front=True)
-    drawing.finish_layout(figure)
-    for axes, mine in panels:
-        front = [(mine[i]["us"], mine[i]["error"]) for i in pareto([(row["us"], row["error"]) for row in mine])]
-        if front:
-            axes.step(*zip(*front, strict=True), where="post", color=drawing.FAINT, linewidth=0.8, zorder=1)
-        _points(axes, mine, [point_name(row) for row in mine])
-    return figure
-
-
-def world_counts(evidence: Evidence) -> list[int]:
-    """Return the world counts at which error is drawn against run time: ours, or else the peers'."""
-    ours = {row["worlds"] for row in _timed_rows(evidence) if not row.get("peer")}
-    return sorted(ours or {row["worlds"] for row in evidence.peers if "us" in row})
-
-
 def _title(row: dict) -> str:
     return f"{TITLES.get(row['scene'], row['scene'])}, {row['dof']} dof"
 
 
 def _timed_rows(evidence: Evidence) -> list[dict]:
     return [row for row in [*evidence.rows, *evidence.peers] if not row.get("sweep") and "us" in row and "error" in row]
-
-
-def _newest(rows: Sequence[dict]) -> list[dict]:
-    """Return our rows first, and of two rows with the same name and precision the one that the plan chose."""
-    best: dict[tuple, dict] = {}
-    for row in sorted(rows, key=lambda row: (bool(row.get("peer")), not row.get("chosen", True))):
-        best.setdefault((series_name(row), row["dtype"]), row)
-    return list(best.values())
 
 
 def _fastest(rows: Sequence[dict]) -> list[dict]:
@@ -209,13 +138,12 @@ def _speedup(axes: Any, rows: Sequence[dict]) -> None:
                   color=drawing.OURS, fontweight="bold", fontsize=10.5, in_layout=False)  # fmt: skip
 
 
-def _legend(figure: Any, rows: Sequence[dict], pareto_front: bool = False) -> None:
+def _legend(figure: Any, rows: Sequence[dict]) -> None:
     """Put a legend below the panels: a colour a library, a marker a precision."""
     from matplotlib.lines import Line2D
 
     peers = {drawing.library(row["peer"]): row["peer"] for row in rows if row.get("peer")}
-    ours = "warp_spo, named by granularity" if pareto_front else "warp_spo"
-    names = {ours: None} if any(not row.get("peer") for row in rows) else {}
+    names = {"warp_spo": None} if any(not row.get("peer") for row in rows) else {}
     handles = []
     for name, peer in [*names.items(), *sorted(peers.items(), key=lambda each: each[0].lower())]:
         size = 5.5 if peer else 8.5
@@ -229,8 +157,6 @@ def _legend(figure: Any, rows: Sequence[dict], pareto_front: bool = False) -> No
             label, marker = drawing.PRECISIONS.get(dtype, dtype), drawing.MARKERS.get(dtype, "v")
             handles.append(Line2D([], [], marker=marker, linestyle="", color=drawing.FAINT, label=label))
     handles.append(Line2D([], [], color=drawing.FAINT, linewidth=1.0, alpha=0.6, marker="|", label=RANGE))
-    if pareto_front:
-        handles.append(Line2D([], [], color=drawing.FAINT, linewidth=0.8, label="Pareto front"))
     drawing.legend_below(figure, handles)
 
 

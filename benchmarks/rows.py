@@ -2,11 +2,11 @@
 
     python -m benchmarks.rows FILE [PATTERN] [--device cuda:0] [--compile] [--seconds 120] [--jobs 12]
 
-The cases are those of the parts of ``python -m benchmarks --everything`` that measure this library. ``--compile``
-compiles their kernels into Warp's cache, on all cores, and times nothing. Cases of one scene, number of worlds and
-precision form a group, which one process computes, the largest group first. It makes inputs and references beside the
-others; while it times a case, the others stand still. ``FILE`` is written after each group; one that is there already
-is continued, if it has the same commit and device. ``PATTERN`` is a regular expression on names of groups, such as
+The cases are those of :mod:`benchmarks.parts`. ``--compile`` compiles their kernels into Warp's cache, on all cores,
+and times nothing. Cases of one scene, number of worlds and precision form a group, which one process computes, the
+largest group first. It makes inputs and references beside the others; while it times a case, the others stand still.
+``FILE`` is written after each group; one that is there already is continued, if it has the same commit and device.
+``PATTERN`` is a regular expression on names of groups, such as
 "go2.w4096.float32". After ``--seconds`` what is left is named; the exit code is 1 then, or if an error is too large.
 """
 
@@ -28,21 +28,15 @@ from .__main__ import choose, parser
 from .cases import FACTORIES, case_name
 from .turns import Turn, take_turns
 
-OURS = ("headline", "operations", "others", "throughput", "granularities", "randomised", "refined", "sweep")
-"""Kinds of parts."""
 JOBS = 14  # processes that prepare; each imports Warp and torch
 
 
 def cases(compiling: bool = False) -> list[dict]:
     """Return the cases of all parts; those that are compiled have fewer worlds."""
     found: dict[tuple, dict] = {}
-    for kind in OURS:
-        for part in parts.gpu_parts():
-            if part.name.split(".")[0] == kind:
-                arguments = (part.compile if compiling else part.measure) or ()
-                options = parser().parse_args([each for each in arguments[1:] if each != "--compile"])
-                for case in choose(options, True):
-                    found.setdefault(tuple(case.values()), case)
+    for part in parts.gpu_parts():
+        for case in choose(parser().parse_args(part.compile if compiling else part.measure), True):
+            found.setdefault(tuple(case.values()), case)
     return list(found.values())
 
 

@@ -40,14 +40,7 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": [],
 }
-PROJECT = (
-    "project",
-    "contributing",
-    "measured_facts",
-    "log",
-    "log_first_day",
-    "changelog",
-)  # pages that list each other
+PROJECT = ("project", "contributing", "measured_facts", "changelog")  # pages that list each other
 html_sidebars = {page.stem: [] for page in Path(__file__).parent.glob("*.md") if page.stem not in PROJECT}
 html_static_path = ["_static"]
 html_css_files = ["page.css"]

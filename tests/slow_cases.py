@@ -6,7 +6,6 @@ A name is a test, or one case of a parametrized test, as pytest writes it behind
 SLOW_CASES = (
     "test_adjoints.py::test_forward_dynamics[limbs-float64-segment]",
     "test_adjoints.py::test_forward_dynamics[limbs-float64-tree]",
-    "test_benchmark_parts.py::test_everything_goes_on_where_it_stopped",
     "test_benchmarks.py::test_capabilities_are_compared_with_references",
     "test_benchmarks.py::test_every_operation_of_every_scene_is_within_its_tolerance",
     "test_closed_step.py::test_multipliers_step_as_embedded_loops_do[cassie_leg]",

@@ -1,6 +1,5 @@
-"""Results of benchmarks: the README's table, the report's page, comparison of two runs."""
+"""Results of benchmarks: the README's table, comparison of two runs."""
 
-import base64
 import json
 import math
 import re
@@ -119,26 +118,6 @@ def test_committed_page_of_limits_is_that_of_its_newest_run():
     assert f"| go2 inverse_dynamics | 65,536 | {row['us']:.4g} |" in page
 
 
-def test_report_is_one_page_with_tables_pictures_and_the_stress_suite(tmp_path, capsys):
-    run = _data()
-    run["rows"].append(_row("ant", "phi", "float32", 9.0, float("nan"), peer="P 1"))
-    law = dict(precision="float32", max_error=1e-3, median_error=1e-4, law=5e-7, ratio=2e3, formula="5e-7 & more")
-    run["stress"] = [dict(case="S1.chain", parameters=dict(n=4), verdict="FAILS", **law),
-                     dict(case="S14", parameters={}, precision="float64", verdict="ok")]  # fmt: skip
-    file = runner.save(run, tmp_path / "run.json")
-    assert json.loads(file.read_text())["stress"][0]["law"] == 5e-7
-    assert main(["--from", str(file), "--report", str(tmp_path / "page")]) == 0
-    (page,) = (tmp_path / "page").iterdir()
-    text = page.read_text()
-    assert '<td class="bad">nan</td>' in text and '<td class="bad">FAILS</td>' in text
-    assert "<td>S1.chain n=4</td>" in text and "5e-7 &amp; more" in text and "1 of 2 errors are within" in text
-    images = [base64.b64decode(image).decode() for image in re.findall(r"base64,([^\"]+)", text)]
-    assert len(images) == 2  # one for each world count
-    assert any("1 without a result" in image and "P 1" in image for image in images)
-    assert main(["--from", str(file)]) == 2
-    assert "--report DIR" in capsys.readouterr().err
-
-
 def test_pareto_front_is_what_nothing_beats():
     points = [(1.0, 1e-3), (2.0, 1e-3), (3.0, 1e-9), (2.5, 1e-6), (1.0, 1e-4), (9.0, 1e-8)]
     assert [points[i] for i in pictures.pareto(points)] == [(1.0, 1e-4), (2.5, 1e-6), (3.0, 1e-9)]
@@ -178,6 +157,5 @@ def test_what_is_no_run_is_refused_by_name(tmp_path, capsys, run):
     """A JSON file that no run wrote is named, whatever was to be made of it."""
     file = tmp_path / "odd.json"
     file.write_text(json.dumps(run))
-    for call in (["--compare", str(file), str(file)], ["--table", str(file)],
-                 ["--from", str(tmp_path), "--report", str(tmp_path)]):  # fmt: skip
+    for call in (["--compare", str(file), str(file)], ["--table", str(file)]):
         assert main(call) == 2 and f"{str(file)!r} is not the JSON of a run" in capsys.readouterr().err

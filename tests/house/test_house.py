@@ -17,7 +17,6 @@ SYMBOLIC = sorted(path for folder in ("trace", "hinges", "recursions") for path 
 TESTS = sorted(pathlib.Path(__file__).parents[1].rglob("test_*.py"))
 DEVICE = sorted(KERNELS.glob("*.py"))
 REPOSITORY = pathlib.Path(__file__).parents[2]
-LONGEST, LONG, LONG_FILES = 600, 400, 15  # lines; at most so many files may be longer than LONG
 
 ROOMS = (
     "errors",
@@ -171,19 +170,6 @@ def test_imports_among_rooms_point_one_way(path):
     assert room in ROOMS, f"{room} is new: give it its place in ROOMS, after all that it imports"
     for line, imported in rooms_imported(path):
         assert imported == room or imported in ROOMS[: ROOMS.index(room)], f"line {line}: {room} imports {imported}"
-
-
-def test_files_are_short():
-    """Lines of every Python and Markdown file of the repository; kernels/ counts once, not through its link."""
-    folders = [REPOSITORY / name for name in ("warp_spo", "kernels", "tests", "benchmarks", "docs")]
-    files = {path.resolve() for folder in folders for kind in ("*.py", "*.md") for path in folder.rglob(kind)}
-    files |= set(REPOSITORY.glob("*.md"))
-    lines = {str(path.relative_to(REPOSITORY)): len(path.read_text().splitlines()) for path in files}
-    assert len(lines) > 100 and "kernels/straight.py" in lines
-    longest = {name: count for name, count in lines.items() if count > LONGEST}
-    assert not longest, f"more than {LONGEST} lines: {longest}"
-    long = {name: count for name, count in lines.items() if count > LONG}
-    assert len(long) <= LONG_FILES, f"{len(long)} files have more than {LONG} lines, {LONG_FILES} may: {long}"
 
 
 def test_the_reference_imports_numpy_alone():

@@ -89,7 +89,6 @@ table { border-collapse: collapse; font-size: 12px; margin: 1em 0; }
 th, td { padding: 1px 7px; text-align: right; white-space: nowrap; border-bottom: 1px solid #ddd; }
 th:first-child, td:first-child { text-align: left; } th { position: sticky; top: 0; background: #fff; }
 td.bad { color: #c00; font-weight: bold; } img { max-width: 100%; }"""
-BAD = ("nan", "FAILS")  # texts of cells that are coloured
 
 
 def page(title: str, parts: Sequence[str]) -> str:
@@ -109,17 +108,12 @@ def paragraph(text: str) -> str:
 
 
 def table(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Return a table; cells that say NaN or FAILS are coloured."""
+    """Return a table; cells that say NaN are coloured."""
     rows = ["<tr>" + "".join(f"<th>{html.escape(head)}</th>" for head in heads) + "</tr>"]
     for line in lines:
-        marked = ((' class="bad"' if cell in BAD else "", html.escape(cell)) for cell in line)
+        marked = ((' class="bad"' if cell == "nan" else "", html.escape(cell)) for cell in line)
         rows.append("<tr>" + "".join(f"<td{mark}>{cell}</td>" for mark, cell in marked) + "</tr>")
     return "<table>\n" + "\n".join(rows) + "\n</table>"
-
-
-def details(summary: str, part: str) -> str:
-    """Return a part that shows after a click on ``summary``."""
-    return f"<details><summary>{html.escape(summary)}</summary>\n{part}\n</details>"
 
 
 def image(figure: Any) -> str:
