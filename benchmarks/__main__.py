@@ -14,10 +14,10 @@ import warp as wp
 from warp_spo.__main__ import find_device
 from warp_spo.trials import drawing
 
-from . import cases as data
-from . import commits, evidence, pictures, roofline, runner, table
-from .cases import case_name
-from .precisions import PRECISIONS
+from .table import cases as data
+from .table import commits, evidence, pictures, roofline, runner, table
+from .table.cases import case_name
+from .table.precisions import PRECISIONS
 
 ALLOWED = 0.05  # largest difference of two runs on one machine, for cases of 20 us or more
 SHOWN = 10  # differences that --compare prints

@@ -19,11 +19,11 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.dynamics.samples import rotations
+from warp_spo.dynamics.trial_inputs import rotations
 
-from . import runner
+from .table import runner
 from .capabilities import SETS, measure_time
-from .cases import SCENES
+from .table.cases import SCENES
 
 DT = 2e-3  # [s]
 KP, KD, MOST = 60.0, 2.0, 20.0  # gains and bound of the servos and drives [N m/rad, N m s/rad, N m]

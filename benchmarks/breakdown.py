@@ -23,12 +23,12 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
-from warp_spo import launches
-from warp_spo.dynamics.traced_reference import inverse_dynamics_rates
-from warp_spo.reference import Dense
-from warp_spo.trials.operations import TOLERANCE, Inputs
+from warp_spo.runtime import launches
+from warp_spo.dynamics.derivative_references import inverse_dynamics_rates
+from warp_spo.reference.dense import Dense
+from warp_spo.trials.inputs import TOLERANCE, Inputs
 
-from . import robots, runner
+from .table import robots, runner
 from .capabilities import SETS, measure_time
 
 DISTINCT = 1024  # worlds with inputs of their own; further worlds repeat them

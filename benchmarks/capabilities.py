@@ -32,10 +32,10 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.trials.operations import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
+from warp_spo.trials.inputs import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, Trial, all_finite
 
-from . import robots, runner, turns
+from .table import robots, runner, process_turns as turns
 
 DT = 2e-3  # [s]
 SETS = 4

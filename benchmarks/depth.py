@@ -34,12 +34,12 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.execution import plan
 from warp_spo.trials import drawing
-from warp_spo.trials.operations import OPERATIONS, Inputs
+from warp_spo.trials.inputs import OPERATIONS, Inputs
 from warp_spo.trials.trial import Subject, Trial
 
-from . import runner
-from .resources import record_launches
-from .shapes import Recursive, chain, random_tree
+from .table import runner
+from .table.resources import record_launches
+from .table.shapes import Recursive, chain, random_tree
 
 TOLERANCE = {"float32": 1e-3, "float64": 1e-10}  # of chains of up to 4096 bodies, whose condition grows with length
 PATH = 10**6  # nodes of a stretch that is a whole path

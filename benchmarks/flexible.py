@@ -24,9 +24,9 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.examples import crane
 
-from . import runner
+from .table import runner
 from .capabilities import SETS, measure_time
-from .resources import record_launches, resources
+from .table.resources import record_launches, resources
 
 SIX = ({"y": 2, "z": 2, "torsion": 1, "axial": 1},) * 3
 MODES = {"six": SIX, "few": crane.COUNTS}

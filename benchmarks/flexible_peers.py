@@ -35,9 +35,10 @@ import warp as wp
 
 from warp_spo.trials import drawing
 
-from . import boom, runner
+from . import boom
+from .table import runner
 from .boom import Simulation
-from .pictures import pareto
+from .table.pictures import pareto
 
 STEPS = (20.0, 10.0, 5.0, 2.0, 1.0, 0.5)  # [ms]
 REPEATS, BUDGET = 5, 2.0  # runs, and seconds after which no further run begins

@@ -26,8 +26,8 @@ import warp as wp
 
 import warp_spo as spo
 
-from . import robots, runner
-from .cases import SCENES
+from .table import robots, runner
+from .table.cases import SCENES
 
 GROUP = "called from Python,"  # of the rows, before the name of the scene
 BATCH, BATCHES, WARM_UP = 20, 100, 5

@@ -26,7 +26,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.dynamics.inverse_kinematics import ITERATIONS, starts
 
-from . import arms, runner
+from .table import arms, runner
 
 DISTANCE, ANGLE = 1e-3, np.radians(0.1)  # [m, rad] within which a target is reached
 ENOUGH = 0.99  # of the targets

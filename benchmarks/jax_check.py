@@ -26,10 +26,10 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.reference import Dense
+from warp_spo.reference.dense import Dense
 
-from . import runner
-from .cases import SCENES
+from .table import runner
+from .table.cases import SCENES
 
 BATCH, BATCHES, WARM_UP, STEPS, DT = 20, 30, 3, 50, 1e-3
 SINGLE = 2e-5  # of float32 results: rounding, times the condition of a humanoid's mass matrix, as the trials allow

@@ -26,13 +26,13 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
-from warp_spo import launches
+from warp_spo.runtime import launches
 from warp_spo.dynamics import dynamics
 from warp_spo.examples import biped, fivebar, fourbar, slider_crank, stewart
 from warp_spo.execution.device_facts import MEASURED
 from warp_spo.kernels import native
 
-from . import robots, shapes
+from .table import robots, shapes
 from .contact import scenes
 
 WORLDS = (1, 4096, 65536)

@@ -29,12 +29,12 @@ import warp_spo as spo
 from warp_spo.dynamics import dynamics
 from warp_spo.examples import grasp
 from warp_spo.execution.device_facts import DeviceFacts, read_facts
-from warp_spo.trials.operations import OPERATIONS, TOLERANCE, Inputs
+from warp_spo.trials.inputs import OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, Trial
 
-from . import robots, runner, turns
+from .table import robots, runner, process_turns as turns
 from .capabilities import DT, KD, KE
-from .crowding import crowd
+from .table.occupied_gpu import crowd
 
 sys.path.append(str(Path(__file__).parent.parent / "tests"))  # the random trees come from the tests
 from support import zoo

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.reference import Dense
+from warp_spo.reference.dense import Dense
 
 PAGE = Path(__file__).parent.parent / "docs" / "robot_files.md"
 STATES = 1
@@ -218,7 +218,7 @@ def mjcf_files() -> list[tuple[str, Path]]:
 
 def compare_mjcf(name: str, file: Path) -> Row:
     """Return the errors of an MJCF's scene beside MuJoCo; see :mod:`benchmarks.mjcf_files`."""
-    from warp_spo.mujoco.files import compiled
+    from warp_spo.mujoco.mjcf import compiled
 
     from .mjcf_files import Agreement
 

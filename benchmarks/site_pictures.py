@@ -13,7 +13,7 @@ import numpy as np
 from warp_spo.trials import drawing
 
 from .blocks import ROOT, STATIC
-from .evidence import RESULTS, files, gather, read
+from .table.evidence import RESULTS, files, gather, read
 from .stress.cases import ALLOWED
 
 FILES = ROOT / "docs" / "robot_files.md"

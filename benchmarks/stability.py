@@ -29,7 +29,7 @@ import warp as wp
 
 import warp_spo as spo
 
-from .robots import INSTALLED, PACKAGE, remove_shapes
+from .table.robots import INSTALLED, PACKAGE, remove_shapes
 
 STEPS = (2e-3, 5e-3)  # [s]
 FINE, COMPARED = 1e-4, 0.5  # MuJoCo's step, and the simulated time that is compared with it [s]

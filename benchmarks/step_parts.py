@@ -28,9 +28,9 @@ from warp_spo.newton import SolverSPO, from_newton
 from warp_spo.newton.drives import Drives
 from warp_spo.trials.trial import Timing
 
-from . import robots, runner
+from .table import robots, runner
 from .capabilities import DT, KD, KE, SETS, inputs, measure_time
-from .resources import record_launches, resources
+from .table.resources import record_launches, resources
 
 NAMES = ("go2", "g1", "b1_z1", "centauro")
 SAMPLE = 64  # worlds that are compared with float64

@@ -20,10 +20,11 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.scene.scene import Scene
 
-from . import runner, step_parts
+from .table import runner
+from . import step_parts
 from .capabilities import SETS, measure_time
 from .contact import scenes
-from .resources import record_launches, resources
+from .table.resources import record_launches, resources
 
 DT = 5e-3
 ON_PLANE = " on a plane"

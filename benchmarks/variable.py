@@ -15,11 +15,11 @@ from typing import Any
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.trials.operations import OPERATIONS, TOLERANCE, Inputs
+from warp_spo.trials.inputs import OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, Trial
 
-from .cases import SCENES
-from .resources import record_launches, resources
+from .table.cases import SCENES
+from .table.resources import record_launches, resources
 
 VARIABLE = ("body_mass", "body_com", "body_inertia")
 OPERATION = "forward_dynamics"

@@ -11,7 +11,7 @@ def declare(file: types.ModuleType, kind: object) -> None:
     Args:
         file: a module of this package.
         kind: the argument of its factories: the scalar type or, for kernels at node granularity, the node functions of
-            that type (:mod:`warp_spo.execution.node_functions`).
+            that type (:mod:`warp_spo.execution.node.functions`).
     """
     for factory in file.KERNELS:
         factory(kind)

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from . import coupling_points, hulls, pass_loops, touches
+from . import coupling_points, hull_distance as hulls, pass_loops, narrow_phase as touches
 from .coupling import FEW, VALUES, entries, table
 from .elementary import C_TYPE
-from .touches import AWAY, HEADER, POINT
+from .narrow_phase import AWAY, HEADER, POINT
 
 FIELDS, EXCESS, LAST, PLACES, MOST_WARPS = 5, 3, 27, 24, 4  # the first ones as in warp_spo.recursions.contact.coupled
 

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from . import coupling_matrices, coupling_passes, coupling_points, hulls, touches
+from . import coupling_matrices, coupling_passes, coupling_points, hull_distance as hulls, narrow_phase as touches
 from .elementary import C_TYPE
-from .touches import AWAY, HEADER, POINT
+from .narrow_phase import AWAY, HEADER, POINT
 
 EXACT, SWEEPS, FEW, BLOCK = 8, 16, 2, 64
 VALUES, REPORTS, EXCESS = 3, 5, 4

@@ -17,10 +17,10 @@ from typing import Any
 
 import warp as wp
 
-from . import coupling_blocks, coupling_matrices, coupling_points, coupling_shared, hulls, touches
+from . import coupling_blocks, coupling_matrices, coupling_points, coupling_shared, hull_distance as hulls, narrow_phase as touches
 from .coupling import COLUMN, FEW, entries, table
 from .elementary import C_TYPE
-from .touches import AWAY, HEADER, POINT
+from .narrow_phase import AWAY, HEADER, POINT
 
 BASE = 27  # values that the base gets: an inertia and a force
 

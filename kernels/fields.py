@@ -7,7 +7,7 @@ zero along its worlds or tiles.
 
 from collections.abc import Sequence
 
-from .slots import WARP_SIZE
+from .long_results import WARP_SIZE
 
 TILED = ("value", "node_value", "lost_value")
 """Names of the tables of links: what links are made of; what bodies by themselves are, for the operators; whether some

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import warp as wp
 
 from .elementary import C_TYPE
-from .slots import STREAMING_STORE, VECTORS, WARP_SIZE
-from .straight import SHARED_BYTES, TILE
+from .long_results import STREAMING_STORE, VECTORS, WARP_SIZE
+from .straight_line import SHARED_BYTES, TILE
 
 MOST_THREADS = 320  # of a block; ten warps, whose registers leave room for other blocks
 MOST_BYTES = 96 * 4  # of two rows of A, which a thread then holds: a value from shared memory serves both

@@ -4,7 +4,7 @@ A quantity of a node is one vector: a pose (R by rows, then l), a motion or a fo
 moment, inertia about the frame's origin: xx, yy, zz, xy, xz, yz), or an articulated inertia (the upper triangle of P by
 rows). Arrays inside the library are ``[node or dof, component, world]`` with neighbouring worlds at neighbouring
 addresses, so that the reads of a warp are contiguous. Functions of these vectors are in
-:mod:`warp_spo.execution.node_functions`.
+:mod:`warp_spo.execution.node.functions`.
 """
 
 import functools

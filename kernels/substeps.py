@@ -4,7 +4,7 @@ On CUDA the state of a world is in shared memory while the loop runs, or in the 
 the CPU it is in the rows of the result. All other rows stay as they are, and are read again.
 """
 
-from .staged_rows import Row
+from .shared_rows import Row
 
 SUBSTEPS = "substeps"  # the name of the number of substeps
 # without it the compiler holds rows that stay in registers from substep to substep, and spills others

@@ -8,7 +8,7 @@ import functools
 
 import warp as wp
 
-from .straight import C_TYPE, TILE
+from .straight_line import C_TYPE, TILE
 
 TYPES = """\
 struct alignas(16) Part { %(c)s x[16 / sizeof(%(c)s)]; };  // read at once

@@ -1,4 +1,4 @@
-"""The tables of a scene's tree that every recursion reads; :mod:`warp_spo.execution.sweeps` fills them."""
+"""The tables of a scene's tree that every recursion reads; :mod:`warp_spo.execution.node.sweeps` fills them."""
 
 import warp as wp
 

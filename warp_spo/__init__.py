@@ -12,17 +12,17 @@ from .errors import DirectedLoopError, UnsupportedError
 from .execution.tuned import Tuned
 from .graph.factorization import Factorization
 from .graph.operators import BWA, Blocks, Identity, Operator
-from .hinges.functions import clip, spline, where
+from .trace.functions import clip, spline, where
 from .scene import terrain
 from .scene.actuators import Actuator, Keyframe
-from .scene.beams import beam_modes
+from .scene.flexible.beams import beam_modes
 from .scene.contacts import Contact, HeightField, Plane
 from .scene.gears import Rotor
-from .scene.modes import MassPoints, Modes
-from .scene.normal_modes import normal_modes
+from .scene.flexible.modes import MassPoints, Modes
+from .scene.flexible.normal_modes import normal_modes
 from .scene.parts import Body, Coupling, Hinge, Loop
 from .scene.scene import Scene
-from .scene.sections import Material, Section
+from .scene.flexible.sections import Material, Section
 from .scene.tree import Digraph, Tree
 from .status import Status
 

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .commands import Parser
+from .command_line import Parser
 from .dynamics.closures import LOOPS
 from .dynamics.dynamics import MOST_WORLDS, Dynamics
 from .dynamics.dynamics import OPERATIONS as DECLARED
@@ -37,7 +37,7 @@ from .dynamics.operation import AS_WRITTEN
 from .scene.scene import Scene
 from .trials import drawing, film, report
 from .trials.memory import check_memory
-from .trials.operations import OPERATIONS, TOLERANCE, Inputs, Operation
+from .trials.inputs import OPERATIONS, TOLERANCE, Inputs, Operation
 from .trials.trial import SAMPLE, Subject, Trial
 
 WORLDS = {False: 1024, True: 4096}  # on a CPU, on a GPU

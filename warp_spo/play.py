@@ -23,7 +23,7 @@ from typing import Any
 
 def main(arguments: list[str] | None = None) -> int:
     """Play the checkpoint that the arguments name."""
-    from .commands import Parser, count, seconds
+    from .command_line import Parser, count, seconds
     from .env.tasks import TASKS, task
     from .train import load_learning
 

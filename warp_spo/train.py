@@ -22,8 +22,8 @@ BEGAN = time.time()
 
 def main(arguments: list[str] | None = None) -> int:
     """Train the task that the arguments name."""
-    from .commands import Parser, count, seconds
-    from .env.checks import check_folder
+    from .command_line import Parser, count, seconds
+    from .env.validation import check_folder
     from .env.tasks import TASKS, task
 
     parser = Parser(
@@ -57,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
         return subprocess.call([*run, "-m", "warp_spo.train", *given])
 
     learning = load_learning(parser)
-    from .env.course import draw_curve
+    from .env.training_log import draw_curve
 
     rank = int(os.environ.get("RANK", 0))
     chosen = task(options.task)

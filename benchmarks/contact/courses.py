@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.reference_contact import ContactStep
+from warp_spo.reference.contact import ContactStep
 
 from . import scenes
 

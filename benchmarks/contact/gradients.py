@@ -22,7 +22,7 @@ import warp as wp
 
 import warp_spo as spo
 from warp_spo.dynamics.operation import derivative_of
-from warp_spo.dynamics.steps import STEP
+from warp_spo.dynamics.stepping.step import STEP
 from warp_spo.scene.contacts import HEIGHTS
 from warp_spo.trials.drawing import OTHER, OURS
 

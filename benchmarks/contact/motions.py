@@ -20,9 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.reference_contact import ContactStep
+from warp_spo.reference.contact import ContactStep
 
-from .. import robots
+from ..table import robots
 from . import scenes
 from .courses import courses
 

@@ -23,7 +23,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.trials import drawing
 
-from .. import robots
+from ..table import robots
 from .motions import BENT
 from .scenes import SOLE
 

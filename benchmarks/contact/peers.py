@@ -6,7 +6,7 @@ Two groups. "file": the robots of the environments, one MJCF file for both sides
 "model": a Newton model of robots that come with Newton, stepped by Newton's solvers with the settings of Newton's own
 examples, and by SolverSPO. All take the same dt and start standing or just above the ground, pushed differently in
 each world. A time is that of a step among steps that are replayed in a CUDA graph, from a state after 0.5 s.
-Processes prepare side by side; one at a time measures (:mod:`benchmarks.turns`).
+Processes prepare side by side; one at a time measures (:mod:`benchmarks.table.process_turns`).
 The error is the root mean square, over worlds, of how far the base is after 0.5 s from where the same solver puts it
 with steps of 0.1 ms.
 """
@@ -28,7 +28,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.env import robots
 
-from .. import turns
+from ..table import process_turns as turns
 from ..capabilities import median_replay
 
 DT, FINE, SECONDS = 5e-3, 1e-4, 0.5

@@ -13,9 +13,9 @@ import warp as wp
 
 import warp_spo as spo
 from warp_spo.env import robots as env_robots
-from warp_spo.reference_contact import ContactStep
+from warp_spo.reference.contact import ContactStep
 
-from .. import robots
+from ..table import robots
 from ..capabilities import SETS
 
 DT = 5e-3

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_spo.reference_contact import ContactStep
+from warp_spo.reference.contact import ContactStep
 
 from ..capabilities import measure_time
 from .scenes import DT, force_array, subject

@@ -11,10 +11,10 @@ from pathlib import Path
 import warp as wp
 
 from warp_spo.__main__ import find_device
-from warp_spo.trials.operations import Inputs
+from warp_spo.trials.inputs import Inputs
 
-from .. import runner
-from ..cases import SCENES
+from ..table import runner
+from ..table.cases import SCENES
 from . import PEERS
 from .coordinates import SETS
 from .lumped import Unsupported, lump

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_spo.reference import Dense
-from warp_spo.trials.operations import OPERATIONS, Inputs
+from warp_spo.reference.dense import Dense
+from warp_spo.trials.inputs import OPERATIONS, Inputs
 
 from .lumped import Robot, rotation, skew
 
@@ -109,7 +109,7 @@ def _apply(T: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 class States:
-    """The random states of ``warp_spo.trials.operations.Inputs`` in a peer's coordinates and precision.
+    """The random states of ``warp_spo.trials.inputs.Inputs`` in a peer's coordinates and precision.
 
     Args:
         coordinates: the peer's coordinates.

@@ -22,7 +22,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from warp_spo.trials.operations import Inputs
+from warp_spo.trials.inputs import Inputs
 
 from . import exchange
 from .coordinates import States
@@ -112,7 +112,7 @@ def build(out: Path, name: str, robot: Robot, arch: str) -> None:
 
 
 def main() -> None:
-    from ..cases import SCENES
+    from ..table.cases import SCENES
 
     parser = argparse.ArgumentParser(prog="python -m benchmarks.peers.grid", description="Build GRiD's harnesses.")
     parser.add_argument("folder", type=Path)

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from warp_spo.trials.operations import Inputs
+from warp_spo.trials.inputs import Inputs
 
 from .coordinates import Coordinates, States, sample
 from .lumped import Robot

@@ -16,7 +16,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, ClassVar
 
-from warp_spo.trials.operations import Inputs
+from warp_spo.trials.inputs import Inputs
 
 from . import exchange
 from .coordinates import States

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.trials.operations import OPERATIONS, Inputs
+from warp_spo.trials.inputs import OPERATIONS, Inputs
 
 from .lumped import Robot, Unsupported
 from .torch_dense import TorchDense

@@ -15,7 +15,7 @@ from typing import Any
 
 import warp as wp
 
-from .. import runner
+from ..table import runner
 from .cases import Case, choose
 from .checks import CHECKS, LONG, READS_PIVOTS
 from .measure import Subject, contrasts, row

@@ -4,15 +4,12 @@ import dataclasses
 
 import pytest
 
-from benchmarks import (
-    parts,
-    rows,
-    runner,
-)
+from benchmarks.table import parts, runner
+from benchmarks import rows
 from benchmarks.__main__ import choose, main, parser
-from benchmarks.precisions import PRECISIONS
+from benchmarks.table.precisions import PRECISIONS
 from support.benchmark_results import RUN
-from warp_spo.trials.operations import OPERATIONS, TOLERANCE
+from warp_spo.trials.inputs import OPERATIONS, TOLERANCE
 
 
 def test_an_error_beyond_its_tolerance_fails_and_is_named(device, capsys, monkeypatch):

@@ -6,13 +6,8 @@ import re
 
 import pytest
 
-from benchmarks import (
-    evidence,
-    limits,
-    pictures,
-    runner,
-    table,
-)
+from benchmarks.table import evidence, pictures, runner, table
+from benchmarks import limits
 from benchmarks.__main__ import main
 from support.benchmark_results import RUN, _data, _gathered, _row
 

@@ -8,24 +8,14 @@ import numpy as np
 import pytest
 
 import warp_spo as spo
-from benchmarks import (
-    breakdown,
-    capabilities,
-    cases,
-    env_digests,
-    kernel_texts,
-    operation_counts,
-    robots,
-    roofline,
-    runner,
-    shapes,
-)
+from benchmarks import breakdown, capabilities, env_digests, kernel_texts
+from benchmarks.table import cases, operation_counts, robots, roofline, runner, shapes
 from benchmarks.__main__ import main
-from benchmarks.precisions import PRECISIONS
+from benchmarks.table.precisions import PRECISIONS
 from support import zoo
 from support.benchmark_results import NODE, REFINED, ROOF
-from warp_spo.reference import Dense
-from warp_spo.trials.operations import INPUTS, OPERATIONS, TOLERANCE, Inputs, rotations
+from warp_spo.reference.dense import Dense
+from warp_spo.trials.inputs import INPUTS, OPERATIONS, TOLERANCE, Inputs, rotations
 
 
 def test_every_operation_of_every_scene_is_within_its_tolerance(device):

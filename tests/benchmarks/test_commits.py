@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import commits, evidence, robots
+from benchmarks.table import commits, evidence, robots
 from benchmarks.__main__ import main
 
 IN_GIT = (evidence.ROOT / ".git").exists()

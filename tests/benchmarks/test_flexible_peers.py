@@ -5,7 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks import boom, evidence, flexible_peers
+from benchmarks import boom, flexible_peers
+from benchmarks.table import evidence
 from support.rendering import assert_is_whole
 from warp_spo.trials import drawing
 

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import warp_spo as spo
-from benchmarks import cases, peers, robots
+from benchmarks.table import cases, robots
+from benchmarks import peers
 from benchmarks.peers import coordinates, exchange, lumped
 from benchmarks.peers.__main__ import main
 from benchmarks.peers.peer import Absent
 from support import zoo
-from warp_spo.trials.operations import TOLERANCE, Inputs
+from warp_spo.trials.inputs import TOLERANCE, Inputs
 
 WORLDS = 3
 FLOAT64_MAP = 1e-12  # of a state of size one, mapped there and back

@@ -4,7 +4,8 @@ import re
 
 import pytest
 
-from benchmarks import evidence, peers, pictures, table
+from benchmarks.table import evidence, pictures, table
+from benchmarks import peers
 from support.rendering import assert_is_whole
 from warp_spo.trials import drawing, report
 

@@ -3,7 +3,7 @@
 import os
 import time
 
-from benchmarks.turns import take_turns
+from benchmarks.table.process_turns import take_turns
 
 TASKS = "first", "second", "fails", "dies", "slow"
 

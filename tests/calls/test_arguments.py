@@ -13,7 +13,7 @@ from support import laws, zoo
 from support.border import POSE, WORLDS, assert_right, dynamics, explained, given, scene
 from support.granularities import of_random_scenes
 from support.laws import OPERATIONS, TOLERANCE
-from warp_spo import reference
+from warp_spo.reference import dense as reference
 
 
 # -- frames ------------------------------------------------------------------------------------------------------------

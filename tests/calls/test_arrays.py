@@ -6,8 +6,8 @@ import torch
 import warp as wp
 
 from support.allocations import no_warp_allocation
-from warp_spo import arrays
-from warp_spo.arrays import Call
+from warp_spo.runtime import arrays
+from warp_spo.runtime.arrays import Call
 
 WORLDS, SIZE = 3, 4
 VALUES = np.arange(12.0).reshape(WORLDS, SIZE)

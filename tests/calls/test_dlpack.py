@@ -165,7 +165,7 @@ def test_results_keep_their_memory(dyn):
 
 def test_cupy_runs_on_its_own_stream(monkeypatch):
     """With a stand-in for CuPy: its stream is asked for on the device, and its memory is its own."""
-    from warp_spo import dlpack
+    from warp_spo.runtime import dlpack
 
     asked = []
 

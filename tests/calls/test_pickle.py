@@ -17,7 +17,7 @@ import warp_spo as spo
 from support import custom_hinges, laws, mechanisms, zoo
 from support.border import explained
 from support.solver_models import turned_model
-from warp_spo.dynamics import storage
+from warp_spo.dynamics import pickling as storage
 from warp_spo.torch import Module
 
 WORLDS = 3

@@ -14,7 +14,7 @@ from support import actuated, laws, zoo
 from support.border import explained, made
 from support.laws import numbers
 from support.mechanisms import MECHANISMS
-from warp_spo import launches
+from warp_spo.runtime import launches
 from warp_spo.dynamics.operation import Argument
 
 WORLDS = 3

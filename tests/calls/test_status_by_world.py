@@ -12,7 +12,7 @@ from support import laws, zoo
 from support.border import made
 from support.laws import numbers
 from support.value_scenes import KINDS, WORLDS, assert_equals
-from warp_spo import reference
+from warp_spo.reference import dense as reference
 from warp_spo.execution import plan
 
 

@@ -15,7 +15,7 @@ from support.border import made
 from support.granularities import of_random_scenes
 from support.laws import OPERATIONS, TOLERANCE
 from support.value_scenes import FLOAT32_VALUES, KINDS, NAMES, TELLING, WORLDS, assert_equals, drawn, no_warning, scene
-from warp_spo import reference
+from warp_spo.reference import dense as reference
 
 QUICK = {*((name, "warp") for name in NAMES if name != "body_gravcomp")}  # that has tests of its own
 QUICK |= {(name, kind) for name in ("body_mass", "joint_X_p", "gravity") for kind in KINDS}

@@ -14,8 +14,8 @@ from support.border import made
 from support.gradients import check
 from support.step_scenes import TOLERANCE, H
 from support.value_scenes import KINDS
-from warp_spo.kernels import rows
-from warp_spo.reference import Dense
+from warp_spo.kernels import row_copies as rows
+from warp_spo.reference.dense import Dense
 
 WORLDS = 3
 MASK = np.array([True, False, True])

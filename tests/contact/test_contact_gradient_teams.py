@@ -9,13 +9,13 @@ from support import contact_cases, contact_gradients, symbolic, warp_machine
 from support.actuated import driven_hand
 from support.contact_cases import quadruped, touching, waisted
 from support.contact_steps import steps
-from warp_spo.dynamics import contact_gradients as kernels
+from warp_spo.dynamics.stepping import contact_gradients as kernels
 from warp_spo.dynamics.operation import derivative_of
-from warp_spo.dynamics.steps import STEP
-from warp_spo.recursions.contact.middle import KICK, PATH, START
+from warp_spo.dynamics.stepping.step import STEP
+from warp_spo.recursions.contact.velocity_kicks import KICK, PATH, START
 from warp_spo.recursions.derivatives.contact import INERTIA, PassGradient, PassSolve, divides
 from warp_spo.recursions.derivatives.contact_pass import weighed_pieces
-from warp_spo.reference import Dense
+from warp_spo.reference.dense import Dense
 
 H, WORLDS, PASSES = 5e-3, 4, 2
 ROUTINES = {"contact_pass": kernels.PASS, "contact_solve": kernels.SOLVE, "contact_gradient": kernels.GRADIENT}

@@ -6,8 +6,8 @@ import pytest
 import warp_spo as spo
 from support import symbolic
 from support.contact_cases import STAND, box, pressed, quadruped, quadruped_case, random_case, rise
-from warp_spo import reference_contact as reference
-from warp_spo.reference_contact import ContactStep
+from warp_spo.reference import contact as reference
+from warp_spo.reference.contact import ContactStep
 
 ROUNDING = 1e-11  # of the energy before; dense solves of masses that differ by 1e4
 H = 5e-3

@@ -8,9 +8,9 @@ import pytest
 import warp_spo as spo
 from support import zoo
 from support.contact_cases import box, quadruped
-from warp_spo.dynamics.integrators import CONTACT_STEP
+from warp_spo.dynamics.stepping.integrators import CONTACT_STEP
 from warp_spo.execution.builder import Builder
-from warp_spo.reference import Dense
+from warp_spo.reference.dense import Dense
 from warp_spo.scene.contacts import Stand
 
 

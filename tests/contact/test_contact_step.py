@@ -11,9 +11,9 @@ from support import actuated, symbolic, zoo
 from support.contact_cases import box, everywhere, quadruped, touching
 from support.contact_steps import FIELDS, H, above, assert_is_dense, by_point
 from support.step_scenes import furnished, states
-from warp_spo.dynamics import contacts
-from warp_spo.recursions.contact import dampers, ground, law, middle, points, secants, step
-from warp_spo.reference_contact import ContactStep
+from warp_spo.dynamics.stepping import contact_options as contacts
+from warp_spo.recursions.contact import dampers, ground, law, velocity_kicks as middle, points, secant_laws as secants, step
+from warp_spo.reference.contact import ContactStep
 
 WORLDS = 4
 TOLERANCE = {"float64": (1e-10, 1e-10), "float32": (1e-4, 5e-4)}

@@ -13,14 +13,15 @@ from support.actuated import driven_hand
 from support.contact_cases import box, everywhere, quadruped, touching
 from support.contact_steps import FIELDS, above, assert_is_dense, steps
 from support.step_scenes import furnished, states
-from warp_spo.dynamics.integrators import CONTACT_STEP
-from warp_spo.execution import plan, teams
-from warp_spo.kernels import pass_loops, straight
+from warp_spo.dynamics.stepping.integrators import CONTACT_STEP
+from warp_spo.execution import plan
+from warp_spo.execution.segment import warp_specialized as teams
+from warp_spo.kernels import pass_loops, straight_line as straight
 from warp_spo.kernels.substeps import repeat_on_cuda
 from warp_spo.recursions.contact import points, step
 from warp_spo.recursions.contact.step import REPORTS
-from warp_spo.recursions.tracing import Trace
-from warp_spo.reference_contact import ContactStep
+from warp_spo.recursions.model.tracing import Trace
+from warp_spo.reference.contact import ContactStep
 
 H, WORLDS = 5e-3, 4
 SIZES = {"contact_f": (3,), "contact_gap": (), "contact_slip": ()}

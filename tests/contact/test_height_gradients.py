@@ -7,7 +7,7 @@ import warp as wp
 import warp_spo as spo
 from support.contact_cases import box
 from support.contact_steps import FIELDS, H, above
-from warp_spo.execution.heights import HeightSums
+from warp_spo.execution.height_gradients import HeightSums
 
 torch = pytest.importorskip("torch")
 

@@ -7,12 +7,12 @@ import warp as wp
 import warp_spo as spo
 from support import contact_cases, symbolic, warp_machine
 from support.contact_cases import quadruped, waisted
-from warp_spo.dynamics import rounds
-from warp_spo.recursions.contact import middle, step
-from warp_spo.recursions.contact.middle import FOUND, GAINED, KICKED, PATH
-from warp_spo.recursions.links import Links
-from warp_spo.recursions.tracing import Trace
-from warp_spo.reference import Dense
+from warp_spo.dynamics.stepping import midpoint_contact as rounds
+from warp_spo.recursions.contact import velocity_kicks as middle, step
+from warp_spo.recursions.contact.velocity_kicks import FOUND, GAINED, KICKED, PATH
+from warp_spo.recursions.model.links import Links
+from warp_spo.recursions.model.tracing import Trace
+from warp_spo.reference.dense import Dense
 from warp_spo.trace.evaluation import evaluate
 
 H, WORLDS = 5e-3, 3

@@ -30,7 +30,7 @@ from support.pair_scenes import (
 )
 from support.pair_steps import assert_is_dense, plant, respond_by_whole_trees
 from support.pair_touches import assert_points_are_those_of_the_reference
-from warp_spo.dynamics.integrators import CONTACT_STEP, PAIRED_STEP
+from warp_spo.dynamics.stepping.integrators import CONTACT_STEP, PAIRED_STEP
 from warp_spo.examples import grasp
 from warp_spo.execution import plan
 from warp_spo.execution.device_facts import MEASURED

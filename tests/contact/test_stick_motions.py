@@ -8,7 +8,7 @@ from support.hull_scenes import RAMP, SLOPE
 from support.pair_motions import largest_rise, momentum, stand
 from support.pair_scenes import H, cube, free
 from support.pair_touches import assert_points_are_those_of_the_reference, planted
-from warp_spo.kernels import sticks
+from warp_spo.kernels import segment_convex as sticks
 
 LAW = dict(stiffness=1e5, damping=300.0)
 STICK = dict(capsule=((-0.2, 0.0, 0.0), (0.2, 0.0, 0.0), 0.03))

@@ -6,7 +6,7 @@ import warp as wp
 
 import warp_spo as spo
 from support import laws, oracles, symbolic, zoo
-from warp_spo import reference
+from warp_spo.reference import dense as reference
 from warp_spo.recursions import articulated, hybrid
 
 WORLDS = 3

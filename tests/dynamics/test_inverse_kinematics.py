@@ -7,13 +7,13 @@ import pytest
 import warp as wp
 
 import warp_spo as spo
-from benchmarks import arms, robots
+from benchmarks.table import arms, robots
 from benchmarks import inverse_kinematics as benchmark
 from support import laws, zoo
 from support.allocations import no_warp_allocation
 from support.mechanisms import MECHANISMS
 from warp_spo.dynamics.inverse_kinematics import ANGLE_WEIGHT, starts
-from warp_spo.reference import Dense, rotation
+from warp_spo.reference.dense import Dense, rotation
 
 WORLDS = 32
 FILES = {"panda": "panda_description/urdf/panda.urdf", "ur5": "ur_description/urdf/ur5_robot.urdf"}

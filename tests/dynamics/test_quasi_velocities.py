@@ -10,7 +10,7 @@ from support.flexible_trees import TREES
 from support.flexible_trees import states as flexible_states
 from support.flexible_trees import tree as flexible_tree
 from warp_spo.examples import quasi_velocities as example
-from warp_spo.reference import Dense
+from warp_spo.reference.dense import Dense
 
 NAMES = ["chain7", "fork", "every_d6", "forest", "floating_tree"]
 CUSTOM = ("rolling_knee", "ellipsoid_shoulder", "many_functions")

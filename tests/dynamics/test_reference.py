@@ -20,7 +20,7 @@ from support.reference_cases import (
     same_poses,
     trees,
 )
-from warp_spo.reference import Dense, homogeneous, quaternion, rotation, rotation_about, rotation_vector, skew
+from warp_spo.reference.dense import Dense, homogeneous, quaternion, rotation, rotation_about, rotation_vector, skew
 from warp_spo.scene.parts import Body, Hinge
 from warp_spo.scene.scene import Scene
 

@@ -20,7 +20,7 @@ from support.reference_cases import (
     trees,
 )
 from warp_spo.newton import from_newton, load, shipped
-from warp_spo.reference import Dense, rotation
+from warp_spo.reference.dense import Dense, rotation
 from warp_spo.scene.parts import Body, Hinge
 from warp_spo.scene.scene import Scene
 

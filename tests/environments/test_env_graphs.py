@@ -5,7 +5,7 @@ import contextlib
 import pytest
 import torch
 
-from warp_spo.env.graphs import Part, Replay
+from warp_spo.env.compile.cuda_graphs import Part, Replay
 
 
 class Device:

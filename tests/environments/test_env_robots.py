@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import warp_spo as spo
-from benchmarks import robots as released
+from benchmarks.table import robots as released
 from warp_spo.env import robots
 from warp_spo.newton import shipped
-from warp_spo.reference_rotations import rotation, skew
+from warp_spo.reference.rotations import rotation, skew
 
 ROUNDED = 2e-9  # share of the largest entry; figures in the files have ten digits
 

@@ -158,7 +158,7 @@ def test_an_action_that_moves_a_follower_is_exported_as_its_own_joint():
 def test_shapes_are_where_joints_and_contacts_are():
     """A capsule's ends are the joints, whichever way it points; a box is about the corners."""
     from warp_spo.env import shapes
-    from warp_spo.reference_rotations import rotation
+    from warp_spo.reference.rotations import rotation
 
     for end in np.vstack([np.eye(3), -np.eye(3), np.random.default_rng(0).normal(size=(4, 3))]):
         start = np.array([0.1, -0.2, 0.3])

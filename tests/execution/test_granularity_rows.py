@@ -10,7 +10,7 @@ import warp_spo as spo
 from support import laws, warp_machine, zoo
 from support.granularity_scenes import DTYPES, GRANULARITIES, MANY, dynamics, equals_reference, states
 from warp_spo.execution import plan
-from warp_spo.kernels import straight
+from warp_spo.kernels import straight_line as straight
 
 
 @pytest.mark.parametrize("granularity", GRANULARITIES)

@@ -6,7 +6,7 @@ import warp as wp
 
 import warp_spo as spo
 from support import laws, zoo
-from warp_spo.reference import Dense
+from warp_spo.reference.dense import Dense
 
 WORLDS = 3
 ROUNDED = 1e-7  # relative, 2-norm: each entry within half a unit in the last place of float32, 6e-8

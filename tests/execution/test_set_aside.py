@@ -8,12 +8,12 @@ import warp as wp
 from support import zoo
 from warp_spo.execution.device_facts import MEASURED
 from warp_spo.execution.plan import choose
-from warp_spo.kernels import native, staged_rows, straight
+from warp_spo.kernels import native, shared_rows as staged_rows, straight_line as straight
 from warp_spo.recursions.forward_dynamics import forward_dynamics_bias_first
-from warp_spo.recursions.links import Links
-from warp_spo.recursions.tracing import Trace
+from warp_spo.recursions.model.links import Links
+from warp_spo.recursions.model.tracing import Trace
 from warp_spo.trace.emission import Emitter, Store, render
-from warp_spo.trace.set_aside import set_aside
+from warp_spo.trace.register_spilling import set_aside
 
 TEXT = """\
 if (warp == 0) {

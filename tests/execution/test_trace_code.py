@@ -9,9 +9,9 @@ import warp as wp
 
 import warp_spo as spo
 from support import laws, symbolic, zoo
-from warp_spo.kernels import native, staged_rows, straight
-from warp_spo.recursions.links import Links
-from warp_spo.recursions.tracing import Trace
+from warp_spo.kernels import native, shared_rows as staged_rows, straight_line as straight
+from warp_spo.recursions.model.links import Links
+from warp_spo.recursions.model.tracing import Trace
 from warp_spo.trace import fusion
 from warp_spo.trace import scalars as g
 from warp_spo.trace.emission import Emitter, Store, literal, render

@@ -11,11 +11,12 @@ from support.granularity_scenes import mirrored
 from support.pieces_of_trees import TREES, hand
 from support.robots import ROBOTS
 from support.routines import ROUTINES
-from warp_spo.execution import plan, shared_text
-from warp_spo.kernels import straight
-from warp_spo.recursions import alike
-from warp_spo.recursions.links import Links
-from warp_spo.recursions.pieces import Pieces
+from warp_spo.execution import plan
+from warp_spo.execution.segment import shared_code as shared_text
+from warp_spo.kernels import straight_line as straight
+from warp_spo.recursions.model import shared_constants as alike
+from warp_spo.recursions.model.links import Links
+from warp_spo.recursions.model.segments import Pieces
 
 LARGE = ("tree20", "three roots", "humanoid")  # trees of which a quick run takes one operation
 

@@ -14,7 +14,7 @@ import warp as wp
 import warp_spo as spo
 from support import contact_cases, pair_scenes, zoo
 from warp_spo.dynamics import tuning
-from warp_spo.dynamics.integrators import CONTACT_STEP
+from warp_spo.dynamics.stepping.integrators import CONTACT_STEP
 from warp_spo.examples import fourbar
 from warp_spo.execution import plan, tuned
 from warp_spo.execution.device_facts import CPU, MEASURED

@@ -12,7 +12,7 @@ from benchmarks.robot_files import mjcf_files
 from support.mjcf_damage import damaged
 from support.mjcf_texts import ACTUATORS, EMPTY, EQUALITY, EXACT, FREE, KEYS, TIES
 from support.random_mjcf import random_mjcf
-from warp_spo.mujoco.files import compiled
+from warp_spo.mujoco.mjcf import compiled
 
 SHIPPED = ("nv_ant.xml", "nv_humanoid.xml", "mjcf_exclude_test.xml", "testdata/model.xml")
 ROUNDING = 1e-14  # relative error of an acceleration for each unit of the mass matrix's condition number

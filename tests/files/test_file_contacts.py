@@ -13,7 +13,7 @@ import pytest
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.scene.shapes import reduced
+from warp_spo.scene.collision_shapes import reduced
 
 EXACT = 1e-12  # float64 on both sides; sizes of a metre
 SINGLE = 3e-6  # MuJoCo keeps the vertices of meshes in float32

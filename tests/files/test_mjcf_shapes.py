@@ -8,8 +8,8 @@ import pytest
 
 import warp_spo as spo
 from warp_spo.newton import mjcf
-from warp_spo.reference_rotations import rotation
-from warp_spo.scene.shapes import Choice
+from warp_spo.reference.rotations import rotation
+from warp_spo.scene.collision_shapes import Choice
 
 EXACT = 1e-12  # float64 on both sides; sizes of a metre
 MARGINS = """<mujoco><option o_margin="0.07" o_friction="0.4 0.4 0.01 0.01 0.01"><flag override="{override}"/></option>

@@ -11,8 +11,8 @@ import pytest
 import warp_spo as spo
 from benchmarks.robot_files import compare_urdf, short, urdf_files
 from warp_spo.newton import load
-from warp_spo.newton.repair import repaired
-from warp_spo.reference import Dense, homogeneous
+from warp_spo.newton.files.inertia_repair import repaired
+from warp_spo.reference.dense import Dense, homogeneous
 
 FILES = {file.name: file for file in urdf_files()}
 QUICK = ("go2.urdf", "tiago_pro.urdf", "talos_left_arm.urdf", "double_pendulum_continuous.urdf", "panda.urdf")

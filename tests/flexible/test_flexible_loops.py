@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import warp_spo as spo
-from warp_spo.dynamics.embedding import Closing
+from warp_spo.dynamics.loop_analysis import Closing
 from warp_spo.examples.parts import at, bar
 
 DENSE = 1e-10  # the rows' change along qd is a difference of two Jacobians

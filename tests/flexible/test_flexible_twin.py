@@ -8,8 +8,8 @@ from support.flexible_scenes import Traced
 from support.flexible_trees import TREES, states, tree
 from support.flexible_twin import Twin
 from warp_spo.hinges import deflection
-from warp_spo.recursions import flexible
-from warp_spo.scene import modes
+from warp_spo.recursions.model import flexible
+from warp_spo.scene.flexible import modes
 
 ROUNDING = 1e-12  # of the largest entry; measured 4e-16 to 2e-15
 SOLVED = 1e-9  # accelerations: times the condition of the mass matrix, 1e6 for light tips; measured 5e-13

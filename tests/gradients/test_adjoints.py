@@ -11,10 +11,10 @@ from support import laws, symbolic, warp_machine, zoo
 from support.granularity_scenes import hand
 from support.routines import ROUTINES
 from warp_spo.execution import plan
-from warp_spo.kernels import straight
+from warp_spo.kernels import straight_line as straight
 from warp_spo.recursions.derivatives import power
 from warp_spo.recursions.derivatives.power import FromParent, Power
-from warp_spo.reference import Dense
+from warp_spo.reference.dense import Dense
 
 WORLDS = 3
 TOLERANCE = {"float64": 1e-11, "float32": 2e-5}  # grows with the condition of Mass; measured 3e-14, 3e-6

@@ -6,8 +6,8 @@ import pytest
 from support import symbolic, zoo
 from support.robots import ROBOTS
 from warp_spo.recursions.composite import mass_matrix
-from warp_spo.recursions.links import Links
-from warp_spo.recursions.tracing import Trace
+from warp_spo.recursions.model.links import Links
+from warp_spo.recursions.model.tracing import Trace
 from warp_spo.trace import scalars as g
 from warp_spo.trace.differentiation import forward, partial, reverse
 from warp_spo.trace.evaluation import FUNCTIONS, evaluate

@@ -7,17 +7,17 @@ import pytest
 import warp as wp
 
 import warp_spo as spo
-from benchmarks import cases
+from benchmarks.table import cases
 from support import laws, oracles, symbolic, warp_machine, zoo
 from support.allocations import no_warp_allocation
 from support.pieces_of_trees import TREES
 from support.robots import ROBOTS
 from support.routines import ROUTINES
 from warp_spo.execution.plan import MOST_DOFS
-from warp_spo.kernels import straight
+from warp_spo.kernels import straight_line as straight
 from warp_spo.recursions.derivatives import inverse_dynamics as dense
 from warp_spo.recursions.derivatives import sensitivity
-from warp_spo.reference import Dense
+from warp_spo.reference.dense import Dense
 
 STEP = 1e-5
 DIFFERENCES = 1e-6  # relative: eps / h + h^2; the bound, measured 4e-9

@@ -10,11 +10,11 @@ import warp_spo as spo
 from support import laws, zoo
 from support.gradients import DT, OPERATIONS, WORLDS, called, on, options, restore_values, tree_and_state
 from warp_spo import torch as spo_torch
-from warp_spo.dynamics.steps import INTEGRATE
+from warp_spo.dynamics.stepping.step import INTEGRATE
 from warp_spo.execution.plan import MOST_DOFS
 from warp_spo.execution.staging import is_read_before_written
 from warp_spo.recursions.derivatives.adjoints import forward_dynamics_vjp
-from warp_spo.recursions.tracing import Trace
+from warp_spo.recursions.model.tracing import Trace
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import warp_spo as spo
 from support import zoo
 from support.operator_scenes import abstract_system
 from support.operators_of_robots import close
-from warp_spo import reference
+from warp_spo.reference import dense as reference
 
 
 @pytest.mark.parametrize("delta", [True, False])

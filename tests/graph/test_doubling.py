@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from support.operator_scenes import random_parents
-from warp_spo import launches
+from warp_spo.runtime import launches
 from warp_spo.graph.operators import BWA
 from warp_spo.scene.tree import Digraph, Tree
 

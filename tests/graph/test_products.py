@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_spo.execution import products
+from warp_spo.execution import mass_inverse_products as products
 from warp_spo.kernels import products as kernels
-from warp_spo.kernels.straight import SHARED_BYTES, TILE
+from warp_spo.kernels.straight_line import SHARED_BYTES, TILE
 
 ROUNDING = {"float32": 3e-6, "float64": 1e-14}  # of sums of 100 products, relative; measured 7e-7 and 2e-15
 

@@ -16,7 +16,7 @@ from support.flexible_trees import tree as flexible_tree
 from support.operator_scenes import SCENES, TOLERANCE, abstract_system, scene_of
 from support.operators_of_robots import close
 from support.rendering import assert_is_whole
-from warp_spo import reference
+from warp_spo.reference import dense as reference
 
 WORLDS = 3
 CONDITION = 1e3  # of random blocks, squared in B M B*: how much rounding grows; 1e2 here

@@ -8,7 +8,7 @@ import warp_spo as spo
 from support import laws
 from support.allocations import no_warp_allocation
 from support.operators_of_robots import DENSE, IDENTITY, SCENES, SWEEP, close, operators, scene_of
-from warp_spo import reference
+from warp_spo.reference import dense as reference
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])

@@ -11,13 +11,13 @@ import pytest
 import warp as wp
 
 import warp_spo as spo
-from benchmarks import robots, shapes
+from benchmarks.table import robots, shapes
 from support import contact_cases, laws, warp_machine
 from support.granularity_scenes import GRANULARITIES, dynamics, states
 from warp_spo.errors import UnsupportedError
 from warp_spo.execution import plan
 from warp_spo.execution.device_facts import MEASURED
-from warp_spo.trials.operations import APPLICATIONS, DT, OPERATIONS, Inputs, Operation
+from warp_spo.trials.inputs import APPLICATIONS, DT, OPERATIONS, Inputs, Operation
 from warp_spo.trials.trial import Subject, Trial
 
 STATES = 31  # different worlds; one less than a warp has threads, so that each comes to stand in every place of a warp

@@ -5,11 +5,11 @@ import pytest
 import warp as wp
 
 import warp_spo as spo
-from benchmarks import cases
+from benchmarks.table import cases
 from support import laws, zoo
 from support.routines import ROUTINES
 from warp_spo.execution.parameters import VARIABLE
-from warp_spo.recursions.links import MOTION_VALUES
+from warp_spo.recursions.model.links import MOTION_VALUES
 
 GIVEN = {"forward_dynamics": ("qd", "tau"), "inverse_dynamics": ("qd", "qdd"), "solve_mass_matrix": ("b",),
          "mass_matrix": (), "mass_matrix_inverse": (), "log_det_mass_matrix": ()}  # fmt: skip

@@ -15,7 +15,7 @@ import warp as wp
 from warp_spo import Dynamics
 from warp_spo import __main__ as job
 from warp_spo.trials import film, memory, report, trial
-from warp_spo.trials.operations import OPERATIONS, TOLERANCE
+from warp_spo.trials.inputs import OPERATIONS, TOLERANCE
 
 # Two bars on the ground whose tips are pinned together: a loop.
 LOOP = """<mujoco><default><geom size=".03"/></default><worldbody>

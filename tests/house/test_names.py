@@ -10,7 +10,7 @@ import pytest
 
 import warp_spo as spo
 from support.env_scenes import walker_q, walker_scene
-from warp_spo import launches
+from warp_spo.runtime import launches
 from warp_spo.env import Env, Observation, TorchTerm, actions, events, terminations
 from warp_spo.errors import shown
 from warp_spo.examples import fourbar

@@ -8,11 +8,13 @@ from support import laws, symbolic, warp_machine, zoo
 from support.laws import TOLERANCE
 from support.mutants import mutant
 from support.routines import ROUTINES
-from warp_spo.execution import node_functions, shared_text, teams
-from warp_spo.execution import sweeps as levels
+from warp_spo.execution.node import functions as node_functions
+from warp_spo.execution.segment import shared_code as shared_text, warp_specialized as teams
+from warp_spo.execution.node import sweeps as levels
 from warp_spo.graph import blocks
-from warp_spo.kernels import straight
-from warp_spo.recursions import articulated, articulated_sweeps, inverse, links, messages, newton_euler, pieces
+from warp_spo.kernels import straight_line as straight
+from warp_spo.recursions import articulated, articulated_sweeps, mass_matrix_inverse as inverse, newton_euler
+from warp_spo.recursions.model import links, messages, segments as pieces
 from warp_spo.trace import scalars as graph
 from warp_spo.trace import spatial
 

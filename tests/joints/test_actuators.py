@@ -9,7 +9,7 @@ import warp_spo as spo
 from support import actuated
 from support.actuated import CURVES, KINDS, arm, everything, mujoco_arm, slider, states
 from support.mechanisms import MECHANISMS
-from warp_spo.reference import Dense
+from warp_spo.reference.dense import Dense
 
 ROUNDED = {"float64": 1e-13, "float32": 2e-6}  # of forces up to 50; they are sums of a few products
 STEPPED = 1e-12  # of velocities of the order of 10 after 50 steps

@@ -13,10 +13,10 @@ from support.custom_hinges import RADIUS
 from support.hinge_twins import AGREE, SAME, WORLDS, difference, more_states, shapes, states
 from support.step_scenes import FORCES, H, furnished
 from support.step_scenes import states as step_states
-from warp_spo.dynamics.embedding import embedding
+from warp_spo.dynamics.loop_analysis import embedding
 from warp_spo.examples import fourbar
-from warp_spo.recursions.links import Links
-from warp_spo.reference import Dense
+from warp_spo.recursions.model.links import Links
+from warp_spo.reference.dense import Dense
 from warp_spo.trace.evaluation import evaluate
 
 EXACT = 1e-13  # closed forms in float64, of one body

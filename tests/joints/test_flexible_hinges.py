@@ -12,7 +12,7 @@ import warp_spo as spo
 from support import geared, implicit, laws, symbolic, zoo
 from support.step_scenes import FORCES, H, furnished
 from support.step_scenes import states as step_states
-from warp_spo.reference import Dense
+from warp_spo.reference.dense import Dense
 
 WORLDS = 3
 EXACT = 1e-12  # float64 on scenes of few bodies

@@ -7,8 +7,8 @@ import pytest
 import warp_spo as spo
 from support import laws, mechanisms, symbolic, zoo
 from support.step_scenes import held
-from warp_spo.dynamics.integrators import INTEGRATORS
-from warp_spo.reference import Dense
+from warp_spo.dynamics.stepping.integrators import INTEGRATORS
+from warp_spo.reference.dense import Dense
 
 H = 2e-3
 ROUNDED = 1e-13  # of forces up to 40 N m

@@ -15,10 +15,10 @@ from support import geared, implicit, laws, symbolic, zoo
 from support.hinge_twins import AGREE, SAME, difference, more_states, shapes
 from support.step_scenes import FORCES, H, furnished
 from support.step_scenes import states as step_states
-from warp_spo.dynamics.embedding import embedding
+from warp_spo.dynamics.loop_analysis import embedding
 from warp_spo.examples import fourbar
-from warp_spo.reference import Dense
-from warp_spo.trials.operations import DECLARED, Inputs, of_declaration
+from warp_spo.reference.dense import Dense
+from warp_spo.trials.inputs import DECLARED, Inputs, of_declaration
 from warp_spo.trials.trial import Subject, Trial
 
 EXACT = 1e-12  # float64, two bodies

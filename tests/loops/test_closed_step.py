@@ -10,10 +10,10 @@ from support import implicit, laws, mechanisms, symbolic
 from support.mechanisms import MECHANISMS
 from support.rollouts import energy
 from support.step_scenes import FORCES, furnished, smooth
-from warp_spo.dynamics.embedding import Closing
+from warp_spo.dynamics.loop_analysis import Closing
 from warp_spo.errors import UnsupportedError
 from warp_spo.examples.parts import at, bar
-from warp_spo.recursions import impedance, step
+from warp_spo.recursions.step import joint_laws as impedance, step
 from warp_spo.recursions.loops import closed_step, clusters
 
 H = 2e-3

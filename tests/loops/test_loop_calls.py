@@ -8,7 +8,7 @@ import warp_spo as spo
 from support import laws, mechanisms, symbolic, zoo
 from support.closed_loops import AGREE, DIFFERENCES, LOADED, both, by_embedding
 from support.mechanisms import MECHANISMS, Closed
-from warp_spo.dynamics.embedding import Closing
+from warp_spo.dynamics.loop_analysis import Closing
 from warp_spo.examples.parts import at
 
 

@@ -9,7 +9,7 @@ import warp_spo as spo
 from support import mechanisms, symbolic
 from support.mechanisms import FIRST, MECHANISMS
 from support.step_scenes import furnished, held, smooth
-from warp_spo.dynamics.embedding import Closing
+from warp_spo.dynamics.loop_analysis import Closing
 from warp_spo.errors import UnsupportedError
 from warp_spo.recursions.derivatives import adjoints, power
 from warp_spo.recursions.loops import embedded_adjoints

@@ -7,10 +7,10 @@ import warp_spo as spo
 from support import laws, mechanisms, zoo
 from support.closed_loops import AGREE, DIFFERENCES, both, by_embedding, by_multipliers, flat, lagrange, traced
 from support.mechanisms import MECHANISMS, Closed
-from warp_spo.dynamics.embedding import Closing, _spanning, drawn, embedding
+from warp_spo.dynamics.loop_analysis import Closing, _spanning, drawn, embedding
 from warp_spo.examples.parts import at, bar
 from warp_spo.recursions.loops.embedded import Embedding
-from warp_spo.reference import homogeneous, pose7
+from warp_spo.reference.dense import homogeneous, pose7
 
 TRUSS = 1e-8  # differences of order 8, over a margin of the loops of 0.1 and more
 

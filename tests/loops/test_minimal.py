@@ -10,7 +10,7 @@ from support.allocations import no_warp_allocation
 from support.closed_loops import traced
 from support.mechanisms import MECHANISMS, Closed
 from warp_spo.dynamics import inertia
-from warp_spo.dynamics.embedding import Closing, embedding
+from warp_spo.dynamics.loop_analysis import Closing, embedding
 from warp_spo.recursions.loops import minimal
 
 DIFFERENCES = 1e-9  # what differences of order 8 leave of second derivatives; conditioning of the draws

@@ -13,7 +13,7 @@ from support.newton_models import arm
 from support.solver_models import floating, moving, replicated
 from warp_spo.newton import SolverSPO
 from warp_spo.newton.isaaclab import adapter
-from warp_spo.reference import Dense
+from warp_spo.reference.dense import Dense
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from support.solver_grounds import CFG, SIDE, WEIGHT, block, boxes, plane, run, 
 from support.solver_models import H
 from warp_spo import Status
 from warp_spo.errors import UnsupportedError
-from warp_spo.kernels import contact_slots
+from warp_spo.kernels import newton_contact_slots as contact_slots
 from warp_spo.newton import SolverSPO
 from warp_spo.scene import contacts as scene_contacts
 

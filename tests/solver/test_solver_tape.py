@@ -14,7 +14,7 @@ from support.newton_models import add_joint, add_link, arm
 from support.solver_models import floating, fourbar, moving
 from warp_spo.errors import UnsupportedError
 from warp_spo.newton import SolverSPO
-from warp_spo.reference import Dense, quaternion_product, rotation
+from warp_spo.reference.dense import Dense, quaternion_product, rotation
 
 STEPS, H = 3, 0.01
 NUDGE = 1e-6  # of central differences in float64

@@ -8,9 +8,9 @@ import warp_spo as spo
 from support import zoo
 from support.granularity_scenes import hand
 from support.step_scenes import FORCES, H, furnished, states
-from warp_spo.execution import walks
-from warp_spo.recursions import body_frames
-from warp_spo.recursions.links import Links
+from warp_spo.execution.segment import body_kinematics as walks
+from warp_spo.execution.segment import body_frames
+from warp_spo.recursions.model.links import Links
 
 WORLDS = 3
 SIZES = dict(poses=7, velocities=6)

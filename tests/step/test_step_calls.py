@@ -13,7 +13,7 @@ from support.allocations import no_warp_allocation
 from support.step_scenes import FORCES, H, furnished, slider, states
 from warp_spo.errors import UnsupportedError
 from warp_spo.kernels import native, pass_loops
-from warp_spo.reference import Dense, rotation
+from warp_spo.reference.dense import Dense, rotation
 
 
 def test_in_place_and_without_allocation(device):

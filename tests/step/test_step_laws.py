@@ -6,8 +6,8 @@ import pytest
 import warp_spo as spo
 from support import implicit, symbolic, zoo
 from support.step_scenes import H, slide, slider
-from warp_spo.recursions import impedance, step
-from warp_spo.reference import Dense
+from warp_spo.recursions.step import joint_laws as impedance, step
+from warp_spo.reference.dense import Dense
 
 
 def test_dampers_and_springs():

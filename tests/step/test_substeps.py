@@ -6,7 +6,7 @@ import torch
 import warp as wp
 
 import warp_spo as spo
-from benchmarks.resources import record_launches
+from benchmarks.table.resources import record_launches
 from support import zoo
 from support.actuated import CURVES, KINDS, arm, states
 from support.allocations import no_warp_allocation
@@ -119,7 +119,7 @@ def test_status_is_the_worst(device):
     scene = spo.Scene([spo.Body(2.0, inertia=np.eye(3))], [hinge], gravity=(0, 0, 0))
     dyn = spo.Dynamics(scene, 3, device=device, dtype="float64")
     words = [(5, 0, 0), (0, 1, 2), (2, 2, 2), (7, 5, 6), (6, 2, 2), (0, 0, 0)]
-    from warp_spo.dynamics.steps import SEVERITY
+    from warp_spo.dynamics.stepping.step import SEVERITY
     from warp_spo.kernels import combination
 
     status = wp.array([word[0] for word in words], dtype=int, device=device)

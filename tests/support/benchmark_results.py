@@ -1,8 +1,6 @@
 """Results of benchmarks as the runner writes them, made by hand."""
 
-from benchmarks import (
-    evidence,
-)
+from benchmarks.table import evidence
 
 NODE = ("node",)  # compiles nothing for a scene; other granularities have tests of their own
 REFINED = ("float32", "refined", "float64")

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import warp_spo as spo
-from warp_spo.dynamics.embedding import Closing
-from warp_spo.recursions.links import Links
-from warp_spo.recursions.tracing import Trace
+from warp_spo.dynamics.loop_analysis import Closing
+from warp_spo.recursions.model.links import Links
+from warp_spo.recursions.model.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
 
 from . import symbolic

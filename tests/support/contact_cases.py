@@ -5,7 +5,7 @@ import functools
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.reference_contact import ContactStep, Laws, Limits, Points
+from warp_spo.reference.contact import ContactStep, Laws, Limits, Points
 
 EFFORT = 5.0  # of the quadruped's drives, so small that many are saturated [N m]
 STAND = np.array([0.0, 0.7, -1.4] * 4)  # joints of the quadruped [rad]

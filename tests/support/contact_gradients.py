@@ -9,13 +9,13 @@ import numpy as np
 from warp_spo.recursions.contact import step as contact
 from warp_spo.recursions.contact.ground import CORNERS, GROUND, by_cell, corner_steps
 from warp_spo.recursions.contact.points import surface_numbers
-from warp_spo.recursions.contact.secants import SECANT
+from warp_spo.recursions.contact.secant_laws import SECANT
 from warp_spo.recursions.derivatives import contact as back
 from warp_spo.recursions.derivatives import contact_pass as one
-from warp_spo.recursions.links import Links
-from warp_spo.recursions.messages import SIZES
-from warp_spo.recursions.step import GAIN
-from warp_spo.recursions.tracing import Trace
+from warp_spo.recursions.model.links import Links
+from warp_spo.recursions.model.messages import SIZES
+from warp_spo.recursions.step.step import GAIN
+from warp_spo.recursions.model.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
 from warp_spo.trace.scalars import ordered
 

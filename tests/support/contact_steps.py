@@ -3,7 +3,7 @@
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.reference_contact import MANY, ContactStep
+from warp_spo.reference.contact import MANY, ContactStep
 
 from . import symbolic
 

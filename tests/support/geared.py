@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.reference import Dense
-from warp_spo.reference_rotations import rotation
+from warp_spo.reference.dense import Dense
+from warp_spo.reference.rotations import rotation
 
 from . import zoo
 

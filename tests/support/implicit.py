@@ -6,7 +6,7 @@ with its own rate: sweeps over the dofs that solve each one's equation for its o
 
 import numpy as np
 
-from warp_spo.reference import Dense
+from warp_spo.reference.dense import Dense
 
 CREEP, HOLD = 1e-4, 300.0  # what Dynamics.step documents
 NONE = 1e6

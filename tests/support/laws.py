@@ -8,7 +8,7 @@ import functools
 import numpy as np
 import warp as wp
 
-from warp_spo import reference
+from warp_spo.reference import dense as reference
 from warp_spo.scene.parts import SCREWS
 
 from . import zoo

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.dynamics.embedding import Closing, drawn, embedding
+from warp_spo.dynamics.loop_analysis import Closing, drawn, embedding
 from warp_spo.examples.parts import at, bar
 from warp_spo.recursions.loops.embedded import Embedding
-from warp_spo.reference import Dense, homogeneous, pose7, rotation_vector
+from warp_spo.reference.dense import Dense, homogeneous, pose7, rotation_vector
 
 from . import zoo
 

@@ -6,8 +6,8 @@ import numpy as np
 
 import warp_spo as spo
 from warp_spo.recursions import operators as recursion
-from warp_spo.recursions.links import Links
-from warp_spo.recursions.tracing import Trace
+from warp_spo.recursions.model.links import Links
+from warp_spo.recursions.model.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
 
 from . import laws, zoo

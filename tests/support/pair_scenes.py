@@ -3,8 +3,8 @@
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.reference_pairs import faces
-from warp_spo.reference_rotations import homogeneous
+from warp_spo.reference.body_contact import faces
+from warp_spo.reference.rotations import homogeneous
 
 from .contact_cases import solid
 

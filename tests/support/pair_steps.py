@@ -6,7 +6,7 @@ import textwrap
 import numpy as np
 
 from warp_spo.recursions.contact import coupled, pair_pieces
-from warp_spo.reference_pairs import PairStep
+from warp_spo.reference.body_contact import PairStep
 
 from .pair_scenes import H, stepped
 

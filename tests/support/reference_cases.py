@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 
-from warp_spo.reference import Dense, rotation
+from warp_spo.reference.dense import Dense, rotation
 
 from . import zoo
 

@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 
-from warp_spo import reference
+from warp_spo.reference import dense as reference
 
 from . import laws, zoo
 from .laws import OPERATIONS, TOLERANCE

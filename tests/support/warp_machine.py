@@ -12,8 +12,8 @@ import numpy as np
 
 import warp_spo as spo
 from warp_spo.execution.builder import Builder
-from warp_spo.execution.teams import BARRIER
-from warp_spo.kernels.straight import BY_TABLE, IN_PLACE, TILED, KernelLayout
+from warp_spo.execution.segment.warp_specialized import BARRIER
+from warp_spo.kernels.straight_line import BY_TABLE, IN_PLACE, TILED, KernelLayout
 from warp_spo.kernels.substeps import FENCE, SYNC
 
 NOBODY = (-1, -1)

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, overload
 
 import warp as wp
 
-from .. import launches
-from ..arrays import AnyArray, ArrayT
+from ..runtime import launches
+from ..runtime.arrays import AnyArray, ArrayT
 from ..errors import UnsupportedError, as_integer
 from ..execution.routine import Routine
 from ..recursions.loops import projection

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from .. import launches
-from ..arrays import Call
+from ..runtime import launches
+from ..runtime.arrays import Call
 from ..errors import UnsupportedError
 from ..execution import status_words
 from ..execution.routine import Routine
@@ -24,7 +24,7 @@ from ..kernels import declare
 from ..kernels import loops as kernels
 from ..recursions.loops import embedded, multipliers, projection
 from ..scene.scene import Scene
-from .embedding import Closing, embedding, usual_rank
+from .loop_analysis import Closing, embedding, usual_rank
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..arrays import AnyArray, ArrayT
+from ..runtime.arrays import AnyArray, ArrayT
 from ..execution.routine import Routine
 from ..recursions import coordinates as recursion
 from ..recursions.derivatives import adjoints
 from .operation import AS_WRITTEN, KINEMATIC, Argument, Derivative, Operation, Result, Trial
-from .samples import rotations
+from .trial_inputs import rotations
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics

@@ -16,36 +16,18 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import warp as wp
 
-from ..arrays import parse_device, parse_dtype
+from ..runtime.arrays import parse_device, parse_dtype
 from ..errors import UnsupportedError, as_integer, as_names
 from ..execution import plan as plans
 from ..execution.device_facts import read_facts
 from ..execution.parameters import RIGID_VALUES, VARIABLE
 from ..execution.programs import Programs
-from ..execution.sweeps import Sweeps
-from ..gradients import TensorValues
-from ..registry import register
+from ..execution.node.sweeps import Sweeps
+from ..runtime.autograd import TensorValues
+from ..runtime.registry import register
 from ..scene.scene import Scene
-from . import (
-    actuators,
-    closed_loops,
-    configurations,
-    contacts,
-    derivatives,
-    energy,
-    inertia,
-    inverse_kinematics,
-    kinematics,
-    momentum,
-    operational,
-    preparation,
-    regressor,
-    scene_values,
-    spatial_operators,
-    steps,
-    storage,
-    tuning,
-)
+from . import actuators, closed_loops, configurations, derivatives, energy, inertia, inverse_kinematics, kinematics, momentum, operational, preparation, regressor, scene_values, spatial_operators, pickling as storage, tuning
+from .stepping import contact_options as contacts, step as steps
 from . import forward_dynamics as forward
 from . import hybrid_dynamics as hybrid
 from . import inverse_dynamics as inverse
@@ -55,7 +37,7 @@ from .engine import Engine
 from .gradients import Gradients
 from .operation import Operation, declared
 from .refinement import Refinement
-from .replays import Replays
+from .call_replay import Replays
 
 if TYPE_CHECKING:
     pass

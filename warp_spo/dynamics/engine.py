@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from .. import launches
-from ..arrays import Call
+from ..runtime import launches
+from ..runtime.arrays import Call
 from ..errors import UnsupportedError
 from ..execution.routine import Routine
-from ..gradients import records_gradient
+from ..runtime.autograd import records_gradient
 from .operation import Argument, Closed, Derivative, Operation, Refused, Result
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..arrays import AnyArray, ArrayT
-from ..execution import node_operations as nodes
+from ..runtime.arrays import AnyArray, ArrayT
+from ..execution.node import operations as nodes
 from ..execution import status_words as words
 from ..execution.routine import Routine
 from ..recursions import forward_dynamics as recursion
@@ -18,23 +18,8 @@ from .closures import FORWARD_DYNAMICS as EMBEDDED_FORWARD_DYNAMICS
 from .gradients import by_name
 from .inertia import SOLVE_MASS_MATRIX
 from .inverse_dynamics import DQ, divides_backwards
-from .operation import (
-    AS_WRITTEN,
-    BODY_F,
-    EMBEDDED_DERIVATIVE,
-    QD,
-    STATUS,
-    TAU,
-    Argument,
-    Derivative,
-    Operation,
-    Q,
-    Result,
-    Trial,
-    derivative_of,
-    direction,
-)
-from .traced_reference import forward_dynamics_by_q
+from .operation import AS_WRITTEN, BODY_F, EMBEDDED_DERIVATIVE, QD, STATUS, TAU, Argument, Derivative, Operation, Q, Result, Trial, derivative_of, direction
+from .derivative_references import forward_dynamics_by_q
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from .. import launches
-from ..arrays import AnyArray, ArrayT, Call, shape_of
+from ..runtime import launches
+from ..runtime.arrays import AnyArray, ArrayT, Call, shape_of
 from ..errors import UnsupportedError, refuse_masked
 from ..execution.routine import Routine
-from ..memory import broadcast_worlds
+from ..runtime.memory import broadcast_worlds
 from ..recursions import hybrid
 from ..recursions.loops import minimal
-from . import samples
+from . import trial_inputs as samples
 from .operation import BODY_F, QD, QDD, TAU, USE_EMBED, Operation, Option, Q, Result, Trial
 
 if TYPE_CHECKING:

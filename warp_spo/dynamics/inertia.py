@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from .. import launches
-from ..arrays import AnyArray, ArrayT
-from ..execution import node_operations as nodes
+from ..runtime import launches
+from ..runtime.arrays import AnyArray, ArrayT
+from ..execution.node import operations as nodes
 from ..execution.routine import Routine
-from ..recursions import composite, determinant, inverse
+from ..recursions import composite, determinant, mass_matrix_inverse as inverse
 from ..recursions import forward_dynamics as solving
 from ..recursions.derivatives import adjoints
 from ..recursions.loops import minimal

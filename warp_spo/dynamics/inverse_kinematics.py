@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..arrays import AnyArray, ArrayT, Call
+from ..runtime.arrays import AnyArray, ArrayT, Call
 from ..errors import UnsupportedError, as_integer
-from ..execution import searches
+from ..execution import multi_start as searches
 from ..execution.routine import Routine
 from ..kernels import declare
-from ..kernels import searches as kernels
+from ..kernels import multi_start as kernels
 from ..recursions import inverse_kinematics as recursion
 from ..scene.frames import Frame
 from ..scene.parts import UNLIMITED
 from ..scene.scene import Scene
 from .operation import ORIENTED_FRAMES, Argument, Operation, Option, Refused, Result
-from .samples import rotations
+from .trial_inputs import rotations
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..arrays import AnyArray, ArrayT
-from ..execution import node_operations as nodes
+from ..runtime.arrays import AnyArray, ArrayT
+from ..execution.node import operations as nodes
 from ..execution.routine import Routine
 from ..recursions import momentum as recursion
 from ..recursions.derivatives import adjoints

@@ -37,16 +37,16 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import numpy as np
 import warp as wp
 
-from ..arrays import Call
-from ..dlpack import settle
+from ..runtime.arrays import Call
+from ..runtime.dlpack import settle
 from ..execution.routine import Routine
-from ..gradients import call_in_graph, call_with_gradient, is_exported, is_traced, records_gradient
-from ..recursions.links import LINK_VALUES, MOTION_VALUES, Links
+from ..runtime.autograd import call_in_graph, call_with_gradient, is_exported, is_traced, records_gradient
+from ..recursions.model.links import LINK_VALUES, MOTION_VALUES, Links
 from ..scene.contacts import CONTACT_VALUES, HEIGHTS
 from ..scene.frames import check_frames, origins
 from ..scene.scene import Scene
-from . import samples
-from .replays import MISS
+from . import trial_inputs as samples
+from .call_replay import MISS
 from .seconds import STAND_IN, seconds
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class Argument:
         columns: a further axis may hold several right-hand sides.
         number: a number is allowed, too, the same in all worlds.
         direction: the argument is the direction of a derivative by the argument without the first letter, "dq" by "q".
-        sample: name of the random input that trials pass, see :class:`warp_spo.trials.operations.Inputs`.
+        sample: name of the random input that trials pass, see :class:`warp_spo.trials.inputs.Inputs`.
     """
 
     name: str
@@ -237,7 +237,7 @@ class Trial:
     """Comparison of an operation with the dense float64 reference, in one world.
 
     Attributes:
-        dense: ``dense(reference, *arguments)``, the first result from :class:`warp_spo.reference.Dense`.
+        dense: ``dense(reference, *arguments)``, the first result from :class:`warp_spo.reference.dense.Dense`.
         scale: ``scale(reference, expected)``, the error is divided by it; None: the 2-norm of the expected result.
         solves: ``solves(reference, *arguments)``, matrix A and right-hand side b of the equation A x = b that the
             result solves, if it solves one.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ..arrays import AnyArray, ArrayT
-from ..execution import node_operations as nodes
+from ..runtime.arrays import AnyArray, ArrayT
+from ..execution.node import operations as nodes
 from ..execution.routine import Routine
 from ..kernels import cholesky
 from ..recursions import operational as recursion

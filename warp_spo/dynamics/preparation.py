@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from .. import launches
+from ..runtime import launches
 from ..errors import as_integer, as_names
 from .operation import Argument, Operation, Option, derivative_of
 

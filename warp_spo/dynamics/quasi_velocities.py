@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..arrays import AnyArray, ArrayT
+from ..runtime.arrays import AnyArray, ArrayT
 from ..execution.routine import Routine
 from ..recursions import quasi_velocities as recursion
 from .operation import AS_WRITTEN, BODY_F, QD, TAU, Argument, Operation, Q, Refused, Result, Trial, required
 
 if TYPE_CHECKING:
-    from ..reference import Dense
+    from ..reference.dense import Dense
     from .dynamics import Dynamics
 
 NU = Argument("nu", "world, dof", sample="qdd")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from .. import launches
+from ..runtime import launches
 from ..execution import status_words as words
 from ..kernels import refinement as kernels
 from .forward_dynamics import FORWARD_DYNAMICS

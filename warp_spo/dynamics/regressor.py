@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..arrays import AnyArray, ArrayT
+from ..runtime.arrays import AnyArray, ArrayT
 from ..execution.routine import Routine
 from ..recursions import regressor as recursion
 from .operation import AS_WRITTEN, QD, QDD, TAU, Argument, Operation, Q, Refused, Result, Trial, required

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..arrays import Call
+from ..runtime.arrays import Call
 from ..errors import is_bool
-from ..gradients import check_plain
+from ..runtime.autograd import check_plain
 from ..scene.parts import real
 
 STAND_IN = 1e-3  # [s], of steps that only compile

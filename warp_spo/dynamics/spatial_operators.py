@@ -11,13 +11,13 @@ from weakref import WeakSet
 import numpy as np
 import warp as wp
 
-from .. import launches
-from ..arrays import WARP, AnyArray, Call
-from ..dlpack import settle
+from ..runtime import launches
+from ..runtime.arrays import WARP, AnyArray, Call
+from ..runtime.dlpack import settle
 from ..errors import UnsupportedError
 from ..execution.programs import Programs
 from ..execution.routine import Routine
-from ..execution.sweeps import Sweeps
+from ..execution.node.sweeps import Sweeps
 from ..graph.algebra import LetterOwner, Operator
 from ..graph.blocks import Blocks, DeferredWeights, new_weights, weights_array
 from ..graph.factorization import Factorization

@@ -23,7 +23,7 @@ from ..scene.fingerprint import fingerprint
 from ..scene.scene import Scene
 from .operation import Operation
 from .preparation import stand_ins
-from .samples import rotations
+from .trial_inputs import rotations
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ..hinges.functions import clip
+from ..trace.functions import clip
 from ..scene.scene import Scene
-from .checks import check_optional_span
-from .vectors import Vector, find
+from .validation import check_optional_span
+from .compile.vectors import Vector, find
 from .world import World
 
 

@@ -10,23 +10,23 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..arrays import parse_device
+from ..runtime.arrays import parse_device
 from ..dynamics.dynamics import Dynamics
 from ..execution.device_facts import read_facts
-from ..launches import compile_side_by_side
+from ..runtime.launches import compile_side_by_side
 from ..recursions.contact.ground import GROUND, SINGLE
 from ..scene.scene import Scene
 from ..torch import stream
-from . import given, saving
-from .checks import check_whole
+from . import given, checkpoint as saving
+from .validation import check_whole
 from .events import Delays, Values, changed_values
-from .graphs import Part, Replay, run_all
-from .layout import Layout
-from .logs import Log, describe, explain
+from .compile.cuda_graphs import Part, Replay, run_all
+from .compile.memory_layout import Layout
+from .episode_log import Log, describe, explain
 from .observations import TorchTerm
-from .stage import Launch
-from .storage import Storage
-from .tracing import Tracing
+from .compile.fused_kernel import Launch
+from .compile.buffers import Storage
+from .compile.step_kernels import Tracing
 
 try:
     from rsl_rl.env import VecEnv
@@ -269,7 +269,7 @@ class Env(VecEnv):
         return {name: controls.clone() for name, controls in self._controls.items()}
 
     def log(self) -> dict[str, torch.Tensor]:
-        """Return means over worlds' last finished episodes by name, and counts: ``warp_spo.env.logs.Log``."""
+        """Return means over worlds' last finished episodes by name, and counts: ``warp_spo.env.episode_log.Log``."""
         return self._log(self._tensors["memory"])
 
     def explain(self) -> str:

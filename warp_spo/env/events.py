@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ..hinges.functions import where
+from ..trace.functions import where
 from ..scene.terrain import Tiles
 from .actions import actuator_labels
-from .checks import Range, check_interval, check_number, check_span, check_steps
-from .vectors import between, find, multiply, vector
+from .validation import Range, check_interval, check_number, check_span, check_steps
+from .compile.vectors import between, find, multiply, vector
 from .world import World
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..hinges.functions import Condition, where
+from ..trace.functions import Condition, where
 
 if TYPE_CHECKING:
-    from .vectors import Vector
+    from .compile.vectors import Vector
     from .world import World
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..reference_rotations import rotation
+from ..reference.rotations import rotation
 from ..scene.contacts import HeightField
 from .robots import Primitive, Robot
 

@@ -23,10 +23,10 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.runners import OnPolicyRunner
 
-from ..arrays import parse_device
+from ..runtime.arrays import parse_device
 from ..errors import as_integer
-from .checks import check_folder
-from .course import Course, OutOfTime
+from .validation import check_folder
+from .training_log import Course, OutOfTime
 from .environment import Env
 
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..hinges.functions import clip, where
-from .checks import check_function, check_number, check_optional_span, check_steps, check_whole
-from .stage import ROW_NUMBER
-from .vectors import Vector, rotate, rotate_back, vector
+from ..trace.functions import clip, where
+from .validation import check_function, check_number, check_optional_span, check_steps, check_whole
+from .compile.fused_kernel import ROW_NUMBER
+from .compile.vectors import Vector, rotate, rotate_back, vector
 from .world import World
 
 Term = Callable[[World], Any]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..hinges.functions import Condition, where
+from ..trace.functions import Condition, where
 from .world import World
 
 Term = Callable[[World], Any]

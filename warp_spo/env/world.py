@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..hinges.functions import AbstractScalar, clip, where
+from ..trace.functions import AbstractScalar, clip, where
 from ..recursions.contact.ground import Place, height
 from ..trace import spatial
 from ..trace.scalars import floor, lookup
 from .feet import Feet, feet
-from .stage import Stage
-from .vectors import Vector, as_scalar, as_value, cross, find, rotate, rotate_back, vector
+from .compile.fused_kernel import Stage
+from .compile.vectors import Vector, as_scalar, as_value, cross, find, rotate, rotate_back, vector
 
 if TYPE_CHECKING:
-    from .layout import Layout
+    from .compile.memory_layout import Layout
 
 
 class Frame(NamedTuple):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warp_spo.commands import Parser, count, seconds
+from warp_spo.command_line import Parser, count, seconds
 
 OPTIONS = {
     "seconds": "simulated time [s]",

@@ -6,25 +6,25 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from ..kernels import coupling, native, straight
+from ..kernels import coupling, native, straight_line as straight
 from ..kernels.fields import axes
 from ..kernels.native import INTEGERS
-from ..kernels.straight import BY_TABLE, TILED, KernelLayout
-from ..recursions import body_frames
+from ..kernels.straight_line import BY_TABLE, TILED, KernelLayout
+from .segment import body_frames
 from ..recursions.contact import coupled, pairs
 from ..recursions.contact.ground import GROUND
-from ..recursions.contact.secants import SECANT
-from ..recursions.flexible import attach
-from ..recursions.links import Links
-from ..recursions.messages import INWARD, OUTWARD
-from ..recursions.step import FORCE, LOOPED, RESISTANCE
+from ..recursions.contact.secant_laws import SECANT
+from ..recursions.model.flexible import attach
+from ..recursions.model.links import Links
+from ..recursions.model.messages import INWARD, OUTWARD
+from ..recursions.step.step import FORCE, LOOPED, RESISTANCE
 from ..scene.contacts import HeightField
 from ..trace.emission import Store
 from . import staging
 from .device_facts import RESERVED
 from .plan import Plan
 from .routine import Routine
-from .sweeps import Sweeps
+from .node.sweeps import Sweeps
 
 PASSED = (*LOOPED, SECANT, FORCE, RESISTANCE)  # variables of the loops over passes
 

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import warp as wp
 
-from .. import launches
-from ..kernels import native, straight
+from ..runtime import launches
+from ..kernels import native, straight_line as straight
 from ..kernels.fields import place_in_tile
-from ..kernels.slots import WARP_SIZE
-from ..memory import broadcast_worlds
-from ..recursions.links import Links
+from ..kernels.long_results import WARP_SIZE
+from ..runtime.memory import broadcast_worlds
+from ..recursions.model.links import Links
 from ..trace.differentiation import reverse
 from ..trace.emission import Emitter, Store, render
 from ..trace.scalars import ordered

@@ -12,18 +12,18 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from .. import launches
+from ..runtime import launches
 from ..kernels import parameters as kernels
-from ..kernels.heights import list_corners
+from ..kernels.height_field import list_corners
 from ..kernels.spatial import POSE, RIGID
 from ..kernels.topology import Topology
-from ..memory import broadcast_worlds, empty, size_in_bytes
+from ..runtime.memory import broadcast_worlds, empty, size_in_bytes
 from ..recursions.contact.ground import CORNERS
 from ..scene.actuators import ACTUATOR_VALUES
 from ..scene.contacts import CONTACT_VALUES, GROUND_VALUES, HEIGHTS
 from ..scene.scene import Scene
-from .node_functions import node_functions
-from .rows import as_rows, copy_rows
+from .node.functions import node_functions
+from .row_copies import as_rows, copy_rows
 
 VARIABLE = (
     "body_mass",

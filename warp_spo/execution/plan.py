@@ -6,13 +6,13 @@ import dataclasses
 import itertools
 
 from ..errors import UnsupportedError
-from ..kernels.slots import WARP_SIZE
-from ..recursions.links import Links
-from ..recursions.pieces import PARTS, Pieces
+from ..kernels.long_results import WARP_SIZE
+from ..recursions.model.links import Links
+from ..recursions.model.segments import PARTS, Pieces
 from ..scene.scene import Scene
 from .device_facts import RESERVED, DeviceFacts
 from .routine import Routine
-from .stretches import cut, solid_nodes
+from .node.path_blocks import cut, solid_nodes
 from .tuned import Tuned
 
 SHARED, ASKED = "links share dofs", "asked for"

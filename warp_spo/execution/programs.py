@@ -6,17 +6,18 @@ from typing import Any
 
 import warp as wp
 
-from .. import launches
+from ..runtime import launches
 from ..kernels.substeps import SUBSTEPS
 from ..recursions.contact import coupled
-from ..recursions.links import TABLES, Links
-from ..recursions.pieces import Pieces
-from . import link_values, products, searches, segment_programs, tree_programs, walks
+from ..recursions.model.links import TABLES, Links
+from ..recursions.model.segments import Pieces
+from . import link_values, mass_inverse_products as products, multi_start as searches, tree_programs
+from .segment import programs as segment_programs, body_kinematics as walks
 from .builder import Builder, Job, Program
 from .plan import MOST_WARPS, Plan
 from .routine import Routine
-from .segment_programs import BODIES
-from .sweeps import Sweeps
+from .segment.programs import BODIES
+from .node.sweeps import Sweeps
 
 
 class Programs:

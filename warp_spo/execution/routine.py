@@ -26,7 +26,7 @@ class Routine:
         sweeps: ``sweeps(run, out, **arrays)`` launches the same computation at node granularity; None: there is only
             the traced kernel of the scene.
         blocks: at node granularity the caller applies stored blocks instead of this routine.
-        letters: messages that limbs send each other, see :mod:`warp_spo.recursions.messages`. "": they send none.
+        letters: messages that limbs send each other, see :mod:`warp_spo.recursions.model.messages`. "": they send none.
         alone: limbs share the work without messages. Where they do not, and without letters, one thread works on a
             whole world.
         divides: ``divides(scene, inputs, **options)``, whether limbs can share the work for these inputs and options.

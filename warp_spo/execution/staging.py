@@ -8,21 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping, Sequence
 
-from ..kernels.slots import WARP_SIZE
-from ..kernels.staged_rows import Row
-from ..kernels.straight import (
-    BY_TABLE,
-    DIRECT,
-    IN_PLACE,
-    MAPPED,
-    RELAYED,
-    STAGED,
-    TILED,
-    KernelLayout,
-    Result,
-)
+from ..kernels.long_results import WARP_SIZE
+from ..kernels.shared_rows import Row
+from ..kernels.straight_line import BY_TABLE, DIRECT, IN_PLACE, MAPPED, RELAYED, STAGED, TILED, KernelLayout, Result
 from ..kernels.substeps import SUBSTEPS
-from ..recursions.links import TABLES
+from ..recursions.model.links import TABLES
 from ..scene.actuators import ACTUATOR_VALUES
 from ..scene.contacts import CONTACT_VALUES, GROUND_VALUES
 from ..scene.parts import DOF_VALUES
@@ -64,7 +54,7 @@ def choose_layout(
         gathered: short results are written through shared memory even if rows are not read through it.
         tiled: the result is left in tiles.
         room: the bytes of shared memory that a block may have.
-        relays: a result without room in shared memory may wait in its own rows, see :mod:`warp_spo.kernels.slots`.
+        relays: a result without room in shared memory may wait in its own rows, see :mod:`warp_spo.kernels.long_results`.
         wide: there is room for long results as they are, without a table of their distinct values.
     """
     used = read_entries(everything)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import warp as wp
 
-from .. import launches
+from ..runtime import launches
 from ..kernels import declare, loops
 from ..kernels import status as kernels
 from ..kernels.spatial import ARTICULATED
-from .sweeps import Sweeps
+from .node.sweeps import Sweeps
 
 
 def write(

@@ -6,17 +6,17 @@ from typing import Any
 
 from ..kernels import couples as couple_points
 from ..kernels import coupling, pass_loops
-from ..kernels.slots import WARP_SIZE
-from ..kernels.straight import DIRECT, RELAYED, TILED, KernelLayout
+from ..kernels.long_results import WARP_SIZE
+from ..kernels.straight_line import DIRECT, RELAYED, TILED, KernelLayout
 from ..recursions.contact import coupled, pairs
-from ..recursions.contact.secants import SECANT
+from ..recursions.contact.secant_laws import SECANT
 from ..recursions.contact.ties import couples_of
-from ..recursions.links import Links
-from ..recursions.step import GAIN, LOOPED
-from ..recursions.tracing import Trace
+from ..recursions.model.links import Links
+from ..recursions.step.step import GAIN, LOOPED
+from ..recursions.model.tracing import Trace
 from ..trace.emission import Store, render
 from . import staging
-from .access import make_emitter
+from .array_access import make_emitter
 from .builder import PASSED, Builder, Job, Program, flatten
 
 PAIR = 2  # warps of a block that share nothing: fewer blocks start sooner

@@ -14,11 +14,11 @@ from typing import Any, NoReturn, overload
 
 import warp as wp
 
-from .. import launches
-from ..arrays import ArrayT, Call, kind_of, new, parse_device, parse_dtype
+from ..runtime import launches
+from ..runtime.arrays import ArrayT, Call, kind_of, new, parse_device, parse_dtype
 from ..errors import never_copied
 from ..kernels import block_sparse, declare
-from ..memory import view
+from ..runtime.memory import view
 
 
 class Workspace:

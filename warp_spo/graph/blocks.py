@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .. import launches
-from ..arrays import NUMPY, WARP, Call, device_of, kind_of, parse_device, parse_dtype
+from ..runtime import launches
+from ..runtime.arrays import NUMPY, WARP, Call, device_of, kind_of, parse_device, parse_dtype
 from ..kernels import block_sparse
 from .algebra import Operator, Workspace
 
@@ -199,7 +199,7 @@ def pack(
     """Copy matrices [world, rows, columns] or [rows, columns] into one array [world or 1, scalar], and return it.
 
     Raises:
-        ValueError: the numbers of worlds differ, or :class:`warp_spo.arrays.Call` refuses an array.
+        ValueError: the numbers of worlds differ, or :class:`warp_spo.runtime.arrays.Call` refuses an array.
     """
     counts = {array.shape[0] for array in arrays if len(array.shape) == 3} - {1}
     if len(counts) > 1:

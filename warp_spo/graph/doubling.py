@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .. import launches
+from ..runtime import launches
 from ..kernels import declare
 from ..kernels import doubling as kernels
 from ..scene.tree import Tree

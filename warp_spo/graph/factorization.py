@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .. import launches
+from ..runtime import launches
 from ..kernels import factorization as kernels
-from ..memory import broadcast_worlds
+from ..runtime.memory import broadcast_worlds
 from ..scene.tree import Tree
 from .blocks import Blocks, new_weights, weights_array
 from .operators import BWA

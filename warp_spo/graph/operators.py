@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..arrays import WARP
+from ..runtime.arrays import WARP
 from ..errors import as_integer
 from ..scene.tree import Digraph, Tree
 from .algebra import Identity, Operator, Product, Scaled, Sum, Transpose, Workspace, add_scaled

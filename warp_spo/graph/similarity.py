@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from .. import launches
+from ..runtime import launches
 from ..kernels import declare
 from ..kernels import similarity as kernels
 from .algebra import common

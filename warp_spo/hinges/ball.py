@@ -8,7 +8,7 @@ import numpy as np
 
 from ..trace.scalars import Value, is_constant, reciprocal, sqrt
 from ..trace.spatial import ZERO, Matrix, Pose, Vector, cross, dot
-from .kind import BALL, Carrier, Entry, Kind, Placed, Twist
+from .hinge_type import BALL, Carrier, Entry, Kind, Placed, Twist
 from .quaternions import Quaternion, multiplied, quaternion_rotation, rotated_by, rotation_vector
 
 

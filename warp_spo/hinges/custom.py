@@ -18,8 +18,8 @@ import numpy as np
 from ..trace.differentiation import forward
 from ..trace.scalars import Graph, Value, cut, is_constant
 from ..trace.spatial import ZERO, Matrix, Pose, Vector, dot
-from .functions import AbstractScalar
-from .kind import Carrier, Entry, Kind, Placed, Twist
+from ..trace.functions import AbstractScalar
+from .hinge_type import Carrier, Entry, Kind, Placed, Twist
 from .quaternions import Quaternion, matrix_quaternion, multiplied
 
 MOST = 6

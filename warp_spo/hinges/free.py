@@ -11,7 +11,7 @@ import numpy as np
 from ..trace.scalars import Value
 from ..trace.spatial import ZERO, Matrix, Vector, cross
 from .ball import Ball, back, turned
-from .kind import FREE, Carrier, Entry, Placed, Twist
+from .hinge_type import FREE, Carrier, Entry, Placed, Twist
 from .quaternions import quaternion_rotation
 
 

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import warp as wp
 
-from ..arrays import Call
+from ..runtime.arrays import Call
 from ..dynamics.operation import Argument
 from ..errors import as_names
 from ..execution.parameters import SHARED
-from .programs import Program
+from .operations import Program
 
 if TYPE_CHECKING:
     from ..dynamics.dynamics import Dynamics

@@ -10,7 +10,7 @@ import numpy as np
 from ..scene.actuators import UNBOUNDED, Actuator
 from .mechanism import SIZES, Mechanism, actuator_output
 from .source import Source
-from .ties import fixed_tendon
+from .equality_constraints import fixed_tendon
 
 WORDS = {
     "mjTRN_SLIDERCRANK": "a slider-crank transmission",

@@ -11,13 +11,13 @@ import numpy as np
 from ..errors import UnsupportedError
 from ..scene.actuators import Keyframe
 from ..scene.scene import Scene
-from ..scene.shapes import NONE, POINTS, Choice, moving_bodies
+from ..scene.collision_shapes import NONE, POINTS, Choice, moving_bodies
 from .actuators import read_actuators
 from .mechanism import BALL, FREE, SIZES, Mechanism, rotation, scene_entries, xyzw
-from .refusals import refuse_unsupported
-from .shapes import collision_shapes
+from .unsupported_features import refuse_unsupported
+from .collision_shapes import collision_shapes
 from .source import Source
-from .ties import read_ties
+from .equality_constraints import read_ties
 
 
 def from_mujoco(model: Any, contacts: Any = None, ground: Any = None, points: int = POINTS) -> Scene:

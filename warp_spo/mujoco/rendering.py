@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..reference_rotations import rotation
+from ..reference.rotations import rotation
 
 GROUND = """
 <mujoco>

@@ -11,11 +11,11 @@ import warp as wp
 from newton import ShapeFlags
 
 from ..errors import UnsupportedError
-from ..kernels import contacts as kernels
+from ..kernels import newton_contacts as kernels
 from ..kernels import declare
 from ..scene.contacts import HEIGHTS
 from ..scene.scene import Scene
-from ..scene.shapes import Choice, moving_bodies
+from ..scene.collision_shapes import Choice, moving_bodies
 from ..status import Status
 from .elevations import Elevations
 from .model_contacts import CONTACT_MATERIALS, ModelContacts, model_contacts
@@ -203,7 +203,7 @@ class StatusWords:
 
     Attributes:
         kept: int32 [world].
-        severity: of each status, int32. role: of each shape, int32, see :mod:`warp_spo.kernels.contacts`.
+        severity: of each status, int32. role: of each shape, int32, see :mod:`warp_spo.kernels.newton_contacts`.
     """
 
     def __init__(

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels import declare
-from ..kernels import elevations as kernels
+from ..kernels import newton_height_fields as kernels
 from .worlds import to_numpy
 
 

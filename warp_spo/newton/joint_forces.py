@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..dynamics.dynamics import Dynamics
-from ..kernels import exchange
+from ..kernels import newton_arrays as exchange
 from .layout import Layouts
 
 

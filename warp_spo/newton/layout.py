@@ -11,8 +11,8 @@ import newton
 import numpy as np
 import warp as wp
 
-from ..kernels import exchange
-from ..memory import view
+from ..kernels import newton_arrays as exchange
+from ..runtime.memory import view
 from ..scene.scene import Scene
 from .worlds import Worlds
 

@@ -7,7 +7,7 @@ import numpy as np
 from newton import JointTargetMode
 
 from ..errors import UnsupportedError
-from ..recursions.impedance import DEFAULT_BOUND
+from ..recursions.step.joint_laws import DEFAULT_BOUND
 from ..scene.parts import UNLIMITED
 
 

@@ -15,7 +15,7 @@ from newton import GeoType, ShapeFlags
 from ..errors import UnsupportedError
 from ..scene.contacts import HeightField, pose_matrix
 from ..scene.scene import Scene
-from ..scene.shapes import TURNED, Choice, Chosen, Shape
+from ..scene.collision_shapes import TURNED, Choice, Chosen, Shape
 from .elevations import Fields
 from .worlds import Worlds, to_numpy, unit_pose
 

@@ -10,7 +10,7 @@ import warp as wp
 from newton.solvers import SolverBase
 
 from ..dynamics.dynamics import Dynamics
-from ..memory import view
+from ..runtime.memory import view
 from .layout import Layouts
 
 OF_CONTACTS = frozenset({"contact_f", "contact_slip", "contact_residual"})

@@ -11,34 +11,26 @@ import warp as wp
 from newton import ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
-from .. import launches
+from ..runtime import launches
 from ..dynamics.dynamics import Dynamics
-from ..dynamics.steps import INTEGRATORS
+from ..dynamics.stepping.step import INTEGRATORS
 from ..errors import UnsupportedError, as_integer, as_names, never_copied, shown
-from ..kernels import declare, exchange
+from ..kernels import declare, newton_arrays as exchange
 from ..scene.scene import Scene
-from ..scene.shapes import POINTS
+from ..scene.collision_shapes import POINTS
 from .body_states import BodyStates
 from .checks import check_state, read_flags
-from .contacts import (
-    ELEVATIONS,
-    MODES,
-    VALUES,
-    StatusWords,
-    find_contacts,
-    sources_of,
-    warn_of_contacts_left_out,
-)
+from .contacts import ELEVATIONS, MODES, VALUES, StatusWords, find_contacts, sources_of, warn_of_contacts_left_out
 from .drives import GAINS, Drives
 from .joint_forces import JointForces
 from .layout import Layouts
 from .loop_joints import check_loop_joints
-from .model import from_newton
+from .from_newton import from_newton
 from .model_arrays import ModelArrays
 from .model_contacts import ModelContacts
 from .observables import Observables, Reports
 from .pairs import ModelPairs, find_pairs, warn_of_bodies_apart
-from .plugs import Plugs
+from .mass_matrix_interface import Plugs
 from .resets import reset_state
 from .slots import VARIABLE as SLOT_VALUES
 from .slots import Slots

@@ -19,7 +19,7 @@ import warp as wp
 from ..dynamics.dynamics import Dynamics
 from ..dynamics.kinematics import BODY_POSES, BODY_VELOCITIES
 from ..dynamics.operation import DIFFERENTIABLE, Operation, derivative_of
-from ..dynamics.steps import STEP
+from ..dynamics.stepping.step import STEP
 from ..errors import UnsupportedError
 from .drives import Drives
 from .joint_forces import JointForces

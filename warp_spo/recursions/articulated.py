@@ -15,7 +15,7 @@ import numpy as np
 
 from ..trace.scalars import Value, absolute, guarded, is_constant, quotient, reciprocal
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Rigid, Vector, cross, dot, magnitude, symmetric, total
-from .links import Link, Placed
+from .model.links import Link, Placed
 from .motion import NONE, Motion, carry_acceleration, hinge_entries, hinge_motion
 
 LEAST = 4.0  # roundings of the terms that cancel in a pivot; a smaller pivot may be rounding alone

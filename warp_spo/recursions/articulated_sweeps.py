@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Any
 from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant
 from ..trace.spatial import ZERO, Articulated, Pose, Vector, total
-from . import articulated, groups
+from . import articulated
+from .model import shared_dofs as groups
 from .articulated import HERE, NO_INERTIA
-from .links import Link
+from .model.links import Link
 from .motion import STILL
 from .newton_euler import link_acceleration
 
 if TYPE_CHECKING:
-    from .tracing import Trace
+    from .model.tracing import Trace
 
 Factors = dict[int, Any]
 """The factor of every link by id, of :mod:`.articulated`; at the leader of a group the factor of :mod:`.groups`."""

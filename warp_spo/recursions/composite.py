@@ -9,12 +9,12 @@ from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Pose, Rigid, Vector
 from .articulated import columns
 from .articulated_sweeps import mirror, pack
-from .links import NOTHING as NOTHING
-from .links import Link, Placed
+from .model.links import NOTHING as NOTHING
+from .model.links import Link, Placed
 from .motion import hinge_entries
 
 if TYPE_CHECKING:
-    from .tracing import Trace
+    from .model.tracing import Trace
 
 
 Force = tuple[Vector, Vector]

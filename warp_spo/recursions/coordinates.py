@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 from ..trace.emission import Store
 from ..trace.scalars import Value
 from . import integration
-from .links import Link
+from .model.links import Link
 
 if TYPE_CHECKING:
-    from .tracing import Trace
+    from .model.tracing import Trace
 
 
 def integrate(trace: Trace) -> list[Store]:

@@ -19,7 +19,7 @@ from .articulated_sweeps import factor_tree
 from .derivatives.tangents import tangent_gradient
 
 if TYPE_CHECKING:
-    from .tracing import Trace
+    from .model.tracing import Trace
 
 
 def to_child(pose: Pose, S: Articulated) -> Articulated:

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 from ..trace.emission import Store
 from ..trace.spatial import ZERO, Vector, dot
-from .impedance import Impedance
+from .step.joint_laws import Impedance
 from .kinematics import link_velocities, place_all
 from .momentum import composite_inertias
 
 if TYPE_CHECKING:
-    from .tracing import Trace
+    from .model.tracing import Trace
 
 
 def kinetic_energy(trace: Trace) -> list[Store]:

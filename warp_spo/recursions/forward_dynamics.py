@@ -10,7 +10,7 @@ from .articulated_sweeps import expand, reduce
 from .newton_euler import inverse_dynamics
 
 if TYPE_CHECKING:
-    from .tracing import Trace
+    from .model.tracing import Trace
 
 
 def forward_dynamics(trace: Trace, right: str = "tau", bias: bool = True) -> list[Store]:

@@ -21,13 +21,13 @@ from ..scene.parts import UNLIMITED
 from ..trace.emission import Store
 from ..trace.scalars import Value, absolute, is_constant, less, reciprocal, select, sqrt
 from ..trace.spatial import IDENTITY, ZERO, Vector, dot, total
-from .impedance import Impedance
+from .step.joint_laws import Impedance
 from .kinematics import columns, place_axes
-from .links import Link
-from .tracing import EPSILON
+from .model.links import Link
+from .model.tracing import EPSILON
 
 if TYPE_CHECKING:
-    from .tracing import Trace
+    from .model.tracing import Trace
 
 DAMPING = 0.03  # of half the square of the error; see docs/measured_facts.md
 ROUNDINGS = 16.0  # of the system's trace, damping that keeps its pivots positive where the error is zero

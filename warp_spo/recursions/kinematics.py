@@ -9,12 +9,12 @@ from ..hinges.quaternions import Quaternion, constant_quaternion, multiplied, tu
 from ..trace.emission import Store
 from ..trace.scalars import Value, constant_of
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, dot
-from .links import Link, Links, Placed, place_link
+from .model.links import Link, Links, Placed, place_link
 from .motion import hinge_motion
 from .newton_euler import link_acceleration
 
 if TYPE_CHECKING:
-    from .tracing import Trace
+    from .model.tracing import Trace
 
 NEUTRAL = Vector((0.0, 0.0, 0.0, 1.0))  # quaternion xyzw of no rotation
 

@@ -10,10 +10,10 @@ from ..trace.scalars import Value, reciprocal
 from ..trace.spatial import ZERO, Rigid, Vector, cross
 from . import articulated, composite, newton_euler
 from .kinematics import link_accelerations, link_velocities, place_all, zero
-from .links import Link
+from .model.links import Link
 
 if TYPE_CHECKING:
-    from .tracing import Trace
+    from .model.tracing import Trace
 
 
 def composite_inertias(trace: Trace) -> dict[int, Rigid]:

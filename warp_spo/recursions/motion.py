@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from ..trace.scalars import Value
 from ..trace.spatial import ZERO, Matrix, Pose, Vector, cross, symmetric
-from .links import Link, Placed
+from .model.links import Link, Placed
 
 NONE = Matrix.of([[0.0] * 3] * 3)
 

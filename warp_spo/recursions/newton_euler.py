@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Rigid, Vector, cross, skew
-from .links import Link, Placed
+from .model.links import Link, Placed
 from .motion import Motion, armature_forces, carry_acceleration, hinge_entries, hinge_motion
 
 if TYPE_CHECKING:
-    from .tracing import Trace
+    from .model.tracing import Trace
 
 
 def link_acceleration(

@@ -19,18 +19,18 @@ from typing import TYPE_CHECKING
 
 from ..hinges.deflection import Deflection
 from ..hinges.quaternions import matrix_quaternion
-from ..hinges.spin import Spin
+from ..hinges.rotor_axis import Spin
 from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Pose, Rigid, Vector, cross, dot
 from .articulated import columns
 from .kinematics import place_all
-from .link import Link, Seat
-from .rotations import folded
-from .rotors import locked, own_link
+from .model.link import Link, Seat
+from .model.rotations import folded
+from .model.rotors import locked, own_link
 
 if TYPE_CHECKING:
-    from .tracing import Trace
+    from .model.tracing import Trace
 
 NOTHING = Vector((*ZERO, *ZERO))
 Six = list[Value]

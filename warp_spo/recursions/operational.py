@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING
 from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import ZERO, Vector, cross
-from . import articulated, groups
+from . import articulated
+from .model import shared_dofs as groups
 from .articulated_sweeps import NO_FORCE, factor_tree, mirror, pivots, propagate_inward, weighted_products
 from .kinematics import accelerations_of_frames, frame_on_link, place_all, place_axes
-from .links import Link
+from .model.links import Link
 from .motion import STILL
 from .newton_euler import link_acceleration
 
 if TYPE_CHECKING:
-    from .tracing import Trace
+    from .model.tracing import Trace
 
 
 def operational_inertia_inverse(trace: Trace, frames: tuple) -> list[Store]:

@@ -15,11 +15,11 @@ from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Vector, cross, dot
 from . import articulated
 from .expressions import NODES, Expression, spaces
-from .links import Link, Placed, place_link
+from .model.links import Link, Placed, place_link
 from .motion import hinge_entries, hinge_motion
 
 if TYPE_CHECKING:
-    from .tracing import Trace
+    from .model.tracing import Trace
 
 Field = Callable[[int], Any]  # node -> Vector of its entries
 

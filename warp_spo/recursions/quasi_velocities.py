@@ -13,14 +13,15 @@ from ..trace.differentiation import forward
 from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant, ordered, sqrt
 from ..trace.spatial import ZERO, Articulated, Vector, dot, total
-from . import articulated, groups, hybrid
+from . import articulated, hybrid
+from .model import shared_dofs as groups
 from .articulated_sweeps import Factors, eliminate
 from .derivatives.tangents import coordinate_directions
 from .motion import carry_acceleration, link_motion
 
 if TYPE_CHECKING:
-    from .links import Link, Placed
-    from .tracing import Trace
+    from .model.links import Link, Placed
+    from .model.tracing import Trace
 
 Entry = Callable[[int], Value]
 

@@ -11,7 +11,7 @@ from .kinematics import place_all
 from .motion import STILL
 
 if TYPE_CHECKING:
-    from .tracing import Trace
+    from .model.tracing import Trace
 
 
 def body_accelerations(trace: Trace) -> list[Store]:

@@ -18,12 +18,12 @@ from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, cross, dot, skew, symmetric
 from .kinematics import carried_velocity
-from .links import Link
+from .model.links import Link
 from .motion import Motion, hinge_motion, whirl
 from .newton_euler import body_force, hinge_entries, link_acceleration
 
 if TYPE_CHECKING:
-    from .tracing import Trace
+    from .model.tracing import Trace
 
 Twist = tuple[Vector, Vector]
 COUNT = 10  # parameters of a body

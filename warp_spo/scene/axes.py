@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import refuse_masked
-from ..hinges.sequences import BY_NAME
+from ..hinges.elementary import BY_NAME
 from .checks import SYMMETRY, checked_array, checked_unit, real
 
 Screw = tuple[Any, float, float]  # axis [3], radians and metres per coordinate

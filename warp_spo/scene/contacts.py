@@ -12,7 +12,7 @@ from ..errors import UnsupportedError, as_integer
 from .checks import checked_array, checked_unit, read_only
 from .hulls import with_corners
 from .pairs import pair_values
-from .storage import Stored, StoredPart
+from .pickling import Stored, StoredPart
 
 CONTACT_VALUES = ("contact_friction", "contact_stiffness", "contact_damping")
 """Names of a scene's values that come from its contacts, one entry a point."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import as_integer, refuse_masked
-from ..gradients import check_plain
+from ..runtime.autograd import check_plain
 from .parts import IDENTITY_POSE, real
 from .scene import Scene
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import UnsupportedError
 from .checks import SYMMETRY, checked_array, checked_inertia, checked_unit, read_only
-from .storage import StoredPart
+from .pickling import StoredPart
 
 MODELS = ("full", "reduced", "reflected")
 

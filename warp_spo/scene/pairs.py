@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import UnsupportedError, as_integer
 from .checks import read_only, real
 from .hulls import Hull, convex_hull
-from .storage import StoredPart
+from .pickling import StoredPart
 
 SINK = 1e-4  # how far the lighter body sinks in [m] that rests on the other one, where the stiffness is chosen
 DAMPING = 2.0  # of sqrt(k m): critical, so that stacks come to rest

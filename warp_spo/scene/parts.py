@@ -20,18 +20,18 @@ import numpy as np
 
 from ..errors import UnsupportedError, as_integer
 from ..hinges.custom import MOST, Custom, checked
-from ..hinges.kind import FREE as FREE
-from ..hinges.kind import SCREWS as SCREWS
-from ..hinges.kind import Element
-from ..hinges.sequences import BY_NAME, elements
+from ..hinges.hinge_type import FREE as FREE
+from ..hinges.hinge_type import SCREWS as SCREWS
+from ..hinges.hinge_type import Element
+from ..hinges.elementary import BY_NAME, elements
 from .axes import in_plane as in_plane
 from .axes import screws_of
 from .checks import checked_array, checked_unit, read_only
 from .checks import checked_inertia as checked_inertia
 from .checks import real as real
 from .gears import Rotor, checked_flexible, motor_and_deflection, resolve_rotor
-from .modes import Modes
-from .storage import StoredPart, check_function
+from .flexible.modes import Modes
+from .pickling import StoredPart, check_function
 
 IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 UNLIMITED = 1e10
@@ -197,7 +197,7 @@ class Hinge(StoredPart):
     coordinates: int | None = None
     pose: Callable[[list], Any] | None = None
     screws: tuple = dataclasses.field(init=False, repr=False)
-    elements: tuple = dataclasses.field(init=False, repr=False)  # of warp_spo.hinges.kind.Element, inboard first
+    elements: tuple = dataclasses.field(init=False, repr=False)  # of warp_spo.hinges.hinge_type.Element, inboard first
 
     def __post_init__(self) -> None:
         call = f"Hinge({self.label!r})" if self.label else f"Hinge({self.kind!r})"

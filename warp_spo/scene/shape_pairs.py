@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import UnsupportedError, as_integer
 from .contacts import Contact, pose_matrix, spread_directions
 from .hulls import Hull, convex_hull, grown, is_convex
-from .shapes import Shape
+from .collision_shapes import Shape
 
 if TYPE_CHECKING:
     from .scene import Scene

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from .tensors import is_tensor, like, pointer, requires_grad
+from ..runtime.torch_tensors import is_tensor, like, pointer, requires_grad
 
 if TYPE_CHECKING:
     from ..dynamics.dynamics import Dynamics

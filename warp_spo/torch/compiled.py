@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch.autograd import forward_ad
 
-from ..registry import KNOWN
+from ..runtime.registry import KNOWN
 from .autograd import Record
-from .tensors import DTYPES, is_tensor, pointer
+from ..runtime.torch_tensors import DTYPES, is_tensor, pointer
 
 if TYPE_CHECKING:
     from ..dynamics.dynamics import Dynamics

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from ..errors import as_names
-from .tensors import DTYPES, torch_device
+from ..runtime.torch_tensors import DTYPES, torch_device
 
 if TYPE_CHECKING:
     from ..dynamics.dynamics import Dynamics

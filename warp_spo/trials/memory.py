@@ -12,7 +12,7 @@ import warp as wp
 
 from ..execution.plan import MOST_DOFS
 from ..scene.scene import Scene
-from .operations import OPERATIONS, Inputs
+from .inputs import OPERATIONS, Inputs
 
 WORKSPACE = {"node": (250.0, 190.0, 7.0), "tree": (4.5, 4.0, 1.05)}
 """Numbers in one world of operators and intermediate results, for each body, each dof and each pair of dofs.

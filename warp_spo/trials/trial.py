@@ -13,7 +13,7 @@ import warp as wp
 from ..dynamics.dynamics import Dynamics
 from ..dynamics.spatial_operators import SpatialOperators
 from ..graph.algebra import Operator
-from .operations import Inputs, Operation
+from .inputs import Inputs, Operation
 
 SAMPLE = 8  # worlds that are compared with the reference, which takes 10 to 100 ms a world
 WARM_UP = 0.2  # [s] of evaluations before timing, in which clocks rise and caches fill
@@ -113,7 +113,7 @@ class Trial:
 
         The error is NaN if the result of any world is not finite.
 
-        See :meth:`warp_spo.trials.operations.Operation.error`.
+        See :meth:`warp_spo.trials.inputs.Operation.error`.
         """
         operation, subject, worlds = self.operation, self.subject, self.subject.dyn.worlds
         if operation.reveal:

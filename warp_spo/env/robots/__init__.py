@@ -82,7 +82,7 @@ def load(
     """
     if name not in NAMES:
         raise ValueError(f"robots.load: {name!r} is unknown; expected one of {', '.join(NAMES)}")
-    from ...mujoco.files import compiled
+    from ...mujoco.mjcf import compiled
 
     path = FILES / f"{name}.xml"
     model, *_ = compiled(path)

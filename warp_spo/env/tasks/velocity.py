@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ...hinges.functions import where
+from ...trace.functions import where
 from .. import Observation, World, events, rewards
 from .. import observations as obs
 

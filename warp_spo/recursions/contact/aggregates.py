@@ -22,12 +22,12 @@ from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Pose, Vector, 
 from .. import articulated
 from ..articulated import NO_INERTIA
 from ..articulated_sweeps import NO_FORCE, Factors, eliminate
-from ..links import Link
+from ..model.links import Link
 from ..motion import STILL, carry_acceleration, hinge_entries, hinge_motion
 from .ties import Aggregate, Plan, key
 
 if TYPE_CHECKING:
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 UNITS = [Vector(1.0 if i == j else 0.0 for i in range(6)) for j in range(6)]
 LAST = 27  # entries of a couple: the upper triangle of its damper K, order (omega; v), and its load f0, (n; f)

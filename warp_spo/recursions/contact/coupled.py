@@ -1,7 +1,7 @@
 """A step of a scene whose bodies touch each other: what its passes read of couples, and what they leave for them.
 
 Before the first pass and after each one, native code finds dampers and loads of couples from their points;
-:mod:`.aggregates` says what a pass makes of them. The specification is :mod:`warp_spo.reference_pairs`.
+:mod:`.aggregates` says what a pass makes of them. The specification is :mod:`warp_spo.reference.body_contact`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ...trace.scalars import Value
 from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Vector, cross, total
 from .. import articulated
 from ..articulated_sweeps import Factors
-from ..links import Link, Links
+from ..model.links import Link, Links
 from . import aggregates
 from .aggregates import LAST, Node, Seat, Seats, Tie, add
 from .pairs import RESIDUAL, place_axes_of, values_of, velocities_of

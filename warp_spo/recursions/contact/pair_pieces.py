@@ -19,28 +19,18 @@ from ...trace.spatial import Articulated, Matrix, Vector, cross, dot, total
 from ..articulated import reduce_link
 from ..articulated_sweeps import NO_FORCE
 from ..kinematics import frame_on_link, velocity
-from ..links import Link, Links
-from ..messages import INWARD, OUTWARD
+from ..model.links import Link, Links
+from ..model.messages import INWARD, OUTWARD
 from ..motion import STILL
-from ..pieces import Piece, Pieces
+from ..model.segments import Piece, Pieces
 from .coupled import CoupledStep, suits
 from .couples import EXCESS, Team
-from .pairs import (
-    RESIDUAL,
-    PairedStep,
-    inverse_weights,
-    members,
-    place_axes_of,
-    places_of,
-    solids_of,
-    values_of,
-    velocities_of,
-)
+from .pairs import RESIDUAL, PairedStep, inverse_weights, members, place_axes_of, places_of, solids_of, values_of, velocities_of
 from .points import Point
 from .step import ContactStep, Touch
 
 if TYPE_CHECKING:
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 MOST = 8  # couples that are solved together
 

@@ -2,7 +2,7 @@
 
 A pass of :mod:`.step` gives x0, without forces between bodies, and the response of the bodies of all pairs, the blocks
 J A0^-1 J*. Native code finds the wrenches on these bodies. With the factors of the same pass, a
-sweep then adds A0^-1 J* times the wrenches to x0. :mod:`warp_spo.reference_pairs` is the specification.
+sweep then adds A0^-1 J* times the wrenches to x0. :mod:`warp_spo.reference.body_contact` is the specification.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Value, sqrt
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, total
-from .. import neutral
+from ..model import effective_mass as neutral
 from ..articulated_sweeps import NO_FORCE, pivots, propagate_inward, weighted_products
 from ..kinematics import carried_velocity, frame_on_link, velocity
-from ..links import Link, Links
+from ..model.links import Link, Links
 from ..motion import hinge_motion
 from ..operational import respond, unit_wrenches
-from ..remembered import remembered
+from ..model.scene_cache import remembered
 from . import step as ground
 from .couples import Polyhedron, Solids
 from .points import SLIP, with_ancestors
 
 if TYPE_CHECKING:
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 PASSES = 4  # of a step with pairs; with three, random poses gained energy in 17 of 4500 cases, with four in 4
 PLACE, VALUE, START, TWIST, RESPONSE = "pair_place", "pair_value", "pair_start", "pair_twist", "pair_response"

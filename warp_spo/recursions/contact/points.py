@@ -28,20 +28,20 @@ from ...scene.contacts import AWAY, HEIGHTS, PLACE, ContactPoint, HeightField, L
 from ...scene.scene import Scene
 from ...trace.scalars import Value, absolute, branch, is_constant, less, lost, reciprocal, select
 from ...trace.spatial import IDENTITY, ZERO, Vector, cross, dot, total
-from .. import neutral
-from ..impedance import is_number
+from ..model import effective_mass as neutral
+from ..step.joint_laws import is_number
 from ..kinematics import arm_on_link, carried_velocity, frame_on_link, zero
-from ..links import Link, Links
+from ..model.links import Link, Links
 from ..motion import Motion, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
-from ..pieces import Piece, Pieces
-from ..remembered import remembered
-from ..tracing import Trace
+from ..model.segments import Piece, Pieces
+from ..model.scene_cache import remembered
+from ..model.tracing import Trace
 from .ground import Corners, Place, Surface, directions, lowest, surface_count, surfaces
-from .middle import KICK, PATH
+from .velocity_kicks import KICK, PATH
 
 if TYPE_CHECKING:
-    from ..impedance import Impedance
+    from ..step.joint_laws import Impedance
 
 ARMS = 8  # spheres of a limb up to which their arms are kept, see docs/contact_measured.md
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip

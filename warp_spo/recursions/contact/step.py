@@ -6,7 +6,7 @@ Velocity terms, gravity and loads become forces of the hinges once, before the p
 
 where S, l are the hinges' laws (:mod:`.secants`) and G, f0 the contacts' (:mod:`.points`). The first pass closes every
 point that may touch; later passes open those that pull, and close those that the pass before carried below ground; the
-last of three or more opens none. :mod:`warp_spo.reference_contact` is the specification.
+last of three or more opens none. :mod:`warp_spo.reference.contact` is the specification.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from ...trace.emission import Store
 from ...trace.scalars import Value, branch, is_constant, less, reciprocal, select
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from ..articulated_sweeps import Factors, expand, reduce
-from ..impedance import Law, add_laws
+from ..step.joint_laws import Law, add_laws
 from ..integration import integrate_link
 from ..kinematics import zero
-from ..links import Link
+from ..model.links import Link
 from ..newton_euler import inverse_dynamics
-from ..pieces import Piece, Pieces
-from ..step import GAIN, Step
-from .crowds import Crowd, gather
+from ..model.segments import Piece, Pieces
+from ..step.step import GAIN, Step
+from .contact_culling import Crowd, gather
 from .dampers import SEVERAL, chosen, damper, load
 from .law import Found, Touch, begin_point, finish_point, force_at, normal_force
-from .middle import KICK, START
+from .velocity_kicks import KICK, START
 from .points import Point, ground_place, keeps_arms, own_points, place_points
-from .secants import Kept, Secant, largest, single_dofs
+from .secant_laws import Kept, Secant, largest, single_dofs
 
 if TYPE_CHECKING:
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 PASSES = 3  # what a step with contacts takes if the caller does not say
 TOLERANCE = 0.1  # share of the weight, or of an effort limit, by which the last pass may exceed its laws without a word

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from ...trace.scalars import is_constant
-from ..links import Link, Links
+from ..model.links import Link, Links
 
 
 class Couple(NamedTuple):

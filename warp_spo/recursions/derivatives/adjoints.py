@@ -19,29 +19,22 @@ from ...trace.differentiation import forward, reverse
 from ...trace.emission import Store
 from ...trace.scalars import Scalar, Value, ordered
 from ...trace.spatial import ZERO, total
-from ..actuation import actuator_force, hinge_laws
+from ..step.actuation import actuator_force, hinge_laws
 from ..articulated_sweeps import expand, reduce
 from ..composite import mass_matrix
 from ..coordinates import difference, integrate, interpolate
 from ..energy import kinetic_energy, potential_energy
 from ..forward_dynamics import forward_dynamics
 from ..integration import integrate_link
-from ..kinematics import (
-    body_poses,
-    body_velocities,
-    frame_accelerations,
-    frame_poses,
-    frame_velocities,
-    jacobian,
-)
-from ..links import Link
+from ..kinematics import body_poses, body_velocities, frame_accelerations, frame_poses, frame_velocities, jacobian
+from ..model.links import Link
 from ..momentum import com, com_velocity
 from ..newton_euler import inverse_dynamics
 from .power import Entry, Power, Ways
 from .tangents import coordinate_directions, tangent_gradient
 
 if TYPE_CHECKING:
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 
 COORDINATES = ("q", "q_before", "target_q", "q0", "q1", "joint_rest_q")  # arguments and values that are laid out as q

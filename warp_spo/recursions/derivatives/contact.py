@@ -37,20 +37,20 @@ from ...trace.scalars import Scalar, Value, cut, is_constant, less, ordered, sel
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from ..articulated_sweeps import Factors, eliminate, expand, reduce
 from ..contact.ground import CORNERS
-from ..contact.middle import KICK, PATH, START
+from ..contact.velocity_kicks import KICK, PATH, START
 from ..contact.points import Carried, Point, own_points, place_points, point_links, with_ancestors
 from ..integration import integrate_link
 from ..kinematics import carried_velocity
-from ..links import Link
+from ..model.links import Link
 from ..motion import hinge_motion, whirl
-from ..pieces import Piece, Pieces
+from ..model.segments import Piece, Pieces
 from .adjoints import entries, result_name
 from .contact_pass import NUMBER, OnePass
 from .power import Entry, Power, Ways
 
 if TYPE_CHECKING:
     from ...scene.scene import Scene
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 COTANGENT, CAME, SOLVED = "cotangent", "cotangent_came", "solved"
 """The gradient by what a pass leaves, qdd of each dof and then the variables; by what the pass before left, likewise;

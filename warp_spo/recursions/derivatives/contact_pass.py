@@ -16,15 +16,15 @@ from ...scene.contacts import HEIGHTS
 from ...trace.emission import Store
 from ...trace.scalars import Value, cut, reciprocal, select
 from ..contact.points import Point, own_points, surface_numbers
-from ..contact.secants import Kept, single_dofs
+from ..contact.secant_laws import Kept, single_dofs
 from ..contact.step import ContactStep, Touch
-from ..impedance import LIMIT, Law
-from ..links import Link, Links
-from ..pieces import Pieces
-from ..step import GAIN
+from ..step.joint_laws import LIMIT, Law
+from ..model.links import Link, Links
+from ..model.segments import Pieces
+from ..step.step import GAIN
 
 if TYPE_CHECKING:
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 ROW, BEFORE = "row", "qdd_before"
 """Inputs that the pass before left: variables [world, variable] and qdd [world, dof]."""

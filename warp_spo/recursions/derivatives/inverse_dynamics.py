@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING
 from ...trace.emission import Store, merge
 from ...trace.scalars import Value
 from ...trace.spatial import ZERO, Rigid, Vector, cross, dot
-from .. import composite, messages, motion, newton_euler
-from ..links import Link, Placed
+from .. import composite, motion, newton_euler
+from ..model import messages
+from ..model.links import Link, Placed
 from ..motion import STILL, Motion
 from . import sensitivity
 from .sensitivity import CarriedSums, Row, Sensitivity
 
 if TYPE_CHECKING:
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 Q, QD, QDD = range(3)  # blocks of the result
 LETTERS = "RULf"

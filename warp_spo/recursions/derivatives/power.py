@@ -15,11 +15,11 @@ from ...trace.differentiation import reverse
 from ...trace.emission import Store
 from ...trace.scalars import Value, cut, is_constant, ordered
 from ...trace.spatial import ZERO, Matrix, Rigid, Vector, cross, dot, skew
-from ..links import Link, Placed
+from ..model.links import Link, Placed
 from ..motion import armature_forces, hinge_motion, own_bias, whirl
 
 if TYPE_CHECKING:
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 Entry = Callable[[int], Value]
 Ways = dict[tuple, Value]

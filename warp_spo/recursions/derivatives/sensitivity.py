@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from ...trace.scalars import Value
 from ...trace.spatial import ZERO, Matrix, Rigid, Vector, cross, dot, skew, symmetric
-from ..links import Link, Placed
+from ..model.links import Link, Placed
 from ..motion import NONE, Motion, carry_acceleration, hinge_motion, whirl
 
 

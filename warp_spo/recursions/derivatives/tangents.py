@@ -8,7 +8,7 @@ from ...trace.scalars import Value
 from .power import Entry
 
 if TYPE_CHECKING:
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 
 def tangent_gradient(trace: Trace, gradient: dict[tuple, Value]) -> list[tuple[tuple[int, ...], Value]]:

@@ -20,8 +20,8 @@ from ...trace.scalars import Value, less, select
 from ...trace.spatial import total
 from ..articulated_sweeps import expand, reduce
 from ..integration import integrate_link
-from ..links import Link, place_link
-from ..step import Step, all_finite
+from ..model.links import Link, place_link
+from ..step.step import Step, all_finite
 from . import clusters
 from .closures import Ratio, count_open_rows
 from .clusters import Cluster, Columns
@@ -30,7 +30,7 @@ from .multipliers import combine_rows, loop_system
 from .projection import place_links
 
 if TYPE_CHECKING:
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 NEWTON_STEPS = 2  # of position and of velocity for clusters with loop joints; couplings are linear and take one
 RESOLVED = 4.0  # roundings; a smaller margin may be rounding alone

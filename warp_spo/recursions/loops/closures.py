@@ -19,7 +19,7 @@ from ...scene.parts import Coupling, Loop, in_plane
 from ...trace.scalars import Value, less, reciprocal
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, dot, total
 from .. import articulated
-from ..links import Link, Links, Placed, Seat
+from ..model.links import Link, Links, Placed, Seat
 from ..motion import hinge_motion, own_bias
 
 PARALLEL = 1e-6  # sine of the angle between two axes of a loop joint, below which they are one

@@ -23,7 +23,7 @@ from ...trace.scalars import Value, absolute, guarded, reciprocal, sqrt
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from .. import articulated, newton_euler
 from ..articulated import NO_INERTIA
-from ..links import Link, Links, Placed
+from ..model.links import Link, Links, Placed
 from ..motion import Motion, hinge_entries
 from .closures import Closure, Ratio
 from .nullspace import Basis, NullSpace

@@ -15,14 +15,14 @@ from ...trace.scalars import Value
 from ...trace.spatial import Articulated, Vector, total
 from .. import articulated, newton_euler
 from ..articulated import HERE, NO_INERTIA
-from ..links import Link
+from ..model.links import Link
 from . import clusters as aggregates
 from .closures import Closure, Ratio, closures
 from .clusters import Cluster, Columns, Tied
 from .nullspace import Basis, NullSpace
 
 if TYPE_CHECKING:
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 
 class Embedding(NamedTuple):

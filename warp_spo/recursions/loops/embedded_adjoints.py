@@ -31,7 +31,7 @@ from .nullspace import NullSpace
 from .projection import place_links
 
 if TYPE_CHECKING:
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 
 class ClosedEquations(TreeEquations):

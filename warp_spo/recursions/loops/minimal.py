@@ -16,7 +16,7 @@ from ...trace.spatial import ZERO, Vector, total
 from .. import articulated, composite, kinematics, momentum, newton_euler, operational
 from ..articulated import NO_INERTIA
 from ..articulated_sweeps import mirror, weighted_products
-from ..links import Link
+from ..model.links import Link
 from ..motion import STILL
 from . import clusters as aggregates
 from .clusters import Cluster, Columns
@@ -25,7 +25,7 @@ from .nullspace import Basis, NullSpace
 from .projection import place_links
 
 if TYPE_CHECKING:
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 NO_FORCE = Vector((*ZERO, *ZERO))
 

@@ -20,7 +20,7 @@ from .clusters import Columns
 from .projection import move_all, place_links
 
 if TYPE_CHECKING:
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 
 def constraint_rows(trace: Trace) -> list[Columns]:

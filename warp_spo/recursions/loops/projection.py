@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 from ...trace.emission import Store
 from ...trace.scalars import Value
 from ...trace.spatial import total
-from ..links import Link
+from ..model.links import Link
 from .closures import closures
 from .clusters import Columns
 from .embedded import ClosedLoops, Embedding
 
 if TYPE_CHECKING:
-    from ..tracing import Trace
+    from ..model.tracing import Trace
 
 
 def place_links(trace: Trace, moves: bool = False) -> None:

@@ -1,0 +1,245 @@
+"""Facts about the loops of a scene, found once on the host: which rows count, and which dofs are independent.
+
+Configurations are drawn at random and closed by damped least squares in float64; rank and independence are what the
+Jacobians of the closures say there. The draw is the same every time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..errors import UnsupportedError, as_integer, shown
+from ..recursions.model.links import Links
+from ..recursions.loops.closures import closures
+from ..recursions.loops.clusters import clusters
+from ..recursions.loops.embedded import Embedding
+from ..recursions.loops.projection import closure_error, closure_jacobian, move
+from ..recursions.model.tracing import Trace
+from ..scene.parts import UNLIMITED
+from ..scene.scene import Scene
+from ..trace.evaluation import evaluate
+
+SAMPLES = 64
+STEPS = 60
+CLOSED = 1e-9  # largest g of a configuration that counts as closed [m, rad]
+RANK = 1e-7  # singular values below this share of the largest are zero: the rows are redundant
+WORST = 0.1  # share of the draws that a choice may serve worse than it is said to
+NEARLY = 0.3  # share of the best choice's hold that an earlier dof must have
+NAMED = 6  # bodies that an error lists
+MOST_DOFS = 32  # of a cluster: its D costs their cube, in straight-line code
+
+
+class Closing:
+    """The closures of a scene in one world, evaluated by NumPy at many configurations.
+
+    Attributes:
+        clusters: the sets of links that loops and couplings tie.
+        size: rows of all closures.
+    """
+
+    def __init__(self, scene: Scene):
+        one = {name: array[0] for name, array in scene.values.items() if array.shape[0] > 1}
+        self.scene = scene.with_values(**one) if one else scene
+        trace = Trace(Links(self.scene), "float64", ("q", "step"))
+        constraints = closures(trace.links)
+        self.clusters = clusters(trace.links, constraints)
+        self.size = sum(constraint.rows for constraint in constraints)
+        self._error, self._jacobian = closure_error(trace), closure_jacobian(trace)
+        step = trace.vector("step")
+        self._moved = [
+            (link.coordinate + i, value)
+            for link in trace.links.leaders
+            for i, value in enumerate(move(trace, link, [step(dof) for dof in link.dofs]))
+        ]
+
+    def at(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """g [world, row] and Y [world, row, dof] at q [world, coordinate]."""
+        stores = self._error + self._jacobian
+        values = evaluate([item.value for item in stores], lambda _, index: q[:, index[0]])
+        g, Y = np.zeros((len(q), self.size)), np.zeros((len(q), self.size, self.scene.dof_count))
+        for item, value in zip(stores, values, strict=True):
+            into: Any = g if len(item.index) == 1 else Y
+            into[(slice(None), *item.index)] = value
+        return g, Y
+
+    def moved(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
+        arrays = {"q": q, "step": step}
+        values = evaluate([value for _, value in self._moved], lambda name, index: arrays[name][:, index[0]])
+        new = q.copy()
+        for (coordinate, _), value in zip(self._moved, values, strict=True):
+            new[:, coordinate] = value
+        return new
+
+    def closed(self, q: np.ndarray) -> np.ndarray:
+        """Those of the configurations [world, coordinate] that could be closed, closed."""
+        damping = np.full(len(q), 1e-3)
+        g, Y = self.at(q)
+        for _ in range(STEPS):
+            lifted = Y @ Y.transpose(0, 2, 1) + damping[:, None, None] * np.eye(self.size)
+            step = -(Y.transpose(0, 2, 1) @ np.linalg.solve(lifted, g[..., None]))[..., 0]
+            tried = self.moved(q, step)
+            g_tried, Y_tried = self.at(tried)
+            better = np.linalg.norm(g_tried, axis=1) < np.linalg.norm(g, axis=1)
+            q, g = np.where(better[:, None], tried, q), np.where(better[:, None], g_tried, g)
+            Y = np.where(better[:, None, None], Y_tried, Y)
+            damping = np.maximum(np.where(better, 0.1 * damping, 10.0 * damping), 1e-12)
+        return q[np.abs(g).max(axis=1, initial=0.0) < CLOSED]
+
+
+def drawn(scene: Scene, count: int, seed: int = 0) -> np.ndarray:
+    """Random coordinates [count, coordinate]: within limits, else in (-1.5, 1.5) [rad, m]; any rotation."""
+    rng = np.random.default_rng(seed)
+    q = np.tile(scene.neutral_q, (count, 1))
+    lower, upper = (scene.values[f"joint_limit_{side}"][0] for side in ("lower", "upper"))
+    for hinge, coordinate, dof in zip(scene.hinges, scene.q_start, scene.qd_start, strict=False):
+        for first in coordinate + np.array(hinge.quaternions, dtype=int):
+            turn = rng.normal(size=(count, 4))
+            q[:, first : first + 4] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
+        if hinge.quaternions:
+            continue
+        for i in range(hinge.dof_count):
+            bounded = lower[dof + i] > -UNLIMITED and upper[dof + i] < UNLIMITED and lower[dof + i] < upper[dof + i]
+            low, high = (lower[dof + i], upper[dof + i]) if bounded else (-1.5, 1.5)
+            q[:, coordinate + i] = rng.uniform(max(low, -3.2), min(high, 3.2), count)
+    small = q[::2]  # every other one near the neutral configuration, from which robots are drawn
+    q[::2] = scene.neutral_q + 0.1 * (small - scene.neutral_q)
+    return q
+
+
+def usual_rank(scene: Scene) -> int:
+    """Independent rows where the loops close, but for change points; 0 if no configuration that closes was found."""
+    closing = Closing(scene)
+    q = closing.closed(drawn(scene, SAMPLES))
+    if len(q) == 0 or closing.size == 0:
+        return 0
+    Y, rank = closing.at(q)[1], 0
+    for cluster in closing.clusters:
+        singular = np.linalg.svd(Y[:, cluster.rows][:, :, cluster.dofs], compute_uv=False)
+        rank += int((singular > RANK * singular[:, :1]).sum(axis=1).max())
+    return rank
+
+
+def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str = "Dynamics") -> Embedding:
+    """The rows that count, and the independent dofs: those ``asked`` for, or the first ones that move all others well.
+
+    Raises:
+        ValueError: no configuration was found that closes all loops, or the dofs asked for do not move all others.
+        UnsupportedError: more dofs in a cluster than straight-line code is good for.
+    """
+    wanted = None if asked is None else _numbers(scene, asked, call)
+    closing = Closing(scene)
+    clusters = closing.clusters
+    for cluster in clusters:
+        if len(cluster.dofs) > MOST_DOFS:
+            names = [shown(scene.body_labels[node]) for node in dict.fromkeys(link.node for link in cluster.links)]
+            tied = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
+            raise UnsupportedError(
+                call,
+                f"embedding {len(cluster.dofs)} dof that move together ({tied}; up to {MOST_DOFS} are)",
+                "use loops='multipliers'",
+            )
+    q = closing.closed(drawn(scene, SAMPLES))
+    if len(q) == 0:
+        raise ValueError(
+            f"{call}: no configuration was found that closes {scene.ties}; expected anchors that can "
+            f"meet; loops='cut' leaves them open"
+        )
+    Y = closing.at(q)[1]
+    rows: list[int] = []
+    free = set(range(scene.dof_count))
+    for cluster in clusters:
+        numbers, dofs = np.array(cluster.rows, dtype=int), np.array(cluster.dofs, dtype=int)
+        kept, X = _spanning(Y[:, numbers][:, :, dofs])
+        rows += numbers[kept].tolist()
+        if wanted is None:
+            independent = _independent(X)
+        else:
+            independent = [i for i, dof in enumerate(dofs.tolist()) if dof in wanted]
+            if len(independent) != X.shape[2] or not (_hold(X, independent) > RANK).any():
+                labels = [scene.dof_labels[dof] for dof in dofs]
+                still = [label for label, size in zip(labels, _mobility(X), strict=True) if size == 0.0]
+                raise ValueError(
+                    f"{call}: independent names {[labels[i] for i in independent]} of the dofs that move "
+                    f"together, {labels}; expected {X.shape[2]} that move all of them"
+                    + (f"; the closures do not let {still} move" if still else "")
+                )
+        free -= set(dofs.tolist()) - set(dofs[independent].tolist())
+    if wanted is not None and free != wanted:
+        missing = [scene.dof_labels[dof] for dof in sorted(free - wanted)]
+        raise ValueError(f"{call}: independent leaves out {missing}, which no loop ties; expected them too")
+    return Embedding(tuple(sorted(rows)), tuple(sorted(free)))
+
+
+def _numbers(scene: Scene, asked: Sequence[int | str], call: str) -> set[int]:
+    labels, found = scene.dof_labels, set()
+    if not isinstance(asked, Sequence | np.ndarray) or isinstance(asked, str):
+        raise TypeError(f"{call}: independent is {asked!r}; expected a list of dofs, indices or labels")
+    for dof in asked:
+        number = labels.index(dof) if isinstance(dof, str) and dof in labels else as_integer(dof)
+        if number is None or not 0 <= number < scene.dof_count:
+            raise ValueError(
+                f"{call}: independent names {dof!r}; expected dofs, 0 to {scene.dof_count - 1}, or labels "
+                f"among {', '.join(map(shown, labels))}"
+            )
+        found.add(number)
+    return found
+
+
+def _spanning(Y: np.ndarray) -> tuple[list[int], np.ndarray]:
+    """Rows that span all of them, of Y [draw, row, column], and orthonormal X [draw, column, free] with Y X = 0."""
+    singular = np.linalg.svd(Y, compute_uv=False)
+    ranks = (singular > RANK * singular[:, :1]).sum(axis=1)
+    rank = int(ranks.max(initial=0))
+    if rank == 0:
+        return [], np.tile(np.eye(Y.shape[2]), (len(Y), 1, 1))
+    Y = Y[ranks == rank]
+    measure = lambda rows: np.quantile(np.linalg.svd(Y[:, rows], compute_uv=False)[:, -1], WORST)  # noqa: E731
+    rows = list(max(sorted({tuple(_pivots(y, rank)) for y in Y}), key=lambda rows: float(measure(list(rows)))))
+    return rows, np.linalg.svd(Y[:, rows])[2][:, rank:].transpose(0, 2, 1)
+
+
+def _hold(X: np.ndarray, dofs: list[int]) -> np.ndarray:
+    """Return how well some dofs determine the others [draw]: 0 where they do not. Units of dofs do not matter."""
+    if not dofs:
+        return np.ones(len(X))
+    scale = _mobility(X)
+    if not scale[dofs].all():
+        return np.zeros(len(X))
+    return np.linalg.svd(X[:, dofs] / scale[dofs][:, None], compute_uv=False)[:, -1]
+
+
+def _mobility(X: np.ndarray) -> np.ndarray:
+    """Return how far each dof moves, over all draws [column]; zero where only rounding moves it, as in a truss."""
+    size = np.sqrt((X**2).sum(axis=2).mean(axis=0))
+    return np.where(size > RANK * size.max(initial=0.0), size, 0.0)
+
+
+def _independent(X: np.ndarray) -> list[int]:
+    """Return the first dofs that determine the others nearly as well as any, in the worst tenth of the draws."""
+    count = X.shape[2]
+    measure = lambda dofs: float(np.quantile(_hold(X, list(dofs)), WORST))  # noqa: E731
+    subsets = {tuple(_pivots(x, count)) for x in X}
+    for least in (0.3, 0.1, 0.03):
+        greedy: list[int] = []
+        for dof in range(X.shape[1]):
+            if len(greedy) < count and measure([*greedy, dof]) > least:
+                greedy.append(dof)
+        if len(greedy) == count:
+            subsets.add(tuple(greedy))
+    best = max(map(measure, subsets))
+    return list(min(subset for subset in subsets if measure(subset) >= NEARLY * best))
+
+
+def _pivots(A: np.ndarray, count: int) -> list[int]:
+    """Rows of A that span the most: each the longest beyond those before it, the first of equals."""
+    left, found = A.copy(), []
+    for _ in range(count):
+        lengths = np.linalg.norm(left, axis=1)
+        row = int(np.argmax(lengths > lengths.max() * (1.0 - 1e-9)))
+        found.append(row)
+        unit = left[row] / lengths[row]
+        left = left - np.outer(left @ unit, unit)
+    return sorted(found)

@@ -1,0 +1,92 @@
+"""Options and reports of a step of a scene with contacts: passes, forces, gaps, slips, excess."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from ...runtime.arrays import Call
+from ...errors import UnsupportedError, as_integer
+from ...kernels import combination
+from ...recursions.contact import step as ground
+from ...recursions.contact.pair_pieces import by_limbs
+from ...recursions.contact.pairs import RESIDUAL, default_passes
+from ...scene.contacts import HeightField, contact_figures
+from . import integrators
+from ..closures import AMID_CONTACTS
+from ..operation import Argument
+
+if TYPE_CHECKING:
+    from ..dynamics import Dynamics
+
+REPORTS = (*ground.REPORTS, RESIDUAL)
+AXES = ("world, contact, 3", "world, contact", "world, contact", "world, 3", "world")
+ARGUMENTS = tuple(
+    Argument(name, axes, optional=True, asked=True, written=True) for name, axes in zip(REPORTS, AXES, strict=True)
+)
+MOST_HEIGHTS = {"float32": 2**24, "float64": 2**31}  # points of a field whose numbers the dtype tells apart
+
+
+def check_step(dyn: Dynamics, call: Call, integrator: str, passes: Any, asked: dict[str, Any]) -> int | None:
+    """Return the number of passes, None without contacts; raise an error for what a step with contacts cannot do.
+
+    Args:
+        passes: as the caller gives it. asked: arrays of REPORTS by name; None where the caller gives none.
+    """
+    if not dyn.scene.contacts:
+        for name, value in (("passes", passes), *asked.items()):
+            if value is not None:
+                raise ValueError(f"{call.name}: {name} is given, and the scene has no contacts; expected None")
+        return None
+    if asked[RESIDUAL] is not None and not dyn.scene.contact_pairs:
+        raise ValueError(
+            f"{call.name}: {RESIDUAL} is given, and no bodies of the scene touch each other; expected None"
+        )
+    count = default_passes(dyn.scene) if passes is None else as_integer(passes)
+    if count is None or count < 1:
+        raise ValueError(f"{call.name}: passes is {passes!r}; expected an integer, 1 or more")
+    refuse(dyn, call, integrator)
+    reports = [name for name, value in asked.items() if value is not None]
+    if reports and dyn.scene.dof_count == 0:
+        what = f"{' and '.join(reports)} of a scene in which nothing can move"
+        raise UnsupportedError(call.name, what, "leave it out")
+    return count
+
+
+def refuse(dyn: Dynamics, call: Call, integrator: str) -> None:
+    """Raise UnsupportedError for a step with contacts that has no kernel."""
+    forced = dyn._options["granularity"]
+    if integrator != "semi_implicit":
+        raise UnsupportedError(call.name, f"integrator={integrator!r} with contacts", "use 'semi_implicit'")
+    if dyn.closed:
+        raise UnsupportedError(call.name, "closing loops in a scene with contacts", AMID_CONTACTS)
+    if forced == "node":
+        raise UnsupportedError(call.name, f"granularity={forced!r} with contacts", "use another one, or leave it out")
+    if forced == "segment" and dyn.scene.contact_pairs and not by_limbs(dyn.scene):
+        what = "granularity='segment' where pairs of bodies are not all on limbs of one link, or more than eight"
+        raise UnsupportedError(call.name, what, "leave it out")
+    if isinstance(dyn.scene.ground, HeightField) and dyn.scene.ground.heights.size >= MOST_HEIGHTS[dyn.dtype.__name__]:
+        way = "use dtype='float64', or a coarser field"
+        raise UnsupportedError(call.name, f"a HeightField of {dyn.scene.ground.heights.size} points in float32", way)
+
+
+def add_share(dyn: Dynamics, substep: int, count: int, now: wp.array, mean: wp.array) -> None:
+    """Launch ``mean`` += ``now`` / count, [world, contact, 3]; in the first substep ``mean`` holds nothing yet."""
+    flat = [array.reshape((dyn.worlds, 3 * array.shape[1])) for array in (now, mean)]
+    shares = [1.0 / count, flat[0], 1.0, flat[1]] if substep else [1.0 / count, flat[0], 0.0, flat[0]]
+    dyn.recursions.launch(combination.combine, flat[0].shape, shares, [flat[1]])
+
+
+def explain(dyn: Dynamics) -> str:
+    """Return a line on the scene's contacts."""
+    figures = contact_figures(dyn.scene)
+    if not dyn.scene.contacts:
+        return figures
+    routine = integrators.contact_routine(dyn)
+    form = "a thread computes a whole world"
+    if dyn.plan.of(routine) == "segment" and routine.divides(dyn.scene, ()):
+        held = dyn.programs.warps(routine) != 1  # 1: a kernel was built, and limbs found no room in it
+        form = "a warp for each limb" if held else f"{form}: what limbs tell each other does not fit in shared memory"
+    passes = f"{default_passes(dyn.scene)} passes of a step unless passes= says otherwise, none at node"
+    return f"{figures}; {passes}; {form}"

@@ -1,0 +1,147 @@
+"""The arrays of an environment, as torch tensors and as kernels see them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+
+from .memory_layout import Layout
+from .fused_kernel import CHOSEN, COLUMN, INT, LONG, ROW, SHARED, Buffer
+
+CONTACT_ARRAYS = {"contact_f": 3, "contact_gap": 1, "contact_slip": 1}  # entries of each point, and of each pair
+LINE = 32  # scalars of a line of the caches
+
+
+class Storage:
+    """The arrays of an environment.
+
+    Args:
+        layout: what the stages agreed on. worlds: number of worlds. device: torch device.
+        read: names of the arrays that stages read. results: entries of each result, in order.
+        apart: names of results that several kernels write, whose rows begin at whole lines of the caches.
+        tables: which all worlds share, besides those of the layout, by name.
+
+    Attributes:
+        tensors: by name. buffers: the same memory as kernels see it.
+        controls: tensors that actions set, by name. written: tensors that a step of the dynamics writes besides the
+            state, by name. values: the scene's values that events change [world, ...], by name.
+        out: all results, one after the other. places: (start, entries, distance of rows) of each result in it.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        worlds: int,
+        device: torch.device,
+        read: set[str],
+        results: list[tuple[str, int]],
+        apart: set[str],
+        tables: Mapping[str, torch.Tensor],
+    ):
+        self.worlds, self.device, self._output = worlds, device, layout.output
+        self.tensors: dict[str, torch.Tensor] = {}
+        self.buffers: dict[str, Buffer] = {}
+        self.controls: dict[str, torch.Tensor] = {}
+        self.written: dict[str, torch.Tensor] = {}
+        self.values: dict[str, torch.Tensor] = {}
+        self._add_state(layout)
+        self._add_controls(layout, read)
+        self._add_measured(layout, read)
+        self._add_numbers(layout, tables)
+        self._add_results(results, apart)
+
+    def part(self, out: torch.Tensor, name: str) -> torch.Tensor:
+        """Return a result in a copy of ``out`` [world, entries]."""
+        _, size, _ = self.places[name]
+        return self._rows(out, name)[:, :size]
+
+    def _rows(self, out: torch.Tensor, name: str) -> torch.Tensor:
+        start, _, pitch = self.places[name]
+        return out[start : start + self.worlds * pitch].view(self.worlds, pitch)
+
+    def changing(self) -> dict[str, torch.Tensor]:
+        """Return the tensors that steps change, by name; "out" holds all results."""
+        results = {self._output(name) for name in self.places}
+        own = {name for name, buffer in self.buffers.items() if buffer.way != SHARED} | {"key"}
+        return {name: x for name, x in self.tensors.items() if name in own - results} | {"out": self.out}
+
+    @property
+    def bytes_per_world(self) -> int:
+        """Bytes that a world takes, without what all worlds share."""
+        own = (buffer.tensor.nbytes for buffer in self.buffers.values() if buffer.way != SHARED)
+        return sum(own) // self.worlds
+
+    # -- inside ----------------------------------------------------------------------------------------------------
+    def _zeros(self, *shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        return torch.zeros(shape, dtype=dtype, device=self.device)
+
+    def _add(self, name: str, tensor: torch.Tensor, way: str = ROW) -> torch.Tensor:
+        self.tensors[name] = tensor
+        self.buffers[name] = Buffer(tensor.view(self.worlds, -1) if way == ROW else tensor, way)
+        return tensor
+
+    def _add_state(self, layout: Layout) -> None:
+        worlds, scene = self.worlds, layout.scene
+        default = torch.tensor(layout.default_q, dtype=torch.float32, device=self.device)
+        self._add("q", default.repeat(worlds, 1))
+        self._add("qd", self._zeros(worlds, scene.dof_count))
+        self._add("actions", self._zeros(worlds, layout.action_count))
+        self._add("memory", self._zeros(max(1, layout.memory_size), worlds), COLUMN)
+        self._add("tick", self._zeros(worlds, dtype=torch.int32), INT)
+        self._add("key", self._zeros(3, dtype=torch.int32), SHARED)
+        self._add("advance", self._zeros(1) + 1.0, SHARED)
+        self._add("episode_length", self._zeros(worlds, dtype=torch.int64), LONG)
+        self._add("chosen", self._zeros(worlds, dtype=torch.bool), CHOSEN)
+
+    def _add_controls(self, layout: Layout, read: set[str]) -> None:
+        scene = layout.scene
+        sizes = {"ctrl": len(scene.actuators), "tau": scene.dof_count, "target_q": scene.coord_count}
+        for name in sorted(layout.action_arrays):
+            self.controls[name] = self._add(name, self._zeros(self.worlds, sizes[name]))
+        if "target_q" in self.controls:
+            self.controls["target_q"].copy_(self.tensors["q"])
+        if "actuator_force" in read:
+            self._add("actuator_force", self._zeros(self.worlds, scene.dof_count))
+
+    def _add_measured(self, layout: Layout, read: set[str]) -> None:
+        """Add what the dynamics write: contacts, frames."""
+        worlds, points, frames = self.worlds, layout.scene.contact_count, len(layout.frames)
+        for name, each in CONTACT_ARRAYS.items():
+            if name in read:
+                shape = (worlds, points, 3) if each == 3 else (worlds, points)
+                self.written[name] = self._add(name, self._zeros(*shape))
+        if frames:
+            self._add("frame_pose", self._zeros(worlds, frames, 7))
+            self._add("frame_velocity", self._zeros(worlds, frames, 6))
+        if "frame_acceleration" in read:
+            self.written["qdd"] = self._zeros(worlds, layout.scene.dof_count)
+            self._add("frame_acceleration", self._zeros(worlds, frames, 6))
+
+    def _add_numbers(self, layout: Layout, tables: Mapping[str, torch.Tensor]) -> None:
+        """Add tables that all worlds share, values that events change, and what users compute in torch."""
+        for name, table in tables.items():
+            self._add(name, table.reshape(-1), SHARED)
+        for name, numbers in layout.tables.items():
+            flat = torch.tensor(np.asarray(numbers), dtype=torch.float32, device=self.device).reshape(-1)
+            self._add(name, flat, SHARED)
+        for name in layout.values:
+            own = torch.tensor(layout.scene.values[name][0], dtype=torch.float32, device=self.device)
+            self.values[name] = self._add(f"value_{name}", own.expand(self.worlds, *own.shape).contiguous())
+        if layout.users:
+            self._add("user", self._zeros(self.worlds, layout.user_size))
+
+    def _add_results(self, results: list[tuple[str, int]], apart: set[str]) -> None:
+        self.places: dict[str, tuple[int, int, int]] = {}
+        at = 0
+        for name, size in results:
+            pitch = -(-size // LINE) * LINE if name in apart else size
+            self.places[name] = at, size, pitch
+            at += -(-self.worlds * pitch // LINE) * LINE
+        self.out = self._zeros(at)
+        for name in self.places:
+            rows, held = self._rows(self.out, name), self._output(name)
+            whole = name == "done"
+            self._add(held, rows.view(-1).view(torch.int32) if whole else rows, INT if whole else ROW)
+            self.buffers[held] = self.buffers[held]._replace(passes=name in apart)

@@ -1,0 +1,100 @@
+"""The layout that the stages of an environment share while they are traced: memory, frames, values, counts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...scene.scene import Scene
+from .vectors import find
+
+
+class Layout:
+    """The arrangement of an environment's arrays.
+
+    Attributes:
+        memory: (start, size, value at a reset) of what worlds remember, by name. frames: that terms ask for.
+        action_arrays: that actions set: "ctrl", "target_q", "tau". biased: hinges whose encoders have a bias.
+        sensors: (size, value at a reset, function that keeps it) of memory that each step brings up to date, by name.
+        users: (stage, start) of the numbers of each user's term in torch.
+        drawn: functions that return memory that is drawn once, by name. observations: a number for each of those that
+            remember something.
+        tables: numbers that all worlds share, by their names in kernels. table_names: names that terms give them.
+        weights: of rewards.
+        values: names of the scene's values that differ between worlds.
+        outputs: names under which kernels write results ("reward", a group of observations, ...), by result.
+    """
+
+    def __init__(self, scene: Scene, default_q: np.ndarray, step_dt: float, commands: Any, values: tuple[str, ...]):
+        self.scene, self.default_q, self.step_dt, self.commands, self.values = (
+            scene,
+            default_q,
+            step_dt,
+            commands,
+            values,
+        )
+        self.action_count = 0
+        self.action_arrays: set[str] = set()
+        self.biased: list[int] = []
+        self.memory: dict[str, tuple[int, int, float | None]] = {}
+        self.memory_size = 0
+        self.frames: list[Any] = []
+        self.drawn: dict[str, Any] = {}
+        self.observations: dict[Any, int] = {}
+        self.tables: dict[str, np.ndarray] = {}
+        self.table_names: list[str] = []
+        self.weights: dict[str, float] = {}
+        self.users: dict[Any, tuple[str, int]] = {}
+        self.user_size = 0
+        self.sensors: dict[str, tuple[int, float | None, Any]] = {}
+        self.outputs: dict[str, str] = {}
+
+    def remember(self, name: str, size: int, reset: float | None) -> int:
+        """Return where ``size`` numbers of this name are in the memory."""
+        if name not in self.memory:
+            self.memory[name] = self.memory_size, size, reset
+            self.memory_size += size
+        start, *known = self.memory[name]
+        if known != [size, reset]:
+            raise ValueError(
+                f"World.memory: {name!r} has {known[0]} numbers, which a reset sets to {known[1]}; a term asks for "
+                f"{size}, set to {reset}; expected the same in all terms"
+            )
+        return start
+
+    def output(self, result: str) -> str:
+        """Return the name under which kernels write a result: its number, so that no user's name reaches a compiler."""
+        return self.outputs.setdefault(result, f"out_{len(self.outputs)}")
+
+    def table(self, name: str, numbers: np.ndarray) -> str:
+        """Return the name under which kernels read a table."""
+        numbers = np.asarray(numbers, dtype=np.float64)
+        held = next((f"table_{i}" for i, known in enumerate(self.table_names) if known == name), "")
+        if not held:
+            self.table_names.append(name)
+            held = f"table_{len(self.table_names) - 1}"
+        if not np.array_equal(self.tables.setdefault(held, numbers), numbers):
+            raise ValueError(
+                f"World.table: {name!r} is the name of two tables with different numbers; expected another"
+            )
+        return held
+
+    def user(self, term: Any, stage: str) -> int:
+        """Return where the numbers of a user's term in torch are that a stage reads."""
+        place, start = self.users.setdefault(term, (stage, self.user_size))
+        if place != stage:
+            raise ValueError(
+                f"Env: the term {term.name} is read by {place} and {stage}; expected two TorchTerm objects"
+            )
+        if start == self.user_size:
+            self.user_size += term.size
+        return start
+
+    def frame(self, name: Any) -> int:
+        """Return the number of a frame among those that terms ask for."""
+        if isinstance(name, str) and name not in self.scene.sites:
+            (name,) = find("Env", "site or body", self.scene.body_labels, name)[:1]
+        if name not in self.frames:
+            self.frames.append(name)
+        return self.frames.index(name)

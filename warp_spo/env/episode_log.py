@@ -1,0 +1,87 @@
+"""Logs of an environment: means over finished episodes, counts of bad numbers, and the parts of a step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from ..errors import shown
+from .compile.memory_layout import Layout
+from .compile.fused_kernel import Launch
+from .compile.step_kernels import CAUSES
+
+if TYPE_CHECKING:
+    from .environment import Env
+
+
+class Log:
+    """Reads the worlds' memory, without waiting for the device.
+
+    Means are over the worlds' last finished episodes, zero where there are none. "/episode/finished" is the number of
+    worlds that have finished one, "/episode/whole" of those whose length counts: not where ``episode_length_buf`` was
+    written. "/not finite/" counts actions, states and rewards that were not.
+
+    Args:
+        layout: where the memory is. rewards, ends: names. device: of the memory. worlds: their number.
+    """
+
+    def __init__(self, layout: Layout, rewards: list[str], ends: list[str], device: torch.device, worlds: int):
+        means = {f"/reward/{name}": f"last reward {name}" for name in rewards}
+        means |= {f"/termination/{name}": f"last end {name}" for name in ends}
+        means["/episode/seconds"] = "last seconds"
+        counts = {f"/not finite/{cause}": f"bad {cause}" for cause in CAUSES}
+        self._names = [*means, *counts, "/episode/finished", "/episode/whole"]
+        self._means, self._counts, self._episodes = (
+            torch.tensor([layout.memory[name][0] for name in names], device=device)
+            for names in (means.values(), counts.values(), ["episodes"])
+        )
+        self._cut = torch.zeros(worlds, device=device)  # number of a world's episode whose age was written; 0: none
+
+    def write_ages(self, memory: torch.Tensor, written: torch.Tensor) -> None:
+        """Leave the lengths of the episodes that now go on where ``written`` [world] holds out of the report."""
+        self._cut = torch.where(written, memory[self._episodes][0] + 1.0, self._cut)
+
+    def __call__(self, memory: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return the report for the memory [number, world]."""
+        episodes = memory[self._episodes][0]
+        finished = (episodes > 0).float()
+        whole = finished * (episodes != self._cut)
+        rows = memory[self._means]  # the last one is of lengths
+        means = [*(rows[:-1] @ share(finished)).unbind(), rows[-1] @ share(whole)]
+        found = [*means, *memory[self._counts].sum(dim=1).unbind(), finished.sum(), whole.sum()]
+        return dict(zip(self._names, found, strict=True))
+
+
+def share(counted: torch.Tensor) -> torch.Tensor:
+    """Return the weight of each world in a mean over those that count [world]; zeros where none does."""
+    return counted / counted.sum().clamp(min=1.0)
+
+
+def describe(env: Env) -> str:
+    """Return the size of an environment in a line."""
+    groups = ", ".join(f"{shown(name)} {size}" for name, size in env.num_obs.items())
+    return f"Env({env.num_envs} worlds on {env.warp_device}, {env.num_actions} actions, observations: {groups})"
+
+
+def explain(env: Env, stages: dict[str, list[Launch]], users: dict[Any, tuple[str, int]]) -> str:
+    """Return what a step consists of, and what it takes in memory.
+
+    Args:
+        env: the environment. stages: its kernels, by stage. users: terms in torch, with the stage that reads them.
+    """
+    lines = [
+        f"{env.num_envs} worlds on {env.warp_device}, {env.decimation} steps of {env.dt:g} s a step, "
+        f"{env.max_episode_length} steps an episode",
+        f"actions      {env.num_actions}: {', '.join(map(shown, env.action_labels))}",
+        f"observations {', '.join(f'{shown(name)} {size}' for name, size in env.num_obs.items())}",
+        f"rewards      {', '.join(map(shown, env.reward_names))}",
+        f"ends         {', '.join(map(shown, env.termination_names))}, after {env.max_episode_length} steps",
+        f"variable     {', '.join(env.values) or 'nothing'}",
+        f"memory       {env.bytes_per_world} bytes a world",
+    ]
+    kernels = [(name, kernel) for name, some in stages.items() for kernel in some]
+    parts = [f"{each.threads} threads a world, each" if each.threads else "a world," for _, each in kernels]
+    lines += [f"{name:12} {part} {one.operations} operations" for (name, one), part in zip(kernels, parts, strict=True)]
+    lines += [f"in torch     {shown(term.name)}, before {place}" for term, (place, _) in users.items()]
+    return "\n".join(lines)

@@ -1,0 +1,287 @@
+"""Programs at segment granularity: a block computes 32 worlds, a warp one limb of each.
+
+Limbs of equal structure run one text, in which what differs is read from a table. Without room for what limbs tell each
+other, or with pairs of bodies that one node holds, one thread can run the work of all limbs (``alone``).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import warp as wp
+
+from ...kernels import coupling_teams
+from ...kernels.elementary import C_TYPE
+from ...kernels.long_results import WARP_SIZE
+from ...kernels.straight_line import DIRECT, KernelLayout
+from ...recursions.model import shared_constants as alike, messages
+from ...recursions.contact import pair_pieces
+from ...recursions.contact.couples import Team as Couplings
+from ...recursions.contact.points import own_points
+from ...recursions.contact.secant_laws import SECANT
+from ...recursions.model.messages import INWARD, OUTWARD
+from ...recursions.model.segments import PARTS, Piece, Pieces
+from ...recursions.step.step import FORCE, GAIN, GUESS, MISSED, RESISTANCE
+from ...recursions.model.tracing import Trace
+from ...trace.emission import Emitter, Store, under
+from ...trace.scalars import Scalar, Value, is_literal, negative, ordered
+from ...trace.register_spilling import set_aside
+from .. import staging
+from ..array_access import make_emitter
+from ..builder import Builder, Job, Program, flatten
+from ..device_facts import RESERVED
+from .warp_specialized import HELD, Passes, Team, Work
+
+MOST_REGISTERS = 255  # of a thread
+BODIES = "bodies"  # option of a step by limbs whose kernel writes the states of bodies, too
+
+
+class Traced(NamedTuple):
+    """The stores of the work on one piece.
+
+    Attributes:
+        stores: what its trace returns.
+        begin: what it stores and sends before the passes. held: what it computes once before them.
+        laws, checks, news, rounds, couples, carried: as of a :class:`~warp_spo.recursions.model.tracing.Trace`.
+        numbers: its constants, where they may be kept from folding.
+    """
+
+    stores: list[Store]
+    begin: list[Store]
+    held: list[Scalar]
+    laws: list[list[Store]]
+    checks: list[list[Store]]
+    news: list[Store]
+    rounds: list[list[Store]]
+    couples: list[tuple[int, list[Store]]]
+    carried: list[Value]
+    numbers: alike.Numbers | None
+
+    @property
+    def everything(self) -> list[Store]:
+        """All stores of a piece."""
+        turns = (*self.laws, *self.checks, *self.rounds, *(items for _, items in self.couples))
+        return [*self.begin, *self.stores, *self.news, *(item for turn in turns for item in turn)]
+
+
+class Gathered(NamedTuple):
+    """The work of all pieces before it is one text.
+
+    Attributes:
+        table: which value each entry of the result receives, if a table says so. sent: how many scalars pieces send.
+        looks_up: some piece reads heights. couples: the pairs of bodies. numbers: the constants of each piece.
+    """
+
+    team: Team
+    layout: KernelLayout
+    table: list[int] | None
+    sent: int
+    looks_up: bool
+    couples: Couplings | None
+    numbers: list[alike.Numbers]
+
+
+def build(builder: Builder, job: Job, pieces: Pieces, alone: bool = False, local: bool = False) -> Program | None:
+    """Return the program in which limbs share the work, None if there is no room.
+
+    Args:
+        builder: the parts that all programs share.
+        job: what the program computes.
+        pieces: the limbs.
+        alone: one thread takes them all. local: it keeps what they tell each other in memory of its own.
+    """
+    return _Limbs(builder, job, pieces, alone, local).build()
+
+
+class _Limbs:
+    """The work of limbs on a job; arguments as of :func:`build`."""
+
+    def __init__(self, builder: Builder, job: Job, pieces: Pieces, alone: bool, local: bool):
+        self.builder, self.job, self.pieces, self.alone, self.local = builder, job, pieces, alone, local
+        self.run, self.plan, self.dtype = builder.run, builder.plan, builder.dtype
+        self.letters = messages.needed(job.routine.letters, job.shapes)
+        self.slots, self.sent = messages.slots(self.letters, pieces)
+        self.couples = self._couples() if job.routine.couples else None
+        self.sent = self.couples.layout["end"] if self.couples is not None else self.sent
+        self.unfolds = not job.routine.couples  # constants in which limbs differ may be kept from folding
+
+    def build(self) -> Program | None:
+        """Return the program; of two, with constants that fold and with some that do not, that with fewer texts."""
+        found = self._gather([frozenset()] * len(self.pieces.pieces))
+        if found is not None and self.unfolds:
+            apart = alike.differing(self.pieces.pieces, found.numbers, found.team.texts)
+            other = self._gather(apart) if any(apart) else None
+            if other is not None and len(set(other.team.texts)) < len(set(found.team.texts)):
+                found = other
+        return None if found is None else self._finish(found)
+
+    def _couples(self) -> Couplings:
+        """Return the pairs of bodies as a team couples them; their values follow those of messages."""
+        links = self.builder.links
+        seats = pair_pieces.seats_of(links, pieces := Pieces(links))
+        alpha = -1 if seats is None or seats.base is None else self.slots["a", seats.base.index]
+        return pair_pieces.team(links, pieces, alpha, self.sent)
+
+    # -- the work of each piece ------------------------------------------------------------------------------------
+    def _trace(self, index: int, unfolded: frozenset) -> Traced:
+        """Return what the work on a piece stores; the constants ``unfolded`` do not fold, see :mod:`.alike`."""
+        shapes, options = self.job.shapes, self.job.options
+        links = self.builder.own_links(options, self.unfolds)  # its own: pieces of equal structure then give equal text
+        slot = lambda letter, piece: self.slots[letter, piece.index]  # noqa: E731
+        trace = Trace(links, self.dtype, tuple(shapes), Pieces(links).pieces[index], slot)
+        trace.team = self.couples
+        if self.unfolds and trace.piece is not None:
+            points = [number for number, _ in own_points(trace)]
+            links.numbers = alike.Numbers(links.graph, trace.piece, points, unfolded)
+
+        def flat(items: list[Store]) -> list[Store]:
+            return [flatten(item, shapes) for item in items]
+
+        stores = flat(self.job.routine.trace(trace, **options))
+        found = Traced(
+            stores=stores,
+            begin=trace.begin,
+            held=trace.ahead,
+            laws=trace.laws,
+            checks=trace.checks,
+            news=flat(trace.news),
+            rounds=[flat(turn) for turn in trace.rounds],
+            couples=trace.couples,
+            carried=trace.carried,
+            numbers=links.numbers if self.unfolds else None,
+        )
+        return found._replace(held=_read(found.held, [*found.everything][len(found.begin) :]))
+
+    def _gather(self, unfolded: list[frozenset]) -> Gathered | None:
+        """Return the work of all pieces, None if there is no room; ``unfolded``: by piece, see :meth:`_trace`."""
+        job, pieces = self.job, self.pieces
+        routine = job.routine
+        traced = [self._trace(index, unfolded[index]) for index in range(len(pieces.pieces))]
+        everything = [item for one in traced for item in one.everything]
+        bends = any(item.array == MISSED for item in everything)
+        if not (bends or routine.counted):
+            traced = [one._replace(held=[]) for one in traced]
+        passes = self._passes(traced, bends)
+        sent = self.sent + (2 * pieces.warps if bends else 0)
+        whole = [item for item in everything if item.array == "out"]
+        warps = 1 if self.alone else pieces.warps
+        layout = self.builder.layout(job, whole, everything, 0 if self.local else sent, warps)
+        if not self._fits(layout):
+            return None
+        declared = "" if self.couples is None else coupling_teams.declare(self.couples, self.run.dtype, self.local)
+        team = Team(pieces, self.dtype, passes, declared)
+        outs = [[item for item in one.stores if item.array == "out"] for one in traced]
+        placed, table = staging.arrange_stores(whole, layout.result)
+        outs[0] += placed[len(whole) :] if table is None else []  # zeros
+        looks_up = False
+        for piece, one, items in zip(pieces.pieces, traced, outs, strict=True):
+            looks_up |= self._add_work(team, layout, table, piece, one, items)
+        numbers = [one.numbers for one in traced if one.numbers is not None]
+        return Gathered(team, layout, table, sent, looks_up, self.couples, numbers)
+
+    def _passes(self, traced: list[Traced], bends: bool) -> Passes | None:
+        """Return how the work is repeated; ``bends``: guesses of a pass may turn out wrong."""
+        sizes = {index: len(one.held) for index, one in enumerate(traced)}
+        if self.job.routine.counted:
+            counts = [sum(item.array == SECANT for item in one.begin) for one in traced]
+            return Passes((GAIN,), None, sizes, dict(enumerate(counts)))
+        if not self.job.routine.passes:
+            return None
+        kept = (GUESS, GAIN, FORCE, RESISTANCE) if any(one.laws for one in traced) else (GUESS, GAIN)
+        return Passes(kept, self.sent if bends else None, sizes)
+
+    def _fits(self, layout: KernelLayout) -> bool:
+        """Whether shared memory has room for the result, for messages of limbs, and for the states of bodies.
+
+        The result without room matters more than a thread a limb; another kernel then writes the states of bodies.
+        """
+        routine, options = self.job.routine, self.job.options
+        if layout.result.way == DIRECT and layout.result.array.entries > staging.LONG_ROW:
+            return False
+        if not layout.fits(self.run.dtype, self.builder.room(routine.wide, routine.couples, BODIES in options)):
+            return False
+        return not options.get(BODIES) or bool(layout.further_staged)
+
+    def _add_work(
+        self, team: Team, layout: KernelLayout, table: list[int] | None, piece: Piece, one: Traced, outs: list[Store]
+    ) -> bool:
+        """Add the statements of a piece to the team, ``outs`` of its stores; return whether it reads heights."""
+        routine, shapes, more, _ = self.job
+
+        def emitter() -> Emitter:
+            return make_emitter(self.dtype, shapes, layout, True)
+
+        def by_slot(found: list[Store]) -> list[Store]:
+            return found if table is None else staging.stores_by_slot(found, table)
+
+        first, sweeps, ruling, checking = (emitter() for _ in range(4))
+        later = emitter() if team.passes else sweeps
+        ahead = first.region([*one.begin, *(Store(HELD, (at,), value) for at, value in enumerate(one.held))])
+        sweeps.keep(HELD, one.held)
+        if routine.counted:
+            later.keep(HELD, one.held)  # other pieces may have written over what these come from
+        inward = [item for item in one.stores if item.array == INWARD]
+        outward = [item for item in one.stores if item.array == OUTWARD]
+        last = outward if set(self.letters) & set(messages.OUTWARD_LETTERS) else inward
+        last += by_slot(outs)
+        last += [item for item in one.stores if item.array in (*more, GAIN, SECANT)]
+        sweep = sweeps.region(inward, one.carried)
+        couples = [under(sweeps.branch(items), "SENT({}) > 0", INWARD, flag) for flag, items in one.couples]
+        back = sweeps.region(outward)
+        ends = [item for item in one.news if item.array == "out"]
+        news = later.branch([item for item in one.news if item.array != "out"] + by_slot(ends))
+        rounds = [later.branch(by_slot(turn)) for turn in one.rounds]
+        laws, checks = [ruling.branch(turn) for turn in one.laws], [checking.branch(turn) for turn in one.checks]
+        emitters = {first, sweeps, later, ruling, checking}
+        work = Work(piece, sweep, back, laws, checks, news, rounds, ahead, couples)
+        team.add(work, sum(each.operations for each in emitters))
+        return any(each.counts["lookup"] for each in emitters)
+
+    # -- from the work to a kernel ---------------------------------------------------------------------------------
+    def _finish(self, found: Gathered) -> Program:
+        """Return the program of gathered work."""
+        team, layout, table, sent, looks_up, couples, _ = found
+        routine, T = self.job.routine, self.run.dtype
+        cpu = team.cpu()
+        if self.local:
+            cpu = f"{C_TYPE[T]} sent[{sent}];\n#undef SENT\n#define SENT(i) sent[i]\n{cpu}"
+        cuda = cpu if self.alone else team.cuda()  # fills the tables
+        registers = self._registers(layout)
+        if places := self.plan.places_aside(
+            routine, layout.shared_bytes(T), wp.types.type_size_in_bytes(T), layout.warps
+        ):
+            layout, registers = layout._replace(aside=places), routine.aside
+            cuda = set_aside(cuda, C_TYPE[T], places)
+        lists = {"place": table, "table": team.shared.table, "shifts": team.shared.shifts}
+        tables = {name: values for name, values in lists.items() if values} | self.builder.height_tables(looks_up)
+        if couples is not None:
+            tables |= self.builder.touch_tables(couples.points)
+        cap = registers if registers < MOST_REGISTERS else None
+        return self.builder.finish(routine, layout, cuda, cpu, tables, team.shared.operations, cap)
+
+    def _registers(self, layout: KernelLayout) -> int:
+        """Return how many registers a thread may take, so that a multiprocessor holds as many blocks as help."""
+        warps = 1 if self.alone else self.pieces.warps
+        if self.dtype == "float32" and not self.plan.few:
+            for blocks, enough in self.job.routine.occupancy:
+                fewer = self._shared_registers(blocks * self.pieces.warps)
+                room = blocks * (layout.shared_bytes(self.run.dtype) + RESERVED) <= self.plan.device.shared_bytes
+                if fewer >= enough and room:
+                    return fewer
+        return self._shared_registers(warps)
+
+    def _shared_registers(self, warps: int) -> int:
+        """Of a thread, if a multiprocessor is to hold so many warps: its parts share them, each with its registers."""
+        return self.plan.device.registers // PARTS // (WARP_SIZE * -(-warps // PARTS)) // 8 * 8
+
+
+def _read(values: list[Value], stores: list[Store]) -> list[Scalar]:
+    """Return what ``stores`` read of values that are computed once: of a - b perhaps b - a, of -a what it negates."""
+    needed = {x.key for x in ordered(item.value for item in stores)}
+    found: dict[tuple, Scalar] = {}
+    for value in (x for x in values if not is_literal(x)):
+        for either in (value, negative(value)):
+            x = either.args[0] if either.op == "neg" else either
+            if x.key in needed and x.op != "input":
+                found[x.key] = x
+    return [*found.values()]

@@ -1,0 +1,136 @@
+"""Collision shapes of a MuJoCo model, and the friction that MuJoCo gives them on the ground."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from ..scene.contacts import HeightField
+from ..scene.collision_shapes import Shape
+from .mechanism import xyzw
+from .source import Source
+
+GEOMS = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")): name.lower() for name in (
+    "PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH", "SDF")}  # fmt: skip
+"""MuJoCo's kinds by number."""
+Pairs = dict[frozenset[int], int]  # number of an explicit pair by its two geoms
+KINDS = {"mesh": "hull", "hfield": "height field"}
+
+
+def collision_shapes(source: Source, moving: np.ndarray) -> list[Shape]:
+    """Return the collision shapes of a model, those that explicit pairs name included.
+
+    ``moving`` says which bodies of the scene can move, bool [body]; body k of it is body k + 1 of the model.
+
+    A shape that moves has the friction that it has on the model's ground, if there is one: by the rule of MuJoCo for
+    priorities, and zero where the contact has one dimension. Its rounding is the margin of the contact, the sum of both
+    geoms' or that of their pair, because MuJoCo pushes two surfaces apart until they are so far from each other.
+    """
+    m = source.model
+    pairs = _pairs(source)
+    solid = {int(geom) for geom in np.flatnonzero(m.geom_contype | m.geom_conaffinity)}
+    solid |= {geom for pair in pairs for geom in pair}
+    still = lambda geom: m.geom_bodyid[geom] == 0 or not moving[m.geom_bodyid[geom] - 1]  # noqa: E731
+    grounds = [geom for geom in sorted(solid) if still(geom) and _name(m, geom) in ("plane", "hfield")]
+    found = []
+    for geom in sorted(solid):
+        touched = [ground for ground in grounds if _touches(source, geom, ground, pairs)]
+        if grounds and not still(geom) and not touched:
+            continue  # it collides with other things than the ground
+        if still(geom):
+            found.append(_shape(source, geom, None, 0.0))
+            continue
+        ground = touched[0] if touched else None
+        friction = _friction(source, geom, ground, pairs)
+        found.append(_shape(source, geom, friction, _margin(source, geom, ground, pairs)))
+    return found
+
+
+def _name(m: Any, geom: int) -> str:
+    return GEOMS.get(int(m.geom_type[geom]), f"geom of type {int(m.geom_type[geom])}")
+
+
+def _pairs(source: Source) -> Pairs:
+    """Return the explicit pairs of geoms: number of the pair by its geoms."""
+    m = source.model
+    return {frozenset((int(m.pair_geom1[i]), int(m.pair_geom2[i]))): i for i in range(m.npair)}
+
+
+def _touches(source: Source, geom: int, ground: int, pairs: Pairs) -> bool:
+    """Whether MuJoCo makes contacts of a geom with a geom of the world: by masks or by a pair, unless excluded."""
+    m = source.model
+    if frozenset((geom, ground)) in pairs:
+        return True
+    body, other = sorted((int(m.geom_bodyid[geom]), int(m.geom_bodyid[ground])))
+    if (body << 16) + other in m.exclude_signature.tolist() or (other << 16) + body in m.exclude_signature.tolist():
+        return False
+    return bool(m.geom_contype[geom] & m.geom_conaffinity[ground] | m.geom_contype[ground] & m.geom_conaffinity[geom])
+
+
+def _friction(source: Source, geom: int, ground: int | None, pairs: Pairs) -> float:
+    """Return the sliding friction of a geom on a ground, its own without one."""
+    m = source.model
+    pair = None if ground is None else pairs.get(frozenset((geom, ground)))
+    if pair is not None:
+        (value, across), dimensions = m.pair_friction[pair, :2], m.pair_dim[pair]
+        if dimensions > 1 and across != value:
+            words = f"the friction {across:g} across of a contact pair of {source.words('geom', geom)}"
+            source.left_out.append(f"{words}, which has {value:g} in all directions")
+    else:
+        both = [geom] if ground is None else [geom, ground]
+        priority = max(m.geom_priority[g] for g in both)
+        both = [g for g in both if m.geom_priority[g] == priority]
+        value, dimensions = (max(values[g] for g in both) for values in (m.geom_friction[:, 0], m.geom_condim))
+    if source.enabled("OVERRIDE"):
+        value = m.opt.o_friction[0]
+    return float(value) if dimensions > 1 else 0.0
+
+
+def _margin(source: Source, geom: int, ground: int | None, pairs: Pairs) -> float:
+    """Return how far apart MuJoCo keeps the surfaces of a geom and a ground [m]; of the geom alone without one."""
+    m = source.model
+    if source.enabled("OVERRIDE"):
+        return float(m.opt.o_margin)
+    pair = None if ground is None else pairs.get(frozenset((geom, ground)))
+    if pair is not None:
+        return float(m.pair_margin[pair])
+    return float(sum(m.geom_margin[g] for g in (geom, ground) if g is not None))
+
+
+def _shape(source: Source, geom: int, friction: float | None, margin: float) -> Shape:
+    m, kind = source.model, source.missing.get(geom) or _name(source.model, geom)
+    names: tuple[str, ...] = ()
+    if kind in ("mesh", "hfield"):
+        names = (source.name(kind, int(m.geom_dataid[geom])),)
+    return Shape(
+        source.name("geom", geom) or (names[0] if names else ""),
+        int(m.geom_bodyid[geom]) - 1,
+        KINDS.get(kind, kind),
+        np.concatenate([m.geom_pos[geom], xyzw(m.geom_quat[geom])]),
+        () if geom in source.missing else _sizes(m, geom, kind),
+        rounding=margin,
+        friction=friction,
+        names=names,
+    )
+
+
+def _sizes(m: Any, geom: int, kind: str) -> Any:
+    size, data = np.array(m.geom_size[geom]), int(m.geom_dataid[geom])
+    if kind == "mesh":
+        first = int(m.mesh_vertadr[data])
+        return np.array(m.mesh_vert[first : first + int(m.mesh_vertnum[data])], dtype=np.float64)
+    if kind == "hfield":
+        return _field(m, data)
+    return size[: {"sphere": 1, "capsule": 2, "cylinder": 2}.get(kind, 3)]
+
+
+def _field(m: Any, number: int) -> HeightField:
+    """Return a height field about its geom: rows of MuJoCo's data go along y."""
+    rows, columns = int(m.hfield_nrow[number]), int(m.hfield_ncol[number])
+    first = int(m.hfield_adr[number])
+    half_x, half_y, top, _ = (float(x) for x in m.hfield_size[number])
+    data = np.array(m.hfield_data[first : first + rows * columns], dtype=np.float64).reshape(rows, columns)
+    cells = 2.0 * half_x / (columns - 1), 2.0 * half_y / (rows - 1)
+    return HeightField(top * data.T, cells, (-half_x, -half_y))

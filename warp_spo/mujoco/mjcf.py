@@ -1,0 +1,115 @@
+"""Scenes from MJCF files, compiled by MuJoCo."""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+from ..scene.scene import Scene
+from ..scene.collision_shapes import NONE, Choice
+from .model import scene_of
+from .source import Source
+
+
+def read_mjcf(file: Path, floating: bool | None, repair: bool = True, choice: Choice = NONE) -> Scene:
+    """Return the scene of an MJCF file; see :func:`warp_spo.load`. ``repair`` changes nothing: MuJoCo repairs nothing.
+
+    Raises:
+        ET.ParseError: the file is not XML.
+        ValueError: the file is not MJCF, or MuJoCo refuses it; the message holds MuJoCo's.
+        UnsupportedError: as :func:`from_mujoco`; the message names the file, too.
+    """
+    tag = ET.parse(file).getroot().tag
+    if tag != "mujoco":
+        raise ValueError(
+            f"load: {str(file)!r} holds <{tag}>; expected <mujoco>; if it is URDF, let its name end in .urdf"
+        )
+    model, dropped, missing = compiled(file)
+    source = Source(model, "load", str(file), missing)
+    source.left_out += dropped
+    return scene_of(source, floating, choice)
+
+
+def compiled(file: Path) -> tuple[mujoco.MjModel, list[str], dict[int, str]]:
+    """Return MuJoCo's model of a file, in words what had to be dropped from it, and by geom what cannot be read of it.
+
+    A file that MuJoCo refuses is compiled again without sensors, skins and textures, and without the meshes and height
+    fields that give no body its mass, at last without contact pairs: a scene needs none of them, and files are often
+    without them.
+    """
+    try:
+        return mujoco.MjModel.from_xml_path(os.fspath(file)), [], {}
+    except ValueError as error:
+        refusal = _one_line(error)
+    for unneeded in (UNNEEDED, (*UNNEEDED, *OF_CONTACT)):
+        try:
+            spec = mujoco.MjSpec.from_file(os.fspath(file))
+            dropped, shapeless = _drop(spec, unneeded)
+            model = spec.compile()
+        except ValueError as error:
+            last = error
+            continue
+        missing = {int(geom.id): kind for geom, kind in shapeless}
+        return model, [f"{', '.join(dropped)}, with which MuJoCo refuses the file ({refusal})"], missing
+    raise ValueError(f"load: {str(file)!r}: MuJoCo refuses it: {_one_line(last)}; correct the file") from None
+
+
+UNNEEDED, OF_CONTACT = ("sensors", "skins", "tuples"), ("pairs", "excludes")
+
+
+def _drop(spec: Any, unneeded: tuple[str, ...]) -> tuple[list[str], list[tuple[Any, str]]]:
+    """Take from a specification what changes no mass and no joint.
+
+    Returns:
+        In words what it was; and the geoms that lost their shape, with what it was.
+    """
+    dropped = []
+    for name in unneeded:
+        elements = list(getattr(spec, name))
+        for element in elements:
+            spec.delete(element)
+        dropped += [f"{len(elements)} {name}"] if elements else []
+    for texture in spec.textures:
+        texture.file, texture.cubefiles = "", [""] * 6
+        texture.builtin, texture.width, texture.height = mujoco.mjtBuiltin.mjBUILTIN_FLAT, 1, 1
+        texture.nchannel = 3
+    shapeless = []
+    for geom in spec.geoms:
+        if (geom.meshname or geom.hfieldname) and _gives_no_mass(spec, geom):
+            shapeless.append((geom, f"{'mesh' if geom.meshname else 'height field'} that MuJoCo cannot read"))
+            geom.type, geom.size = mujoco.mjtGeom.mjGEOM_SPHERE, [1e-3, 0.0, 0.0]
+            geom.meshname = geom.hfieldname = ""
+            geom.mass = 0.0
+    dropped += [f"the meshes and height fields of {len(shapeless)} geoms"] if shapeless else []
+    used = {name for geom in spec.geoms for name in (geom.meshname, geom.hfieldname)}
+    for asset in [*spec.meshes, *spec.hfields]:
+        if (asset.name or Path(asset.file).stem) not in used:  # MuJoCo's rule for the name of an asset without one
+            spec.delete(asset)
+    return dropped, shapeless
+
+
+def _gives_no_mass(spec: Any, geom: Any) -> bool:
+    """Whether a geom changes no body that can move: its body stands still, has an <inertial>, or takes none from it."""
+    always, never = (
+        spec.compiler.inertiafromgeom == getattr(mujoco.mjtInertiaFromGeom, f"mjINERTIAFROMGEOM_{name}")
+        for name in ("TRUE", "FALSE")
+    )
+    first, last = spec.compiler.inertiagrouprange
+    if never or 0.0 in (geom.mass, geom.density) or not first <= geom.group <= last:
+        return True
+    body = geom.parent
+    if body.explicitinertial and not always:
+        return True
+    while body.name != "world":  # whose parent is None in MuJoCo 4 and no body at all in 3.11
+        if body.joints:
+            return False
+        body = body.parent
+    return True
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

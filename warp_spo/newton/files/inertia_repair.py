@@ -1,0 +1,57 @@
+"""Masses and inertias that no rigid body can have, and the values that take their place.
+
+The rule is that of Newton's ``finalize``, in float64 and with the names of the bodies. A negative mass becomes zero,
+and a massless body has no inertia. All principal moments grow by the same amount until the least is positive, and
+again until none exceeds the sum of the other two.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..worlds import quote_labels
+
+LEAST_SHARE = 1e-6  # least principal moment as a share of the largest; Newton's figure, as are all below
+LEAST = 1e-10  # least principal moment [kg m^2]; also the excess over the triangle inequality that counts as rounding
+ADDED = 1e-6  # what a replaced inertia gets beyond the least that it needs [kg m^2]
+ROUNDING = 1.2e-7  # relative excess over the triangle inequality that counts as rounding
+
+
+def repaired(mass: float, inertia: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return a body's mass [kg] and inertia [kg m^2, 3 x 3], replaced if no rigid body can have them."""
+    if not (np.isfinite(mass) and np.isfinite(inertia).all() and mass > 0.0):
+        return 0.0, np.zeros((3, 3))
+    moments = np.linalg.eigvalsh(0.5 * (inertia + inertia.T))
+    least = max(LEAST_SHARE * moments[2], LEAST)
+    growth = least - moments[0] + ADDED if moments[0] < least else 0.0
+    low, middle, high = moments + growth
+    if low + middle < high - max(ROUNDING * high, LEAST):
+        growth += high - low - middle + ADDED
+    return mass, 0.5 * (inertia + inertia.T) + growth * np.eye(3) if growth else inertia
+
+
+def repair_bodies(
+    labels: Sequence[str], masses: Sequence[float], inertias: Sequence[np.ndarray], depth: int
+) -> tuple[list[float], list[np.ndarray]]:
+    """Return the masses and inertias of bodies, repaired. A warning names the bodies whose values were replaced.
+
+    ``depth`` is the number of calls from the user's to this one; the warning names the user's line.
+    """
+    values = [repaired(mass, inertia) for mass, inertia in zip(masses, inertias, strict=True)]
+    replaced = [
+        label
+        for label, mass, inertia, (new_mass, new_inertia) in zip(labels, masses, inertias, values, strict=True)
+        if mass != new_mass or not np.array_equal(inertia, new_inertia)
+    ]
+    if replaced:
+        warnings.warn(
+            f"load: replaced the mass or inertia of {quote_labels(replaced)}: the file's values are those of no rigid "
+            "body (negative, a mass without inertia or an inertia without mass, or one principal moment exceeds the "
+            "sum of the others); correct the file, or keep its values with load(path, repair=False)",
+            UserWarning,
+            stacklevel=depth + 1,
+        )
+    return [mass for mass, _ in values], [inertia for _, inertia in values]

@@ -1,0 +1,143 @@
+"""Scenes from robot files, by their format, and the files that come with Newton."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from xml.etree.ElementTree import ParseError
+
+import newton
+
+from ...scene.contacts import HeightField, Plane
+from ...scene.scene import Scene
+from ...scene.collision_shapes import POINTS, Choice
+from ..mjcf import read_mjcf
+from .urdf import read_urdf
+from .usd import read_usd
+
+FORMATS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf"} | dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "usd")
+"""Format by suffix in lower case."""
+
+
+SHIPPED = {
+    "humanoid": "nv_humanoid.xml",
+    "ant": "nv_ant.xml",
+    "quadruped": "quadruped.urdf",
+    "cartpole": "cartpole.urdf",
+}
+
+
+def shipped(name: str) -> Path:
+    """Return the path of a robot file that comes with Newton.
+
+    They are "humanoid" and "ant", which are MJCF, and "quadruped" and "cartpole", which are URDF.
+
+    Raises:
+        ValueError: The name is none of these.
+    """
+    if name not in SHIPPED:
+        raise ValueError(
+            f"shipped: unknown robot {name!r}; expected one of {', '.join(SHIPPED)}; "
+            "call load(path) for a file of your own"
+        )
+    return Path(newton.__file__).parent / "examples" / "assets" / SHIPPED[name]
+
+
+def load(
+    path: str | os.PathLike[str],
+    floating: bool | None = None,
+    repair: bool = True,
+    contacts: bool | str | Sequence[str] | Mapping[str, int] | None = None,
+    ground: Plane | HeightField | None = None,
+    points: int = POINTS,
+) -> Scene:
+    """Return the scene of a robot file: URDF (.urdf), MJCF (.xml, .mjcf) or USD (.usd, .usda, .usdc, .usdz).
+
+    MJCF is compiled by MuJoCo if the package is installed (extra ``mujoco``), and becomes a scene as by
+    :func:`from_mujoco`, in float64. A URDF is read in float64, and the scene has its numbers; order, labels and
+    coordinates are those of Newton's model of the file. The unit of a COLLADA mesh counts, its up axis does not. USD,
+    and MJCF without the package mujoco, are read by Newton's importers, in float32. Visual shapes are skipped.
+    Collision shapes are read if ``contacts`` asks for them. A mesh file is needed only if a body that can move takes
+    its mass from it, or a contact its points.
+
+    Args:
+        path: The robot file.
+        floating: Whether the root body floats (True) or is fixed to the world (False). None keeps the format's own
+            rule: a URDF root is fixed, an MJCF root has the joints that the file gives it, and a USD root floats unless
+            a joint fixes it.
+        repair: Whether to replace masses and inertias that no rigid body can have, by Newton's rule: negative ones, an
+            inertia that is zero beside a mass, and one whose largest principal moment exceeds the sum of the others.
+            In a URDF, links that move as one and have no mass then take it from their collision shapes, 1000 kg/m^3.
+            MuJoCo refuses an MJCF file that has such. False keeps the file's numbers; where they make the mass matrix
+            singular, results are NaN and ``status=`` says so.
+        contacts: Which collision shapes touch the ground in :meth:`Dynamics.step`: None, none; True, those of all
+            bodies that can move, or none, with a warning, where an MJCF file's options disable contacts; a pattern such
+            as ``"*foot*"``, or a list of patterns, those whose name, or that of their body or mesh, matches
+            (``fnmatch``, in any case; a name also by what follows its last slash); or {pattern: points}. The scene's
+            ``contacts`` hold the result. A sphere and the ends of a capsule touch with their lowest point, a box with
+            its corners. A mesh, a cylinder, a cone and an ellipsoid touch with ``points`` of their surface. Friction is
+            the file's: MuJoCo's of the two geoms, Bullet's ``lateral_friction``, Gazebo's ``mu1``, a USD material's;
+            0.8 where a file has none.
+        ground: The ground that they touch. None: the file's plane or height field, or else the plane at height zero.
+        points: Of a shape that is the hull of points, at most.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: No importer reads files with this suffix, or the file's contents. Of a URDF, the message names the
+            line and the element. Or a pattern of ``contacts`` matches no shape; the message lists the bodies with some.
+        ImportError: A package for meshes or USD is missing. The message names the extra that installs it.
+        UnsupportedError, DirectedLoopError: As :func:`from_newton` and :func:`from_mujoco`.
+        UnsupportedError: Without the package mujoco, an MJCF file uses a feature that Newton 1.8 misreads, such as a
+            slide after a hinge in one body, joints of one body with different ``pos``, a joint's ``ref``,
+            ``shellinertia`` where shapes give the mass, or ``settotalmass``. The message says what to write instead.
+        UnsupportedError: A pattern of ``contacts`` names a shape that no contact represents, or the file has several
+            grounds and ``ground`` does not choose. With contacts=True, such shapes are left out, with a warning.
+
+    Warns:
+        UserWarning: A mass or an inertia was replaced, or taken from shapes. The message names the bodies. A mimic in a
+            URDF names no joint of the file and was left out. An MJCF file holds contacts, sensors or other things that
+            a scene leaves out.
+    """
+    file = Path(path)
+    importer = robot_format(file)
+    read = _mjcf_reader() if importer == "mjcf" else {"urdf": read_urdf, "usd": read_usd}[importer]
+    try:
+        return read(file, floating, repair, Choice(contacts, ground, points))
+    except ParseError as error:
+        raise ValueError(f"load: {str(file)!r} is not XML: {error}; expected {importer.upper()}") from None
+    except ImportError as error:
+        extra = "usd" if importer == "usd" else "meshes"
+        need = "USD files" if importer == "usd" else "meshes"
+        raise ImportError(
+            f"load: {str(file)!r} needs a package that is missing ({error}) to read {need}; "
+            f"pip install warp_spo[{extra}]"
+        ) from error
+
+
+def _mjcf_reader() -> Callable[[Path, bool | None, bool, Choice], Scene]:
+    """Return the function that reads MJCF files: through MuJoCo or, without that package, through Newton's importer."""
+    if find_spec("mujoco") is None:
+        return read_mjcf
+    from ...mujoco.mjcf import read_mjcf as read_through_mujoco  # imports the package mujoco
+
+    return read_through_mujoco
+
+
+def robot_format(file: Path) -> str:
+    """Return the format of an existing robot file by its suffix: "urdf", "mjcf" or "usd".
+
+    Raises:
+        ValueError: The suffix is none of a robot file.
+        FileNotFoundError: There is no such file.
+    """
+    name = FORMATS.get(file.suffix.lower())
+    if name is None:
+        raise ValueError(f"load: {str(file)!r} ends in {file.suffix!r}; expected one of {', '.join(FORMATS)}")
+    if not file.is_file():
+        raise FileNotFoundError(
+            f"load: no file {str(file)!r} (from {os.getcwd()!r}); expected the path of a "
+            f"{name.upper()} file; call shipped(name) for a robot that comes with Newton"
+        )
+    return name

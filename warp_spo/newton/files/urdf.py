@@ -1,0 +1,348 @@
+"""Scenes from URDF files, read in float64.
+
+Bodies, hinges, their order and their labels are those of Newton's ``add_urdf``: joints depth first from the root link,
+joints of one parent in the order of the file; bodies in the order of the joints that carry them. Masses, inertias,
+origins and axes are the file's numbers. Where Newton 1.8 reads something else than URDF says, URDF counts: a link
+without <inertial> has no mass, a "continuous" joint has no limits, and a "planar" joint turns about its normal, too.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import UnsupportedError
+from ...scene.parts import UNLIMITED, Body, Coupling, Hinge
+from ...scene.scene import Scene
+from ...scene.collision_shapes import NONE, Choice
+from .inertia_repair import repair_bodies
+from .urdf_masses import mass_of_shapes
+from .urdf_shapes import urdf_shapes
+from ..worlds import quote_labels
+from .xml_source import Element, read_xml
+
+KINDS = {
+    "fixed": "fixed",
+    "revolute": "revolute",
+    "continuous": "revolute",
+    "prismatic": "prismatic",
+    "planar": "planar",
+    "floating": "free",
+    "spherical": "ball",  # of Bullet and MuJoCo, not of URDF
+}
+"""Hinge of a scene by type of the joint."""
+SCALAR = ("revolute", "continuous", "prismatic")
+NO_LIMITS: dict[str, Any] = {"limit_ke": 0.0, "limit_kd": 0.0}  # of free and ball hinges, as in Newton
+QUARTER = np.pi / 2
+TYPED = 5e-10  # an angle this close to a multiple of a quarter turn [rad] is one that was written with ten digits
+Inertial = tuple[float, np.ndarray, np.ndarray]  # mass [kg], centre of mass [m, 3], inertia about it [kg m^2, 3 x 3]
+
+
+def read_urdf(file: Path, floating: bool | None, repair: bool, choice: Choice = NONE) -> Scene:
+    """Return the scene of a URDF file. See :func:`warp_spo.newton.load`.
+
+    Raises:
+        ValueError: The file is not XML or not a URDF; the message names line and element.
+        UnsupportedError: The file needs xacro first.
+    """
+    robot = read_xml(file)
+    _check_robot(robot)
+    links, joints = _by_name(robot, "link"), _by_name(robot, "joint")
+    root, carried = _sort_joints(robot, links, joints)
+
+    name = robot.get("name")
+    label = lambda part: f"{name}/{part}" if name else part  # noqa: E731
+    kind, base_name = ("free", "floating_base") if floating else ("fixed", "fixed_base")
+    base = Hinge(kind, -1, 0, label=label(base_name), **NO_LIMITS)
+    number = {link: index for index, link in enumerate([root, *(_ends(joint)[1] for joint in carried)])}
+    hinges = [base, *(_hinge(joint, number, label) for joint in carried)]
+    inertials = _inertials([links[link] for link in number], hinges, repair)
+    masses, inertias = [i[0] for i in inertials], [i[2] for i in inertials]
+    couplings = _couplings(carried)
+    try:
+        if repair:
+            masses, inertias = repair_bodies(list(map(label, number)), masses, inertias, depth=3)
+        bodies = [
+            Body(mass, com, inertia, label(link), any_inertia=not repair)
+            for mass, (_, com, _), inertia, link in zip(masses, inertials, inertias, number, strict=True)
+        ]
+        scene = Scene(bodies, hinges, couplings=couplings)
+    except ValueError as error:
+        raise ValueError(f"load: {str(file)!r}: {error}") from error
+    ordered = [links[link] for link in number]
+    call = f"load: {str(file)!r}"
+    scene, lost = choice.applied(call, scene, lambda: urdf_shapes(robot, ordered, list(map(label, number)), _origin))
+    if lost:
+        warnings.warn(f"{call}: left out: {', '.join(lost)}", UserWarning, stacklevel=3)
+    return scene
+
+
+def _check_robot(robot: Element) -> None:
+    """Raise an error unless the root element is that of a URDF with links."""
+    if robot.tag != "robot":
+        raise robot.error("the outermost element; expected <robot>; if it is MJCF, let its name end in .xml")
+    for element in robot.iter():
+        if element.tag.startswith("xacro:"):
+            raise UnsupportedError(
+                "load",
+                f"{str(robot.file)!r}, line {element.line}: <{element.tag}>",  # type: ignore[attr-defined]
+                "expand the file first: xacro FILE > robot.urdf",
+            )
+    if robot.find("link") is None:
+        raise robot.error("no <link>; expected one or more; a file made by xacro is empty if its macro is never called")
+
+
+def _by_name(robot: Element, tag: str) -> dict[str, Element]:
+    """Return the robot's links or joints by name."""
+    found: dict[str, Element] = {}
+    parts: list[Any] = robot.findall(tag)
+    for element in parts:
+        if found.setdefault(element.needed("name"), element) is not element:
+            earlier = found[element.needed("name")].line
+            raise element.error(f"the name is that of line {earlier}, too; expected different names; rename one")
+    return found
+
+
+def _ends(joint: Element) -> tuple[str, str]:
+    """Return the names of a joint's parent link and child link."""
+    ends = [joint.child(tag) for tag in ("parent", "child")]
+    for tag, end in zip(("parent", "child"), ends, strict=True):
+        if end is None:
+            raise joint.error(f"no <{tag}>; expected the link that it joins; write <{tag} link=...>")
+    return ends[0].needed("link"), ends[1].needed("link")  # type: ignore[union-attr]
+
+
+def _sort_joints(robot: Element, links: dict[str, Element], joints: dict[str, Element]) -> tuple[str, list[Element]]:
+    """Return the root link and the joints depth first from it; raise ValueError unless all links form one tree."""
+    carriers: dict[str, Element] = {}
+    below: dict[str, list[Element]] = {link: [] for link in links}
+    for joint in joints.values():
+        parent, child = _ends(joint)
+        for link in (parent, child):
+            if link not in links:
+                raise joint.error(f"there is no link {link!r}; expected one of the file's; correct the name")
+        if carriers.setdefault(child, joint) is not joint:
+            raise joint.error(
+                f"link {child!r} is the child of joint {carriers[child].get('name')!r}, too; expected one joint a "
+                "link; build a closed loop with Scene(loops=...)"
+            )
+        below[parent].append(joint)
+
+    roots = [link for link in links if link not in carriers]
+    if len(roots) > 1:
+        raise links[roots[1]].error(
+            f"links {quote_labels(roots)} are the child of no joint; expected one root link, so that all links form "
+            "one tree; join them (type='fixed'), or load one file a robot"
+        )
+    order: list[Element] = []
+    rest = [joint for root in roots for joint in reversed(below[root])]
+    while rest:
+        order.append(rest.pop())
+        rest += reversed(below[_ends(order[-1])[1]])
+    if len(order) < len(joints):
+        lost = next(joint for joint in joints.values() if joint not in order)
+        raise lost.error("the joint is part of a directed loop of joints; expected a tree; swap its parent and child")
+    return roots[0], order
+
+
+# -- joints ------------------------------------------------------------------------------------------------------------
+def _hinge(joint: Element, number: dict[str, int], label: Callable[[str], str]) -> Hinge:
+    """Return the hinge of a joint; ``number`` is the index of each link's body."""
+    kind, (parent, child) = joint.needed("type"), _ends(joint)
+    if kind not in KINDS:
+        raise joint.error(f"the type is {kind!r}; expected one of {', '.join(KINDS)}")
+    values: dict[str, Any] = _resistances(joint) if kind != "fixed" else {}
+    if kind in ("floating", "spherical"):
+        values |= NO_LIMITS
+    if kind == "floating" and any(values.values()):
+        raise joint.error("has damping or friction; expected none of a floating joint; remove <dynamics>")
+    if kind in (*SCALAR, "planar"):
+        axis = _axis(joint)
+        values["axis"] = _in_plane(axis) if kind == "planar" else axis
+    if kind in SCALAR:
+        values |= _limits(joint, kind)
+    pose = np.concatenate(_origin(joint))
+    try:
+        return Hinge(
+            KINDS[kind], number[parent], number[child], parent_pose=pose, label=label(joint.needed("name")), **values
+        )
+    except ValueError as error:
+        raise joint.error(str(error)) from error
+
+
+def _origin(holder: Element) -> tuple[np.ndarray, np.ndarray]:
+    """Return the position [m, 3] and the unit quaternion (xyzw) that an element's <origin> gives."""
+    origin = holder.child("origin")
+    if origin is None:
+        return np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+    if origin.get("quat_xyzw"):
+        raise origin.error("quat_xyzw is not read; expected rpy; write the rotation as rpy")
+    roll, pitch, yaw = origin.numbers("rpy", 3, (0.0, 0.0, 0.0))
+    (x, w), (y, v), (z, u) = (_half(angle) for angle in (roll, pitch, yaw))
+    # The product of the turns about z, y and x: each is (sine of the half angle along its axis, cosine).
+    quaternion = [u * v * x - z * y * w, u * y * w + z * v * x, z * v * w - u * y * x, u * v * w + z * y * x]
+    return origin.numbers("xyz", 3, (0.0, 0.0, 0.0)), np.array(quaternion)
+
+
+def _half(angle: float) -> tuple[float, float]:
+    """Return the sine and cosine of half an angle; 1.57079632679 is a quarter turn, so that its zeros are zeros."""
+    quarter = round(angle / QUARTER) * QUARTER
+    half = 0.5 * (quarter if abs(angle - quarter) < TYPED else angle)
+    return float(np.sin(half)), float(np.cos(half))
+
+
+def _rotation(quaternion: np.ndarray) -> np.ndarray:
+    """Return the rotation matrix of a unit quaternion (xyzw)."""
+    v, w = quaternion[:3], quaternion[3]
+    cross = np.cross(np.eye(3), v)  # cross @ a = v x a
+    return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+
+
+def _axis(joint: Element) -> np.ndarray:
+    """Return the unit vector along a joint's <axis>; x where there is none."""
+    element = joint.child("axis")
+    if element is None:
+        return np.array([1.0, 0.0, 0.0])
+    axis = element.numbers("xyz", 3)
+    if not axis.any():
+        raise element.error("xyz is the zero vector; expected a direction")
+    axis /= np.abs(axis).max()  # so that squares are in range
+    return axis / np.linalg.norm(axis)
+
+
+def _in_plane(normal: np.ndarray) -> list[np.ndarray]:
+    """Return two unit vectors that complete a normal to a right-handed frame, those of Newton's planar joint."""
+    helper = np.array([1.0, 0.0, 0.0] if np.allclose(normal, [0.0, 1.0, 0.0]) else [0.0, 1.0, 0.0])
+    first = np.cross(helper, normal)
+    if not first.any():  # the normal is -y
+        first = np.array([1.0, 0.0, 0.0])
+    first /= np.linalg.norm(first)
+    return [first, np.cross(normal, first)]
+
+
+def _resistances(joint: Element) -> dict[str, float]:
+    """Return the damping [N m s/rad or N s/m] and the dry friction [N m or N] of a joint."""
+    dynamics = joint.child("dynamics")
+    return {} if dynamics is None else {name: dynamics.number(name, 0.0, least=0.0) for name in ("damping", "friction")}
+
+
+def _limits(joint: Element, kind: str) -> dict[str, float]:
+    """Return the limits of a joint, in the names of :class:`Hinge`.
+
+    If one bound is absent it is zero, as URDF says. If both are absent, the joint has no limits, as in Newton.
+    """
+    limit, found = joint.child("limit"), {}
+    if limit is None:
+        return {}
+    for name in ("effort", "velocity"):
+        if limit.get(name) is not None:
+            found[f"{name}_limit"] = min(limit.number(name, least=0.0, infinite=True), UNLIMITED)
+    if kind != "continuous" and (limit.get("lower") is not None or limit.get("upper") is not None):
+        lower, upper = (limit.number(name, 0.0, infinite=True) for name in ("lower", "upper"))
+        if lower > upper:
+            absent = " (an absent one is 0)" if None in (limit.get("lower"), limit.get("upper")) else ""
+            raise limit.error(
+                f"of joint {joint.get('name')!r}: lower is {lower:g}, above upper {upper:g}{absent}; "
+                "expected lower <= upper; swap them"
+            )
+        found["limit_lower"], found["limit_upper"] = np.clip([lower, upper], -UNLIMITED, UNLIMITED).tolist()
+    return found
+
+
+def _couplings(joints: list[Element]) -> list[Coupling]:
+    """Return the couplings of all mimics; hinge 0 is the base, hinge k + 1 that of joint k.
+
+    A mimic of a mimic is followed to the joint that moves by itself. A mimic on a fixed joint says nothing. A mimic
+    of a joint that is not there is left out, with a warning.
+    """
+    by_name = {joint.get("name"): index for index, joint in enumerate(joints)}
+    mimics = [joint.child("mimic") if joint.get("type") != "fixed" else None for joint in joints]
+    couplings = []
+    for index, mimic in enumerate(mimics):
+        if mimic is None:
+            continue
+        ratio, offset, leader, seen = 1.0, 0.0, index, [index]
+        at: Element | None = mimic
+        while at is not None:
+            offset, ratio = offset + ratio * at.number("offset", 0.0), ratio * at.number("multiplier", 1.0)
+            leader = by_name.get(at.needed("joint"), -1)
+            if leader < 0:
+                break
+            if leader in seen:
+                names = quote_labels([str(joints[joint].get("name")) for joint in seen])
+                raise at.error(f"joints {names} mimic each other in a circle; let one of them move by itself")
+            seen.append(leader)
+            at = mimics[leader]
+        if leader < 0:
+            warnings.warn(
+                f"load: {str(mimic.file)!r}, line {mimic.line}: joint {joints[index].get('name')!r} mimics "
+                f"{at.get('joint')!r}, which is no joint of the file; it moves by itself; correct the name",  # type: ignore[union-attr]
+                UserWarning,
+                stacklevel=4,
+            )
+            continue
+        for joint in (joints[index], joints[leader]):
+            if joint.get("type") not in SCALAR:
+                raise mimic.error(
+                    f"ties {joints[index].get('name')!r} to {joints[leader].get('name')!r}; joint "
+                    f"{joint.get('name')!r} is {joint.get('type')}; expected one of {', '.join(SCALAR)}; "
+                    "remove the mimic, or make both joints fixed"
+                )
+        couplings.append(Coupling(index + 1, leader + 1, ratio, offset))
+    return couplings
+
+
+# -- links -------------------------------------------------------------------------------------------------------------
+def _inertials(links: list[Element], hinges: list[Hinge], repair: bool) -> list[Inertial]:
+    """Return mass, centre of mass and inertia of each link, of which hinge k carries link k.
+
+    Links that fixed joints join move as one. If no link of such a group has a mass, and with ``repair`` alone, the
+    collision shapes of its links without <inertial> give one, as in Newton. A warning says so if the group moves; if
+    it does not move, meshes are left out, so that their files are not needed.
+    """
+    inertials = [_inertial(link) for link in links]
+    group = list(range(len(links)))
+    for child, hinge in enumerate(hinges):
+        if child and hinge.kind == "fixed":
+            group[child] = group[hinge.parent]
+    weights = np.bincount(group, [abs(inertial[0]) for inertial in inertials], len(links))
+    weighed = []
+    for index, link in enumerate(links):
+        moves = hinges[group[index]].dof_count > 0
+        shapes = link.findall("collision")
+        if not repair or weights[group[index]] != 0.0 or not shapes or link.find("inertial") is not None:
+            continue
+        if moves or link.find("collision//mesh") is None:
+            inertials[index] = mass_of_shapes(link)
+            weighed += [link] * moves
+    if weighed:
+        names = quote_labels([str(link.get("name")) for link in weighed])
+        warnings.warn(
+            f"load: {str(links[0].file)!r}, line {weighed[0].line}: links {names} move and have no mass; their "
+            "collision shapes give them one, with 1000 kg/m^3 as in Newton; write their <inertial>, or keep them "
+            "massless with load(path, repair=False)",
+            UserWarning,
+            stacklevel=4,
+        )
+    return inertials
+
+
+def _inertial(link: Element) -> Inertial:
+    """Return the mass, the centre of mass and the inertia about it that a link's <inertial> gives; zeros without."""
+    inertial = link.child("inertial")
+    if inertial is None:
+        return 0.0, np.zeros(3), np.zeros((3, 3))
+    parts = [inertial.child(tag) for tag in ("mass", "inertia")]
+    for tag, part in zip(("mass", "inertia"), parts, strict=True):
+        if part is None:
+            raise inertial.error(f"of link {link.get('name')!r}: no <{tag}>; expected <mass> and <inertia>; write it")
+    mass, tensor = (part for part in parts if part is not None)
+    xx, xy, xz, yy, yz, zz = (tensor.number(f"i{name}") for name in ("xx", "xy", "xz", "yy", "yz", "zz"))
+    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    com, turn = _origin(inertial)
+    rotation = _rotation(turn)
+    return mass.number("value"), com, inertia if turn[3] == 1.0 else rotation @ inertia @ rotation.T

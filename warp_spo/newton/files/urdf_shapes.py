@@ -1,0 +1,93 @@
+"""Collision shapes of a URDF, in float64."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ...scene.collision_shapes import Shape
+from .urdf_masses import mesh_file, unit_of
+from .xml_source import Element
+
+PRIMITIVES = ("sphere", "capsule", "cylinder", "box")
+
+
+def urdf_shapes(
+    robot: Element, links: list[Element], labels: list[str], origin: Callable[[Element], tuple[np.ndarray, np.ndarray]]
+) -> list[Shape]:
+    """Return the <collision> elements of the links, of which link k is body k, in float64.
+
+    Friction is that of Bullet's <contact><lateral_friction> in the link, or of <mu1> in a <gazebo> of the link.
+
+    Args:
+        labels: of the bodies. origin: reads the position and the quaternion of an element's <origin>.
+
+    Raises:
+        ValueError: an element is invalid, or a file of a mesh is missing; the message names the line.
+    """
+    found = []
+    for body, (link, label) in enumerate(zip(links, labels, strict=True)):
+        elements: list[Any] = link.findall("collision")
+        for number, collision in enumerate(elements):
+            geometry = collision.child("geometry")
+            if geometry is None:
+                raise collision.error("no <geometry>; expected one; write it")
+            name = collision.get("name") or (label if len(elements) == 1 else f"{label}:{number}")
+            pose = np.concatenate(origin(collision))
+            friction = _urdf_friction(robot, link)
+            for shape in geometry:
+                if shape.tag in (*PRIMITIVES, "mesh"):
+                    kind, sizes, names = _urdf_sizes(shape)
+                    found.append(Shape(name, body, kind, pose, sizes, friction=friction, names=names))
+                else:
+                    found.append(Shape(name, body, f"<{shape.tag}>", pose))
+    return found
+
+
+def _urdf_sizes(shape: Any) -> tuple[str, Any, tuple[str, ...]]:
+    """Return kind, sizes and other names of a primitive, whose axis is z, or of a mesh."""
+    size = lambda name: shape.number(name, least=0.0)  # noqa: E731
+    if shape.tag == "sphere":
+        return "sphere", (size("radius"),), ()
+    if shape.tag == "box":
+        lengths = shape.numbers("size", 3)
+        if lengths.min() < 0.0:
+            raise shape.error(f"size is {lengths.tolist()}; expected none below zero")
+        return "box", 0.5 * lengths, ()
+    if shape.tag == "mesh":
+        file = mesh_file(shape, "because contacts= asks for its shape; choose other shapes")
+        scale = unit_of(shape, file) * shape.numbers("scale", 3, (1.0, 1.0, 1.0))
+        return "hull", _vertices(shape, file) * scale, (file.stem,)
+    length = "height" if shape.tag == "capsule" and shape.get("height") is not None else "length"
+    return shape.tag, (size("radius"), 0.5 * size(length)), ()
+
+
+def _vertices(shape: Any, file: Any) -> np.ndarray:
+    """Return the vertices of all parts of a mesh file, in its unit [n, 3]."""
+    import trimesh  # an ImportError names the extra
+
+    try:
+        scene = trimesh.load_scene(file)
+        parts = [part.vertices for part in scene.dump() if hasattr(part, "vertices")]
+    except Exception as error:  # its readers raise errors of any type for a damaged file
+        raise shape.error(f"its file cannot be read ({type(error).__name__}: {error}); correct it") from error
+    if not parts or not sum(map(len, parts)):
+        raise shape.error("its file has no vertices; expected a mesh; correct it")
+    return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
+
+
+def _urdf_friction(robot: Element, link: Any) -> float | None:
+    contact = link.child("contact")
+    bullet = None if contact is None else contact.child("lateral_friction")
+    if bullet is not None:
+        return bullet.number("value", least=0.0)
+    for gazebo in robot.findall("gazebo"):
+        mu: Any = gazebo.find("mu1") if gazebo.get("reference") == link.get("name") else None
+        if mu is not None:
+            try:
+                return float(mu.get("value") or mu.text)
+            except (TypeError, ValueError):
+                raise mu.error(f"is {mu.text!r}; expected a number") from None
+    return None

@@ -1,0 +1,121 @@
+"""Scenes from USD files, read by Newton's importer and converted to metres and kilograms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import newton
+import numpy as np
+
+from ...errors import UnsupportedError
+from ...scene.contacts import Contact
+from ...scene.scene import Scene
+from ...scene.collision_shapes import NONE, Choice
+from .imported import scene_of, unreadable
+from ..worlds import quote_labels
+
+DIMENSIONS = {
+    "joint_limit_lower": ((0, 1), (0, 0)),
+    "joint_limit_upper": ((0, 1), (0, 0)),
+    "joint_velocity_limit": ((0, 1), (0, 0)),
+    "joint_effort_limit": ((1, 1), (1, 2)),
+    "joint_friction": ((1, 1), (1, 2)),
+    "joint_armature": ((1, 0), (1, 2)),
+    "joint_damping": ((1, 0), (1, 2)),
+    "joint_stiffness": ((1, 0), (1, 2)),
+    "joint_target_ke": ((1, 0), (1, 2)),
+    "joint_target_kd": ((1, 0), (1, 2)),
+    "joint_limit_ke": ((1, 0), (1, 2)),
+    "joint_limit_kd": ((1, 0), (1, 2)),
+}
+"""Powers of mass and length in the unit of each value, for a dof that slides and for one that turns."""
+
+
+def read_usd(file: Path, floating: bool | None, repair: bool, choice: Choice = NONE) -> Scene:
+    """Return the scene of a USD file, in SI units.
+
+    Raises:
+        UnsupportedError: Newton's importer loses a body, as it does if the only joint that carries the body has
+            ``excludeFromArticulation``.
+    """
+    from pxr import Usd, UsdGeom, UsdPhysics  # an ImportError names the extra
+
+    builder = newton.ModelBuilder()
+    try:
+        stage = Usd.Stage.Open(str(file))
+        stage.Reload()  # layers stay in memory as long as a stage has them
+        metre, kilogram = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
+        builder.default_shape_cfg.density *= metre**3 / kilogram  # the importer computes in the stage's units
+        builder.default_shape_cfg.mu = Contact.friction  # of shapes without a material
+        found = builder.add_usd(str(file), floating=floating, load_visual_shapes=False, skip_mesh_approximation=True)
+    except ImportError:
+        raise
+    except Exception as error:
+        raise unreadable(file, error) from error
+    if builder.body_count == 0:
+        raise ValueError(f"load: {str(file)!r} has no rigid bodies; expected prims with PhysicsRigidBodyAPI")
+    if (metre, kilogram) != (1.0, 1.0):
+        _convert(builder, metre, kilogram, gravity=found.get("physics_scene_path") is not None)
+    read = set(builder.body_label)
+    lost = [path for path in _rigid_bodies(stage) if path not in read]
+    if lost:
+        raise UnsupportedError(
+            "load",
+            f"{str(file)!r} with bodies that Newton's importer leaves out ({quote_labels(lost)})",
+            "give each a joint without excludeFromArticulation, or take it out of the articulation root",
+        )
+    carried = set(builder.joint_child)
+    loose = [label for body, label in enumerate(builder.body_label) if body not in carried]
+    if loose:
+        raise UnsupportedError(
+            "load",
+            f"{str(file)!r} with bodies that are body1 of no joint ({quote_labels(loose)})",
+            "join each to the world by a joint without body0, or put an articulation root above them all",
+        )
+    return scene_of(file, builder, repair, choice)
+
+
+def _rigid_bodies(stage: Any) -> list[str]:
+    """Return the paths of the bodies of a stage."""
+    from pxr import UsdPhysics
+
+    bodies = [UsdPhysics.RigidBodyAPI(prim) for prim in stage.Traverse() if prim.HasAPI(UsdPhysics.RigidBodyAPI)]
+    return [str(body.GetPath()) for body in bodies if body.GetRigidBodyEnabledAttr().Get()]
+
+
+def _convert(builder: newton.ModelBuilder, metre: float, kilogram: float, gravity: bool) -> None:
+    """Convert the builder's values from a stage's units to metres and kilograms.
+
+    Args:
+        builder: what the importer made; its gravity is that of the stage if ``gravity`` says so, in the stage's units.
+        metre, kilogram: the stage's unit of length [m] and of mass [kg].
+        gravity: whether the stage has a gravity.
+    """
+    values: Any = builder
+    values.body_mass[:] = [kilogram * mass for mass in values.body_mass]
+    values.body_com[:] = [metre * np.array(com) for com in values.body_com]
+    values.body_inertia[:] = [
+        kilogram * metre**2 * np.array(i, dtype=np.float64).reshape(3, 3) for i in values.body_inertia
+    ]
+    if gravity:
+        values.gravity = metre * np.array(values.gravity)
+    for poses in (values.joint_X_p, values.joint_X_c, values.shape_transform):
+        for index, pose in enumerate(poses):
+            poses[index] = np.concatenate([metre * np.array(pose)[:3], np.array(pose)[3:]])
+    for lengths in (values.shape_scale, values.shape_margin):
+        lengths[:] = [metre * np.array(length) for length in lengths]
+    default = values.default_joint_cfg
+    slides = [turn for linear, angular in values.joint_dof_dim for turn in [True] * linear + [False] * angular]
+    for name, powers in DIMENSIONS.items():
+        column, unset = getattr(values, name), getattr(default, name.removeprefix("joint_"))
+        for dof, slide in enumerate(slides):
+            mass, length = powers[0] if slide else powers[1]
+            if column[dof] != unset:  # a default is one in SI units
+                column[dof] *= kilogram**mass * metre**length
+    length_of = [metre if linear else 1.0 for linear, _ in values.joint_dof_dim]
+    for joint, reference in enumerate(values.joint_mimic_joint):
+        if reference >= 0:
+            offset, ratio = values.joint_mimic_coeffs[joint]
+            own, other = length_of[joint], length_of[reference]
+            values.joint_mimic_coeffs[joint] = (own * offset, own / other * ratio)

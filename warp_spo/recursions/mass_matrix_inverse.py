@@ -1,0 +1,148 @@
+"""All of Mass^-1 = Y* D Y, Y = D^-1 [I - H psi K] (eq. 1), a few operations an entry, piece by piece.
+
+Inward, a unit force at dof j gives the rates Y_j in its piece and a force F_j on the link that the piece is mounted on.
+The rates further in are linear in the six numbers of F_j: outward, a piece receives them as a matrix N, with which its
+columns of Y are complete. The product of two columns is a sum over the pivots that both branches share.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..trace.emission import Store
+from ..trace.scalars import Value
+from ..trace.spatial import Vector, dot, total
+from . import articulated
+from .articulated_sweeps import NO_FORCE, factor, factor_tree, mirror, pack, pivots, propagate_inward, weighted_products
+from .model.links import Link
+from .motion import STILL
+from .model.segments import Piece, Pieces
+
+if TYPE_CHECKING:
+    from .model.tracing import Trace
+
+
+class Inverse:
+    """The entries of Mass^-1 that the pieces of a :class:`.tracing.Trace` work out.
+
+    Columns of Y are lists over the pivots from the root out to the end of a piece; it has one pivot for each dof.
+
+    Attributes:
+        entries: by (row, column), one triangle.
+        rounds: the entries that the trace's own piece shares with others, for one dof of another piece at a time.
+        stores: messages. news: messages to the pieces that share entries with this one.
+    """
+
+    def __init__(self, trace: Trace):
+        self.trace, self.pieces = trace, Pieces(trace.links).pieces
+        self.entries: dict[tuple[int, int], Value] = {}
+        self.rounds: list[dict[tuple[int, int], Value]] = []
+        self.done, self.stores = factor(trace)
+        self.news: list[Store] = []
+        self._rates: dict[int, list[Value]] = {}  # the part of Y_j in j's own piece
+        self._forces: dict[int, Vector] = {}  # F_j
+        self._columns: dict[int, list[Value]] = {}  # Y_j
+        own = [piece for piece in self.pieces if trace.piece is None or piece.index == trace.piece.index]
+        for piece in own:
+            for at, link in enumerate(piece.links):
+                for i, dof in enumerate(link.dofs):
+                    trace.graph.step = f"column {dof}|y"
+                    unit = [1.0 if j == i else 0.0 for j in range(len(link.dofs))]
+                    self._rates[dof], self._forces[dof] = self._inward(piece.links[: at + 1], NO_FORCE, unit)
+        for piece in own:
+            self._come_back(piece)
+        for piece in own:
+            for other in self.pieces:
+                if other in piece.ancestors or piece.looks_at(other):
+                    self._meet(piece, other)
+
+    def _inward(self, links: list[Link], force: Vector, right: list[Value]) -> tuple[list[Value], Vector]:
+        """Return the rates for a ``force`` on the last link and ``right`` at its dofs, and the force further in."""
+        rates: list[Value] = []
+        for link in reversed(links):
+            key = id(link)
+            found, force = articulated.reduce_link(link, self.trace.places[key], self.done[key], STILL, force, right)
+            rates = found + rates
+            inner = link.parent
+            right = [0.0] * (0 if inner is None else len(inner.dofs))
+        return rates, NO_FORCE if links[0].parent is None else force
+
+    def _come_back(self, piece: Piece) -> None:
+        """Complete the columns of a piece and multiply them with each other."""
+        trace = self.trace
+        further = [one for one in reversed(piece.ancestors)]
+        N = [] if piece.parent is None else _sixes(trace.receive("N", piece.parent))
+        D = [d for one in further for d in trace.receive("D", one)]
+        D += [pivot.D for link in piece.links for pivot in self.done[id(link)].pivots]
+        for j in piece.dofs:
+            trace.graph.step = f"column {j}|y"
+            self._columns[j] = [dot(row, self._forces[j]) for row in N] + self._rates[j]
+        if any(other.looks_at(piece) for other in self.pieces):
+            heads = (self._columns[j][: len(N)] for j in piece.dofs)
+            self.news += trace.send("Y", piece, [x for head in heads for x in head])
+        weighted = {j: [d * y for d, y in zip(D, self._columns[j], strict=False)] for j in piece.dofs}
+        for at, j in enumerate(piece.dofs):
+            trace.graph.step = f"column {j}|m"
+            for i in piece.dofs[: at + 1]:
+                self.entries[i, j] = _meeting(weighted[i], self._columns[j])
+        if not piece.children:
+            return
+        trace.label(piece.links[-1], "n")
+        still = [0.0] * len(piece.links[-1].dofs)
+        columns = []
+        for c in range(6):
+            rates, force = self._inward(piece.links, Vector(float(i == c) for i in range(6)), still)
+            columns.append([dot(row, force) for row in N] + rates)
+        self.stores += trace.send("N", piece, [x for row in zip(*columns, strict=True) for x in row])
+        self.stores += trace.send("D", piece, D[len(N) :])
+        rest = {j: [0.0] * (len(D) - len(self._columns[j])) for j in piece.dofs}
+        self.stores += trace.send("V", piece, [x for j in piece.dofs for x in self._columns[j] + rest[j]])
+
+    def _meet(self, piece: Piece, other: Piece) -> None:
+        """Compute the entries of two branches, or of a branch and one that carries it, over shared pivots."""
+        fork = piece.fork(other)
+        assert fork is not None
+        common = len(fork.all_dofs)
+        D = [d for one in reversed([fork, *fork.ancestors]) for d in self.trace.receive("D", one)]
+        sent = self.trace.receive("V" if fork is other else "Y", other)
+        length = len(sent) // other.weight
+        for at, i in enumerate(other.dofs):
+            self.trace.graph.step = f"column {i}|m"
+            theirs = [d * y for d, y in zip(D, sent[length * at : length * at + common], strict=True)]
+            self.rounds.append({(i, j): _meeting(theirs, self._columns[j]) for j in piece.dofs})
+
+
+def _meeting(first: list[Value], second: list[Value]) -> Value:
+    """Return the sum of products over the pivots that both share."""
+    return total(a * b for a, b in zip(first, second, strict=False))
+
+
+def _sixes(values: list[Value]) -> list[list[Value]]:
+    return [values[i : i + 6] for i in range(0, len(values), 6)]
+
+
+def mass_matrix_inverse(trace: Trace) -> list[Store]:
+    """out = Mass^-1, both triangles"""
+    if trace.links.shared:
+        return by_columns(trace)
+    inverse = Inverse(trace)
+    rounds = [mirror(entries) for entries in inverse.rounds]
+    if trace.piece is not None:
+        trace.rounds, trace.news, rounds = rounds, inverse.news, []
+    return inverse.stores + mirror(inverse.entries) + [item for stores in rounds for item in stores]
+
+
+def by_columns(trace: Trace) -> list[Store]:
+    """out = Mass^-1 of a scene whose links share dofs, as Y* D Y over the whole tree"""
+    done, columns = factor_tree(trace), {}
+    for link in trace.links.leaders:
+        for i, dof in enumerate(link.dofs):
+            trace.graph.step = f"column {dof}|y"
+            unit = [float(i == j) for j in range(len(link.dofs))]
+            columns[dof] = propagate_inward(trace, done, link, NO_FORCE, unit)
+    return mirror(weighted_products(trace, *pivots(done), columns))
+
+
+def mass_matrix_inverse_packed(trace: Trace) -> list[Store]:
+    """out = the entries of Mass^-1 within one tree, lower triangle, row after row"""
+    return pack(mass_matrix_inverse(trace))

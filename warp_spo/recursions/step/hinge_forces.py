@@ -1,0 +1,64 @@
+"""Forces of springs, dampers, drives, limits, friction and gravity compensation at a state, by themselves."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ...trace.emission import Store
+from ...trace.scalars import Value
+from ...trace.spatial import Vector, total
+from .actuation import hinge_laws
+from .joint_laws import Impedance
+from ..motion import hinge_entries
+
+if TYPE_CHECKING:
+    from ..model.tracing import Trace
+
+
+def hinge_force(trace: Trace) -> list[Store]:
+    """out = the forces of all laws at q, qd: springs, dampers, drives, limits, friction, actuators under "ctrl"
+
+    Gravity compensation is a part of it.
+    """
+    impedance = hinge_laws(trace, 0.0)
+    stores = []
+    held = compensation(trace)
+    for link in trace.links.leaders:
+        trace.label(link, "f")
+        for dof, laws in zip(link.dofs, impedance.laws(link), strict=True):
+            stores.append(Store("out", (dof,), total(law.at(0.0) for law in laws) + held.get(dof, 0.0)))
+    return stores
+
+
+def passive_force(trace: Trace) -> list[Store]:
+    """out = -damping qd - stiffness (q - rest) + the forces that hold up the bodies' gravcomp"""
+    impedance = Impedance(trace.links, 0.0, trace.vector("q"), trace.vector("qd"))
+    stores = []
+    held = compensation(trace)
+    for link in trace.links.leaders:
+        trace.label(link, "f")
+        for dof, law in zip(link.dofs, impedance.passive(link), strict=True):
+            stores.append(Store("out", (dof,), law.force + held.get(dof, 0.0)))
+    return stores
+
+
+def compensation(trace: Trace) -> dict[int, Value]:
+    """Return the forces of the hinges that -gravcomp mass gravity at the bodies' CoMs amounts to, by dof."""
+    found: dict[int, Value] = {}
+    if not trace.compensate_gravity():
+        return found
+    forces: dict[int, Vector] = {}
+    for link, outward in trace.traversal():
+        if outward:
+            trace.place(link)
+            continue
+        trace.label(link, "g")
+        place, wrench = trace.places[id(link)], trace.external_wrench(link)
+        for child in link.children:
+            wrench = wrench + forces[id(child)]
+        n, f = Vector(wrench[:3]), Vector(wrench[3:])
+        for dof, force in zip(link.dofs, hinge_entries(link, place, n, f), strict=True):
+            found[dof] = found.get(dof, 0.0) + force
+        n, f = place.pose.force_to_parent(n, f)
+        forces[id(link)] = Vector((*n, *f))
+    return found

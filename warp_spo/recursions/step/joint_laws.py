@@ -1,0 +1,306 @@
+"""Forces of the hinges in a time step: springs, dampers, drives, limits and friction, all implicit.
+
+A step of h seconds takes qd to qd' = qd + u and moves q along h qd'. The force of every law of a dof is a linear
+function of u between two bounds,
+
+    f(u) = force - resistance u, held between ``least`` and ``most``,
+
+that does not increase with u. Each of its three pieces is linear, so that an armature h resistance and a force make it
+implicit: (Mass + h R) qdd = tau - bias_force + F, u = h qdd. The active piece is guessed and checked afterwards, a
+semismooth Newton iteration that is exact once the guess is right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from ...errors import UnsupportedError
+from ...scene.parts import UNLIMITED
+from ...scene.scene import Scene
+from ...trace.scalars import Value, absolute, is_constant, less, reciprocal, select
+from ...trace.spatial import total
+from ..model.links import Link, Links
+from ..model.effective_mass import masses
+from ..model.scene_cache import remembered
+
+CREEP = 1e-4  # rate [rad/s, m/s] below which dry friction is a damper; it saturates at this rate
+DEFAULT_BOUND = 1e6  # effort and velocity limits of this size and more are no limits; Newton's default
+HOLD = 300.0  # resistance of a velocity limit, in inertias / h; the excess over the limit shrinks by this factor
+FREE = 1e20  # bound that no force or rate reaches, in place of a variable one of DEFAULT_BOUND and more
+LIMIT, FRICTION = "limit", "friction"  # roles of laws
+NOISE = 4.0  # roundings of a law's terms; two pieces may differ by so much where they meet
+
+
+class Law(NamedTuple):
+    """f(u) = scale * clip(force - resistance u, least, most); None is no bound.
+
+    ``scale`` is zero or more and does not influence which piece is active, so that derivatives by it exist at zero.
+    ``role`` is LIMIT or FRICTION where a step with contacts treats a law in its own way; ``depth`` is how far outside a
+    limit q is, and ``stiffness`` its spring. ``symmetric``: the bounds are opposite numbers.
+    """
+
+    force: Value
+    resistance: Value
+    least: Value | None = None
+    most: Value | None = None
+    scale: Value = 1.0
+    role: str = ""
+    depth: Value = 0.0
+    stiffness: Value = 0.0
+    symmetric: bool = False
+
+    @property
+    def bends(self) -> bool:
+        return self.least is not None or self.most is not None
+
+    def line(self, u: Value) -> Value:
+        return self.force - self.resistance * u
+
+    def bounded(self, line: Value) -> Value:
+        if self.most is not None:
+            line = select(less(self.most, line), self.most, line)
+        if self.least is not None:
+            line = select(less(line, self.least), self.least, line)
+        return line
+
+    def at(self, u: Value) -> Value:
+        """Return f(u)."""
+        return self.scale * self.bounded(self.line(u))
+
+    def piece(self, u: Value) -> Law:
+        """Return the piece that is active at ``u``, as a law without bounds."""
+        if not self.bends:
+            return self
+        line = self.line(u)
+        force, resistance = self.force, self.resistance
+        if self.most is not None:
+            over = less(self.most, line)
+            force, resistance = select(over, self.most, force), select(over, 0.0, resistance)
+        if self.least is not None:
+            under = less(line, self.least)
+            force, resistance = select(under, self.least, force), select(under, 0.0, resistance)
+        return Law(self.scale * force, self.scale * resistance)
+
+    def missed(self, guess: Value, u: Value, epsilon: float) -> Value:
+        """Return non-zero where the piece at ``guess`` differs from the law at ``u`` by more than rounding."""
+        if not self.bends:
+            return 0.0
+        one = self._replace(scale=1.0)
+        piece = one.piece(guess)
+        size = absolute(piece.force) + absolute(piece.resistance * u)
+        return less(NOISE * epsilon * size, absolute(one.at(u) - piece.line(u)))
+
+    def holding(self, u: Value, epsilon: float) -> Value:
+        """Return the resistance at ``u``; within rounding of a bound, that of the unbounded piece."""
+        if not self.bends:
+            return self.resistance
+        line, size = self.line(u), absolute(self.force) + absolute(self.resistance * u)
+        cut = less(NOISE * epsilon * size, absolute(self.bounded(line) - line))
+        return select(cut, 0.0, self.scale * self.resistance)
+
+    def skipped(self, guess: Value, u: Value) -> Value:
+        """Return non-zero where ``guess`` and ``u`` lie beyond opposite bounds."""
+        if self.least is None or self.most is None:
+            return 0.0
+        before, after = self.line(guess), self.line(u)
+        down = less(self.most, before) * less(after, self.least)
+        up = less(before, self.least) * less(self.most, after)
+        return down + up
+
+    @property
+    def middle(self) -> Value:
+        """The u at which the force is zero."""
+        return self.force * reciprocal(self.resistance)
+
+
+def add_laws(laws: list[Law]) -> Law:
+    """Return the sum of laws without bounds."""
+    return Law(total(law.force for law in laws), total(law.resistance for law in laws))
+
+
+class Impedance:
+    """The laws of every dof of a scene for one step.
+
+    Args:
+        links: of the scene. Values that are ``variable``, or that differ between worlds, are inputs by their name.
+        h: length of the step [s]; 0.0 gives the forces as they are, without what the step changes.
+        q, qd: entries of the state that the laws start from; ``qd`` None is zero.
+        ahead: entries of what a step adds to q if u = 0; None is h qd.
+        target_q, target_qd: entries of the drives' targets, laid out as q and qd; None: the neutral ones, zero.
+        actuators: returns the laws of a dof's actuators; None: they do not act.
+    """
+
+    def __init__(
+        self,
+        links: Links,
+        h: Value,
+        q: Callable[[int], Value],
+        qd: Callable[[int], Value],
+        ahead: Callable[[int], Value] | None = None,
+        target_q: Callable[[int], Value] | None = None,
+        target_qd: Callable[[int], Value] = lambda dof: 0.0,
+        actuators: Callable[[int], list[Law]] | None = None,
+    ):
+        self.links, self.scene, self.h, self.q, self.qd = links, links.scene, h, q, qd
+        self.ahead = ahead or (lambda dof: h * qd(dof))
+        self.target_q, self.target_qd = target_q or self._neutral, target_qd
+        self.actuators = actuators or (lambda dof: [])
+
+    def laws(self, link: Link) -> list[list[Law]]:
+        """Return all laws of each dof of a link; those without bounds come first, added up."""
+        every = []
+        for i, dof in enumerate(link.dofs):
+            straight = [*self._damper(dof), *self._spring(link, i, "joint_stiffness", self._rest)]
+            found = [*self._drive(link, i), *self._limits(link, i), *self._friction(dof)]
+            found += self.actuators(dof)
+            found += self._rate_limit(dof, straight + found)
+            straight += [law for law in found if not law.bends]
+            every.append([add_laws(straight)] * bool(straight) + [law for law in found if law.bends])
+        return every
+
+    def passive(self, link: Link) -> list[Law]:
+        """Return damper and spring of each dof of a link, added up."""
+        return [
+            add_laws([*self._damper(dof), *self._spring(link, i, "joint_stiffness", self._rest)])
+            for i, dof in enumerate(link.dofs)
+        ]
+
+    def spring_energies(self, link: Link) -> list[Value]:
+        """Return stiffness (q - rest)^2 / 2 of each dof of a link."""
+        found = []
+        for i, dof in enumerate(link.dofs):
+            k = self.value("joint_stiffness", dof)
+            stretch = 0.0 if is_number(k, 0.0) else self._stretch(link, i, self._rest)
+            found.append(0.5 * k * (stretch * stretch))
+        return found
+
+    # -- values ----------------------------------------------------------------------------------------------------
+    def value(self, name: str, index: int) -> Value:
+        """Return a value of the scene by dof, or by coordinate for joint_rest_q."""
+        column = self.scene.values[name][:, index]
+        if name in self.links.variable or (column != column[0]).any():
+            return self.links.graph.input(name, index)
+        return self._constant(name, index, column[0])
+
+    def _constant(self, name: str, index: int, value: float) -> Value:
+        """Return a constant; pieces of one make may keep it from folding, see :mod:`.alike`."""
+        numbers = self.links.numbers
+        return float(value) if numbers is None else numbers.of_scene(name, index, float(value))
+
+    def _bound(self, name: str, dof: int, none: float) -> Value | None:
+        """Return a bound; None if it is ``none`` or larger in all worlds, and stays so."""
+        if name not in self.links.variable and (np.abs(self.scene.values[name][:, dof]) >= none).all():
+            return None
+        return self.value(name, dof)
+
+    def range(self, dof: int) -> tuple[Value | None, Value | None]:
+        """Return the lower and the upper limit of a dof, None where it has none."""
+        low, high = (self._bound(f"joint_limit_{side}", dof, UNLIMITED) for side in ("lower", "upper"))
+        return low, high
+
+    def _most(self, name: str, dof: int) -> Value | None:
+        """Return a bound of a force or a rate; one of DEFAULT_BOUND and more in some world has no effect there."""
+        bound = self._bound(name, dof, DEFAULT_BOUND)
+        some = name in self.links.variable or (self.scene.values[name][:, dof] >= DEFAULT_BOUND).any()
+        return select(less(bound, DEFAULT_BOUND), bound, FREE) if bound is not None and some else bound
+
+    def _rest(self, coordinate: int) -> Value:
+        return self.value("joint_rest_q", coordinate)
+
+    def _neutral(self, coordinate: int) -> Value:
+        return self._constant("neutral_q", coordinate, self.scene.neutral_q[coordinate])
+
+    def inertia(self, dof: int) -> Value:
+        """Return the inertia at a dof in the neutral configuration of world 0, all other dofs being free."""
+        return self._constant("joint_inertia", dof, neutral_inertias(self.scene)[dof])
+
+    # -- laws ------------------------------------------------------------------------------------------------------
+    def _damper(self, dof: int) -> list[Law]:
+        d = self.value("joint_damping", dof)
+        return [] if is_number(d, 0.0) else [Law(-(d * self.qd(dof)), d)]
+
+    def _spring(self, link: Link, i: int, name: str, rest: Callable[[int], Value]) -> list[Law]:
+        """-k (q' - rest), q' = q + h (qd + u)"""
+        k = self.value(name, link.dofs[i])
+        if is_number(k, 0.0):
+            return []
+        stretch = self._stretch(link, i, rest)
+        return [Law(-k * (stretch + self.ahead(link.dofs[i])), self.h * k)]
+
+    def _stretch(self, link: Link, i: int, rest: Callable[[int], Value]) -> Value:
+        """Return q - rest of one dof of a link; of a rotation, an entry of its rotation vector."""
+        first = link.coordinate
+        return link.hinge.displacement(i, lambda c: self.q(first + c), lambda c: rest(first + c))
+
+    def _drive(self, link: Link, i: int) -> list[Law]:
+        """ke (target_q - q') + kd (target_qd - qd'), within the effort limit."""
+        dof = link.dofs[i]
+        kd = self.value("joint_target_kd", dof)
+        laws = self._spring(link, i, "joint_target_ke", self.target_q)
+        laws += [] if is_number(kd, 0.0) else [Law(kd * (self.target_qd(dof) - self.qd(dof)), kd)]
+        if not laws:
+            return []
+        effort, law = self._most("joint_effort_limit", dof), add_laws(laws)
+        if effort is not None and is_number(effort, 0.0):
+            return []
+        return [law] if effort is None else [law._replace(least=-effort, most=effort, symmetric=True)]
+
+    def _limits(self, link: Link, i: int) -> list[Law]:
+        """Return springs that push back into the range and never pull; outside the range with dampers."""
+        dof, laws = link.dofs[i], []
+        for name, inward in (("joint_limit_lower", 1.0), ("joint_limit_upper", -1.0)):
+            turns = link.hinge.quaternion is not None
+            if turns and (np.abs(self.scene.values[name][:, dof]) >= UNLIMITED).all():
+                continue  # variable or not: such a dof has no limits
+            bound = self._bound(name, dof, UNLIMITED)
+            if bound is None:
+                continue
+            if turns:
+                label = self.scene.dof_labels[dof]
+                raise UnsupportedError(
+                    "Dynamics.step",
+                    f"a limit on {label!r}, a dof of a ball or free hinge,",
+                    f"leave {name} at {-inward * UNLIMITED:.0e} there",
+                )
+            depth = inward * (bound - self.q(link.coordinate + i))  # how far outside; positive there
+            k, d = self.value("joint_limit_ke", dof), self.value("joint_limit_kd", dof)
+            d = select(less(0.0, depth), d, 0.0)
+            force = k * (depth - inward * self.ahead(dof)) - d * (inward * self.qd(dof))
+            least, most = (0.0, None) if inward > 0.0 else (None, 0.0)
+            laws.append(Law(inward * force, self.h * k + d, least, most, 1.0, LIMIT, depth, k))
+        return laws
+
+    def _friction(self, dof: int) -> list[Law]:
+        """Return a force of at most ``joint_friction`` against the motion; a damper below CREEP."""
+        f = self.value("joint_friction", dof)
+        return [] if is_number(f, 0.0) else [Law(-(1.0 / CREEP) * self.qd(dof), 1.0 / CREEP, -1.0, 1.0, f, FRICTION)]
+
+    def _rate_limit(self, dof: int, others: list[Law]) -> list[Law]:
+        """Return dampers on the excess over the velocity limit, HOLD times the inertia over the step.
+
+        A dof without inertia takes the resistance of the ``others`` instead.
+        """
+        bound = self._most("joint_velocity_limit", dof)
+        if bound is None or is_number(self.h, 0.0):
+            return []
+        qd, inertia = self.qd(dof), self.inertia(dof)
+        r = HOLD * inertia * reciprocal(self.h)
+        if is_number(inertia, 0.0):
+            r = HOLD * total(law.scale * law.resistance for law in others)
+        return [Law(r * (bound - qd), r, None, 0.0), Law(-(r * (bound + qd)), r, 0.0, None)]
+
+
+def is_number(x: Value, number: float) -> bool:
+    return is_constant(x) and x == number
+
+
+@remembered
+def neutral_inertias(scene: Scene) -> np.ndarray:
+    """Return 1 / diagonal of Mass^-1 at the neutral configuration of world 0 [dof]; of Mass where it is singular."""
+    mass, inverse = masses(scene)
+    with np.errstate(all="ignore"):
+        found = 1.0 / np.diagonal(inverse)
+    return np.where((found > 0.0) & (found <= np.diagonal(mass)), found, np.diagonal(mass))
