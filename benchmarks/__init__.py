@@ -3,12 +3,9 @@
 Each file that is a command says so in its first lines; CONTRIBUTING.md has the usual calls.
 
 The table of results:
-    ``cases``, ``precisions``, ``robots``, ``shapes`` and ``arms`` are the scenes and operations; ``runner`` checks and
-    times them, with ``resources``, ``roofline`` and ``operation_counts``; ``rows`` and ``parts`` run all of
-    it on one machine, ``turns`` gives it to one process at a time, ``peers/`` is what other libraries compute;
-    ``table``, ``pictures`` and ``evidence`` make pages of the rows; ``commits`` and ``probe`` compare commits.
+    ``rows`` runs it, ``table/`` is the library behind it, ``peers/`` is what other libraries compute.
 One question each, on a GPU:
-    ``speed`` and ``limits`` (times beside limits), ``breakdown`` (launches of a call), ``plans`` and ``crowding`` (the
+    ``speed`` and ``limits`` (times beside limits), ``breakdown`` (launches of a call), ``plans`` (the
     plan's choice), ``depth`` (scans), ``variable`` (values that are read), ``substeps``, ``step_parts`` (SolverSPO's
     step), ``actuators``, ``flexible``, ``capabilities`` (other solvers), ``host_time``, ``jax_check``, ``many_gpus``.
 Accuracy, mostly on a CPU:

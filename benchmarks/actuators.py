@@ -21,8 +21,8 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.dynamics.trial_inputs import rotations
 
-from .table import runner
 from .capabilities import SETS, measure_time
+from .table import runner
 from .table.cases import SCENES
 
 DT = 2e-3  # [s]

@@ -23,13 +23,13 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.runtime import launches
 from warp_spo.dynamics.derivative_references import inverse_dynamics_rates
 from warp_spo.reference.dense import Dense
+from warp_spo.runtime import launches
 from warp_spo.trials.inputs import TOLERANCE, Inputs
 
-from .table import robots, runner
 from .capabilities import SETS, measure_time
+from .table import robots, runner
 
 DISTINCT = 1024  # worlds with inputs of their own; further worlds repeat them
 SAMPLE = (0, 1)  # worlds that are compared

@@ -35,7 +35,8 @@ import warp_spo as spo
 from warp_spo.trials.inputs import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, Trial, all_finite
 
-from .table import robots, runner, process_turns as turns
+from .table import process_turns as turns
+from .table import robots, runner
 
 DT = 2e-3  # [s]
 SETS = 4

@@ -24,8 +24,8 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.examples import crane
 
-from .table import runner
 from .capabilities import SETS, measure_time
+from .table import runner
 from .table.resources import record_launches, resources
 
 SIX = ({"y": 2, "z": 2, "torsion": 1, "axial": 1},) * 3

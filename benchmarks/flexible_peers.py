@@ -36,8 +36,8 @@ import warp as wp
 from warp_spo.trials import drawing
 
 from . import boom
-from .table import runner
 from .boom import Simulation
+from .table import runner
 from .table.pictures import pareto
 
 STEPS = (20.0, 10.0, 5.0, 2.0, 1.0, 0.5)  # [ms]

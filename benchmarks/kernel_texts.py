@@ -26,14 +26,14 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.runtime import launches
 from warp_spo.dynamics import dynamics
 from warp_spo.examples import biped, fivebar, fourbar, slider_crank, stewart
 from warp_spo.execution.device_facts import MEASURED
 from warp_spo.kernels import native
+from warp_spo.runtime import launches
 
-from .table import robots, shapes
 from .contact import scenes
+from .table import robots, shapes
 
 WORLDS = (1, 4096, 65536)
 MANY_WORLDS = 1 << 18  # beyond every world count at which a plan changes

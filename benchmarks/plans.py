@@ -32,8 +32,9 @@ from warp_spo.execution.device_facts import DeviceFacts, read_facts
 from warp_spo.trials.inputs import OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, Trial
 
-from .table import robots, runner, process_turns as turns
 from .capabilities import DT, KD, KE
+from .table import process_turns as turns
+from .table import robots, runner
 from .table.occupied_gpu import crowd
 
 sys.path.append(str(Path(__file__).parent.parent / "tests"))  # the random trees come from the tests

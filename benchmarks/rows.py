@@ -2,7 +2,7 @@
 
     python -m benchmarks.rows FILE [PATTERN] [--device cuda:0] [--compile] [--seconds 120] [--jobs 12]
 
-The cases are those of :mod:`benchmarks.table.parts`. ``--compile`` compiles their kernels into Warp's cache, on all cores,
+The cases are those of :mod:`.table.parts`. ``--compile`` compiles their kernels into Warp's cache, on all cores,
 and times nothing. Cases of one scene, number of worlds and precision form a group, which one process computes, the
 largest group first. It makes inputs and references beside the others; while it times a case, the others stand still.
 ``FILE`` is written after each group; one that is there already is continued, if it has the same commit and device.
@@ -23,8 +23,8 @@ from pathlib import Path
 
 import warp as wp
 
-from .table import evidence, parts, roofline, runner
 from .__main__ import choose, parser
+from .table import evidence, parts, roofline, runner
 from .table.cases import FACTORIES, case_name
 from .table.process_turns import Turn, take_turns
 

@@ -13,8 +13,8 @@ import numpy as np
 from warp_spo.trials import drawing
 
 from .blocks import ROOT, STATIC
-from .table.evidence import RESULTS, files, gather, read
 from .stress.cases import ALLOWED
+from .table.evidence import RESULTS, files, gather, read
 
 FILES = ROOT / "docs" / "robot_files.md"
 READERS = {"urdf": ("Pinocchio", "o", None), "mjcf": ("MuJoCo", "s", "MuJoCo C")}

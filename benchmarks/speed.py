@@ -35,12 +35,27 @@ from warp_spo.trials.inputs import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, Trial
 
 from . import limits, step_parts, substeps
-from .table import robots, runner
 from .contact import scenes
 from .contact import steps as contact_steps
-from .limits import FIRST_STEP, FUSED, LEAN_STEP, LINES, MANY, MOST, ON_FIELD, ON_PLANE, SOLVER_STEP, STEPS, SUBSTEPS, Call, Line, describe
-from .table.resources import record_launches, resources
+from .limits import (
+    FIRST_STEP,
+    FUSED,
+    LEAN_STEP,
+    LINES,
+    MANY,
+    MOST,
+    ON_FIELD,
+    ON_PLANE,
+    SOLVER_STEP,
+    STEPS,
+    SUBSTEPS,
+    Call,
+    Line,
+    describe,
+)
+from .table import robots, runner
 from .table.process_turns import Turn, take_turns
+from .table.resources import record_launches, resources
 
 CONTACT_TOLERANCE = 1e-4  # of velocities after a step with contacts, in float32
 SETS, SAMPLE, REPEATS, WARM_UP, BUDGET = 4, 2, 15, 0.1, 0.3  # of MANY worlds four sets exceed an L2 of 50 MB

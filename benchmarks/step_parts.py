@@ -28,8 +28,8 @@ from warp_spo.newton import SolverSPO, from_newton
 from warp_spo.newton.drives import Drives
 from warp_spo.trials.trial import Timing
 
-from .table import robots, runner
 from .capabilities import DT, KD, KE, SETS, inputs, measure_time
+from .table import robots, runner
 from .table.resources import record_launches, resources
 
 NAMES = ("go2", "g1", "b1_z1", "centauro")

@@ -20,10 +20,10 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.scene.scene import Scene
 
-from .table import runner
 from . import step_parts
 from .capabilities import SETS, measure_time
 from .contact import scenes
+from .table import runner
 from .table.resources import record_launches, resources
 
 DT = 5e-3

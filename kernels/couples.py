@@ -17,7 +17,9 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from . import coupling_points, hull_distance as hulls, pass_loops, narrow_phase as touches
+from . import coupling_points, pass_loops
+from . import hull_distance as hulls
+from . import narrow_phase as touches
 from .coupling import FEW, VALUES, entries, table
 from .elementary import C_TYPE
 from .narrow_phase import AWAY, HEADER, POINT

@@ -16,7 +16,9 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from . import coupling_matrices, coupling_passes, coupling_points, hull_distance as hulls, narrow_phase as touches
+from . import coupling_matrices, coupling_passes, coupling_points
+from . import hull_distance as hulls
+from . import narrow_phase as touches
 from .elementary import C_TYPE
 from .narrow_phase import AWAY, HEADER, POINT
 

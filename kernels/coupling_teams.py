@@ -17,7 +17,9 @@ from typing import Any
 
 import warp as wp
 
-from . import coupling_blocks, coupling_matrices, coupling_points, coupling_shared, hull_distance as hulls, narrow_phase as touches
+from . import coupling_blocks, coupling_matrices, coupling_points, coupling_shared
+from . import hull_distance as hulls
+from . import narrow_phase as touches
 from .coupling import COLUMN, FEW, entries, table
 from .elementary import C_TYPE
 from .narrow_phase import AWAY, HEADER, POINT

@@ -9,7 +9,9 @@ from typing import Any
 
 import warp as wp
 
-from . import hull_clipping as hull_faces, hull_distance as hulls, segment_convex as sticks
+from . import hull_clipping as hull_faces
+from . import hull_distance as hulls
+from . import segment_convex as sticks
 from .elementary import C_TYPE
 
 HEADER, POINT, AWAY = 3, 7, -1e3

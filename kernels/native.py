@@ -14,7 +14,7 @@ const long long thread = (long long)blockIdx.x * blockDim.x + threadIdx.x;
 const long long thread = index;
 #endif
 """
-"""The number of the thread, in 64 bits. On CUDA it needs a grid of one axis, see :func:`warp_spo.runtime.launches.launch`."""
+"""The number of the thread, in 64 bits. On CUDA it needs a grid of one axis, as ``runtime.launches`` gives."""
 INTEGERS = ("place", "shifts", "status")  # names of the arrays that hold integers; each has one axis
 
 

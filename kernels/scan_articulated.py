@@ -24,8 +24,7 @@ import warp as wp
 
 from .articulated import dof_elimination
 from .elementary import EPSILON
-from .stretches import Stretches
-from .topology import Topology
+from .topology import Stretches, Topology
 
 
 @functools.cache

@@ -9,8 +9,7 @@ import functools
 
 import warp as wp
 
-from .stretches import Stretches
-from .topology import Topology
+from .topology import Stretches, Topology
 
 
 @functools.cache

@@ -5,8 +5,8 @@ The rows of 32 worlds are contiguous in the callers' arrays, so that neighbourin
 
 from typing import NamedTuple
 
-from .native import MASKS
 from .long_results import VECTORS, WARP_SIZE
+from .native import MASKS
 
 LONG_COPY = 64  # rows of this many entries or more are copied to shared memory without passing through registers
 MANY = 8  # turns that copy single entries, side by side; more take longer to fetch than to execute

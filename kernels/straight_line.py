@@ -11,9 +11,19 @@ import warp as wp
 
 from .elementary import C_TYPE, NATIVE
 from .fields import copy_cached_fields, define_fields
-from .native import INTEGERS
 from .long_results import RELAY_WORLDS, WARP_SIZE, SlotLayout
-from .shared_rows import DEFINE_ASYNC_COPY, WAIT_FOR_COPIES, Row, copy_rows_in, copy_rows_out, pitch, rows_on_their_way, source, wait_where_used
+from .native import INTEGERS
+from .shared_rows import (
+    DEFINE_ASYNC_COPY,
+    WAIT_FOR_COPIES,
+    Row,
+    copy_rows_in,
+    copy_rows_out,
+    pitch,
+    rows_on_their_way,
+    source,
+    wait_where_used,
+)
 from .substeps import STATE, hold_state, move_state, repeat_on_cuda, repeat_substeps, replace_state, write_state
 
 # shared memory that a block may declare: 48 KiB less the share that Warp uses; more is asked for at the launch

@@ -16,3 +16,16 @@ class Topology:
     qd_start: wp.array[int]  # [node], first degree of freedom of the node's hinge
     dof_count: wp.array[int]  # [node]
     dof_node: wp.array[int]  # [dof]
+
+
+@wp.struct
+class Stretches:
+    """The stretches, path by path, from the outermost of a path to the innermost."""
+
+    first: wp.array[int]  # [stretch + 1], into nodes
+    nodes: wp.array[int]  # outermost node of a stretch first
+    position: wp.array[int]  # [stretch], stretches further out on its path
+    feed: wp.array[int]  # [stretch], child of its outermost node on its path; -1 where the path begins
+    parent: wp.array[int]  # [stretch], stretch that it hangs on; -1 = the inertial frame
+    child_start: wp.array[int]  # [stretch + 1], into children
+    children: wp.array[int]  # stretches that hang on a stretch

@@ -12,19 +12,19 @@ from .errors import DirectedLoopError, UnsupportedError
 from .execution.tuned import Tuned
 from .graph.factorization import Factorization
 from .graph.operators import BWA, Blocks, Identity, Operator
-from .trace.functions import clip, spline, where
 from .scene import terrain
 from .scene.actuators import Actuator, Keyframe
-from .scene.flexible.beams import beam_modes
 from .scene.contacts import Contact, HeightField, Plane
-from .scene.gears import Rotor
+from .scene.flexible.beams import beam_modes
 from .scene.flexible.modes import MassPoints, Modes
 from .scene.flexible.normal_modes import normal_modes
+from .scene.flexible.sections import Material, Section
+from .scene.gears import Rotor
 from .scene.parts import Body, Coupling, Hinge, Loop
 from .scene.scene import Scene
-from .scene.flexible.sections import Material, Section
 from .scene.tree import Digraph, Tree
 from .status import Status
+from .trace.functions import clip, spline, where
 
 if TYPE_CHECKING:
     from . import jax as jax

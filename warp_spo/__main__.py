@@ -36,8 +36,8 @@ from .dynamics.dynamics import OPERATIONS as DECLARED
 from .dynamics.operation import AS_WRITTEN
 from .scene.scene import Scene
 from .trials import drawing, film, report
-from .trials.memory import check_memory
 from .trials.inputs import OPERATIONS, TOLERANCE, Inputs, Operation
+from .trials.memory import check_memory
 from .trials.trial import SAMPLE, Subject, Trial
 
 WORLDS = {False: 1024, True: 4096}  # on a CPU, on a GPU

@@ -23,8 +23,8 @@ BEGAN = time.time()
 def main(arguments: list[str] | None = None) -> int:
     """Train the task that the arguments name."""
     from .command_line import Parser, count, seconds
-    from .env.validation import check_folder
     from .env.tasks import TASKS, task
+    from .env.validation import check_folder
 
     parser = Parser(
         prog="python -m warp_spo.train", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

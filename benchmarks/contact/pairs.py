@@ -22,8 +22,8 @@ import warp as wp
 
 import warp_spo as spo
 from warp_spo.examples import grasp
-from warp_spo.reference.contact import ContactStep
 from warp_spo.reference.body_contact import PairStep
+from warp_spo.reference.contact import ContactStep
 
 from ..capabilities import SETS, measure_time
 from . import scenes

@@ -28,8 +28,8 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.env import robots
 
-from ..table import process_turns as turns
 from ..capabilities import median_replay
+from ..table import process_turns as turns
 
 DT, FINE, SECONDS = 5e-3, 1e-4, 0.5
 SAMPLE = 64  # worlds of a run for the error

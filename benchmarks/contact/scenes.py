@@ -15,8 +15,8 @@ import warp_spo as spo
 from warp_spo.env import robots as env_robots
 from warp_spo.reference.contact import ContactStep
 
-from ..table import robots
 from ..capabilities import SETS
+from ..table import robots
 
 DT = 5e-3
 GO2_STAND = np.array([0.0, 0.8, -1.5] * 4)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
 IDENTITY = ("scene", "op", "worlds", "dtype", "granularity", "peer", "variant", "sweep", "group", "name")
 """Keys that tell one measurement from another; each row has some of them."""

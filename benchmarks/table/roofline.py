@@ -2,7 +2,7 @@
 
     share of the roof = max(operations / peak, bytes / bandwidth) / run time
 
-Operations are those of the algorithm (:mod:`benchmarks.table.operation_counts`). Bytes are those of the caller's arrays, read
+Operations are those of the algorithm (:mod:`.operation_counts`). Bytes are those of the caller's arrays, read
 and written once. Further operations and transfers of the kernels do not count.
 """
 

@@ -253,7 +253,7 @@ def commit() -> str:
     """
     command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
-        found = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
+        found = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return os.environ.get("WARP_SPO_COMMIT", "unknown")
     return found.stdout.strip()
@@ -281,6 +281,6 @@ def versions() -> dict:
         except metadata.PackageNotFoundError:
             found[name] = "unknown"
     if found["warp_spo"] == "unknown":  # warp_spo runs from a checkout and is not installed
-        project = (Path(__file__).parent.parent / "pyproject.toml").read_text()
+        project = (Path(__file__).parents[2] / "pyproject.toml").read_text()
         found["warp_spo"] = re.search(r'^version = "(.*)"', project, re.MULTILINE)[1]
     return found

@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 
-from benchmarks.table import parts, runner
 from benchmarks import rows
 from benchmarks.__main__ import choose, main, parser
+from benchmarks.table import parts, runner
 from benchmarks.table.precisions import PRECISIONS
 from support.benchmark_results import RUN
 from warp_spo.trials.inputs import OPERATIONS, TOLERANCE

@@ -6,9 +6,9 @@ import re
 
 import pytest
 
-from benchmarks.table import evidence, pictures, runner, table
 from benchmarks import limits
 from benchmarks.__main__ import main
+from benchmarks.table import evidence, pictures, runner, table
 from support.benchmark_results import RUN, _data, _gathered, _row
 
 

@@ -9,8 +9,8 @@ import pytest
 
 import warp_spo as spo
 from benchmarks import breakdown, capabilities, env_digests, kernel_texts
-from benchmarks.table import cases, operation_counts, robots, roofline, runner, shapes
 from benchmarks.__main__ import main
+from benchmarks.table import cases, operation_counts, robots, roofline, runner, shapes
 from benchmarks.table.precisions import PRECISIONS
 from support import zoo
 from support.benchmark_results import NODE, REFINED, ROOF

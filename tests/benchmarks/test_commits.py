@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.table import commits, evidence, robots
 from benchmarks.__main__ import main
+from benchmarks.table import commits, evidence, robots
 
 IN_GIT = (evidence.ROOT / ".git").exists()
 needs_git = pytest.mark.skipif(not IN_GIT, reason="this is no checkout of git")

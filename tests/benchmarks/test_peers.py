@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import warp_spo as spo
-from benchmarks.table import cases, robots
 from benchmarks import peers
 from benchmarks.peers import coordinates, exchange, lumped
 from benchmarks.peers.__main__ import main
 from benchmarks.peers.peer import Absent
+from benchmarks.table import cases, robots
 from support import zoo
 from warp_spo.trials.inputs import TOLERANCE, Inputs
 

@@ -4,8 +4,8 @@ import re
 
 import pytest
 
-from benchmarks.table import evidence, pictures, table
 from benchmarks import peers
+from benchmarks.table import evidence, pictures, table
 from support.rendering import assert_is_whole
 from warp_spo.trials import drawing, report
 

@@ -14,8 +14,8 @@ from support import actuated, laws, zoo
 from support.border import explained, made
 from support.laws import numbers
 from support.mechanisms import MECHANISMS
-from warp_spo.runtime import launches
 from warp_spo.dynamics.operation import Argument
+from warp_spo.runtime import launches
 
 WORLDS = 3
 UNRECORDED = ("hybrid_dynamics", "operators")  # takes a NumPy mask; makes an object

@@ -12,8 +12,8 @@ from support import laws, zoo
 from support.border import made
 from support.laws import numbers
 from support.value_scenes import KINDS, WORLDS, assert_equals
-from warp_spo.reference import dense as reference
 from warp_spo.execution import plan
+from warp_spo.reference import dense as reference
 
 
 @pytest.fixture(autouse=True, params=["plan", "node"])

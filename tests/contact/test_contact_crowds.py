@@ -9,8 +9,8 @@ import warp_spo as spo
 from support import symbolic
 from support.contact_cases import box, quadruped
 from warp_spo.kernels import native
-from warp_spo.recursions.model import shared_constants as alike
 from warp_spo.recursions.contact import contact_culling as crowds
+from warp_spo.recursions.model import shared_constants as alike
 
 SKIP = re.compile(r"if \(\w+ != 0\) \{")
 REPORTS = {"contact_f": 3, "contact_gap": 1, "contact_slip": 1}

@@ -9,8 +9,8 @@ from support import contact_cases, contact_gradients, symbolic, warp_machine
 from support.actuated import driven_hand
 from support.contact_cases import quadruped, touching, waisted
 from support.contact_steps import steps
-from warp_spo.dynamics.stepping import contact_gradients as kernels
 from warp_spo.dynamics.operation import derivative_of
+from warp_spo.dynamics.stepping import contact_gradients as kernels
 from warp_spo.dynamics.stepping.step import STEP
 from warp_spo.recursions.contact.velocity_kicks import KICK, PATH, START
 from warp_spo.recursions.derivatives.contact import INERTIA, PassGradient, PassSolve, divides

@@ -12,7 +12,9 @@ from support.contact_cases import box, everywhere, quadruped, touching
 from support.contact_steps import FIELDS, H, above, assert_is_dense, by_point
 from support.step_scenes import furnished, states
 from warp_spo.dynamics.stepping import contact_options as contacts
-from warp_spo.recursions.contact import dampers, ground, law, velocity_kicks as middle, points, secant_laws as secants, step
+from warp_spo.recursions.contact import dampers, ground, law, points, step
+from warp_spo.recursions.contact import secant_laws as secants
+from warp_spo.recursions.contact import velocity_kicks as middle
 from warp_spo.reference.contact import ContactStep
 
 WORLDS = 4

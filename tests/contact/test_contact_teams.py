@@ -16,7 +16,8 @@ from support.step_scenes import furnished, states
 from warp_spo.dynamics.stepping.integrators import CONTACT_STEP
 from warp_spo.execution import plan
 from warp_spo.execution.segment import warp_specialized as teams
-from warp_spo.kernels import pass_loops, straight_line as straight
+from warp_spo.kernels import pass_loops
+from warp_spo.kernels import straight_line as straight
 from warp_spo.kernels.substeps import repeat_on_cuda
 from warp_spo.recursions.contact import points, step
 from warp_spo.recursions.contact.step import REPORTS

@@ -9,8 +9,9 @@ from support.pair_motions import momentum, stand
 from support.pair_scenes import WEDGE, box, cube, free, stack, stacked, stepped
 from support.pair_steps import assert_is_dense
 from support.pair_touches import hull_of, planted, touches_found
+from warp_spo.kernels import hull_clipping as hull_faces
+from warp_spo.kernels import narrow_phase as touches
 from warp_spo.reference import body_contact as reference_pairs
-from warp_spo.kernels import hull_clipping as hull_faces, narrow_phase as touches
 from warp_spo.reference.rotations import homogeneous
 
 PRISM = np.array([[0.07 * np.cos(a), 0.05 * np.sin(a), z] for a in np.arange(6) * np.pi / 3.0 for z in (-0.04, 0.05)])

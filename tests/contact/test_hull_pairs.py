@@ -14,11 +14,11 @@ from support.hull_scenes import CAN, CUBE, LAW, TETRAHEDRON
 from support.pair_scenes import WEDGE, cube, free, stepped
 from support.pair_steps import assert_is_dense, respond_by_whole_trees
 from support.pair_touches import hull_of, planted, touches_found
-from warp_spo.reference import body_contact as reference_pairs
 from warp_spo.kernels import hull_distance as hulls
+from warp_spo.reference import body_contact as reference_pairs
 from warp_spo.reference.rotations import homogeneous
-from warp_spo.scene.hulls import MOST
 from warp_spo.scene.collision_shapes import reduced
+from warp_spo.scene.hulls import MOST
 
 
 def test_faces_are_those_of_qhull():

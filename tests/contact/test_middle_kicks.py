@@ -8,7 +8,8 @@ import warp_spo as spo
 from support import contact_cases, symbolic, warp_machine
 from support.contact_cases import quadruped, waisted
 from warp_spo.dynamics.stepping import midpoint_contact as rounds
-from warp_spo.recursions.contact import velocity_kicks as middle, step
+from warp_spo.recursions.contact import step
+from warp_spo.recursions.contact import velocity_kicks as middle
 from warp_spo.recursions.contact.velocity_kicks import FOUND, GAINED, KICKED, PATH
 from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.model.tracing import Trace

@@ -7,7 +7,8 @@ import warp_spo as spo
 from support.pair_motions import largest_rise, momentum, stand
 from support.pair_scenes import H, cube, cubes_in_a_row, free, stack, stacked, stepped
 from warp_spo.examples import grasp
-from warp_spo.kernels import coupling, straight_line as straight
+from warp_spo.kernels import coupling
+from warp_spo.kernels import straight_line as straight
 from warp_spo.recursions.contact import coupled, pair_pieces
 from warp_spo.reference.body_contact import PairStep
 

@@ -6,8 +6,8 @@ import warp as wp
 
 import warp_spo as spo
 from support import laws, oracles, symbolic, zoo
-from warp_spo.reference import dense as reference
 from warp_spo.recursions import articulated, hybrid
+from warp_spo.reference import dense as reference
 
 WORLDS = 3
 TOLERANCE = {

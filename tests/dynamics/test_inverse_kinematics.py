@@ -7,8 +7,8 @@ import pytest
 import warp as wp
 
 import warp_spo as spo
-from benchmarks.table import arms, robots
 from benchmarks import inverse_kinematics as benchmark
+from benchmarks.table import arms, robots
 from support import laws, zoo
 from support.allocations import no_warp_allocation
 from support.mechanisms import MECHANISMS

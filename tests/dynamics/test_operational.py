@@ -10,7 +10,15 @@ from support import laws, oracles, robots, symbolic, zoo
 from support.allocations import no_warp_allocation
 from warp_spo.dynamics import quasi_velocities as quasi
 from warp_spo.examples import estimation
-from warp_spo.recursions import articulated_sweeps, determinant, kinematics, momentum, newton_euler, operational, quasi_velocities
+from warp_spo.recursions import (
+    articulated_sweeps,
+    determinant,
+    kinematics,
+    momentum,
+    newton_euler,
+    operational,
+    quasi_velocities,
+)
 from warp_spo.reference.dense import Dense
 from warp_spo.trials.inputs import APPLICATIONS, Inputs
 from warp_spo.trials.trial import Subject, Trial

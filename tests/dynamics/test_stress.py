@@ -10,8 +10,8 @@ from benchmarks.stress.cases import ALLOWED, CASES, CAUSES, choose
 from benchmarks.stress.exact import Sweep
 from benchmarks.stress.scenes import Setting
 from support.granularities import GRANULARITIES, SLOW, skip_unless_served
-from warp_spo.reference import dense as reference
 from warp_spo.kernels import status as status_kernels
+from warp_spo.reference import dense as reference
 
 KNOWN = {(case.id, dtype): CAUSES[case.name] for case in CASES if case.name in CAUSES for dtype in case.precisions}
 """(case, precision) -> why it fails. One case; three are allowed."""

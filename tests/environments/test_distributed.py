@@ -10,7 +10,8 @@ import pytest
 import torch
 import torch.multiprocessing as processes
 
-from warp_spo.env import training_log as course, learning, make
+from warp_spo.env import learning, make
+from warp_spo.env import training_log as course
 from warp_spo.env.tasks import task
 
 pytestmark = pytest.mark.slow

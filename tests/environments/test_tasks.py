@@ -12,7 +12,8 @@ pytest.importorskip("rsl_rl")
 import warp_spo as spo  # noqa: E402
 from warp_spo import env as envs  # noqa: E402
 from warp_spo import play, terrain, train  # noqa: E402
-from warp_spo.env import training_log as course, evaluation, film, learning, observations, robots  # noqa: E402
+from warp_spo.env import evaluation, film, learning, observations, robots  # noqa: E402
+from warp_spo.env import training_log as course  # noqa: E402
 from warp_spo.env.tasks import TASKS, go2_flat, go2_rough, task, velocity  # noqa: E402
 
 

@@ -11,7 +11,8 @@ from support import zoo
 from warp_spo.dynamics.inertia import SOLVE_MASS_MATRIX
 from warp_spo.execution import device_facts, plan
 from warp_spo.execution.device_facts import CPU, MEASURED, DeviceFacts
-from warp_spo.kernels import native, straight_line as straight
+from warp_spo.kernels import native
+from warp_spo.kernels import straight_line as straight
 
 L4 = DeviceFacts("NVIDIA L4", multiprocessors=58, shared_bytes=100 * 1024)
 RTX_4090 = DeviceFacts("NVIDIA GeForce RTX 4090", multiprocessors=128, shared_bytes=100 * 1024)

@@ -6,9 +6,9 @@ import pytest
 import warp_spo as spo
 from support import laws, zoo
 from support.routines import ROUTINES
-from warp_spo.reference import dense as reference
 from warp_spo.kernels import fields
 from warp_spo.recursions.model.links import TABLES, Links
+from warp_spo.reference import dense as reference
 from warp_spo.trace.scalars import ordered
 
 INERTIAS = ("body_mass", "body_com", "body_inertia")

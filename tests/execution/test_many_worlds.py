@@ -16,9 +16,9 @@ import warp as wp
 import warp_spo as spo
 from benchmarks.table import shapes
 from support.env_scenes import walker_q, walker_scene
-from warp_spo.runtime import launches, memory
 from warp_spo.env import make, robots
 from warp_spo.kernels import row_copies as rows
+from warp_spo.runtime import launches, memory
 
 FEW = 1021  # worlds of the small batch: a prime, so that a world and its equals lie differently in their blocks
 PART = 1 << 20  # worlds that are compared at once

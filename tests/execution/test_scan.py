@@ -10,10 +10,10 @@ import warp as wp
 import warp_spo as spo
 from support import laws, zoo
 from support.allocations import no_warp_allocation
-from warp_spo.runtime import launches
 from warp_spo.execution import plan
 from warp_spo.execution.device_facts import CPU, MEASURED
 from warp_spo.execution.node.path_blocks import cut, solid_nodes
+from warp_spo.runtime import launches
 
 SWEEP = {"float64": 1e-12, "float32": 5e-6}  # of P+, z+ and tau; float64 also of qdd
 SWEEPS = 4  # errors of float32 qdd, in those of float32 sweeps: with 4096 bodies 3.3 with a node a stretch, 2 with four

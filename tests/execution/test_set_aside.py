@@ -8,7 +8,9 @@ import warp as wp
 from support import zoo
 from warp_spo.execution.device_facts import MEASURED
 from warp_spo.execution.plan import choose
-from warp_spo.kernels import native, shared_rows as staged_rows, straight_line as straight
+from warp_spo.kernels import native
+from warp_spo.kernels import shared_rows as staged_rows
+from warp_spo.kernels import straight_line as straight
 from warp_spo.recursions.forward_dynamics import forward_dynamics_bias_first
 from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.model.tracing import Trace

@@ -9,7 +9,9 @@ import warp as wp
 
 import warp_spo as spo
 from support import laws, symbolic, zoo
-from warp_spo.kernels import native, shared_rows as staged_rows, straight_line as straight
+from warp_spo.kernels import native
+from warp_spo.kernels import shared_rows as staged_rows
+from warp_spo.kernels import straight_line as straight
 from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.model.tracing import Trace
 from warp_spo.trace import fusion

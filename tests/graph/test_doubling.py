@@ -5,8 +5,8 @@ import pytest
 import warp as wp
 
 from support.operator_scenes import random_parents
-from warp_spo.runtime import launches
 from warp_spo.graph.operators import BWA
+from warp_spo.runtime import launches
 from warp_spo.scene.tree import Digraph, Tree
 
 ROUNDING = {"float64": 1e-13, "float32": 5e-6}  # of sums of products of hundreds of weights, to the largest entry

@@ -10,8 +10,8 @@ import warp_spo as spo
 from support import laws, warp_machine, zoo
 from support.allocations import no_warp_allocation
 from support.operators_of_robots import IDENTITY, SCENES, close, fused, inverse_mass, scene_of, traced
-from warp_spo.reference import dense as reference
 from warp_spo.execution.staging import is_read_before_written
+from warp_spo.reference import dense as reference
 from warp_spo.trace.emission import Store
 from warp_spo.trace.scalars import Graph
 

@@ -10,7 +10,28 @@ import numpy as np
 import pytest
 
 from support.rendering import assert_is_whole
-from warp_spo.examples import crane, double_fourbar, floating_arm, fourbar, geared_arm, grasp, gripper, harmonic_drive, hop, identify, identify_boom, newton_grasp, newton_ground, options, parts, reach, slider_crank, spinning_beam, star, tether
+from warp_spo.examples import (
+    crane,
+    double_fourbar,
+    floating_arm,
+    fourbar,
+    geared_arm,
+    grasp,
+    gripper,
+    harmonic_drive,
+    hop,
+    identify,
+    identify_boom,
+    newton_grasp,
+    newton_ground,
+    options,
+    parts,
+    reach,
+    slider_crank,
+    spinning_beam,
+    star,
+    tether,
+)
 
 FOLDER = Path(parts.__file__).parent
 

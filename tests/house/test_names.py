@@ -10,12 +10,12 @@ import pytest
 
 import warp_spo as spo
 from support.env_scenes import walker_q, walker_scene
-from warp_spo.runtime import launches
 from warp_spo.env import Env, Observation, TorchTerm, actions, events, terminations
 from warp_spo.errors import shown
 from warp_spo.examples import fourbar
 from warp_spo.kernels import native
 from warp_spo.newton import load
+from warp_spo.runtime import launches
 
 CONTROL = [chr(code) for code in range(0xA0)]  # U+0000 to U+009F
 LINE_ENDS = ["\x85", "\u2028", "\u2029", "\r\n"]

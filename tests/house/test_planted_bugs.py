@@ -9,12 +9,15 @@ from support.laws import TOLERANCE
 from support.mutants import mutant
 from support.routines import ROUTINES
 from warp_spo.execution.node import functions as node_functions
-from warp_spo.execution.segment import shared_code as shared_text, warp_specialized as teams
 from warp_spo.execution.node import sweeps as levels
+from warp_spo.execution.segment import shared_code as shared_text
+from warp_spo.execution.segment import warp_specialized as teams
 from warp_spo.graph import blocks
 from warp_spo.kernels import straight_line as straight
-from warp_spo.recursions import articulated, articulated_sweeps, mass_matrix_inverse as inverse, newton_euler
-from warp_spo.recursions.model import links, messages, segments as pieces
+from warp_spo.recursions import articulated, articulated_sweeps, newton_euler
+from warp_spo.recursions import mass_matrix_inverse as inverse
+from warp_spo.recursions.model import links, messages
+from warp_spo.recursions.model import segments as pieces
 from warp_spo.trace import scalars as graph
 from warp_spo.trace import spatial
 

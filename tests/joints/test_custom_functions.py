@@ -5,10 +5,10 @@ import pytest
 
 import warp_spo as spo
 from support import custom_hinges
-from warp_spo.trace.functions import AbstractScalar
 from warp_spo.reference.jets import Jet
 from warp_spo.trace.differentiation import forward
 from warp_spo.trace.evaluation import evaluate
+from warp_spo.trace.functions import AbstractScalar
 from warp_spo.trace.scalars import Graph, is_constant
 
 EXACT = 1e-14

@@ -13,8 +13,9 @@ from support.step_scenes import FORCES, furnished, smooth
 from warp_spo.dynamics.loop_analysis import Closing
 from warp_spo.errors import UnsupportedError
 from warp_spo.examples.parts import at, bar
-from warp_spo.recursions.step import joint_laws as impedance, step
 from warp_spo.recursions.loops import closed_step, clusters
+from warp_spo.recursions.step import joint_laws as impedance
+from warp_spo.recursions.step import step
 
 H = 2e-3
 SHORTEST = 1e-7  # of the way back onto the closures: ours is the shortest seen from where the step ends, O(h^4)

@@ -17,9 +17,9 @@ from support.closed_loops import (
 )
 from support.mechanisms import MECHANISMS, Closed
 from warp_spo.dynamics.loop_analysis import Closing, embedding
-from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.loops import closures, clusters, embedded, nullspace
 from warp_spo.recursions.loops.projection import place_links
+from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.model.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
 

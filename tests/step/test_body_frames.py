@@ -8,8 +8,7 @@ import warp_spo as spo
 from support import zoo
 from support.granularity_scenes import hand
 from support.step_scenes import FORCES, H, furnished, states
-from warp_spo.execution.segment import body_kinematics as walks
-from warp_spo.execution.segment import body_frames
+from warp_spo.execution.segment import body_frames, body_kinematics
 from warp_spo.recursions.model.links import Links
 
 WORLDS = 3
@@ -64,7 +63,7 @@ def test_equal_those_of_statements(name, variable, device):
 
 def test_warps_take_several_walks(monkeypatch, device):
     """Where there are more pieces than warps."""
-    monkeypatch.setattr(walks, "MOST_WARPS", 2)
+    monkeypatch.setattr(body_kinematics, "MOST_WARPS", 2)
     test_equal_those_of_statements("walker", (), device)
 
 

@@ -6,14 +6,15 @@ import torch
 import warp as wp
 
 import warp_spo as spo
-from benchmarks.table import robots
 from benchmarks.contact import throws
+from benchmarks.table import robots
 from support import implicit, laws, symbolic, zoo
 from support.step_scenes import FORCES, SETTLED, TOLERANCE, H, furnished, slider, states
 from warp_spo.errors import UnsupportedError
 from warp_spo.hinges import ball, free
 from warp_spo.kernels import pass_loops
-from warp_spo.recursions.step import joint_laws as impedance, joint_space, step
+from warp_spo.recursions.step import joint_laws as impedance
+from warp_spo.recursions.step import joint_space, step
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,8 @@ import pytest
 import warp_spo as spo
 from support import implicit, symbolic, zoo
 from support.step_scenes import H, slide, slider
-from warp_spo.recursions.step import joint_laws as impedance, step
+from warp_spo.recursions.step import joint_laws as impedance
+from warp_spo.recursions.step import step
 from warp_spo.reference.dense import Dense
 
 

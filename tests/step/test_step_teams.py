@@ -13,7 +13,8 @@ from support.routines import ROUTINES
 from support.step_scenes import FORCES, TOLERANCE, H, furnished, states
 from warp_spo.execution import plan
 from warp_spo.execution.segment import warp_specialized as teams
-from warp_spo.kernels import pass_loops, straight_line as straight
+from warp_spo.kernels import pass_loops
+from warp_spo.kernels import straight_line as straight
 from warp_spo.kernels.substeps import repeat_on_cuda
 from warp_spo.recursions.step import step as steps
 from warp_spo.recursions.step.step import SHORT, Step, by_pieces

@@ -14,8 +14,8 @@ from warp_spo.recursions.derivatives import contact as back
 from warp_spo.recursions.derivatives import contact_pass as one
 from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.model.messages import SIZES
-from warp_spo.recursions.step.step import GAIN
 from warp_spo.recursions.model.tracing import Trace
+from warp_spo.recursions.step.step import GAIN
 from warp_spo.trace.evaluation import evaluate
 from warp_spo.trace.scalars import ordered
 

@@ -7,10 +7,13 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.reference import body_contact as reference_pairs
-from warp_spo.kernels import hull_clipping as hull_faces, hull_distance as hulls, native, narrow_phase as touches
+from warp_spo.kernels import hull_clipping as hull_faces
+from warp_spo.kernels import hull_distance as hulls
+from warp_spo.kernels import narrow_phase as touches
+from warp_spo.kernels import native
 from warp_spo.kernels.elementary import C_TYPE, NATIVE
 from warp_spo.recursions.contact.couples import Polyhedron
+from warp_spo.reference import body_contact as reference_pairs
 from warp_spo.reference.rotations import homogeneous
 from warp_spo.scene.pairs import shape_of
 

@@ -10,17 +10,33 @@ import numpy as np
 import warp_spo
 from warp_spo.dynamics.stepping.midpoint_contact import ROUNDS
 from warp_spo.execution.routine import Routine
-from warp_spo.recursions import composite, coordinates, determinant, energy, forward_dynamics, hybrid, mass_matrix_inverse as inverse, kinematics, momentum, newton_euler, operational, operators, quasi_velocities, reactions, regressor
-from warp_spo.recursions.step import hinge_forces, step
-from warp_spo.recursions.contact import velocity_kicks as middle
+from warp_spo.recursions import (
+    composite,
+    coordinates,
+    determinant,
+    energy,
+    forward_dynamics,
+    hybrid,
+    kinematics,
+    momentum,
+    newton_euler,
+    operational,
+    operators,
+    quasi_velocities,
+    reactions,
+    regressor,
+)
+from warp_spo.recursions import mass_matrix_inverse as inverse
 from warp_spo.recursions.contact import step as contact
+from warp_spo.recursions.contact import velocity_kicks as middle
 from warp_spo.recursions.contact.ground import GROUND, by_cell
 from warp_spo.recursions.contact.secant_laws import SECANT
 from warp_spo.recursions.derivatives import adjoints, inverse_dynamics
-from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.loops import closed_step, embedded, embedded_adjoints, minimal, multipliers, projection
-from warp_spo.recursions.step.step import GAIN, LOOPED, MISSED, PASS
+from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.model.tracing import Trace
+from warp_spo.recursions.step import hinge_forces, step
+from warp_spo.recursions.step.step import GAIN, LOOPED, MISSED, PASS
 from warp_spo.trace.evaluation import evaluate
 from warp_spo.trace.scalars import ordered as ordered
 

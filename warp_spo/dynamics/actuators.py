@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import warp as wp
 
-from ..runtime import launches
-from ..runtime.arrays import WARP, AnyArray, ArrayT, Call, kind_of
 from ..errors import as_integer
 from ..execution.routine import Routine
 from ..kernels import actuator_delays as delays
-from ..recursions.step.actuation import actuator_force as trace_of_force
 from ..recursions.derivatives import adjoints
+from ..recursions.step.actuation import actuator_force as trace_of_force
+from ..runtime import launches
+from ..runtime.arrays import WARP, AnyArray, ArrayT, Call, kind_of
 from .operation import ACTUATION, AS_WRITTEN, CTRL, QD, Derivative, Operation, Q, Result, Trial, required
 
 if TYPE_CHECKING:

@@ -1,6 +1,6 @@
 """Repeats recorded calls of a Dynamics: the checks that can fail from call to call, and the launches. Nothing else.
 
-The first call of a kind compiles and allocates. The second is recorded: :mod:`warp_spo.runtime.launches` keeps its device work.
+The first call of a kind compiles and allocates. The second is recorded: :mod:`.runtime.launches` keeps its device work.
 From the third on, arrays are compared with what the recorded call took, their addresses are set in the packed arguments
 of the kernels, and the kernels are launched. Two calls are of one kind if they pass the same arguments by the same
 names, arrays of the same classes and numbers that are equal. Whatever differs from the recorded call in any other way
@@ -19,10 +19,10 @@ from typing import Any
 import warp as wp
 
 from ..runtime.arrays import CLASSES, TORCH, torch_border
+from ..runtime.call_order import Turn
 from ..runtime.launches import Recording
 from ..runtime.launches import recording as open_recording
 from ..runtime.memory import ranges_overlap, size_in_bytes
-from ..runtime.call_order import Turn
 
 Builder = Callable[[Sequence[Any], list], Any]
 """``build(arrays, results)`` returns what a caller gets, of the arrays of the call and those that it made."""

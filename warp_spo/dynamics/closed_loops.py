@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any, overload
 
 import warp as wp
 
-from ..runtime import launches
-from ..runtime.arrays import AnyArray, ArrayT
 from ..errors import UnsupportedError, as_integer
 from ..execution.routine import Routine
 from ..recursions.loops import projection
+from ..runtime import launches
+from ..runtime.arrays import AnyArray, ArrayT
 from .operation import AS_WRITTEN, BODY_F, QD, TAU, Operation, Option, Q, Result
 
 if TYPE_CHECKING:

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..runtime import launches
-from ..runtime.arrays import Call
 from ..errors import UnsupportedError
 from ..execution import status_words
 from ..execution.routine import Routine
 from ..kernels import declare
 from ..kernels import loops as kernels
 from ..recursions.loops import embedded, multipliers, projection
+from ..runtime import launches
+from ..runtime.arrays import Call
 from ..scene.scene import Scene
 from .loop_analysis import Closing, embedding, usual_rank
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..runtime.arrays import AnyArray, ArrayT
 from ..execution.routine import Routine
 from ..recursions import coordinates as recursion
 from ..recursions.derivatives import adjoints
+from ..runtime.arrays import AnyArray, ArrayT
 from .operation import AS_WRITTEN, KINEMATIC, Argument, Derivative, Operation, Result, Trial
 from .trial_inputs import rotations
 

@@ -13,17 +13,30 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import warp as wp
 
-from ..runtime import launches
-from ..runtime.arrays import AnyArray, ArrayT
 from ..execution.programs import Program
 from ..execution.routine import Routine
 from ..kernels import tiles
 from ..kernels.straight_line import TILE
 from ..recursions.derivatives import inverse_dynamics as recursion
+from ..runtime import launches
+from ..runtime.arrays import AnyArray, ArrayT
+from .derivative_references import forward_dynamics_by_q, inverse_dynamics_rates
 from .forward_dynamics import FORWARD_DYNAMICS, known_accelerations
 from .inertia import MASS_MATRIX_INVERSE
-from .operation import AS_WRITTEN, BODY_F, EMBEDDED_DERIVATIVE, NO_DERIVATIVE, QD, QDD, TAU, Operation, Q, Result, Trial, derivative_of
-from .derivative_references import forward_dynamics_by_q, inverse_dynamics_rates
+from .operation import (
+    AS_WRITTEN,
+    BODY_F,
+    EMBEDDED_DERIVATIVE,
+    NO_DERIVATIVE,
+    QD,
+    QDD,
+    TAU,
+    Operation,
+    Q,
+    Result,
+    Trial,
+    derivative_of,
+)
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics

@@ -16,28 +16,45 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import warp as wp
 
-from ..runtime.arrays import parse_device, parse_dtype
 from ..errors import UnsupportedError, as_integer, as_names
 from ..execution import plan as plans
 from ..execution.device_facts import read_facts
+from ..execution.node.sweeps import Sweeps
 from ..execution.parameters import RIGID_VALUES, VARIABLE
 from ..execution.programs import Programs
-from ..execution.node.sweeps import Sweeps
-from ..runtime.autograd import TensorValues
-from ..runtime.registry import register
+from ..runtime.arrays import parse_device, parse_dtype
+from ..runtime.autograd import TensorValues, register
 from ..scene.scene import Scene
-from . import actuators, closed_loops, configurations, derivatives, energy, inertia, inverse_kinematics, kinematics, momentum, operational, preparation, regressor, scene_values, spatial_operators, pickling as storage, tuning
-from .stepping import contact_options as contacts, step as steps
+from . import (
+    actuators,
+    closed_loops,
+    configurations,
+    derivatives,
+    energy,
+    inertia,
+    inverse_kinematics,
+    kinematics,
+    momentum,
+    operational,
+    preparation,
+    regressor,
+    scene_values,
+    spatial_operators,
+    tuning,
+)
 from . import forward_dynamics as forward
 from . import hybrid_dynamics as hybrid
 from . import inverse_dynamics as inverse
+from . import pickling as storage
 from . import quasi_velocities as quasi
+from .call_replay import Replays
 from .closures import Closures, check_loops
 from .engine import Engine
 from .gradients import Gradients
 from .operation import Operation, declared
 from .refinement import Refinement
-from .call_replay import Replays
+from .stepping import contact_options as contacts
+from .stepping import step as steps
 
 if TYPE_CHECKING:
     pass

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..runtime.arrays import AnyArray, ArrayT
 from ..errors import UnsupportedError
 from ..execution.node import operations as nodes
 from ..execution.routine import Routine
 from ..recursions import energy as recursion
 from ..recursions.derivatives import adjoints
 from ..recursions.model.links import MOTION_VALUES, Links
+from ..runtime.arrays import AnyArray, ArrayT
 from ..trace.scalars import is_constant
 from .operation import AS_WRITTEN, KINEMATIC, QD, Derivative, Operation, Q, Result, Trial, required
 

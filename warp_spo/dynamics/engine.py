@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..runtime import launches
-from ..runtime.arrays import Call
 from ..errors import UnsupportedError
 from ..execution.routine import Routine
+from ..runtime import launches
+from ..runtime.arrays import Call
 from ..runtime.autograd import records_gradient
 from .operation import Argument, Closed, Derivative, Operation, Refused, Result
 

@@ -7,19 +7,34 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..runtime.arrays import AnyArray, ArrayT
-from ..execution.node import operations as nodes
 from ..execution import status_words as words
+from ..execution.node import operations as nodes
 from ..execution.routine import Routine
 from ..recursions import forward_dynamics as recursion
 from ..recursions.derivatives import adjoints
 from ..recursions.loops import embedded_adjoints
+from ..runtime.arrays import AnyArray, ArrayT
 from .closures import FORWARD_DYNAMICS as EMBEDDED_FORWARD_DYNAMICS
+from .derivative_references import forward_dynamics_by_q
 from .gradients import by_name
 from .inertia import SOLVE_MASS_MATRIX
 from .inverse_dynamics import DQ, divides_backwards
-from .operation import AS_WRITTEN, BODY_F, EMBEDDED_DERIVATIVE, QD, STATUS, TAU, Argument, Derivative, Operation, Q, Result, Trial, derivative_of, direction
-from .derivative_references import forward_dynamics_by_q
+from .operation import (
+    AS_WRITTEN,
+    BODY_F,
+    EMBEDDED_DERIVATIVE,
+    QD,
+    STATUS,
+    TAU,
+    Argument,
+    Derivative,
+    Operation,
+    Q,
+    Result,
+    Trial,
+    derivative_of,
+    direction,
+)
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics

@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..runtime import launches
-from ..runtime.arrays import Call
 from ..errors import UnsupportedError, as_names
 from ..execution import link_values
 from ..execution.height_gradients import HeightSums
 from ..execution.parameters import SHARED
 from ..execution.plan import MOST_DOFS
 from ..recursions.model.links import LINK_VALUES
-from .operation import DIFFERENTIABLE, Derivative, Operation, derivative_of
+from ..runtime import launches
+from ..runtime.arrays import Call
 from .call_replay import MISS, as_written, kind_of_call
+from .operation import DIFFERENTIABLE, Derivative, Operation, derivative_of
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..runtime import launches
-from ..runtime.arrays import AnyArray, ArrayT, Call, shape_of
 from ..errors import UnsupportedError, refuse_masked
 from ..execution.routine import Routine
-from ..runtime.memory import broadcast_worlds
 from ..recursions import hybrid
 from ..recursions.loops import minimal
+from ..runtime import launches
+from ..runtime.arrays import AnyArray, ArrayT, Call, shape_of
+from ..runtime.memory import broadcast_worlds
 from . import trial_inputs as samples
 from .operation import BODY_F, QD, QDD, TAU, USE_EMBED, Operation, Option, Q, Result, Trial
 

@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..runtime import launches
-from ..runtime.arrays import AnyArray, ArrayT
 from ..execution.node import operations as nodes
 from ..execution.routine import Routine
-from ..recursions import composite, determinant, mass_matrix_inverse as inverse
+from ..recursions import composite, determinant
 from ..recursions import forward_dynamics as solving
+from ..recursions import mass_matrix_inverse as inverse
 from ..recursions.derivatives import adjoints
 from ..recursions.loops import minimal
+from ..runtime import launches
+from ..runtime.arrays import AnyArray, ArrayT
 from .operation import AS_WRITTEN, Argument, Derivative, Operation, Q, Refused, Result, Trial
 
 if TYPE_CHECKING:

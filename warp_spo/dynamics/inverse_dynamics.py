@@ -7,16 +7,32 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..runtime.arrays import AnyArray, ArrayT
 from ..errors import UnsupportedError
 from ..execution.node import operations as nodes
 from ..execution.routine import Routine
-from ..recursions.step import hinge_forces
 from ..recursions import newton_euler, reactions
 from ..recursions.derivatives import adjoints
 from ..recursions.loops import embedded_adjoints, minimal
+from ..recursions.step import hinge_forces
+from ..runtime.arrays import AnyArray, ArrayT
 from .gradients import by_name
-from .operation import AS_WRITTEN, BODY_F, EMBEDDED_DERIVATIVE, QD, QDD, Argument, Derivative, Operation, Q, Refused, Result, Trial, derivative_of, direction, required
+from .operation import (
+    AS_WRITTEN,
+    BODY_F,
+    EMBEDDED_DERIVATIVE,
+    QD,
+    QDD,
+    Argument,
+    Derivative,
+    Operation,
+    Q,
+    Refused,
+    Result,
+    Trial,
+    derivative_of,
+    direction,
+    required,
+)
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..runtime.arrays import AnyArray, ArrayT, Call
 from ..errors import UnsupportedError, as_integer
 from ..execution import multi_start as searches
 from ..execution.routine import Routine
 from ..kernels import declare
 from ..kernels import multi_start as kernels
 from ..recursions import inverse_kinematics as recursion
+from ..runtime.arrays import AnyArray, ArrayT, Call
 from ..scene.frames import Frame
 from ..scene.parts import UNLIMITED
 from ..scene.scene import Scene

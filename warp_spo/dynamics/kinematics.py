@@ -5,16 +5,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ..runtime.arrays import AnyArray, ArrayT
 from ..execution.node import operations as nodes
 from ..execution.routine import Routine
 from ..recursions import kinematics as recursion
 from ..recursions import reactions
 from ..recursions.derivatives import adjoints
-from ..recursions.model.links import Links
 from ..recursions.loops import minimal
+from ..recursions.model.links import Links
+from ..runtime.arrays import AnyArray, ArrayT
 from ..scene.frames import Frame
-from .operation import ANCHORS, AS_WRITTEN, FRAMES, KINEMATIC, ORIENTED_FRAMES, QD, QDD, Derivative, Operation, Q, Result, Trial, required
+from .operation import (
+    ANCHORS,
+    AS_WRITTEN,
+    FRAMES,
+    KINEMATIC,
+    ORIENTED_FRAMES,
+    QD,
+    QDD,
+    Derivative,
+    Operation,
+    Q,
+    Result,
+    Trial,
+    required,
+)
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import UnsupportedError, as_integer, shown
-from ..recursions.model.links import Links
 from ..recursions.loops.closures import closures
 from ..recursions.loops.clusters import clusters
 from ..recursions.loops.embedded import Embedding
 from ..recursions.loops.projection import closure_error, closure_jacobian, move
+from ..recursions.model.links import Links
 from ..recursions.model.tracing import Trace
 from ..scene.parts import UNLIMITED
 from ..scene.scene import Scene

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..runtime.arrays import AnyArray, ArrayT
 from ..execution.node import operations as nodes
 from ..execution.routine import Routine
 from ..recursions import momentum as recursion
 from ..recursions.derivatives import adjoints
 from ..recursions.loops import minimal
+from ..runtime.arrays import AnyArray, ArrayT
 from .operation import AS_WRITTEN, KINEMATIC, QD, Derivative, Operation, Q, Result, Trial, required
 
 if TYPE_CHECKING:

@@ -37,20 +37,22 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import numpy as np
 import warp as wp
 
-from ..runtime.arrays import Call
-from ..runtime.dlpack import settle
 from ..execution.routine import Routine
-from ..runtime.autograd import call_in_graph, call_with_gradient, is_exported, is_traced, records_gradient
 from ..recursions.model.links import LINK_VALUES, MOTION_VALUES, Links
+from ..runtime.arrays import Call
+from ..runtime.autograd import call_in_graph, call_with_gradient, is_exported, is_traced, records_gradient
+from ..runtime.dlpack import settle
 from ..scene.contacts import CONTACT_VALUES, HEIGHTS
 from ..scene.frames import check_frames, origins
 from ..scene.scene import Scene
 from . import trial_inputs as samples
 from .call_replay import MISS
-from .seconds import STAND_IN, seconds
 
 if TYPE_CHECKING:
     from .gradients import Pull
+from ..errors import is_bool
+from ..runtime.autograd import check_plain
+from ..scene.parts import real
 
 MethodT = TypeVar("MethodT", bound=Callable[..., Any])
 
@@ -367,3 +369,37 @@ def declared(methods: Mapping[str, Any]) -> dict[str, Operation]:
     """Return the operations among the members of a class by name, in their order."""
     found = [vars(member).get("operation") for member in methods.values() if inspect.isfunction(member)]
     return {operation.name: operation for operation in found if isinstance(operation, Operation)}
+
+
+STAND_IN = 1e-3  # [s], of steps that only compile
+LIMITS: dict[type, tuple[float, float]] = {
+    dtype: (float(numbers.tiny), float(numbers.max))
+    for dtype, numbers in ((wp.float32, np.finfo(np.float32)), (wp.float64, np.finfo(np.float64)))
+}
+"""Least and largest normal number of each dtype."""
+
+
+def seconds(call: Call, dt: Any) -> float:
+    """Return ``dt`` [s] as a float.
+
+    Raises:
+        TypeError: not a number. ValueError: it requires grad, is not finite, or the dtype does not hold it.
+    """
+    name = call.name
+    if isinstance(dt, float):
+        found = float(dt)
+    elif getattr(dt, "requires_grad", False):
+        raise ValueError(f"{name}: dt requires grad; derivatives are not available through this call; pass float(dt)")
+    else:
+        check_plain(name, "dt", dt)
+        try:
+            number = real(dt)
+            if number.ndim or is_bool(dt):
+                raise TypeError
+        except (TypeError, ValueError):
+            raise TypeError(f"{name}: dt is {dt!r}; expected a number of seconds, the same in all worlds") from None
+        found = float(number)
+    least, most = LIMITS[call.dtype]
+    if found != 0.0 and not least <= abs(found) <= most:
+        raise ValueError(f"{name}: dt is {found} s; expected a number that {call.dtype.__name__} holds, finite")
+    return found

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ..runtime.arrays import AnyArray, ArrayT
 from ..execution.node import operations as nodes
 from ..execution.routine import Routine
 from ..kernels import cholesky
 from ..recursions import operational as recursion
 from ..recursions.loops import minimal
+from ..runtime.arrays import AnyArray, ArrayT
 from ..scene.frames import Frame
 from .operation import AS_WRITTEN, FRAMES, USE_EMBED, Argument, Operation, Q, Result, Trial
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..runtime import launches
 from ..execution.tuned import Tuned
+from ..runtime import launches
 from ..scene.scene import Scene
 from . import tuning
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..runtime import launches
 from ..errors import as_integer, as_names
+from ..runtime import launches
 from .operation import Argument, Operation, Option, derivative_of
 
 if TYPE_CHECKING:

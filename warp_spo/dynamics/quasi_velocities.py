@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..runtime.arrays import AnyArray, ArrayT
 from ..execution.routine import Routine
 from ..recursions import quasi_velocities as recursion
+from ..runtime.arrays import AnyArray, ArrayT
 from .operation import AS_WRITTEN, BODY_F, QD, TAU, Argument, Operation, Q, Refused, Result, Trial, required
 
 if TYPE_CHECKING:

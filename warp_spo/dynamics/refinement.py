@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..runtime import launches
 from ..execution import status_words as words
 from ..kernels import refinement as kernels
+from ..runtime import launches
 from .forward_dynamics import FORWARD_DYNAMICS
 from .inertia import SOLVE_MASS_MATRIX
 from .inverse_dynamics import INVERSE_DYNAMICS

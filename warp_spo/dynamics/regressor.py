@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..runtime.arrays import AnyArray, ArrayT
 from ..execution.routine import Routine
 from ..recursions import regressor as recursion
+from ..runtime.arrays import AnyArray, ArrayT
 from .operation import AS_WRITTEN, QD, QDD, TAU, Argument, Operation, Q, Refused, Result, Trial, required
 
 if TYPE_CHECKING:

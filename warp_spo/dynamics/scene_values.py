@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..runtime.arrays import AnyArray, ArrayT, Call, shape_of
-from ..runtime.dlpack import settle
 from ..execution.parameters import SHARED, VARIABLE
 from ..execution.row_copies import as_rows, copy_rows
+from ..runtime.arrays import AnyArray, ArrayT, Call, shape_of
 from ..runtime.autograd import records_gradient
+from ..runtime.dlpack import settle
 from ..scene.actuators import check_actuator_value
 from ..scene.contacts import CONTACT_VALUES
 from ..scene.parts import real

@@ -11,13 +11,10 @@ from weakref import WeakSet
 import numpy as np
 import warp as wp
 
-from ..runtime import launches
-from ..runtime.arrays import WARP, AnyArray, Call
-from ..runtime.dlpack import settle
 from ..errors import UnsupportedError
+from ..execution.node.sweeps import Sweeps
 from ..execution.programs import Programs
 from ..execution.routine import Routine
-from ..execution.node.sweeps import Sweeps
 from ..graph.algebra import LetterOwner, Operator
 from ..graph.blocks import Blocks, DeferredWeights, new_weights, weights_array
 from ..graph.factorization import Factorization
@@ -26,6 +23,9 @@ from ..graph.similarity import ChangeOfVariables, check_together
 from ..kernels import common_frames, declare, kinematics, rigid_blocks
 from ..recursions import expressions, node_blocks
 from ..recursions import operators as recursion
+from ..runtime import launches
+from ..runtime.arrays import WARP, AnyArray, Call
+from ..runtime.dlpack import settle
 from .operation import AS_WRITTEN, Operation, Q, Refused
 
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ..trace.functions import clip
 from ..scene.scene import Scene
-from .validation import check_optional_span
+from ..trace.functions import clip
 from .compile.vectors import Vector, find
+from .validation import check_optional_span
 from .world import World
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from ..errors import never_copied
-from . import given as checks
+from . import arguments as checks
 from .commands import LEVEL
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ..trace.functions import Condition, clip, where
-from .validation import Range, check_interval, check_number, check_optional_span, check_span
 from .compile.vectors import Vector, vector
+from .validation import Range, check_interval, check_number, check_optional_span, check_span
 from .world import World
 
 LEVEL = "command level"  # name under which a world remembers by how much its share has grown

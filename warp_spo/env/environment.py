@@ -10,23 +10,24 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..runtime.arrays import parse_device
 from ..dynamics.dynamics import Dynamics
 from ..execution.device_facts import read_facts
-from ..runtime.launches import compile_side_by_side
 from ..recursions.contact.ground import GROUND, SINGLE
+from ..runtime.arrays import parse_device
+from ..runtime.launches import compile_side_by_side
 from ..scene.scene import Scene
 from ..torch import stream
-from . import given, checkpoint as saving
-from .validation import check_whole
-from .events import Delays, Values, changed_values
-from .compile.cuda_graphs import Part, Replay, run_all
-from .compile.memory_layout import Layout
-from .episode_log import Log, describe, explain
-from .observations import TorchTerm
-from .compile.fused_kernel import Launch
+from . import arguments
+from . import checkpoint as saving
 from .compile.buffers import Storage
+from .compile.cuda_graphs import Part, Replay, run_all
+from .compile.fused_kernel import Launch
+from .compile.memory_layout import Layout
 from .compile.step_kernels import Tracing
+from .episode_log import Log, describe, explain
+from .events import Delays, Values, changed_values
+from .observations import TorchTerm
+from .validation import check_whole
 
 try:
     from rsl_rl.env import VecEnv
@@ -106,21 +107,21 @@ class Env(VecEnv):
         final_observations: bool = False,
         cfg: Any = None,
     ):
-        self.scene, self.num_envs = given.checked_scene(scene), worlds
+        self.scene, self.num_envs = arguments.checked_scene(scene), worlds
         self.warp_device = parse_device(str(device) if device is not None else None, "Env")
         self.device = torch.device(wp.device_to_torch(self.warp_device))
-        self.dt, self.decimation, self.max_episode_length = given.checked_times(dt, decimation, episode_length_s)
+        self.dt, self.decimation, self.max_episode_length = arguments.checked_times(dt, decimation, episode_length_s)
         self.step_dt = self.dt * self.decimation
         self.first_world = check_whole("Env", "first_world", first_world, 0, 2**32 - 1)
         self.seed, self.cfg = check_whole("Env", "seed", seed, 0, 2**64 - 1), {} if cfg is None else cfg
         self.log_interval = check_whole("Env", "log_interval", log_interval, 1)
-        self._passes, self.has_commands = given.checked_passes(scene, passes), commands is not None
-        self.final = given.checked_bool("final_observations", final_observations)
+        self._passes, self.has_commands = arguments.checked_passes(scene, passes), commands is not None
+        self.final = arguments.checked_bool("final_observations", final_observations)
         self._steps = 0
-        default = given.checked_default(scene, default_q)
-        terms = given.checked_terms(observations, rewards, terminations or {}, events)
+        default = arguments.checked_default(scene, default_q)
+        terms = arguments.checked_terms(observations, rewards, terminations or {}, events)
         self._layout = Layout(scene, default, self.step_dt, commands, changed_values(scene, events))
-        tracing = self._trace(given.checked_parts(actions), *terms, commands, events)
+        tracing = self._trace(arguments.checked_parts(actions), *terms, commands, events)
         variable = self._layout.values
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=variable, granularity=granularity)
         store = self._store = self._allocate(tracing)
@@ -156,7 +157,7 @@ class Env(VecEnv):
     def _allocate(self, tracing: Tracing) -> Storage:
         """Return the arrays that the traced stages and the dynamics read and write."""
         finals = [(f"final {name}", size) for name, size in self.num_obs.items()] if self.final else []
-        results = [*((name, 1) for name in given.RESULTS), *self.num_obs.items(), *finals]
+        results = [*((name, 1) for name in arguments.RESULTS), *self.num_obs.items(), *finals]
         of_ground = {GROUND: "ground_cells", SINGLE: "ground_heights"}  # the same memory that the dynamics read
         held = self.dyn.recursions.parameters
         tables = {name: wp.to_torch(getattr(held, of_ground[name])) for name in of_ground.keys() & tracing.tables}
@@ -223,7 +224,7 @@ class Env(VecEnv):
         if mask is None:
             self.chosen.fill_(True)
         else:
-            mask = given.checked_mask("Env.reset", mask, self.num_envs, self.device)
+            mask = arguments.checked_mask("Env.reset", mask, self.num_envs, self.device)
             self.chosen.copy_(mask)
         before = self._store.out.clone()
         self._launch("reset")
@@ -250,7 +251,7 @@ class Env(VecEnv):
             Observations by group; rewards [world]; whether the episode ended, int [world]; a dictionary with
             ``time_outs`` [world], 1 where it ended for its length alone, and now and then ``log``.
         """
-        self.actions.copy_(given.checked_actions("Env.step", actions, self.num_envs, self.action_labels))
+        self.actions.copy_(arguments.checked_actions("Env.step", actions, self.num_envs, self.action_labels))
         self.replay()
         self._steps += 1
         out = self._store.out.clone()
@@ -264,7 +265,7 @@ class Env(VecEnv):
 
     def controls(self, actions: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return what actions set, "ctrl", "target_q" or "tau" [world, ...]; worlds remember them as their actions."""
-        self.actions.copy_(given.checked_actions("Env.controls", actions, self.num_envs, self.action_labels))
+        self.actions.copy_(arguments.checked_actions("Env.controls", actions, self.num_envs, self.action_labels))
         self._launch("act")
         return {name: controls.clone() for name, controls in self._controls.items()}
 
@@ -397,4 +398,4 @@ class Env(VecEnv):
         return [Part(functools.partial(self._fill_in, term, start), term.name) for term, start in users]
 
     def _fill_in(self, term: TorchTerm, start: int) -> None:
-        self._tensors["user"][:, start : start + term.size].copy_(given.numbers_of(term, self))
+        self._tensors["user"][:, start : start + term.size].copy_(arguments.numbers_of(term, self))

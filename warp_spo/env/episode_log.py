@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from ..errors import shown
-from .compile.memory_layout import Layout
 from .compile.fused_kernel import Launch
+from .compile.memory_layout import Layout
 from .compile.step_kernels import CAUSES
 
 if TYPE_CHECKING:

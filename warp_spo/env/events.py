@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ..trace.functions import where
 from ..scene.terrain import Tiles
+from ..trace.functions import where
 from .actions import actuator_labels
-from .validation import Range, check_interval, check_number, check_span, check_steps
 from .compile.vectors import between, find, multiply, vector
+from .validation import Range, check_interval, check_number, check_span, check_steps
 from .world import World
 
 

@@ -23,11 +23,11 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.runners import OnPolicyRunner
 
-from ..runtime.arrays import parse_device
 from ..errors import as_integer
-from .validation import check_folder
-from .training_log import Course, OutOfTime
+from ..runtime.arrays import parse_device
 from .environment import Env
+from .training_log import Course, OutOfTime
+from .validation import check_folder
 
 
 @dataclasses.dataclass(frozen=True)

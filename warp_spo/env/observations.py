@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ..trace.functions import clip, where
-from .validation import check_function, check_number, check_optional_span, check_steps, check_whole
 from .compile.fused_kernel import ROW_NUMBER
 from .compile.vectors import Vector, rotate, rotate_back, vector
+from .validation import check_function, check_number, check_optional_span, check_steps, check_whole
 from .world import World
 
 Term = Callable[[World], Any]

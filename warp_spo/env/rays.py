@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..trace.functions import where
 from ..scene.contacts import HeightField, Plane
-from .observations import Each
+from ..trace.functions import where
 from .compile.vectors import rotate, rotate_back, vector
+from .observations import Each
 from .world import World
 
 SMALLEST = 1e-9  # of a denominator

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..trace.functions import AbstractScalar, clip, where
 from ..recursions.contact.ground import Place, height
 from ..trace import spatial
+from ..trace.functions import AbstractScalar, clip, where
 from ..trace.scalars import floor, lookup
-from .feet import Feet, feet
 from .compile.fused_kernel import Stage
 from .compile.vectors import Vector, as_scalar, as_value, cross, find, rotate, rotate_back, vector
+from .feet import Feet, feet
 
 if TYPE_CHECKING:
     from .compile.memory_layout import Layout

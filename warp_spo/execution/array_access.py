@@ -5,7 +5,6 @@ from __future__ import annotations
 from ..kernels import straight_line as straight
 from ..kernels.straight_line import DIRECT, RELAYED, TILED, KernelLayout
 from ..kernels.substeps import SUBSTEPS
-from .segment.body_frames import FRAME, GEOMETRY
 from ..recursions.contact import coupled
 from ..recursions.contact.secant_laws import SECANT
 from ..recursions.model.messages import INWARD, OUTWARD
@@ -13,8 +12,9 @@ from ..recursions.step.step import FORCE, GUESS, LOOPED, MISSED, RESISTANCE
 from ..status import Status
 from ..trace.emission import C_TYPE, PREFIX, Emitter, RangeReduction
 from . import staging
-from .staging import FIELDS
+from .segment.body_frames import FRAME, GEOMETRY
 from .segment.warp_specialized import HELD
+from .staging import FIELDS
 
 _SEVERITIES = hex(sum(word.severity << (4 * word) for word in Status)) + "ull"
 _SEVERITY = f"({_SEVERITIES} >> 4 * {{}} & 15)".format

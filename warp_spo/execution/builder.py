@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from ..kernels import coupling, native, straight_line as straight
+from ..kernels import coupling, native
+from ..kernels import straight_line as straight
 from ..kernels.fields import axes
 from ..kernels.native import INTEGERS
 from ..kernels.straight_line import BY_TABLE, TILED, KernelLayout
-from .segment import body_frames
 from ..recursions.contact import coupled, pairs
 from ..recursions.contact.ground import GROUND
 from ..recursions.contact.secant_laws import SECANT
@@ -22,9 +22,10 @@ from ..scene.contacts import HeightField
 from ..trace.emission import Store
 from . import staging
 from .device_facts import RESERVED
+from .node.sweeps import Sweeps
 from .plan import Plan
 from .routine import Routine
-from .node.sweeps import Sweeps
+from .segment import body_frames
 
 PASSED = (*LOOPED, SECANT, FORCE, RESISTANCE)  # variables of the loops over passes
 

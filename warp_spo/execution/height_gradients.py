@@ -6,8 +6,8 @@ from typing import Any
 
 import warp as wp
 
-from ..runtime import launches
 from ..kernels import height_field as kernels
+from ..runtime import launches
 
 
 class HeightSums:

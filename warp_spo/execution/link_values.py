@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from ..runtime import launches
-from ..kernels import native, straight_line as straight
+from ..kernels import native
+from ..kernels import straight_line as straight
 from ..kernels.fields import place_in_tile
 from ..kernels.long_results import WARP_SIZE
-from ..runtime.memory import broadcast_worlds
 from ..recursions.model.links import Links
+from ..runtime import launches
+from ..runtime.memory import broadcast_worlds
 from ..trace.differentiation import reverse
 from ..trace.emission import Emitter, Store, render
 from ..trace.scalars import ordered

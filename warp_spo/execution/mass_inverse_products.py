@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import warp as wp
 
-from ..runtime import launches
 from ..kernels import native, products
+from ..runtime import launches
 
 
 class Product(NamedTuple):

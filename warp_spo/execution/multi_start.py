@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..runtime import launches
-from ..kernels import native, multi_start as searches
+from ..kernels import multi_start as searches
+from ..kernels import native
 from ..kernels.fields import axes
 from ..recursions.model.links import Links
 from ..recursions.model.tracing import Trace
+from ..runtime import launches
 from ..trace.emission import Emitter, render
 from .routine import Routine
 from .staging import FIELDS, read_entries

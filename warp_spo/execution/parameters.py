@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from ..runtime import launches
 from ..kernels import parameters as kernels
 from ..kernels.height_field import list_corners
 from ..kernels.spatial import POSE, RIGID
 from ..kernels.topology import Topology
-from ..runtime.memory import broadcast_worlds, empty, size_in_bytes
 from ..recursions.contact.ground import CORNERS
+from ..runtime import launches
+from ..runtime.memory import broadcast_worlds, empty, size_in_bytes
 from ..scene.actuators import ACTUATOR_VALUES
 from ..scene.contacts import CONTACT_VALUES, GROUND_VALUES, HEIGHTS
 from ..scene.scene import Scene

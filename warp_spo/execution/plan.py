@@ -11,8 +11,8 @@ from ..recursions.model.links import Links
 from ..recursions.model.segments import PARTS, Pieces
 from ..scene.scene import Scene
 from .device_facts import RESERVED, DeviceFacts
-from .routine import Routine
 from .node.path_blocks import cut, solid_nodes
+from .routine import Routine
 from .tuned import Tuned
 
 SHARED, ASKED = "links share dofs", "asked for"

@@ -6,18 +6,21 @@ from typing import Any
 
 import warp as wp
 
-from ..runtime import launches
 from ..kernels.substeps import SUBSTEPS
 from ..recursions.contact import coupled
 from ..recursions.model.links import TABLES, Links
 from ..recursions.model.segments import Pieces
-from . import link_values, mass_inverse_products as products, multi_start as searches, tree_programs
-from .segment import programs as segment_programs, body_kinematics as walks
+from ..runtime import launches
+from . import link_values, tree_programs
+from . import mass_inverse_products as products
+from . import multi_start as searches
 from .builder import Builder, Job, Program
+from .node.sweeps import Sweeps
 from .plan import MOST_WARPS, Plan
 from .routine import Routine
+from .segment import body_kinematics as walks
+from .segment import programs as segment_programs
 from .segment.programs import BODIES
-from .node.sweeps import Sweeps
 
 
 class Programs:

@@ -8,8 +8,8 @@ from typing import Any
 
 import warp as wp
 
-from ..runtime import launches
 from ..kernels import row_copies as kernels
+from ..runtime import launches
 from ..runtime.memory import view
 
 

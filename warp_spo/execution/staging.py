@@ -54,7 +54,7 @@ def choose_layout(
         gathered: short results are written through shared memory even if rows are not read through it.
         tiled: the result is left in tiles.
         room: the bytes of shared memory that a block may have.
-        relays: a result without room in shared memory may wait in its own rows, see :mod:`warp_spo.kernels.long_results`.
+        relays: a result without room in shared memory may wait in its own rows, see ``kernels.long_results``.
         wide: there is room for long results as they are, without a table of their distinct values.
     """
     used = read_entries(everything)

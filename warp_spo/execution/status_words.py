@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from ..runtime import launches
 from ..kernels import declare, loops
 from ..kernels import status as kernels
 from ..kernels.spatial import ARTICULATED
+from ..runtime import launches
 from .node.sweeps import Sweeps
 
 

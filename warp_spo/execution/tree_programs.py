@@ -12,8 +12,8 @@ from ..recursions.contact import coupled, pairs
 from ..recursions.contact.secant_laws import SECANT
 from ..recursions.contact.ties import couples_of
 from ..recursions.model.links import Links
-from ..recursions.step.step import GAIN, LOOPED
 from ..recursions.model.tracing import Trace
+from ..recursions.step.step import GAIN, LOOPED
 from ..trace.emission import Store, render
 from . import staging
 from .array_access import make_emitter

@@ -14,10 +14,10 @@ from typing import Any, NoReturn, overload
 
 import warp as wp
 
-from ..runtime import launches
-from ..runtime.arrays import ArrayT, Call, kind_of, new, parse_device, parse_dtype
 from ..errors import never_copied
 from ..kernels import block_sparse, declare
+from ..runtime import launches
+from ..runtime.arrays import ArrayT, Call, kind_of, new, parse_device, parse_dtype
 from ..runtime.memory import view
 
 

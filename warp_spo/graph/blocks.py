@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ..kernels import block_sparse
 from ..runtime import launches
 from ..runtime.arrays import NUMPY, WARP, Call, device_of, kind_of, parse_device, parse_dtype
-from ..kernels import block_sparse
 from .algebra import Operator, Workspace
 
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..runtime import launches
 from ..kernels import declare
 from ..kernels import doubling as kernels
+from ..runtime import launches
 from ..scene.tree import Tree
 from .algebra import add_scaled
 from .blocks import new_weights

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..runtime import launches
 from ..kernels import factorization as kernels
+from ..runtime import launches
 from ..runtime.memory import broadcast_worlds
 from ..scene.tree import Tree
 from .blocks import Blocks, new_weights, weights_array

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..runtime.arrays import WARP
 from ..errors import as_integer
+from ..runtime.arrays import WARP
 from ..scene.tree import Digraph, Tree
 from .algebra import Identity, Operator, Product, Scaled, Sum, Transpose, Workspace, add_scaled
 from .blocks import Blocks, DeferredWeights, Table, choose_memory, matrix_size, pack, place_offsets, weights_array

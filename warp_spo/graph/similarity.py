@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from ..runtime import launches
 from ..kernels import declare
 from ..kernels import similarity as kernels
+from ..runtime import launches
 from .algebra import common
 from .blocks import Blocks, new_weights, weights_array
 

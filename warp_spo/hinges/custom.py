@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..trace.differentiation import forward
+from ..trace.functions import AbstractScalar
 from ..trace.scalars import Graph, Value, cut, is_constant
 from ..trace.spatial import ZERO, Matrix, Pose, Vector, dot
-from ..trace.functions import AbstractScalar
 from .hinge_type import Carrier, Entry, Kind, Placed, Twist
 from .quaternions import Quaternion, matrix_quaternion, multiplied
 

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import warp as wp
 
-from ..runtime.arrays import Call
 from ..dynamics.operation import Argument
 from ..errors import as_names
 from ..execution.parameters import SHARED
+from ..runtime.arrays import Call
 from .operations import Program
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 
 from ..scene.actuators import UNBOUNDED, Actuator
+from .equality_constraints import fixed_tendon
 from .mechanism import SIZES, Mechanism, actuator_output
 from .source import Source
-from .equality_constraints import fixed_tendon
 
 WORDS = {
     "mjTRN_SLIDERCRANK": "a slider-crank transmission",

@@ -7,8 +7,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from ..scene.contacts import HeightField
 from ..scene.collision_shapes import Shape
+from ..scene.contacts import HeightField
 from .mechanism import xyzw
 from .source import Source
 

@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ..runtime.arrays import AnyArray, ArrayT, Call, parse_device, parse_dtype
 from ..errors import as_integer, never_copied
 from ..kernels import declare
 from ..kernels import mujoco_states as kernels
+from ..runtime.arrays import AnyArray, ArrayT, Call, parse_device, parse_dtype
 from ..runtime.memory import broadcast_worlds
 from ..scene.parts import Hinge
 from ..scene.scene import Scene

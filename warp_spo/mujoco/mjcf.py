@@ -9,8 +9,8 @@ from typing import Any
 
 import mujoco
 
-from ..scene.scene import Scene
 from ..scene.collision_shapes import NONE, Choice
+from ..scene.scene import Scene
 from .model import scene_of
 from .source import Source
 

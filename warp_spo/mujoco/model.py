@@ -10,14 +10,14 @@ import numpy as np
 
 from ..errors import UnsupportedError
 from ..scene.actuators import Keyframe
-from ..scene.scene import Scene
 from ..scene.collision_shapes import NONE, POINTS, Choice, moving_bodies
+from ..scene.scene import Scene
 from .actuators import read_actuators
-from .mechanism import BALL, FREE, SIZES, Mechanism, rotation, scene_entries, xyzw
-from .unsupported_features import refuse_unsupported
 from .collision_shapes import collision_shapes
-from .source import Source
 from .equality_constraints import read_ties
+from .mechanism import BALL, FREE, SIZES, Mechanism, rotation, scene_entries, xyzw
+from .source import Source
+from .unsupported_features import refuse_unsupported
 
 
 def from_mujoco(model: Any, contacts: Any = None, ground: Any = None, points: int = POINTS) -> Scene:

@@ -11,11 +11,11 @@ import warp as wp
 from newton import ShapeFlags
 
 from ..errors import UnsupportedError
-from ..kernels import newton_contacts as kernels
 from ..kernels import declare
+from ..kernels import newton_contacts as kernels
+from ..scene.collision_shapes import Choice, moving_bodies
 from ..scene.contacts import HEIGHTS
 from ..scene.scene import Scene
-from ..scene.collision_shapes import Choice, moving_bodies
 from ..status import Status
 from .elevations import Elevations
 from .model_contacts import CONTACT_MATERIALS, ModelContacts, model_contacts

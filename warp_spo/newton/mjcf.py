@@ -18,9 +18,9 @@ import newton
 import warp as wp
 
 from ..errors import UnsupportedError
-from ..scene.scene import Scene
 from ..scene.collision_shapes import NONE, Choice, On, Shape, Touches
-from .files.imported import scene_of, unreadable
+from ..scene.scene import Scene
+from .files.usd import scene_of, unreadable
 from .mjcf_differences import MISREAD, find_misread, left_out, mjcf_classes
 from .worlds import quote_labels
 

@@ -13,9 +13,9 @@ import numpy as np
 from newton import GeoType, ShapeFlags
 
 from ..errors import UnsupportedError
+from ..scene.collision_shapes import TURNED, Choice, Chosen, Shape
 from ..scene.contacts import HeightField, pose_matrix
 from ..scene.scene import Scene
-from ..scene.collision_shapes import TURNED, Choice, Chosen, Shape
 from .elevations import Fields
 from .worlds import Worlds, to_numpy, unit_pose
 

@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 from ..errors import UnsupportedError
-from ..kernels import contact_pairs as kernels
 from ..kernels import declare
+from ..kernels import newton_contacts as kernels
 from ..scene.contacts import GROUND_VALUES
 from ..scene.scene import Scene
 from ..scene.shape_pairs import PairChoice

@@ -10,11 +10,11 @@ import warp as wp
 
 from ..dynamics.dynamics import Dynamics
 from ..errors import UnsupportedError
-from ..kernels import newton_contact_slots as kernels
 from ..kernels import declare
+from ..kernels import newton_contact_slots as kernels
+from ..scene.collision_shapes import moving_bodies
 from ..scene.contacts import PLACE, Contact, Listed
 from ..scene.scene import Scene
-from ..scene.collision_shapes import moving_bodies
 from ..status import Status
 from .model_contacts import ModelShapes
 from .pairs import ModelPairs

@@ -11,26 +11,25 @@ import warp as wp
 from newton import ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
-from ..runtime import launches
 from ..dynamics.dynamics import Dynamics
 from ..dynamics.stepping.step import INTEGRATORS
 from ..errors import UnsupportedError, as_integer, as_names, never_copied, shown
-from ..kernels import declare, newton_arrays as exchange
-from ..scene.scene import Scene
+from ..kernels import declare
+from ..kernels import newton_arrays as exchange
+from ..runtime import launches
 from ..scene.collision_shapes import POINTS
+from ..scene.scene import Scene
 from .body_states import BodyStates
-from .checks import check_state, read_flags
 from .contacts import ELEVATIONS, MODES, VALUES, StatusWords, find_contacts, sources_of, warn_of_contacts_left_out
 from .drives import GAINS, Drives
 from .joint_forces import JointForces
 from .layout import Layouts
-from .loop_joints import check_loop_joints
-from .from_newton import from_newton
+from .mass_matrix_interface import Plugs
+from .model import check_loop_joints, from_newton
 from .model_arrays import ModelArrays
 from .model_contacts import ModelContacts
 from .observables import Observables, Reports
 from .pairs import ModelPairs, find_pairs, warn_of_bodies_apart
-from .mass_matrix_interface import Plugs
 from .resets import reset_state
 from .slots import VARIABLE as SLOT_VALUES
 from .slots import Slots
@@ -474,3 +473,17 @@ class SolverSPO(Plugs, SolverBase):
                 f"SolverSPO.check_model: model.{name} {difference}; "
                 f"call notify_model_changed(ModelFlags.{self._arrays.flag_of_name(name).name})"
             )
+
+
+def check_state(call: str, name: str, state: Any) -> None:
+    """Raise TypeError unless ``state`` is a state."""
+    if not hasattr(state, "joint_q"):
+        raise TypeError(f"{call}: {name} is of type {type(state).__name__}; expected a newton.State")
+
+
+def read_flags(call: str, kind: type, flags: Any) -> int:
+    """Return ``flags`` as an int, or raise TypeError."""
+    bits = as_integer(flags)
+    if bits is None:
+        raise TypeError(f"{call}: flags is {flags!r}; expected newton.{kind.__name__}, or an integer of their bits")
+    return bits

@@ -9,8 +9,8 @@ from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant
 from ..trace.spatial import ZERO, Articulated, Pose, Vector, total
 from . import articulated
-from .model import shared_dofs as groups
 from .articulated import HERE, NO_INERTIA
+from .model import shared_dofs as groups
 from .model.links import Link
 from .motion import STILL
 from .newton_euler import link_acceleration

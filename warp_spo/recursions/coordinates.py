@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from ..trace.emission import Store
 from ..trace.scalars import Value
-from . import integration
 from .model.links import Link
 
 if TYPE_CHECKING:
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
 def integrate(trace: Trace) -> list[Store]:
     """out = q moved along qd for dt"""
     q, qd, h = trace.vector("q"), trace.vector("qd"), trace.graph.input("dt", 0)
-    return _coordinates(trace, lambda link: integration.integrate_link(link, q, qd, h))
+    return _coordinates(trace, lambda link: integrate_link(link, q, qd, h))
 
 
 def difference(trace: Trace) -> list[Store]:
@@ -40,7 +39,7 @@ def interpolate(trace: Trace) -> list[Store]:
 
 def coordinate_rates(trace: Trace) -> list[Store]:
     """out = dq/dt"""
-    return _coordinates(trace, lambda link: integration.coordinate_rates(link, trace.vector("q"), trace.vector("qd")))
+    return _coordinates(trace, lambda link: rates_of_link(link, trace.vector("q"), trace.vector("qd")))
 
 
 def _coordinates(trace: Trace, of: Callable[[Link], list[Value]]) -> list[Store]:
@@ -49,3 +48,14 @@ def _coordinates(trace: Trace, of: Callable[[Link], list[Value]]) -> list[Store]
         trace.label(link, "q")
         stores += [Store("out", (link.coordinate + c,), value) for c, value in enumerate(of(link))]
     return stores
+
+
+def integrate_link(link: Link, q: Callable[[int], Value], rate: Callable[[int], Value], h: Value) -> list[Value]:
+    """Return the link's coordinates after ``rate(dof)`` has been constant for ``h`` [s]; quaternions come out
+    normalised."""
+    return link.hinge.moved(link, q, [rate(dof) for dof in link.dofs], h)
+
+
+def rates_of_link(link: Link, q: Callable[[int], Value], rate: Callable[[int], Value]) -> list[Value]:
+    """Return the time derivatives of the link's coordinates; of a quaternion, of the unit one."""
+    return link.hinge.coordinate_rates(link, q, [rate(dof) for dof in link.dofs])

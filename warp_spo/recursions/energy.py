@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from ..trace.emission import Store
 from ..trace.spatial import ZERO, Vector, dot
-from .step.joint_laws import Impedance
 from .kinematics import link_velocities, place_all
 from .momentum import composite_inertias
+from .step.joint_laws import Impedance
 
 if TYPE_CHECKING:
     from .model.tracing import Trace

@@ -13,9 +13,9 @@ from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant, select
 from ..trace.spatial import Articulated, Pose, Vector, dot, total
 from . import articulated, newton_euler
-from .model import shared_dofs as groups
 from .articulated import LEAST, NO_INERTIA, Factor, Pivot
 from .articulated_sweeps import NO_FORCE, Factors, inside, total_inertia
+from .model import shared_dofs as groups
 from .model.links import Link, Placed
 from .motion import Motion, carry_acceleration
 

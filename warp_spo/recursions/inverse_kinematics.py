@@ -21,10 +21,10 @@ from ..scene.parts import UNLIMITED
 from ..trace.emission import Store
 from ..trace.scalars import Value, absolute, is_constant, less, reciprocal, select, sqrt
 from ..trace.spatial import IDENTITY, ZERO, Vector, dot, total
-from .step.joint_laws import Impedance
 from .kinematics import columns, place_axes
 from .model.links import Link
 from .model.tracing import EPSILON
+from .step.joint_laws import Impedance
 
 if TYPE_CHECKING:
     from .model.tracing import Trace

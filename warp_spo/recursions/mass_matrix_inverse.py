@@ -15,8 +15,8 @@ from ..trace.spatial import Vector, dot, total
 from . import articulated
 from .articulated_sweeps import NO_FORCE, factor, factor_tree, mirror, pack, pivots, propagate_inward, weighted_products
 from .model.links import Link
-from .motion import STILL
 from .model.segments import Piece, Pieces
+from .motion import STILL
 
 if TYPE_CHECKING:
     from .model.tracing import Trace

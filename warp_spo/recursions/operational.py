@@ -9,9 +9,9 @@ from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import ZERO, Vector, cross
 from . import articulated
-from .model import shared_dofs as groups
 from .articulated_sweeps import NO_FORCE, factor_tree, mirror, pivots, propagate_inward, weighted_products
 from .kinematics import accelerations_of_frames, frame_on_link, place_all, place_axes
+from .model import shared_dofs as groups
 from .model.links import Link
 from .motion import STILL
 from .newton_euler import link_acceleration

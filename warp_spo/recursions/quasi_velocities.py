@@ -14,9 +14,9 @@ from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant, ordered, sqrt
 from ..trace.spatial import ZERO, Articulated, Vector, dot, total
 from . import articulated, hybrid
-from .model import shared_dofs as groups
 from .articulated_sweeps import Factors, eliminate
 from .derivatives.tangents import coordinate_directions
+from .model import shared_dofs as groups
 from .motion import carry_acceleration, link_motion
 
 if TYPE_CHECKING:

@@ -15,7 +15,16 @@ from functools import cached_property
 import numpy as np
 
 from .kinematics import Motion
-from .rotations import homogeneous, pose7, quaternion, quaternion_product, rotation, rotation_about, rotation_vector, skew
+from .rotations import (
+    homogeneous,
+    pose7,
+    quaternion,
+    quaternion_product,
+    rotation,
+    rotation_about,
+    rotation_vector,
+    skew,
+)
 from .rotors import Rotors, moving
 
 __all__ = [

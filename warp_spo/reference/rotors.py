@@ -16,7 +16,7 @@ def moving(dense):
 
 
 class Rotors:
-    """The rotors of a scene at the configuration of a :class:`warp_spo.reference.dense.Dense`; reflected ones are armature.
+    """The rotors of a scene at the configuration of a :class:`.dense.Dense`; reflected ones are armature.
 
     Attributes:
         hinges: of each rotor (parent, dof, axis in the world, ratio).

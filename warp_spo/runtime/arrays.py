@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, Union
 import numpy as np
 import warp as wp
 
-from . import dlpack, launches
 from ..errors import refuse_masked
-from .memory import is_same, overlap, view
+from . import dlpack, launches
 from .call_order import Turn
+from .memory import is_same, overlap, view
 
 if TYPE_CHECKING:
     import jax

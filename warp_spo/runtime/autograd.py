@@ -1,6 +1,8 @@
 """Which calls torch's autograd records. torch is used only if the caller has imported it."""
 
+import itertools
 import sys
+import weakref
 from typing import Any
 
 from .arrays import torch_border
@@ -69,3 +71,14 @@ def call_in_graph(*call: Any) -> Any:
     from ..torch import call_in_graph
 
     return call_in_graph(*call)
+
+
+KNOWN: weakref.WeakValueDictionary[str, Any] = weakref.WeakValueDictionary()
+_numbers = itertools.count()
+
+
+def register(dyn: Any) -> str:
+    """Return a new number for a Dynamics, by which :data:`KNOWN` has it."""
+    found = str(next(_numbers))
+    KNOWN[found] = dyn
+    return found

@@ -64,7 +64,7 @@ def is_traced(array: object) -> bool:
 def settle(arguments: Iterable[Any]) -> None:
     """Wait until JAX has computed the arrays among some arguments.
 
-    A caller does so before it takes a turn (:mod:`warp_spo.runtime.call_order`). JAX computes in threads of its own, and what it has
+    A caller does so before it takes a turn (:mod:`.call_order`). JAX computes in threads of its own, and what it has
     not computed yet may be a call of ours that waits for the same turn.
     """
     if "jax" in sys.modules:

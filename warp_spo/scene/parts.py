@@ -20,17 +20,17 @@ import numpy as np
 
 from ..errors import UnsupportedError, as_integer
 from ..hinges.custom import MOST, Custom, checked
+from ..hinges.elementary import BY_NAME, elements
 from ..hinges.hinge_type import FREE as FREE
 from ..hinges.hinge_type import SCREWS as SCREWS
 from ..hinges.hinge_type import Element
-from ..hinges.elementary import BY_NAME, elements
 from .axes import in_plane as in_plane
 from .axes import screws_of
 from .checks import checked_array, checked_unit, read_only
 from .checks import checked_inertia as checked_inertia
 from .checks import real as real
-from .gears import Rotor, checked_flexible, motor_and_deflection, resolve_rotor
 from .flexible.modes import Modes
+from .gears import Rotor, checked_flexible, motor_and_deflection, resolve_rotor
 from .pickling import StoredPart, check_function
 
 IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)

@@ -16,10 +16,33 @@ import numpy as np
 from ..errors import refuse_masked, shown
 from .actuators import RANGES, Actuator, Keyframe, actuator_values, check_actuator_value
 from .checks import SYMMETRY
-from .contacts import CONTACT_VALUES, HEIGHTS, Contact, ContactPoint, HeightField, Plane, check_contacts, check_field, contact_points, contact_values
+from .contacts import (
+    CONTACT_VALUES,
+    HEIGHTS,
+    Contact,
+    ContactPoint,
+    HeightField,
+    Plane,
+    check_contacts,
+    check_field,
+    contact_points,
+    contact_values,
+)
 from .flexible.modes import MASS_VALUES, check_modes, with_modes
 from .pairs import ContactPair, contact_pairs
-from .parts import DOF_VALUES, Body, Coupling, Hinge, Loop, checked_array, checked_inertia, checked_pose, checked_unit, read_only, real
+from .parts import (
+    DOF_VALUES,
+    Body,
+    Coupling,
+    Hinge,
+    Loop,
+    checked_array,
+    checked_inertia,
+    checked_pose,
+    checked_unit,
+    read_only,
+    real,
+)
 from .pickling import Stored
 from .tree import Tree
 

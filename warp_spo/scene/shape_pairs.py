@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..errors import UnsupportedError, as_integer
+from .collision_shapes import Shape
 from .contacts import Contact, pose_matrix, spread_directions
 from .hulls import Hull, convex_hull, grown, is_convex
-from .collision_shapes import Shape
 
 if TYPE_CHECKING:
     from .scene import Scene

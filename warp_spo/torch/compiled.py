@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch.autograd import forward_ad
 
-from ..runtime.registry import KNOWN
-from .autograd import Record
+from ..runtime.autograd import KNOWN
 from ..runtime.torch_tensors import DTYPES, is_tensor, pointer
+from .autograd import Record
 
 if TYPE_CHECKING:
     from ..dynamics.dynamics import Dynamics

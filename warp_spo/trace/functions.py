@@ -11,7 +11,23 @@ from typing import Any
 
 import numpy as np
 
-from .scalars import Value, absolute, arctangent, cos, exponential, is_constant, less, logarithm, negative, power, quotient, reciprocal, select, sin, sqrt
+from .scalars import (
+    Value,
+    absolute,
+    arctangent,
+    cos,
+    exponential,
+    is_constant,
+    less,
+    logarithm,
+    negative,
+    power,
+    quotient,
+    reciprocal,
+    select,
+    sin,
+    sqrt,
+)
 
 WAY_OUT = (
     "expected + - * / **, abs, np.sin, cos, tan, exp, log, sqrt, arctan2, hypot, and spo.where(condition, a, b), "

@@ -15,8 +15,8 @@ import numpy as np
 from ..dynamics.dynamics import OPERATIONS as DECLARED
 from ..dynamics.dynamics import Dynamics
 from ..dynamics.operation import Operation as Declaration
-from ..dynamics.trial_inputs import DT, FRAME_POSE, every_other, rotations, two_frames
 from ..dynamics.spatial_operators import EXPRESSION
+from ..dynamics.trial_inputs import DT, FRAME_POSE, every_other, rotations, two_frames
 from ..execution.routine import Routine
 from ..reference.dense import Dense
 from ..scene.scene import Scene

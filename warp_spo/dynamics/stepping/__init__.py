@@ -1,1 +1,1 @@
-"""TODO."""
+"""``Dynamics.step``: options, reports, integrators, contact, and gradients of a step."""

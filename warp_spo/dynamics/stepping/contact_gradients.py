@@ -20,11 +20,20 @@ from ...recursions.contact.step import PASSES
 from ...recursions.derivatives import contact
 from ...recursions.derivatives.adjoints import result_name
 from ...recursions.derivatives.contact import CAME, COTANGENT, HEIGHTS_AT, INERTIA, SOLVED
-from ...recursions.derivatives.contact_pass import BEFORE, NUMBER, ROW, contact_pass, count_laws, count_variables, weighed_pieces
+from ...recursions.derivatives.contact_pass import (
+    BEFORE,
+    NUMBER,
+    ROW,
+    contact_pass,
+    count_laws,
+    count_variables,
+    weighed_pieces,
+)
 from ...recursions.model.messages import SIZES
 from ...recursions.model.tracing import Trace
 from ...scene.contacts import HEIGHTS, HeightField
-from . import midpoint_contact as rounds, midpoint_contact_gradients as rounds_back
+from . import midpoint_contact as rounds
+from . import midpoint_contact_gradients as rounds_back
 
 if TYPE_CHECKING:
     from ..dynamics import Dynamics

@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ...runtime.arrays import Call
 from ...errors import UnsupportedError, as_integer
 from ...kernels import combination
 from ...recursions.contact import step as ground
 from ...recursions.contact.pair_pieces import by_limbs
 from ...recursions.contact.pairs import RESIDUAL, default_passes
+from ...runtime.arrays import Call
 from ...scene.contacts import HeightField, contact_figures
-from . import integrators
 from ..closures import AMID_CONTACTS
 from ..operation import Argument
+from . import integrators
 
 if TYPE_CHECKING:
     from ..dynamics import Dynamics

@@ -7,23 +7,23 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import warp as wp
 
-from ...runtime import launches
-from ...runtime.arrays import Call
 from ...errors import UnsupportedError
 from ...execution.routine import Routine
 from ...kernels import combination, loops
 from ...kernels.substeps import SUBSTEPS
 from ...recursions import coordinates, kinematics
-from ...recursions.step import hinge_forces
-from ...recursions.step import step as recursion
 from ...recursions.contact import pair_pieces, pairs
-from ...recursions.step.joint_laws import DEFAULT_BOUND
 from ...recursions.loops import closed_step, multipliers
 from ...recursions.loops.closed_step import NEWTON_STEPS
+from ...recursions.step import hinge_forces
+from ...recursions.step import step as recursion
+from ...recursions.step.joint_laws import DEFAULT_BOUND
+from ...runtime import launches
+from ...runtime.arrays import Call
 from ...scene.scene import Scene
-from . import midpoint_contact as rounds
 from ..forward_dynamics import accelerations
 from ..kinematics import BODY_STATES
+from . import midpoint_contact as rounds
 from .midpoint_contact import CONTACT_STEP
 
 if TYPE_CHECKING:

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import warp as wp
 
-from ...runtime import launches
 from ...execution.routine import Routine
-from ...kernels import unsettled
+from ...kernels.status import mark_unsettled
 from ...recursions.contact import step as contact
 from ...recursions.contact.velocity_kicks import FOUND, GAINED, KICK, KICKED, PATH, START, last_kick, middle_kick
 from ...recursions.derivatives import adjoints
+from ...runtime import launches
 from ...scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def step(
     dyn._engine.launch_routine(LAST_KICK, qd_out, further, **state)
     if status is not None:
         read = [last.found, last.kick, qd_out, UNSETTLED]
-        dyn.recursions.launch(unsettled.mark_unsettled, dyn.worlds, read, [status])
+        dyn.recursions.launch(mark_unsettled, dyn.worlds, read, [status])
 
 
 def _copy(dyn: Dynamics, name: str, array: wp.array) -> wp.array:

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ...runtime import launches
 from ...kernels import combination
 from ...recursions.contact.velocity_kicks import KICK, PATH, START
-from . import midpoint_contact as rounds
+from ...runtime import launches
 from ..inertia import SOLVE_MASS_MATRIX
 from ..inverse_dynamics import WAY_BACK
+from . import midpoint_contact as rounds
 
 if TYPE_CHECKING:
     from collections.abc import Callable

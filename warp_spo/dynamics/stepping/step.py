@@ -6,20 +6,41 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ...runtime.arrays import AnyArray, ArrayT, Call
 from ...errors import as_integer
 from ...execution.routine import Routine
 from ...kernels import combination
 from ...recursions.derivatives import adjoints
 from ...recursions.loops import embedded_adjoints
+from ...runtime.arrays import AnyArray, ArrayT, Call
 from ...status import Status
 from .. import actuators
-from . import contact_gradients, contact_options as contacts, integrators
 from ..gradients import by_name
-from .integrators import INTEGRATORS, Interval
-from ..operation import AS_WRITTEN, BODY_F, CTRL, DIFFERENTIABLE, DT, EMBEDDED_DERIVATIVE, KINEMATIC, QD, STATUS, TAU, Argument, Derivative, Operation, Option, Q, Result, Trial, derivative_of, required
-from .midpoint_contact import INTEGRATE_VJP
+from ..operation import (
+    AS_WRITTEN,
+    BODY_F,
+    CTRL,
+    DIFFERENTIABLE,
+    DT,
+    EMBEDDED_DERIVATIVE,
+    KINEMATIC,
+    QD,
+    STATUS,
+    TAU,
+    Argument,
+    Derivative,
+    Operation,
+    Option,
+    Q,
+    Result,
+    Trial,
+    derivative_of,
+    required,
+)
 from ..trial_inputs import rotations
+from . import contact_gradients, integrators
+from . import contact_options as contacts
+from .integrators import INTEGRATORS, Interval
+from .midpoint_contact import INTEGRATE_VJP
 
 MOST_FUSED = 1 << 10  # substeps in one kernel, so that it ends soon; drivers stop kernels that keep a display waiting
 SEVERITY = [Status(word).severity for word in range(len(Status))]

@@ -1,1 +1,1 @@
-"""TODO."""
+"""How an environment's step becomes fused kernels: symbolic worlds, memory, buffers, CUDA graphs."""

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from .memory_layout import Layout
 from .fused_kernel import CHOSEN, COLUMN, INT, LONG, ROW, SHARED, Buffer
+from .memory_layout import Layout
 
 CONTACT_ARRAYS = {"contact_f": 3, "contact_gap": 1, "contact_slip": 1}  # entries of each point, and of each pair
 LINE = 32  # scalars of a line of the caches

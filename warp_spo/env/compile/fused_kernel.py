@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from ...runtime import launches
 from ...kernels import native, philox, row_chunks
 from ...kernels.elementary import C_TYPE
 from ...kernels.elementary import NATIVE as ELEMENTARY
+from ...runtime import launches
 from ...trace.emission import Emitter, Listing, RangeReduction, Store, render, replaces
 from ...trace.scalars import BRANCHES, Graph, Scalar, ordered
 

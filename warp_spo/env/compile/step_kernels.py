@@ -15,11 +15,11 @@ import numpy as np
 from ...trace.functions import AbstractScalar, Condition, where
 from ...trace.scalars import Value, absolute, branch, less
 from ..events import EncoderBias, Interval, Reset, Start, Values
-from .memory_layout import Layout
 from ..observations import Observation, name_of
-from .fused_kernel import Stage
-from .vectors import Vector, as_condition, as_value, vector
 from ..world import World
+from .fused_kernel import Stage
+from .memory_layout import Layout
+from .vectors import Vector, as_condition, as_value, vector
 
 LARGEST = 1e30  # numbers beyond it count as not finite
 CAUSES = ("action", "state", "reward")  # of ends for numbers that are not finite, the first first

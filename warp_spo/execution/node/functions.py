@@ -20,8 +20,8 @@ from ...kernels.spatial import spatial
 from ...recursions import articulated, kinematics, motion, newton_euler
 from ...recursions.articulated import Pivot
 from ...recursions.model.links import Placed
-from ...recursions.motion import STILL, Motion
 from ...recursions.model.tracing import EPSILON
+from ...recursions.motion import STILL, Motion
 from ...trace.emission import Emitter, Store, render
 from ...trace.scalars import Graph, Value, reciprocal
 from ...trace.spatial import Articulated, Matrix, Pose, Rigid, Vector, magnitude

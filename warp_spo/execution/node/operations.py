@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from ...kernels import articulated, declare, kinematics, body_sums as sums
+from ...kernels import articulated, declare, kinematics
+from ...kernels import body_sums as sums
 from .sweeps import Sweeps
 
 

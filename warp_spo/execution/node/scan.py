@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ...runtime import launches
 from ...graph.blocks import new_weights
 from ...graph.doubling import Doubling, Round
 from ...kernels import declare, scan_articulated, scan_forces, scan_motion, scan_solve
 from ...kernels.spatial import ARTICULATED, MOTION, POSE
-from ...kernels.stretches import Stretches
+from ...kernels.topology import Stretches
+from ...runtime import launches
 from .path_blocks import Cut, cut, solid_nodes
 
 if TYPE_CHECKING:

@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ...runtime import launches, memory
 from ...kernels import articulated, composite, declare, kinematics, newton_euler, parameters, rigid_blocks, tiles
 from ...kernels.spatial import ARTICULATED, MOTION, POSE, RIGID
 from ...kernels.topology import Topology
+from ...runtime import launches, memory
+from ...runtime.call_order import Turn
 from ...runtime.memory import broadcast_worlds
 from ...scene.scene import Scene
-from ...runtime.call_order import Turn
-from . import hinges as node_hinges
-from .functions import node_functions
 from ..parameters import Parameters
 from ..plan import Plan
+from . import hinges as node_hinges
+from .functions import node_functions
 from .scan import Scan
 
 

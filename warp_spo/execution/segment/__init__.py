@@ -1,1 +1,1 @@
-"""TODO."""
+"""Kernels at segment granularity: one warp a serial segment of the tree, in blocks of 32 worlds."""

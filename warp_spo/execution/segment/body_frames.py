@@ -13,14 +13,14 @@ from typing import NamedTuple
 
 from ...hinges.quaternions import Quaternion, constant_quaternion, multiplied, turned
 from ...hinges.revolute import Turn
+from ...recursions.kinematics import NEUTRAL, quaternions_in_links, relative_quaternion
+from ...recursions.model.links import Link, Links, place_link
+from ...recursions.model.scene_cache import remembered
+from ...recursions.model.segments import Pieces
 from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Graph, Value, is_constant
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross
-from ...recursions.kinematics import NEUTRAL, quaternions_in_links, relative_quaternion
-from ...recursions.model.links import Link, Links, place_link
-from ...recursions.model.segments import Pieces
-from ...recursions.model.scene_cache import remembered
 
 GEOMETRY = "geometry"
 """The table of RECORD numbers for each body: origin and quaternion in the frame that its link has in a walk, and its

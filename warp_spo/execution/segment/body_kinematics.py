@@ -5,12 +5,12 @@ Steps that differ in numbers alone share a text. So little code stays in the ins
 
 from __future__ import annotations
 
-from . import body_frames
 from ...recursions.model.links import Links
 from ...trace.emission import C_TYPE, Emitter, Listing, Store, render
 from ..array_access import make_emitter
 from ..builder import Builder, Job, Program, flatten
 from ..plan import MOST_WARPS
+from . import body_frames
 from .shared_code import SharedText
 
 

@@ -14,18 +14,19 @@ from ...kernels import coupling_teams
 from ...kernels.elementary import C_TYPE
 from ...kernels.long_results import WARP_SIZE
 from ...kernels.straight_line import DIRECT, KernelLayout
-from ...recursions.model import shared_constants as alike, messages
 from ...recursions.contact import pair_pieces
 from ...recursions.contact.couples import Team as Couplings
 from ...recursions.contact.points import own_points
 from ...recursions.contact.secant_laws import SECANT
+from ...recursions.model import messages
+from ...recursions.model import shared_constants as alike
 from ...recursions.model.messages import INWARD, OUTWARD
 from ...recursions.model.segments import PARTS, Piece, Pieces
-from ...recursions.step.step import FORCE, GAIN, GUESS, MISSED, RESISTANCE
 from ...recursions.model.tracing import Trace
+from ...recursions.step.step import FORCE, GAIN, GUESS, MISSED, RESISTANCE
 from ...trace.emission import Emitter, Store, under
-from ...trace.scalars import Scalar, Value, is_literal, negative, ordered
 from ...trace.register_spilling import set_aside
+from ...trace.scalars import Scalar, Value, is_literal, negative, ordered
 from .. import staging
 from ..array_access import make_emitter
 from ..builder import Builder, Job, Program, flatten

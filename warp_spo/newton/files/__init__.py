@@ -1,1 +1,1 @@
-"""TODO."""
+"""Robot files: URDF and USD by readers of this library, MJCF by MuJoCo."""

@@ -10,9 +10,9 @@ from xml.etree.ElementTree import ParseError
 
 import newton
 
+from ...scene.collision_shapes import POINTS, Choice
 from ...scene.contacts import HeightField, Plane
 from ...scene.scene import Scene
-from ...scene.collision_shapes import POINTS, Choice
 from ..mjcf import read_mjcf
 from .urdf import read_urdf
 from .usd import read_usd

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from ...errors import UnsupportedError
+from ...scene.collision_shapes import NONE, Choice
 from ...scene.parts import UNLIMITED, Body, Coupling, Hinge
 from ...scene.scene import Scene
-from ...scene.collision_shapes import NONE, Choice
+from ..worlds import quote_labels
 from .inertia_repair import repair_bodies
 from .urdf_masses import mass_of_shapes
 from .urdf_shapes import urdf_shapes
-from ..worlds import quote_labels
 from .xml_source import Element, read_xml
 
 KINDS = {

@@ -21,11 +21,21 @@ from ..articulated_sweeps import NO_FORCE
 from ..kinematics import frame_on_link, velocity
 from ..model.links import Link, Links
 from ..model.messages import INWARD, OUTWARD
-from ..motion import STILL
 from ..model.segments import Piece, Pieces
+from ..motion import STILL
 from .coupled import CoupledStep, suits
 from .couples import EXCESS, Team
-from .pairs import RESIDUAL, PairedStep, inverse_weights, members, place_axes_of, places_of, solids_of, values_of, velocities_of
+from .pairs import (
+    RESIDUAL,
+    PairedStep,
+    inverse_weights,
+    members,
+    place_axes_of,
+    places_of,
+    solids_of,
+    values_of,
+    velocities_of,
+)
 from .points import Point
 from .step import ContactStep, Touch
 

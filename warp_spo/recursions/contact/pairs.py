@@ -17,13 +17,13 @@ from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Value, sqrt
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, total
-from ..model import effective_mass as neutral
 from ..articulated_sweeps import NO_FORCE, pivots, propagate_inward, weighted_products
 from ..kinematics import carried_velocity, frame_on_link, velocity
+from ..model import effective_mass as neutral
 from ..model.links import Link, Links
+from ..model.scene_cache import remembered
 from ..motion import hinge_motion
 from ..operational import respond, unit_wrenches
-from ..model.scene_cache import remembered
 from . import step as ground
 from .couples import Polyhedron, Solids
 from .points import SLIP, with_ancestors

@@ -28,15 +28,15 @@ from ...scene.contacts import AWAY, HEIGHTS, PLACE, ContactPoint, HeightField, L
 from ...scene.scene import Scene
 from ...trace.scalars import Value, absolute, branch, is_constant, less, lost, reciprocal, select
 from ...trace.spatial import IDENTITY, ZERO, Vector, cross, dot, total
-from ..model import effective_mass as neutral
-from ..step.joint_laws import is_number
 from ..kinematics import arm_on_link, carried_velocity, frame_on_link, zero
+from ..model import effective_mass as neutral
 from ..model.links import Link, Links
+from ..model.scene_cache import remembered
+from ..model.segments import Piece, Pieces
+from ..model.tracing import Trace
 from ..motion import Motion, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
-from ..model.segments import Piece, Pieces
-from ..model.scene_cache import remembered
-from ..model.tracing import Trace
+from ..step.joint_laws import is_number
 from .ground import Corners, Place, Surface, directions, lowest, surface_count, surfaces
 from .velocity_kicks import KICK, PATH
 

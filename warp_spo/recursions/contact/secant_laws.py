@@ -10,8 +10,8 @@ from __future__ import annotations
 from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Graph, Value, absolute, inverse_root, less, reciprocal, select
-from ..step.joint_laws import CREEP, FRICTION, LIMIT, Law, is_number
 from ..model.scene_cache import remembered
+from ..step.joint_laws import CREEP, FRICTION, LIMIT, Law, is_number
 
 SECANT = "secant"
 """Variables that passes leave for the next one, of a thread."""

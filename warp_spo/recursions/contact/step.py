@@ -19,19 +19,19 @@ from ...trace.emission import Store
 from ...trace.scalars import Value, branch, is_constant, less, reciprocal, select
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from ..articulated_sweeps import Factors, expand, reduce
-from ..step.joint_laws import Law, add_laws
-from ..integration import integrate_link
+from ..coordinates import integrate_link
 from ..kinematics import zero
 from ..model.links import Link
-from ..newton_euler import inverse_dynamics
 from ..model.segments import Piece, Pieces
+from ..newton_euler import inverse_dynamics
+from ..step.joint_laws import Law, add_laws
 from ..step.step import GAIN, Step
 from .contact_culling import Crowd, gather
 from .dampers import SEVERAL, chosen, damper, load
 from .law import Found, Touch, begin_point, finish_point, force_at, normal_force
-from .velocity_kicks import KICK, START
 from .points import Point, ground_place, keeps_arms, own_points, place_points
 from .secant_laws import Kept, Secant, largest, single_dofs
+from .velocity_kicks import KICK, START
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace

@@ -27,7 +27,7 @@ from ...trace.emission import Store
 from ...trace.scalars import Value, reciprocal
 from ...trace.spatial import ZERO
 from ..articulated_sweeps import expand, reduce
-from ..integration import integrate_link
+from ..coordinates import integrate_link
 from ..kinematics import zero
 from ..model.links import Link
 from ..newton_euler import inverse_dynamics

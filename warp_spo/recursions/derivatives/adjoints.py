@@ -19,17 +19,16 @@ from ...trace.differentiation import forward, reverse
 from ...trace.emission import Store
 from ...trace.scalars import Scalar, Value, ordered
 from ...trace.spatial import ZERO, total
-from ..step.actuation import actuator_force, hinge_laws
 from ..articulated_sweeps import expand, reduce
 from ..composite import mass_matrix
-from ..coordinates import difference, integrate, interpolate
+from ..coordinates import difference, integrate, integrate_link, interpolate
 from ..energy import kinetic_energy, potential_energy
 from ..forward_dynamics import forward_dynamics
-from ..integration import integrate_link
 from ..kinematics import body_poses, body_velocities, frame_accelerations, frame_poses, frame_velocities, jacobian
 from ..model.links import Link
 from ..momentum import com, com_velocity
 from ..newton_euler import inverse_dynamics
+from ..step.actuation import actuator_force, hinge_laws
 from .power import Entry, Power, Ways
 from .tangents import coordinate_directions, tangent_gradient
 

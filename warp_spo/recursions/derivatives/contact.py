@@ -37,13 +37,13 @@ from ...trace.scalars import Scalar, Value, cut, is_constant, less, ordered, sel
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from ..articulated_sweeps import Factors, eliminate, expand, reduce
 from ..contact.ground import CORNERS
-from ..contact.velocity_kicks import KICK, PATH, START
 from ..contact.points import Carried, Point, own_points, place_points, point_links, with_ancestors
-from ..integration import integrate_link
+from ..contact.velocity_kicks import KICK, PATH, START
+from ..coordinates import integrate_link
 from ..kinematics import carried_velocity
 from ..model.links import Link
-from ..motion import hinge_motion, whirl
 from ..model.segments import Piece, Pieces
+from ..motion import hinge_motion, whirl
 from .adjoints import entries, result_name
 from .contact_pass import NUMBER, OnePass
 from .power import Entry, Power, Ways

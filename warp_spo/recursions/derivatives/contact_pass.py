@@ -18,9 +18,9 @@ from ...trace.scalars import Value, cut, reciprocal, select
 from ..contact.points import Point, own_points, surface_numbers
 from ..contact.secant_laws import Kept, single_dofs
 from ..contact.step import ContactStep, Touch
-from ..step.joint_laws import LIMIT, Law
 from ..model.links import Link, Links
 from ..model.segments import Pieces
+from ..step.joint_laws import LIMIT, Law
 from ..step.step import GAIN
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from ...trace.emission import Store
 from ...trace.scalars import Value, less, select
 from ...trace.spatial import total
 from ..articulated_sweeps import expand, reduce
-from ..integration import integrate_link
+from ..coordinates import integrate_link
 from ..model.links import Link, place_link
 from ..step.step import Step, all_finite
 from . import clusters

@@ -1,1 +1,1 @@
-"""TODO."""
+"""The scene as the recursions see it: links, serial segments, constants, and one symbolic evaluation."""

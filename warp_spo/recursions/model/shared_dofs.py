@@ -18,9 +18,9 @@ from typing import NamedTuple
 from ...trace.scalars import Value, guarded, reciprocal, select
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from ..articulated import LEAST, NO_INERTIA, columns
+from ..motion import Motion
 from .link import Link
 from .links import Placed
-from ..motion import Motion
 
 NO_FORCE = Vector((*ZERO, *ZERO))
 

@@ -13,10 +13,10 @@ from typing import Any
 from ...trace.emission import Store
 from ...trace.scalars import Value
 from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Vector, cross
-from . import messages
 from .. import motion, newton_euler
-from .links import Link, Links, Placed, place_link
 from ..motion import STILL, Motion
+from . import messages
+from .links import Link, Links, Placed, place_link
 from .segments import Piece
 
 EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}

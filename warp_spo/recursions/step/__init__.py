@@ -1,1 +1,1 @@
-"""TODO."""
+"""The implicit time step without contact."""

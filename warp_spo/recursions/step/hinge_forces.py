@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 from ...trace.emission import Store
 from ...trace.scalars import Value
 from ...trace.spatial import Vector, total
+from ..motion import hinge_entries
 from .actuation import hinge_laws
 from .joint_laws import Impedance
-from ..motion import hinge_entries
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace

@@ -22,8 +22,8 @@ from ...scene.parts import UNLIMITED
 from ...scene.scene import Scene
 from ...trace.scalars import Value, absolute, is_constant, less, reciprocal, select
 from ...trace.spatial import total
-from ..model.links import Link, Links
 from ..model.effective_mass import masses
+from ..model.links import Link, Links
 from ..model.scene_cache import remembered
 
 CREEP = 1e-4  # rate [rad/s, m/s] below which dry friction is a damper; it saturates at this rate

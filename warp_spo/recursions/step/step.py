@@ -19,15 +19,15 @@ from ...status import Status
 from ...trace.emission import Store
 from ...trace.scalars import Value, alone, floor, less, reciprocal, select
 from ...trace.spatial import total
-from .actuation import hinge_laws
 from ..articulated_sweeps import expand, reduce
-from .joint_laws import Law, add_laws, is_number
-from ..integration import integrate_link
-from .joint_space import JointSpace
+from ..coordinates import integrate_link
 from ..kinematics import body_states
 from ..model.links import Link
 from ..model.segments import Piece, Pieces
 from ..model.tracing import Trace
+from .actuation import hinge_laws
+from .joint_laws import Law, add_laws, is_number
+from .joint_space import JointSpace
 
 GUESS, GAIN, MISSED, PASS = "guess", "gain", "missed", "pass"
 """Variables of the loop over passes, zero at first: guess of u, and u, by dof of a piece; number of wrong guesses. And

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Elastic bodies: modes, beams, sections."""

@@ -21,9 +21,9 @@ import numpy as np
 
 from ...errors import as_integer
 from ..checks import checked_array, read_only
+from ..pickling import StoredPart
 from .modes import MassPoints, Modes
 from .sections import Material, Section, positive
-from ..pickling import StoredPart
 
 DIRECTIONS = ("y", "z", "torsion", "axial")
 """Kinds of modes, in the order of the modal coordinates."""

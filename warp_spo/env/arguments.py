@@ -9,9 +9,9 @@ import torch
 
 from ..errors import UnsupportedError, is_bool, shown
 from ..scene.scene import Scene
-from .validation import check_function, check_mapping, check_number, check_whole
-from .observations import Observation, TorchTerm
 from .compile.step_kernels import NOT_FINITE
+from .observations import Observation, TorchTerm
+from .validation import check_function, check_mapping, check_number, check_whole
 
 INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 RESULTS = ("reward", "done", "time_out")
