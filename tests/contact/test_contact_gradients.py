@@ -1,5 +1,6 @@
 """Gradients of steps with contacts: every pass against differences away from switches, and through torch."""
 
+import functools
 import itertools
 
 import newton
@@ -12,6 +13,7 @@ from support import contact_gradients, geared, symbolic, zoo
 from support.contact_cases import EFFORT, box, everywhere, quadruped, touching
 from support.contact_steps import FIELDS, above
 from support.hopping_leg import leg, loss
+from support.quick import slow_unless
 from support.solver_grounds import SIDE, boxes, plane
 from support.step_scenes import furnished, states
 from warp_spo.env import robots
@@ -32,22 +34,27 @@ def without_friction(scene):
     return scene.with_values(joint_friction=np.zeros(scene.dof_count))
 
 
-def cases():
-    """Scenes with states in which points stick, slide, close and open, and drives are saturated."""
-    for name, friction, fast in (("stick", 0.8, 1.0), ("slide", 0.2, 3.0)):
-        scene = without_friction(quadruped(EFFORT, friction=friction))
-        q, qd, tau = touching(scene, 4, WORLDS)
-        yield name, scene, {"q": q, "qd": fast * qd, "tau": tau}
-    scene = without_friction(everywhere(furnished(zoo.random_tree(6, 1)), 1))
-    a = states(scene, WORLDS)
-    yield "tree", scene, a | {"qd": np.random.default_rng(0).normal(size=a["qd"].shape)}
-    scene = everywhere(geared.geared_tree("full"), 1)
-    a = states(scene, WORLDS)
-    yield "geared", scene, {"q": a["q"], "qd": np.random.default_rng(0).normal(size=a["qd"].shape), "tau": a["tau"]}
-    for name, field in FIELDS.items():
+@functools.cache
+def case(name):
+    """A scene with states in which points stick, slide, close and open, and drives are saturated."""
+    if name in FIELDS:
+        field = FIELDS[name]
         uneven = field.heights + 1e-3 * np.random.default_rng(0).normal(size=field.heights.shape)
         scene = box(ground=spo.HeightField(uneven, field.cell, field.origin), friction=0.3)  # no two corners as low
-        yield name, scene, above(scene, 1, 2 * WORLDS)
+        a = above(scene, 1, 2 * WORLDS)
+    elif name in ("stick", "slide"):
+        friction, fast = {"stick": (0.8, 1.0), "slide": (0.2, 3.0)}[name]
+        scene = without_friction(quadruped(EFFORT, friction=friction))
+        q, qd, tau = touching(scene, 4, WORLDS)
+        a = {"q": q, "qd": fast * qd, "tau": tau}
+    else:
+        tree = furnished(zoo.random_tree(6, 1)) if name == "tree" else geared.geared_tree("full")
+        scene = everywhere(without_friction(tree), 1)
+        a = states(scene, WORLDS)
+        a |= {"qd": np.random.default_rng(0).normal(size=a["qd"].shape)}
+        if name == "geared":
+            a = {argument: a[argument] for argument in ("q", "qd", "tau")}
+    return scene, contact_gradients.furnish(scene, a)
 
 
 def go2(ground):
@@ -72,16 +79,13 @@ def test_gradients_of_go2_are_differences(ground):
         assert crossed <= 0.05, (argument, errors)
 
 
-CASES = {name: (scene, contact_gradients.furnish(scene, a)) for name, scene, a in cases()}
-
-
 SLOW = ("stick", "slide", "tree", "geared")
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in CASES])
+@pytest.mark.parametrize("name", slow_unless(FIELDS, [*SLOW, *FIELDS]))
 def test_gradients_are_differences(name):
     """By state, forces, targets, gains and the contacts' values; hardly any difference crosses a switch."""
-    scene, a = CASES[name]
+    scene, a = case(name)
     errors = contact_gradients.errors(scene, a, H, 3)
     for argument, (error, crossed) in errors.items():
         assert error <= LARGEST.get(argument, LARGEST_ELSE), (argument, errors)
@@ -90,7 +94,7 @@ def test_gradients_are_differences(name):
 
 @pytest.mark.parametrize("passes", [1, 4])
 def test_any_number_of_passes_is_differentiated(passes):
-    scene, a = CASES["rough"]
+    scene, a = case("rough")
     errors = contact_gradients.errors(scene, a, H, passes, names=("q", "qd", "contact_friction"))
     assert max(error for error, _ in errors.values()) <= LARGEST_ELSE
 
@@ -108,7 +112,7 @@ BUGS = {
 @pytest.mark.parametrize("bug", BUGS)
 def test_planted_bugs(bug, monkeypatch):
     symbolic.plant(monkeypatch, *BUGS[bug])
-    scene, a = CASES["rough"]
+    scene, a = case("rough")
     errors = contact_gradients.errors(scene, a, H, 3, names=("q", "qd", "contact_friction"))
     assert max(error for error, _ in errors.values()) >= 1e-3, errors
 

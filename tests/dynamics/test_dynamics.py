@@ -1,6 +1,7 @@
 """Dynamics: laws x operations x scenes at node granularity; robots at the granularity of the plan, too."""
 
 import functools
+import itertools
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ from support import laws, zoo
 from support.allocations import no_warp_allocation
 from support.granularities import of_random_scenes
 from support.laws import OPERATIONS, TOLERANCE
+from support.quick import slow_unless
 from support.robots import ROBOTS
 
 SCENES = zoo.SCENES | ROBOTS
 QUICK = ("humanoid", "cartpole", "arm")  # robots that a quick run compiles at the plan's granularity
+FEW = (*zoo.FEW, "arm", "cartpole")  # scenes that a quick run takes at node granularity
 SOME = ["tree20", "forest", "humanoid"]  # every hinge kind; several roots; a robot
 FINITE_DIFFERENCE = 1e-6  # central differences with h = 1e-5: eps / h + h^2
 
@@ -36,8 +39,13 @@ def _twin(name, worlds, dtype, device, varied):
 
 
 # -- against the dense reference ---------------------------------------------------------------------------------------
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    slow_unless(
+        [*((name, "float64") for name in FEW), ("tree10", "float32"), ("arm", "float32")],
+        itertools.product(SCENES, ["float64", "float32"]),
+    ),
+)
 def test_equals_reference(name, dtype, device):
     """Masses, CoMs, inertias, anchors, armature and gravity differ in every world."""
     dyn = twin(name, 3, dtype, device)
@@ -99,7 +107,7 @@ def test_mass_matrix_is_inverse_dynamics_columns(name, device):
     laws.inverse_dynamics_columns_are_the_mass_matrix(dyn, laws.states(dyn.scene, 3), TOLERANCE["float64"])
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", slow_unless(FEW, SCENES))
 def test_forward_undoes_inverse_dynamics(name, device):
     dyn = twin(name, 3, "float64", device)
     laws.forward_undoes_inverse_dynamics(dyn, laws.states(dyn.scene, 3), TOLERANCE["float64"])

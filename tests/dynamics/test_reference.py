@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from support import zoo
+from support.quick import slow_unless
 from support.reference_cases import (
     ALGEBRA,
     DIFFERENCE,
@@ -25,7 +26,13 @@ from warp_spo.scene.parts import Body, Hinge
 from warp_spo.scene.scene import Scene
 
 
-@pytest.mark.parametrize("name", [name for name, screws in is_screws.items() if screws])
+@pytest.mark.parametrize(
+    "name",
+    slow_unless(
+        ("one_fixed_then_revolute", "chain_helical", "every_d6", "plain"),
+        [name for name, screws in is_screws.items() if screws],
+    ),
+)
 def test_bias_force_is_christoffel(name):
     """sum_jk (dM_ij/dq_k - 1/2 dM_jk/dq_i) qd_j qd_k + dU/dq_i, from the paper's mass matrix alone."""
     scene, d, _ = case(name)
@@ -46,7 +53,7 @@ def test_power_is_energy_rate(name):
     assert abs(rate - tau @ d.qd) <= DIFFERENCE * (np.abs(tau * d.qd).sum() + abs(energy(d)))
 
 
-@pytest.mark.parametrize("name", is_floating)
+@pytest.mark.parametrize("name", slow_unless(("chain_free", "fork", "tree10"), is_floating))
 def test_momentum_is_conserved(name):
     """O9 as a rate: without armature, gravity and root force a tree's momentum about the world origin stands still."""
     scene, d, tau = case(name)

@@ -11,11 +11,11 @@ import warp_spo as spo
 from support import laws
 from support.granularity_scenes import (
     DTYPES,
-    FEW,
     GRANULARITIES,
     MANY,
+    OF_HAND,
     OPERATIONS,
-    PRECISION,
+    QUICK,
     SCENES,
     SEGMENTED,
     dynamics,
@@ -32,10 +32,8 @@ def cases():
         for granularity in GRANULARITIES:
             for dtype in DTYPES:
                 for operation in OPERATIONS if granularity == "tree" else (*SEGMENTED, "bias_force"):
-                    quick = operation in FEW.get(name, OPERATIONS)
-                    quick = quick and (name in PRECISION[dtype] or operation in SEGMENTED[:2])
-                    quick = quick and not (name == "deep" and (dtype == "float64" or granularity == "segment"))
-                    marks = [] if quick else [pytest.mark.slow]
+                    quick = dtype == QUICK[name][0] and operation in QUICK[name][1]
+                    marks = [] if quick and (name, granularity) != ("deep", "segment") else [pytest.mark.slow]
                     found.append(pytest.param(name, granularity, dtype, operation, marks=marks))
     return found
 
@@ -52,7 +50,7 @@ def test_equals_reference(name, granularity, dtype, operation, device):
 @pytest.mark.parametrize("granularity", GRANULARITIES)
 def test_equals_reference_where_a_warp_is_not_full(granularity, worlds, device):
     dyn = dynamics("hand", granularity, worlds, "float32", device)
-    for operation in FEW["hand"]:
+    for operation in OF_HAND:
         equals_reference(dyn, operation, states(dyn), laws.TOLERANCE["float32"])
 
 
@@ -108,7 +106,7 @@ def test_same_bits_at_every_number_and_order_of_worlds(granularity, device):
     many = dynamics("hand", granularity, MANY, "float32", device)
     arrays = states(many)
     order = np.random.default_rng(7).permutation(MANY)
-    for operation in FEW["hand"]:
+    for operation in OF_HAND:
         wanted = laws.numpy_call(many, operation, arrays)
         moved = laws.numpy_call(many, operation, {name: array[order] for name, array in arrays.items()})
         np.testing.assert_array_equal(moved, wanted[order])

@@ -8,10 +8,13 @@ import warp as wp
 
 from support.allocations import no_warp_allocation
 from support.operator_scenes import (
+    CASES,
+    OPERATORS,
     TOLERANCE,
     WORLDS,
     assert_close,
     every,
+    every_case,
     everywhere,
     full,
     inverse_of,
@@ -25,9 +28,10 @@ from warp_spo.graph.operators import BWA
 from warp_spo.scene.tree import Digraph, Tree
 
 
-@pytest.mark.parametrize("dtype", TOLERANCE)
-@everywhere
-@every
+@pytest.mark.parametrize(
+    ("operator", "scene", "dtype"),
+    [*((*case, "float64") for case in CASES), *((operator, "random", "float32") for operator in OPERATORS)],
+)
 def test_dense_and_apply_equal_numpy(operator, scene, dtype, device):
     op, matrix = pair(operator, scene, device, dtype)
     if op.worlds == 1:
@@ -44,8 +48,7 @@ def test_dense_and_apply_equal_numpy(operator, scene, dtype, device):
         np.testing.assert_allclose(out, wanted, rtol=0, atol=TOLERANCE[dtype] * magnitude)
 
 
-@everywhere
-@every
+@every_case
 def test_adjoint(operator, scene, device):
     """<op x, z> = <x, op.T z>, and x @ op = op.T @ x."""
     op, matrix = pair(operator, scene, device)
@@ -103,8 +106,7 @@ def test_same_bits_in_every_run_order_and_number_of_worlds(operator, dtype, devi
     np.testing.assert_array_equal((op @ columns)[..., 0], y[:33])
 
 
-@everywhere
-@every
+@every_case
 def test_no_allocation_after_first_use(operator, scene, device):
     op, _ = pair(operator, scene, device)
     for shape in ((WORLDS, op.shape[1]), (WORLDS, op.shape[1], 2)):

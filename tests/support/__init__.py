@@ -26,5 +26,6 @@ Traces and kernels without a compiler or a GPU:
     ``symbolic`` (traces evaluated by NumPy), ``warp_machine`` (the CUDA text of teams, run in Python), ``routines``,
     ``granularities``, ``mutants`` (kernel files with a planted bug), ``allocations``.
 Others:
-    ``benchmark_results``, ``rendering`` (pictures), ``typing_user``.
+    ``quick`` (parameters of which a quick run takes some), ``benchmark_results``, ``rendering`` (pictures),
+    ``typing_user``.
 """

@@ -132,23 +132,29 @@ SCENES = {
     "several robots": zoo.forest,
     "oblique chain": lambda: zoo.chain(4),
 }
-FEW = {  # operations that a quick run takes of a scene; the others have all
-    "deep": ("forward_dynamics", "inverse_dynamics"),
-    "no gravity": ("forward_dynamics", "gravity_force"),
-    "no armature": SEGMENTED[:1],
-    "isotropic armature": ("forward_dynamics", "solve_mass_matrix"),
-    "anisotropic armature": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
-    "several robots": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
-    "two arms": ("forward_dynamics", "mass_matrix"),
-    "dancer": ("mass_matrix_inverse",),
-    "hand": (*SEGMENTED, "bias_force"),
-    "mirrored": ("forward_dynamics",),
-    "arm": (*SEGMENTED, "log_det_mass_matrix", "body_poses"),
-    "three roots": (*SEGMENTED, "bias_force", "jacobian"),
-}
-PRECISION = {"float32": ("every kind", "arm", "hand", "massless", "deep"),
-             "float64": ("fixed", "anisotropic armature", "three roots", "dancer")}  # fmt: skip
-"""Scenes of which a quick run takes all of those in this precision; in the other one the first two."""
+FORWARD = ("forward_dynamics",)
+OF_HAND = (*SEGMENTED, "bias_force")
+QUICK = {
+    "every kind": (
+        "float32", (*FORWARD, "mass_matrix_inverse", "body_velocities", "jacobian", "operational_inertia_inverse")
+    ),
+    "arm": ("float32", (*FORWARD, "log_det_mass_matrix")),
+    "fixed": ("float64", OPERATIONS),
+    "hand": ("float32", OF_HAND),
+    "mirrored": ("float32", FORWARD),
+    "deep": ("float32", FORWARD),
+    "massless": ("float32", FORWARD),
+    "no armature": ("float64", FORWARD),
+    "isotropic armature": ("float64", (*FORWARD, "solve_mass_matrix")),
+    "anisotropic armature": ("float64", (*FORWARD, "mass_matrix")),
+    "no gravity": ("float32", (*FORWARD, "gravity_force")),
+    "three roots": ("float64", (*FORWARD, "inverse_dynamics", "jacobian")),
+    "two arms": ("float64", (*FORWARD, "mass_matrix")),
+    "dancer": ("float64", ("mass_matrix_inverse",)),
+    "several robots": ("float64", (*FORWARD, "inverse_dynamics")),
+    "oblique chain": ("float64", FORWARD),
+}  # fmt: skip
+"""Precision and operations that a quick run takes of a scene, at each granularity."""
 
 
 @functools.cache

@@ -203,8 +203,19 @@ def assert_close(value, wanted, dtype="float64"):
     assert np.abs(value - wanted).max(initial=0) <= TOLERANCE[dtype] * scale
 
 
+ON_EVERY_GRAPH = ("A", "A.T", "doubled", "products")
+"""Operators that meet every graph: a sweep each way, doubling, and sums of products. The others are made of these."""
+CASES = [
+    (operator, scene)
+    for operator in OPERATORS
+    for scene in SCENES
+    if operator in ON_EVERY_GRAPH or scene in ("random", "digraph")
+]
+"""(operator, graph): every operator on a forest and on a graph whose nodes have several parents."""
+
 every = pytest.mark.parametrize("operator", OPERATORS)
 everywhere = pytest.mark.parametrize("scene", SCENES)
+every_case = pytest.mark.parametrize(("operator", "scene"), CASES)
 
 
 def path(graph, i, k):

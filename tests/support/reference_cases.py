@@ -8,6 +8,7 @@ import pytest
 from warp_spo.reference.dense import Dense, rotation
 
 from . import zoo
+from .quick import slow_unless
 
 # Relative to the largest entry of the expected array unless said otherwise.
 ORACLE = 1e-11  # float64 against float64, forward dynamics loses cond(M) eps; measured 4e-13, cond up to 5e3
@@ -18,7 +19,7 @@ FLOAT32 = 1e-5  # Newton's forward kinematics, a chain of 8; measured 5e-7
 
 STENCIL = 3e-4  # of unit time: 1e-3 loses a factor 100 where accelerations reach 1e3, 1e-4 meets eps / h
 
-every_scene = pytest.mark.parametrize("name", zoo.SCENES)
+every_scene = pytest.mark.parametrize("name", slow_unless(zoo.FEW, zoo.SCENES))
 is_screws = {name: all(h.kind not in ("ball", "free") for h in make().hinges) for name, make in zoo.SCENES.items()}
 is_floating = [
     name for name, make in zoo.SCENES.items() if any(h.kind == "free" for h in make().hinges if h.parent < 0)

@@ -327,3 +327,7 @@ SCENES |= {
     "trees25": functools.partial(random_tree, 25, 25, roots=3),
 }
 """Name -> scene factory without arguments."""
+
+FEW = ("one_fixed_then_revolute", "chain_free", "chain_helical", "every_d6", "fork", "forest", "plain", "tree10")
+"""Scenes that a quick run takes where a law holds for all of them: every kind of hinge, free hinges within a tree,
+limbs, several roots, fixed bodies, anchors that coincide with body frames."""
