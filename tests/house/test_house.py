@@ -111,10 +111,11 @@ def test_host_code_launches():
     for path in HOST:
         text, imported = path.read_text(), imports(path)
         assert "@wp.kernel" not in text and "@wp.func" not in text, path
-        assert "torch" not in imported or path.parent.name in ("torch", "env", "examples"), path
-        assert "jax" not in imported or path.parent == PACKAGE / "jax", path
-        assert "newton" not in imported or path.parent in (PACKAGE / "newton", PACKAGE / "examples"), path
-        assert "mujoco" not in imported or path.parent == PACKAGE / "mujoco", path
+        room = path.relative_to(PACKAGE).parts[0]
+        assert "torch" not in imported or room in ("torch", "env", "examples") or path.name == "torch_tensors.py", path
+        assert "jax" not in imported or room == "jax", path
+        assert "newton" not in imported or room in ("newton", "viewing", "examples"), path
+        assert "mujoco" not in imported or room == "mujoco", path
 
 
 @pytest.mark.parametrize("room", ["graph", "execution", "dynamics"])
@@ -159,20 +160,13 @@ def test_imports_among_rooms_point_one_way():
         assert room in ROOMS, f"{path}: {room} is new: give it its place in ROOMS, after all that it imports"
         for line, imported in rooms_imported(path):
             one_way = imported == room or imported in ROOMS[: ROOMS.index(room)]
+            one_way |= (path.name, imported) == ("autograd.py", "torch")  # calls that record a gradient for torch
             assert one_way, f"{path}, line {line}: {room} imports {imported}"
 
 
 def test_the_reference_imports_numpy_and_itself_alone():
     for path in sorted((PACKAGE / "reference").glob("*.py")):
-        assert imports(path) <= {
-            "__future__",
-            "functools",
-            "itertools",
-            "typing",
-            "dataclasses",
-            "collections",
-            "numpy",
-        }
+        assert imports(path) <= {"__future__", "collections", "functools", "itertools", "typing", "numpy"}, path
         assert {room for _, room in rooms_imported(path)} <= {"reference"}
 
 

@@ -15,8 +15,8 @@ from ..execution.device_facts import read_facts
 from ..recursions.contact.ground import GROUND, SINGLE
 from ..runtime.arrays import parse_device
 from ..runtime.launches import compile_side_by_side
+from ..runtime.torch_tensors import stream
 from ..scene.scene import Scene
-from ..torch import stream
 from . import arguments
 from . import checkpoint as saving
 from .compile.buffers import Storage

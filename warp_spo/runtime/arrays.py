@@ -486,8 +486,8 @@ def _describe(array: Any, kind: str) -> str:
 
 @functools.cache
 def torch_border() -> Any:
-    """Return the module :mod:`warp_spo.torch`."""
-    from .. import torch  # the only file that imports torch, used only if the caller has imported torch
+    """Return the module :mod:`.torch_tensors`."""
+    from . import torch_tensors  # imports torch, which the caller has imported
 
-    CLASSES.update(dict.fromkeys(torch.CLASSES, TORCH))
-    return torch
+    CLASSES.update(dict.fromkeys(torch_tensors.CLASSES, TORCH))
+    return torch_tensors

@@ -52,7 +52,9 @@ def check_plain(call: str, name: str, value: Any) -> None:
 
 def call_with_gradient(*call: Any) -> Any:
     """Return the result of :func:`warp_spo.torch.call_with_gradient`."""
-    return torch_border().call_with_gradient(*call)
+    from ..torch import call_with_gradient
+
+    return call_with_gradient(*call)
 
 
 def is_traced() -> bool:
