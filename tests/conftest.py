@@ -31,12 +31,6 @@ def pytest_addoption(parser):
     )
 
 
-@pytest.fixture
-def newtons_importer(monkeypatch):
-    """MJCF files are read by Newton's importer, as without the package mujoco."""
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-
-
 def pytest_configure(config):
     if config.getoption("--device") == "cpu":
         os.environ.setdefault("JAX_PLATFORMS", "cpu")

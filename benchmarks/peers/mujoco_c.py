@@ -9,7 +9,7 @@ import numpy as np
 from .coordinates import States
 from .lumped import Robot
 from .mujoco_model import model
-from .peer import Absent, PythonPeer
+from .peer import PythonPeer
 
 CALL = "one core, one world after the other, a few Python calls each"
 
@@ -28,10 +28,8 @@ class MujocoC(PythonPeer):
 
     @classmethod
     def version(cls) -> str:
-        try:
-            import mujoco
-        except ImportError as error:
-            raise Absent(f"{error}; pip install warp_spo[oracles]") from None
+        import mujoco
+
         return mujoco.__version__
 
     def __init__(self, robot: Robot, device: Any, dtype: str):

@@ -14,7 +14,7 @@ import pytest
 import warp_spo as spo
 from support import laws, oracles, zoo
 from support.granularities import of_random_scenes
-from support.robots import ROBOTS
+from support.robots import ROBOTS, of_newtons_importer
 from warp_spo.newton import shipped
 
 WORLDS = 3
@@ -126,7 +126,7 @@ def name_in_file(label):
 
 
 class ParsedMjcf(oracles.MujocoModel):
-    """MuJoCo's model of an MJCF file, in the coordinates of the scene that ``load`` makes of it.
+    """MuJoCo's model of an MJCF file, in the coordinates of the scene of Newton's model of it.
 
     The joints of a body, in the file's order, are the degrees of freedom of its one hinge, whose label joins their
     names. Springs and dampers are switched off: forward and inverse dynamics contain none. Sensors are left out:
@@ -275,13 +275,14 @@ def file_agrees(scene, model, device):
     agrees(dyn, [model] * WORLDS, PARSED, seed=13)
 
 
-@pytest.mark.usefixtures("newtons_importer")
 @pytest.mark.parametrize("name", ["humanoid", "ant", "probe.xml"])
-def test_mjcf_is_read_as_mujoco_reads_it(name, tmp_path, device):
-    """Masses from shapes and densities, inertias, frames, axes, armature and gravity; Newton's two engines aside."""
+def test_newtons_models_of_mjcf_are_as_mujoco_reads_the_file(name, tmp_path, device):
+    """Masses from shapes and densities, inertias, frames, axes and armature, by ``from_newton``. Newton's importer
+    does not read the file's gravity."""
     path = file_of(name, tmp_path)
-    scene = spo.load(path)
-    file_agrees(scene, ParsedMjcf(scene, path), device)
+    scene = of_newtons_importer(path)
+    model = ParsedMjcf(scene, path)
+    file_agrees(scene.with_values(gravity=model.model.opt.gravity), model, device)
 
 
 @pytest.mark.parametrize("floating", [False, True], ids=["fixed", "floating"])
@@ -317,84 +318,3 @@ def test_newton_weighs_a_link_without_inertial_by_its_shapes(device):
     for world in range(WORLDS):
         assert laws.error(mass[world], model.mass_matrix(q[world])) <= PARSED
         assert laws.error(tau[world], model.inverse_dynamics(q[world], qd[world], qdd[world])) <= PARSED
-
-
-LIFT, YAW = (line for line in MJCF.splitlines() if 'name="lift"' in line or 'name="yaw"' in line)
-MISREAD = {
-    "hinge_before_slide": (
-        (f"{LIFT}\n{YAW}", f"{YAW}\n{LIFT}"),
-        "a slide after a hinge or ball (body 'mast')",
-        "of its own",
-    ),
-    "two_anchors": (
-        (
-            f"{LIFT}\n{YAW}",
-            f"{YAW}\n{YAW}".replace('"yaw"', '"roll"', 1).replace("0 1 0", "1 0 0", 1).replace("0.03", "0.1", 1),
-        ),
-        "joints with different pos (body 'mast')",
-        "give each joint a body of its own",
-    ),
-    "ref": (('name="nod"', 'name="nod" ref="0.5"'), "a joint's ref (body 'tip')", "subtract it from range"),
-    "shell": (
-        ('name="box"', 'name="box" shellinertia="true"'),
-        "a geom's shellinertia (body 'base')",
-        "write the <inertial> of its body",
-    ),
-    "total": (
-        ("<compiler ", '<compiler settotalmass="2" '),
-        "<compiler settotalmass> (body 'base', 'mast', 'head', 'tip', 'pin')",
-        "Scene.with_values",
-    ),
-}
-"""Name -> a change of the probe that Newton 1.8 misreads without a word, the refusal, and a part of its way out."""
-
-
-def changed_probe(folder, old, new):
-    if old not in MJCF:
-        pytest.fail(f"the probe lacks {old!r}", pytrace=False)
-    path = folder / "probe.xml"
-    path.write_text(MJCF.replace(old, new))
-    return path
-
-
-@pytest.mark.usefixtures("newtons_importer")
-@pytest.mark.parametrize("name", MISREAD)
-def test_what_newton_misreads_is_refused(name, tmp_path):
-    change, feature, way_out = MISREAD[name]
-    path = changed_probe(tmp_path, *change)
-    with pytest.raises(spo.UnsupportedError) as caught:
-        spo.load(path)
-    assert str(caught.value).startswith(f"load: {str(path)!r} with {feature} is not supported; ")
-    assert way_out in str(caught.value)
-
-
-@pytest.mark.usefixtures("newtons_importer")
-@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
-@pytest.mark.parametrize("name", MISREAD)
-def test_newton_misreads(name, tmp_path, monkeypatch, device):
-    """Without the refusal the scene is another robot. A failure says that Newton has learnt it: the refusal can go."""
-    path = changed_probe(tmp_path, *MISREAD[name][0])
-    monkeypatch.setattr("warp_spo.newton.mjcf.find_misread", lambda root, floating: {})
-    scene = spo.load(path)
-    with pytest.raises(AssertionError):
-        file_agrees(scene, ParsedMjcf(scene, path), device)
-
-
-@pytest.mark.usefixtures("newtons_importer")
-def test_a_hinge_on_a_body_of_its_own_before_a_slide(tmp_path, device):
-    """The way out. MuJoCo wants a mass of every body that moves."""
-    weight = '<inertial pos="0 0 0" mass="1e-6" diaginertia="1e-6 1e-6 1e-6"/>'
-    path = changed_probe(tmp_path, f"{LIFT}\n{YAW}", f'{YAW}{weight}<body name="upper">\n{LIFT}')
-    path.write_text(path.read_text().replace("</worldbody>", "</body></worldbody>"))
-    scene = spo.load(path)
-    assert scene.body_count == 6
-    file_agrees(scene, ParsedMjcf(scene, path), device)
-
-
-@pytest.mark.usefixtures("newtons_importer")
-def test_oblique_hinges_of_a_file_are_refused(tmp_path):
-    """MuJoCo turns about oblique axes; Newton's D6 does not."""
-    path = tmp_path / "probe.xml"
-    path.write_text(MJCF.replace(LIFT, YAW.replace('"yaw"', '"roll"').replace("0 1 0", "1 0.5 0")))
-    with pytest.raises(spo.UnsupportedError, match=r"D6 joint '.*roll_yaw' with oblique angular axes"):
-        spo.load(path)

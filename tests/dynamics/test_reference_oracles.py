@@ -19,6 +19,7 @@ from support.reference_cases import (
     same_poses,
     trees,
 )
+from support.robots import of_newtons_importer
 from warp_spo.newton import from_newton, load, shipped
 from warp_spo.reference.dense import Dense, rotation
 from warp_spo.scene.parts import Body, Hinge
@@ -81,11 +82,11 @@ def test_quaternions_are_normalised_when_read():
     same_poses(Dense(scene, q).body_poses, d.body_poses, ORACLE)
 
 
-@pytest.mark.usefixtures("newtons_importer")
 @pytest.mark.parametrize("oracle", [oracles.PinocchioModel, oracles.MujocoModel])
 @pytest.mark.parametrize("name", ["ant", "humanoid", "quadruped", "cartpole"])
 def test_oracle_robot(name, oracle):
-    scene = load(shipped(name))
+    path = shipped(name)
+    scene = of_newtons_importer(path) if path.suffix == ".xml" else load(path)
     theirs = oracle(scene)
     for q, qd, tau in zip(*zoo.random_state(scene, 2, seed=3), strict=True):
         agrees(scene, theirs, q, qd, tau, ORACLE)

@@ -3,6 +3,7 @@
 import inspect
 import json
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -93,7 +94,6 @@ LEG = """
 @pytest.mark.slow
 def test_a_robot_of_ones_own_moves_in_mujoco_as_here(tmp_path):
     """From a file without free joint, servos, armature and keyframe, which the metadata add."""
-    mujoco = pytest.importorskip("mujoco")
     from warp_spo.mujoco import deployment
 
     env = legged()

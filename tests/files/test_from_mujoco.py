@@ -2,6 +2,7 @@
 
 import warnings
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -9,8 +10,6 @@ import warp_spo as spo
 from benchmarks.mjcf_files import Agreement
 from support.mjcf_texts import ACTUATORS, EMPTY, EQUALITY, EXACT, FREE, KEYS, TIES
 from support.random_mjcf import random_mjcf
-
-mujoco = pytest.importorskip("mujoco")
 
 ROUNDING = 1e-14  # of poses, constraint residuals and states of order one
 pytestmark = pytest.mark.filterwarnings("ignore:from_mujoco. left out")

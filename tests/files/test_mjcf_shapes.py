@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 import warp_spo as spo
-from warp_spo.newton import mjcf
 from warp_spo.reference.rotations import rotation
-from warp_spo.scene.collision_shapes import Choice
 
 EXACT = 1e-12  # float64 on both sides; sizes of a metre
 MARGINS = """<mujoco><option o_margin="0.07" o_friction="0.4 0.4 0.01 0.01 0.01"><flag override="{override}"/></option>
@@ -81,17 +79,15 @@ def test_a_mesh_that_is_missing_touches_nothing(tmp_path):
 
 @pytest.mark.parametrize("flag", ["contact", "constraint"])
 def test_a_file_that_disables_contacts_is_obeyed(flag, tmp_path):
-    """By True, with a warning, through MuJoCo and without it; a pattern takes the shapes anyway."""
+    """By True, with a warning; a pattern takes the shapes anyway."""
     file = tmp_path / "ball.xml"
     body = '<body name="b"><freejoint/><geom name="s" type="sphere" size="0.1"/></body>'
     text = '<mujoco><option>{}</option><worldbody><geom type="plane" size="1 1 1"/>{}</worldbody></mujoco>'
     file.write_text(text.format(f'<flag {flag}="disable"/>', body))
-    through_newton = lambda contacts: mjcf.read_mjcf(file, None, True, Choice(contacts, None, 8))  # noqa: E731
-    for read in (lambda contacts: spo.load(file, contacts=contacts), through_newton):
-        with pytest.warns(UserWarning, match=r"left out: all contacts, which its options disable .*contacts='\*'"):
-            scene = read(True)
-        assert not scene.contacts and scene.ground is None
-        assert len(read("*").contacts) == 1
+    with pytest.warns(UserWarning, match=r"left out: all contacts, which its options disable .*contacts='\*'"):
+        scene = spo.load(file, contacts=True)
+    assert not scene.contacts and scene.ground is None
+    assert len(spo.load(file, contacts="*").contacts) == 1
     file.write_text(text.format("", body))
     assert len(spo.load(file, contacts=True).contacts) == 1
 
@@ -104,16 +100,33 @@ MASKED = """<mujoco><default><default class="second"><geom contype="2" conaffini
  conaffinity="0"/></body></body></worldbody><contact>{contact}</contact></mujoco>"""
 
 
+def mujocos_contacts(file):
+    """Return the friction of MuJoCo's contact with geom 'floor' by the other geom's name, all bodies at the origin."""
+    model = mujoco.MjModel.from_xml_path(str(file))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    found = {}
+    for contact in data.contact:
+        names = {model.geom(geom).name for geom in contact.geom}
+        if "floor" in names:
+            (name,) = names - {"floor"}
+            found[name] = contact.friction[0] if contact.dim > 1 else 0.0
+    return found
+
+
 @pytest.mark.parametrize("floor", ["", 'contype="2" conaffinity="2"', 'conaffinity="0"', 'contype="0" conaffinity="0"'])
 @pytest.mark.parametrize("contact", ["", '<pair geom1="lone" geom2="floor"/>', '<pair geom1="tip" geom2="floor"/>'])
 @pytest.mark.parametrize("exclude", ["", '<exclude body1="world" body2="base"/>'])
-def test_masks_pairs_and_excludes_hold_without_mujoco(floor, contact, exclude, tmp_path):
-    """Newton's importer keeps the shapes that MuJoCo's rules let touch the ground, and no others."""
+def test_masks_pairs_and_excludes_choose_what_touches_in_mujoco(floor, contact, exclude, tmp_path):
+    """Shapes have contacts where MuJoCo finds some, and no others. A plane that can touch nothing is no ground: then
+    all shapes touch the plane at height zero."""
     file = tmp_path / "masked.xml"
     file.write_text(MASKED.format(floor=floor, contact=contact + exclude))
-    wanted = [c.label for c in spo.load(file, contacts=True).contacts]
-    scene = mjcf.read_mjcf(file, None, True, Choice(True, None, 8))
-    assert [c.label.split("/")[-1] for c in scene.contacts] == wanted and 0 < len(wanted) + len(exclude)
+    wanted = mujocos_contacts(file).keys()
+    if 'contype="0"' in floor and not contact:
+        assert not wanted
+        wanted = {"sole", "apart", "lone", "rod", "tip"}
+    assert {c.label for c in spo.load(file, contacts=True).contacts} == wanted
 
 
 def test_friction_that_differs_across_is_said_to_be_left_out(tmp_path):
@@ -144,30 +157,13 @@ RUBBED = """<mujoco><default><geom friction="0.6"/><pair friction="0.35 0.35"/><
  <pair geom1="floor" geom2="listed" margin="0.07" friction="0.45 0.45" condim="3"/>
  <pair geom1="wet" geom2="floor" class="smooth"/></contact></mujoco>"""
 FLOORS = ["", 'friction="0.8" condim="1"', 'friction="0.2" priority="1" condim="4" margin="0.05"', 'priority="2"']
-"""Under a margin of the floor, the pairs have less than it or more."""
 
 
 @pytest.mark.parametrize("floor", FLOORS)
-def test_friction_and_margins_are_mujocos_without_mujoco(floor, tmp_path):
+def test_friction_is_mujocos(floor, tmp_path):
     """The larger of both, or that of higher priority, zero in contacts of one dimension; a pair has its own."""
     file = tmp_path / "rubbed.xml"
     file.write_text(RUBBED.format(floor=floor))
-    wanted, found = spo.load(file, contacts=True), mjcf.read_mjcf(file, None, True, Choice(True, None, 8))
-    assert len(wanted.contacts) == 7 and len({contact.friction for contact in wanted.contacts}) > 2
-    for one, other in zip(wanted.contacts, found.contacts, strict=True):
-        assert one.label == other.label.rpartition("/")[2]
-        assert other.friction == pytest.approx(one.friction, abs=1e-7)
-        assert other.radius + found.ground.height == pytest.approx(one.radius + wanted.ground.height, abs=1e-7)
-
-
-def test_a_height_field_is_refused_without_mujoco(tmp_path):
-    file = tmp_path / "field.xml"
-    file.write_text(
-        '<mujoco><asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1" elevation="0 0 0 1"/></asset><worldbody>'
-        '<geom type="hfield" hfield="h"/><body><freejoint/><geom size="0.1"/></body></worldbody></mujoco>'
-    )
-    with pytest.raises(spo.UnsupportedError, match=r"a height field that Newton's importer does not read"):
-        mjcf.read_mjcf(file, None, True, Choice(True, None, 8))
-    own = spo.HeightField(np.zeros((2, 2)), 1.0)
-    assert mjcf.read_mjcf(file, None, True, Choice(True, own, 8)).ground is own
-    assert spo.load(file, contacts=True).ground.heights.max() == 1.0
+    wanted, found = mujocos_contacts(file), {c.label: c.friction for c in spo.load(file, contacts=True).contacts}
+    assert len(found) == 7 and len(set(found.values())) > 2
+    assert found == pytest.approx(wanted)

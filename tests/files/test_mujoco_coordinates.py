@@ -2,6 +2,7 @@
 
 import re
 
+import mujoco
 import numpy as np
 import pytest
 import warp as wp
@@ -9,8 +10,6 @@ import warp as wp
 import warp_spo as spo
 from support.allocations import no_warp_allocation
 from support.random_mjcf import random_mjcf
-
-mujoco = pytest.importorskip("mujoco")
 
 ROUNDING = {"float32": 3e-6, "float64": 1e-14}  # of sums of ten terms of order one
 WORLDS = 5

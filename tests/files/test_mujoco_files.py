@@ -3,6 +3,7 @@
 import re
 import struct
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -10,8 +11,6 @@ import warp_spo as spo
 from benchmarks.mjcf_files import Agreement
 from benchmarks.robot_files import compare_mjcf, mjcf_files
 from warp_spo.newton import shipped
-
-mujoco = pytest.importorskip("mujoco")
 
 EXACT = 1e-12  # relative to the largest entry; rounding leaves 2e-14
 pytestmark = pytest.mark.filterwarnings("ignore:load. .* left out")
@@ -196,8 +195,3 @@ def test_a_base_that_an_actuator_drives_stays(tmp_path):
     with pytest.raises(spo.UnsupportedError, match="actuator 'm', which needs joint 'lift', under floating="):
         spo.load(file, floating=False)
     assert spo.load(file).actuators[0].hinges == (0,)
-
-
-def test_without_the_package_newton_reads(tmp_path, newtons_importer):
-    file = written(tmp_path, world=BODY.format(**BODIES))
-    assert spo.load(file).body_labels[0].endswith("worldbody/b")

@@ -1,10 +1,10 @@
 """Features of MuJoCo's models that no scene represents: each raises an error that names the element and a way out."""
 
+import mujoco
 import pytest
 
 import warp_spo as spo
 
-mujoco = pytest.importorskip("mujoco")
 pytestmark = pytest.mark.filterwarnings("ignore:from_mujoco. left out")
 
 MODEL = """<mujoco><option {option}/><worldbody><body name="base"><joint name="slide" type="slide"{slide}/>

@@ -1,5 +1,6 @@
 """Actuators: their forces against MuJoCo and the dense reference, and in a step against closed forms."""
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -32,7 +33,6 @@ def test_forces_are_those_of_the_reference(dtype, device):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_reference_is_mujoco(kind):
-    mujoco = pytest.importorskip("mujoco")
     scene, model = arm([KINDS[kind][0]]), mujoco_arm([KINDS[kind][1]])
     data, reached = mujoco.MjData(model), set()
     for q, qd, ctrl in zip(*states(scene, 20), strict=True):
@@ -45,7 +45,6 @@ def test_reference_is_mujoco(kind):
 
 def test_voltage_of_a_motor_is_mujocos():
     """A motor of which the terminal voltage is controlled: gain K / R, bias -K^2 / R."""
-    mujoco = pytest.importorskip("mujoco")
     K, R, gear = 0.3, 2.0, 5.0
     model = mujoco_arm([f'<dcmotor joint="a" motorconst="{K}" resistance="{R}" gear="{gear}"/>'])
     scene = arm([spo.Actuator(0, gear=gear, gain=K / R, bias=(0.0, 0.0, -K * K / R))])
@@ -60,7 +59,6 @@ def test_voltage_of_a_motor_is_mujocos():
 
 def test_steps_are_mujocos_where_both_are_implicit_in_the_rate():
     """MuJoCo's implicitfast takes derivatives of forces by qd alone: motors and velocity servos agree step by step."""
-    mujoco = pytest.importorskip("mujoco")
     names, h = ("motor", "motor with ranges", "velocity"), 1e-3
     model, scene = mujoco_arm([KINDS[name][1] for name in names], h), arm([KINDS[name][0] for name in names])
     dyn, data = spo.Dynamics(scene, 1, device="cpu", dtype="float64"), mujoco.MjData(model)

@@ -192,7 +192,3 @@ def fourbar(enabled=True):
                                parent_xform=wp.transform((1, 0, 0), wp.quat_identity()),
                                child_xform=wp.transform((0, 0, 1), wp.quat_identity()))  # fmt: skip
     return arm(builder, joints=1, label="pendulum")
-
-
-MJCF = """<mujoco><option gravity="0 0 -3" solver="pgs"/>{asset}<worldbody><body name="post"><geom size=".1"/>
-  <body name="tip"><joint type="hinge" axis="0 1 0"/>{tip}</body></body></worldbody></mujoco>"""

@@ -2,13 +2,20 @@
 
 import functools
 
+import newton
 import numpy as np
 
 import warp_spo as spo
 from warp_spo.newton import shipped
-from warp_spo.newton.mjcf import read_mjcf
 
 from . import zoo
+
+
+def of_newtons_importer(file):
+    """The scene of Newton's model of an MJCF file: one D6 for all joints of a body, where ``load`` has a hinge each."""
+    builder = newton.ModelBuilder()
+    builder.add_mjcf(str(file), parse_visuals=False)
+    return spo.from_newton(builder.finalize(device="cpu"))
 
 
 def tall_humanoid():
@@ -61,9 +68,7 @@ def arm():
 
 
 ROBOTS = {
-    "humanoid": functools.partial(
-        read_mjcf, shipped("humanoid"), None, True
-    ),  # by Newton: a D6 for all joints of a body
+    "humanoid": lambda: of_newtons_importer(shipped("humanoid")),
     "ant": functools.partial(spo.load, shipped("ant")),
     "quadruped": functools.partial(spo.load, shipped("quadruped"), floating=True),
     "cartpole": functools.partial(spo.load, shipped("cartpole")),

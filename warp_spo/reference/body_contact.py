@@ -2,7 +2,7 @@
 
 Two bodies share points, each with a normal n towards the first body and a depth. A point is a contact as one with the
 ground is, whose velocity is that of the first body at the point less that of the second: J = J_first - J_second. So a
-step solves the system of :mod:`.reference_contact` with more rows, exactly, and forces come in pairs.
+step solves the system of :mod:`.contact` with more rows, exactly, and forces come in pairs.
 """
 
 from itertools import combinations

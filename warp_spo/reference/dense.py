@@ -7,7 +7,7 @@ the hinge that carries the body. N = 6 bodies rows, node after node; the columns
 There are two independent formulations of the dynamics, which share only poses: the paper's matrices, built by
 ``inv(I - E)`` (``E_phi``, ``phi``, ``H``, ``M``, ``mass_matrix``, ``P``, ``D``, ...), and Newton's and Euler's
 equations for each body in three-vectors in world axes (``inverse_dynamics``, ``bias_force``), from the accelerations of
-``reference_motion.py``. The specification imports NumPy only and reads a scene by the names of its attributes.
+``kinematics.py``. The specification imports NumPy only and reads a scene by the names of its attributes.
 """
 
 from functools import cached_property

@@ -78,7 +78,6 @@ def load(
 
     Raises:
         ValueError: the name is unknown.
-        ImportError: the package mujoco, which reads the file, is missing.
     """
     if name not in NAMES:
         raise ValueError(f"robots.load: {name!r} is unknown; expected one of {', '.join(NAMES)}")

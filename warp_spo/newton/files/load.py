@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from xml.etree.ElementTree import ParseError
 
@@ -13,7 +12,6 @@ import newton
 from ...scene.collision_shapes import POINTS, Choice
 from ...scene.contacts import HeightField, Plane
 from ...scene.scene import Scene
-from ..mjcf import read_mjcf
 from .urdf import read_urdf
 from .usd import read_usd
 
@@ -55,10 +53,9 @@ def load(
 ) -> Scene:
     """Return the scene of a robot file: URDF (.urdf), MJCF (.xml, .mjcf) or USD (.usd, .usda, .usdc, .usdz).
 
-    MJCF is compiled by MuJoCo if the package is installed (extra ``mujoco``), and becomes a scene as by
-    :func:`from_mujoco`, in float64. A URDF is read in float64, and the scene has its numbers; order, labels and
-    coordinates are those of Newton's model of the file. The unit of a COLLADA mesh counts, its up axis does not. USD,
-    and MJCF without the package mujoco, are read by Newton's importers, in float32. Visual shapes are skipped.
+    MJCF is compiled by MuJoCo, and becomes a scene as by :func:`from_mujoco`, in float64. A URDF is read in float64,
+    and the scene has its numbers; order, labels and coordinates are those of Newton's model of the file. The unit of a
+    COLLADA mesh counts, its up axis does not. USD is read by Newton's importer, in float32. Visual shapes are skipped.
     Collision shapes are read if ``contacts`` asks for them. A mesh file is needed only if a body that can move takes
     its mass from it, or a contact its points.
 
@@ -89,9 +86,6 @@ def load(
             line and the element. Or a pattern of ``contacts`` matches no shape; the message lists the bodies with some.
         ImportError: A package for meshes or USD is missing. The message names the extra that installs it.
         UnsupportedError, DirectedLoopError: As :func:`from_newton` and :func:`from_mujoco`.
-        UnsupportedError: Without the package mujoco, an MJCF file uses a feature that Newton 1.8 misreads, such as a
-            slide after a hinge in one body, joints of one body with different ``pos``, a joint's ``ref``,
-            ``shellinertia`` where shapes give the mass, or ``settotalmass``. The message says what to write instead.
         UnsupportedError: A pattern of ``contacts`` names a shape that no contact represents, or the file has several
             grounds and ``ground`` does not choose. With contacts=True, such shapes are left out, with a warning.
 
@@ -102,7 +96,13 @@ def load(
     """
     file = Path(path)
     importer = robot_format(file)
-    read = _mjcf_reader() if importer == "mjcf" else {"urdf": read_urdf, "usd": read_usd}[importer]
+    read: Callable[[Path, bool | None, bool, Choice], Scene]
+    if importer == "mjcf":
+        from ...mujoco.mjcf import read_mjcf  # imports the package mujoco, which other formats do not need
+
+        read = read_mjcf
+    else:
+        read = {"urdf": read_urdf, "usd": read_usd}[importer]
     try:
         return read(file, floating, repair, Choice(contacts, ground, points))
     except ParseError as error:
@@ -114,15 +114,6 @@ def load(
             f"load: {str(file)!r} needs a package that is missing ({error}) to read {need}; "
             f"pip install warp_spo[{extra}]"
         ) from error
-
-
-def _mjcf_reader() -> Callable[[Path, bool | None, bool, Choice], Scene]:
-    """Return the function that reads MJCF files: through MuJoCo or, without that package, through Newton's importer."""
-    if find_spec("mujoco") is None:
-        return read_mjcf
-    from ...mujoco.mjcf import read_mjcf as read_through_mujoco  # imports the package mujoco
-
-    return read_through_mujoco
 
 
 def robot_format(file: Path) -> str:

@@ -11,7 +11,7 @@ import newton
 import numpy as np
 
 from ...errors import UnsupportedError
-from ...scene.collision_shapes import NONE, Choice, On, Shape, Touches
+from ...scene.collision_shapes import NONE, Choice, Shape
 from ...scene.contacts import Contact
 from ...scene.scene import Scene
 from ..model import from_newton
@@ -125,21 +125,12 @@ def _convert(builder: newton.ModelBuilder, metre: float, kilogram: float, gravit
             values.joint_mimic_coeffs[joint] = (own * offset, own / other * ratio)
 
 
-def scene_of(
-    file: Path,
-    builder: newton.ModelBuilder,
-    repair: bool,
-    choice: Choice = NONE,
-    touches: Touches | None = None,
-    on: On = Shape.on,
-) -> Scene:
-    """Return the scene of a builder that read a file; errors name the file.
+def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool, choice: Choice = NONE) -> Scene:
+    """Return the scene of a builder that read a file; errors name the file. Contacts obey Newton's groups and filters.
 
     Args:
         file: for errors. builder: what an importer made of the file. choice: of shapes that touch the ground.
         repair: replace masses and inertias that no rigid body can have; a warning names the bodies.
-        touches: says whether a shape touches a ground of the file; None: by Newton's groups and filters. on: returns a
-            shape as it is on that.
     """
     try:
         if repair:
@@ -159,10 +150,10 @@ def scene_of(
     def shapes() -> ModelShapes:
         return ModelShapes(model, Worlds(model), materials=False)
 
-    def by_groups(shape: Shape, ground: Shape) -> bool:
+    def touches(shape: Shape, ground: Shape) -> bool:
         return shapes().touches(shape, ground)
 
-    scene, lost = choice.applied(call, scene, lambda: shapes().first(), touches or by_groups, on)
+    scene, lost = choice.applied(call, scene, lambda: shapes().first(), touches, Shape.on)
     if lost:
         warnings.warn(f"{call}: left out: {', '.join(lost)}", UserWarning, stacklevel=4)
     return scene
