@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from warp_spo.__main__ import find_device
-from warp_spo.trials import drawing
+from warp_spo.viewing import charts
 
 from . import cases as data
 from . import commits, everything, evidence, history, parts, pictures, report, roofline, runner, table
@@ -111,11 +111,11 @@ def main(argv: list[str] | None = None) -> int:
                 return compare(*map(Path, options.compare))
             return compare_commits(options)
         if options.history:
-            return keep_history(options, drawing.load_pyplot("--history"))
+            return keep_history(options, charts.load_pyplot("--history"))
         for option, out in (("--json", options.json), ("--report", options.report and options.report / report.FILE)):
             if out:
                 runner.check_place(option, out)
-        pyplot = drawing.load_pyplot() if options.report or options.readme else None
+        pyplot = charts.load_pyplot() if options.report or options.readme else None
         if options.everything:
             device = find_device(options.device)
             chosen = parts.choose(options.filter, device.is_cuda, str(device))
@@ -187,7 +187,7 @@ def write_readme(pyplot: Any, source: Path) -> None:
     for name, figure in zip(table.PICTURES, (pictures.headline, pictures.scaling), strict=True):
         drawn = figure(pyplot, found[0])
         if drawn is not None:
-            (evidence.RESULTS / name).write_text(drawing.svg(drawn))
+            (evidence.RESULTS / name).write_text(charts.svg(drawn))
             pyplot.close(drawn)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_spo.trials import drawing
+from warp_spo.viewing import charts
 
 from . import commits, evidence, runner
 from .everything import short_name
@@ -21,7 +21,7 @@ PAGE = "README.md"
 RESULTS_IN_GIT = Path("benchmarks") / "results"
 PAST_WORLDS = (1024, 4096, 65536)  # of committed results
 KEPT = ("date", "machine", "versions")
-COLORS = (drawing.OURS, drawing.OURS_DARK)  # of the numbers of worlds, least first
+COLORS = (charts.OURS, charts.OURS_DARK)  # of the numbers of worlds, least first
 HEAD = """\
 # Run times over time
 
@@ -153,7 +153,7 @@ def write_page(pyplot: Any, folder: Path = FOLDER) -> Path:
     for device, mine in machines.items():
         name = f"history-{short_name(mine[0]['machine'])}.svg"
         figure = chart(pyplot, device, mine)
-        (folder / name).write_text(drawing.svg(figure))
+        (folder / name).write_text(charts.svg(figure))
         pyplot.close(figure)
         text += [f"## {device}\n", f"![Run times over commits on {device}]({name})\n", table(mine)]
     page = folder / PAGE
@@ -177,7 +177,7 @@ def table(mine: Sequence[dict]) -> str:
 
 
 # -- the chart ---------------------------------------------------------------------------------------------------------
-@drawing.style()
+@charts.style()
 def chart(pyplot: Any, device: str, mine: Sequence[dict]) -> Any:
     """Draw one panel for each operation and robot: run time against commits, a line for each number of worlds."""
     from matplotlib.lines import Line2D
@@ -201,13 +201,13 @@ def chart(pyplot: Any, device: str, mine: Sequence[dict]) -> Any:
         axes.set_xticks(places, names if axes in grid[-1] else [""] * len(names), fontsize=7.0)
     for axes in grid[-1]:
         axes.set_xlabel("commit, oldest first")
-    drawing.title(figure, f"Run times over commits, {device}, float32: lower is better")
+    charts.title(figure, f"Run times over commits, {device}, float32: lower is better")
     handles = [
         Line2D([], [], color=color, marker=".", linewidth=1.6, label=f"{count:,} worlds")
         for count, color in zip(counts, COLORS, strict=False)
     ]
-    drawing.legend_below(figure, handles)
-    drawing.finish_layout(figure)
+    charts.legend_below(figure, handles)
+    charts.finish_layout(figure)
     return figure
 
 
@@ -220,7 +220,7 @@ def _panel(axes: Any, own: Sequence[Sequence[dict]], counts: Sequence[int]) -> N
             axes.plot([at, at], [row["low_us"], row["high_us"]], color=color, linewidth=3.0, alpha=0.4)
         times += [row[key] for _, row in points for key in ("us", "low_us", "high_us")]
     if times:
-        drawing.log_axis(axes.yaxis, times, drawing.time_text, most=4)
+        charts.log_axis(axes.yaxis, times, charts.time_text, most=4)
 
 
 def _ticks(mine: Sequence[dict], most: int = 6) -> tuple[list[int], list[str]]:

@@ -10,7 +10,7 @@ import pytest
 from benchmarks import commits, evidence, history, robots
 from benchmarks.__main__ import main
 from support.rendering import assert_is_whole
-from warp_spo.trials import drawing
+from warp_spo.viewing import charts
 
 MACHINE = dict(device="NVIDIA L4", device_memory_GiB=22.0)
 VERSIONS = {"warp-lang": "1.19.0"}
@@ -24,7 +24,7 @@ needs_git = pytest.mark.skipif(not IN_GIT, reason="this is no checkout of git")
 
 @pytest.fixture(scope="module")
 def pyplot():
-    return drawing.load_pyplot()
+    return charts.load_pyplot()
 
 
 def rows(*times, skipped=None):
